@@ -1,0 +1,172 @@
+"""A finished calibration as plain tables: made from a `Calibration`, written to and read from HDF5."""
+
+import os
+from typing import NamedTuple
+
+import numpy as np
+
+from . import storage
+from .arm_files import ArmSpecification
+from .calibrate import Calibration
+from .capture_files import arm_table, recording_of, recording_tables, specification_of
+from .evaluate import Evaluation, evaluate
+from .manifest import Recording
+from .parameters import Parameters, is_length
+from .solver import Reason
+from .storage import Table, Variable
+
+STAGES = ("nominal", "stage1", "calibrated")
+
+
+class CalibrationRecord(NamedTuple):
+    """Everything a calibration file holds. Arrays are NumPy's, in mm and rad, in the order of ``names``."""
+
+    recording: Recording  # what it was identified from, and the nominal arm
+    stage1: ArmSpecification
+    calibrated: ArmSpecification
+    names: tuple[str, ...]  # free parameters
+    held: tuple[str, ...]
+    hold: str | None  # held in stage 1 only
+    lower: np.ndarray
+    upper: np.ndarray
+    active_stage1: np.ndarray  # -1, 0, +1
+    active: np.ndarray
+    covariance: np.ndarray
+    k: float
+    u_k: float
+    method: str
+    steps: int
+    converged: bool
+    reason: str
+
+    def vectors(self) -> dict[str, np.ndarray]:
+        """Free parameters of the nominal arm, after stage 1, and calibrated; and of the true arm of a simulation."""
+        space = Parameters(self.recording.nominal.arm, self.names)
+        arms = {"nominal": self.recording.nominal.arm, "stage1": self.stage1.arm, "calibrated": self.calibrated.arm}
+        if self.recording.true is not None:
+            arms["true"] = self.recording.true.arm
+        return {stage: np.asarray(space.vector(arm)) for stage, arm in arms.items()}
+
+    def evaluations(self) -> dict[str, Evaluation]:
+        """The three arms on the capture that was identified from."""
+        arms = {"nominal": self.recording.nominal.arm, "stage1": self.stage1.arm, "calibrated": self.calibrated.arm}
+        return {stage: evaluate(arm, self.recording.capture) for stage, arm in arms.items()}
+
+
+def record_of(calibration: Calibration, recording: Recording) -> CalibrationRecord:
+    """The record of a calibration, given the recording that it was identified from."""
+    nominal, stage1 = recording.nominal, calibration.stage1
+    result = calibration.result if bool(stage1.converged) else stage1.result
+    return CalibrationRecord(
+        recording=recording,
+        stage1=nominal._replace(arm=stage1.arm, name=f"{nominal.name}, after stage 1"),
+        calibrated=nominal._replace(arm=calibration.arm, name=f"{nominal.name}, calibrated"),
+        names=calibration.space.names,
+        held=calibration.space.held,
+        hold=stage1.hold,
+        lower=np.asarray(calibration.bounds.lower),
+        upper=np.asarray(calibration.bounds.upper),
+        active_stage1=np.asarray(stage1.active),
+        active=np.asarray(calibration.active),
+        covariance=np.asarray(calibration.covariance),
+        k=float(calibration.scale.value),
+        u_k=float(calibration.scale.u),
+        method=calibration.method,
+        steps=int(calibration.steps),
+        converged=bool(calibration.converged),
+        reason=Reason[result],
+    )
+
+
+def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None:
+    """Write a calibration with its capture and arms to HDF5, whole or not at all."""
+    tables = recording_tables(record.recording)
+    tables["stage1_arm"] = arm_table(record.stage1)
+    tables["calibrated_arm"] = arm_table(record.calibrated)
+    tables["parameters"] = _parameter_table(record)
+    tables["sockets"] = _socket_table(record)
+    reference = tables["reference"].variables
+    for stage, evaluation in record.evaluations().items():
+        reference[f"measured_{stage}"] = Variable(
+            ("length",), np.asarray(evaluation.measured), "mm", f"length as the {stage} arm measures it"
+        )
+    attributes = {
+        "seed": record.recording.seed,
+        "method": record.method,
+        "held": ",".join(record.held),
+        "hold": record.hold,
+        "scale_k": record.k,
+        "scale_u": record.u_k,
+        "steps": record.steps,
+        "converged": record.converged,
+        "reason": record.reason,
+    }
+    storage.write_tables(path, "calibration", tables, attributes)
+
+
+def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
+    """Read a calibration. Raises `InputError` where the file is missing, damaged, foreign, newer or no calibration."""
+    stored = storage.read_tables(path, ("calibration",))
+    for name in ("stage1_arm", "calibrated_arm", "parameters"):
+        storage.need(path, stored.tables, name)  # type: ignore[arg-type]
+    table, attributes = stored.tables["parameters"], stored.attributes
+    storage.need(path, table, "parameter", "lower", "upper", "active_stage1", "active", "covariance")
+    return CalibrationRecord(
+        recording=recording_of(path, stored),
+        stage1=specification_of(path, stored, "stage1_arm"),
+        calibrated=specification_of(path, stored, "calibrated_arm"),
+        names=tuple(str(name) for name in table["parameter"]),
+        held=tuple(attributes["held"].split(",")) if attributes.get("held") else (),
+        hold=attributes.get("hold"),
+        lower=table["lower"],
+        upper=table["upper"],
+        active_stage1=table["active_stage1"],
+        active=table["active"],
+        covariance=table["covariance"],
+        k=attributes["scale_k"],
+        u_k=attributes["scale_u"],
+        method=attributes["method"],
+        steps=attributes["steps"],
+        converged=bool(attributes["converged"]),
+        reason=attributes["reason"],
+    )
+
+
+def _parameter_table(record: CalibrationRecord) -> Table:
+    names = list(record.names)
+    units = ["mm" if is_length(name) else "rad" for name in names]
+    both = "mm or rad, see unit"
+    variables = {
+        "parameter": Variable(("parameter",), names, "", "free parameter"),
+        "parameter_2": Variable(("parameter_2",), names, "", "free parameter, second axis of the covariance"),
+        "unit": Variable(("parameter",), units, "", "unit of the parameter"),
+        "lower": Variable(("parameter",), record.lower, both, "lower bound of the identification"),
+        "upper": Variable(("parameter",), record.upper, both, "upper bound of the identification"),
+        "u": Variable(("parameter",), np.sqrt(np.diag(record.covariance)), both, "standard uncertainty"),
+        "active_stage1": Variable(("parameter",), record.active_stage1, "1", "-1 on the lower bound, +1 on the upper, in stage 1"),
+        "active": Variable(("parameter",), record.active, "1", "-1 on the lower bound, +1 on the upper"),
+        "covariance": Variable(("parameter", "parameter_2"), record.covariance, "products of units", "covariance"),
+    }
+    for stage, vector in record.vectors().items():
+        variables[stage] = Variable(("parameter",), vector, both, f"value in the {stage} arm")
+    return Table(variables)
+
+
+def _socket_table(record: CalibrationRecord) -> Table:
+    capture = record.recording.capture
+    variables = {
+        "socket": Variable(("socket",), list(capture.names), "", "socket"),
+        "axis": Variable(("axis",), ["x", "y", "z"], "", "axis of the base frame"),
+        "poses": Variable(("socket",), list(capture.sizes), "1", "number of poses"),
+    }
+    for stage, evaluation in record.evaluations().items():
+        figures = evaluation.repeatability
+        for name, values, text in (
+            ("de", figures.socket_de, "mean distance from the centroid"),
+            ("deltam", figures.socket_deltam, "largest half range"),
+            ("rms", figures.socket_rms, "root mean square distance from the centroid"),
+        ):
+            variables[f"{name}_{stage}"] = Variable(("socket",), np.asarray(values), "mm", f"{text}, {stage} arm")
+        if stage == "calibrated":
+            variables["centroid"] = Variable(("socket", "axis"), np.asarray(figures.centroids), "mm", "socket position")
+    return Table(variables)

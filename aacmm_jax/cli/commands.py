@@ -1,0 +1,287 @@
+"""The commands: what each takes, and which of the package's functions it calls. Units are in the options' names."""
+
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, NoReturn
+
+import typer
+
+from ..errors import InputError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    rich_markup_mode="rich",
+    help="Calibrate articulated-arm coordinate measuring machines and other serial arms.",
+    epilog="Every command takes --help and, for a traceback when something fails, --debug. Start with: aacmm demo",
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else there.")]
+Only = Annotated[list[str] | None, typer.Option("--only", metavar="PATTERN", help="Use only the sockets that match (shell pattern); repeatable.")]
+Without = Annotated[list[str] | None, typer.Option("--without", metavar="PATTERN", help="Leave out the sockets that match; repeatable.")]
+CaptureFile = Annotated[Path, typer.Argument(metavar="CAPTURE.h5", help="Capture written by import or simulate.")]
+CalibrationFile = Annotated[Path, typer.Argument(metavar="CALIBRATION.h5", help="Calibration written by calibrate.")]
+
+
+@app.callback()
+def prepare() -> None:
+    """Calibrate articulated-arm coordinate measuring machines and other serial arms."""
+    # Compiled kernels are kept between runs; it more than halves the time of a short command.
+    import jax
+
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(home / "aacmm_jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+@app.command(epilog="Example: aacmm demo my-demo --seed 7")
+def demo(
+    folder: Annotated[Path, typer.Argument(help="Folder for the files; made if absent.")] = Path("aacmm-demo"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Simulate the paper's arm with realistic noise, calibrate it, and compare with the truth."""
+    from ..demo import run
+    from . import display
+
+    summary = _busy("Simulating and calibrating", lambda: run(folder, seed))
+    _show(summary, as_json, display.demo)
+
+
+@app.command(epilog="Example: aacmm simulate cheng2018-simulation -o capture.h5 --socket A=400,200,300 --socket B=600,200,300 "
+             "--poses 70 --length A,B,0.002 --encoder-arcsec 2 --seating-mm 0.005")  # fmt: skip
+def simulate(
+    arm: Annotated[str, typer.Argument(metavar="ARM", help="Nominal arm: a TOML file or a name that ships with the package.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Capture to write (HDF5).")],
+    socket: Annotated[list[str], typer.Option(metavar="NAME=X,Y,Z", help="A socket and its position in mm; repeatable.")],
+    poses: Annotated[list[str] | None, typer.Option(metavar="N or NAME=N", help="Poses a socket; repeatable. Default 70.")] = None,
+    length: Annotated[list[str] | None, typer.Option(metavar="A,B[,U]", help="Reference length between two sockets, u in mm; repeatable.")] = None,
+    encoder_arcsec: Annotated[float, typer.Option(min=0, help="Standard deviation of a reading.")] = 0.0,
+    resolution_arcsec: Annotated[float, typer.Option(min=0, help="Resolution of a reading.")] = 0.0,
+    seating_mm: Annotated[float, typer.Option(min=0, help="Standard deviation, a coordinate, of the seat.")] = 0.0,
+    true_arm: Annotated[str | None, typer.Option(help="Arm that makes the poses, where it is not the nominal one.")] = None,
+    deviate_length_mm: Annotated[float, typer.Option(min=0, help="Draw the true arm: lengths off by up to this.")] = 0.0,
+    deviate_angle_deg: Annotated[float, typer.Option(min=0, help="Draw the true arm: angles off by up to this.")] = 0.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of poses and noise.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Make a capture with a simulated arm."""
+    from .. import simulate as simulation
+    from ..arm_files import load_specification
+    from ..capture_files import save_capture
+    from ..manifest import Recording
+    from ..parameters import Parameters
+    from ..summary import capture_summary
+    from . import display
+
+    nominal = load_specification(arm)
+    true = load_specification(true_arm) if true_arm else nominal
+    if deviate_length_mm or deviate_angle_deg:
+        space = Parameters.free_of(true.arm, held=true.held)
+        drawn = simulation.deviated(space, length=deviate_length_mm, angle=math.radians(deviate_angle_deg), seed=seed)
+        true = true._replace(arm=drawn, name=f"{true.name}, deviated")
+    points = dict(_socket_option(text) for text in socket)
+    capture = _busy(
+        "Simulating",
+        lambda: simulation.simulate(
+            true.arm,
+            points,
+            poses=_poses_option(poses or ["70"], points),
+            lengths=[_length_option(text) for text in length or ()],
+            encoder_arcsec=encoder_arcsec,
+            resolution_arcsec=resolution_arcsec,
+            seating=seating_mm,
+            seed=seed,
+        ),
+    )
+    recording = Recording(capture, nominal, true, seed)
+    save_capture(output, recording)
+    _show(capture_summary(recording) | {"written": str(output)}, as_json, display.capture)
+
+
+@app.command(name="import", epilog="Example: aacmm import capture.toml -o capture.h5")
+def import_(
+    manifest: Annotated[Path, typer.Argument(metavar="MANIFEST.toml", help="Which files hold which socket, in which unit; and the lengths.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Capture to write (HDF5).")],
+    as_json: Json = False,
+) -> None:
+    """Read recorded joint angles into a capture."""
+    from ..capture_files import save_capture
+    from ..manifest import read_manifest
+    from ..summary import capture_summary
+    from . import display
+
+    recording = read_manifest(manifest)
+    save_capture(output, recording)
+    _show(capture_summary(recording) | {"written": str(output)}, as_json, display.capture)
+
+
+@app.command(epilog="Example: aacmm calibrate capture.h5 -o calibration.h5 --without 'test*' --method joint")
+def calibrate(
+    capture: CaptureFile,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Calibration to write (HDF5).")],
+    method: Annotated[Literal["two-stage", "joint"], typer.Option(help="Scale fix after stage 1, or one least squares of poses and lengths.")] = "two-stage",
+    hold: Annotated[str, typer.Option(help="Length held in stage 1: a name, 'longest', or 'none' to free all as the paper does.")] = "longest",
+    only: Only = None,
+    without: Without = None,
+    held: Annotated[str | None, typer.Option(metavar="NAMES", help="Parameters that are not identified, with commas; replaces the arm's own list.")] = None,
+    free: Annotated[str | None, typer.Option(metavar="NAMES", help="Parameters to free besides, with commas (beta_2 for Hayati's angle).")] = None,
+    length_bound_mm: Annotated[float | None, typer.Option(min=0, help="Half-width of the bounds of lengths.")] = None,
+    angle_bound_deg: Annotated[float | None, typer.Option(min=0, help="Half-width of the bounds of angles.")] = None,
+    bound: Annotated[list[str] | None, typer.Option(metavar="NAME=WIDTH", help="Half-width of one parameter's bounds, mm or deg; repeatable.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Identify the arm from repeatability, and fix its scale with the reference lengths."""
+    from ..calibrate import calibrate as run
+    from ..calibration_files import record_of, save_calibration
+    from ..capture_files import load_capture
+    from ..summary import calibration_summary
+    from . import display, options
+
+    recording = load_capture(capture)
+    recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
+    bounds = options.bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])
+    recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
+    result = _busy(
+        "Calibrating",
+        lambda: run(bounds.space.base, recording.capture, bounds, method=method, hold=None if hold == "none" else hold),
+    )
+    record = record_of(result, recording)
+    save_calibration(output, record)
+    _show(calibration_summary(record) | {"written": str(output)}, as_json, display.calibration)
+    if not record.converged:
+        raise typer.Exit(1)
+
+
+@app.command(epilog="Example: aacmm evaluate calibration.h5 capture.h5 --max-rms-mm 0.05")
+def evaluate(
+    calibration: CalibrationFile,
+    capture: CaptureFile,
+    only: Only = None,
+    without: Without = None,
+    max_rms_mm: Annotated[float | None, typer.Option(min=0, help="Exit with code 1 where the RMS distance is larger.")] = None,
+    max_deltam_mm: Annotated[float | None, typer.Option(min=0, help="Exit with code 1 where Deltam is larger.")] = None,
+    max_length_error_mm: Annotated[float | None, typer.Option(min=0, help="Exit with code 1 where any length's error is larger.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Try a calibration on a capture: sockets it was identified from, and sockets it has never seen."""
+    from ..calibration_files import load_calibration
+    from ..capture_files import load_capture
+    from ..summary import evaluation_summary, exceeded
+    from . import display
+
+    record = load_calibration(calibration)
+    part = load_capture(capture).capture.select(only or None, without or ())
+    summary = _busy("Evaluating", lambda: evaluation_summary(record, part))
+    limits = (("rms_mm", max_rms_mm), ("deltam_mm", max_deltam_mm), ("length_error_largest_mm", max_length_error_mm))
+    summary["failed"] = exceeded(summary, limits)
+    _show(summary, as_json, display.evaluation)
+    if summary["failed"]:
+        raise typer.Exit(1)
+
+
+@app.command(epilog="Example: aacmm export calibration.h5 --format toml -o arm.toml")
+def export(
+    calibration: CalibrationFile,
+    form: Annotated[Literal["toml", "json", "csv"], typer.Option("--format", help="toml: an arm file; json: everything; csv: the parameters.")] = "toml",
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="File to write; standard output without it.")] = None,
+) -> None:
+    """Write a calibrated arm for other programs."""
+    from .. import storage
+    from ..arm_files import specification_toml
+    from ..calibration_files import load_calibration
+    from ..summary import calibration_summary, parameters_csv
+
+    record = load_calibration(calibration)
+    source = f"calibrated from {sum(record.recording.capture.sizes)} poses, {record.method}, k = {record.k:.8f}"
+    text = {
+        "toml": lambda: specification_toml(record.calibrated, source=source),
+        "json": lambda: json.dumps(calibration_summary(record), indent=2) + "\n",
+        "csv": lambda: parameters_csv(record),
+    }[form]()
+    if output is None:
+        typer.echo(text, nl=False)
+    else:
+        storage.write_text(output, text)
+
+
+@app.command(epilog="Example: aacmm show calibration.h5")
+def show(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Capture or calibration (HDF5), or an arm: TOML file or shipped name.")],
+    as_json: Json = False,
+) -> None:
+    """Print what a file holds."""
+    from .. import storage
+    from ..arm_files import load_specification, shipped_arms
+    from ..calibration_files import load_calibration
+    from ..capture_files import load_capture
+    from ..summary import arm_summary, calibration_summary, capture_summary
+    from . import display
+
+    if str(file) in shipped_arms() or file.suffix == ".toml":
+        _show(arm_summary(load_specification(str(file))), as_json, display.arm)
+        return
+    stored = storage.read_tables(file, ("capture", "calibration"))
+    if stored.attributes["kind"] == "capture":
+        _show(capture_summary(load_capture(file)), as_json, display.capture)
+    else:
+        _show(calibration_summary(load_calibration(file)), as_json, display.calibration)
+
+
+def _busy(what: str, work: Callable[[], Any]) -> Any:
+    """Do work behind a spinner on standard error, where that is a terminal."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        return work()
+    with console.status(f"{what} ..."):
+        return work()
+
+
+def _show(summary: dict[str, Any], as_json: bool, printed: Callable[[dict[str, Any]], None]) -> None:
+    if as_json:
+        typer.echo(json.dumps(summary, indent=2))
+    else:
+        printed(summary)
+
+
+def _socket_option(text: str) -> tuple[str, tuple[float, ...]]:
+    name, _, point = text.partition("=")
+    try:
+        x, y, z = (float(part) for part in point.split(","))
+    except ValueError:
+        _bad("--socket", text, "NAME=X,Y,Z in mm, for example A=400,200,300")
+    return name, (x, y, z)
+
+
+def _poses_option(texts: Sequence[str], sockets: dict[str, Any]) -> dict[str, int]:
+    counts = dict.fromkeys(sockets, 70)
+    for text in texts:
+        name, equals, number = text.rpartition("=")
+        if not number.isdecimal():
+            _bad("--poses", text, "N, or NAME=N for one socket")
+        if not equals:
+            counts = dict.fromkeys(counts, int(number))
+        elif name not in counts:
+            raise InputError(f"--poses {text} names the unknown socket '{name}'; known are {', '.join(counts)}.")
+        else:
+            counts[name] = int(number)
+    return counts
+
+
+def _length_option(text: str) -> tuple:
+    parts = text.split(",")
+    try:
+        return (*parts[:2], *(float(u) for u in parts[2:])) if len(parts) in (2, 3) else _bad("--length", text, "A,B or A,B,U")
+    except ValueError:
+        _bad("--length", text, "A,B or A,B,U with u in mm")
+
+
+def _bad(option: str, text: str, form: str) -> NoReturn:
+    raise InputError(f"{option} '{text}' is not of the form {form}.")

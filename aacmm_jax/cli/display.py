@@ -1,0 +1,177 @@
+"""Tables on a terminal. Lengths are printed in mm and um, angles in degrees and arcseconds, each named in its heading."""
+
+import math
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+_ARCSEC = 3600 * 180 / math.pi
+_FIGURES = (
+    ("de_mm", "DE, mean distance from centroid"),
+    ("deltam_mm", "Deltam, largest half range"),
+    ("rms_mm", "RMS distance from centroid"),
+    ("length_error_mean_absolute_mm", "length error, mean absolute"),
+    ("length_error_largest_mm", "length error, largest"),
+)
+_TRUTH = (
+    ("length_error_largest_mm", "largest error of a length parameter [mm]", 1.0),
+    ("angle_error_largest_rad", "largest error of an angle parameter [arcsec]", _ARCSEC),
+)
+
+
+def _console() -> Console:
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=110)
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="left" if number == 0 else "right")
+    return table
+
+
+def _number(value: float | None, decimals: int = 4) -> str:
+    if value is None:
+        return "-"
+    small = value != 0 and abs(value) < 0.5 * 10**-decimals
+    return f"{value:.1e}" if small else f"{value:.{decimals}f}"
+
+
+def arm(summary: dict[str, Any]) -> None:
+    """One arm: its table and what its file proposes."""
+    console = _console()
+    beta = any(row["beta_rad"] is not None for row in summary["joints"])
+    table = _table(
+        f"{escape(summary['name'])} (standard D-H)",
+        "joint", "alpha [deg]", "a [mm]", "d [mm]", "theta [deg]", *(["beta [deg]"] if beta else []), "limits [deg]",
+    )  # fmt: skip
+    for row in summary["joints"]:
+        limits = row["limits_rad"]
+        angles = [math.degrees(row["alpha_rad"]), row["a_mm"], row["d_mm"], math.degrees(row["theta_rad"])]
+        cells = [_number(value) for value in angles] + ([_number(math.degrees(row["beta_rad"] or 0.0))] if beta else [])
+        cells.append("-" if limits is None else f"{math.degrees(limits[0]):.0f} to {math.degrees(limits[1]):.0f}")
+        table.add_row(str(row["joint"]), *cells)
+    console.print(table)
+    console.print(f"Probe {', '.join(_number(x) for x in summary['probe_mm'])} mm. Not identified: {', '.join(summary['held'])}.")
+
+
+def capture(summary: dict[str, Any]) -> None:
+    """One capture."""
+    console = _console()
+    console.print(
+        f"[bold]{escape(summary['arm'])}[/bold]: {summary['poses']} poses of {summary['joints']} joints in "
+        f"{len(summary['sockets'])} sockets, {len(summary['lengths'])} reference lengths"
+        + (", simulated" if summary["simulated"] else "")
+    )
+    table = _table("", "socket", "poses")
+    for row in summary["sockets"]:
+        table.add_row(escape(row["socket"]), str(row["poses"]))
+    console.print(table)
+    if summary["lengths"]:
+        table = _table("\nReference lengths", "from", "to", "value [mm]", "u [mm]")
+        for row in summary["lengths"]:
+            table.add_row(escape(row["from"]), escape(row["to"]), _number(row["value_mm"]), _number(row["u_mm"]))
+        console.print(table)
+    _written(console, summary)
+
+
+def calibration(summary: dict[str, Any]) -> None:
+    """One calibration: warnings first."""
+    console = _console()
+    verdict = "[green]converged[/green]" if summary["converged"] else "[red]did not converge[/red]"
+    console.print(
+        f"[bold]{escape(summary['arm'])}[/bold], {summary['method']}: {verdict} in {summary['steps']} steps on "
+        f"{summary['poses']} poses in {len(summary['sockets_used'])} sockets"
+    )
+    held = f"{summary['hold']} held meanwhile" if summary["hold"] else "no length held"
+    console.print(f"Scale of stage 1: k = {summary['scale_k']:.8f}, u(k) = {summary['scale_u']:.1e} ({held})")
+    for warning in summary["warnings"]:
+        console.print(f"[yellow]Warning:[/yellow] {escape(warning)}")
+    _stages(console, "\nOn the poses it was identified from [mm]", summary, ("nominal", "stage1", "calibrated"))
+    if "truth" in summary:
+        _truth(console, summary["truth"])
+    table = _table(
+        "\nParameters (lengths in mm, u in um; angles in deg, u in arcsec)",
+        "parameter", "nominal", "calibrated", "change", "u", "bound",
+    )  # fmt: skip
+    for row in summary["parameters"]:
+        factor, fine = (1.0, 1e3) if row["unit"] == "mm" else (180 / math.pi, _ARCSEC)
+        nominal, value = factor * row["nominal"], factor * row["calibrated"]
+        table.add_row(
+            row["parameter"], f"{nominal:.5f}", f"{value:.5f}", f"{value - nominal:+.5f}", f"{fine * row['u']:.2f}", row["bound"] or ""
+        )
+    console.print(table)
+    _written(console, summary)
+
+
+def evaluation(summary: dict[str, Any]) -> None:
+    """One evaluation: held-out sockets first, since they are what counts."""
+    console = _console()
+    console.print(f"[bold]{escape(summary['arm'])}[/bold]")
+    for group, text in (("held_out", "Sockets never identified from"), ("identified_from", "Sockets identified from")):
+        part = summary[group]
+        if part is None:
+            continue
+        _stages(console, f"\n{text} [mm]", part, ("nominal", "calibrated"))
+        table = _table("", "socket", "poses", "DE [mm]", "Deltam [mm]", "RMS [mm]")
+        for row in part["sockets"]:
+            cells = (_number(row[key]) for key in ("de_mm", "deltam_mm", "rms_mm"))
+            table.add_row(escape(row["socket"]), str(row["poses"]), *cells)
+        console.print(table)
+        if part["lengths"]:
+            table = _table("", "length", "value [mm]", "measured [mm]", "error [mm]")
+            for row in part["lengths"]:
+                name = escape(f"{row['from']} - {row['to']}")
+                table.add_row(name, *(_number(row[key]) for key in ("value_mm", "measured_mm", "error_mm")))
+            console.print(table)
+    for sentence in summary["failed"]:
+        console.print(f"[red]Over the limit:[/red] {sentence}")
+
+
+def demo(summary: dict[str, Any]) -> None:
+    """The demonstration: before, stage 1 and stage 2 against the truth."""
+    console = _console()
+    console.print(
+        f"The simulated arm of Cheng et al. 2018, off by up to {summary['deviation_mm']:g} mm and {summary['deviation_deg']:g} deg, "
+        f"measured with {summary['encoder_arcsec']:g} arcsec and {summary['seating_um']:g} um of noise:\n{summary['poses']} poses in one "
+        f"socket (stage 1), one length of {summary['length_mm']:.4f} mm with u = {summary['length_u_um']:g} um (stage 2)."
+    )
+    table = _table("", "against the truth", "before", "stage 1", "stage 2")
+    for key, text, factor in (
+        ("de_mm", "DE, mean distance from centroid [mm]", 1.0),
+        ("deltam_mm", "Deltam, largest half range [mm]", 1.0),
+        *_TRUTH,
+        ("check_rms_mm", f"RMS error of {summary['checks']} lengths of {summary['check_length_mm']:g} mm [mm]", 1.0),
+    ):
+        table.add_row(text, *(_number(factor * summary[stage][key]) for stage in ("nominal", "stage1", "calibrated")))
+    console.print(table)
+    console.print(
+        f"k = {summary['scale_k']:.7f}, u(k) = {summary['scale_u']:.1e}: stage 1 sees repeatability only and leaves every length "
+        "off by this one factor; stage 2 divides it out."
+    )
+    console.print(f"Files in {escape(summary['folder'])}: {', '.join(escape(name) for name in summary['files'])}")
+
+
+def _stages(console: Console, title: str, figures: dict[str, Any], stages: tuple[str, ...]) -> None:
+    names = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
+    table = _table(title, "", *(names[stage] for stage in stages))
+    for key, text in _FIGURES:
+        if key in figures[stages[0]]:
+            table.add_row(text, *(_number(figures[stage][key]) for stage in stages))
+    console.print(table)
+
+
+def _truth(console: Console, truth: dict[str, Any]) -> None:
+    stages = ("nominal", "stage1", "calibrated")
+    table = _table("\nAgainst the true arm of the simulation", "", "nominal", "stage 1", "calibrated")
+    for key, text, factor in _TRUTH:
+        table.add_row(text, *(_number(factor * truth[stage][key]) for stage in stages))
+    console.print(table)
+
+
+def _written(console: Console, summary: dict[str, Any]) -> None:
+    if "written" in summary:
+        console.print(f"\nWritten: {escape(summary['written'])}")

@@ -1,0 +1,40 @@
+"""Options of ``calibrate`` that together make the free parameters and their box."""
+
+import math
+from collections.abc import Sequence
+
+from ..arm_files import ArmSpecification
+from ..errors import InputError
+from ..parameters import Bounds, Parameters, is_length
+
+
+def bounds(
+    nominal: ArmSpecification,
+    held: str | None,
+    free: str | None,
+    length_mm: float | None,
+    angle_deg: float | None,
+    single: Sequence[str],
+) -> Bounds:
+    """The box: what the arm's file proposes, changed by what the command line says."""
+    names = _names(held) if held is not None else nominal.held
+    space = Parameters.free_of(nominal.arm, held=names, free=_names(free or ""))
+    override = {name: width for name, width in nominal.override.items() if name in space.names}
+    for text in single:
+        name, _, width = text.partition("=")
+        try:
+            value = float(width)
+        except ValueError as error:
+            raise InputError(f"--bound '{text}' is not of the form NAME=WIDTH, in mm or deg.") from error
+        override[name] = value if is_length(name) else math.radians(value)
+    return Bounds.around(
+        space.base,
+        space,
+        length=nominal.length if length_mm is None else length_mm,
+        angle=nominal.angle if angle_deg is None else math.radians(angle_deg),
+        override=override,
+    )
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())

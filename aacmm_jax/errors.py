@@ -1,0 +1,21 @@
+"""The one exception that people see, and the wording helpers it needs."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class InputError(ValueError):
+    """Something given to the toolkit is wrong: the message says what, where, and what to do.
+
+    Commands turn it into exit code 2 and one sentence; in Python it is an ordinary ``ValueError``.
+    """
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """A hint ``; did you mean 'x'?`` for a misspelt word, or the list of what is known when nothing is near."""
+    known = list(known)
+    matches = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    if matches:
+        return f"; did you mean '{matches[0]}'?"
+    shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
+    return f"; known are {shown}" if known else ""

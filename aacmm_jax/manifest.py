@@ -1,0 +1,182 @@
+"""The capture manifest: a short TOML file that says which text files hold which socket, in which unit, and the lengths."""
+
+import math
+import os
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+
+from . import storage
+from .arm_files import ArmSpecification, load_specification
+from .capture import Capture, ReferenceLength
+from .errors import InputError
+
+_UNITS = {"rad": 1.0, "deg": math.pi / 180, "arcsec": math.pi / (180 * 3600)}
+_FIELD = re.compile(r"\{(\w+)\}")
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", populate_by_name=True)
+
+
+class _Angles(_Strict):
+    unit: Literal["rad", "deg", "arcsec", "counts"]
+    counts_per_turn: PositiveFloat | list[PositiveFloat] | None = None
+    sign: Literal[1, -1] | list[Literal[1, -1]] = 1
+    offset: FiniteFloat | list[FiniteFloat] = 0.0
+    columns: list[PositiveInt] | None = None
+
+    @model_validator(mode="after")
+    def _counts(self) -> "_Angles":
+        if (self.unit == "counts") != (self.counts_per_turn is not None):
+            raise ValueError("counts_per_turn belongs to unit = 'counts', and only to it.")
+        return self
+
+
+class _Socket(_Strict):
+    name: str | None = None
+    file: str | None = None
+    files: Annotated[list[str], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> "_Socket":
+        if (self.file is None) == (self.files is None):
+            raise ValueError("a socket needs either file or files.")
+        if self.files is not None and self.name is None:
+            raise ValueError("a socket of several files needs a name.")
+        return self
+
+    @property
+    def paths(self) -> list[str]:
+        return [self.file] if self.file is not None else list(self.files or ())
+
+
+class _Length(_Strict):
+    start: str = Field(alias="from")
+    end: str = Field(alias="to")
+    value: float
+    u: NonNegativeFloat = 0.0
+
+
+class _Manifest(_Strict):
+    arm: str
+    angles: _Angles
+    socket: Annotated[list[_Socket], Field(min_length=1)]
+    length: list[_Length] = []
+
+
+class Recording(NamedTuple):
+    """A capture with the nominal arm that recorded it and, for a simulation, the true one."""
+
+    capture: Capture
+    nominal: ArmSpecification
+    true: ArmSpecification | None = None
+    seed: int | None = None
+
+
+def read_manifest(path: str | os.PathLike) -> Recording:
+    """Read a manifest and every file it names; paths are relative to the manifest.
+
+    A field in braces stands for part of a path and makes one socket for each value found: with
+    ``file = "run_1/{place}/hole_{hole}.csv"`` and ``name = "{place}/{hole}"``, the length ``from = "{place}/0"``,
+    ``to = "{place}/1"`` holds at every place. Angles: reading -> sign * (reading - offset), in the stated unit.
+
+    Raises `InputError` that names the file, the place in it and the mend.
+    """
+    path = Path(path)
+    model = storage.read_toml(path, _Manifest)
+    try:
+        nominal = load_specification(_arm_source(path, model.arm))
+        sockets: dict[str, np.ndarray] = {}
+        fields: list[dict[str, str]] = []
+        for entry in model.socket:
+            for name, files, values in _expand(path.parent, entry):
+                if name in sockets:
+                    raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
+                tables = [storage.read_numbers(file, model.angles.columns) for file in files]
+                joints = nominal.arm.joints
+                for file, table in zip(files, tables, strict=True):
+                    if table.shape[1] != joints:
+                        raise InputError(
+                            f"{file} has {table.shape[1]} columns, but the arm has {joints} joints; give one column a joint, "
+                            "or pick them with columns = [...] in [angles]."
+                        )
+                sockets[name] = _radians(np.concatenate(tables), model.angles)
+                fields.append(values)
+        return Recording(Capture(sockets, _lengths(model.length, fields)), nominal)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _arm_source(manifest: Path, arm: str) -> str | Path:
+    beside = manifest.parent / arm
+    return beside if arm.endswith(".toml") or beside.is_file() else arm
+
+
+def _radians(readings: np.ndarray, angles: _Angles) -> np.ndarray:
+    joints = readings.shape[1]
+
+    def a_joint(value: float | list, what: str) -> np.ndarray:
+        array = np.asarray(value, dtype=float)
+        if array.ndim and array.shape != (joints,):
+            raise InputError(f"angles.{what} has {array.size} values, but there are {joints} joints.")
+        return array
+
+    unit = 2 * math.pi / a_joint(angles.counts_per_turn, "counts_per_turn") if angles.counts_per_turn else _UNITS[angles.unit]
+    return a_joint(angles.sign, "sign") * (readings - a_joint(angles.offset, "offset")) * unit
+
+
+def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dict[str, str]]]:
+    """Sockets of one entry: name, files and the values of its fields in braces."""
+    first = entry.paths[0]
+    names = _FIELD.findall(first)
+    if not names:
+        yield entry.name or Path(first).stem, [folder / file for file in entry.paths], {}
+        return
+    used = set(_FIELD.findall(entry.name or ""))
+    if entry.name is None or used != set(names):
+        raise InputError(f"file '{first}' has the fields {sorted(set(names))}; use the same ones in the socket's name.")
+    pattern = _matcher(first)
+    found = sorted(item for item in folder.glob(_FIELD.sub("*", first)))
+    matches = [match for item in found if (match := pattern.fullmatch(item.relative_to(folder).as_posix()))]
+    if not matches:
+        raise InputError(f"no file matches '{first}' in {folder}; check the path.")
+    for match in matches:
+        values = match.groupdict()
+        yield _fill(entry.name, values), [folder / _fill(file, values) for file in entry.paths], values
+
+
+def _matcher(pattern: str) -> re.Pattern[str]:
+    """Regular expression of a path with fields; a field that returns must match the same text."""
+    parts, last, seen = "", 0, set()
+    for field in _FIELD.finditer(pattern):
+        parts += re.escape(pattern[last : field.start()])
+        name = field.group(1)
+        parts += f"(?P={name})" if name in seen else f"(?P<{name}>[^/]+)"
+        seen.add(name)
+        last = field.end()
+    return re.compile(parts + re.escape(pattern[last:]))
+
+
+def _fill(text: str, values: Mapping[str, str]) -> str:
+    return _FIELD.sub(lambda field: values[field.group(1)], text)
+
+
+def _lengths(entries: list[_Length], fields: list[dict[str, str]]) -> list[ReferenceLength]:
+    """Reference lengths; one with fields in braces stands for every combination that the sockets' files showed."""
+    lengths = []
+    for entry in entries:
+        names = set(_FIELD.findall(entry.start + entry.end))
+        if not names:
+            lengths.append(ReferenceLength(entry.start, entry.end, entry.value, entry.u))
+            continue
+        choices = {tuple((name, values[name]) for name in sorted(names)) for values in fields if names <= values.keys()}
+        if not choices:
+            raise InputError(f"length from '{entry.start}' to '{entry.end}' uses a field that no socket has.")
+        for choice in sorted(choices):
+            lengths.append(ReferenceLength(_fill(entry.start, dict(choice)), _fill(entry.end, dict(choice)), entry.value, entry.u))
+    return lengths

@@ -1,0 +1,101 @@
+"""Stage 2: the one number that repeatability cannot see, from reference lengths (Cheng et al. 2018, section 2.3)."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from .arm import Arm, is_concrete, replace
+from .capture import Capture
+from .errors import InputError
+from .metrics import repeatability
+from .residuals import Measurement
+
+
+class Scale(eqx.Module):
+    """k = measured / nominal with its standard uncertainty, and the lengths it was found from (mm)."""
+
+    value: Float[Array, ""]
+    u: Float[Array, ""]
+    measured: Float[Array, " l"]
+    nominal: Float[Array, " l"]
+
+
+class ScaleFix(eqx.Module):
+    """Result of stage 2: the arm divided by k, and k."""
+
+    arm: Arm
+    scale: Scale
+
+
+def divide_lengths(arm: Arm, k: Float[Array, ""]) -> Arm:
+    """The arm with its lengths divided by k: every a, every d but ``d_1``, and the probe.
+
+    ``d_1`` only shifts the whole base frame along the first axis. No length and no repeatability depends on it, k says
+    nothing about it, and it stays as given (as in Table 2 of the paper).
+    """
+    k = k[..., None]
+    d = jnp.concatenate([arm.d[..., :1], arm.d[..., 1:] / k], axis=-1)
+    return replace(arm, a=arm.a / k, d=d, probe=arm.probe / k)
+
+
+def fix_scale(arm: Arm, capture: Capture) -> ScaleFix:
+    """Stage 2: k from every reference length of a capture, and the arm divided by it.
+
+    k is the mean of measured / nominal weighted by uncertainty: the length's own u, and the scatter of the poses over
+    the number of them at each end. Its standard uncertainty is the larger of what those predict and what the lengths'
+    disagreement shows (the Birge ratio). Raises `InputError` without a reference length.
+    """
+    if not capture.lengths:
+        raise InputError(
+            "the capture holds no reference length, so the scale cannot be fixed; add one between two of its sockets."
+        )
+    scale = scale_of(arm, Measurement.of(capture))
+    return ScaleFix(divide_lengths(arm, scale.value), scale)
+
+
+def scale_of(arm: Arm, measurement: Measurement) -> Scale:
+    """k of an arm from the reference lengths of a measurement."""
+    tips = arm.position(measurement.q)
+    sigma = repeatability(tips, measurement.sizes).sigma
+    measured = measurement.distances(tips)
+    ratio = measured / measurement.nominal
+    scatter = sigma**2 * jnp.asarray(measurement.averaging_variance())
+    # The floor (1e-12 mm) only makes the weights of a noise-free simulation equal instead of infinite.
+    variance = (scatter + (ratio * measurement.u) ** 2 + 1e-24) / measurement.nominal**2
+    return Scale(*_weighted_mean(ratio, variance), measured, measurement.nominal)
+
+
+def _weighted_mean(ratio: Float[Array, " l"], variance: Float[Array, " l"]) -> tuple[Array, Array]:
+    # The weights are constants of the estimate: its derivative by a length must not pass through them.
+    weight = jax.lax.stop_gradient(1 / variance)
+    value = jnp.sum(weight * ratio) / jnp.sum(weight)
+    predicted = 1 / jnp.sum(weight)
+    observed = jnp.sum(weight * (ratio - value) ** 2) / (max(ratio.shape[0] - 1, 1) * jnp.sum(weight))
+    return value, jnp.sqrt(jnp.maximum(predicted, jax.lax.stop_gradient(observed)))
+
+
+def scale_from_lengths(
+    measured: ArrayLike | Sequence[float], nominal: ArrayLike | Sequence[float], u: float = 0.0
+) -> Scale:
+    """k from lengths measured by the arm and their nominal value (one, or one each), mm.
+
+    ``u`` is the standard uncertainty of the nominal value (of all alike). The uncertainty of k combines it with the
+    standard deviation of the mean of the measurements (JCGM 100, type A). Raises `InputError` for lengths that are not
+    positive and finite.
+    """
+    measured = jnp.atleast_1d(jnp.asarray(measured, dtype=jnp.float64))
+    nominal = jnp.broadcast_to(jnp.asarray(nominal, dtype=jnp.float64), measured.shape)
+    for what, values in (("measured", measured), ("nominal", nominal)):
+        if values.ndim != 1 or values.shape[0] == 0:
+            raise InputError(f"{what} must be a list of at least one length, in mm.")
+        if is_concrete(values) and not np.all(np.isfinite(values) & (np.asarray(values) > 0)):
+            raise InputError(f"{what} holds {np.asarray(values).min():g} mm; a length must be positive and finite.")
+    ratio = measured / nominal
+    count = ratio.shape[0]
+    value = jnp.mean(ratio)
+    repeated = jnp.sum((ratio - value) ** 2) / (max(count - 1, 1) * count)
+    return Scale(value, jnp.sqrt(repeated + (value * u / jnp.mean(nominal)) ** 2), measured, nominal)

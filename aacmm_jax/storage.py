@@ -1,0 +1,291 @@
+"""Files, without any idea of arms: whole-or-nothing writes, HDF5 tables after netCDF-4's conventions, TOML, CSV."""
+
+import contextlib
+import csv
+import datetime
+import os
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from .errors import InputError, nearest
+
+FORMAT = "aacmm_jax"
+FORMAT_VERSION = 1
+
+
+class Variable(NamedTuple):
+    """One column or block of a table: the names of its dimensions, its values, its unit and what it is."""
+
+    dimensions: tuple[str, ...]
+    values: np.ndarray | Sequence
+    units: str
+    long_name: str
+
+
+class Table(NamedTuple):
+    """One HDF5 group: variables by name (a variable named like its only dimension is its coordinate), and attributes."""
+
+    variables: dict[str, Variable]
+    attributes: dict[str, Any] = {}
+
+
+@contextlib.contextmanager
+def whole_file(path: str | os.PathLike) -> Iterator[Path]:
+    """Write a file whole or not at all: yields a temporary path beside the target, renamed onto it at the end.
+
+    Whatever goes wrong (Ctrl-C included), the temporary file is removed and an existing target stays as it was.
+    Raises `InputError` where the path cannot be written.
+    """
+    target = Path(path)
+    temporary: Path | None = None
+    try:
+        if target.is_dir():
+            raise IsADirectoryError(None, "it is a folder")
+        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+        temporary = Path(name)
+        os.close(handle)
+        yield temporary
+        with open(temporary, "rb+") as written:
+            os.fsync(written.fileno())
+        # mkstemp makes private files; give the mode that an ordinary open() would have given.
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(temporary, 0o666 & ~mask)
+        os.replace(temporary, target)
+        temporary = None
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise InputError(f"{target} cannot be written: {reason}; choose another output path.") from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def write_text(path: str | os.PathLike, text: str) -> None:
+    """Write a text file whole or not at all."""
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_tables(path: str | os.PathLike, kind: str, tables: Mapping[str, Table], attributes: Mapping[str, Any]) -> None:
+    """Write an HDF5 file of tables that netCDF-4 readers (xarray) understand. ``kind`` says what the file is."""
+    import h5py
+
+    with whole_file(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
+        file.attrs.update(provenance(kind))
+        file.attrs.update({key: value for key, value in attributes.items() if value is not None})
+        for name, table in tables.items():
+            _write_group(file.create_group(name, track_order=True), table)
+
+
+def provenance(kind: str) -> dict[str, Any]:
+    """Root attributes of every file: what it is, and what made it."""
+    from importlib import metadata
+
+    return {
+        "format": FORMAT,
+        "kind": kind,
+        "format_version": FORMAT_VERSION,
+        "package_version": metadata.version("aacmm_jax"),
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]) if sys.argv and sys.argv[0] else "python",
+    }
+
+
+def _write_group(group: Any, table: Table) -> None:
+    import h5py
+
+    group.attrs.update({key: value for key, value in table.attributes.items() if value is not None})
+    for name, variable in table.variables.items():
+        values = np.asarray(variable.values)
+        text = not variable.units
+        data = values.astype(object) if text else values
+        options = {"compression": "gzip", "shuffle": True} if values.ndim and values.size > 1000 and not text else {}
+        dataset = group.create_dataset(name, data=data, dtype=h5py.string_dtype() if text else None, **options)
+        dataset.attrs["long_name"] = variable.long_name
+        if not text:
+            dataset.attrs["units"] = variable.units
+        if variable.dimensions == (name,):
+            dataset.make_scale(name)
+    for name, variable in table.variables.items():
+        for axis, dimension in enumerate(variable.dimensions):
+            if dimension != name:
+                group[name].dims[axis].attach_scale(group[dimension])
+
+
+class Stored(NamedTuple):
+    """What `read_tables` found: root attributes, and per group its arrays and attributes."""
+
+    attributes: dict[str, Any]
+    tables: dict[str, dict[str, np.ndarray]]
+    table_attributes: dict[str, dict[str, Any]]
+
+
+def read_tables(path: str | os.PathLike, kinds: Sequence[str]) -> Stored:
+    """Read a file of tables whole. Raises `InputError` where it is missing, damaged, foreign, newer or of another kind."""
+    import h5py
+
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path} does not exist; check the path.")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; name an HDF5 file.")
+    if not h5py.is_hdf5(path):
+        raise InputError(f"{path} is not an HDF5 file, or it is damaged; name a file written by aacmm.")
+    try:
+        with h5py.File(path, "r") as file:
+            attributes = {key: _plain(value) for key, value in file.attrs.items()}
+            _check_kind(path, attributes, kinds)
+            groups = {name: group for name, group in file.items() if isinstance(group, h5py.Group)}
+            tables = {name: {key: _values(item) for key, item in group.items()} for name, group in groups.items()}
+            table_attributes = {
+                name: {key: _plain(value) for key, value in group.attrs.items()} for name, group in groups.items()
+            }
+    except (OSError, RuntimeError, KeyError) as error:
+        raise InputError(f"{path} is damaged or was cut short ({error}); make it again.") from error
+    return Stored(attributes, tables, table_attributes)
+
+
+def _check_kind(path: Path, attributes: Mapping[str, Any], kinds: Sequence[str]) -> None:
+    if attributes.get("format") != FORMAT:
+        raise InputError(f"{path} is HDF5, but was not written by aacmm; name a {' or '.join(kinds)} file.")
+    version = attributes.get("format_version")
+    if not isinstance(version, int) or version > FORMAT_VERSION:
+        raise InputError(
+            f"{path} has format version {version}, newer than this package reads ({FORMAT_VERSION}); update aacmm_jax."
+        )
+    if attributes.get("kind") not in kinds:
+        raise InputError(f"{path} holds a {attributes.get('kind')}, but a {' or '.join(kinds)} is needed.")
+
+
+def need(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], *names: str) -> None:
+    """Raise `InputError` where a table lacks a variable."""
+    for name in names:
+        if name not in arrays:
+            raise InputError(f"{path} lacks the table entry '{name}'; it is damaged or was edited, make it again.")
+
+
+def _values(dataset: Any) -> np.ndarray:
+    return dataset.asstr()[()] if dataset.dtype.kind == "O" else dataset[()]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return value.decode()
+    if isinstance(value, np.ndarray):
+        return [_plain(item) for item in value.tolist()]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+Model = TypeVar("Model")
+
+
+def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
+    """Read a TOML file into a pydantic model. Raises `InputError` that names the file, the place and the mend."""
+    import pydantic
+
+    path = Path(path)
+    try:
+        with open(path, "rb") as file:
+            content = tomllib.load(file)
+    except FileNotFoundError as error:
+        raise InputError(f"{path} does not exist; check the path.") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not valid TOML: {error}.") from error
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {(error.strerror or str(error)).lower()}.") from error
+    try:
+        return model.model_validate(content)  # type: ignore[attr-defined]
+    except pydantic.ValidationError as error:
+        raise InputError(f"{path}: {_explain(error.errors()[0], model)}") from error
+
+
+def _explain(error: Any, model: Any) -> str:
+    """One pydantic error as one sentence with its place, counting rows from 1 as people do."""
+    steps = [step for step in error["loc"] if not (isinstance(step, str) and step.startswith("function-"))]
+    place = ""
+    for step in steps:
+        place += f" {step + 1}" if isinstance(step, int) else (f".{step}" if place else str(step))
+    if error["type"] == "extra_forbidden":
+        return f"unknown key '{place}'{nearest(str(steps[-1]), _known_keys(model, steps[:-1]))}"
+    if error["type"] == "missing":
+        return f"'{place}' is missing; add it."
+    message = error["msg"].removeprefix("Value error, ")
+    value = "" if error["type"] == "value_error" or isinstance(error["input"], (dict, list)) else f" (got {error['input']!r})"
+    return f"{place or 'the file'}: {message}{value}{'' if message.endswith('.') and not value else '.'}"
+
+
+def _known_keys(model: Any, steps: Sequence[Any]) -> list[str]:
+    """Field names of the model that an unknown key belongs to."""
+    import typing
+
+    for step in steps:
+        if isinstance(step, int):
+            continue
+        annotation = model.model_fields[step].annotation if step in model.model_fields else None
+        while annotation is not None and not hasattr(annotation, "model_fields"):
+            inner = [item for item in typing.get_args(annotation) if item is not type(None)]
+            annotation = inner[0] if inner else None
+        if annotation is None:
+            return []
+        model = annotation
+    return [field.alias or name for name, field in model.model_fields.items()]
+
+
+def read_numbers(path: str | os.PathLike, columns: Sequence[int] | None = None) -> np.ndarray:
+    """Read a text table of numbers, ``(rows, columns)``: comma, semicolon, tab or blank between them, header lines allowed.
+
+    ``columns`` picks columns, counted from 1. Raises `InputError` that names the file, the line and the column.
+    """
+    path = Path(path)
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            lines = file.read().splitlines()
+    except FileNotFoundError as error:
+        raise InputError(f"{path} does not exist; check the path in the manifest.") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read as text: {error}.") from error
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, start=1):
+        cells = _cells(line)
+        if not cells or cells[0].startswith("#"):
+            continue
+        try:
+            rows.append([float(cell) for cell in cells])
+        except ValueError as error:
+            if not rows and not any(_is_number(cell) for cell in cells):
+                continue  # a header
+            column = next(i for i, cell in enumerate(cells, start=1) if not _is_number(cell))
+            raise InputError(f"{path} line {number} column {column}: '{cells[column - 1]}' is not a number.") from error
+        if len(rows[-1]) != len(rows[0]):
+            raise InputError(f"{path} line {number} has {len(rows[-1])} columns, the lines before it {len(rows[0])}.")
+    if not rows:
+        raise InputError(f"{path} holds no numbers; give one line a pose.")
+    table = np.array(rows)
+    if columns is None:
+        return table
+    for column in columns:
+        if not 1 <= column <= table.shape[1]:
+            raise InputError(f"{path} has {table.shape[1]} columns, so there is no column {column}.")
+    return table[:, [column - 1 for column in columns]]
+
+
+def _cells(line: str) -> list[str]:
+    for delimiter in (";", ",", "\t"):
+        if delimiter in line:
+            return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]
+    return line.split()
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
