@@ -3,13 +3,28 @@
 from . import _float64 as _float64  # isort: skip - must come before anything that makes an array
 from .arm import Arm as Arm
 from .arm import parameter_names as parameter_names
+from .arm_files import ArmSpecification as ArmSpecification
+from .arm_files import load_arm as load_arm
+from .arm_files import load_specification as load_specification
+from .arm_files import save_arm as save_arm
+from .arm_files import shipped_arms as shipped_arms
 from .calibrate import Calibration as Calibration
 from .calibrate import Identification as Identification
 from .calibrate import calibrate as calibrate
 from .calibrate import identify as identify
+from .calibration_files import CalibrationRecord as CalibrationRecord
+from .calibration_files import load_calibration as load_calibration
+from .calibration_files import record_of as record_of
+from .calibration_files import save_calibration as save_calibration
 from .capture import Capture as Capture
 from .capture import ReferenceLength as ReferenceLength
+from .capture_files import load_capture as load_capture
+from .capture_files import save_capture as save_capture
 from .errors import InputError as InputError
+from .evaluate import Evaluation as Evaluation
+from .evaluate import evaluate as evaluate
+from .manifest import Recording as Recording
+from .manifest import read_manifest as read_manifest
 from .metrics import Repeatability as Repeatability
 from .metrics import repeatability as repeatability
 from .parameters import Bounds as Bounds
@@ -17,6 +32,7 @@ from .parameters import Parameters as Parameters
 from .scale import Scale as Scale
 from .scale import fix_scale as fix_scale
 from .scale import scale_from_lengths as scale_from_lengths
+from .simulate import deviated as deviated
 from .simulate import simulate as simulate
 from .solver import Reason as Reason
 from .solver import least_squares as least_squares

@@ -3,32 +3,16 @@
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from . import chain
+from .arrays import Numbers, as_floats
 from .errors import InputError, nearest
 
 LENGTHS = ("a", "d", "probe")
 ANGLES = ("alpha", "theta", "beta")
 _PROBE_AXES = ("x", "y", "z")
-
-
-def is_concrete(*arrays: object) -> bool:
-    """Whether values can be looked at now; inside jit, vmap or grad they cannot, and checks of values are left out."""
-    return not any(isinstance(array, jax.core.Tracer) for array in arrays)
-
-
-def _as_floats(value: ArrayLike, what: str) -> Array:
-    array = value if isinstance(value, jax.Array) else np.asarray(value)
-    if not jnp.issubdtype(array.dtype, jnp.number) or jnp.issubdtype(array.dtype, jnp.complexfloating):
-        raise InputError(f"{what} must be real numbers, got {array.dtype}.")
-    array = jnp.asarray(array, dtype=jnp.float64)
-    if is_concrete(array) and not bool(jnp.all(jnp.isfinite(array))):
-        raise InputError(f"{what} holds a value that is not finite; every parameter must be a finite number.")
-    return array
 
 
 class Arm(eqx.Module):
@@ -55,20 +39,20 @@ class Arm(eqx.Module):
     def __init__(
         self,
         *,
-        alpha: ArrayLike | Sequence[float],
-        a: ArrayLike | Sequence[float],
-        d: ArrayLike | Sequence[float],
-        theta: ArrayLike | Sequence[float] | None = None,
-        beta: ArrayLike | Sequence[float] | None = None,
-        probe: ArrayLike | Sequence[float] = (0.0, 0.0, 0.0),
+        alpha: Numbers,
+        a: Numbers,
+        d: Numbers,
+        theta: Numbers | None = None,
+        beta: Numbers | None = None,
+        probe: Numbers = (0.0, 0.0, 0.0),
         limits: Sequence[Sequence[float]] | None = None,
     ):
-        self.alpha = _as_floats(alpha, "alpha")
-        self.a = _as_floats(a, "a")
-        self.d = _as_floats(d, "d")
-        self.theta = jnp.zeros_like(self.alpha) if theta is None else _as_floats(theta, "theta")
-        self.beta = None if beta is None else _as_floats(beta, "beta")
-        self.probe = _as_floats(probe, "probe")
+        self.alpha = as_floats(alpha, "alpha")
+        self.a = as_floats(a, "a")
+        self.d = as_floats(d, "d")
+        self.theta = jnp.zeros_like(self.alpha) if theta is None else as_floats(theta, "theta")
+        self.beta = None if beta is None else as_floats(beta, "beta")
+        self.probe = as_floats(probe, "probe")
         if self.alpha.ndim == 0 or self.alpha.shape[-1] == 0:
             raise InputError("alpha needs one value a joint, and an arm at least one joint.")
         joints = self.alpha.shape[-1]
@@ -96,15 +80,15 @@ class Arm(eqx.Module):
         """The parameters without the limits, as the kinematic kernels take them."""
         return chain.Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe)
 
-    def position(self, q: Float[ArrayLike, "... n"]) -> Float[Array, "... 3"]:
+    def position(self, q: Numbers) -> Float[Array, "... 3"]:
         """Tip in the base frame, mm, at joint angles q in rad: ``(..., n) -> (..., 3)``."""
         return chain.tip_position(self.geometry, self._checked(q))
 
-    def pose(self, q: Float[ArrayLike, "... n"]) -> Float[Array, "... 4 4"]:
+    def pose(self, q: Numbers) -> Float[Array, "... 4 4"]:
         """Homogeneous pose of the last frame moved to the tip, mm: ``(..., n) -> (..., 4, 4)``."""
         return chain.tip_pose(self.geometry, self._checked(q))
 
-    def jacobian(self, q: Float[ArrayLike, "... n"], names: Sequence[str] | None = None) -> Float[Array, "... 3 p"]:
+    def jacobian(self, q: Numbers, names: Sequence[str] | None = None) -> Float[Array, "... 3 p"]:
         """Exact derivative of the tip by named parameters, ``(..., n) -> (..., 3, p)``; mm per mm or mm per rad.
 
         ``names`` are parameter names (``alpha_1`` ... ``probe_z``) or joint readings ``q_1`` ... ``q_n``; by default all
@@ -113,7 +97,7 @@ class Arm(eqx.Module):
         names = parameter_names(self) if names is None else names
         return chain.tip_jacobian(self.geometry, self._checked(q), tuple(locate(self, n, extra=("q",)) for n in names))
 
-    def _checked(self, q: Float[ArrayLike, "... n"]) -> Float[Array, "... n"]:
+    def _checked(self, q: Numbers) -> Float[Array, "... n"]:
         array = jnp.asarray(q, dtype=jnp.float64)
         if array.shape[-1:] != (self.joints,):
             raise InputError(f"q has shape {array.shape}, but the arm has {self.joints} joints; the last axis is the joint.")
@@ -142,6 +126,4 @@ def locate(arm: Arm, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
 def replace(arm: Arm, **changes: Array | None) -> Arm:
     """The same arm with some parameters replaced, by kind (``a=...``); nothing is checked, so it works on tracers."""
     kinds = tuple(changes)
-    return eqx.tree_at(
-        lambda x: [getattr(x, kind) for kind in kinds], arm, list(changes.values()), is_leaf=lambda x: x is None
-    )
+    return eqx.tree_at(lambda x: [getattr(x, kind) for kind in kinds], arm, list(changes.values()), is_leaf=lambda x: x is None)

@@ -5,6 +5,7 @@ import os
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -72,7 +73,7 @@ class ArmSpecification(NamedTuple):
     held: tuple[str, ...] | None = None  # None: the default of `Parameters.free_of`
     length: float = 10.0  # half-width of the bounds of lengths
     angle: float = 0.0175  # and of angles
-    override: Mapping[str, float] = {}  # half-widths by parameter name
+    override: Mapping[str, float] = MappingProxyType({})  # half-widths by parameter name
 
     def bounds(self) -> Bounds:
         """The box that the file proposes."""
@@ -98,7 +99,9 @@ def load_specification(source: str | os.PathLike) -> ArmSpecification:
             return _specification(path)
     path = Path(source)
     if not path.exists() and path.suffix != ".toml":
-        raise InputError(f"'{source}' is neither a file nor an arm that ships with the package{nearest(str(source), shipped_arms())}")
+        raise InputError(
+            f"'{source}' is neither a file nor an arm that ships with the package{nearest(str(source), shipped_arms())}"
+        )
     return _specification(path)
 
 

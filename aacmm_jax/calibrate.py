@@ -6,19 +6,27 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
-from .arm import Arm, is_concrete
+from .arm import Arm
+from .arrays import Numbers, is_concrete
 from .capture import Capture
 from .errors import InputError
 from .metrics import Repeatability, repeatability
 from .parameters import Bounds, Parameters, is_length
-from .residuals import Measurement, derivatives, joint_residual, repeatability_residual
+from .residuals import (
+    Measurement,
+    joint_model,
+    joint_residual,
+    length_derivatives,
+    repeatability_model,
+    repeatability_residual,
+)
 from .scale import Scale, divide_lengths, scale_of
-from .solver import Reason, Tolerances, least_squares
+from .solver import BoundedLevenbergMarquardt, Reason, least_squares
 
 # The boxes of this problem are small against its curvature, so the first steps can be nearly Gauss-Newton's.
-_TOLERANCES = Tolerances(initial_damping=1e-6)
+_SOLVER = BoundedLevenbergMarquardt(initial_damping=1e-6)
 _MAX_STEPS = 300
 # Standard deviations (mm) below which noise-free data would get infinite weight.
 _LEAST_SIGMA = 1e-9
@@ -104,11 +112,9 @@ def converged(result: Reason) -> Array:
     return (result == Reason.gradient) | (result == Reason.step) | (result == Reason.rounding)
 
 
-def active_names(space: Parameters, active: Int[ArrayLike, " p"]) -> dict[str, str]:
+def active_names(space: Parameters, active: Numbers) -> dict[str, str]:
     """Parameters on a bound: name -> 'lower' or 'upper'."""
-    return {
-        name: "lower" if side < 0 else "upper" for name, side in zip(space.names, np.asarray(active), strict=True) if side
-    }
+    return {name: "lower" if side < 0 else "upper" for name, side in zip(space.names, np.asarray(active), strict=True) if side}
 
 
 def identify(
@@ -117,7 +123,7 @@ def identify(
     bounds: Bounds,
     *,
     hold: str | None = "longest",
-    start: Float[ArrayLike, " p"] | None = None,
+    start: Numbers | None = None,
     max_steps: int = _MAX_STEPS,
 ) -> Identification:
     """Stage 1: the parameters that make the poses of every socket agree, within bounds.
@@ -146,7 +152,7 @@ def calibrate(
     *,
     method: Literal["two-stage", "joint"] = "two-stage",
     hold: str | None = "longest",
-    start: Float[ArrayLike, " p"] | None = None,
+    start: Numbers | None = None,
     max_steps: int = _MAX_STEPS,
 ) -> Calibration:
     """Both stages: identify from repeatability, then fix the scale with the reference lengths.
@@ -182,7 +188,8 @@ def _identify(
         lower=bounds.lower[index],
         upper=bounds.upper[index],
         scale=reduced.scale,
-        tolerances=_TOLERANCES,
+        normal=repeatability_model,
+        solver=_SOLVER,
         max_steps=max_steps,
         throw=False,
     )
@@ -211,9 +218,7 @@ def _identify(
 
 
 @eqx.filter_jit
-def _finish(
-    arm: Arm, measurement: Measurement, stage1: Identification, method: str, max_steps: int
-) -> Calibration:
+def _finish(arm: Arm, measurement: Measurement, stage1: Identification, method: str, max_steps: int) -> Calibration:
     space = stage1.space
     assert stage1.scale is not None
     scaled = divide_lengths(stage1.arm, stage1.scale.value)
@@ -243,10 +248,9 @@ def _finish(
     )
 
 
-def _joint(
-    scaled: Arm, measurement: Measurement, stage1: Identification, max_steps: int
-) -> tuple[Array, Array, Array, Reason]:
+def _joint(scaled: Arm, measurement: Measurement, stage1: Identification, max_steps: int) -> tuple[Array, Array, Array, Reason]:
     space = Parameters(scaled, stage1.space.names)
+    assert stage1.scale is not None
     sigma = jnp.maximum(jax.lax.stop_gradient(stage1.after.sigma / stage1.scale.value), _LEAST_SIGMA)
     solution = least_squares(
         joint_residual,
@@ -255,7 +259,8 @@ def _joint(
         lower=stage1.bounds.lower,
         upper=stage1.bounds.upper,
         scale=space.scale,
-        tolerances=_TOLERANCES,
+        normal=joint_model,
+        solver=_SOLVER,
         max_steps=max_steps,
         throw=False,
     )
@@ -285,13 +290,12 @@ def _covariance(
     """
     space = space if base is None else Parameters(base, space.names)
     sigma = jnp.maximum(sigma, _LEAST_SIGMA)
-    by_pose, by_length = derivatives(parameters, space, measurement)
-    rows = [by_pose / sigma]
+    information = repeatability_model(parameters, (space, measurement)).gram / sigma**2
     if with_lengths:
-        rows.append(by_length / _length_sigma(measurement, sigma)[:, None])
+        rows = length_derivatives(parameters, space, measurement) / _length_sigma(measurement, sigma)[:, None]
+        information = information + rows.T @ rows
     scale = jnp.where(fixed, 0.0, space.scale)
-    weighted = jnp.concatenate(rows) * scale[None, :]
-    values, vectors = jnp.linalg.eigh(weighted.T @ weighted)
+    values, vectors = jnp.linalg.eigh(scale[:, None] * information * scale[None, :])
     known = values > 1e-12 * values[-1]
     inverse = jnp.where(known, 1 / jnp.where(known, values, 1.0), 0.0)
     spread = scale[:, None] * vectors

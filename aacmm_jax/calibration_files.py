@@ -143,7 +143,9 @@ def _parameter_table(record: CalibrationRecord) -> Table:
         "lower": Variable(("parameter",), record.lower, both, "lower bound of the identification"),
         "upper": Variable(("parameter",), record.upper, both, "upper bound of the identification"),
         "u": Variable(("parameter",), np.sqrt(np.diag(record.covariance)), both, "standard uncertainty"),
-        "active_stage1": Variable(("parameter",), record.active_stage1, "1", "-1 on the lower bound, +1 on the upper, in stage 1"),
+        "active_stage1": Variable(
+            ("parameter",), record.active_stage1, "1", "-1 on the lower bound, +1 on the upper, in stage 1"
+        ),
         "active": Variable(("parameter",), record.active, "1", "-1 on the lower bound, +1 on the upper"),
         "covariance": Variable(("parameter", "parameter_2"), record.covariance, "products of units", "covariance"),
     }

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
-from .arm import is_concrete
+from .arrays import Numbers, is_concrete
 from .errors import InputError, nearest
 
 # Encoders of arms with unlimited joints count a few turns at most; readings beyond this are degrees taken for radians.
@@ -26,7 +26,7 @@ class ReferenceLength(eqx.Module):
     value: Float[Array, ""]
     u: Float[Array, ""]
 
-    def __init__(self, start: str, end: str, value: ArrayLike, u: ArrayLike = 0.0):
+    def __init__(self, start: str, end: str, value: Numbers, u: Numbers = 0.0):
         self.start, self.end = start, end
         self.value, self.u = jnp.asarray(value, dtype=jnp.float64), jnp.asarray(u, dtype=jnp.float64)
         where = f"reference length '{start}' to '{end}'"
@@ -56,7 +56,7 @@ class Capture(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, sockets: Mapping[str, ArrayLike | Sequence], lengths: Iterable[ReferenceLength] = ()):
+    def __init__(self, sockets: Mapping[str, Numbers], lengths: Iterable[ReferenceLength] = ()):
         if not sockets:
             raise InputError("a capture needs at least one socket with poses.")
         blocks = {name: _checked_angles(name, angles) for name, angles in sockets.items()}
@@ -123,7 +123,7 @@ def _matching(names: Sequence[str], patterns: Iterable[str]) -> list[str]:
     return [name for name in names if name in chosen]
 
 
-def _checked_angles(name: str, angles: ArrayLike | Sequence) -> Array:
+def _checked_angles(name: str, angles: Numbers) -> Array:
     if not is_concrete(angles):
         array = jnp.asarray(angles, dtype=jnp.float64)
     else:
@@ -132,7 +132,9 @@ def _checked_angles(name: str, angles: ArrayLike | Sequence) -> Array:
         except (TypeError, ValueError) as error:
             raise InputError(f"socket '{name}' holds something that is not a number, or rows of unequal length.") from error
     if array.ndim != 2 or 0 in array.shape:
-        raise InputError(f"socket '{name}' has shape {array.shape}; give one row a pose and one column a joint, at least one of each.")
+        raise InputError(
+            f"socket '{name}' has shape {array.shape}; give one row a pose and one column a joint, at least one of each."
+        )
     if is_concrete(array):
         _check_values(name, np.asarray(array))
     return jnp.asarray(array)

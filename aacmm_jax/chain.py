@@ -1,22 +1,22 @@
 """The Denavit-Hartenberg chain itself: tip position, tip pose and their exact derivatives.
 
-Everything here is written component by component (a vector is a tuple of three arrays) and joint by joint.
-An array of thousands of poses then stays one contiguous vector per component, which is what both XLA's CPU
-code generator and a GPU want; 3x3 matrix products in the innermost axes are several times slower.
+Layout: joints first, then the three components of a vector, then the batch, poses last. One loop over the joints works on
+whole contiguous rows of poses, which suits XLA on a CPU and a GPU alike. (Measured, 70 poses x 21 columns on one core:
+30 us; written out joint by joint 180-580 us, because XLA then computes the chain anew for every column, and compiling
+takes four times as long.)
 
-Geometry used by every derivative: turning the chain by a small angle about a unit axis ``u`` through a point
-``o`` moves the tip by ``u x (tip - o)``; sliding it along ``u`` moves the tip by ``u``. So each Jacobian column
-is read off an axis of the chain.
+Geometry behind every derivative: turning the chain by a small angle about a unit axis ``u`` through a point ``o`` moves
+the tip by ``u x (tip - o)``; sliding it along ``u`` moves the tip by ``u``. So each Jacobian column is read off an axis of
+the chain.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-Scalars = Float[Array, "..."]
-Vector = tuple[Scalars, Scalars, Scalars]
 KINDS = ("alpha", "a", "d", "theta", "beta", "probe")
 
 
@@ -31,146 +31,141 @@ class Geometry(NamedTuple):
     probe: Float[Array, "... 3"]
 
 
-class Frame(NamedTuple):
-    """An orthonormal frame: axes ``x``, ``y``, ``z`` and ``origin`` (mm), in the base frame."""
-
-    x: Vector
-    y: Vector
-    z: Vector
-    origin: Vector
-
-
 class JointAxes(NamedTuple):
-    """What one joint leaves for the derivatives: unit axes, and the points those axes pass through."""
+    """What the joints leave for the derivatives: unit axes and the points they pass through; in the base frame, mm."""
 
-    z_before: Vector  # axis of q, theta and d
-    origin_before: Vector
-    x: Vector  # axis of a and alpha
-    y: Vector  # axis of beta
-    origin: Vector
-
-
-def _combine(first: Scalars, u: Vector, second: Scalars, v: Vector) -> Vector:
-    return (first * u[0] + second * v[0], first * u[1] + second * v[1], first * u[2] + second * v[2])
+    z_before: Float[Array, "n 3 ..."]  # axis of q, theta and d
+    origin_before: Float[Array, "n 3 ..."]
+    x: Float[Array, "n 3 ..."]  # axis of a and alpha
+    y: Float[Array, "n 3 ..."] | None  # axis of beta
+    origin: Float[Array, "n 3 ..."]
 
 
-def _moved(origin: Vector, first: Scalars, u: Vector, second: Scalars, v: Vector) -> Vector:
-    step = _combine(first, u, second, v)
-    return (origin[0] + step[0], origin[1] + step[1], origin[2] + step[2])
+def _rows(parameter: Float[Array, "... n"], rank: int) -> Float[Array, "n ..."]:
+    """Last axis first, and ones inserted after it so that the batch lines up with a batch of ``rank`` axes."""
+    moved = jnp.moveaxis(parameter, -1, 0)
+    return moved.reshape(moved.shape[:1] + (1,) * (rank - moved.ndim + 1) + moved.shape[1:])
 
 
-def _cross(u: Vector, v: Vector) -> Vector:
-    return (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
-
-
-def _minus(u: Vector, v: Vector) -> Vector:
-    return (u[0] - v[0], u[1] - v[1], u[2] - v[2])
-
-
-def walk(geometry: Geometry, q: Float[Array, "... n"]) -> tuple[Frame, list[JointAxes]]:
+def _walk(geometry: Geometry, q: Float[Array, "... n"]) -> tuple[Float[Array, "3 3 ..."], Float[Array, "3 ..."], JointAxes]:
     """Walk the chain from base to flange: T_i = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)].
 
-    Returns the last frame and, joint by joint, the axes that the derivatives need. Leading shapes broadcast.
+    Returns the axes x, y, z of the last frame, the tip, and the axes that the derivatives need. The batches of the
+    parameters and of q broadcast to ``*c``.
     """
-    zero, one = jnp.zeros(()), jnp.ones(())
-    frame = Frame((one, zero, zero), (zero, one, zero), (zero, zero, one), (zero, zero, zero))
-    joints = []
-    for i in range(q.shape[-1]):
-        turn = q[..., i] + geometry.theta[..., i]
-        cos_turn, sin_turn = jnp.cos(turn), jnp.sin(turn)
-        x = _combine(cos_turn, frame.x, sin_turn, frame.y)
-        y = _combine(-sin_turn, frame.x, cos_turn, frame.y)
-        origin = _moved(frame.origin, geometry.d[..., i], frame.z, geometry.a[..., i], x)
-        cos_twist, sin_twist = jnp.cos(geometry.alpha[..., i]), jnp.sin(geometry.alpha[..., i])
-        y, z = _combine(cos_twist, y, sin_twist, frame.z), _combine(-sin_twist, y, cos_twist, frame.z)
-        joints.append(JointAxes(frame.z, frame.origin, x, y, origin))
-        if geometry.beta is not None:
-            cos_tilt, sin_tilt = jnp.cos(geometry.beta[..., i]), jnp.sin(geometry.beta[..., i])
-            x, z = _combine(cos_tilt, x, -sin_tilt, z), _combine(sin_tilt, x, cos_tilt, z)
-        frame = Frame(x, y, z, origin)
-    return frame, joints
+    rank = max(q.ndim, *(leaf.ndim for leaf in jax.tree.leaves(geometry))) - 1
+    batch = jnp.broadcast_shapes(q.shape[:-1], *(leaf.shape[:-1] for leaf in jax.tree.leaves(geometry)))
+    turn = _rows(q, rank) + _rows(geometry.theta, rank)
+    twist, tilt = _rows(geometry.alpha, rank), None if geometry.beta is None else _rows(geometry.beta, rank)
+    inputs = (
+        (jnp.cos(turn), jnp.sin(turn)),
+        (jnp.cos(twist), jnp.sin(twist)),
+        None if tilt is None else (jnp.cos(tilt), jnp.sin(tilt)),
+        _rows(geometry.a, rank),
+        _rows(geometry.d, rank),
+    )
+
+    def joint(frame, row):
+        (x, y, z), origin = frame
+        (cos_turn, sin_turn), (cos_twist, sin_twist), tilts, a, d = row
+        new_x = cos_turn * x + sin_turn * y
+        turned_y = cos_turn * y - sin_turn * x
+        new_origin = origin + d * z + a * new_x
+        new_y = cos_twist * turned_y + sin_twist * z
+        new_z = cos_twist * z - sin_twist * turned_y
+        axes = JointAxes(z, origin, new_x, None if tilts is None else new_y, new_origin)
+        if tilts is not None:
+            cos_tilt, sin_tilt = tilts
+            new_x, new_z = cos_tilt * new_x - sin_tilt * new_z, sin_tilt * new_x + cos_tilt * new_z
+        return ((new_x, new_y, new_z), new_origin), axes
+
+    base = jnp.broadcast_to(jnp.eye(3).reshape((3, 3) + (1,) * rank), (3, 3, *batch))
+    start = ((base[0], base[1], base[2]), jnp.zeros((3, *batch)))
+    # Ones for the component axis, so that every factor has the rank of the vectors.
+    inputs = jax.tree.map(lambda factor: factor[:, None], inputs)
+    (frame, origin), axes = jax.lax.scan(joint, start, inputs)
+    probe = _rows(geometry.probe, rank)[:, None]
+    tip = origin + probe[0] * frame[0] + probe[1] * frame[1] + probe[2] * frame[2]
+    return jnp.stack(frame), tip, axes
 
 
-def _tip(frame: Frame, probe: Float[Array, "... 3"]) -> Vector:
-    in_plane = _moved(frame.origin, probe[..., 0], frame.x, probe[..., 1], frame.y)
-    along = probe[..., 2]
-    return (
-        in_plane[0] + along * frame.z[0],
-        in_plane[1] + along * frame.z[1],
-        in_plane[2] + along * frame.z[2],
+def _cross(u: Float[Array, "n 3 ..."], v: Float[Array, "n 3 ..."]) -> Float[Array, "n 3 ..."]:
+    return jnp.stack(
+        [
+            u[:, 1] * v[:, 2] - u[:, 2] * v[:, 1],
+            u[:, 2] * v[:, 0] - u[:, 0] * v[:, 2],
+            u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0],
+        ],
+        axis=1,
     )
 
 
-def _stack(vector: Vector) -> Float[Array, "... 3"]:
-    return jnp.stack(jnp.broadcast_arrays(*vector), axis=-1)
-
-
-def _tip_and_columns(
+def tip_and_columns(
     geometry: Geometry, q: Float[Array, "... n"]
-) -> tuple[Vector, dict[str, list[Vector]]]:
-    """Tip, and the derivative of the tip with respect to every parameter: kind -> one vector a joint (or a probe axis).
+) -> tuple[Float[Array, "3 ..."], dict[str, Float[Array, "k 3 ..."]]]:
+    """Tip, and the derivative of the tip by every parameter: kind -> one vector a joint (or a probe axis).
 
-    ``theta`` also serves for q: the two enter only as their sum.
+    ``theta`` also serves for q: the two enter only as their sum. Components lie before the batch.
     """
-    frame, joints = walk(geometry, q)
-    tip = _tip(frame, geometry.probe)
-    columns: dict[str, list[Vector]] = {
-        "alpha": [_cross(joint.x, _minus(tip, joint.origin)) for joint in joints],
-        "a": [joint.x for joint in joints],
-        "d": [joint.z_before for joint in joints],
-        "theta": [_cross(joint.z_before, _minus(tip, joint.origin_before)) for joint in joints],
-        "probe": [frame.x, frame.y, frame.z],
+    frame, tip, axes = _walk(geometry, q)
+    columns = {
+        "alpha": _cross(axes.x, tip[None] - axes.origin),
+        "a": axes.x,
+        "d": axes.z_before,
+        "theta": _cross(axes.z_before, tip[None] - axes.origin_before),
+        "probe": frame,
     }
-    if geometry.beta is not None:
-        columns["beta"] = [_cross(joint.y, _minus(tip, joint.origin)) for joint in joints]
+    if axes.y is not None:
+        columns["beta"] = _cross(axes.y, tip[None] - axes.origin)
     return tip, columns
 
 
+def chosen_columns(
+    columns: dict[str, Float[Array, "k 3 ..."]], entries: tuple[tuple[str, int], ...]
+) -> Float[Array, "p 3 ..."]:
+    """The columns of named entries (kind and 0-based index; ``q`` counts as ``theta``), in their order."""
+    kinds = list(columns)
+    starts = dict(zip(kinds, np.cumsum([0, *(columns[kind].shape[0] for kind in kinds)])[:-1], strict=True))
+    rows = np.array([starts["theta" if kind == "q" else kind] + i for kind, i in entries], dtype=int)
+    return jnp.concatenate([columns[kind] for kind in kinds])[rows]
+
+
 @jax.custom_jvp
-def tip_position(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 3"]:
+def tip_position(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "*c 3"]:
     """Tip position in mm, in the base frame. Leading shapes of the parameters and of q broadcast.
 
     JAX's own differentiation of this function uses the analytic columns, forward and reverse, to any order.
     """
-    frame, _ = walk(geometry, q)
-    return _stack(_tip(frame, geometry.probe))
+    _, tip, _ = _walk(geometry, q)
+    return jnp.moveaxis(tip, 0, -1)
 
 
 def _tip_position_jvp(primals, tangents):
     geometry, q = primals
     geometry_dot, q_dot = tangents
-    tip, columns = _tip_and_columns(geometry, q)
+    tip, columns = tip_and_columns(geometry, q)
+    rank = tip.ndim - 1
     pairs = [(kind, getattr(geometry_dot, kind)) for kind in columns] + [("theta", q_dot)]
-    total = [jnp.zeros(()), jnp.zeros(()), jnp.zeros(())]
+    moved = jnp.zeros_like(tip)
     for kind, tangent in pairs:
         # Unperturbed arguments arrive as symbolic zeros: a derivative by parameters then never touches q.
-        if isinstance(tangent, jax.custom_derivatives.SymbolicZero):
-            continue
-        for i, column in enumerate(columns[kind]):
-            for axis in range(3):
-                total[axis] = total[axis] + column[axis] * tangent[..., i]
-    position = _stack(tip)
-    return position, jnp.broadcast_to(_stack((total[0], total[1], total[2])), position.shape)
+        if not isinstance(tangent, jax.custom_derivatives.SymbolicZero):
+            moved = moved + jnp.sum(columns[kind] * _rows(tangent, rank)[:, None], axis=0)
+    return jnp.moveaxis(tip, 0, -1), jnp.moveaxis(moved, 0, -1)
 
 
 tip_position.defjvp(_tip_position_jvp, symbolic_zeros=True)
 
 
-def tip_pose(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 4 4"]:
+def tip_pose(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "*c 4 4"]:
     """Homogeneous pose of the last frame with the tip as its origin (mm), in the base frame."""
-    frame, _ = walk(geometry, q)
-    columns = [_stack(frame.x), _stack(frame.y), _stack(frame.z), _stack(_tip(frame, geometry.probe))]
-    top = jnp.stack(jnp.broadcast_arrays(*columns), axis=-1)
-    bottom = jnp.broadcast_to(jnp.array([[0.0, 0.0, 0.0, 1.0]]), (*top.shape[:-2], 1, 4))
+    frame, tip, _ = _walk(geometry, q)
+    top = jnp.moveaxis(jnp.concatenate([frame, tip[None]]), (1, 0), (-2, -1))
+    bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]).reshape((1,) * (top.ndim - 1) + (4,)), (*top.shape[:-2], 1, 4))
     return jnp.concatenate([top, bottom], axis=-2)
 
 
-def tip_jacobian(
-    geometry: Geometry, q: Float[Array, "... n"], entries: tuple[tuple[str, int], ...]
-) -> Float[Array, "... 3 p"]:
+def tip_jacobian(geometry: Geometry, q: Float[Array, "... n"], entries: tuple[tuple[str, int], ...]) -> Float[Array, "*c 3 p"]:
     """Derivative of the tip by the named entries, each a kind (``alpha`` ... ``probe``, or ``q``) and a 0-based index."""
-    tip, columns = _tip_and_columns(geometry, q)
-    columns["q"] = columns["theta"]
-    shape = _stack(tip).shape
-    chosen = [jnp.broadcast_to(_stack(columns[kind][i]), shape) for kind, i in entries]
-    return jnp.stack(chosen, axis=-1) if chosen else jnp.zeros((*shape, 0))
+    _, columns = tip_and_columns(geometry, q)
+    return jnp.moveaxis(chosen_columns(columns, entries), (1, 0), (-2, -1))

@@ -29,20 +29,22 @@ def run(folder: Path, seed: int) -> dict[str, Any]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder} cannot be used as a folder: {(error.strerror or str(error)).lower()}; name another.") from error
+        raise InputError(
+            f"{folder} cannot be used as a folder: {(error.strerror or str(error)).lower()}; name another."
+        ) from error
     bounds = nominal.bounds()
     true = nominal._replace(
         arm=deviated(bounds.space, length=_DEVIATION_MM, angle=math.radians(_DEVIATION_DEG), seed=seed),
         name=f"{nominal.name}, true",
     )
-    noise = {"encoder_arcsec": _ENCODER_ARCSEC, "seating": _SEATING_MM}
     capture = simulate(
         true.arm,
         {"A": _START, "B": _END},
         poses={"A": 70, "B": 10},
         lengths=[("A", "B", _LENGTH_U_MM)],
+        encoder_arcsec=_ENCODER_ARCSEC,
+        seating=_SEATING_MM,
         seed=seed,
-        **noise,
     )
     recording = Recording(capture, nominal, true, seed)
     record = record_of(calibrate(nominal.arm, capture, bounds), recording)
@@ -51,7 +53,7 @@ def run(folder: Path, seed: int) -> dict[str, Any]:
     save_arm(nominal.arm, folder / "nominal.toml", name=nominal.name)
     save_arm(true.arm, folder / "true.toml", name=true.name)
     save_arm(record.calibrated.arm, folder / "calibrated.toml", name=record.calibrated.name)
-    summary = _summary(record, _checks(record, seed, noise))
+    summary = _summary(record, _checks(record, seed))
     from .figures import calibration_figure
 
     calibration_figure(record, folder / "calibration.png")
@@ -59,7 +61,7 @@ def run(folder: Path, seed: int) -> dict[str, Any]:
     return summary | {"folder": str(folder), "files": files}
 
 
-def _checks(record: CalibrationRecord, seed: int, noise: dict[str, float]) -> dict[str, float]:
+def _checks(record: CalibrationRecord, seed: int) -> dict[str, float]:
     """RMS error of lengths that were not used, all over the volume, measured with the same noise by each arm."""
     random = np.random.default_rng(seed)
     assert record.recording.true is not None
@@ -70,7 +72,15 @@ def _checks(record: CalibrationRecord, seed: int, noise: dict[str, float]) -> di
         half = 0.5 * _CHECK_MM * direction / np.linalg.norm(direction)
         sockets[f"{i}-"], sockets[f"{i}+"] = tuple(middle - half), tuple(middle + half)
     pairs = [(f"{i}-", f"{i}+") for i in range(_CHECKS)]
-    capture: Capture = simulate(record.recording.true.arm, sockets, poses=1, lengths=pairs, seed=seed + 1, **noise)
+    capture: Capture = simulate(
+        record.recording.true.arm,
+        sockets,
+        poses=1,
+        lengths=pairs,
+        encoder_arcsec=_ENCODER_ARCSEC,
+        seating=_SEATING_MM,
+        seed=seed + 1,
+    )
     arms = {"nominal": record.recording.nominal, "stage1": record.stage1, "calibrated": record.calibrated}
     return {
         stage: float(np.sqrt(np.mean(np.asarray(evaluate(specification.arm, capture).error) ** 2)))

@@ -178,5 +178,7 @@ def _lengths(entries: list[_Length], fields: list[dict[str, str]]) -> list[Refer
         if not choices:
             raise InputError(f"length from '{entry.start}' to '{entry.end}' uses a field that no socket has.")
         for choice in sorted(choices):
-            lengths.append(ReferenceLength(_fill(entry.start, dict(choice)), _fill(entry.end, dict(choice)), entry.value, entry.u))
+            lengths.append(
+                ReferenceLength(_fill(entry.start, dict(choice)), _fill(entry.end, dict(choice)), entry.value, entry.u)
+            )
     return lengths

@@ -1,35 +1,22 @@
 """Repeatability figures of tip positions: how far the poses of one socket disagree."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 
-def mean_error_distance(tips: Float[Array, "m 3"]) -> Float[Array, ""]:
-    """DE of one socket, mm: mean over poses of the distance from the centroid (Cheng et al. 2018, eq. 13-15)."""
-    return jnp.mean(_distances(tips))
-
-
-def largest_half_range(tips: Float[Array, "m 3"]) -> Float[Array, ""]:
-    """Deltam of one socket, mm: largest over the axes of (max - min) / 2 (Cheng et al. 2018, eq. 11-12)."""
-    return jnp.max(jnp.max(tips, axis=0) - jnp.min(tips, axis=0)) / 2
-
-
-def _distances(tips: Float[Array, "m 3"]) -> Float[Array, " m"]:
-    squared = jnp.sum((tips - jnp.mean(tips, axis=0, keepdims=True)) ** 2, axis=-1)
-    # sqrt has no derivative at 0, which a socket of one pose meets exactly; its distance there is 0 and so is the slope.
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
-
-
 class Repeatability(eqx.Module):
     """How well the poses of a capture agree, over all sockets and socket by socket; mm."""
 
-    de: Float[Array, ""]  # mean distance from the own socket's centroid, over the poses of all sockets
-    deltam: Float[Array, ""]  # largest Deltam of any socket
+    # DE (Cheng et al. 2018, eq. 13-15): mean distance from the own socket's centroid, over the poses of all sockets.
+    de: Float[Array, ""]
+    # Deltam (eq. 11-12): largest over axes, and sockets, of (max - min) / 2.
+    deltam: Float[Array, ""]
     rms: Float[Array, ""]  # root mean square distance from the own socket's centroid
     socket_de: Float[Array, " s"]
     socket_deltam: Float[Array, " s"]
@@ -46,24 +33,29 @@ def repeatability(tips: Float[Array, "N 3"], sizes: Sequence[int], *, fitted: in
     DE of several sockets is the mean over all poses of sockets with at least two (a single pose has no spread to show);
     Deltam is the worst socket's. ``fitted`` parameters are taken off the degrees of freedom of ``sigma``.
     """
-    blocks = jnp.split(tips, np.cumsum(np.asarray(sizes))[:-1].tolist(), axis=0)
-    distances = [_distances(block) for block in blocks]
-    spread = [d for d, size in zip(distances, sizes, strict=True) if size > 1] or distances
-    everything = jnp.concatenate(spread)
-    freedom = max(3 * sum(size - 1 for size in sizes) - fitted, 1)
-    squares = jnp.sum(everything**2)
+    counts = np.asarray(sizes)
+    owner = jnp.asarray(np.repeat(np.arange(len(counts)), counts))
+    total = partial(jax.ops.segment_sum, segment_ids=owner, num_segments=len(counts), indices_are_sorted=True)
+    highest = partial(jax.ops.segment_max, segment_ids=owner, num_segments=len(counts), indices_are_sorted=True)
+    centroids = total(tips) / jnp.asarray(counts, dtype=tips.dtype)[:, None]
+    squared = jnp.sum((tips - centroids[owner]) ** 2, axis=-1)
+    distances = _root(squared)
+    half_range = jnp.max(highest(tips) + highest(-tips), axis=-1) / 2
+    spread = max(int(counts[counts > 1].sum()), 1)
+    freedom = max(3 * int((counts - 1).sum()) - fitted, 1)
     return Repeatability(
-        de=jnp.mean(everything),
-        deltam=jnp.max(jnp.stack([largest_half_range(block) for block in blocks])),
-        rms=_root(squares / everything.shape[0]),
-        socket_de=jnp.stack([jnp.mean(d) for d in distances]),
-        socket_deltam=jnp.stack([largest_half_range(block) for block in blocks]),
-        socket_rms=jnp.stack([_root(jnp.mean(d**2)) for d in distances]),
-        centroids=jnp.stack([jnp.mean(block, axis=0) for block in blocks]),
-        sigma=_root(squares / freedom),
+        de=jnp.sum(distances) / spread,
+        deltam=jnp.max(half_range),
+        rms=_root(jnp.sum(squared) / spread),
+        socket_de=total(distances) / jnp.asarray(counts, dtype=tips.dtype),
+        socket_deltam=half_range,
+        socket_rms=_root(total(squared) / jnp.asarray(counts, dtype=tips.dtype)),
+        centroids=centroids,
+        sigma=_root(jnp.sum(squared) / freedom),
     )
 
 
-def _root(value: Float[Array, ""]) -> Float[Array, ""]:
+def _root(value: Float[Array, "..."]) -> Float[Array, "..."]:
+    # sqrt has no derivative at 0, which a socket of one pose meets exactly; its distance there is 0 and so is the slope.
     positive = value > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)

@@ -1,13 +1,14 @@
 """Which numbers of an arm are free, and within what bounds."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from .arm import LENGTHS, Arm, is_concrete, locate, parameter_names, replace
+from .arm import LENGTHS, Arm, locate, parameter_names, replace
+from .arrays import Numbers, is_concrete
 from .errors import InputError, nearest
 
 # Steps of about 1 mm and 1 mrad are comparable at the tip of an arm of about 1 m.
@@ -49,11 +50,7 @@ class Parameters(eqx.Module):
                 raise InputError(f"parameter '{name}' is named as held and as free; name it once.")
         if arm.beta is None and any(name.startswith("beta_") for name in (*held, *free)):
             arm = replace(arm, beta=jnp.zeros_like(arm.alpha))
-        wanted = [
-            name
-            for name in parameter_names(arm)
-            if name not in held and (name in free or not name.startswith("beta_"))
-        ]
+        wanted = [name for name in parameter_names(arm) if name not in held and (name in free or not name.startswith("beta_"))]
         if not wanted:
             raise InputError("every parameter is held, so nothing is left to identify; hold fewer.")
         return cls(base=arm, names=tuple(wanted))
@@ -92,7 +89,7 @@ class Parameters(eqx.Module):
         values["beta"] = zero if arm.beta is None else arm.beta
         return jnp.stack([values[kind][..., i] for kind, i in self.entries()], axis=-1)
 
-    def arm(self, vector: Float[ArrayLike, " p"]) -> Arm:
+    def arm(self, vector: Numbers) -> Arm:
         """The base arm with its free parameters taken from ``(p,)``. Use ``vmap`` for a batch of vectors."""
         vector = jnp.asarray(vector, dtype=jnp.float64)
         if vector.shape[-1:] != (len(self.names),):
@@ -130,7 +127,7 @@ class Bounds(eqx.Module):
     lower: Float[Array, " p"]
     upper: Float[Array, " p"]
 
-    def __init__(self, space: Parameters, lower: ArrayLike | Sequence[float], upper: ArrayLike | Sequence[float]):
+    def __init__(self, space: Parameters, lower: Numbers, upper: Numbers):
         self.space = space
         self.lower = jnp.asarray(lower, dtype=jnp.float64)
         self.upper = jnp.asarray(upper, dtype=jnp.float64)

@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .capture import Capture
-from .chain import tip_jacobian
+from .chain import chosen_columns, tip_and_columns
 from .parameters import Parameters
+from .solver import Model
 
 
 class Measurement(eqx.Module):
@@ -39,6 +40,7 @@ class Measurement(eqx.Module):
         owner = np.repeat(np.arange(len(self.sizes)), self.sizes)
         return (owner[None, :] == np.arange(len(self.sizes))[:, None]) / np.asarray(self.sizes, dtype=float)[:, None]
 
+    # Sums over sockets are products with this matrix: sockets are few, and a scatter would not vectorise.
     def centroids(self, tips: Float[Array, "N k"]) -> Float[Array, "s k"]:
         """Mean of each socket's rows."""
         return jnp.asarray(self.averaging) @ tips
@@ -65,9 +67,7 @@ class Measurement(eqx.Module):
         return ends[:, 0], ends[:, 1]
 
 
-def repeatability_residual(
-    vector: Float[Array, " p"], args: tuple[Parameters, Measurement]
-) -> Float[Array, "N 3"]:
+def repeatability_residual(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Float[Array, "N 3"]:
     """Distance vectors of all tips from their socket's centroid, mm (Cheng et al. 2018, eq. 13-14, by component)."""
     space, measurement = args
     return measurement.centred(space.arm(vector).position(measurement.q))
@@ -86,17 +86,65 @@ def joint_residual(
     return measurement.centred(tips) / sigma, (measurement.distances(tips) - measurement.nominal) / length_sigma
 
 
-def derivatives(
+def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Model:
+    """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic columns.
+
+    The mean over a socket is taken off the Gram matrix as a correction of rank 3 a socket, J^T J - m mu^T mu, which spares
+    a centred copy of the columns; the gradient needs none, because centred residuals sum to zero.
+    """
+    space, measurement = args
+    tip, flat, means = _columns(vector, space, measurement)
+    # Centred twice: the rounding that one pass leaves in the mean (1e-13 mm) would otherwise be multiplied by the columns'
+    # means, and near a perfect fit outweigh the gradient.
+    residual = _centred_rows(_centred_rows(tip, measurement), measurement).reshape(-1)
+    sizes = jnp.asarray(np.asarray(measurement.sizes, dtype=float))
+    means_flat = means.reshape(means.shape[0], -1)
+    weighted = (means * sizes[None, None, :]).reshape(means.shape[0], -1)
+    return Model(0.5 * jnp.dot(residual, residual), flat @ residual, flat @ flat.T - weighted @ means_flat.T)
+
+
+def joint_model(
+    vector: Float[Array, " p"],
+    args: tuple[Parameters, Measurement, Float[Array, ""], Float[Array, " l"]],
+) -> Model:
+    """Cost, gradient and Gram matrix of `joint_residual`."""
+    space, measurement, sigma, length_sigma = args
+    poses = repeatability_model(vector, (space, measurement))
+    tip, _, means = _columns(vector, space, measurement)
+    distance, rows = _length_rows(tip @ jnp.asarray(measurement.averaging.T), means, measurement)
+    residual, rows = (distance - measurement.nominal) / length_sigma, rows / length_sigma[:, None]
+    return Model(
+        poses.cost / sigma**2 + 0.5 * jnp.dot(residual, residual),
+        poses.gradient / sigma**2 + rows.T @ residual,
+        poses.gram / sigma**2 + rows.T @ rows,
+    )
+
+
+def length_derivatives(vector: Float[Array, " p"], space: Parameters, measurement: Measurement) -> Float[Array, "l p"]:
+    """Analytic Jacobian of the measured lengths by the free parameters."""
+    tip, _, means = _columns(vector, space, measurement)
+    return _length_rows(tip @ jnp.asarray(measurement.averaging.T), means, measurement)[1]
+
+
+def _columns(
     vector: Float[Array, " p"], space: Parameters, measurement: Measurement
-) -> tuple[Float[Array, "N3 p"], Float[Array, "l p"]]:
-    """Analytic Jacobians, by the free parameters, of the repeatability residual and of the measured lengths."""
-    arm = space.arm(vector)
-    columns = tip_jacobian(arm.geometry, measurement.q, space.entries())
-    flat = columns.reshape(columns.shape[0], -1)
-    centred = measurement.centred(flat).reshape(-1, len(space.names))
+) -> tuple[Float[Array, "3 N"], Float[Array, "p N3"], Float[Array, "p 3 s"]]:
+    """Tips, Jacobian columns flattened over components and poses, and the columns' means over each socket."""
+    tip, columns = tip_and_columns(space.arm(vector).geometry, measurement.q)
+    chosen = chosen_columns(columns, space.entries())
+    return tip, chosen.reshape(chosen.shape[0], -1), chosen @ jnp.asarray(measurement.averaging.T)
+
+
+def _centred_rows(tip: Float[Array, "3 N"], measurement: Measurement) -> Float[Array, "3 N"]:
+    averaging = jnp.asarray(measurement.averaging)
+    return tip - (tip @ averaging.T) @ (averaging > 0).astype(tip.dtype)
+
+
+def _length_rows(
+    centroids: Float[Array, "3 s"], means: Float[Array, "p 3 s"], measurement: Measurement
+) -> tuple[Float[Array, " l"], Float[Array, "l p"]]:
     start, end = measurement._end_indices()
-    centroids = measurement.centroids(arm.position(measurement.q))
-    mean_columns = measurement.centroids(flat).reshape(len(measurement.sizes), 3, -1)
-    between = centroids[end] - centroids[start]
-    direction = between / jnp.linalg.norm(between, axis=-1, keepdims=True)
-    return centred, jnp.einsum("li,lip->lp", direction, mean_columns[end] - mean_columns[start])
+    between = centroids[:, end] - centroids[:, start]
+    distance = jnp.linalg.norm(between, axis=0)
+    direction = between / distance[None]
+    return distance, jnp.einsum("cl,pcl->lp", direction, means[:, :, end] - means[:, :, start])

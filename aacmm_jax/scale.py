@@ -1,14 +1,13 @@
 """Stage 2: the one number that repeatability cannot see, from reference lengths (Cheng et al. 2018, section 2.3)."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from .arm import Arm, is_concrete, replace
+from .arm import Arm, replace
+from .arrays import Numbers, is_concrete
 from .capture import Capture
 from .errors import InputError
 from .metrics import repeatability
@@ -78,9 +77,7 @@ def _weighted_mean(ratio: Float[Array, " l"], variance: Float[Array, " l"]) -> t
     return value, jnp.sqrt(jnp.maximum(predicted, jax.lax.stop_gradient(observed)))
 
 
-def scale_from_lengths(
-    measured: ArrayLike | Sequence[float], nominal: ArrayLike | Sequence[float], u: float = 0.0
-) -> Scale:
+def scale_from_lengths(measured: Numbers, nominal: Numbers, u: float = 0.0) -> Scale:
     """k from lengths measured by the arm and their nominal value (one, or one each), mm.
 
     ``u`` is the standard uncertainty of the nominal value (of all alike). The uncertainty of k combines it with the

@@ -172,7 +172,9 @@ def _reference_lengths(points: Mapping[str, Array], lengths: Iterable, key: Arra
             drawn.append(length)
             continue
         if len(length) not in (2, 3) or any(end not in points for end in length[:2]):
-            raise InputError(f"reference length {length} must be (socket, socket) or (socket, socket, u), of simulated sockets.")
+            raise InputError(
+                f"reference length {length} must be (socket, socket) or (socket, socket, u), of simulated sockets."
+            )
         start, end = length[:2]
         u = float(length[2]) if len(length) == 3 else 0.0
         draw = jax.random.normal(jax.random.fold_in(key, number))

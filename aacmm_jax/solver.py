@@ -8,6 +8,7 @@ step (a clipped step can point uphill, and is then refused). f is never evaluate
 Sources: Marquardt 1963; More 1978 (scaling, tests); Nielsen 1999 (damping); Bertsekas 1982 (active set of a projection).
 """
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -81,16 +82,7 @@ class Progress(eqx.Module):
     reason: Reason
 
 
-class Tolerances(eqx.Module):
-    """When to stop, and how cautiously to begin."""
-
-    rtol: float = 1e-12  # on the step, relative to |y| (both scaled)
-    atol: float = 1e-15  # on the step, in scaled units
-    gtol: float = 1e-10  # on the projected gradient: cosine between residual and column of J
-    initial_damping: float = 1e-3  # relative to the largest curvature
-
-
-def begin(y: Flat, box: Box, max_damping: float = 1.0) -> Progress:
+def begin(y: Flat, box: Box) -> Progress:
     """State before the first evaluation, which happens at the start clipped to the box."""
     p = y.shape[0]
     zero = jnp.zeros(())
@@ -101,7 +93,7 @@ def begin(y: Flat, box: Box, max_damping: float = 1.0) -> Progress:
         trial=y,
         predicted=zero,
         reach=zero + jnp.inf,
-        damping=zero + max_damping,
+        damping=zero,
         growth=zero + 2.0,
         curvature=jnp.zeros(p),
         steps=jnp.zeros((), dtype=jnp.int64),
@@ -110,7 +102,7 @@ def begin(y: Flat, box: Box, max_damping: float = 1.0) -> Progress:
     )
 
 
-def advance(progress: Progress, evaluated: Model, box: Box, tolerances: Tolerances) -> Progress:
+def advance(progress: Progress, evaluated: Model, box: Box, solver: "BoundedLevenbergMarquardt") -> Progress:
     """Judge the trial from its evaluated model, test for convergence, and propose the next trial."""
     first = progress.steps == 0
     finite = evaluated.finite()
@@ -122,18 +114,18 @@ def advance(progress: Progress, evaluated: Model, box: Box, tolerances: Toleranc
 
     damping, growth = _next_damping(progress, evaluated, accept)
     largest = jnp.max(scale**2 * curvature)
-    damping = jnp.where(first, tolerances.initial_damping * largest, damping)
+    damping = jnp.where(first, solver.initial_damping * largest, damping)
     # Below this floor rounding in the Gram matrix can make it indefinite.
     damping = jnp.maximum(damping, 1e3 * _EPSILON * largest)
 
     # Judged before clipping: a step that the box cuts to nothing says only that the damping is still too small.
-    small_step = progress.reach <= tolerances.rtol * _norm(y / scale) + tolerances.atol
+    small_step = progress.reach <= solver.rtol * _norm(y / scale) + solver.atol
     hopeless = jnp.abs(progress.predicted) <= 4 * _EPSILON * progress.model.cost
     unclipped = _norm((progress.trial - progress.y) / scale) >= 0.5 * progress.reach
     reason = Reason.where(damping > 1e20 * jnp.maximum(largest, 1.0), Reason.stalled, Reason.running)
     reason = Reason.where(~first & ~accept & finite & hopeless & unclipped, Reason.rounding, reason)
     reason = Reason.where(~first & small_step, Reason.step, reason)
-    reason = Reason.where(_optimality(y, model, box) <= tolerances.gtol, Reason.gradient, reason)
+    reason = Reason.where(_optimality(y, model, box) <= solver.gtol, Reason.gradient, reason)
     reason = Reason.where(first & ~finite, Reason.nonfinite, reason)
 
     trial, predicted, reach = propose(y, model, box, scale, damping)
@@ -200,9 +192,7 @@ def _improves(progress: Progress, evaluated: Model, box: Box) -> Bool[Array, ""]
     return (progress.predicted > 0) & jnp.where(blurred, nearer, decreases)
 
 
-def _next_damping(
-    progress: Progress, evaluated: Model, accept: Bool[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _next_damping(progress: Progress, evaluated: Model, accept: Bool[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     # Nielsen's rule: shrink smoothly with the gain ratio, grow ever faster while steps are refused.
     promised = jnp.where(progress.predicted > 0, progress.predicted, 1.0)
     gain = jnp.where(accept, (progress.model.cost - evaluated.cost) / promised, 0.0)
@@ -251,15 +241,18 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Levenberg-Marquardt within a box, as an Optimistix least-squares solver.
 
     The box comes in ``options``: ``lower``, ``upper`` (PyTrees like y, scalars, or None) and ``scale``, the natural step of
-    each unknown (None: chosen from the columns of the Jacobian). ``stats`` of the solution holds ``reason``,
+    each unknown (None: chosen from the columns of the Jacobian). ``normal``, a function of (y, args), may supply the `Model`
+    where it can be had cheaper than from the Jacobian of the residual. ``stats`` of the solution holds ``reason``,
     ``num_accepted_steps``, ``cost``, ``gradient`` and ``optimality``.
 
     Use it through `least_squares`, which also brings the adjoint that knows the bounds.
     """
 
-    tolerances: Tolerances = Tolerances()
-    rtol: float = 1e-12
-    atol: float = 1e-15
+    rtol: float = 1e-12  # on the step, relative to |y| (both scaled)
+    atol: float = 1e-15  # on the step, scaled
+    gtol: float = 1e-10  # on the projected gradient: cosine between the residual and a column of J
+    initial_damping: float = 1e-3  # relative to the largest curvature
+    # Optimistix asks for a norm; every test here is written out, since it scales by unknowns.
     norm: Callable[[PyTree], Array] = optx.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Progress:
@@ -268,8 +261,12 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     def step(self, fn, y, args, options, state, tags):
         _, unravel = ravel_pytree(y)
-        evaluated, aux = _evaluate(fn, unravel, state.trial, args)
-        state = advance(state, evaluated, _box(y, options), self.tolerances)
+        normal = options.get("normal")
+        if normal is None:
+            evaluated, aux = _evaluate(fn, unravel, state.trial, args)
+        else:
+            evaluated, aux = normal(unravel(state.trial), args), None
+        state = advance(state, evaluated, _box(y, options), self)
         return unravel(state.y), state, aux
 
     def terminate(self, fn, y, args, options, state, tags):
@@ -315,7 +312,8 @@ class BoundedAdjoint(optx.AbstractAdjoint):
     def apply(self, primal_fn, rewrite_fn, inputs, tags):
         del rewrite_fn
         inputs = (*inputs, _while_loop)
-        return implicit_jvp(primal_fn, _stationarity, inputs, tags, self.linear_solver)
+        # Optimistix wants a plain global function, not one that a run-time type checker has wrapped.
+        return implicit_jvp(primal_fn, inspect.unwrap(_stationarity), inputs, tags, self.linear_solver)
 
 
 def _while_loop(cond_fun, body_fun, init_val, *, max_steps):
@@ -340,7 +338,9 @@ def _stationarity(y: PyTree[Array], solved: PyTree, inputs: PyTree) -> Flat:
     pinned = box.pinned(fixed_point, fixed_gradient)
     nearer_lower = fixed_point - box.lower <= box.upper - fixed_point
     # An absent bound is infinite; it is never the nearer one of a pinned unknown, but must not make NaN in the other branch.
-    bound = jnp.where(nearer_lower, jnp.where(jnp.isfinite(box.lower), box.lower, 0.0), jnp.where(jnp.isfinite(box.upper), box.upper, 0.0))
+    bound = jnp.where(
+        nearer_lower, jnp.where(jnp.isfinite(box.lower), box.lower, 0.0), jnp.where(jnp.isfinite(box.upper), box.upper, 0.0)
+    )
     return jnp.where(pinned, (flat - bound) / scale, scale * gradient)
 
 
@@ -352,7 +352,8 @@ def least_squares(
     lower: PyTree = None,
     upper: PyTree = None,
     scale: PyTree = None,
-    tolerances: Tolerances = Tolerances(),
+    normal: Callable[[PyTree, PyTree], Model] | None = None,
+    solver: BoundedLevenbergMarquardt = BoundedLevenbergMarquardt(),
     max_steps: int = 1000,
     throw: bool = True,
 ) -> optx.Solution:
@@ -360,15 +361,16 @@ def least_squares(
 
     ``y0`` is any PyTree of floats; ``lower``, ``upper`` and ``scale`` are PyTrees like it, scalars, or None (no bound;
     scaling by the Jacobian's columns). ``y0`` is clipped to the box. Returns an `optimistix.Solution`; its
-    ``stats["reason"]`` says which test ended the solve. Differentiable with respect to args and both bounds.
+    ``stats["reason"]`` says which test ended the solve. Differentiable with respect to args and both bounds. ``normal``, a
+    global function of (y, args), may supply cost, gradient and Gram matrix of fn as a `Model`.
 
     With ``throw=False`` a failure is only data (``result``), as a batch needs it.
     """
-    options = {"lower": lower, "upper": upper, "scale": scale}
+    options = {"lower": lower, "upper": upper, "scale": scale, "normal": normal}
     y0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.float64), y0)
     return optx.least_squares(
         fn,
-        BoundedLevenbergMarquardt(tolerances),
+        solver,
         y0,
         args,
         options,

@@ -9,6 +9,7 @@ import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -32,7 +33,7 @@ class Table(NamedTuple):
     """One HDF5 group: variables by name (a variable named like its only dimension is its coordinate), and attributes."""
 
     variables: dict[str, Variable]
-    attributes: dict[str, Any] = {}
+    attributes: Mapping[str, Any] = MappingProxyType({})
 
 
 @contextlib.contextmanager

@@ -160,12 +160,18 @@ def warnings(record: CalibrationRecord) -> list[str]:
         )
     elif stage1:
         sides = ", ".join(f"{name} ({side})" for name, side in stage1.items())
-        found.append(f"On a bound: {sides}. Widen the bounds unless they are known limits; uncertainties ignore such parameters.")
+        found.append(
+            f"On a bound: {sides}. Widen the bounds unless they are known limits; uncertainties ignore such parameters."
+        )
     if record.hold is not None and abs(record.k - 1) > _SUSPICIOUS_SHRINK:
-        found.append(f"k = {record.k:.5f} is far from 1: is {record.hold} at its nominal value, and is each reference length right?")
+        found.append(
+            f"k = {record.k:.5f} is far from 1: is {record.hold} at its nominal value, and is each reference length right?"
+        )
     lengths = record.recording.capture.lengths
     if len(lengths) == 1:
-        found.append("A single reference length fixes the scale, so its error after calibration says nothing; keep another for checking.")
+        found.append(
+            "A single reference length fixes the scale, so its error after calibration says nothing; keep another for checking."
+        )
     return found
 
 
@@ -194,9 +200,7 @@ def evaluation_summary(record: CalibrationRecord, capture: Capture) -> dict[str,
             summary[group] = None
             continue
         part = capture.select(names)
-        evaluations = {
-            stage: evaluate(specification.arm, part) for stage, specification in _arms(record).items()
-        }
+        evaluations = {stage: evaluate(specification.arm, part) for stage, specification in _arms(record).items()}
         summary[group] = {
             **{stage: figures(evaluation) for stage, evaluation in evaluations.items()},
             **tables(part, evaluations["calibrated"]),

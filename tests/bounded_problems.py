@@ -27,7 +27,16 @@ def draw(seed: int) -> dict[str, np.ndarray]:
     lower = centre + unit * (middle - width * random.uniform(0.1, 1, size=p))
     upper = centre + unit * (middle + width * random.uniform(0.1, 1, size=p))
     start = lower + random.uniform(0.05, 0.95, size=p) * (upper - lower)
-    return dict(matrix=matrix, curvature=np.asarray(curvature), unit=unit, centre=centre, target=target, lower=lower, upper=upper, start=start)
+    return dict(
+        matrix=matrix,
+        curvature=np.asarray(curvature),
+        unit=unit,
+        centre=centre,
+        target=target,
+        lower=lower,
+        upper=upper,
+        start=start,
+    )
 
 
 def residual(y, problem):

@@ -24,7 +24,9 @@ def main() -> None:
     except Exception as error:
         if debug:
             raise
-        _fail(f"aacmm failed unexpectedly ({type(error).__name__}: {error}); run again with --debug and report what it shows.", 1)
+        _fail(
+            f"aacmm failed unexpectedly ({type(error).__name__}: {error}); run again with --debug and report what it shows.", 1
+        )
 
 
 def _fail(message: str, code: int) -> None:

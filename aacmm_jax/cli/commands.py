@@ -21,8 +21,13 @@ app = typer.Typer(
 )
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else there.")]
-Only = Annotated[list[str] | None, typer.Option("--only", metavar="PATTERN", help="Use only the sockets that match (shell pattern); repeatable.")]
-Without = Annotated[list[str] | None, typer.Option("--without", metavar="PATTERN", help="Leave out the sockets that match; repeatable.")]
+Only = Annotated[
+    list[str] | None,
+    typer.Option("--only", metavar="PATTERN", help="Use only the sockets that match (shell pattern); repeatable."),
+]
+Without = Annotated[
+    list[str] | None, typer.Option("--without", metavar="PATTERN", help="Leave out the sockets that match; repeatable.")
+]
 CaptureFile = Annotated[Path, typer.Argument(metavar="CAPTURE.h5", help="Capture written by import or simulate.")]
 CalibrationFile = Annotated[Path, typer.Argument(metavar="CALIBRATION.h5", help="Calibration written by calibrate.")]
 
@@ -59,8 +64,12 @@ def simulate(
     arm: Annotated[str, typer.Argument(metavar="ARM", help="Nominal arm: a TOML file or a name that ships with the package.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Capture to write (HDF5).")],
     socket: Annotated[list[str], typer.Option(metavar="NAME=X,Y,Z", help="A socket and its position in mm; repeatable.")],
-    poses: Annotated[list[str] | None, typer.Option(metavar="N or NAME=N", help="Poses a socket; repeatable. Default 70.")] = None,
-    length: Annotated[list[str] | None, typer.Option(metavar="A,B[,U]", help="Reference length between two sockets, u in mm; repeatable.")] = None,
+    poses: Annotated[
+        list[str] | None, typer.Option(metavar="N or NAME=N", help="Poses a socket; repeatable. Default 70.")
+    ] = None,
+    length: Annotated[
+        list[str] | None, typer.Option(metavar="A,B[,U]", help="Reference length between two sockets, u in mm; repeatable.")
+    ] = None,
     encoder_arcsec: Annotated[float, typer.Option(min=0, help="Standard deviation of a reading.")] = 0.0,
     resolution_arcsec: Annotated[float, typer.Option(min=0, help="Resolution of a reading.")] = 0.0,
     seating_mm: Annotated[float, typer.Option(min=0, help="Standard deviation, a coordinate, of the seat.")] = 0.0,
@@ -106,7 +115,9 @@ def simulate(
 
 @app.command(name="import", epilog="Example: aacmm import capture.toml -o capture.h5")
 def import_(
-    manifest: Annotated[Path, typer.Argument(metavar="MANIFEST.toml", help="Which files hold which socket, in which unit; and the lengths.")],
+    manifest: Annotated[
+        Path, typer.Argument(metavar="MANIFEST.toml", help="Which files hold which socket, in which unit; and the lengths.")
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Capture to write (HDF5).")],
     as_json: Json = False,
 ) -> None:
@@ -125,15 +136,27 @@ def import_(
 def calibrate(
     capture: CaptureFile,
     output: Annotated[Path, typer.Option("--output", "-o", help="Calibration to write (HDF5).")],
-    method: Annotated[Literal["two-stage", "joint"], typer.Option(help="Scale fix after stage 1, or one least squares of poses and lengths.")] = "two-stage",
-    hold: Annotated[str, typer.Option(help="Length held in stage 1: a name, 'longest', or 'none' to free all as the paper does.")] = "longest",
+    method: Annotated[
+        Literal["two-stage", "joint"], typer.Option(help="Scale fix after stage 1, or one least squares of poses and lengths.")
+    ] = "two-stage",
+    hold: Annotated[
+        str, typer.Option(help="Length held in stage 1: a name, 'longest', or 'none' to free all as the paper does.")
+    ] = "longest",
     only: Only = None,
     without: Without = None,
-    held: Annotated[str | None, typer.Option(metavar="NAMES", help="Parameters that are not identified, with commas; replaces the arm's own list.")] = None,
-    free: Annotated[str | None, typer.Option(metavar="NAMES", help="Parameters to free besides, with commas (beta_2 for Hayati's angle).")] = None,
+    held: Annotated[
+        str | None,
+        typer.Option(metavar="NAMES", help="Parameters that are not identified, with commas; replaces the arm's own list."),
+    ] = None,
+    free: Annotated[
+        str | None, typer.Option(metavar="NAMES", help="Parameters to free besides, with commas (beta_2 for Hayati's angle).")
+    ] = None,
     length_bound_mm: Annotated[float | None, typer.Option(min=0, help="Half-width of the bounds of lengths.")] = None,
     angle_bound_deg: Annotated[float | None, typer.Option(min=0, help="Half-width of the bounds of angles.")] = None,
-    bound: Annotated[list[str] | None, typer.Option(metavar="NAME=WIDTH", help="Half-width of one parameter's bounds, mm or deg; repeatable.")] = None,
+    bound: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=WIDTH", help="Half-width of one parameter's bounds, mm or deg; repeatable."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Identify the arm from repeatability, and fix its scale with the reference lengths."""
@@ -166,7 +189,9 @@ def evaluate(
     without: Without = None,
     max_rms_mm: Annotated[float | None, typer.Option(min=0, help="Exit with code 1 where the RMS distance is larger.")] = None,
     max_deltam_mm: Annotated[float | None, typer.Option(min=0, help="Exit with code 1 where Deltam is larger.")] = None,
-    max_length_error_mm: Annotated[float | None, typer.Option(min=0, help="Exit with code 1 where any length's error is larger.")] = None,
+    max_length_error_mm: Annotated[
+        float | None, typer.Option(min=0, help="Exit with code 1 where any length's error is larger.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Try a calibration on a capture: sockets it was identified from, and sockets it has never seen."""
@@ -188,7 +213,10 @@ def evaluate(
 @app.command(epilog="Example: aacmm export calibration.h5 --format toml -o arm.toml")
 def export(
     calibration: CalibrationFile,
-    form: Annotated[Literal["toml", "json", "csv"], typer.Option("--format", help="toml: an arm file; json: everything; csv: the parameters.")] = "toml",
+    form: Annotated[
+        Literal["toml", "json", "csv"],
+        typer.Option("--format", help="toml: an arm file; json: everything; csv: the parameters."),
+    ] = "toml",
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File to write; standard output without it.")] = None,
 ) -> None:
     """Write a calibrated arm for other programs."""
@@ -212,7 +240,9 @@ def export(
 
 @app.command(epilog="Example: aacmm show calibration.h5")
 def show(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Capture or calibration (HDF5), or an arm: TOML file or shipped name.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Capture or calibration (HDF5), or an arm: TOML file or shipped name.")
+    ],
     as_json: Json = False,
 ) -> None:
     """Print what a file holds."""

@@ -27,9 +27,11 @@ def _console() -> Console:
 
 
 def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table = Table(
+        title=escape(title) or None, title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 2, 0, 0)
+    )
     for number, column in enumerate(columns):
-        table.add_column(column, justify="left" if number == 0 else "right")
+        table.add_column(escape(column), justify="left" if number == 0 else "right")
     return table
 
 
@@ -45,7 +47,7 @@ def arm(summary: dict[str, Any]) -> None:
     console = _console()
     beta = any(row["beta_rad"] is not None for row in summary["joints"])
     table = _table(
-        f"{escape(summary['name'])} (standard D-H)",
+        f"{summary['name']} (standard D-H)",
         "joint", "alpha [deg]", "a [mm]", "d [mm]", "theta [deg]", *(["beta [deg]"] if beta else []), "limits [deg]",
     )  # fmt: skip
     for row in summary["joints"]:
@@ -55,7 +57,9 @@ def arm(summary: dict[str, Any]) -> None:
         cells.append("-" if limits is None else f"{math.degrees(limits[0]):.0f} to {math.degrees(limits[1]):.0f}")
         table.add_row(str(row["joint"]), *cells)
     console.print(table)
-    console.print(f"Probe {', '.join(_number(x) for x in summary['probe_mm'])} mm. Not identified: {', '.join(summary['held'])}.")
+    console.print(
+        f"Probe {', '.join(_number(x) for x in summary['probe_mm'])} mm. Not identified: {', '.join(summary['held'])}."
+    )
 
 
 def capture(summary: dict[str, Any]) -> None:
@@ -101,7 +105,12 @@ def calibration(summary: dict[str, Any]) -> None:
         factor, fine = (1.0, 1e3) if row["unit"] == "mm" else (180 / math.pi, _ARCSEC)
         nominal, value = factor * row["nominal"], factor * row["calibrated"]
         table.add_row(
-            row["parameter"], f"{nominal:.5f}", f"{value:.5f}", f"{value - nominal:+.5f}", f"{fine * row['u']:.2f}", row["bound"] or ""
+            row["parameter"],
+            f"{nominal:.5f}",
+            f"{value:.5f}",
+            f"{value - nominal:+.5f}",
+            f"{fine * row['u']:.2f}",
+            row["bound"] or "",
         )
     console.print(table)
     _written(console, summary)
@@ -146,7 +155,7 @@ def demo(summary: dict[str, Any]) -> None:
         *_TRUTH,
         ("check_rms_mm", f"RMS error of {summary['checks']} lengths of {summary['check_length_mm']:g} mm [mm]", 1.0),
     ):
-        table.add_row(text, *(_number(factor * summary[stage][key]) for stage in ("nominal", "stage1", "calibrated")))
+        table.add_row(escape(text), *(_number(factor * summary[stage][key]) for stage in ("nominal", "stage1", "calibrated")))
     console.print(table)
     console.print(
         f"k = {summary['scale_k']:.7f}, u(k) = {summary['scale_u']:.1e}: stage 1 sees repeatability only and leaves every length "
@@ -160,7 +169,7 @@ def _stages(console: Console, title: str, figures: dict[str, Any], stages: tuple
     table = _table(title, "", *(names[stage] for stage in stages))
     for key, text in _FIGURES:
         if key in figures[stages[0]]:
-            table.add_row(text, *(_number(figures[stage][key]) for stage in stages))
+            table.add_row(escape(text), *(_number(figures[stage][key]) for stage in stages))
     console.print(table)
 
 
@@ -168,7 +177,7 @@ def _truth(console: Console, truth: dict[str, Any]) -> None:
     stages = ("nominal", "stage1", "calibrated")
     table = _table("\nAgainst the true arm of the simulation", "", "nominal", "stage 1", "calibrated")
     for key, text, factor in _TRUTH:
-        table.add_row(text, *(_number(factor * truth[stage][key]) for stage in stages))
+        table.add_row(escape(text), *(_number(factor * truth[stage][key]) for stage in stages))
     console.print(table)
 
 

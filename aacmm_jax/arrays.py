@@ -1,0 +1,34 @@
+"""Numbers at the door: what people pass for arrays, made into float64 arrays or refused."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from .errors import InputError
+
+# What people pass for an array of numbers; lists are converted and checked.
+Numbers = ArrayLike | Sequence[Any]
+
+
+def is_concrete(*arrays: object) -> bool:
+    """Whether values can be looked at now; inside jit, vmap or grad they cannot, and checks of values are left out."""
+    return not any(isinstance(array, jax.core.Tracer) for array in arrays)
+
+
+def as_floats(value: Numbers, what: str) -> Array:
+    """A finite float64 array, or `InputError` that names ``what``."""
+    try:
+        array = value if isinstance(value, jax.Array) else np.asarray(value)
+    except ValueError as error:
+        raise InputError(f"{what} has rows of unequal length.") from error
+    if not jnp.issubdtype(array.dtype, jnp.number) or jnp.issubdtype(array.dtype, jnp.complexfloating):
+        raise InputError(f"{what} must be real numbers, got {array.dtype}.")
+    array = jnp.asarray(array, dtype=jnp.float64)
+    if is_concrete(array) and not bool(jnp.all(jnp.isfinite(array))):
+        raise InputError(f"{what} holds a value that is not finite; every parameter must be a finite number.")
+    return array

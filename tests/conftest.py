@@ -1,0 +1,71 @@
+"""Strictness for all tests: shapes checked at run time, no silent promotion of rank or dtype, warnings are errors."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+with install_import_hook("aacmm_jax", "beartype.beartype"):
+    import aacmm_jax as aj
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """Folder of real captures and published numbers, which stands beside a developer's checkout only."""
+    if not (SHARED / "data" / "mukca").is_dir():
+        pytest.skip("the shared data stand beside a developer's checkout only")
+    return SHARED
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def aacmm(tmp_path, cache):
+    """Run the real command line in a fresh process, in an empty folder; returns exit code, output and error text."""
+
+    def run(*arguments: object, expect: int = 0) -> subprocess.CompletedProcess[str]:
+        environment = os.environ | {"XDG_CACHE_HOME": str(cache), "COLUMNS": "110"}
+        done = subprocess.run(
+            [sys.executable, "-m", "aacmm_jax", *map(str, arguments)],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        assert done.returncode == expect, done.stdout + done.stderr
+        return done
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def paper_arm() -> "aj.Arm":
+    return aj.load_arm("cheng2018-simulation")
+
+
+@pytest.fixture(scope="session")
+def paper_capture(paper_arm) -> "aj.Capture":
+    """70 noise-free poses in one socket, and a second socket that only carries a length: the paper's simulation."""
+    sockets = {"A": (400, 200, 300), "B": (600, 200, 300)}
+    return aj.simulate(paper_arm, sockets, poses={"A": 70, "B": 1}, lengths=[("A", "B")], seed=5)
+
+
+@pytest.fixture(scope="session")
+def noisy_capture(paper_arm) -> "aj.Capture":
+    """The paper's simulation with the noise of a real arm: 2 arcsec and 5 um."""
+    sockets = {"A": (400, 200, 300), "B": (600, 200, 300)}
+    return aj.simulate(
+        paper_arm, sockets, poses={"A": 70, "B": 5}, lengths=[("A", "B", 0.002)], encoder_arcsec=2.0, seating=0.005, seed=5
+    )
