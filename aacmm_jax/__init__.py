@@ -11,6 +11,7 @@ from .arm_files import shipped_arms as shipped_arms
 from .calibrate import Calibration as Calibration
 from .calibrate import Identification as Identification
 from .calibrate import calibrate as calibrate
+from .calibrate import converged as converged
 from .calibrate import identify as identify
 from .calibration_files import CalibrationRecord as CalibrationRecord
 from .calibration_files import load_calibration as load_calibration
@@ -34,5 +35,6 @@ from .scale import fix_scale as fix_scale
 from .scale import scale_from_lengths as scale_from_lengths
 from .simulate import deviated as deviated
 from .simulate import simulate as simulate
+from .solver import BoundedLevenbergMarquardt as BoundedLevenbergMarquardt
 from .solver import Reason as Reason
 from .solver import least_squares as least_squares

@@ -1,13 +1,15 @@
 """The arm: a serial chain of revolute joints in standard Denavit-Hartenberg form, with a probe on its last frame."""
 
+import math
 from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from . import chain
-from .arrays import Numbers, as_floats
+from .arrays import Numbers, as_array, as_floats
 from .errors import InputError, nearest
 
 LENGTHS = ("a", "d", "probe")
@@ -62,13 +64,15 @@ class Arm(eqx.Module):
                 raise InputError(f"{kind} has shape {array.shape}, but alpha has {joints} joints; give one value a joint.")
         if self.probe.shape[-1:] != (3,):
             raise InputError(f"probe has shape {self.probe.shape}; give its three coordinates (x, y, z) in mm.")
-        self.limits = None if limits is None else tuple((float(low), float(high)) for low, high in limits)
-        if self.limits is not None:
-            if len(self.limits) != joints:
-                raise InputError(f"limits has {len(self.limits)} rows, but the arm has {joints} joints.")
-            for i, (low, high) in enumerate(self.limits, start=1):
-                if not low < high:
-                    raise InputError(f"limits of joint {i} are {low:g} to {high:g} rad; the lower must be below the upper.")
+        arrays = [array for array in (self.alpha, self.a, self.d, self.theta, self.beta) if array is not None]
+        batches = [array.shape[:-1] for array in (*arrays, self.probe)]
+        try:
+            np.broadcast_shapes(*batches)
+        except ValueError as error:
+            raise InputError(
+                f"the parameters have the batch shapes {', '.join(map(str, batches))}; make them alike."
+            ) from error
+        self.limits = None if limits is None else checked_limits(limits, joints)
 
     @property
     def joints(self) -> int:
@@ -98,10 +102,23 @@ class Arm(eqx.Module):
         return chain.tip_jacobian(self.geometry, self._checked(q), tuple(locate(self, n, extra=("q",)) for n in names))
 
     def _checked(self, q: Numbers) -> Float[Array, "... n"]:
-        array = jnp.asarray(q, dtype=jnp.float64)
+        array = as_array(q, "q")
         if array.shape[-1:] != (self.joints,):
             raise InputError(f"q has shape {array.shape}, but the arm has {self.joints} joints; the last axis is the joint.")
         return array
+
+
+def checked_limits(limits: Sequence[Sequence[float]], joints: int) -> tuple[tuple[float, float], ...]:
+    """Lowest and highest reading of each joint, rad, or `InputError` that names the joint."""
+    rows = [tuple(float(reading) for reading in row) for row in limits]
+    if len(rows) != joints or any(len(row) != 2 for row in rows):
+        raise InputError(f"limits must be {joints} rows of (lowest, highest) in rad, one a joint.")
+    for i, (low, high) in enumerate(rows, start=1):
+        if not -math.inf < low < high < math.inf:
+            raise InputError(
+                f"limits of joint {i} are {low:g} to {high:g} rad; they must be finite, and the lower below the upper."
+            )
+    return tuple((low, high) for low, high in rows)
 
 
 def parameter_names(arm: Arm) -> tuple[str, ...]:

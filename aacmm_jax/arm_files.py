@@ -142,6 +142,13 @@ def _specification(path: Path) -> ArmSpecification:
     return specification
 
 
+def single(arm: Arm) -> Arm:
+    """The same arm, or `InputError` for a batch of arms: a file holds one."""
+    if any(array is not None and array.ndim != 1 for array in arm.geometry):
+        raise InputError("a file holds one arm, but this is a batch; take one of it first.")
+    return arm
+
+
 def save_arm(arm: Arm, path: str | os.PathLike, *, name: str = "", source: str = "") -> None:
     """Write an arm as TOML: standard convention, mm and rad, digits enough to read back the same numbers."""
     storage.write_text(path, arm_toml(arm, name=name, source=source))
@@ -157,10 +164,10 @@ def specification_toml(specification: ArmSpecification, *, source: str = "") -> 
     import tomlkit
 
     document = tomlkit.document()
-    arm = specification.arm
+    arm = single(specification.arm)
     for key, value in (("name", specification.name), ("source", source)):
         if value:
-            document[key] = value
+            document[key] = storage.storable(value)
     document["convention"] = "standard"
     document["length_unit"] = "mm"
     document["angle_unit"] = "rad"

@@ -14,21 +14,30 @@ from .errors import InputError
 # What people pass for an array of numbers; lists are converted and checked.
 Numbers = ArrayLike | Sequence[Any]
 
+_KINDS = {"U": "text", "S": "text", "b": "true or false", "c": "complex numbers"}
+
 
 def is_concrete(*arrays: object) -> bool:
     """Whether values can be looked at now; inside jit, vmap or grad they cannot, and checks of values are left out."""
     return not any(isinstance(array, jax.core.Tracer) for array in arrays)
 
 
-def as_floats(value: Numbers, what: str) -> Array:
-    """A finite float64 array, or `InputError` that names ``what``."""
+def as_array(value: Numbers, what: str) -> Array:
+    """A float64 array, or `InputError` that names ``what``."""
     try:
         array = value if isinstance(value, jax.Array) else np.asarray(value)
+    except jax.errors.TracerArrayConversionError:
+        array = jnp.asarray(value)  # a list with traced numbers in it
     except ValueError as error:
-        raise InputError(f"{what} has rows of unequal length.") from error
+        raise InputError(f"{what} has rows of unequal length; give rows of one length.") from error
     if not jnp.issubdtype(array.dtype, jnp.number) or jnp.issubdtype(array.dtype, jnp.complexfloating):
-        raise InputError(f"{what} must be real numbers, got {array.dtype}.")
-    array = jnp.asarray(array, dtype=jnp.float64)
-    if is_concrete(array) and not bool(jnp.all(jnp.isfinite(array))):
+        raise InputError(f"{what} must be real numbers, but holds {_KINDS.get(array.dtype.kind, 'something else')}.")
+    return jnp.asarray(array, dtype=jnp.float64)
+
+
+def as_floats(value: Numbers, what: str) -> Array:
+    """A finite float64 array, or `InputError` that names ``what``."""
+    array = as_array(value, what)
+    if is_concrete(array) and not np.all(np.isfinite(np.asarray(array))):
         raise InputError(f"{what} holds a value that is not finite; every parameter must be a finite number.")
     return array

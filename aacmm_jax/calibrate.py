@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .arm import Arm
-from .arrays import Numbers, is_concrete
+from .arm import Arm, locate
+from .arrays import Numbers, as_array, is_concrete
 from .capture import Capture
 from .errors import InputError
 from .metrics import Repeatability, repeatability
@@ -137,11 +137,12 @@ def identify(
     data (``result``). Raises `InputError` for too few poses, a start outside the box, or names that do not fit.
     """
     space = bounds.space
-    vector = space.vector(arm) if start is None else jnp.asarray(start, dtype=jnp.float64)
-    hold = _held_length(space, vector, hold)
+    vector = space.vector(arm) if start is None else as_array(start, "the start")
+    hold = _held_length(space, hold)
     _check_fit(capture, space)
     _check_start(bounds, vector, "the start" if start is not None else "the arm")
-    _check_enough(capture, len(space.names) - 1, with_lengths=False)
+    # Repeatability does not see the scale: where lengths are free, it determines one parameter less.
+    _check_enough(capture, len(space.names) - int(space.lengths.any()))
     return _identify(_based_on(space, arm), Measurement.of(capture), bounds, vector, hold, max_steps)
 
 
@@ -309,7 +310,7 @@ def _based_on(space: Parameters, arm: Arm) -> Parameters:
     return Parameters(base=arm, names=space.names)
 
 
-def _held_length(space: Parameters, start: Array, hold: str | None) -> str | None:
+def _held_length(space: Parameters, hold: str | None) -> str | None:
     lengths = [name for name in space.names if is_length(name)]
     if hold is None or (hold == "longest" and not lengths):
         return None
@@ -319,10 +320,18 @@ def _held_length(space: Parameters, start: Array, hold: str | None) -> str | Non
             raise InputError(f"hold is '{hold}', which is an angle; hold a length, for example '{lengths[0]}'.")
         return hold
     links = [name for name in lengths if not name.startswith("probe")] or lengths
-    nominal = np.abs(np.asarray(space.vector())) if is_concrete(space.vector()) else None
-    if nominal is None:
-        raise InputError("hold='longest' needs an arm with known values; inside jit, name the length to hold.")
-    return max(links, key=lambda name: nominal[..., space.names.index(name)].max())
+    base = space.base
+    if not is_concrete(base.a, base.d, base.probe):
+        raise InputError(
+            "hold='longest' needs an arm with known values; where the arm itself is traced, name the length to hold."
+        )
+
+    # Read with NumPy: under jit even a constant arm's values become tracers once JAX computes with them.
+    def nominal(name: str) -> float:
+        kind, i = locate(base, name)
+        return float(np.abs(np.asarray(getattr(base, kind))[..., i]).max())
+
+    return max(links, key=nominal)
 
 
 def _check_fit(capture: Capture, space: Parameters) -> None:
@@ -334,7 +343,9 @@ def _check_fit(capture: Capture, space: Parameters) -> None:
 
 def _check_start(bounds: Bounds, vector: Array, what: str) -> None:
     if vector.shape != (len(bounds.space.names),):
-        raise InputError(f"{what} has shape {vector.shape}, but {len(bounds.space.names)} parameters are free.")
+        raise InputError(
+            f"{what} has shape {vector.shape}, but {len(bounds.space.names)} parameters are free; give one value each."
+        )
     if not is_concrete(vector, bounds.lower, bounds.upper):
         return
     values, lower, upper = (np.asarray(x) for x in (vector, bounds.lower, bounds.upper))
@@ -347,7 +358,7 @@ def _check_start(bounds: Bounds, vector: Array, what: str) -> None:
         )
 
 
-def _check_enough(capture: Capture, unknowns: int, *, with_lengths: bool) -> None:
+def _check_enough(capture: Capture, unknowns: int) -> None:
     """A socket of m poses gives 3 (m - 1) equations: its own position takes three."""
     equations = 3 * sum(size - 1 for size in capture.sizes)
     if equations < unknowns:

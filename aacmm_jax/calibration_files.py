@@ -107,10 +107,14 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
 def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
     """Read a calibration. Raises `InputError` where the file is missing, damaged, foreign, newer or no calibration."""
     stored = storage.read_tables(path, ("calibration",))
-    for name in ("stage1_arm", "calibrated_arm", "parameters"):
-        storage.need(path, stored.tables, name)  # type: ignore[arg-type]
+    storage.need(path, stored.tables, "stage1_arm", "calibrated_arm", "parameters")
+    with storage.undamaged(path):
+        return _record(path, stored)
+
+
+def _record(path: str | os.PathLike, stored: storage.Stored) -> CalibrationRecord:
     table, attributes = stored.tables["parameters"], stored.attributes
-    storage.need(path, table, "parameter", "lower", "upper", "active_stage1", "active", "covariance")
+    storage.need(path, table, "parameter", "lower", "upper", "active_stage1", "active", "covariance", of="entry")
     return CalibrationRecord(
         recording=recording_of(path, stored),
         stage1=specification_of(path, stored, "stage1_arm"),

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .arrays import Numbers, is_concrete
+from .arrays import Numbers, as_array, is_concrete
 from .errors import InputError, nearest
 
 # Encoders of arms with unlimited joints count a few turns at most; readings beyond this are degrees taken for radians.
@@ -28,16 +28,19 @@ class ReferenceLength(eqx.Module):
 
     def __init__(self, start: str, end: str, value: Numbers, u: Numbers = 0.0):
         self.start, self.end = start, end
-        self.value, self.u = jnp.asarray(value, dtype=jnp.float64), jnp.asarray(u, dtype=jnp.float64)
         where = f"reference length '{start}' to '{end}'"
+        self.value, self.u = as_array(value, where), as_array(u, f"u of {where}")
         if start == end:
             raise InputError(f"{where} joins a socket to itself; name two different sockets.")
         if self.value.ndim or self.u.ndim:
             raise InputError(f"{where} needs one value and one u, in mm.")
-        if is_concrete(self.value) and not (np.isfinite(self.value) and self.value > 0):
+        # NumPy does the looking: inside jit even a constant becomes a tracer once JAX computes with it.
+        if is_concrete(self.value) and not 0 < float(self.value) < np.inf:
             raise InputError(f"{where} is {float(self.value):g} mm; a length must be positive and finite.")
-        if is_concrete(self.u) and not (np.isfinite(self.u) and self.u >= 0):
-            raise InputError(f"{where} has u = {float(self.u):g} mm; a standard uncertainty cannot be negative.")
+        if is_concrete(self.u) and not 0 <= float(self.u) < np.inf:
+            raise InputError(
+                f"{where} has u = {float(self.u):g} mm; a standard uncertainty must be zero or positive, and finite."
+            )
 
 
 class Capture(eqx.Module):

@@ -8,7 +8,7 @@ import numpy as np
 
 from . import storage
 from .arm import Arm
-from .arm_files import ArmSpecification
+from .arm_files import ArmSpecification, single
 from .capture import Capture, ReferenceLength
 from .errors import InputError
 from .manifest import Recording
@@ -25,7 +25,8 @@ def save_capture(path: str | os.PathLike, recording: Recording) -> None:
 def load_capture(path: str | os.PathLike) -> Recording:
     """Read a capture with its arms. Raises `InputError` where the file is missing, damaged, foreign or newer."""
     stored = storage.read_tables(path, ("capture", "calibration"))
-    return recording_of(path, stored)
+    with storage.undamaged(path):
+        return recording_of(path, stored)
 
 
 def recording_tables(recording: Recording) -> dict[str, Table]:
@@ -59,12 +60,10 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
 
 def recording_of(path: str | os.PathLike, stored: storage.Stored) -> Recording:
     """The recording that a file's tables hold."""
-    for name in ("capture", "reference", "nominal_arm"):
-        if name not in stored.tables:
-            raise InputError(f"{path} lacks the table '{name}'; it is damaged or was edited, make it again.")
+    storage.need(path, stored.tables, "capture", "reference", "nominal_arm")
     poses, reference = stored.tables["capture"], stored.tables["reference"]
-    storage.need(path, poses, "angle", "socket")
-    storage.need(path, reference, "start", "end", "value", "u")
+    storage.need(path, poses, "angle", "socket", of="entry")
+    storage.need(path, reference, "start", "end", "value", "u", of="entry")
     owner = np.asarray(poses["socket"]).astype(str)
     names = list(dict.fromkeys(owner.tolist()))
     rows = zip(reference["start"], reference["end"], reference["value"], reference["u"], strict=True)
@@ -81,7 +80,7 @@ def recording_of(path: str | os.PathLike, stored: storage.Stored) -> Recording:
 
 def arm_table(specification: ArmSpecification) -> Table:
     """An arm as a table over ``joint``, with its proposed identification in attributes."""
-    arm = specification.arm
+    arm = single(specification.arm)
     variables = {
         "joint": Variable(("joint",), np.arange(1, arm.joints + 1), "1", "joint number"),
         "axis": Variable(("axis",), ["x", "y", "z"], "", "axis of the last frame"),
@@ -111,7 +110,7 @@ def specification_of(path: str | os.PathLike, stored: storage.Stored, table: str
     """The arm that a table holds."""
     arrays: Mapping[str, np.ndarray] = stored.tables[table]
     attributes = stored.table_attributes[table]
-    storage.need(path, arrays, "alpha", "a", "d", "theta", "probe")
+    storage.need(path, arrays, "alpha", "a", "d", "theta", "probe", of="entry")
     limits = None
     if "lowest" in arrays:
         limits = list(zip(arrays["lowest"].tolist(), arrays["highest"].tolist(), strict=True))

@@ -18,4 +18,4 @@ def nearest(word: str, known: Iterable[str]) -> str:
     if matches:
         return f"; did you mean '{matches[0]}'?"
     shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
-    return f"; known are {shown}" if known else ""
+    return f"; known are {shown}." if known else "."

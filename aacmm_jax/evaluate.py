@@ -22,7 +22,9 @@ class Evaluation(eqx.Module):
 def evaluate(arm: Arm, capture: Capture) -> Evaluation:
     """Repeatability and length errors of an arm on a capture; nothing is fitted but the sockets' positions."""
     if capture.joints != arm.joints:
-        raise InputError(f"the capture has {capture.joints} columns, but the arm has {arm.joints} joints.")
+        raise InputError(
+            f"the capture has {capture.joints} columns, but the arm has {arm.joints} joints; give one column a joint."
+        )
     return evaluate_measurement(arm, Measurement.of(capture))
 
 

@@ -1,5 +1,6 @@
 """The capture manifest: a short TOML file that says which text files hold which socket, in which unit, and the lengths."""
 
+import glob
 import math
 import os
 import re
@@ -140,9 +141,11 @@ def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dic
     used = set(_FIELD.findall(entry.name or ""))
     if entry.name is None or used != set(names):
         raise InputError(f"file '{first}' has the fields {sorted(set(names))}; use the same ones in the socket's name.")
-    pattern = _matcher(first)
-    found = sorted(item for item in folder.glob(_FIELD.sub("*", first)))
-    matches = [match for item in found if (match := pattern.fullmatch(item.relative_to(folder).as_posix()))]
+    before = "" if Path(first).is_absolute() else f"{folder.as_posix()}/"
+    literals = _FIELD.sub("\0", first).split("\0")
+    found = sorted(Path(item).as_posix() for item in glob.glob(glob.escape(before) + "*".join(map(glob.escape, literals))))
+    pattern = re.compile(re.escape(before) + _matcher(first))
+    matches = [match for item in found if (match := pattern.fullmatch(item))]
     if not matches:
         raise InputError(f"no file matches '{first}' in {folder}; check the path.")
     for match in matches:
@@ -150,7 +153,7 @@ def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dic
         yield _fill(entry.name, values), [folder / _fill(file, values) for file in entry.paths], values
 
 
-def _matcher(pattern: str) -> re.Pattern[str]:
+def _matcher(pattern: str) -> str:
     """Regular expression of a path with fields; a field that returns must match the same text."""
     parts, last, seen = "", 0, set()
     for field in _FIELD.finditer(pattern):
@@ -159,7 +162,7 @@ def _matcher(pattern: str) -> re.Pattern[str]:
         parts += f"(?P={name})" if name in seen else f"(?P<{name}>[^/]+)"
         seen.add(name)
         last = field.end()
-    return re.compile(parts + re.escape(pattern[last:]))
+    return parts + re.escape(pattern[last:])
 
 
 def _fill(text: str, values: Mapping[str, str]) -> str:

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .arm import LENGTHS, Arm, locate, parameter_names, replace
-from .arrays import Numbers, is_concrete
-from .errors import InputError, nearest
+from .arrays import Numbers, as_array, is_concrete
+from .errors import InputError
 
 # Steps of about 1 mm and 1 mrad are comparable at the tip of an arm of about 1 m.
 _LENGTH_SCALE, _ANGLE_SCALE = 1.0, 1e-3
@@ -78,7 +78,7 @@ class Parameters(eqx.Module):
         """Position of a free parameter; `InputError` where it is not free."""
         if name not in self.names:
             locate(self.base, name)
-            raise InputError(f"parameter '{name}' is not free{nearest(name, self.names)}")
+            raise InputError(f"parameter '{name}' is held, not free; free it, or name a free one, such as '{self.names[0]}'.")
         return self.names.index(name)
 
     def vector(self, arm: Arm | None = None) -> Float[Array, "... p"]:
@@ -91,9 +91,11 @@ class Parameters(eqx.Module):
 
     def arm(self, vector: Numbers) -> Arm:
         """The base arm with its free parameters taken from ``(p,)``. Use ``vmap`` for a batch of vectors."""
-        vector = jnp.asarray(vector, dtype=jnp.float64)
+        vector = as_array(vector, "vector")
         if vector.shape[-1:] != (len(self.names),):
-            raise InputError(f"vector has shape {vector.shape}, but {len(self.names)} parameters are free.")
+            raise InputError(
+                f"vector has shape {vector.shape}, but {len(self.names)} parameters are free; give one value each."
+            )
         kinds: dict[str, tuple[list[int], list[int]]] = {}
         for position, (kind, i) in enumerate(self.entries()):
             targets, sources = kinds.setdefault(kind, ([], []))
@@ -129,8 +131,8 @@ class Bounds(eqx.Module):
 
     def __init__(self, space: Parameters, lower: Numbers, upper: Numbers):
         self.space = space
-        self.lower = jnp.asarray(lower, dtype=jnp.float64)
-        self.upper = jnp.asarray(upper, dtype=jnp.float64)
+        self.lower = as_array(lower, "lower")
+        self.upper = as_array(upper, "upper")
         for what, bound in (("lower", self.lower), ("upper", self.upper)):
             if bound.shape[-1:] != (len(space.names),):
                 raise InputError(f"{what} has shape {bound.shape}, but {len(space.names)} parameters are free; give one each.")
@@ -140,7 +142,7 @@ class Bounds(eqx.Module):
                 i = int(np.argwhere(wrong)[0][-1])
                 low, high = np.asarray(self.lower)[..., i].ravel()[0], np.asarray(self.upper)[..., i].ravel()[0]
                 raise InputError(
-                    f"lower bound of {space.names[i]} is {low:g}, above its upper bound {high:g}; exchange or widen them."
+                    f"bounds of {space.names[i]} are {low:g} to {high:g}; the lower must be a number not above the upper."
                 )
 
     @classmethod
@@ -162,7 +164,7 @@ class Bounds(eqx.Module):
             widths[space.index(name)] = float(width)
         if not np.all(widths >= 0):
             i = int(np.argmin(widths >= 0))
-            raise InputError(f"half-width of {space.names[i]} is {widths[i]:g}; a half-width cannot be negative.")
+            raise InputError(f"half-width of {space.names[i]} is {widths[i]:g}; give zero or a positive number.")
         centre = space.vector(arm)
         return cls(space, centre - widths, centre + widths)
 

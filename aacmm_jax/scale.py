@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .arm import Arm, replace
-from .arrays import Numbers, is_concrete
+from .arrays import Numbers, as_array, is_concrete
 from .capture import Capture
 from .errors import InputError
 from .metrics import repeatability
@@ -84,12 +84,16 @@ def scale_from_lengths(measured: Numbers, nominal: Numbers, u: float = 0.0) -> S
     standard deviation of the mean of the measurements (JCGM 100, type A). Raises `InputError` for lengths that are not
     positive and finite.
     """
-    measured = jnp.atleast_1d(jnp.asarray(measured, dtype=jnp.float64))
-    nominal = jnp.broadcast_to(jnp.asarray(nominal, dtype=jnp.float64), measured.shape)
+    measured, nominal = jnp.atleast_1d(as_array(measured, "measured")), as_array(nominal, "nominal")
+    if nominal.shape not in ((), measured.shape):
+        raise InputError(
+            f"nominal has shape {nominal.shape}, but measured {measured.shape}; give one nominal length, or one each."
+        )
+    nominal = jnp.broadcast_to(nominal, measured.shape)
     for what, values in (("measured", measured), ("nominal", nominal)):
         if values.ndim != 1 or values.shape[0] == 0:
             raise InputError(f"{what} must be a list of at least one length, in mm.")
-        if is_concrete(values) and not np.all(np.isfinite(values) & (np.asarray(values) > 0)):
+        if is_concrete(values) and not np.all(np.isfinite(np.asarray(values)) & (np.asarray(values) > 0)):
             raise InputError(f"{what} holds {np.asarray(values).min():g} mm; a length must be positive and finite.")
     ratio = measured / nominal
     count = ratio.shape[0]

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import chain
-from .arm import Arm
+from .arm import Arm, checked_limits
+from .arrays import Numbers, as_floats
 from .capture import Capture, ReferenceLength
-from .errors import InputError
+from .errors import InputError, nearest
 from .parameters import Parameters
 
 ARCSEC = math.pi / (180 * 3600)  # rad
@@ -23,7 +24,7 @@ _TOLERANCE = 1e-9  # mm
 
 def simulate(
     arm: Arm,
-    sockets: Mapping[str, Sequence[float]],
+    sockets: Mapping[str, Numbers],
     *,
     poses: int | Mapping[str, int] = 70,
     lengths: Iterable[ReferenceLength | tuple] = (),
@@ -144,21 +145,21 @@ def _limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[Array, 
     rows = limits if limits is not None else arm.limits
     if rows is None:
         rows = [(-math.pi, math.pi)] * arm.joints
-    array = np.asarray(rows, dtype=float)
-    if array.shape != (arm.joints, 2) or not np.all(array[:, 0] < array[:, 1]):
-        raise InputError(f"limits must be {arm.joints} rows of (lowest, highest) in rad, the lowest below the highest.")
-    return jnp.asarray(array)
+    return jnp.asarray(checked_limits(rows, arm.joints))
 
 
-def _point(name: str, point: Sequence[float]) -> Float[Array, " 3"]:
-    array = np.asarray(point, dtype=float)
-    if array.shape != (3,) or not np.all(np.isfinite(array)):
-        raise InputError(f"position of socket '{name}' is {point}; give three finite coordinates in mm.")
-    return jnp.asarray(array)
+def _point(name: str, point: Numbers) -> Float[Array, " 3"]:
+    array = as_floats(point, f"position of socket '{name}'")
+    if array.shape != (3,):
+        raise InputError(f"position of socket '{name}' has shape {array.shape}; give its three coordinates (x, y, z) in mm.")
+    return array
 
 
 def _counts(points: Mapping[str, Array], poses: int | Mapping[str, int]) -> dict[str, int]:
-    counts = {name: poses if isinstance(poses, int) else poses.get(name, 0) for name in points}
+    counts = {name: poses.get(name, 0) if isinstance(poses, Mapping) else poses for name in points}
+    for name in poses if isinstance(poses, Mapping) else ():
+        if name not in points:
+            raise InputError(f"poses are given for the unknown socket '{name}'{nearest(name, points)}")
     for name, count in counts.items():
         if count < 1:
             raise InputError(f"socket '{name}' is given {count} poses; give at least one.")

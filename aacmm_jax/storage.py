@@ -3,9 +3,10 @@
 import contextlib
 import csv
 import datetime
+import math
 import os
+import secrets
 import sys
-import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -44,69 +45,82 @@ def whole_file(path: str | os.PathLike) -> Iterator[Path]:
     Raises `InputError` where the path cannot be written.
     """
     target = Path(path)
-    temporary: Path | None = None
+    # Named before it is made: an interrupt between the two must not leave a file that nobody removes.
+    temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
     try:
-        if target.is_dir():
-            raise IsADirectoryError(None, "it is a folder")
-        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
-        temporary = Path(name)
-        os.close(handle)
+        if target.exists() and not target.is_file():
+            raise OSError(None, "it is a folder" if target.is_dir() else "it is not an ordinary file")
+        open(temporary, "xb").close()
         yield temporary
         with open(temporary, "rb+") as written:
             os.fsync(written.fileno())
-        # mkstemp makes private files; give the mode that an ordinary open() would have given.
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)
         os.replace(temporary, target)
-        temporary = None
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{target} cannot be written: {reason}; choose another output path.") from error
     finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
     """Write a text file whole or not at all."""
     with whole_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_bytes(text.encode())
 
 
 def write_tables(path: str | os.PathLike, kind: str, tables: Mapping[str, Table], attributes: Mapping[str, Any]) -> None:
     """Write an HDF5 file of tables that netCDF-4 readers (xarray) understand. ``kind`` says what the file is."""
     import h5py
 
-    with whole_file(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
-        file.attrs.update(provenance(kind))
-        file.attrs.update({key: value for key, value in attributes.items() if value is not None})
-        for name, table in tables.items():
-            _write_group(file.create_group(name, track_order=True), table)
+    with whole_file(path) as temporary:
+        # HDF5 builds the file in memory and Python writes it: on a full disk the HDF5 library crashes the process.
+        with h5py.File(temporary.name, "w", driver="core", backing_store=False, track_order=True) as file:
+            _write_attributes(file, provenance(kind) | dict(attributes))
+            for name, table in tables.items():
+                _write_group(file.create_group(name, track_order=True), table)
+            file.flush()
+            image = file.id.get_file_image()
+        temporary.write_bytes(image)
+
+
+def storable(text: str) -> str:
+    """The same text, or `InputError` where neither HDF5 nor TOML can hold it (NUL, or a file name that is not UTF-8)."""
+    if "\0" in text or text.encode(errors="ignore").decode() != text:
+        raise InputError(f"the name {text!r} holds a character that no file can hold; rename it.")
+    return text
 
 
 def provenance(kind: str) -> dict[str, Any]:
     """Root attributes of every file: what it is, and what made it."""
     from importlib import metadata
 
+    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]) if sys.argv and sys.argv[0] else "python"
     return {
         "format": FORMAT,
         "kind": kind,
         "format_version": FORMAT_VERSION,
         "package_version": metadata.version("aacmm_jax"),
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]) if sys.argv and sys.argv[0] else "python",
+        # Arguments that are not UTF-8 arrive as surrogates, which HDF5 cannot hold.
+        "command": command.encode(errors="backslashreplace").decode(),
     }
+
+
+def _write_attributes(item: Any, attributes: Mapping[str, Any]) -> None:
+    for key, value in attributes.items():
+        if value is not None:
+            item.attrs[key] = storable(value) if isinstance(value, str) else value
 
 
 def _write_group(group: Any, table: Table) -> None:
     import h5py
 
-    group.attrs.update({key: value for key, value in table.attributes.items() if value is not None})
+    _write_attributes(group, table.attributes)
     for name, variable in table.variables.items():
         values = np.asarray(variable.values)
         text = not variable.units
-        data = values.astype(object) if text else values
+        data = np.array([storable(str(value)) for value in values], dtype=object) if text else values
         options = {"compression": "gzip", "shuffle": True} if values.ndim and values.size > 1000 and not text else {}
         dataset = group.create_dataset(name, data=data, dtype=h5py.string_dtype() if text else None, **options)
         dataset.attrs["long_name"] = variable.long_name
@@ -133,43 +147,58 @@ def read_tables(path: str | os.PathLike, kinds: Sequence[str]) -> Stored:
     import h5py
 
     path = Path(path)
-    if not path.exists():
-        raise InputError(f"{path} does not exist; check the path.")
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; name an HDF5 file.")
+    _check_readable(path)
     if not h5py.is_hdf5(path):
         raise InputError(f"{path} is not an HDF5 file, or it is damaged; name a file written by aacmm.")
-    try:
-        with h5py.File(path, "r") as file:
-            attributes = {key: _plain(value) for key, value in file.attrs.items()}
-            _check_kind(path, attributes, kinds)
-            groups = {name: group for name, group in file.items() if isinstance(group, h5py.Group)}
-            tables = {name: {key: _values(item) for key, item in group.items()} for name, group in groups.items()}
-            table_attributes = {
-                name: {key: _plain(value) for key, value in group.attrs.items()} for name, group in groups.items()
-            }
-    except (OSError, RuntimeError, KeyError) as error:
-        raise InputError(f"{path} is damaged or was cut short ({error}); make it again.") from error
+    with undamaged(path), h5py.File(path, "r") as file:
+        attributes = {key: _plain(value) for key, value in file.attrs.items()}
+        _check_kind(path, attributes, kinds)
+        groups = {name: group for name, group in file.items() if isinstance(group, h5py.Group)}
+        tables = {name: {key: _values(item) for key, item in group.items()} for name, group in groups.items()}
+        table_attributes = {name: {key: _plain(value) for key, value in group.attrs.items()} for name, group in groups.items()}
     return Stored(attributes, tables, table_attributes)
 
 
+@contextlib.contextmanager
+def undamaged(path: str | os.PathLike) -> Iterator[None]:
+    """While the content of a file is taken apart: whatever fails there fails because the file is not as it was written."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # a single wrong byte surfaces as almost any exception of HDF5, h5py and NumPy
+        raise InputError(f"{path} is damaged, cut short or was edited; make it again.") from error
+
+
+def _check_readable(path: Path) -> None:
+    try:
+        open(path, "rb").close()
+    except FileNotFoundError as error:
+        raise InputError(f"{path} does not exist; check the path.") from error
+    except IsADirectoryError as error:
+        raise InputError(f"{path} is a folder; name a file.") from error
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {(error.strerror or str(error)).lower()}; name another file.") from error
+
+
 def _check_kind(path: Path, attributes: Mapping[str, Any], kinds: Sequence[str]) -> None:
+    wanted = " or ".join(kinds)
     if attributes.get("format") != FORMAT:
-        raise InputError(f"{path} is HDF5, but was not written by aacmm; name a {' or '.join(kinds)} file.")
-    version = attributes.get("format_version")
-    if not isinstance(version, int) or version > FORMAT_VERSION:
+        raise InputError(f"{path} is HDF5, but was not written by aacmm; name a {wanted} file.")
+    version = attributes["format_version"]
+    if version > FORMAT_VERSION:
         raise InputError(
             f"{path} has format version {version}, newer than this package reads ({FORMAT_VERSION}); update aacmm_jax."
         )
-    if attributes.get("kind") not in kinds:
-        raise InputError(f"{path} holds a {attributes.get('kind')}, but a {' or '.join(kinds)} is needed.")
+    if attributes["kind"] not in kinds:
+        raise InputError(f"{path} holds a {attributes['kind']}; name a {wanted} file.")
 
 
-def need(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], *names: str) -> None:
-    """Raise `InputError` where a table lacks a variable."""
-    for name in names:
-        if name not in arrays:
-            raise InputError(f"{path} lacks the table entry '{name}'; it is damaged or was edited, make it again.")
+def need(path: str | os.PathLike, names: Mapping[str, Any], *needed: str, of: str = "table") -> None:
+    """Raise `InputError` where a file lacks a table, or a table an entry."""
+    for name in needed:
+        if name not in names:
+            raise InputError(f"{path} lacks the {of} '{name}'; it is damaged or was edited, make it again.")
 
 
 def _values(dataset: Any) -> np.ndarray:
@@ -192,15 +221,11 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
     import pydantic
 
     path = Path(path)
+    _check_readable(path)
     try:
-        with open(path, "rb") as file:
-            content = tomllib.load(file)
-    except FileNotFoundError as error:
-        raise InputError(f"{path} does not exist; check the path.") from error
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not valid TOML: {error}.") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {(error.strerror or str(error)).lower()}.") from error
+        raise InputError(f"{path} is not valid TOML: {error}; mend it there.") from error
     try:
         return model.model_validate(content)  # type: ignore[attr-defined]
     except pydantic.ValidationError as error:
@@ -245,13 +270,11 @@ def read_numbers(path: str | os.PathLike, columns: Sequence[int] | None = None) 
     ``columns`` picks columns, counted from 1. Raises `InputError` that names the file, the line and the column.
     """
     path = Path(path)
+    _check_readable(path)
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            lines = file.read().splitlines()
-    except FileNotFoundError as error:
-        raise InputError(f"{path} does not exist; check the path in the manifest.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read as text: {error}.") from error
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} cannot be read as text; give a text file of numbers, in UTF-8.") from error
     rows: list[list[float]] = []
     for number, line in enumerate(lines, start=1):
         cells = _cells(line)
@@ -263,17 +286,24 @@ def read_numbers(path: str | os.PathLike, columns: Sequence[int] | None = None) 
             if not rows and not any(_is_number(cell) for cell in cells):
                 continue  # a header
             column = next(i for i, cell in enumerate(cells, start=1) if not _is_number(cell))
-            raise InputError(f"{path} line {number} column {column}: '{cells[column - 1]}' is not a number.") from error
+            raise InputError(
+                f"{path} line {number} column {column}: '{cells[column - 1]}' is not a number; mend it."
+            ) from error
         if len(rows[-1]) != len(rows[0]):
-            raise InputError(f"{path} line {number} has {len(rows[-1])} columns, the lines before it {len(rows[0])}.")
+            raise InputError(
+                f"{path} line {number} has {len(rows[-1])} columns, the lines before it {len(rows[0])}; give all the same."
+            )
+        for column, value in enumerate(rows[-1], start=1):
+            if not math.isfinite(value):
+                raise InputError(f"{path} line {number} column {column}: '{cells[column - 1]}' is not finite; mend it.")
     if not rows:
-        raise InputError(f"{path} holds no numbers; give one line a pose.")
+        raise InputError(f"{path} holds no numbers; give one line a pose, with decimal points.")
     table = np.array(rows)
     if columns is None:
         return table
     for column in columns:
         if not 1 <= column <= table.shape[1]:
-            raise InputError(f"{path} has {table.shape[1]} columns, so there is no column {column}.")
+            raise InputError(f"{path} has {table.shape[1]} columns, so there is no column {column}; pick others.")
     return table[:, [column - 1 for column in columns]]
 
 

@@ -9,9 +9,11 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
+from . import run_time_types as run_time_types  # named in the hook below, as an attribute of this package
+
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-with install_import_hook("aacmm_jax", "beartype.beartype"):
+with install_import_hook("aacmm_jax", "tests.run_time_types.checked"):
     import aacmm_jax as aj
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"

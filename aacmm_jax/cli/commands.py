@@ -80,11 +80,12 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Make a capture with a simulated arm."""
-    from .. import simulate as simulation
     from ..arm_files import load_specification
     from ..capture_files import save_capture
     from ..manifest import Recording
     from ..parameters import Parameters
+    from ..simulate import deviated
+    from ..simulate import simulate as run
     from ..summary import capture_summary
     from . import display
 
@@ -92,12 +93,12 @@ def simulate(
     true = load_specification(true_arm) if true_arm else nominal
     if deviate_length_mm or deviate_angle_deg:
         space = Parameters.free_of(true.arm, held=true.held)
-        drawn = simulation.deviated(space, length=deviate_length_mm, angle=math.radians(deviate_angle_deg), seed=seed)
+        drawn = deviated(space, length=deviate_length_mm, angle=math.radians(deviate_angle_deg), seed=seed)
         true = true._replace(arm=drawn, name=f"{true.name}, deviated")
     points = dict(_socket_option(text) for text in socket)
     capture = _busy(
         "Simulating",
-        lambda: simulation.simulate(
+        lambda: run(
             true.arm,
             points,
             poses=_poses_option(poses or ["70"], points),
@@ -157,6 +158,7 @@ def calibrate(
         list[str] | None,
         typer.Option(metavar="NAME=WIDTH", help="Half-width of one parameter's bounds, mm or deg; repeatable."),
     ] = None,
+    max_steps: Annotated[int, typer.Option(min=1, help="Step limit of each solve.")] = 300,
     as_json: Json = False,
 ) -> None:
     """Identify the arm from repeatability, and fix its scale with the reference lengths."""
@@ -172,7 +174,14 @@ def calibrate(
     recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
     result = _busy(
         "Calibrating",
-        lambda: run(bounds.space.base, recording.capture, bounds, method=method, hold=None if hold == "none" else hold),
+        lambda: run(
+            bounds.space.base,
+            recording.capture,
+            bounds,
+            method=method,
+            hold=None if hold == "none" else hold,
+            max_steps=max_steps,
+        ),
     )
     record = record_of(result, recording)
     save_calibration(output, record)
@@ -247,13 +256,13 @@ def show(
 ) -> None:
     """Print what a file holds."""
     from .. import storage
-    from ..arm_files import load_specification, shipped_arms
+    from ..arm_files import load_specification
     from ..calibration_files import load_calibration
     from ..capture_files import load_capture
     from ..summary import arm_summary, calibration_summary, capture_summary
     from . import display
 
-    if str(file) in shipped_arms() or file.suffix == ".toml":
+    if file.suffix in ("", ".toml") and not (file.is_file() and file.suffix == ""):
         _show(arm_summary(load_specification(str(file))), as_json, display.arm)
         return
     stored = storage.read_tables(file, ("capture", "calibration"))

@@ -1,0 +1,40 @@
+# make demo   set up and run the demonstration
+# make test   set up and run the tests
+# make check  lint and types
+# Everything is installed into .venv in this folder.
+
+PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
+	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
+BIN := .venv/bin
+
+.PHONY: demo test check clean
+
+demo: .venv/.run
+	$(BIN)/aacmm demo aacmm-demo
+
+test: .venv/.test
+	$(BIN)/python -m pytest -n auto
+
+check: .venv/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+.venv/bin/python:
+	@test -n "$(PYTHON)" || { echo "aacmm_jax needs Python 3.11 or later; install it, or name one with make PYTHON=..."; exit 1; }
+	$(PYTHON) -m venv .venv
+
+.venv/.run: pyproject.toml | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	touch $@
+
+.venv/.test: pyproject.toml | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	touch $@ .venv/.run
+
+.venv/.dev: pyproject.toml | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@ .venv/.test .venv/.run
+
+clean:
+	rm -rf .venv aacmm-demo

@@ -1,0 +1,116 @@
+"""The command line in fresh processes: the whole path, what is printed for people and for machines, and exit codes."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+
+COMMANDS = ("demo", "simulate", "import", "calibrate", "evaluate", "export", "show")
+SIMULATE = (
+    *("simulate", "cheng2018-simulation", "-o", "capture.h5", "--seed", 4),
+    *("--socket", "A=400,200,300", "--socket", "B=600,200,300", "--socket", "C=500,400,400"),
+    *("--poses", 70, "--poses", "B=4", "--poses", "C=4", "--length", "A,B,0.002", "--length", "A,C,0.002"),
+    *("--encoder-arcsec", 2, "--seating-mm", 0.005, "--deviate-length-mm", 1, "--deviate-angle-deg", 0.1),
+)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_an_example(aacmm, command):
+    text = aacmm(command, "--help").stdout
+    assert f"Example: aacmm {command}" in " ".join(text.split())
+
+
+def test_demo_recovers_the_truth_and_leaves_its_files(aacmm, tmp_path):
+    result = json.loads(aacmm("demo", "out", "--json", "--seed", 3).stdout)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(result["files"])
+    # Stage 1 mends repeatability, stage 2 the lengths; 2 arcsec at about 1.2 m and 5 um leave about 0.02 mm in a length.
+    assert result["stage1"]["de_mm"] < 0.02 < result["nominal"]["de_mm"]
+    assert result["calibrated"]["check_rms_mm"] < 0.03 < result["stage1"]["check_rms_mm"]
+    assert (tmp_path / "out" / "calibration.png").stat().st_size > 10_000
+    printed = aacmm("demo", "out", "--seed", 3).stdout
+    assert "stage 2" in printed
+    assert "largest error of a length parameter [mm]" in printed
+    true, calibrated = (aj.load_arm(tmp_path / "out" / f"{name}.toml") for name in ("true", "calibrated"))
+    np.testing.assert_allclose(calibrated.a, true.a, atol=0.1)
+
+
+def test_whole_path(aacmm, tmp_path):
+    summary = json.loads(aacmm(*SIMULATE, "--json").stdout)
+    assert summary["poses"] == 78
+    done = aacmm("calibrate", "capture.h5", "-o", "calibration.h5", "--without", "C", "--json")
+    result = json.loads(done.stdout)
+    assert result["converged"]
+    assert result["sockets_used"] == ["A", "B"]
+    assert result["truth"]["calibrated"]["length_error_largest_mm"] < 0.1 < result["truth"]["stage1"]["length_error_largest_mm"]
+    # Python reads the same calibration.
+    record = aj.load_calibration(tmp_path / "calibration.h5")
+    assert record.k == result["scale_k"]
+    space = aj.Parameters(record.recording.nominal.arm, record.names)
+    values = [row["calibrated"] for row in result["parameters"]]
+    np.testing.assert_array_equal(space.vector(record.calibrated.arm), values)
+    # Held-out sockets are told apart from those that were used, and a limit decides the exit code.
+    evaluated = json.loads(aacmm("evaluate", "calibration.h5", "capture.h5", "--json").stdout)
+    assert [row["socket"] for row in evaluated["held_out"]["sockets"]] == ["C"]
+    assert evaluated["held_out"]["calibrated"]["rms_mm"] < 0.05
+    aacmm("evaluate", "calibration.h5", "capture.h5", "--max-rms-mm", 0.05)
+    failed = aacmm("evaluate", "calibration.h5", "capture.h5", "--max-rms-mm", 0.001, expect=1)
+    assert "over the limit of 0.001 mm" in failed.stdout
+    # Three ways out, with the same numbers.
+    arm = tomllib.loads(aacmm("export", "calibration.h5").stdout)
+    assert arm["joint"][2]["d"] == float(record.calibrated.arm.d[2])
+    assert json.loads(aacmm("export", "calibration.h5", "--format", "json").stdout)["scale_k"] == record.k
+    aacmm("export", "calibration.h5", "--format", "csv", "-o", "parameters.csv")
+    rows = (tmp_path / "parameters.csv").read_text().splitlines()
+    assert rows[0] == "parameter,unit,nominal,calibrated,u"
+    assert [float(row.split(",")[3]) for row in rows[1:]] == values
+    for file in ("capture.h5", "calibration.h5", "panda"):
+        assert json.loads(aacmm("show", file, "--json").stdout)["kind"] in ("capture", "calibration", "arm")
+        assert aacmm("show", file).stdout
+
+
+def test_not_converged_is_exit_code_1_and_still_written(aacmm, tmp_path, monkeypatch):
+    """A capture whose one socket was in truth two (half the poses elsewhere) still converges; a capped solve does not."""
+    aacmm(*SIMULATE)
+    done = aacmm("calibrate", "capture.h5", "-o", "calibration.h5", "--max-steps", 2, "--json", expect=1)
+    result = json.loads(done.stdout)
+    assert not result["converged"]
+    assert "step limit" in result["reason"]
+    assert (tmp_path / "calibration.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("calibrate", "none.h5", "-o", "x.h5"), "none.h5 does not exist"),
+        (("show", "pandda"), "did you mean 'panda'?"),
+        (("simulate", "panda", "-o", "x.h5", "--socket", "A=1,2"), "--socket 'A=1,2' is not of the form NAME=X,Y,Z"),
+        (("simulate", "panda", "-o", "x.h5", "--socket", "A=5000,0,0"), "socket 'A' at (5000, 0, 0) mm cannot be reached"),
+        (("simulate", "panda", "-o", "x.h5", "--socket", "A=400,0,300", "--poses", "B=2"), "unknown socket 'B'"),
+        (
+            ("simulate", "panda", "-o", "no/where.h5", "--socket", "A=400,0,300", "--poses", "2"),
+            "no/where.h5 cannot be written",
+        ),
+        (("demo", "/dev/null/x"), "/dev/null/x cannot be used as a folder"),
+        (("calibrate", "capture.h5"), "Missing option"),
+        (("frobnicate",), "No such command"),
+    ],
+)
+def test_bad_input_is_exit_code_2_and_one_sentence(aacmm, tmp_path, arguments, message):
+    failed = aacmm(*arguments, expect=2)
+    error = " ".join(failed.stderr.replace("│", " ").split())
+    assert message in error
+    assert "Traceback" not in failed.stderr
+    assert failed.stdout == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_debug_shows_the_traceback(aacmm):
+    assert "Traceback" in aacmm("calibrate", "none.h5", "-o", "x.h5", "--debug", expect=1).stderr
+
+
+def test_float32_is_refused_at_import(aacmm, monkeypatch):
+    monkeypatch.setenv("JAX_ENABLE_X64", "0")
+    assert "needs 64-bit floats, but JAX_ENABLE_X64=0" in aacmm("show", "panda", expect=1).stderr

@@ -1,0 +1,39 @@
+"""The README's Python runs as printed, and its manifest and arm file are read as printed."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+import aacmm_jax as aj
+
+README = (Path(__file__).resolve().parents[1] / "README.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+def test_python_runs(capsys):
+    (code,) = blocks("python")
+    exec(compile(code, "README.md", "exec"), {})
+    assert "Converged" in capsys.readouterr().out
+
+
+def test_arm_file_is_read(tmp_path):
+    (tmp_path / "arm.toml").write_text(blocks("toml")[1])
+    assert aj.load_arm(tmp_path / "arm.toml").joints == 3
+
+
+def test_manifest_is_read(shared, tmp_path):
+    shutil.copytree(shared / "data" / "mukca" / "panda_2_clean", tmp_path / "panda_2_clean")
+    (tmp_path / "capture.toml").write_text(blocks("toml")[0])
+    capture = aj.read_manifest(tmp_path / "capture.toml").capture
+    assert len(capture.names) == 16
+    assert len(capture.lengths) == 8
+
+
+@pytest.mark.parametrize("name", re.findall(r"`(cheng2018-\w+|panda|iiwa14)`", README))
+def test_named_arms_ship(name):
+    assert name in aj.shipped_arms()
