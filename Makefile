@@ -13,7 +13,7 @@ demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
 
 test: .venv/.test
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist loadscope
 
 check: .venv/.dev
 	$(BIN)/ruff check .

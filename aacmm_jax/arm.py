@@ -121,6 +121,11 @@ def checked_limits(limits: Sequence[Sequence[float]], joints: int) -> tuple[tupl
     return tuple((low, high) for low, high in rows)
 
 
+def is_single(arm: Arm) -> bool:
+    """Whether this is one arm and not a batch."""
+    return all(array is None or array.ndim == 1 for array in arm.geometry)
+
+
 def parameter_names(arm: Arm) -> tuple[str, ...]:
     """All parameter names of an arm: alpha, a, d, theta, (beta,) by joint from 1, then probe_x, probe_y, probe_z."""
     kinds = ("alpha", "a", "d", "theta") + (() if arm.beta is None else ("beta",))

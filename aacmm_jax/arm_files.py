@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
 
 from . import storage
-from .arm import Arm
+from .arm import Arm, is_single
 from .errors import InputError, nearest
 from .parameters import Bounds, Parameters
 
@@ -144,7 +144,7 @@ def _specification(path: Path) -> ArmSpecification:
 
 def single(arm: Arm) -> Arm:
     """The same arm, or `InputError` for a batch of arms: a file holds one."""
-    if any(array is not None and array.ndim != 1 for array in arm.geometry):
+    if not is_single(arm):
         raise InputError("a file holds one arm, but this is a batch; take one of it first.")
     return arm
 

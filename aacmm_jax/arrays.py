@@ -39,5 +39,5 @@ def as_floats(value: Numbers, what: str) -> Array:
     """A finite float64 array, or `InputError` that names ``what``."""
     array = as_array(value, what)
     if is_concrete(array) and not np.all(np.isfinite(np.asarray(array))):
-        raise InputError(f"{what} holds a value that is not finite; every parameter must be a finite number.")
+        raise InputError(f"{what} holds a value that is not finite; give finite numbers.")
     return array

@@ -4,7 +4,7 @@ import glob
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -34,7 +34,7 @@ class _Angles(_Strict):
     @model_validator(mode="after")
     def _counts(self) -> "_Angles":
         if (self.unit == "counts") != (self.counts_per_turn is not None):
-            raise ValueError("counts_per_turn belongs to unit = 'counts', and only to it.")
+            raise ValueError("give counts_per_turn with unit = 'counts', and only with it.")
         return self
 
 
@@ -92,6 +92,11 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     model = storage.read_toml(path, _Manifest)
     try:
         nominal = load_specification(_arm_source(path, model.arm))
+        joints = nominal.arm.joints
+        if model.angles.columns is not None and len(model.angles.columns) != joints:
+            raise InputError(
+                f"angles.columns picks {len(model.angles.columns)} columns, but the arm has {joints} joints; pick one a joint."
+            )
         sockets: dict[str, np.ndarray] = {}
         fields: list[dict[str, str]] = []
         for entry in model.socket:
@@ -99,7 +104,6 @@ def read_manifest(path: str | os.PathLike) -> Recording:
                 if name in sockets:
                     raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
                 tables = [storage.read_numbers(file, model.angles.columns) for file in files]
-                joints = nominal.arm.joints
                 for file, table in zip(files, tables, strict=True):
                     if table.shape[1] != joints:
                         raise InputError(
@@ -124,7 +128,7 @@ def _radians(readings: np.ndarray, angles: _Angles) -> np.ndarray:
     def a_joint(value: float | list, what: str) -> np.ndarray:
         array = np.asarray(value, dtype=float)
         if array.ndim and array.shape != (joints,):
-            raise InputError(f"angles.{what} has {array.size} values, but there are {joints} joints.")
+            raise InputError(f"angles.{what} has {array.size} values, but there are {joints} joints; give one, or one a joint.")
         return array
 
     unit = 2 * math.pi / a_joint(angles.counts_per_turn, "counts_per_turn") if angles.counts_per_turn else _UNITS[angles.unit]
@@ -134,16 +138,21 @@ def _radians(readings: np.ndarray, angles: _Angles) -> np.ndarray:
 def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dict[str, str]]]:
     """Sockets of one entry: name, files and the values of its fields in braces."""
     first = entry.paths[0]
-    names = _FIELD.findall(first)
-    if not names:
+    fields = set(_FIELD.findall(first))
+    for what, text in (("name", entry.name or ""), *(("file", file) for file in entry.paths[1:])):
+        if set(_FIELD.findall(text)) != fields:
+            raise InputError(
+                f"socket {what} '{text}' has {_braces(_FIELD.findall(text))}, but file '{first}' has {_braces(fields)}; "
+                "use the same fields in the name and in every file."
+            )
+    if not fields:
         yield entry.name or Path(first).stem, [folder / file for file in entry.paths], {}
         return
-    used = set(_FIELD.findall(entry.name or ""))
-    if entry.name is None or used != set(names):
-        raise InputError(f"file '{first}' has the fields {sorted(set(names))}; use the same ones in the socket's name.")
+    assert entry.name is not None  # its fields are those of the file
     before = "" if Path(first).is_absolute() else f"{folder.as_posix()}/"
     literals = _FIELD.sub("\0", first).split("\0")
-    found = sorted(Path(item).as_posix() for item in glob.glob(glob.escape(before) + "*".join(map(glob.escape, literals))))
+    # Separators only: to resolve "./" or "//" would keep the pattern from matching.
+    found = sorted(item.replace(os.sep, "/") for item in glob.glob(glob.escape(before) + "*".join(map(glob.escape, literals))))
     pattern = re.compile(re.escape(before) + _matcher(first))
     matches = [match for item in found if (match := pattern.fullmatch(item))]
     if not matches:
@@ -151,6 +160,10 @@ def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dic
     for match in matches:
         values = match.groupdict()
         yield _fill(entry.name, values), [folder / _fill(file, values) for file in entry.paths], values
+
+
+def _braces(fields: Iterable[str]) -> str:
+    return ", ".join(f"{{{name}}}" for name in sorted(set(fields))) or "no field"
 
 
 def _matcher(pattern: str) -> str:
@@ -179,7 +192,9 @@ def _lengths(entries: list[_Length], fields: list[dict[str, str]]) -> list[Refer
             continue
         choices = {tuple((name, values[name]) for name in sorted(names)) for values in fields if names <= values.keys()}
         if not choices:
-            raise InputError(f"length from '{entry.start}' to '{entry.end}' uses a field that no socket has.")
+            raise InputError(
+                f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; name the fields alike."
+            )
         for choice in sorted(choices):
             lengths.append(
                 ReferenceLength(_fill(entry.start, dict(choice)), _fill(entry.end, dict(choice)), entry.value, entry.u)

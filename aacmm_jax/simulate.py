@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import chain
-from .arm import Arm, checked_limits
+from .arm import Arm, checked_limits, is_single
 from .arrays import Numbers, as_floats
 from .capture import Capture, ReferenceLength
 from .errors import InputError, nearest
@@ -52,8 +52,8 @@ def simulate(
     for what, value in (("encoder_arcsec", encoder_arcsec), ("resolution_arcsec", resolution_arcsec), ("seating", seating)):
         if not (math.isfinite(value) and value >= 0):
             raise InputError(f"{what} is {value:g}; noise must be zero or positive.")
-    if arm.alpha.ndim != 1:
-        raise InputError("simulate takes one arm, not a batch.")
+    if not is_single(arm):
+        raise InputError("simulate takes one arm, not a batch; take one of it first.")
     if not sockets:
         raise InputError("simulate needs at least one socket with its position.")
     limits_array = _limits(arm, limits)
@@ -64,13 +64,14 @@ def simulate(
     owner = [name for name, count in counts.items() for _ in range(count)]
     targets = jnp.stack([points[name] for name in owner])
     targets = targets + seating * jax.random.normal(seat_key, targets.shape)
+    references = _reference_lengths(points, lengths, length_key)
     angles = reach(arm, targets, reach_key, limits_array, labels=[f"socket '{name}'" for name in owner])
     angles = angles + encoder_arcsec * ARCSEC * jax.random.normal(encoder_key, angles.shape)
     if resolution_arcsec > 0:
         angles = jnp.round(angles / (resolution_arcsec * ARCSEC)) * (resolution_arcsec * ARCSEC)
     ends = np.cumsum(list(counts.values()))
     readings = {name: angles[end - count : end] for (name, count), end in zip(counts.items(), ends, strict=True)}
-    return Capture(readings, _reference_lengths(points, lengths, length_key))
+    return Capture(readings, references)
 
 
 def deviated(space: Parameters, *, length: float, angle: float, seed: int = 0) -> Arm:

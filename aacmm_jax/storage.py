@@ -223,28 +223,40 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
     path = Path(path)
     _check_readable(path)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not text in UTF-8, as TOML is; name a TOML file.") from error
+    except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} is not valid TOML: {error}; mend it there.") from error
     try:
         return model.model_validate(content)  # type: ignore[attr-defined]
     except pydantic.ValidationError as error:
-        raise InputError(f"{path}: {_explain(error.errors()[0], model)}") from error
+        # A misspelt key is also a missing one, and says more; an error inside a list says more than "not a number".
+        worst = max(error.errors(), key=lambda found: (found["type"] == "extra_forbidden", len(found["loc"])))
+        raise InputError(f"{path}: {_explain(worst, model)}") from error
 
 
 def _explain(error: Any, model: Any) -> str:
     """One pydantic error as one sentence with its place, counting rows from 1 as people do."""
-    steps = [step for step in error["loc"] if not (isinstance(step, str) and step.startswith("function-"))]
+    kind, given, context = error["type"], error["input"], error.get("ctx", {})
+    steps = error["loc"]
+    if kind != "extra_forbidden":  # the last key is then the writer's; else some are pydantic's, for "a number or a list"
+        steps = [step for step in steps if step not in ("float", "constrained-float") and "[" not in str(step)]
     place = ""
     for step in steps:
         place += f" {step + 1}" if isinstance(step, int) else (f".{step}" if place else str(step))
-    if error["type"] == "extra_forbidden":
+    if kind == "extra_forbidden":
         return f"unknown key '{place}'{nearest(str(steps[-1]), _known_keys(model, steps[:-1]))}"
-    if error["type"] == "missing":
+    if kind == "missing":
         return f"'{place}' is missing; add it."
-    message = error["msg"].removeprefix("Value error, ")
-    value = "" if error["type"] == "value_error" or isinstance(error["input"], (dict, list)) else f" (got {error['input']!r})"
-    return f"{place or 'the file'}: {message}{value}{'' if message.endswith('.') and not value else '.'}"
+    if kind == "value_error":
+        return f"{place}: {context['error']}" if place else str(context["error"])
+    if kind in ("too_short", "too_long"):
+        limit = f"at least {context['min_length']}" if kind == "too_short" else f"at most {context['max_length']}"
+        return f"'{place}' has {len(given)} entries; give {limit}."
+    shown = "a table" if isinstance(given, dict) else "a list" if isinstance(given, list) else repr(given)
+    mend = f"; write [[{place}]]" if kind == "list_type" and isinstance(given, dict) else ""
+    return f"'{place}' {error['msg'].replace('Input should', 'must').partition(', unable')[0]}, not {shown}{mend}."
 
 
 def _known_keys(model: Any, steps: Sequence[Any]) -> list[str]:

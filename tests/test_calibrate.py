@@ -144,52 +144,61 @@ def test_identify_under_vmap_equals_single_runs(paper_arm, noisy_capture, bounds
 
 def central(function, point, direction, step=2e-3):
     """Directional derivative by central differences of sixth order (error of order step^6)."""
-    weights = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
-    total = sum(w * (function(point + n * step * direction) - function(point - n * step * direction)) for n, w in weights)
-    return total / step
+
+    def at(n):
+        return function(*(value + n * step * change for value, change in zip(point, direction, strict=True)))
+
+    return sum(w * (at(n) - at(-n)) for n, w in ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))) / step
+
+
+@pytest.fixture(scope="module")
+def differentiated(paper_arm, noisy_capture, space, start):
+    """A calibration as a function of angles, bounds and length; with its forward and reverse derivative, compiled once."""
+
+    def run(q, box, length):
+        cut = noisy_capture.sizes[0]
+        reference = aj.ReferenceLength("A", "B", length, 0.002)
+        capture = aj.Capture({"A": q[:cut], "B": q[cut:]}, [reference])
+        bounds = aj.Bounds(space, box[0], box[1])
+        inside = jnp.clip(start, box[0], box[1])
+        return aj.calibrate(paper_arm, capture, bounds, start=inside, hold="d_3").parameters / space.scale
+
+    forward = jax.jit(lambda point, direction: jax.jvp(run, point, direction)[1])
+    reverse = jax.jit(lambda point, cotangent: jax.vjp(run, *point)[1](cotangent))
+    return jax.jit(run), forward, reverse
 
 
 @pytest.mark.parametrize("boxed", [False, True], ids=["inactive", "active"])
 @pytest.mark.parametrize("by", ["angles", "bounds", "length"])
-def test_derivatives_of_a_calibration(paper_arm, noisy_capture, space, start, by, boxed):
+def test_derivatives_of_a_calibration(paper_arm, noisy_capture, space, differentiated, by, boxed):
     """Forward and reverse against central differences, relative to the largest component, with bounds active and not."""
-    free = aj.Bounds.around(paper_arm, space)
-    # a_2 and alpha_3 end on their upper and lower bound once the box cuts their minimum off.
-    upper = free.upper.at[space.index("a_2")].set(jnp.where(boxed, 61.99, 72.0))
-    lower = free.lower.at[space.index("alpha_3")].set(jnp.where(boxed, paper_arm.alpha[2] + 1e-4, free.lower[2]))
-    inside = jnp.clip(start, lower, upper)
-    reference = noisy_capture.lengths[0]
+    run, forward, reverse = differentiated
+    bounds = aj.Bounds.around(paper_arm, space)
+    lower, upper = np.array(bounds.lower), np.array(bounds.upper)
+    if boxed:  # the box cuts off the minima of a_2 and alpha_3, which then end on a bound
+        upper[space.index("a_2")] = 61.99
+        lower[space.index("alpha_3")] = float(paper_arm.alpha[2]) + 1e-4
+    point = (noisy_capture.q, jnp.asarray(np.stack([lower, upper])), noisy_capture.lengths[0].value)
     random = np.random.default_rng(0)
-    variables = {
-        # Steps of 1e-4 rad, mm-sized bounds, and mm.
-        "angles": (noisy_capture.q, 1e-4 * jnp.asarray(random.normal(size=noisy_capture.q.shape))),
-        "bounds": (
-            jnp.stack([lower, upper]),
-            jnp.asarray(random.normal(size=(2, len(space.names)))) * 0.01 * space.scale[None],
-        ),
-        "length": (reference.value, jnp.array(1.0)),
+    directions = {  # of about 1e-4 rad an angle; a hundredth of a unknown's natural step a bound; 1 mm
+        "angles": 1e-4 * random.normal(size=point[0].shape),
+        "bounds": 0.01 * random.normal(size=(2, len(space.names))) * np.asarray(space.scale),
+        "length": np.ones(()),
     }
-
-    @jax.jit
-    def run(value):
-        q = value if by == "angles" else noisy_capture.q
-        low, high = (value[0], value[1]) if by == "bounds" else (lower, upper)
-        length = aj.ReferenceLength("A", "B", value if by == "length" else reference.value, reference.u)
-        cut = noisy_capture.sizes[0]
-        capture = aj.Capture({"A": q[:cut], "B": q[cut:]}, [length])
-        result = aj.calibrate(paper_arm, capture, aj.Bounds(space, low, high), start=inside, hold="d_3")
-        return result.parameters / space.scale
-
-    point, direction = variables[by]
+    direction = tuple(
+        jnp.asarray(directions[name]) if name == by else jnp.zeros_like(value)
+        for name, value in zip(("angles", "bounds", "length"), point, strict=True)
+    )
     expected = central(run, point, direction)
     size = float(jnp.max(jnp.abs(expected)))
-    assert size > 0 or (by == "bounds" and not boxed)
-    forward = jax.jvp(run, (point,), (direction,))[1]
-    np.testing.assert_allclose(forward, expected, rtol=0, atol=1e-5 * size + 1e-9)
-    # Reverse: one vector-Jacobian product with a random cotangent gives the same number as forward.
+    assert (size > 1e-3) == (by != "bounds" or boxed)  # a bound that does not bind has no influence
+    found = forward(point, direction)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * size + 1e-8)
+    # Reverse: a vector-Jacobian product with a random cotangent gives the same number as forward.
     cotangent = jnp.asarray(random.normal(size=len(space.names)))
-    (pulled,) = jax.vjp(run, point)[1](cotangent)
-    assert float(jnp.vdot(pulled, direction)) == pytest.approx(float(jnp.vdot(cotangent, forward)), rel=1e-8, abs=1e-9)
+    pulled = reverse(point, cotangent)
+    total = sum(float(jnp.vdot(gradient, change)) for gradient, change in zip(pulled, direction, strict=True))
+    assert total == pytest.approx(float(jnp.vdot(cotangent, found)), rel=1e-8, abs=1e-9)
 
 
 def test_hayatis_angle_tells_parallel_axes_apart():

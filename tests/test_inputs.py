@@ -1,0 +1,278 @@
+"""Bad input from Python: every refusal names what is wrong, where, and what to do. Nearly all come before any solve."""
+
+import inspect
+import re
+import sys
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+
+from .refusals import assert_refused, refusal
+
+
+@pytest.fixture(scope="module")
+def given(paper_arm):
+    """What the calls below are made of: the paper's arm, its free parameters and box, and ten poses."""
+    space = aj.Parameters.free_of(paper_arm)
+    q = np.random.default_rng(0).uniform(-1, 1, (10, 6))
+    capture = aj.Capture({"A": q, "B": q[:1]}, [aj.ReferenceLength("A", "B", 100.0)])
+    return SimpleNamespace(
+        arm=paper_arm, space=space, bounds=aj.Bounds.around(paper_arm, space), start=space.vector(), q=q, capture=capture
+    )
+
+
+def with_value(q: np.ndarray, pose: int, joint: int, value: float) -> np.ndarray:
+    changed = q.copy()
+    changed[pose - 1, joint - 1] = value
+    return changed
+
+
+def changed_arm(arm: aj.Arm, **changes) -> aj.Arm:
+    kinds = {kind: getattr(arm, kind) for kind in ("alpha", "a", "d", "theta", "probe")}
+    return aj.Arm(**(kinds | changes))
+
+
+def shifted(given: SimpleNamespace, **changes: float) -> np.ndarray:
+    """The start with some parameters moved."""
+    start = np.array(given.start)
+    for name, change in changes.items():
+        start[given.space.index(name)] += change
+    return start
+
+
+@pytest.mark.parametrize(
+    ("sockets", "parts"),
+    [
+        (lambda q: {"A": with_value(q, 3, 4, np.nan)}, ["socket 'A' pose 3 joint 4 is nan", "must be finite"]),
+        (lambda q: {"A": q, "B": with_value(q, 1, 6, -np.inf)}, ["socket 'B' pose 1 joint 6 is -inf", "must be finite"]),
+        (lambda q: {"A": [[0.1, 0.2], [0.1]]}, ["socket 'A'", "rows of unequal length"]),
+        (lambda q: {"A": [["left", "right"]]}, ["socket 'A'", "not a number"]),
+        (lambda q: {"A": q, "B": q[:, :5]}, ["socket 'B' has 5 columns", "socket 'A' has 6", "one column a joint"]),
+        (lambda q: {"A": q[0]}, ["socket 'A' has shape (6,)", "one row a pose and one column a joint"]),
+        (lambda q: {"A": q[:0]}, ["socket 'A' has shape (0, 6)", "at least one"]),
+        (lambda q: {}, ["at least one socket"]),
+        (
+            lambda q: {"A": with_value(np.rad2deg(q), 2, 6, 178.5)},
+            ["socket 'A' pose 2 joint 6 is 178.5 rad", "degrees", "numpy.deg2rad"],
+        ),
+    ],
+    ids=["nan", "infinite", "ragged", "text", "columns", "one row", "no pose", "no socket", "degrees"],
+)
+def test_angles(given, sockets, parts):
+    assert_refused(lambda: aj.Capture(sockets(given.q)), *parts)
+
+
+@pytest.mark.parametrize(
+    ("call", "parts"),
+    [
+        (lambda q: aj.ReferenceLength("A", "B", 0.0), ["'A' to 'B' is 0 mm", "positive"]),
+        (lambda q: aj.ReferenceLength("A", "B", -200.0), ["'A' to 'B' is -200 mm", "positive"]),
+        (lambda q: aj.ReferenceLength("A", "B", np.nan), ["'A' to 'B' is nan mm", "finite"]),
+        (lambda q: aj.ReferenceLength("A", "B", [1.0, 2.0]), ["'A' to 'B'", "one value"]),
+        (lambda q: aj.ReferenceLength("A", "B", 200.0, u=-0.002), ["'A' to 'B' has u = -0.002 mm", "zero or positive"]),
+        (lambda q: aj.ReferenceLength("A", "A", 200.0), ["'A' to 'A'", "itself", "two different sockets"]),
+        (
+            lambda q: aj.Capture({"plate": q, "B": q}, [aj.ReferenceLength("plaet", "B", 200.0)]),
+            ["'plaet' to 'B'", "unknown socket 'plaet'", "did you mean 'plate'?"],
+        ),
+        (
+            lambda q: aj.Capture({"plate": q, "B": q}, [aj.ReferenceLength("plate", "9", 200.0)]),
+            ["unknown socket '9'", "known are plate, B"],
+        ),
+        (lambda q: aj.Capture({"plate": q}).select("palte"), ["'palte'", "did you mean 'plate'?"]),
+        (lambda q: aj.Capture({"plate": q}).select(without="p*"), ["no socket is left", "widen"]),
+        (lambda q: aj.scale_from_lengths(measured=[200.0, -1.0], nominal=200.0), ["measured holds -1 mm", "positive"]),
+        (lambda q: aj.scale_from_lengths(measured=[200.0], nominal=[1.0, 2.0]), ["(2,)", "(1,)", "one each"]),
+        (lambda q: aj.scale_from_lengths(measured=[], nominal=200.0), ["measured", "at least one length"]),
+    ],
+    ids=[
+        *("zero", "negative", "nan", "two values", "negative u", "same socket", "misspelt socket", "unknown socket"),
+        *("select none", "select nothing left", "scale negative", "scale shapes", "scale of nothing"),
+    ],
+)
+def test_lengths_and_sockets(given, call, parts):
+    assert_refused(lambda: call(given.q), *parts)
+
+
+@pytest.mark.parametrize(
+    ("changes", "parts"),
+    [
+        ({"a": [1.0, 2.0]}, ["a has shape (2,)", "6 joints", "one value a joint"]),
+        ({"alpha": 1.5}, ["alpha", "one value a joint"]),
+        ({"d": [[1.0], [1.0, 2.0]]}, ["d has rows of unequal length"]),
+        ({"d": ["one"] * 6}, ["d must be real numbers", "text"]),
+        ({"d": [0.0, 0.0, np.inf, 0.0, 0.0, 0.0]}, ["d holds a value that is not finite"]),
+        ({"probe": [0.0, 102.0]}, ["probe has shape (2,)", "three coordinates"]),
+        ({"alpha": np.zeros((3, 6)), "a": np.zeros((2, 6))}, ["(3,), (2,)", "make them alike"]),
+        ({"limits": [(-1, 1)] * 3 + [(1, -1)] + [(-1, 1)] * 2}, ["joint 4", "1 to -1 rad", "lower below the upper"]),
+        ({"limits": [(-1, np.inf)] + [(-1, 1)] * 5}, ["joint 1", "inf rad", "finite"]),
+        ({"limits": [(-1, 1)] * 5}, ["limits must be 6 rows"]),
+        ({"limits": [(-1, 0, 1)] * 6}, ["6 rows of (lowest, highest)"]),
+    ],
+    ids=[
+        *("short", "scalar", "ragged", "text", "infinite", "probe", "batches"),
+        *("limits reversed", "limits infinite", "limits rows", "limits columns"),
+    ],
+)
+def test_arm(paper_arm, changes, parts):
+    assert_refused(lambda: changed_arm(paper_arm, **changes), *parts)
+
+
+@pytest.mark.parametrize(
+    ("call", "parts"),
+    [
+        (lambda x: aj.Parameters.free_of(x.arm, held=["d_33"]), ["'d_33'", "6-joint arm", "did you mean 'd_3'?"]),
+        (lambda x: aj.Parameters.free_of(x.arm, free=["beto_2"]), ["'beto_2'", "did you mean 'beta_2'?"]),
+        (lambda x: aj.Parameters.free_of(x.arm, held=["d_1"], free=["d_1"]), ["'d_1'", "as held and as free", "once"]),
+        (lambda x: aj.Parameters.free_of(x.arm, held=["d_1", "d_1"]), ["'d_1'", "twice in held", "once"]),
+        (lambda x: aj.Parameters.free_of(x.arm, held=aj.parameter_names(x.arm)), ["every parameter is held", "hold fewer"]),
+        (lambda x: aj.Bounds.around(x.arm, x.space, override={"prob_z": 60}), ["'prob_z'", "did you mean 'probe_z'?"]),
+        (lambda x: aj.Bounds.around(x.arm, x.space, override={"d_1": 60}), ["'d_1' is held, not free", "such as 'alpha_1'"]),
+        (lambda x: aj.Bounds.around(x.arm, x.space, length=-1.0), ["half-width of a_1 is -1", "zero or a positive"]),
+        (lambda x: aj.Bounds.around(x.arm, x.space, override={"d_3": np.nan}), ["half-width of d_3 is nan"]),
+        (lambda x: aj.Bounds(x.space, x.start, shifted(x, a_2=-1.5)), ["bounds of a_2 are 62 to 60.5", "not above the upper"]),
+        (lambda x: aj.Bounds(x.space, shifted(x, d_4=np.nan), x.start), ["bounds of d_4 are nan to 0", "a number"]),
+        (lambda x: aj.Bounds(x.space, x.start[:-1], x.start), ["lower has shape (20,)", "21 parameters are free"]),
+        (lambda x: aj.Bounds(x.space, x.start, [[0.0], [0.0, 1.0]]), ["upper has rows of unequal length"]),
+        (lambda x: x.space.arm([1.0, 2.0]), ["vector has shape (2,)", "21 parameters are free"]),
+        (lambda x: x.arm.jacobian(x.q, ["q_7"]), ["'q_7'", "6-joint arm", "did you mean"]),
+        (lambda x: x.arm.position(x.q[:, :5]), ["q has shape (10, 5)", "6 joints", "last axis is the joint"]),
+        (lambda x: x.arm.position("straight up"), ["q must be real numbers"]),
+    ],
+    ids=[
+        *("held", "free", "held and free", "held twice", "all held", "override", "override of held", "negative width"),
+        *("nan width", "reversed", "nan bound", "short bound", "ragged bound", "short vector", "jacobian", "columns", "text"),
+    ],
+)
+def test_parameters_and_bounds(given, call, parts):
+    assert_refused(lambda: call(given), *parts)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (lambda x: {"hold": "dd_3"}, ["'dd_3'", "did you mean 'd_3'?"]),
+        (lambda x: {"hold": "theta_2"}, ["'theta_2'", "is an angle", "hold a length", "'a_1'"]),
+        (lambda x: {"hold": "d_1"}, ["'d_1' is held, not free"]),
+        (lambda x: {"capture": aj.Capture({"A": x.q[:, :5]})}, ["5 columns", "6 joints", "one column a joint"]),
+        (
+            lambda x: {"bounds": aj.Bounds(x.space, shifted(x, d_3=1.0), shifted(x, d_3=2.0))},
+            ["the arm is outside the bounds: d_3 is 750, not within 751 to 752", "move the start or widen"],
+        ),
+        (lambda x: {"start": shifted(x, a_4=11.0)}, ["the start is outside", "a_4 is 73, not within 52 to 72"]),
+        (lambda x: {"start": shifted(x, a_4=np.nan)}, ["the start is outside", "a_4 is nan"]),
+        (lambda x: {"start": x.start[:-2]}, ["the start has shape (19,)", "21 parameters are free", "one value each"]),
+    ],
+    ids=["misspelt", "angle", "held", "columns", "arm outside", "start outside", "start nan", "start short"],
+)
+@pytest.mark.parametrize("run", [aj.identify, aj.calibrate], ids=["identify", "calibrate"])
+def test_identification(given, run, arguments, parts):
+    chosen = {"capture": given.capture, "bounds": given.bounds} | arguments(given)
+    # Both need lengths to come as far as these checks; a capture of five columns brings its own.
+    if run is aj.calibrate and not chosen["capture"].lengths:
+        q = chosen["capture"].q
+        chosen["capture"] = aj.Capture({"A": q, "B": q}, given.capture.lengths)
+    assert_refused(lambda: run(given.arm, chosen.pop("capture"), chosen.pop("bounds"), **chosen), *parts)
+
+
+@pytest.mark.parametrize(
+    ("call", "parts"),
+    [
+        (lambda x: aj.calibrate(x.arm, aj.Capture({"A": x.q}), x.bounds), ["no reference length", "add one", "use identify"]),
+        (lambda x: aj.fix_scale(x.arm, aj.Capture({"A": x.q})), ["no reference length", "add one"]),
+        (lambda x: aj.evaluate(x.arm, aj.Capture({"A": x.q[:, :5]})), ["5 columns", "6 joints", "one column a joint"]),
+        # The run-time type checker of the tests would refuse the word first: it is taken off here.
+        (
+            lambda x: inspect.unwrap(aj.calibrate)(x.arm, x.capture, x.bounds, method="both"),
+            ["method is 'both'", "'two-stage' or 'joint'"],
+        ),
+    ],
+    ids=["calibrate without length", "fix_scale without length", "evaluate columns", "method"],
+)
+def test_calibration_and_evaluation(given, call, parts):
+    assert_refused(lambda: call(given), *parts)
+
+
+class Reached(Exception):
+    """The solve would begin."""
+
+
+@pytest.mark.parametrize("hold", ["longest", None])
+@pytest.mark.parametrize(
+    ("sizes", "held"),
+    [((7,), None), ((4, 4), None), ((1, 1, 1), None), ((2, 1), ["alpha_1"]), ((2,), "lengths"), ((4, 1), "lengths")],
+    ids=str,
+)
+def test_too_few_poses(given, monkeypatch, sizes, held, hold):
+    """A socket of m poses gives 3 (m - 1) equations; the number of poses named as enough is enough, and one less is not."""
+    if held == "lengths":
+        # Angles alone: nothing slides with the scale, so every free one is determined.
+        held = [name for name in aj.parameter_names(given.arm) if not name.startswith(("alpha", "theta"))]
+    space = aj.Parameters.free_of(given.arm, held=held)
+    bounds = aj.Bounds.around(given.arm, space)
+
+    def reached(*arguments):
+        raise Reached
+
+    def run(sizes):
+        capture = aj.Capture({f"S{i}": np.resize(given.q, (size, 6)) for i, size in enumerate(sizes)})
+        return aj.identify(given.arm, capture, bounds, hold=hold)
+
+    sentence = refusal(lambda: run(sizes))
+    assert "record more poses or hold more parameters" in sentence
+    poses, sockets, equations, unknowns, needed = map(int, re.findall(r"\d+", sentence))
+    assert (poses, sockets, equations) == (sum(sizes), len(sizes), 3 * sum(size - 1 for size in sizes))
+    # One length is the scale, which repeatability does not see, whether it is held or slides.
+    assert unknowns == len(space.names) - any(space.lengths)
+    assert equations < unknowns
+    assert 3 * (needed - sockets) >= unknowns > 3 * (needed - 1 - sockets)
+    monkeypatch.setattr(sys.modules["aacmm_jax.calibrate"], "_identify", reached)
+    more = needed - sum(sizes)
+    refusal(lambda: run((sizes[0] + more - 1, *sizes[1:])))
+    with pytest.raises(Reached):
+        run((sizes[0] + more, *sizes[1:]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        ({"encoder_arcsec": -2.0}, ["encoder_arcsec is -2", "zero or positive"]),
+        ({"resolution_arcsec": -1.0}, ["resolution_arcsec is -1"]),
+        ({"seating": np.nan}, ["seating is nan"]),
+        ({"poses": 0}, ["socket 'A' is given 0 poses", "at least one"]),
+        ({"poses": {"A": 3}, "sockets": {"A": (400, 200, 300), "B": (500, 200, 300)}}, ["socket 'B' is given 0 poses"]),
+        ({"poses": {"A": 3, "plate": 2}}, ["unknown socket 'plate'", "known are A."]),
+        ({"sockets": {}}, ["at least one socket"]),
+        ({"sockets": {"A": (400.0, 200.0)}}, ["socket 'A' has shape (2,)", "three coordinates", "mm"]),
+        ({"sockets": {"A": (400.0, np.inf, 200.0)}}, ["socket 'A'", "not finite"]),
+        ({"limits": [(-1, 1)] * 5}, ["6 rows of (lowest, highest)"]),
+        ({"limits": [(-1, 1)] * 5 + [(2, 1)]}, ["limits of joint 6 are 2 to 1 rad"]),
+        ({"lengths": [("A", "B")], "poses": 1}, ["('A', 'B')", "of simulated sockets"]),
+        ({"sockets": {"far": (9000, 0, 0)}, "poses": 1}, ["socket 'far' at (9000, 0, 0) mm", "cannot be reached", "1864 mm"]),
+    ],
+    ids=[
+        *("encoder", "resolution", "seating", "no poses", "no poses of one", "poses of unknown", "no socket"),
+        *("two coordinates", "infinite", "limits rows", "limits reversed", "length", "out of reach"),
+    ],
+)
+def test_simulation(paper_arm, arguments, parts):
+    chosen = {"sockets": {"A": (400, 200, 300)}} | arguments
+    assert_refused(lambda: aj.simulate(paper_arm, **chosen), *parts)
+
+
+def test_deviation_and_batch(given):
+    assert_refused(lambda: aj.deviated(given.space, length=-1.0, angle=0.0), "free length is -1", "zero or positive")
+    batch = changed_arm(given.arm, a=np.zeros((2, 6)))
+    assert_refused(lambda: aj.simulate(batch, {"A": (400, 200, 300)}), "one arm, not a batch")
+
+
+def test_values_are_not_looked_at_inside_jit(given):
+    """Traced values cannot be checked, and lists may hold them; shapes are checked as ever."""
+    capture = jax.jit(lambda q: aj.Capture({"A": q}))(with_value(given.q, 1, 1, np.nan))
+    assert np.isnan(capture.q[0, 0])
+    jax.jit(lambda x: aj.Bounds(given.space, [x] * 21, given.start).lower)(1e3)
+    assert_refused(lambda: jax.jit(lambda x: aj.Bounds(given.space, [x] * 20, given.start).lower)(1.0), "lower has shape (20,)")
