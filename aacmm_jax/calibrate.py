@@ -18,7 +18,7 @@ from .residuals import (
     Measurement,
     joint_model,
     joint_residual,
-    length_derivatives,
+    measured_lengths,
     repeatability_model,
     repeatability_residual,
 )
@@ -293,7 +293,7 @@ def _covariance(
     sigma = jnp.maximum(sigma, _LEAST_SIGMA)
     information = repeatability_model(parameters, (space, measurement)).gram / sigma**2
     if with_lengths:
-        rows = length_derivatives(parameters, space, measurement) / _length_sigma(measurement, sigma)[:, None]
+        rows = measured_lengths(parameters, space, measurement)[1] / _length_sigma(measurement, sigma)[:, None]
         information = information + rows.T @ rows
     scale = jnp.where(fixed, 0.0, space.scale)
     values, vectors = jnp.linalg.eigh(scale[:, None] * information * scale[None, :])

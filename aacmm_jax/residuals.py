@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .capture import Capture
-from .chain import chosen_columns, tip_and_columns
+from .chain import Geometry, Turns, stacked_columns, turns_of, walk
 from .parameters import Parameters
 from .solver import Model
 
@@ -14,10 +14,12 @@ from .solver import Model
 class Measurement(eqx.Module):
     """A capture in the form that residuals take: all poses, which socket each belongs to, and the lengths.
 
-    ``sizes`` and ``ends`` are static: they fix the shape of the problem, as the number of poses does.
+    ``sizes`` and ``ends`` are static: they fix the shape of the problem, as the number of poses does. ``turns`` are the
+    cosines and sines of q, which every evaluation needs and none changes.
     """
 
     q: Float[Array, "N n"]
+    turns: Turns
     nominal: Float[Array, " l"]  # calibrated values of the reference lengths, mm
     u: Float[Array, " l"]  # their standard uncertainties, mm
     sizes: tuple[int, ...] = eqx.field(static=True)
@@ -28,6 +30,7 @@ class Measurement(eqx.Module):
         """The measurement of a capture."""
         return cls(
             q=capture.q,
+            turns=turns_of(capture.q),
             nominal=jnp.stack([length.value for length in capture.lengths]) if capture.lengths else jnp.zeros(0),
             u=jnp.stack([length.u for length in capture.lengths]) if capture.lengths else jnp.zeros(0),
             sizes=capture.sizes,
@@ -37,8 +40,7 @@ class Measurement(eqx.Module):
     @property
     def averaging(self) -> Float[np.ndarray, "s N"]:
         """Matrix that takes tips to socket centroids."""
-        owner = np.repeat(np.arange(len(self.sizes)), self.sizes)
-        return (owner[None, :] == np.arange(len(self.sizes))[:, None]) / np.asarray(self.sizes, dtype=float)[:, None]
+        return averaging_matrix(self.sizes)
 
     # Sums over sockets are products with this matrix: sockets are few, and a scatter would not vectorise.
     def centroids(self, tips: Float[Array, "N k"]) -> Float[Array, "s k"]:
@@ -67,6 +69,12 @@ class Measurement(eqx.Module):
         return ends[:, 0], ends[:, 1]
 
 
+def averaging_matrix(sizes: tuple[int, ...]) -> Float[np.ndarray, "s N"]:
+    """Matrix whose product with poses in socket order gives each socket's mean."""
+    owner = np.repeat(np.arange(len(sizes)), sizes)
+    return (owner[None, :] == np.arange(len(sizes))[:, None]) / np.asarray(sizes, dtype=float)[:, None]
+
+
 def repeatability_residual(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Float[Array, "N 3"]:
     """Distance vectors of all tips from their socket's centroid, mm (Cheng et al. 2018, eq. 13-14, by component)."""
     space, measurement = args
@@ -87,20 +95,9 @@ def joint_residual(
 
 
 def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Model:
-    """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic columns.
-
-    The mean over a socket is taken off the Gram matrix as a correction of rank 3 a socket, J^T J - m mu^T mu, which spares
-    a centred copy of the columns; the gradient needs none, because centred residuals sum to zero.
-    """
+    """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic columns."""
     space, measurement = args
-    tip, flat, means = _columns(vector, space, measurement)
-    # Centred twice: the rounding that one pass leaves in the mean (1e-13 mm) would otherwise be multiplied by the columns'
-    # means, and near a perfect fit outweigh the gradient.
-    residual = _centred_rows(_centred_rows(tip, measurement), measurement).reshape(-1)
-    sizes = jnp.asarray(np.asarray(measurement.sizes, dtype=float))
-    means_flat = means.reshape(means.shape[0], -1)
-    weighted = (means * sizes[None, None, :]).reshape(means.shape[0], -1)
-    return Model(0.5 * jnp.dot(residual, residual), flat @ residual, flat @ flat.T - weighted @ means_flat.T)
+    return model_of(space.arm(vector).geometry, measurement.turns, measurement.sizes, space.entries())
 
 
 def joint_model(
@@ -110,8 +107,7 @@ def joint_model(
     """Cost, gradient and Gram matrix of `joint_residual`."""
     space, measurement, sigma, length_sigma = args
     poses = repeatability_model(vector, (space, measurement))
-    tip, _, means = _columns(vector, space, measurement)
-    distance, rows = _length_rows(tip @ jnp.asarray(measurement.averaging.T), means, measurement)
+    distance, rows = measured_lengths(vector, space, measurement)
     residual, rows = (distance - measurement.nominal) / length_sigma, rows / length_sigma[:, None]
     return Model(
         poses.cost / sigma**2 + 0.5 * jnp.dot(residual, residual),
@@ -120,31 +116,42 @@ def joint_model(
     )
 
 
-def length_derivatives(vector: Float[Array, " p"], space: Parameters, measurement: Measurement) -> Float[Array, "l p"]:
-    """Analytic Jacobian of the measured lengths by the free parameters."""
-    tip, _, means = _columns(vector, space, measurement)
-    return _length_rows(tip @ jnp.asarray(measurement.averaging.T), means, measurement)[1]
-
-
-def _columns(
+def measured_lengths(
     vector: Float[Array, " p"], space: Parameters, measurement: Measurement
-) -> tuple[Float[Array, "3 N"], Float[Array, "p N3"], Float[Array, "p 3 s"]]:
-    """Tips, Jacobian columns flattened over components and poses, and the columns' means over each socket."""
-    tip, columns = tip_and_columns(space.arm(vector).geometry, measurement.q)
-    chosen = chosen_columns(columns, space.entries())
-    return tip, chosen.reshape(chosen.shape[0], -1), chosen @ jnp.asarray(measurement.averaging.T)
-
-
-def _centred_rows(tip: Float[Array, "3 N"], measurement: Measurement) -> Float[Array, "3 N"]:
-    averaging = jnp.asarray(measurement.averaging)
-    return tip - (tip @ averaging.T) @ (averaging > 0).astype(tip.dtype)
-
-
-def _length_rows(
-    centroids: Float[Array, "3 s"], means: Float[Array, "p 3 s"], measurement: Measurement
 ) -> tuple[Float[Array, " l"], Float[Array, "l p"]]:
+    """Measured reference lengths, mm, and their analytic Jacobian by the free parameters."""
+    walked = walk(space.arm(vector).geometry, measurement.turns)
+    averaging = jnp.asarray(measurement.averaging.T)
+    centroids, means = walked.tip @ averaging, stacked_columns(walked, space.entries()) @ averaging
     start, end = measurement._end_indices()
     between = centroids[:, end] - centroids[:, start]
     distance = jnp.linalg.norm(between, axis=0)
     direction = between / distance[None]
     return distance, jnp.einsum("cl,pcl->lp", direction, means[:, :, end] - means[:, :, start])
+
+
+def model_of(geometry: Geometry, turns: Turns, sizes: tuple[int, ...], entries: tuple[tuple[str, int], ...]) -> Model:
+    """Cost, gradient and Gram matrix of the repeatability residual, for any batch of arms and poses that broadcast.
+
+    The mean over a socket is taken off the Gram matrix as a correction of rank 3 a socket, J^T J - m mu^T mu, which spares
+    a centred copy of the columns; the gradient needs none, because centred residuals sum to zero.
+    """
+    walked = walk(geometry, turns)
+    averaging = averaging_matrix(sizes)
+    columns = stacked_columns(walked, entries)
+    flat = columns.reshape(*columns.shape[:-2], -1)
+    # Centred twice: the rounding that one pass leaves in the mean (1e-13 mm) would otherwise be multiplied by the columns'
+    # means, and near a perfect fit outweigh the gradient.
+    residual = _centred_rows(_centred_rows(walked.tip, averaging), averaging)
+    residual = residual.reshape(*residual.shape[:-2], -1)
+    weighted = columns @ jnp.asarray((averaging * np.sqrt(np.asarray(sizes, dtype=float))[:, None]).T)
+    weighted = weighted.reshape(*weighted.shape[:-2], -1)
+    return Model(
+        0.5 * jnp.sum(residual**2, axis=-1),
+        (flat @ residual[..., None])[..., 0],
+        flat @ jnp.swapaxes(flat, -1, -2) - weighted @ jnp.swapaxes(weighted, -1, -2),
+    )
+
+
+def _centred_rows(tip: Float[Array, "... 3 N"], averaging: np.ndarray) -> Float[Array, "... 3 N"]:
+    return tip - (tip @ jnp.asarray(averaging.T)) @ jnp.asarray((averaging > 0).astype(float))

@@ -41,9 +41,9 @@ class Reason(eqx.Enumeration):
 class Model(eqx.Module):
     """The quadratic model of the cost at one point: what one evaluation leaves for the step."""
 
-    cost: Float[Array, ""]  # |f|^2 / 2
-    gradient: Flat  # J^T f
-    gram: Float[Array, "p p"]  # J^T J
+    cost: Float[Array, "..."]  # |f|^2 / 2
+    gradient: Float[Array, "... p"]  # J^T f
+    gram: Float[Array, "... p p"]  # J^T J
 
     def finite(self) -> Bool[Array, ""]:
         """Whether every number of it is finite."""
