@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .arm import Arm, locate
 from .arrays import Numbers, as_array, is_concrete
@@ -48,6 +48,9 @@ class Identification(eqx.Module):
     optimality: Float[Array, ""]  # projected gradient as a cosine; 0 at a minimum
     scale: Scale | None  # k of this arm, where the capture holds reference lengths
     covariance: Float[Array, "p p"]  # with the scale as it was held; rows of active and held parameters are 0
+    determined: Bool[
+        Array, " p"
+    ]  # False where only a combination with others is determined; covariance is then that of the rest
     before: Repeatability  # the start
     after: Repeatability
     bounds: Bounds
@@ -80,6 +83,7 @@ class Calibration(eqx.Module):
     steps: Int[Array, ""]
     result: Reason
     covariance: Float[Array, "p p"]
+    determined: Bool[Array, " p"]  # False where only a combination with others is determined
     before: Repeatability
     after: Repeatability
     length_before: Float[Array, " l"]  # measured reference lengths, mm: at the start
@@ -166,7 +170,7 @@ def calibrate(
         raise InputError(f"method is '{method}'; it must be 'two-stage' or 'joint'.")
     if not capture.lengths:
         raise InputError(
-            "the capture holds no reference length, so the scale cannot be fixed; add one, or use identify for stage 1 alone."
+            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, from Python, identify for stage 1 alone)."
         )
     stage1 = identify(arm, capture, bounds, hold=hold, start=start, max_steps=max_steps)
     measurement = Measurement.of(capture)
@@ -200,6 +204,7 @@ def _identify(
     after = repeatability(tips, measurement.sizes, fitted=int(kept.sum()))
     active = jnp.where(jnp.asarray(kept), bounds.active(parameters), 0)
     fixed = (active != 0) | ~jnp.asarray(kept)
+    covariance, determined = _covariance(space, measurement, parameters, fixed, after.sigma, with_lengths=False)
     return Identification(
         arm=identified,
         parameters=parameters,
@@ -210,7 +215,8 @@ def _identify(
         result=solution.stats["reason"],
         optimality=solution.stats["optimality"],
         scale=scale_of(identified, measurement) if measurement.ends else None,
-        covariance=_covariance(space, measurement, parameters, fixed, after.sigma, with_lengths=False),
+        covariance=covariance,
+        determined=determined,
         before=repeatability(space.arm(start).position(measurement.q), measurement.sizes),
         after=after,
         bounds=bounds,
@@ -230,6 +236,9 @@ def _finish(arm: Arm, measurement: Measurement, stage1: Identification, method: 
         scaled = Parameters(scaled, space.names).arm(parameters)
     tips = scaled.position(measurement.q)
     after = repeatability(tips, measurement.sizes, fitted=len(space.names))
+    covariance, determined = _covariance(
+        space, measurement, parameters, active != 0, after.sigma, with_lengths=True, base=scaled
+    )
     return Calibration(
         arm=scaled,
         parameters=parameters,
@@ -239,7 +248,8 @@ def _finish(arm: Arm, measurement: Measurement, stage1: Identification, method: 
         active=active,
         steps=steps,
         result=result,
-        covariance=_covariance(space, measurement, parameters, active != 0, after.sigma, with_lengths=True, base=scaled),
+        covariance=covariance,
+        determined=determined,
         before=stage1.before,
         after=after,
         length_before=measurement.distances(arm.position(measurement.q)),
@@ -283,11 +293,12 @@ def _covariance(
     *,
     with_lengths: bool,
     base: Arm | None = None,
-) -> Float[Array, "p p"]:
+) -> tuple[Float[Array, "p p"], Bool[Array, " p"]]:
     """Covariance of the free parameters on the identifiable subspace: inverse of J^T W J (JCGM 100; see GUM 5.2).
 
     Weights are the residual variance and, ``with_lengths``, the variance of each reference length. Directions that the
-    data do not determine are left out, and so are ``fixed`` parameters; their rows are 0.
+    data do not determine are left out, and so are ``fixed`` parameters; their rows are 0. Second: which parameters have no
+    part in an undetermined direction.
     """
     space = space if base is None else Parameters(base, space.names)
     sigma = jnp.maximum(sigma, _LEAST_SIGMA)
@@ -300,7 +311,8 @@ def _covariance(
     known = values > 1e-12 * values[-1]
     inverse = jnp.where(known, 1 / jnp.where(known, values, 1.0), 0.0)
     spread = scale[:, None] * vectors
-    return (spread * inverse[None, :]) @ spread.T
+    determined = fixed | (jnp.sum(jnp.where(known[None, :], 0.0, vectors**2), axis=1) < 1e-6)
+    return (spread * inverse[None, :]) @ spread.T, determined
 
 
 def _based_on(space: Parameters, arm: Arm) -> Parameters:

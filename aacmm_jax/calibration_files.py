@@ -32,6 +32,7 @@ class CalibrationRecord(NamedTuple):
     active_stage1: np.ndarray  # -1, 0, +1
     active: np.ndarray
     covariance: np.ndarray
+    determined: np.ndarray  # False where only a combination with others is determined
     k: float
     u_k: float
     method: str
@@ -69,6 +70,7 @@ def record_of(calibration: Calibration, recording: Recording) -> CalibrationReco
         active_stage1=np.asarray(stage1.active),
         active=np.asarray(calibration.active),
         covariance=np.asarray(calibration.covariance),
+        determined=np.asarray(calibration.determined),
         k=float(calibration.scale.value),
         u_k=float(calibration.scale.u),
         method=calibration.method,
@@ -114,7 +116,7 @@ def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
 
 def _record(path: str | os.PathLike, stored: storage.Stored) -> CalibrationRecord:
     table, attributes = stored.tables["parameters"], stored.attributes
-    storage.need(path, table, "parameter", "lower", "upper", "active_stage1", "active", "covariance", of="entry")
+    storage.need(path, table, "parameter", "lower", "upper", "active_stage1", "active", "covariance", "determined", of="entry")
     return CalibrationRecord(
         recording=recording_of(path, stored),
         stage1=specification_of(path, stored, "stage1_arm"),
@@ -127,6 +129,7 @@ def _record(path: str | os.PathLike, stored: storage.Stored) -> CalibrationRecor
         active_stage1=table["active_stage1"],
         active=table["active"],
         covariance=table["covariance"],
+        determined=table["determined"].astype(bool),
         k=attributes["scale_k"],
         u_k=attributes["scale_u"],
         method=attributes["method"],
@@ -151,6 +154,7 @@ def _parameter_table(record: CalibrationRecord) -> Table:
             ("parameter",), record.active_stage1, "1", "-1 on the lower bound, +1 on the upper, in stage 1"
         ),
         "active": Variable(("parameter",), record.active, "1", "-1 on the lower bound, +1 on the upper"),
+        "determined": Variable(("parameter",), record.determined.astype(np.int8), "1", "0: only a combination is determined"),
         "covariance": Variable(("parameter", "parameter_2"), record.covariance, "products of units", "covariance"),
     }
     for stage, vector in record.vectors().items():

@@ -69,6 +69,7 @@ class Capture(eqx.Module):
                 raise InputError(
                     f"socket '{name}' has {block.shape[1]} columns, but socket '{first}' has {width}; give one column a joint."
                 )
+        _check_different(blocks)
         self.q = jnp.concatenate(list(blocks.values()), axis=0)
         self.names = tuple(blocks)
         self.sizes = tuple(block.shape[0] for block in blocks.values())
@@ -141,6 +142,16 @@ def _checked_angles(name: str, angles: Numbers) -> Array:
     if is_concrete(array):
         _check_values(name, np.asarray(array))
     return jnp.asarray(array)
+
+
+def _check_different(blocks: Mapping[str, Array]) -> None:
+    """Two sockets with the very same poses are one file given twice."""
+    seen: dict[bytes, str] = {}
+    for name, block in blocks.items():
+        if is_concrete(block) and block.shape[0] > 1:
+            twin = seen.setdefault(np.asarray(block).tobytes(), name)
+            if twin != name:
+                raise InputError(f"sockets '{twin}' and '{name}' hold the very same poses; is one file given twice?")
 
 
 def _check_values(name: str, array: np.ndarray) -> None:

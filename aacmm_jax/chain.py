@@ -63,7 +63,7 @@ def walk(geometry: Geometry, turns: Turns) -> Walked:
     """
     rank = max(turns[0].ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
     cos_q, sin_q = (jnp.reshape(t, t.shape[:1] + (1,) * (rank + 2 - t.ndim) + t.shape[1:]) for t in turns)
-    parameters = Geometry(*(None if leaf is None else _rows(leaf, rank) for leaf in geometry))
+    parameters = jax.tree.map(lambda leaf: _rows(leaf, rank), geometry)
     cos_theta, sin_theta = jnp.cos(parameters.theta), jnp.sin(parameters.theta)
     inputs = (
         (cos_q * cos_theta - sin_q * sin_theta, sin_q * cos_theta + cos_q * sin_theta),
@@ -90,7 +90,7 @@ def walk(geometry: Geometry, turns: Turns) -> Walked:
     batch = jnp.broadcast_shapes(*(leaf.shape[1:] for leaf in jax.tree.leaves((turns, parameters))))
     shape = (*batch[:-2], 3, batch[-1])
     axes_of_base = [jnp.broadcast_to(axis.reshape((1,) * len(batch[:-2]) + (3, 1)), shape) for axis in jnp.eye(3)]
-    start = (tuple(axes_of_base), jnp.zeros(shape))
+    start = ((axes_of_base[0], axes_of_base[1], axes_of_base[2]), jnp.zeros(shape))
     (frame, origin), axes = jax.lax.scan(joint, start, inputs)
     probe = parameters.probe
     tip = origin + probe[0] * frame[0] + probe[1] * frame[1] + probe[2] * frame[2]

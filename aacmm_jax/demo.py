@@ -94,6 +94,7 @@ def _summary(record: CalibrationRecord, checks: dict[str, float]) -> dict[str, A
     return {
         "kind": "demo",
         "poses": record.recording.capture.sizes[0],
+        "more_poses": record.recording.capture.sizes[1],
         "deviation_mm": _DEVIATION_MM,
         "deviation_deg": _DEVIATION_DEG,
         "encoder_arcsec": _ENCODER_ARCSEC,

@@ -5,16 +5,15 @@ from typing import Any
 
 import numpy as np
 
+from .arm import Arm
 from .arm_files import ArmSpecification
 from .calibrate import active_names
 from .calibration_files import CalibrationRecord
 from .capture import Capture
+from .cautions import of_calibration, of_capture
 from .evaluate import Evaluation, evaluate
 from .manifest import Recording
 from .parameters import Parameters, is_length
-
-# Above this a unit in the last place of the encoder or the seat cannot explain a misfit; the scale surely slid.
-_SUSPICIOUS_SHRINK = 0.005
 
 
 def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
@@ -64,7 +63,12 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
             {"from": length.start, "to": length.end, "value_mm": float(length.value), "u_mm": float(length.u)}
             for length in capture.lengths
         ],
+        "ranges": [
+            {"joint": i + 1, "lowest_rad": float(low), "highest_rad": float(high)}
+            for i, (low, high) in enumerate(zip(np.min(capture.q, axis=0), np.max(capture.q, axis=0), strict=True))
+        ],
         "simulated": recording.true is not None,
+        "warnings": of_capture(recording),
     }
 
 
@@ -72,10 +76,14 @@ def figures(evaluation: Evaluation) -> dict[str, Any]:
     """Repeatability over all sockets, and the errors of the lengths; mm."""
     spread, error = evaluation.repeatability, np.asarray(evaluation.error)
     found = {"de_mm": float(spread.de), "deltam_mm": float(spread.deltam), "rms_mm": float(spread.rms)}
-    if len(error):
-        found["length_error_mean_absolute_mm"] = float(np.mean(np.abs(error)))
-        found["length_error_largest_mm"] = float(np.max(np.abs(error)))
-    return found
+    return found | (_length_figures(error) if len(error) else {})
+
+
+def _length_figures(error: np.ndarray) -> dict[str, float]:
+    return {
+        "length_error_mean_absolute_mm": float(np.mean(np.abs(error))),
+        "length_error_largest_mm": float(np.max(np.abs(error))),
+    }
 
 
 def tables(capture: Capture, evaluation: Evaluation) -> dict[str, Any]:
@@ -109,7 +117,7 @@ def calibration_summary(record: CalibrationRecord) -> dict[str, Any]:
         {
             "parameter": name,
             "unit": "mm" if is_length(name) else "rad",
-            "u": float(u[i]),
+            "u": float(u[i]) if record.determined[i] and not record.active[i] else None,
             **{stage: float(vector[i]) for stage, vector in vectors.items()},
             "bound": {-1: "lower", 1: "upper"}.get(int(record.active[i])),
         }
@@ -133,7 +141,7 @@ def calibration_summary(record: CalibrationRecord) -> dict[str, Any]:
         **{stage: figures(evaluation) for stage, evaluation in evaluations.items()},
         **tables(record.recording.capture, evaluations["calibrated"]),
         "parameters": parameters,
-        "warnings": warnings(record),
+        "warnings": of_calibration(record),
     }
     if "true" in vectors:
         summary["truth"] = {stage: truth_errors(record, vectors, stage) for stage in ("nominal", "stage1", "calibrated")}
@@ -143,36 +151,6 @@ def calibration_summary(record: CalibrationRecord) -> dict[str, Any]:
 def active_names_of(record: CalibrationRecord, active: np.ndarray) -> dict[str, str]:
     """Parameters on a bound: name -> side."""
     return active_names(Parameters(record.recording.nominal.arm, record.names), active)
-
-
-def warnings(record: CalibrationRecord) -> list[str]:
-    """What a user should know before trusting the result, one sentence each."""
-    found = []
-    if not record.converged:
-        found.append(record.reason)
-    stage1 = active_names_of(record, record.active_stage1)
-    if record.hold is None and stage1:
-        sides = ", ".join(f"{name} ({side})" for name, side in stage1.items())
-        word = "shrank" if record.k < 1 else "stretched"
-        found.append(
-            f"Stage 1 ran with every length free and {word} the arm to k = {record.k:.5f} until a bound stopped it: {sides}. "
-            "The scale fix undoes that; hold a length (--hold) to avoid it."
-        )
-    elif stage1:
-        sides = ", ".join(f"{name} ({side})" for name, side in stage1.items())
-        found.append(
-            f"On a bound: {sides}. Widen the bounds unless they are known limits; uncertainties ignore such parameters."
-        )
-    if record.hold is not None and abs(record.k - 1) > _SUSPICIOUS_SHRINK:
-        found.append(
-            f"k = {record.k:.5f} is far from 1: is {record.hold} at its nominal value, and is each reference length right?"
-        )
-    lengths = record.recording.capture.lengths
-    if len(lengths) == 1:
-        found.append(
-            "A single reference length fixes the scale, so its error after calibration says nothing; keep another for checking."
-        )
-    return found
 
 
 def truth_errors(record: CalibrationRecord, vectors: dict[str, np.ndarray], stage: str) -> dict[str, float]:
@@ -185,43 +163,76 @@ def truth_errors(record: CalibrationRecord, vectors: dict[str, np.ndarray], stag
     }
 
 
-def evaluation_summary(record: CalibrationRecord, capture: Capture) -> dict[str, Any]:
-    """The nominal and the calibrated arm on a capture, apart for what was identified from and what was held out."""
+def evaluation_summary(record: CalibrationRecord, recording: Recording) -> dict[str, Any]:
+    """The nominal and the calibrated arm on a capture, apart for what was identified from and what was held out.
+
+    A length counts as held out where at least one of its ends was never identified from.
+    """
+    capture = recording.capture
     known = record.recording.capture.sockets
-    used = [
+    used = {
         name
         for name, q in capture.sockets.items()
         if any(np.array_equal(np.asarray(q), np.asarray(other)) for other in known.values())
-    ]
-    groups = {"identified_from": used, "held_out": [name for name in capture.names if name not in used]}
-    summary: dict[str, Any] = {"kind": "evaluation", "arm": record.recording.nominal.name}
-    for group, names in groups.items():
-        if not names:
+    }
+    summary: dict[str, Any] = {"kind": "evaluation", "arm": record.recording.nominal.name, "warnings": []}
+    if not _same(recording.nominal.arm, record.recording.nominal.arm):
+        summary["warnings"].append(
+            f"The capture is of '{recording.nominal.name}', but the calibration of '{record.recording.nominal.name}'; "
+            "is it the same arm?"
+        )
+    whole = {stage: evaluate(specification.arm, capture) for stage, specification in _arms(record).items()}
+    rows = tables(capture, whole["calibrated"])
+    for group in ("held_out", "identified_from"):
+        wanted = group == "identified_from"
+        names = [name for name in capture.names if (name in used) == wanted]
+        lengths = [i for i, length in enumerate(capture.lengths) if (length.start in used and length.end in used) == wanted]
+        if not names and not lengths:
             summary[group] = None
             continue
-        part = capture.select(names)
-        evaluations = {stage: evaluate(specification.arm, part) for stage, specification in _arms(record).items()}
+        part = Capture({name: capture.sockets[name] for name in names}) if names else None
         summary[group] = {
-            **{stage: figures(evaluation) for stage, evaluation in evaluations.items()},
-            **tables(part, evaluations["calibrated"]),
+            stage: _grouped(None if part is None else evaluate(specification.arm, part), whole[stage], lengths)
+            for stage, specification in _arms(record).items()
         }
+        summary[group]["sockets"] = [row for row in rows["sockets"] if row["socket"] in names]
+        summary[group]["lengths"] = [rows["lengths"][i] for i in lengths]
     return summary
+
+
+def _grouped(part: Evaluation | None, whole: Evaluation, lengths: list[int]) -> dict[str, Any]:
+    """Repeatability of a group's own sockets, and errors of the lengths that count for it."""
+    found = {} if part is None else figures(part)
+    return found | (_length_figures(np.asarray(whole.error)[lengths]) if lengths else {})
+
+
+def _same(one: Arm, other: Arm) -> bool:
+    return one.joints == other.joints and all(
+        np.array_equal(np.asarray(getattr(one, kind)), np.asarray(getattr(other, kind)))
+        for kind in ("alpha", "a", "d", "theta", "probe")
+    )
 
 
 def _arms(record: CalibrationRecord) -> dict[str, ArmSpecification]:
     return {"nominal": record.recording.nominal, "calibrated": record.calibrated}
 
 
-def exceeded(summary: dict[str, Any], limits: Sequence[tuple[str, float | None]]) -> list[str]:
-    """Sentences for figures of the calibrated arm, over held-out sockets if there are any, that exceed a limit."""
-    group = summary["held_out"] or summary["identified_from"]
-    found = []
+_LIMITED = {"rms_mm": "RMS distance", "deltam_mm": "Deltam", "length_error_largest_mm": "largest length error"}
+
+
+def exceeded(summary: dict[str, Any], limits: Sequence[tuple[str, float | None]]) -> tuple[list[str], list[str]]:
+    """Sentences on limits kept and limits exceeded by the calibrated arm, over held-out data where there are any."""
+    kept, failed = [], []
     for key, limit in limits:
         if limit is None:
             continue
-        value = group["calibrated"].get(key)
-        if value is None:
-            found.append(f"{key} has a limit of {limit:g} mm, but the capture holds no reference length.")
-        elif not value <= limit:
-            found.append(f"{key} is {value:.4f} mm, over the limit of {limit:g} mm.")
-    return found
+        groups = [group for group in ("held_out", "identified_from") if summary[group] and key in summary[group]["calibrated"]]
+        if not groups:
+            failed.append(f"{_LIMITED[key]} has a limit of {limit:g} mm, but there is nothing to measure it on.")
+            continue
+        value = summary[groups[0]]["calibrated"][key]
+        where = "held-out data" if groups[0] == "held_out" else "the data identified from"
+        relation = "within" if value <= limit else "over"
+        verdict = f"{_LIMITED[key]} on {where} is {value:.4f} mm, {relation} the limit of {limit:g} mm."
+        (kept if value <= limit else failed).append(verdict)
+    return kept, failed

@@ -12,7 +12,7 @@ FLOORS = (
     {"chain", "arm", "parameters", "capture", "arm_files", "manifest", "capture_files", "simulate"},
     {"metrics", "residuals", "solver"},
     {"scale", "evaluate", "calibrate", "calibration_files"},
-    {"summary", "figures", "demo"},
+    {"cautions", "summary", "figures", "demo"},
     {"cli"},
 )
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name not in ("__init__.py", "__main__.py"))

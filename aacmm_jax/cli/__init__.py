@@ -1,6 +1,9 @@
 """The command line, ``aacmm``."""
 
 import sys
+from typing import NoReturn
+
+_INTERRUPTED = 130
 
 
 def main() -> None:
@@ -15,8 +18,16 @@ def main() -> None:
         if debug:
             raise
         _fail(str(error), 2)
+    except KeyboardInterrupt:
+        _interrupted()
     try:
         app()
+    except SystemExit as done:
+        if done.code == _INTERRUPTED:
+            _interrupted()
+        raise
+    except KeyboardInterrupt:
+        _interrupted()
     except InputError as error:
         if debug:
             raise
@@ -29,6 +40,11 @@ def main() -> None:
         )
 
 
-def _fail(message: str, code: int) -> None:
+def _interrupted() -> NoReturn:
+    print("Interrupted; nothing was written that is not whole.", file=sys.stderr)
+    sys.exit(_INTERRUPTED)
+
+
+def _fail(message: str, code: int) -> NoReturn:
     print(f"Error: {message}", file=sys.stderr)
     sys.exit(code)

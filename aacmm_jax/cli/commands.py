@@ -32,8 +32,18 @@ CaptureFile = Annotated[Path, typer.Argument(metavar="CAPTURE.h5", help="Capture
 CalibrationFile = Annotated[Path, typer.Argument(metavar="CALIBRATION.h5", help="Calibration written by calibrate.")]
 
 
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib import metadata
+
+        typer.echo(metadata.version("aacmm_jax"))
+        raise typer.Exit()
+
+
 @app.callback()
-def prepare() -> None:
+def prepare(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,
+) -> None:
     """Calibrate articulated-arm coordinate measuring machines and other serial arms."""
     # Compiled kernels are kept between runs; it more than halves the time of a short command.
     import jax
@@ -96,6 +106,8 @@ def simulate(
         drawn = deviated(space, length=deviate_length_mm, angle=math.radians(deviate_angle_deg), seed=seed)
         true = true._replace(arm=drawn, name=f"{true.name}, deviated")
     points = dict(_socket_option(text) for text in socket)
+    if len(points) < len(socket):
+        raise InputError("a socket is named twice in --socket; give each its own name.")
     capture = _busy(
         "Simulating",
         lambda: run(
@@ -158,6 +170,7 @@ def calibrate(
         list[str] | None,
         typer.Option(metavar="NAME=WIDTH", help="Half-width of one parameter's bounds, mm or deg; repeatable."),
     ] = None,
+    figure: Annotated[Path | None, typer.Option(help="Draw the residuals pose by pose as PNG.")] = None,
     max_steps: Annotated[int, typer.Option(min=1, help="Step limit of each solve.")] = 300,
     as_json: Json = False,
 ) -> None:
@@ -165,9 +178,12 @@ def calibrate(
     from ..calibrate import calibrate as run
     from ..calibration_files import record_of, save_calibration
     from ..capture_files import load_capture
+    from ..cautions import plausible
     from ..summary import calibration_summary
     from . import display, options
 
+    if output.exists() and output.samefile(capture):
+        raise InputError(f"{output} is the capture itself; choose another output, so that held-out sockets are not lost.")
     recording = load_capture(capture)
     recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
     bounds = options.bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])
@@ -185,8 +201,12 @@ def calibrate(
     )
     record = record_of(result, recording)
     save_calibration(output, record)
+    if figure is not None:
+        from ..figures import calibration_figure
+
+        calibration_figure(record, figure)
     _show(calibration_summary(record) | {"written": str(output)}, as_json, display.calibration)
-    if not record.converged:
+    if not record.converged or not plausible(record.k):
         raise typer.Exit(1)
 
 
@@ -210,10 +230,11 @@ def evaluate(
     from . import display
 
     record = load_calibration(calibration)
-    part = load_capture(capture).capture.select(only or None, without or ())
-    summary = _busy("Evaluating", lambda: evaluation_summary(record, part))
+    recording = load_capture(capture)
+    recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
+    summary = _busy("Evaluating", lambda: evaluation_summary(record, recording))
     limits = (("rms_mm", max_rms_mm), ("deltam_mm", max_deltam_mm), ("length_error_largest_mm", max_length_error_mm))
-    summary["failed"] = exceeded(summary, limits)
+    summary["kept"], summary["failed"] = exceeded(summary, limits)
     _show(summary, as_json, display.evaluation)
     if summary["failed"]:
         raise typer.Exit(1)
@@ -226,6 +247,9 @@ def export(
         Literal["toml", "json", "csv"],
         typer.Option("--format", help="toml: an arm file; json: everything; csv: the parameters."),
     ] = "toml",
+    which: Annotated[
+        Literal["calibrated", "nominal", "true"], typer.Option("--arm", help="Which arm, for toml; true: of a simulation.")
+    ] = "calibrated",
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File to write; standard output without it.")] = None,
 ) -> None:
     """Write a calibrated arm for other programs."""
@@ -235,9 +259,19 @@ def export(
     from ..summary import calibration_summary, parameters_csv
 
     record = load_calibration(calibration)
-    source = f"calibrated from {sum(record.recording.capture.sizes)} poses, {record.method}, k = {record.k:.8f}"
+    arms = {"calibrated": record.calibrated, "nominal": record.recording.nominal, "true": record.recording.true}
+    arm = arms[which]
+    if arm is None:
+        raise InputError(f"{calibration} is not of a simulation, so it holds no true arm.")
+    if not record.converged:
+        typer.echo(f"Warning: {calibration} did not converge: {record.reason}", err=True)
+    source = (
+        f"calibrated from {sum(record.recording.capture.sizes)} poses, {record.method}, k = {record.k:.8f}"
+        if which == "calibrated"
+        else ""
+    )
     text = {
-        "toml": lambda: specification_toml(record.calibrated, source=source),
+        "toml": lambda: specification_toml(arm, source=source),
         "json": lambda: json.dumps(calibration_summary(record), indent=2) + "\n",
         "csv": lambda: parameters_csv(record),
     }[form]()

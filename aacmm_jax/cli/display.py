@@ -9,9 +9,9 @@ from rich.table import Table
 
 _ARCSEC = 3600 * 180 / math.pi
 _FIGURES = (
-    ("de_mm", "DE, mean distance from centroid"),
-    ("deltam_mm", "Deltam, largest half range"),
-    ("rms_mm", "RMS distance from centroid"),
+    ("de_mm", "DE, mean distance of poses from their socket's centroid"),
+    ("deltam_mm", "Deltam, largest half range of a coordinate in a socket"),
+    ("rms_mm", "RMS distance of poses from their socket's centroid"),
     ("length_error_mean_absolute_mm", "length error, mean absolute"),
     ("length_error_largest_mm", "length error, largest"),
 )
@@ -70,9 +70,14 @@ def capture(summary: dict[str, Any]) -> None:
         f"{len(summary['sockets'])} sockets, {len(summary['lengths'])} reference lengths"
         + (", simulated" if summary["simulated"] else "")
     )
+    _warnings(console, summary)
     table = _table("", "socket", "poses")
     for row in summary["sockets"]:
         table.add_row(escape(row["socket"]), str(row["poses"]))
+    console.print(table)
+    table = _table("\nReadings", "joint", "lowest [deg]", "highest [deg]")
+    for row in summary["ranges"]:
+        table.add_row(str(row["joint"]), *(f"{math.degrees(row[key]):.3f}" for key in ("lowest_rad", "highest_rad")))
     console.print(table)
     if summary["lengths"]:
         table = _table("\nReference lengths", "from", "to", "value [mm]", "u [mm]")
@@ -92,27 +97,13 @@ def calibration(summary: dict[str, Any]) -> None:
     )
     held = f"{summary['hold']} held meanwhile" if summary["hold"] else "no length held"
     console.print(f"Scale of stage 1: k = {summary['scale_k']:.8f}, u(k) = {summary['scale_u']:.1e} ({held})")
-    for warning in summary["warnings"]:
-        console.print(f"[yellow]Warning:[/yellow] {escape(warning)}")
+    _warnings(console, summary)
     _stages(console, "\nOn the poses it was identified from [mm]", summary, ("nominal", "stage1", "calibrated"))
     if "truth" in summary:
         _truth(console, summary["truth"])
-    table = _table(
-        "\nParameters (lengths in mm, u in um; angles in deg, u in arcsec)",
-        "parameter", "nominal", "calibrated", "change", "u", "bound",
-    )  # fmt: skip
-    for row in summary["parameters"]:
-        factor, fine = (1.0, 1e3) if row["unit"] == "mm" else (180 / math.pi, _ARCSEC)
-        nominal, value = factor * row["nominal"], factor * row["calibrated"]
-        table.add_row(
-            row["parameter"],
-            f"{nominal:.5f}",
-            f"{value:.5f}",
-            f"{value - nominal:+.5f}",
-            f"{fine * row['u']:.2f}",
-            row["bound"] or "",
-        )
-    console.print(table)
+    _parameters(console, summary["parameters"])
+    if summary["lengths"]:
+        _lengths(console, summary["lengths"], fitted=len(summary["lengths"]) == 1)
     _written(console, summary)
 
 
@@ -120,6 +111,7 @@ def evaluation(summary: dict[str, Any]) -> None:
     """One evaluation: held-out sockets first, since they are what counts."""
     console = _console()
     console.print(f"[bold]{escape(summary['arm'])}[/bold]")
+    _warnings(console, summary)
     for group, text in (("held_out", "Sockets never identified from"), ("identified_from", "Sockets identified from")):
         part = summary[group]
         if part is None:
@@ -131,13 +123,11 @@ def evaluation(summary: dict[str, Any]) -> None:
             table.add_row(escape(row["socket"]), str(row["poses"]), *cells)
         console.print(table)
         if part["lengths"]:
-            table = _table("", "length", "value [mm]", "measured [mm]", "error [mm]")
-            for row in part["lengths"]:
-                name = escape(f"{row['from']} - {row['to']}")
-                table.add_row(name, *(_number(row[key]) for key in ("value_mm", "measured_mm", "error_mm")))
-            console.print(table)
+            _lengths(console, part["lengths"])
+    for sentence in summary["kept"]:
+        console.print(f"[green]Passed:[/green] {sentence}")
     for sentence in summary["failed"]:
-        console.print(f"[red]Over the limit:[/red] {sentence}")
+        console.print(f"[red]Failed:[/red] {sentence}")
 
 
 def demo(summary: dict[str, Any]) -> None:
@@ -146,7 +136,7 @@ def demo(summary: dict[str, Any]) -> None:
     console.print(
         f"The simulated arm of Cheng et al. 2018, off by up to {summary['deviation_mm']:g} mm and {summary['deviation_deg']:g} deg, "
         f"measured with {summary['encoder_arcsec']:g} arcsec and {summary['seating_um']:g} um of noise:\n{summary['poses']} poses in one "
-        f"socket (stage 1), one length of {summary['length_mm']:.4f} mm with u = {summary['length_u_um']:g} um (stage 2)."
+        f"socket, {summary['more_poses']} in another (stage 1), between them one length of {summary['length_mm']:.4f} mm with u = {summary['length_u_um']:g} um (stage 2)."
     )
     table = _table("", "against the truth", "before", "stage 1", "stage 2")
     for key, text, factor in (
@@ -178,6 +168,38 @@ def _truth(console: Console, truth: dict[str, Any]) -> None:
     table = _table("\nAgainst the true arm of the simulation", "", "nominal", "stage 1", "calibrated")
     for key, text, factor in _TRUTH:
         table.add_row(escape(text), *(_number(factor * truth[stage][key]) for stage in stages))
+    console.print(table)
+
+
+def _warnings(console: Console, summary: dict[str, Any]) -> None:
+    for warning in summary["warnings"]:
+        console.print(f"[yellow]Warning:[/yellow] {escape(warning)}")
+
+
+def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
+    """Every parameter in its own unit, to the digits that its standard uncertainty allows (two of the uncertainty's)."""
+    table = _table("\nParameters", "parameter", "unit", "nominal", "calibrated", "change", "u", "bound")
+    for row in rows:
+        factor, unit = (1.0, "mm") if row["unit"] == "mm" else (180 / math.pi, "deg")
+        nominal, value = factor * row["nominal"], factor * row["calibrated"]
+        u = None if row["u"] is None else factor * row["u"]
+        decimals = 4 if u is None else min(max(1 - math.floor(math.log10(u)), 0), 9) if u > 0 else 9
+        numbers = (
+            f"{nominal:.4f}",
+            f"{value:.{decimals}f}",
+            f"{value - nominal:+.{decimals}f}",
+            "-" if u is None else f"{u:.{decimals}f}",
+        )
+        table.add_row(row["parameter"], unit, *numbers, row["bound"] or "")
+    console.print(table)
+
+
+def _lengths(console: Console, rows: list[dict[str, Any]], *, fitted: bool = False) -> None:
+    """Reference lengths; the error of a single one that fixed the scale is not shown, since it is zero by construction."""
+    table = _table("\nReference lengths", "between", "value [mm]", "measured [mm]", "error [mm]")
+    for row in rows:
+        error = "fixed the scale" if fitted else _number(row["error_mm"])
+        table.add_row(escape(f"{row['from']} - {row['to']}"), _number(row["value_mm"]), _number(row["measured_mm"]), error)
     console.print(table)
 
 

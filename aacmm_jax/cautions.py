@@ -1,0 +1,155 @@
+"""What a user should know before trusting a capture or a calibration: one sentence each, the gravest first."""
+
+import math
+
+import numpy as np
+
+from .calibrate import active_names
+from .calibration_files import CalibrationRecord
+from .manifest import Recording
+from .parameters import Parameters, is_length
+from .residuals import Measurement
+
+_SUSPICIOUS_SCALE = 0.005  # a held link is not off by more than this; its nominal value or a reference length is wrong
+_PLAUSIBLE_SCALE = (0.5, 2.0)
+_LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 where the D-H model misses something
+_POSE_OUTLIER = 8.0  # in median distances
+_NAMED = 5  # how many of a kind are named
+
+
+def plausible(k: float) -> bool:
+    """Whether a scale can be a calibration's at all, and not a mistaken unit or socket."""
+    return _PLAUSIBLE_SCALE[0] <= k <= _PLAUSIBLE_SCALE[1]
+
+
+def of_capture(recording: Recording) -> list[str]:
+    """Readings outside the arm's limits (a wrong unit, or exchanged columns), and lengths taken as exact."""
+    found = []
+    q = np.asarray(recording.capture.q)
+    for joint, limits in enumerate(recording.nominal.arm.limits or ()):
+        outside = int(np.sum((q[:, joint] < limits[0]) | (q[:, joint] > limits[1])))
+        if outside:
+            low, high = (f"{math.degrees(x):.0f}" for x in limits)
+            found.append(
+                f"Joint {joint + 1}: {outside} of {len(q)} readings lie outside its limits, {low} to {high} deg; "
+                "is the unit right, and the order of the columns?"
+            )
+    exact = [f"{length.start} - {length.end}" for length in recording.capture.lengths if float(length.u) == 0]
+    if exact and recording.true is None:
+        found.append(f"Taken as exact, because u is 0: {_some(exact)}; give the standard uncertainty of each length.")
+    return found
+
+
+def of_calibration(record: CalibrationRecord) -> list[str]:
+    """Everything about a calibration that should be read before its numbers."""
+    found = [] if record.converged else [record.reason]
+    return [*found, *_scale(record), *of_capture(record.recording), *_bounds(record), *_data(record), *_identifiability(record)]
+
+
+def _scale(record: CalibrationRecord) -> list[str]:
+    k = record.k
+    stage1 = _sides(record)
+    if not plausible(k):
+        unit = next((u for u, factor in (("m", 1000), ("cm", 10), ("inch", 1 / 25.4)) if abs(k / factor - 1) < 0.1), None)
+        hint = f"are the lengths in {unit} by mistake?" if unit else "check units, sockets, lengths and arm."
+        return [f"k = {k:.6g} cannot be the scale of this arm; {hint}"]
+    if record.hold is None and stage1:
+        word = "shrank" if k < 1 else "stretched"
+        return [
+            f"Stage 1 ran with every length free and {word} the arm to k = {k:.5f} until a bound stopped it: {_some(stage1)}. "
+            "The scale fix undoes that; hold a length (--hold) to avoid it."
+        ]
+    if record.hold is not None and abs(k - 1) > max(_SUSPICIOUS_SCALE, 3 * record.u_k):
+        return [f"k = {k:.5f} is far from 1: is {record.hold} at its nominal value, and is each reference length right?"]
+    return []
+
+
+def _bounds(record: CalibrationRecord) -> list[str]:
+    sides = _sides(record)
+    if not sides or (record.hold is None and len(sides) < len(record.names) / 3):
+        return []
+    if len(sides) >= len(record.names) / 3:
+        return [
+            f"{len(sides)} of {len(record.names)} parameters are on a bound, so the arm does not fit the data: "
+            "check unit, order of columns, sockets and arm."
+        ]
+    return [f"On a bound: {_some(sides)}; widen the bounds unless they are known limits. Uncertainties leave these out."]
+
+
+def _data(record: CalibrationRecord) -> list[str]:
+    capture = record.recording.capture
+    measurement = Measurement.of(capture)
+    tips = record.calibrated.arm.position(measurement.q)
+    spread = np.linalg.norm(np.asarray(measurement.centred(tips)), axis=1)
+    owner = np.repeat(np.arange(len(capture.sizes)), capture.sizes)
+    first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
+    found = []
+    typical = float(np.median(spread))
+    far = np.flatnonzero(spread > _POSE_OUTLIER * typical) if typical > 1e-6 else []
+    if len(far):
+        worst = sorted(far, key=lambda i: -spread[i])
+        names = [f"{capture.names[owner[i]]} pose {i - first[owner[i]] + 1} ({spread[i]:.3g} mm)" for i in worst]
+        found.append(f"Poses far from their socket, where {typical:.2g} mm is typical: {_some(names)}; was the tip seated?")
+    evaluation = record.evaluations()["calibrated"]
+    sigma = float(evaluation.repeatability.sigma)
+    variance = np.asarray(measurement.u) ** 2 + sigma**2 * measurement.averaging_variance()
+    error = np.asarray(evaluation.error)
+    normalised = np.abs(error) / np.sqrt(variance + 1e-18)
+    wrong = [
+        f"{length.start} - {length.end} ({error[i]:+.3g} mm, {normalised[i]:.0f} times its uncertainty)"
+        for i, length in enumerate(capture.lengths)
+        if len(error) > 1 and normalised[i] > _LENGTH_OUTLIER and abs(error[i]) > 1e-6
+    ]
+    if wrong:
+        found.append(f"Reference lengths that disagree with the arm: {_some(wrong)}; check their values and sockets.")
+    freedom = 3 * sum(size - 1 for size in capture.sizes) - (len(record.names) - 1)
+    if freedom < (len(record.names) - 1) / 2:
+        found.append(
+            f"Only {freedom} more equations than unknowns: the small residuals are the fit's own doing; record more poses."
+        )
+    if len(capture.lengths) == 1:
+        found.append("One reference length fixes the scale, so its own error says nothing; keep another for checking.")
+    return found
+
+
+def _identifiability(record: CalibrationRecord) -> list[str]:
+    found = []
+    if not all(record.determined):
+        names = [name for name, known in zip(record.names, record.determined, strict=True) if not known]
+        found.append(
+            f"Not determined one by one, only together: {_some(names, 12)}. Tip positions are right, but these have no uncertainty of "
+            "their own; hold the redundant ones (--held)."
+        )
+    u, width = np.sqrt(np.diag(record.covariance)), (record.upper - record.lower) / 2
+    loose = [
+        name
+        for i, name in enumerate(record.names)
+        if record.determined[i] and u[i] > (0.5 * width[i] if np.isfinite(width[i]) else np.inf)
+    ]
+    if loose:
+        found.append(
+            f"Hardly determined, with a standard uncertainty over half of what the bounds allow: {_some(loose)}; "
+            "hold some (--held), or record poses that tell them apart."
+        )
+    scaled = [
+        name
+        for name in record.held
+        if is_length(name) and name != "d_1" and _value(record.recording.nominal.arm, name) not in (0.0, None)
+    ]
+    if scaled:
+        found.append(f"The scale fix divides every length by k, held ones too: {_some(scaled)}.")
+    return found
+
+
+def _value(arm, name: str) -> float:
+    space = Parameters(arm, (name,))
+    return float(space.vector()[0])
+
+
+def _sides(record: CalibrationRecord) -> list[str]:
+    space = Parameters(record.recording.nominal.arm, record.names)
+    return [f"{name} ({side})" for name, side in active_names(space, record.active_stage1).items()]
+
+
+def _some(items: list[str], most: int = _NAMED) -> str:
+    return ", ".join(items[:most]) + (f" and {len(items) - most} more" if len(items) > most else "")
