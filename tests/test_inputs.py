@@ -55,12 +55,13 @@ def shifted(given: SimpleNamespace, **changes: float) -> np.ndarray:
         (lambda q: {"A": q[0]}, ["socket 'A' has shape (6,)", "one row a pose and one column a joint"]),
         (lambda q: {"A": q[:0]}, ["socket 'A' has shape (0, 6)", "at least one"]),
         (lambda q: {}, ["at least one socket"]),
+        (lambda q: {"A": q, "B": q}, ["sockets 'A' and 'B' hold the very same poses", "given twice?"]),
         (
             lambda q: {"A": with_value(np.rad2deg(q), 2, 6, 178.5)},
             ["socket 'A' pose 2 joint 6 is 178.5 rad", "degrees", "numpy.deg2rad"],
         ),
     ],
-    ids=["nan", "infinite", "ragged", "text", "columns", "one row", "no pose", "no socket", "degrees"],
+    ids=["nan", "infinite", "ragged", "text", "columns", "one row", "no pose", "no socket", "socket twice", "degrees"],
 )
 def test_angles(given, sockets, parts):
     assert_refused(lambda: aj.Capture(sockets(given.q)), *parts)
@@ -76,11 +77,11 @@ def test_angles(given, sockets, parts):
         (lambda q: aj.ReferenceLength("A", "B", 200.0, u=-0.002), ["'A' to 'B' has u = -0.002 mm", "zero or positive"]),
         (lambda q: aj.ReferenceLength("A", "A", 200.0), ["'A' to 'A'", "itself", "two different sockets"]),
         (
-            lambda q: aj.Capture({"plate": q, "B": q}, [aj.ReferenceLength("plaet", "B", 200.0)]),
+            lambda q: aj.Capture({"plate": q, "B": -q}, [aj.ReferenceLength("plaet", "B", 200.0)]),
             ["'plaet' to 'B'", "unknown socket 'plaet'", "did you mean 'plate'?"],
         ),
         (
-            lambda q: aj.Capture({"plate": q, "B": q}, [aj.ReferenceLength("plate", "9", 200.0)]),
+            lambda q: aj.Capture({"plate": q, "B": -q}, [aj.ReferenceLength("plate", "9", 200.0)]),
             ["unknown socket '9'", "known are plate, B"],
         ),
         (lambda q: aj.Capture({"plate": q}).select("palte"), ["'palte'", "did you mean 'plate'?"]),
@@ -175,14 +176,17 @@ def test_identification(given, run, arguments, parts):
     # Both need lengths to come as far as these checks; a capture of five columns brings its own.
     if run is aj.calibrate and not chosen["capture"].lengths:
         q = chosen["capture"].q
-        chosen["capture"] = aj.Capture({"A": q, "B": q}, given.capture.lengths)
+        chosen["capture"] = aj.Capture({"A": q, "B": -q}, given.capture.lengths)
     assert_refused(lambda: run(given.arm, chosen.pop("capture"), chosen.pop("bounds"), **chosen), *parts)
 
 
 @pytest.mark.parametrize(
     ("call", "parts"),
     [
-        (lambda x: aj.calibrate(x.arm, aj.Capture({"A": x.q}), x.bounds), ["no reference length", "add one", "use identify"]),
+        (
+            lambda x: aj.calibrate(x.arm, aj.Capture({"A": x.q}), x.bounds),
+            ["no reference length", "add one", "identify for stage 1"],
+        ),
         (lambda x: aj.fix_scale(x.arm, aj.Capture({"A": x.q})), ["no reference length", "add one"]),
         (lambda x: aj.evaluate(x.arm, aj.Capture({"A": x.q[:, :5]})), ["5 columns", "6 joints", "one column a joint"]),
         # The run-time type checker of the tests would refuse the word first: it is taken off here.
@@ -219,7 +223,8 @@ def test_too_few_poses(given, monkeypatch, sizes, held, hold):
         raise Reached
 
     def run(sizes):
-        capture = aj.Capture({f"S{i}": np.resize(given.q, (size, 6)) for i, size in enumerate(sizes)})
+        random = np.random.default_rng(0)
+        capture = aj.Capture({f"S{i}": random.uniform(-1, 1, (size, 6)) for i, size in enumerate(sizes)})
         return aj.identify(given.arm, capture, bounds, hold=hold)
 
     sentence = refusal(lambda: run(sizes))

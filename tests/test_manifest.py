@@ -78,7 +78,7 @@ def test_every_unit_gives_the_same_angles(tmp_path, motion, angles, reading):
         (", ", "q1, q2, q3, q4, q5, q6\n"),
         (";", "joint 1;joint 2;joint 3;joint 4;joint 5;joint 6\nrad;rad;rad;rad;rad;rad\n"),
         ("\t", "# recorded on Monday\n\n"),
-        ("   ", "\ufeff"),  # the mark that some editors put before UTF-8
+        ("   ", "\ufeff"),
     ],
     ids=["comma", "header", "semicolon and two headers", "tab and comment", "blank and byte order mark"],
 )
@@ -132,7 +132,8 @@ def test_a_field_that_returns_is_the_same_text(tmp_path, motion):
 
 def test_an_arm_beside_the_manifest(tmp_path, motion):
     aj.save_arm(aj.load_arm("cheng2018-simulation"), tmp_path / "arm.toml", name="ours")
-    (tmp_path / "capture.toml").write_text(SMALL.replace("cheng2018-simulation", "arm.toml"))
+    # With the mark that some editors put before UTF-8.
+    (tmp_path / "capture.toml").write_text(SMALL.replace("cheng2018-simulation", "arm.toml"), encoding="utf-8-sig")
     assert aj.read_manifest(tmp_path / "capture.toml").nominal.name == "ours"
 
 
