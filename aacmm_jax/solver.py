@@ -22,7 +22,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from optimistix.internal import implicit_jvp
 
-Flat = Float[Array, " p"]
+Flat = Float[Array, "*lanes p"]
+Number = Float[Array, "*lanes"]
 _EPSILON = float(jnp.finfo(jnp.float64).eps)
 
 
@@ -41,13 +42,14 @@ class Reason(eqx.Enumeration):
 class Model(eqx.Module):
     """The quadratic model of the cost at one point: what one evaluation leaves for the step."""
 
-    cost: Float[Array, "..."]  # |f|^2 / 2
-    gradient: Float[Array, "... p"]  # J^T f
-    gram: Float[Array, "... p p"]  # J^T J
+    cost: Float[Array, "*lanes"]  # |f|^2 / 2
+    gradient: Float[Array, "*lanes p"]  # J^T f
+    gram: Float[Array, "*lanes p p"]  # J^T J
 
-    def finite(self) -> Bool[Array, ""]:
+    def finite(self) -> Bool[Array, "*lanes"]:
         """Whether every number of it is finite."""
-        return jnp.isfinite(self.cost) & jnp.all(jnp.isfinite(self.gradient)) & jnp.all(jnp.isfinite(self.gram))
+        sums = jnp.sum(self.gradient, axis=-1) + jnp.sum(self.gram, axis=(-2, -1))
+        return jnp.isfinite(self.cost) & jnp.isfinite(sums)
 
 
 class Box(eqx.Module):
@@ -61,45 +63,53 @@ class Box(eqx.Module):
         """The nearest point of the box."""
         return jnp.clip(y, self.lower, self.upper)
 
-    def pinned(self, y: Flat, gradient: Flat) -> Bool[Array, " p"]:
+    def pinned(self, y: Flat, gradient: Flat) -> Bool[Array, "*lanes p"]:
         """Unknowns on a bound with the gradient pushing outwards."""
         return ((y <= self.lower) & (gradient >= 0)) | ((y >= self.upper) & (gradient <= 0))
 
 
 class Progress(eqx.Module):
-    """State of one solve between two evaluations."""
+    """State of one solve, or of many side by side in lanes, between two evaluations."""
 
     y: Flat  # accepted
     model: Model  # at y
     trial: Flat  # where the next evaluation happens
-    predicted: Float[Array, ""]  # decrease of the cost that the model promises for the trial
-    reach: Float[Array, ""]  # scaled length of the damped step before it was clipped to the box
-    damping: Float[Array, ""]
-    growth: Float[Array, ""]  # what the next refusal multiplies the damping by
+    predicted: Number  # decrease of the cost that the model promises for the trial
+    reach: Number  # scaled length of the damped step before it was clipped to the box
+    damping: Number
+    growth: Number  # what the next refusal multiplies the damping by
     curvature: Flat  # running maximum of diag(J^T J)
-    steps: Int[Array, ""]  # evaluations
-    accepted: Int[Array, ""]
+    steps: Int[Array, "*lanes"]  # evaluations
+    accepted: Int[Array, "*lanes"]
     reason: Reason
 
 
 def begin(y: Flat, box: Box) -> Progress:
     """State before the first evaluation, which happens at the start clipped to the box."""
-    p = y.shape[0]
-    zero = jnp.zeros(())
     y = box.clip(y)
+    zero, none = jnp.zeros(y.shape[:-1]), jnp.zeros(y.shape[:-1], dtype=jnp.int64)
     return Progress(
         y=y,
-        model=Model(zero + jnp.inf, jnp.zeros(p), jnp.zeros((p, p))),
+        model=Model(zero + jnp.inf, jnp.zeros_like(y), jnp.zeros((*y.shape, y.shape[-1]))),
         trial=y,
         predicted=zero,
         reach=zero + jnp.inf,
         damping=zero,
         growth=zero + 2.0,
-        curvature=jnp.zeros(p),
-        steps=jnp.zeros((), dtype=jnp.int64),
-        accepted=jnp.zeros((), dtype=jnp.int64),
-        reason=Reason.running,
+        curvature=jnp.zeros_like(y),
+        steps=none,
+        accepted=none,
+        reason=Reason.where(zero == 0, Reason.running, Reason.running),
     )
+
+
+def choose(pred: Bool[Array, "*lanes"], new: PyTree, old: PyTree) -> PyTree:
+    """Lane by lane, the new tree or the old one."""
+
+    def pick(one: Array, other: Array) -> Array:
+        return jnp.where(pred.reshape(pred.shape + (1,) * (one.ndim - pred.ndim)), one, other)
+
+    return jax.tree.map(pick, new, old)
 
 
 def advance(progress: Progress, evaluated: Model, box: Box, solver: "BoundedLevenbergMarquardt") -> Progress:
@@ -107,13 +117,12 @@ def advance(progress: Progress, evaluated: Model, box: Box, solver: "BoundedLeve
     first = progress.steps == 0
     finite = evaluated.finite()
     accept = finite & (first | _improves(progress, evaluated, box))
-    y = jnp.where(accept, progress.trial, progress.y)
-    model = jax.tree.map(lambda new, old: jnp.where(accept, new, old), evaluated, progress.model)
-    curvature = jnp.where(accept, jnp.maximum(progress.curvature, jnp.diagonal(model.gram)), progress.curvature)
+    y, model = choose(accept, (progress.trial, evaluated), (progress.y, progress.model))
+    curvature = jnp.maximum(progress.curvature, jnp.diagonal(model.gram, axis1=-2, axis2=-1))
     scale = _scale(box, curvature)
 
     damping, growth = _next_damping(progress, evaluated, accept)
-    largest = jnp.max(scale**2 * curvature)
+    largest = jnp.max(scale**2 * curvature, axis=-1)
     damping = jnp.where(first, solver.initial_damping * largest, damping)
     # Below this floor rounding in the Gram matrix can make it indefinite.
     damping = jnp.maximum(damping, 1e3 * _EPSILON * largest)
@@ -144,9 +153,7 @@ def advance(progress: Progress, evaluated: Model, box: Box, solver: "BoundedLeve
     )
 
 
-def propose(
-    y: Flat, model: Model, box: Box, scale: Flat, damping: Float[Array, ""]
-) -> tuple[Flat, Float[Array, ""], Float[Array, ""]]:
+def propose(y: Flat, model: Model, box: Box, scale: Flat, damping: Number) -> tuple[Flat, Number, Number]:
     """The damped step on the unpinned unknowns, clipped to the box: next trial, predicted decrease of the cost, and the
     scaled length of the step before clipping.
 
@@ -155,14 +162,16 @@ def propose(
     unknowns zigzag along a bound.
     """
     pinned = box.pinned(y, model.gradient)
-    gram = scale[:, None] * model.gram * scale[None, :]
+    gram = scale[..., :, None] * model.gram * scale[..., None, :]
+    identity = jnp.eye(y.shape[-1], dtype=bool).reshape((1,) * (y.ndim - 1) + (y.shape[-1],) * 2)
 
-    def solve(fixed: Bool[Array, " p"], shift: Flat) -> Flat:
-        rest = -scale * model.gradient - gram @ (shift / scale)
+    def solve(fixed: Bool[Array, "*lanes p"], shift: Flat) -> Flat:
+        rest = -scale * model.gradient - _times(gram, shift / scale)
         inside = ~fixed
-        matrix = jnp.where(inside[:, None] & inside[None, :], gram, 0.0)
-        matrix = matrix + jnp.diag(jnp.where(fixed, 1.0, damping))
-        z = jsl.cho_solve((jnp.linalg.cholesky(matrix, symmetrize_input=False), True), jnp.where(fixed, 0.0, rest))
+        matrix = jnp.where(inside[..., :, None] & inside[..., None, :], gram, 0.0)
+        matrix = matrix + jnp.where(identity, jnp.where(fixed, 1.0, damping[..., None])[..., None, :], 0.0)
+        factor = jnp.linalg.cholesky(matrix, symmetrize_input=False)
+        z = jsl.cho_solve((factor, True), jnp.where(fixed, 0.0, rest)[..., None])[..., 0]
         return jnp.where(fixed, shift, scale * z)
 
     def again(step: Flat) -> Flat:
@@ -172,16 +181,17 @@ def propose(
 
     step = solve(pinned, jnp.zeros_like(y))
     reach = _norm(step / scale)
+    # One test for all lanes: solving again changes nothing in a lane whose step stays inside.
     step = jax.lax.cond(jnp.any(box.clip(y + step) != y + step), again, lambda s: s, step)
     trial = box.clip(y + step)
     step = trial - y
-    predicted = -(jnp.dot(model.gradient, step) + 0.5 * jnp.dot(step, model.gram @ step))
+    predicted = -jnp.sum(step * (model.gradient + 0.5 * _times(model.gram, step)), axis=-1)
     # A failed factorisation shows as NaN: stay, promise nothing, and let the damping grow.
     usable = jnp.isfinite(predicted)
-    return jnp.where(usable, trial, y), jnp.where(usable, predicted, 0.0), jnp.where(usable, reach, jnp.inf)
+    return choose(usable, (trial, predicted, reach), (y, jnp.zeros_like(predicted), jnp.full_like(reach, jnp.inf)))
 
 
-def _improves(progress: Progress, evaluated: Model, box: Box) -> Bool[Array, ""]:
+def _improves(progress: Progress, evaluated: Model, box: Box) -> Bool[Array, "*lanes"]:
     actual = progress.model.cost - evaluated.cost
     decreases = actual > 1e-4 * progress.predicted
     # Close to the solution the decrease drowns in the rounding of the cost; the gradient still tells up from down.
@@ -192,7 +202,7 @@ def _improves(progress: Progress, evaluated: Model, box: Box) -> Bool[Array, ""]
     return (progress.predicted > 0) & jnp.where(blurred, nearer, decreases)
 
 
-def _next_damping(progress: Progress, evaluated: Model, accept: Bool[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _next_damping(progress: Progress, evaluated: Model, accept: Bool[Array, "*lanes"]) -> tuple[Number, Number]:
     # Nielsen's rule: shrink smoothly with the gain ratio, grow ever faster while steps are refused.
     promised = jnp.where(progress.predicted > 0, progress.predicted, 1.0)
     gain = jnp.where(accept, (progress.model.cost - evaluated.cost) / promised, 0.0)
@@ -202,15 +212,19 @@ def _next_damping(progress: Progress, evaluated: Model, accept: Bool[Array, ""])
     return damping, jnp.where(accept, 2.0, 2.0 * progress.growth)
 
 
-def _optimality(y: Flat, model: Model, box: Box) -> Float[Array, ""]:
+def _optimality(y: Flat, model: Model, box: Box) -> Number:
     """Largest projected coordinate step as a cosine: sqrt(h) |y - clip(y - g / h)| / |f|, with h = diag(J^T J).
 
     Away from bounds it is MINPACK's cosine between the residual and a column of J; it does not depend on units.
     """
-    h = jnp.diagonal(model.gram)
+    h = jnp.diagonal(model.gram, axis1=-2, axis2=-1)
     safe = jnp.where(h > 0, h, 1.0)
     moved = jnp.where(h > 0, jnp.sqrt(safe) * jnp.abs(y - box.clip(y - model.gradient / safe)), 0.0)
-    return jnp.max(moved) / jnp.sqrt(2 * jnp.maximum(model.cost, jnp.finfo(jnp.float64).tiny))
+    return jnp.max(moved, axis=-1) / jnp.sqrt(2 * jnp.maximum(model.cost, jnp.finfo(jnp.float64).tiny))
+
+
+def _times(matrix: Float[Array, "*lanes p p"], vector: Flat) -> Flat:
+    return (matrix @ vector[..., None])[..., 0]
 
 
 def _scale(box: Box, curvature: Flat) -> Flat:
@@ -219,8 +233,8 @@ def _scale(box: Box, curvature: Flat) -> Flat:
     return jnp.where(curvature > 0, 1.0 / jnp.sqrt(jnp.where(curvature > 0, curvature, 1.0)), 1.0)
 
 
-def _norm(vector: Flat) -> Float[Array, ""]:
-    return jnp.sqrt(jnp.sum(vector**2))
+def _norm(vector: Flat) -> Number:
+    return jnp.sqrt(jnp.sum(vector**2, axis=-1))
 
 
 def flat_box(y: PyTree[Array], lower: PyTree, upper: PyTree, scale: PyTree) -> Box:
