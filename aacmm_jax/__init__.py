@@ -36,5 +36,5 @@ from .scale import scale_from_lengths as scale_from_lengths
 from .simulate import deviated as deviated
 from .simulate import simulate as simulate
 from .solver import BoundedLevenbergMarquardt as BoundedLevenbergMarquardt
-from .solver import Reason as Reason
 from .solver import least_squares as least_squares
+from .steps import Reason as Reason

@@ -23,7 +23,8 @@ from .residuals import (
     repeatability_residual,
 )
 from .scale import Scale, divide_lengths, scale_of
-from .solver import BoundedLevenbergMarquardt, Reason, least_squares
+from .solver import BoundedLevenbergMarquardt, least_squares
+from .steps import Reason
 
 # The boxes of this problem are small against its curvature, so the first steps can be nearly Gauss-Newton's.
 _SOLVER = BoundedLevenbergMarquardt(initial_damping=1e-6)

@@ -12,7 +12,7 @@ from .capture_files import arm_table, recording_of, recording_tables, specificat
 from .evaluate import Evaluation, evaluate
 from .manifest import Recording
 from .parameters import Parameters, is_length
-from .solver import Reason
+from .steps import Reason
 from .storage import Table, Variable
 
 STAGES = ("nominal", "stage1", "calibrated")

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 from .capture import Capture
 from .chain import Geometry, Turns, stacked_columns, turns_of, walk
 from .parameters import Parameters
-from .solver import Model
+from .steps import Model
 
 
 class Measurement(eqx.Module):

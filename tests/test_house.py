@@ -10,7 +10,7 @@ FLOORS = (
     {"errors", "_float64"},
     {"arrays", "storage"},
     {"chain", "arm", "parameters", "capture", "arm_files", "manifest", "capture_files", "simulate"},
-    {"metrics", "residuals", "solver"},
+    {"metrics", "steps", "residuals", "solver"},
     {"scale", "evaluate", "calibrate", "calibration_files"},
     {"cautions", "summary", "figures", "demo"},
     {"cli"},
