@@ -3,17 +3,18 @@
 from typing import Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .arm import Arm, locate
-from .arrays import Numbers, as_array, is_concrete
+from . import covariance
+from .arm import Arm
+from .arrays import Numbers, as_array
 from .capture import Capture
+from .checks import based_on, check_enough, check_fit, check_start, held_length
 from .errors import InputError
 from .metrics import Repeatability, repeatability
-from .parameters import Bounds, Parameters, is_length
+from .parameters import Bounds, Parameters
 from .residuals import (
     Measurement,
     joint_model,
@@ -22,15 +23,13 @@ from .residuals import (
     repeatability_model,
     repeatability_residual,
 )
-from .scale import Scale, divide_lengths, scale_of
+from .scale import Scale, divide_lengths, scale_derivative, scale_of
 from .solver import BoundedLevenbergMarquardt, least_squares
 from .steps import Reason
 
 # The boxes of this problem are small against its curvature, so the first steps can be nearly Gauss-Newton's.
 _SOLVER = BoundedLevenbergMarquardt(initial_damping=1e-6)
 _MAX_STEPS = 300
-# Standard deviations (mm) below which noise-free data would get infinite weight.
-_LEAST_SIGMA = 1e-9
 
 
 class Identification(eqx.Module):
@@ -135,20 +134,21 @@ def identify(
 
     Minimises the summed squared distance of the tips from their socket's centroid. It starts from ``arm``, or from
     ``start`` ``(p,)``. Repeatability cannot see the scale of the arm, and with noise it is lowered by shrinking it, so one
-    length is held meanwhile: ``hold`` names it, "longest" takes the longest free link, None frees all, as the paper does
-    (then expect active bounds).
+    length is held meanwhile: ``hold`` names it, "longest" takes the longest free link (none, if a length that matters is held
+    anyway), None frees all, as the paper does (then expect active bounds).
 
-    Differentiable with respect to angles, bounds and start, exactly, also where a bound is active. Failure to converge is
+    Differentiable with respect to angles and bounds, exactly, also where a bound is active (not in directions that the data
+    leave open, such as the scale of noise-free data with nothing held). Failure to converge is
     data (``result``). Raises `InputError` for too few poses, a start outside the box, or names that do not fit.
     """
     space = bounds.space
     vector = space.vector(arm) if start is None else as_array(start, "the start")
-    hold = _held_length(space, hold)
-    _check_fit(capture, space)
-    _check_start(bounds, vector, "the start" if start is not None else "the arm")
+    hold = held_length(space, arm, hold)
+    check_fit(capture, space)
+    check_start(bounds, vector, "the start" if start is not None else "the arm")
     # Repeatability does not see the scale: where lengths are free, it determines one parameter less.
-    _check_enough(capture, len(space.names) - int(space.lengths.any()))
-    return _identify(_based_on(space, arm), Measurement.of(capture), bounds, vector, hold, max_steps)
+    check_enough(capture, len(space.names) - int(space.lengths.any()))
+    return _identify(based_on(space, arm), Measurement.of(capture), bounds, vector, hold, max_steps)
 
 
 def calibrate(
@@ -175,9 +175,8 @@ def calibrate(
         )
     stage1 = identify(arm, capture, bounds, hold=hold, start=start, max_steps=max_steps)
     measurement = Measurement.of(capture)
-    if start is not None:
-        arm = bounds.space.arm(start)
-    return _finish(arm, measurement, stage1, method, max_steps)
+    space = based_on(bounds.space, arm)
+    return _finish(space.base if start is None else space.arm(start), measurement, stage1, method, max_steps)
 
 
 @eqx.filter_jit
@@ -205,7 +204,7 @@ def _identify(
     after = repeatability(tips, measurement.sizes, fitted=int(kept.sum()))
     active = jnp.where(jnp.asarray(kept), bounds.active(parameters), 0)
     fixed = (active != 0) | ~jnp.asarray(kept)
-    covariance, determined = _covariance(space, measurement, parameters, fixed, after.sigma, with_lengths=False)
+    spread = covariance.of_parameters(space, measurement, parameters, fixed, after.sigma)
     return Identification(
         arm=identified,
         parameters=parameters,
@@ -215,9 +214,9 @@ def _identify(
         steps=solution.stats["num_steps"],
         result=solution.stats["reason"],
         optimality=solution.stats["optimality"],
-        scale=scale_of(identified, measurement) if measurement.ends else None,
-        covariance=covariance,
-        determined=determined,
+        scale=_scale(tips, measurement, space, parameters, spread, after.sigma) if measurement.ends else None,
+        covariance=spread.matrix,
+        determined=spread.determined,
         before=repeatability(space.arm(start).position(measurement.q), measurement.sizes),
         after=after,
         bounds=bounds,
@@ -225,23 +224,31 @@ def _identify(
     )
 
 
+def _scale(
+    tips: Array, measurement: Measurement, space: Parameters, parameters: Array, spread: covariance.Covariance, sigma: Array
+) -> Scale:
+    """k with an uncertainty that holds that of the identified parameters too."""
+    scale = scale_of(tips, measurement, sigma)
+    rows = measured_lengths(parameters, space, measurement)[1]
+    by_parameters, variance = scale_derivative(tips, measurement, sigma, rows)
+    u = jnp.sqrt(by_parameters @ spread.matrix @ by_parameters + variance)
+    return eqx.tree_at(lambda s: s.u, scale, u)
+
+
 @eqx.filter_jit
 def _finish(arm: Arm, measurement: Measurement, stage1: Identification, method: str, max_steps: int) -> Calibration:
-    space = stage1.space
     assert stage1.scale is not None
-    scaled = divide_lengths(stage1.arm, stage1.scale.value)
-    parameters, active, steps, result = space.vector(scaled), stage1.active, stage1.steps, stage1.result
+    space, k = stage1.space, stage1.scale.value
     if method == "joint":
-        parameters, active, more, result = _joint(scaled, measurement, stage1, max_steps)
-        steps = steps + more
-        scaled = Parameters(scaled, space.names).arm(parameters)
-    tips = scaled.position(measurement.q)
+        calibrated, parameters, active, steps, result, spread = _joint(arm, measurement, stage1, max_steps)
+    else:
+        calibrated = divide_lengths(stage1.arm, k)
+        parameters, active, steps, result = space.vector(calibrated), stage1.active, stage1.steps, stage1.result
+        spread = _divided(measurement, stage1, parameters)
+    tips = calibrated.position(measurement.q)
     after = repeatability(tips, measurement.sizes, fitted=len(space.names))
-    covariance, determined = _covariance(
-        space, measurement, parameters, active != 0, after.sigma, with_lengths=True, base=scaled
-    )
     return Calibration(
-        arm=scaled,
+        arm=calibrated,
         parameters=parameters,
         scale=stage1.scale,
         de=after.de,
@@ -249,8 +256,8 @@ def _finish(arm: Arm, measurement: Measurement, stage1: Identification, method: 
         active=active,
         steps=steps,
         result=result,
-        covariance=covariance,
-        determined=determined,
+        covariance=spread.matrix,
+        determined=spread.determined,
         before=stage1.before,
         after=after,
         length_before=measurement.distances(arm.position(measurement.q)),
@@ -260,14 +267,32 @@ def _finish(arm: Arm, measurement: Measurement, stage1: Identification, method: 
     )
 
 
-def _joint(scaled: Arm, measurement: Measurement, stage1: Identification, max_steps: int) -> tuple[Array, Array, Array, Reason]:
-    space = Parameters(scaled, stage1.space.names)
+def _divided(measurement: Measurement, stage1: Identification, parameters: Array) -> covariance.Covariance:
+    """Covariance after the division by k."""
     assert stage1.scale is not None
-    sigma = jnp.maximum(jax.lax.stop_gradient(stage1.after.sigma / stage1.scale.value), _LEAST_SIGMA)
+    tips = stage1.arm.position(measurement.q)
+    space = Parameters(stage1.arm, stage1.space.names)
+    rows = measured_lengths(stage1.parameters, space, measurement)[1]
+    by_parameters, variance = scale_derivative(tips, measurement, stage1.after.sigma, rows)
+    before = covariance.Covariance(stage1.covariance, stage1.determined)
+    return covariance.after_division(before, by_parameters, variance, space, parameters, stage1.scale.value)
+
+
+def _joint(
+    arm: Arm, measurement: Measurement, stage1: Identification, max_steps: int
+) -> tuple[Arm, Array, Array, Array, Reason, covariance.Covariance]:
+    """One weighted least squares of poses and lengths, from the two-stage result; held parameters stay as given."""
+    assert stage1.scale is not None
+    space, k = Parameters(arm, stage1.space.names), stage1.scale.value
+    scaled = divide_lengths(stage1.arm, k)
+    sigma = jnp.maximum(stage1.after.sigma / k, covariance.LEAST_SIGMA)
+    centroids = measurement.centroids(scaled.position(measurement.q))
+    spread = covariance.length_covariance(centroids, measurement, sigma)
+    whitening = jnp.linalg.inv(jnp.linalg.cholesky(spread))
     solution = least_squares(
         joint_residual,
         space.vector(scaled),
-        (space, measurement, sigma, _length_sigma(measurement, sigma)),
+        (space, measurement, sigma, whitening),
         lower=stage1.bounds.lower,
         upper=stage1.bounds.upper,
         scale=space.scale,
@@ -276,108 +301,7 @@ def _joint(scaled: Arm, measurement: Measurement, stage1: Identification, max_st
         max_steps=max_steps,
         throw=False,
     )
-    stats = solution.stats
-    return solution.value, stage1.bounds.active(solution.value), stats["num_steps"], stats["reason"]
-
-
-def _length_sigma(measurement: Measurement, sigma: Float[Array, ""]) -> Float[Array, " l"]:
-    """Standard deviation of measured minus nominal length: u, and the scatter of the poses at both ends; mm."""
-    return jnp.sqrt(measurement.u**2 + sigma**2 * jnp.asarray(measurement.averaging_variance()))
-
-
-def _covariance(
-    space: Parameters,
-    measurement: Measurement,
-    parameters: Array,
-    fixed: Array,
-    sigma: Array,
-    *,
-    with_lengths: bool,
-    base: Arm | None = None,
-) -> tuple[Float[Array, "p p"], Bool[Array, " p"]]:
-    """Covariance of the free parameters on the identifiable subspace: inverse of J^T W J (JCGM 100; see GUM 5.2).
-
-    Weights are the residual variance and, ``with_lengths``, the variance of each reference length. Directions that the
-    data do not determine are left out, and so are ``fixed`` parameters; their rows are 0. Second: which parameters have no
-    part in an undetermined direction.
-    """
-    space = space if base is None else Parameters(base, space.names)
-    sigma = jnp.maximum(sigma, _LEAST_SIGMA)
-    information = repeatability_model(parameters, (space, measurement)).gram / sigma**2
-    if with_lengths:
-        rows = measured_lengths(parameters, space, measurement)[1] / _length_sigma(measurement, sigma)[:, None]
-        information = information + rows.T @ rows
-    scale = jnp.where(fixed, 0.0, space.scale)
-    values, vectors = jnp.linalg.eigh(scale[:, None] * information * scale[None, :])
-    known = values > 1e-12 * values[-1]
-    inverse = jnp.where(known, 1 / jnp.where(known, values, 1.0), 0.0)
-    spread = scale[:, None] * vectors
-    determined = fixed | (jnp.sum(jnp.where(known[None, :], 0.0, vectors**2), axis=1) < 1e-6)
-    return (spread * inverse[None, :]) @ spread.T, determined
-
-
-def _based_on(space: Parameters, arm: Arm) -> Parameters:
-    """The free parameters on the given arm: held values come from the arm that is calibrated, not from the space's base."""
-    if arm.beta is None and space.base.beta is not None:
-        return space
-    return Parameters(base=arm, names=space.names)
-
-
-def _held_length(space: Parameters, hold: str | None) -> str | None:
-    lengths = [name for name in space.names if is_length(name)]
-    if hold is None or (hold == "longest" and not lengths):
-        return None
-    if hold != "longest":
-        if not is_length(hold) or hold not in lengths:
-            space.index(hold)
-            raise InputError(f"hold is '{hold}', which is an angle; hold a length, for example '{lengths[0]}'.")
-        return hold
-    links = [name for name in lengths if not name.startswith("probe")] or lengths
-    base = space.base
-    if not is_concrete(base.a, base.d, base.probe):
-        raise InputError(
-            "hold='longest' needs an arm with known values; where the arm itself is traced, name the length to hold."
-        )
-
-    # Read with NumPy: under jit even a constant arm's values become tracers once JAX computes with them.
-    def nominal(name: str) -> float:
-        kind, i = locate(base, name)
-        return float(np.abs(np.asarray(getattr(base, kind))[..., i]).max())
-
-    return max(links, key=nominal)
-
-
-def _check_fit(capture: Capture, space: Parameters) -> None:
-    if capture.joints != space.base.joints:
-        raise InputError(
-            f"the capture has {capture.joints} columns, but the arm has {space.base.joints} joints; give one column a joint."
-        )
-
-
-def _check_start(bounds: Bounds, vector: Array, what: str) -> None:
-    if vector.shape != (len(bounds.space.names),):
-        raise InputError(
-            f"{what} has shape {vector.shape}, but {len(bounds.space.names)} parameters are free; give one value each."
-        )
-    if not is_concrete(vector, bounds.lower, bounds.upper):
-        return
-    values, lower, upper = (np.asarray(x) for x in (vector, bounds.lower, bounds.upper))
-    outside = ~((values >= lower) & (values <= upper))
-    if outside.any():
-        i = int(np.flatnonzero(outside)[0])
-        raise InputError(
-            f"{what} is outside the bounds: {bounds.space.names[i]} is {values[i]:g}, not within {lower[i]:g} to {upper[i]:g}; "
-            "move the start or widen the bounds."
-        )
-
-
-def _check_enough(capture: Capture, unknowns: int) -> None:
-    """A socket of m poses gives 3 (m - 1) equations: its own position takes three."""
-    equations = 3 * sum(size - 1 for size in capture.sizes)
-    if equations < unknowns:
-        sockets, poses = len(capture.sizes), sum(capture.sizes)
-        needed = -(-unknowns // 3) + sockets
-        raise InputError(
-            f"{poses} poses in {sockets} socket{'s' if sockets > 1 else ''} give {equations} equations, but {unknowns} unknowns "
-            f"need at least {needed} poses; record more poses or hold more parameters."
-        )
+    stats, active = solution.stats, stage1.bounds.active(solution.value)
+    found = covariance.of_parameters(space, measurement, solution.value, active != 0, sigma, whitening)
+    steps = stage1.steps + stats["num_steps"]
+    return space.arm(solution.value), solution.value, active, steps, stats["reason"], found

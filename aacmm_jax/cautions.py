@@ -6,6 +6,7 @@ import numpy as np
 
 from .calibrate import active_names
 from .calibration_files import CalibrationRecord
+from .covariance import length_covariance
 from .manifest import Recording
 from .parameters import Parameters, is_length
 from .residuals import Measurement
@@ -91,8 +92,8 @@ def _data(record: CalibrationRecord) -> list[str]:
         names = [f"{capture.names[owner[i]]} pose {i - first[owner[i]] + 1} ({spread[i]:.3g} mm)" for i in worst]
         found.append(f"Poses far from their socket, where {typical:.2g} mm is typical: {_some(names)}; was the tip seated?")
     evaluation = record.evaluations()["calibrated"]
-    sigma = float(evaluation.repeatability.sigma)
-    variance = np.asarray(measurement.u) ** 2 + sigma**2 * measurement.averaging_variance()
+    centroids = evaluation.repeatability.centroids
+    variance = np.diag(np.asarray(length_covariance(centroids, measurement, evaluation.repeatability.sigma)))
     error = np.asarray(evaluation.error)
     normalised = np.abs(error) / np.sqrt(variance + 1e-18)
     wrong = [

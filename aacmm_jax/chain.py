@@ -10,6 +10,7 @@ the tip by ``u x (tip - o)``; sliding it along ``u`` moves the tip by ``u``. So 
 the chain.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -134,11 +135,7 @@ def _unrolled(rows: Float[Array, "... 3 N"], geometry: Geometry, q: Float[Array,
 
 
 @jax.custom_jvp
-def tip_position(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 3"]:
-    """Tip position in mm, in the base frame. Leading shapes of the parameters and of q broadcast.
-
-    JAX's own differentiation of this function uses the analytic columns, forward and reverse, to any order.
-    """
+def _tip_position(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 3"]:
     return _unrolled(walk(geometry, turns_of(q)).tip, geometry, q)
 
 
@@ -157,9 +154,19 @@ def _tip_position_jvp(primals, tangents):
     return _unrolled(walked.tip, geometry, q), _unrolled(moved, geometry, q)
 
 
-tip_position.defjvp(_tip_position_jvp, symbolic_zeros=True)
+_tip_position.defjvp(_tip_position_jvp, symbolic_zeros=True)
 
 
+@jax.jit
+def tip_position(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 3"]:
+    """Tip position in mm, in the base frame. Leading shapes of the parameters and of q broadcast.
+
+    JAX's own differentiation of this function uses the analytic columns, forward and reverse, to any order.
+    """
+    return _tip_position(geometry, q)
+
+
+@jax.jit
 def tip_pose(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 4 4"]:
     """Homogeneous pose of the last frame with the tip as its origin (mm), in the base frame."""
     walked = walk(geometry, turns_of(q))
@@ -169,6 +176,7 @@ def tip_pose(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 
     return jnp.concatenate([top, bottom], axis=-2)
 
 
+@partial(jax.jit, static_argnames=("entries",))
 def tip_jacobian(geometry: Geometry, q: Float[Array, "... n"], entries: tuple[tuple[str, int], ...]) -> Float[Array, "... 3 p"]:
     """Derivative of the tip by the named entries, each a kind (``alpha`` ... ``probe``, or ``q``) and a 0-based index."""
     stacked = stacked_columns(walk(geometry, turns_of(q)), entries)

@@ -41,21 +41,26 @@ def repeatability(tips: Float[Array, "N 3"], sizes: Sequence[int], *, fitted: in
     squared = jnp.sum((tips - centroids[owner]) ** 2, axis=-1)
     distances = _root(squared)
     half_range = jnp.max(highest(tips) + highest(-tips), axis=-1) / 2
-    spread = max(int(counts[counts > 1].sum()), 1)
-    freedom = max(3 * int((counts - 1).sum()) - fitted, 1)
+    # With one pose in every socket nothing is known of the scatter: 0 / 0, which is NaN and not a perfect 0.
+    spread = int(counts[counts > 1].sum())
+    freedom = max(3 * int((counts - 1).sum()) - fitted, min(spread, 1))
     return Repeatability(
-        de=jnp.sum(distances) / spread,
+        de=_over(jnp.sum(distances), spread),
         deltam=jnp.max(half_range),
-        rms=_root(jnp.sum(squared) / spread),
+        rms=_root(_over(jnp.sum(squared), spread)),
         socket_de=total(distances) / jnp.asarray(counts, dtype=tips.dtype),
         socket_deltam=half_range,
         socket_rms=_root(total(squared) / jnp.asarray(counts, dtype=tips.dtype)),
         centroids=centroids,
-        sigma=_root(jnp.sum(squared) / freedom),
+        sigma=_root(_over(jnp.sum(squared), freedom)),
     )
+
+
+def _over(total: Float[Array, ""], count: int) -> Float[Array, ""]:
+    return total / count if count else jnp.full_like(total, jnp.nan)
 
 
 def _root(value: Float[Array, "..."]) -> Float[Array, "..."]:
     # sqrt has no derivative at 0, which a socket of one pose meets exactly; its distance there is 0 and so is the slope.
-    positive = value > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)
+    zero = value == 0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, value)))

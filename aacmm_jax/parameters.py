@@ -40,6 +40,7 @@ class Parameters(eqx.Module):
         Raises `InputError` for a name that the arm has not, or one that is both held and free.
         """
         n = arm.joints
+        free = (free,) if isinstance(free, str) else tuple(free)
         if held is None:
             held = ("theta_1", "d_1", f"a_{n}", f"alpha_{n}", "probe_x", "probe_y")
             released = set(free)
@@ -87,7 +88,7 @@ class Parameters(eqx.Module):
         zero = jnp.zeros_like(arm.alpha)
         values = {kind: getattr(arm, kind) for kind in ("alpha", "a", "d", "theta", "probe")}
         values["beta"] = zero if arm.beta is None else arm.beta
-        return jnp.stack([values[kind][..., i] for kind, i in self.entries()], axis=-1)
+        return jnp.stack(jnp.broadcast_arrays(*(values[kind][..., i] for kind, i in self.entries())), axis=-1)
 
     def arm(self, vector: Numbers) -> Arm:
         """The base arm with its free parameters taken from ``(p,)``. Use ``vmap`` for a batch of vectors."""

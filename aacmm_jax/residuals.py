@@ -54,17 +54,12 @@ class Measurement(eqx.Module):
 
     def distances(self, tips: Float[Array, "N 3"]) -> Float[Array, " l"]:
         """Measured reference lengths: distances between the centroids of their end sockets, mm."""
-        start, end = self._end_indices()
+        start, end = self.end_indices()
         centroids = self.centroids(tips)
         return jnp.linalg.norm(centroids[end] - centroids[start], axis=-1)
 
-    def averaging_variance(self) -> Float[np.ndarray, " l"]:
-        """Variance of a measured length per unit variance of a tip coordinate: 1/m at each end."""
-        start, end = self._end_indices()
-        inverse = 1 / np.asarray(self.sizes, dtype=float)
-        return inverse[start] + inverse[end]
-
-    def _end_indices(self) -> tuple[Int[np.ndarray, " l"], Int[np.ndarray, " l"]]:
+    def end_indices(self) -> tuple[Int[np.ndarray, " l"], Int[np.ndarray, " l"]]:
+        """Socket indices of the lengths' starts, and of their ends."""
         ends = np.asarray(self.ends, dtype=int).reshape(-1, 2)
         return ends[:, 0], ends[:, 1]
 
@@ -83,15 +78,16 @@ def repeatability_residual(vector: Float[Array, " p"], args: tuple[Parameters, M
 
 def joint_residual(
     vector: Float[Array, " p"],
-    args: tuple[Parameters, Measurement, Float[Array, ""], Float[Array, " l"]],
+    args: tuple[Parameters, Measurement, Float[Array, ""], Float[Array, "l l"]],
 ) -> tuple[Float[Array, "N 3"], Float[Array, " l"]]:
-    """Repeatability and reference lengths together, each divided by its standard deviation: no unit.
+    """Repeatability and reference lengths together, each in units of its standard deviation.
 
-    args: free parameters, measurement, standard deviation of a tip coordinate (mm), and that of each length (mm).
+    args: free parameters, measurement, standard deviation of a tip coordinate (mm), and the whitening of the lengths: the
+    inverse Cholesky factor of their covariance (1/mm).
     """
-    space, measurement, sigma, length_sigma = args
+    space, measurement, sigma, whitening = args
     tips = space.arm(vector).position(measurement.q)
-    return measurement.centred(tips) / sigma, (measurement.distances(tips) - measurement.nominal) / length_sigma
+    return measurement.centred(tips) / sigma, whitening @ (measurement.distances(tips) - measurement.nominal)
 
 
 def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Model:
@@ -102,13 +98,13 @@ def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Meas
 
 def joint_model(
     vector: Float[Array, " p"],
-    args: tuple[Parameters, Measurement, Float[Array, ""], Float[Array, " l"]],
+    args: tuple[Parameters, Measurement, Float[Array, ""], Float[Array, "l l"]],
 ) -> Model:
     """Cost, gradient and Gram matrix of `joint_residual`."""
-    space, measurement, sigma, length_sigma = args
+    space, measurement, sigma, whitening = args
     poses = repeatability_model(vector, (space, measurement))
     distance, rows = measured_lengths(vector, space, measurement)
-    residual, rows = (distance - measurement.nominal) / length_sigma, rows / length_sigma[:, None]
+    residual, rows = whitening @ (distance - measurement.nominal), whitening @ rows
     return Model(
         poses.cost / sigma**2 + 0.5 * jnp.dot(residual, residual),
         poses.gradient / sigma**2 + rows.T @ residual,
@@ -123,7 +119,7 @@ def measured_lengths(
     walked = walk(space.arm(vector).geometry, measurement.turns)
     averaging = jnp.asarray(measurement.averaging.T)
     centroids, means = walked.tip @ averaging, stacked_columns(walked, space.entries()) @ averaging
-    start, end = measurement._end_indices()
+    start, end = measurement.end_indices()
     between = centroids[:, end] - centroids[:, start]
     distance = jnp.linalg.norm(between, axis=0)
     direction = between / distance[None]

@@ -1,7 +1,6 @@
 """Stage 2: the one number that repeatability cannot see, from reference lengths (Cheng et al. 2018, section 2.3)."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -9,6 +8,7 @@ from jaxtyping import Array, Float
 from .arm import Arm, replace
 from .arrays import Numbers, as_array, is_concrete
 from .capture import Capture
+from .covariance import length_covariance
 from .errors import InputError
 from .metrics import repeatability
 from .residuals import Measurement
@@ -41,40 +41,60 @@ def divide_lengths(arm: Arm, k: Float[Array, ""]) -> Arm:
     return replace(arm, a=arm.a / k, d=d, probe=arm.probe / k)
 
 
-def fix_scale(arm: Arm, capture: Capture) -> ScaleFix:
+def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> ScaleFix:
     """Stage 2: k from every reference length of a capture, and the arm divided by it.
 
     k is the mean of measured / nominal weighted by uncertainty: the length's own u, and the scatter of the poses over
     the number of them at each end. Its standard uncertainty is the larger of what those predict and what the lengths'
-    disagreement shows (the Birge ratio). Raises `InputError` without a reference length.
+    disagreement shows (the Birge ratio). It takes the arm's angles as exact; `calibrate` adds their uncertainty.
+
+    ``sigma`` is the standard deviation of a tip coordinate, mm (stage 1's ``after.sigma``); by default it comes from the
+    capture's own scatter. With one pose in every socket there is none, and u of k is then NaN: unknown.
+    Raises `InputError` without a reference length.
     """
     if not capture.lengths:
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one between two of its sockets."
         )
-    scale = scale_of(arm, Measurement.of(capture))
+    return _fixed(arm, Measurement.of(capture), sigma)
+
+
+@eqx.filter_jit
+def _fixed(arm: Arm, measurement: Measurement, sigma: float | Array | None) -> ScaleFix:
+    tips = arm.position(measurement.q)
+    scatter = repeatability(tips, measurement.sizes).sigma if sigma is None else jnp.asarray(sigma, dtype=jnp.float64)
+    scale = scale_of(tips, measurement, scatter)
     return ScaleFix(divide_lengths(arm, scale.value), scale)
 
 
-def scale_of(arm: Arm, measurement: Measurement) -> Scale:
-    """k of an arm from the reference lengths of a measurement."""
-    tips = arm.position(measurement.q)
-    sigma = repeatability(tips, measurement.sizes).sigma
-    measured = measurement.distances(tips)
-    ratio = measured / measurement.nominal
-    scatter = sigma**2 * jnp.asarray(measurement.averaging_variance())
-    # The floor (1e-12 mm) only makes the weights of a noise-free simulation equal instead of infinite.
-    variance = (scatter + (ratio * measurement.u) ** 2 + 1e-24) / measurement.nominal**2
-    return Scale(*_weighted_mean(ratio, variance), measured, measurement.nominal)
+def scale_of(tips: Float[Array, "N 3"], measurement: Measurement, sigma: Float[Array, ""]) -> Scale:
+    """k from tips, given the standard deviation of a tip coordinate (NaN where unknown)."""
+    return Scale(*_estimate(tips, measurement, sigma)[:2], measurement.distances(tips), measurement.nominal)
 
 
-def _weighted_mean(ratio: Float[Array, " l"], variance: Float[Array, " l"]) -> tuple[Array, Array]:
-    # The weights are constants of the estimate: its derivative by a length must not pass through them.
-    weight = jax.lax.stop_gradient(1 / variance)
-    value = jnp.sum(weight * ratio) / jnp.sum(weight)
-    predicted = 1 / jnp.sum(weight)
-    observed = jnp.sum(weight * (ratio - value) ** 2) / (max(ratio.shape[0] - 1, 1) * jnp.sum(weight))
-    return value, jnp.sqrt(jnp.maximum(predicted, jax.lax.stop_gradient(observed)))
+def scale_derivative(
+    tips: Float[Array, "N 3"], measurement: Measurement, sigma: Float[Array, ""], rows: Float[Array, "l p"]
+) -> tuple[Float[Array, " p"], Float[Array, ""]]:
+    """Derivative of k by the parameters, given that of the lengths, and the variance that the lengths themselves add."""
+    _, u, shares = _estimate(tips, measurement, sigma)
+    return (shares / measurement.nominal) @ rows, u**2
+
+
+def _estimate(
+    tips: Float[Array, "N 3"], measurement: Measurement, sigma: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, " l"]]:
+    """k, its standard uncertainty, and the share of each length in it."""
+    ratio = measurement.distances(tips) / measurement.nominal
+    known = jnp.where(jnp.isnan(sigma), 0.0, sigma)
+    centroids = measurement.centroids(tips)
+    plain = jnp.diagonal(length_covariance(centroids, measurement, known, ratio))
+    weight = measurement.nominal**2 / plain
+    share = weight / jnp.sum(weight)
+    value = jnp.sum(share * ratio)
+    relative = share / measurement.nominal
+    predicted = relative @ length_covariance(centroids, measurement, sigma, value) @ relative
+    observed = jnp.sum(share * (ratio - value) ** 2) / max(ratio.shape[0] - 1, 1)
+    return value, jnp.sqrt(jnp.maximum(predicted, observed)), share
 
 
 def scale_from_lengths(measured: Numbers, nominal: Numbers, u: float = 0.0) -> Scale:

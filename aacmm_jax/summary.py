@@ -75,7 +75,9 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
 def figures(evaluation: Evaluation) -> dict[str, Any]:
     """Repeatability over all sockets, and the errors of the lengths; mm."""
     spread, error = evaluation.repeatability, np.asarray(evaluation.error)
-    found = {"de_mm": float(spread.de), "deltam_mm": float(spread.deltam), "rms_mm": float(spread.rms)}
+    numbers = {"de_mm": spread.de, "deltam_mm": spread.deltam, "rms_mm": spread.rms}
+    # With one pose in every socket there is no repeatability to speak of.
+    found: dict[str, Any] = {key: float(value) for key, value in numbers.items() if np.isfinite(value)}
     return found | (_length_figures(error) if len(error) else {})
 
 
@@ -117,7 +119,7 @@ def calibration_summary(record: CalibrationRecord) -> dict[str, Any]:
         {
             "parameter": name,
             "unit": "mm" if is_length(name) else "rad",
-            "u": float(u[i]) if record.determined[i] and not record.active[i] else None,
+            "u": float(u[i]) if record.determined[i] and u[i] > 0 else None,
             **{stage: float(vector[i]) for stage, vector in vectors.items()},
             "bound": {-1: "lower", 1: "upper"}.get(int(record.active[i])),
         }

@@ -1,5 +1,7 @@
 """Stage 1, stage 2, both and the joint solve: what they recover, what they report, and their derivatives."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,6 +9,8 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.checks import scale_is_free
+from aacmm_jax.simulate import ARCSEC
 
 
 @pytest.fixture(scope="module")
@@ -157,8 +161,9 @@ def differentiated(paper_arm, noisy_capture, space, start):
 
     def run(q, box, length):
         cut = noisy_capture.sizes[0]
-        reference = aj.ReferenceLength("A", "B", length, 0.002)
-        capture = aj.Capture({"A": q[:cut], "B": q[cut:]}, [reference])
+        # Two lengths of different u, measured on the same sockets, so that their weights matter.
+        references = [aj.ReferenceLength("A", "B", length, 0.002), aj.ReferenceLength("A", "B", 200.005, 0.004)]
+        capture = aj.Capture({"A": q[:cut], "B": q[cut:]}, references)
         bounds = aj.Bounds(space, box[0], box[1])
         inside = jnp.clip(start, box[0], box[1])
         return aj.calibrate(paper_arm, capture, bounds, start=inside, hold="d_3").parameters / space.scale
@@ -219,3 +224,89 @@ def test_hayatis_angle_tells_parallel_axes_apart():
     assert result.converged
     assert float(result.de) < 1e-6
     assert float(result.arm.beta[1]) == pytest.approx(2e-3, abs=1e-8)
+
+
+def test_uncertainties_are_those_that_trials_show(paper_arm, space, bounds):
+    """150 simulated calibrations with lengths that share sockets: normalised errors of every parameter, of k and of a length
+    elsewhere have a root mean square near 1, for each method and whether a length is held or not."""
+    sockets = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (400, 500, 300), "D": (450, 250, 600)}
+    pairs = [("A", "B"), ("A", "C"), ("A", "D"), ("B", "C")]
+    exact = aj.simulate(paper_arm, sockets, poses=20, lengths=pairs, seed=2)
+    check = aj.simulate(paper_arm, {"E": (650, 350, 150), "F": (150, 450, 650)}, poses=1, seed=2).q
+    by_q = paper_arm.jacobian(exact.q, [f"q_{i}" for i in range(1, 7)])
+    truth, true_length = space.vector(), jnp.linalg.norm(paper_arm.position(check)[0] - paper_arm.position(check)[1])
+
+    def length_of(vector):
+        ends = space.arm(vector).position(check)
+        return jnp.linalg.norm(ends[0] - ends[1])
+
+    @partial(jax.jit, static_argnames=("method", "hold"))
+    def trials(keys, method, hold):
+        def one(key):
+            encoder, seat, reference = jax.random.split(key, 3)
+            # A seat off by s moves the readings by the least-norm q that moves the tip by s.
+            off = 0.005 * jax.random.normal(seat, (exact.q.shape[0], 3))
+            seated = exact.q + jnp.einsum(
+                "nji,nj->ni", by_q, jnp.linalg.solve(by_q @ jnp.swapaxes(by_q, 1, 2), off[..., None])[..., 0]
+            )
+            q = seated + 2.0 * ARCSEC * jax.random.normal(encoder, seated.shape)
+            ends = np.cumsum(exact.sizes)
+            blocks = {name: q[end - 20 : end] for name, end in zip(exact.names, ends, strict=True)}
+            errors = 0.002 * jax.random.normal(reference, (len(pairs),))
+            lengths = [
+                aj.ReferenceLength(r.start, r.end, r.value + error, 0.002)
+                for r, error in zip(exact.lengths, errors, strict=True)
+            ]
+            result = aj.calibrate(paper_arm, aj.Capture(blocks, lengths), bounds, method=method, hold=hold)
+            slope = jax.grad(length_of)(result.parameters)
+            u_length = jnp.sqrt(slope @ result.covariance @ slope)
+            u = jnp.sqrt(jnp.diagonal(result.covariance))
+            return (result.parameters - truth) / u, (length_of(result.parameters) - true_length) / u_length
+
+        return jax.lax.map(one, keys, batch_size=15)
+
+    keys = jax.random.split(jax.random.key(11), 150)
+    for method, hold in (("two-stage", "d_3"), ("two-stage", None), ("joint", "d_3")):
+        normalised, length = trials(keys, method, hold)
+        spread = np.sqrt(np.mean(np.asarray(normalised) ** 2, axis=0))
+        # With 150 trials an RMS of 1 scatters by 0.06; encoder noise is not the same in every pose, which adds a little.
+        assert np.all((spread > 0.75) & (spread < 1.35)), (method, hold, dict(zip(space.names, spread.round(2), strict=True)))
+        assert 0.75 < np.sqrt(np.mean(np.asarray(length) ** 2)) < 1.3, (method, hold)
+
+
+def test_uncertainty_of_k_is_unknown_without_any_scatter(paper_arm, noisy_capture):
+    """One pose at each end shows no scatter: u(k) is NaN unless stage 1's sigma is given, and then the textbook's."""
+    single = aj.Capture({name: q[:1] for name, q in noisy_capture.sockets.items()}, [aj.ReferenceLength("A", "B", 200.0)])
+    assert np.isnan(float(aj.fix_scale(paper_arm, single).scale.u))
+    known = aj.fix_scale(paper_arm, single, sigma=0.01).scale
+    assert float(known.u) == pytest.approx(0.01 * np.sqrt(2) / 200, rel=1e-6)
+    assert np.isnan(float(aj.evaluate(paper_arm, single).repeatability.de))
+
+
+def test_a_known_length_leaves_nothing_more_to_hold(paper_arm, space):
+    """With d_3 held by the user the scale is known, so "longest" holds nothing; a redundant held length changes nothing."""
+    held = (*space.held, "d_3")
+    known = aj.Parameters.free_of(paper_arm, held=held)
+    longer = known.arm(known.vector().at[known.index("d_5")].add(1.0))
+    capture = aj.simulate(longer, {"A": (400, 200, 300)}, seed=1)
+    result = aj.identify(paper_arm, capture, aj.Bounds.around(paper_arm, known))
+    assert result.hold is None
+    assert float(result.de) < 1e-9
+    assert float(result.arm.d[4]) == pytest.approx(501, abs=1e-8)
+    panda = aj.load_specification("panda")
+    assert scale_is_free(panda.arm, panda.bounds().space)  # d_7 is held, but lies along probe_z
+
+
+def test_what_data_cannot_tell_apart_is_marked(paper_arm, noisy_capture):
+    """With everything free: d_1 and theta_1 only move the base frame, and (a_6, theta_6), (alpha_6, d_6) trade off (AUDIT)."""
+    everything = aj.Parameters.free_of(paper_arm, held=())
+    bounds = aj.Bounds.around(paper_arm, everything)
+    result = aj.identify(paper_arm, noisy_capture, bounds, hold="d_3")
+    unknown = {name for name, known in zip(everything.names, np.asarray(result.determined), strict=True) if not known}
+    assert {"d_1", "theta_1", "a_6", "theta_6", "alpha_6", "d_6"} <= unknown
+    assert not unknown & {"a_2", "d_5", "alpha_2", "theta_3"}
+    assert np.all(
+        np.asarray(
+            aj.identify(paper_arm, noisy_capture, aj.Bounds.around(paper_arm, aj.Parameters.free_of(paper_arm))).determined
+        )
+    )

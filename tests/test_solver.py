@@ -134,6 +134,34 @@ def test_derivative_follows_an_active_bound(mode):
     np.testing.assert_allclose(mode(optimum)(jnp.array(5.0), jnp.array(10.0)), [0, 0], atol=1e-10)
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e8, 1e-8])
+def test_derivative_does_not_depend_on_units(unit):
+    """The same problem with one unknown in another unit: y_1 = u on its bound, y_0 = unit / (1 + u) at the minimum."""
+
+    def optimum(upper):
+        residual = lambda y, _: jnp.stack([y[0] / unit * (1 + y[1]) - 1, 0.1 * (y[1] - 3)])  # noqa: E731
+        return aj.least_squares(residual, jnp.array([0.5 * unit, 0.1]), upper=jnp.stack([jnp.inf, upper])).value
+
+    value, slope = optimum(jnp.array(1.0)), jax.jacrev(optimum)(jnp.array(1.0))
+    np.testing.assert_allclose(value / jnp.array([unit, 1.0]), [0.5, 1.0], rtol=1e-8)
+    np.testing.assert_allclose(slope / jnp.array([unit, 1.0]), [-0.25, 1.0], rtol=1e-6)
+
+
+def test_a_false_derivative_is_not_called_converged():
+    @jax.custom_jvp
+    def wrong(y):
+        return y - 1
+
+    wrong.defjvp(lambda primals, tangents: (wrong(*primals), -tangents[0]))
+    solution = aj.least_squares(lambda y, _: wrong(y), jnp.array([3.0, 4.0]), throw=False)
+    assert solution.stats["reason"] == aj.Reason.stalled
+
+
+def test_crossed_bounds_are_refused():
+    with pytest.raises(aj.InputError, match="lower bound 2 of unknown 1 is above its upper bound 1"):
+        aj.least_squares(lambda y, _: y, jnp.array([1.0]), lower=2.0, upper=1.0)
+
+
 def test_solves_under_vmap_equal_single_solves():
     problems = [bounded_problems.draw(seed) for seed in range(0, 24, 3)]
     stacked = {key: jnp.stack([jnp.asarray(problem[key]) for problem in problems]) for key in problems[0]}
