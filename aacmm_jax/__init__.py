@@ -8,6 +8,9 @@ from .arm_files import load_arm as load_arm
 from .arm_files import load_specification as load_specification
 from .arm_files import save_arm as save_arm
 from .arm_files import shipped_arms as shipped_arms
+from .batch import ManyIdentifications as ManyIdentifications
+from .batch import identify_many as identify_many
+from .batch import stack_captures as stack_captures
 from .calibrate import Calibration as Calibration
 from .calibrate import Identification as Identification
 from .calibrate import calibrate as calibrate

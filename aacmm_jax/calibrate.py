@@ -28,7 +28,7 @@ from .solver import BoundedLevenbergMarquardt, least_squares
 from .steps import Reason
 
 # The boxes of this problem are small against its curvature, so the first steps can be nearly Gauss-Newton's.
-_SOLVER = BoundedLevenbergMarquardt(initial_damping=1e-6)
+SOLVER = BoundedLevenbergMarquardt(initial_damping=1e-6)
 _MAX_STEPS = 300
 
 
@@ -194,7 +194,7 @@ def _identify(
         upper=bounds.upper[index],
         scale=reduced.scale,
         normal=repeatability_model,
-        solver=_SOLVER,
+        solver=SOLVER,
         max_steps=max_steps,
         throw=False,
     )
@@ -297,7 +297,7 @@ def _joint(
         upper=stage1.bounds.upper,
         scale=space.scale,
         normal=joint_model,
-        solver=_SOLVER,
+        solver=SOLVER,
         max_steps=max_steps,
         throw=False,
     )

@@ -16,7 +16,7 @@ from optimistix.internal import implicit_jvp
 
 from .arrays import is_concrete
 from .errors import InputError
-from .steps import Box, Flat, Model, Progress, Reason, Rules, advance, begin, optimality
+from .steps import Box, Flat, Model, Progress, Reason, Rules, advance, begin, either, optimality
 
 
 def flat_box(y: PyTree[Array], lower: PyTree, upper: PyTree, scale: PyTree) -> Box:
@@ -78,9 +78,9 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         box = _box(y, options)
         # Optimistix itself stops, before any step, where y is not finite.
-        unfinished = Reason.where(result == optx.RESULTS.nonfinite, Reason.nonfinite, Reason.max_steps)
+        unfinished = either(result == optx.RESULTS.nonfinite, Reason.nonfinite, Reason.max_steps)
         stats = {
-            "reason": Reason.where(state.reason == Reason.running, unfinished, state.reason),
+            "reason": either(state.reason == Reason.running, unfinished, state.reason),
             "num_accepted_steps": state.accepted,
             "cost": state.model.cost,
             "gradient": state.model.gradient,

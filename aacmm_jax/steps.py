@@ -31,6 +31,21 @@ class Reason(eqx.Enumeration):
     nonfinite = "Not converged: the residual or its derivative is not finite at the start; check the data and the start."
 
 
+def reasons(numbers: Int[Array, "*lanes"]) -> Reason:
+    """Reasons of many lanes from their numbers. (Equinox's own ``where`` takes a single predicate.)"""
+    return eqx.tree_at(lambda item: item._value, Reason.running, numbers)
+
+
+def numbers_of(reason: Reason) -> Int[Array, "*lanes"]:
+    """The number of each lane's reason."""
+    return jnp.asarray(reason._value)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def either(pred: Bool[Array, "*lanes"], one: Reason, other: Reason) -> Reason:
+    """Lane by lane, one reason or the other."""
+    return reasons(jnp.where(pred, numbers_of(one), numbers_of(other)))
+
+
 class Model(eqx.Module):
     """The quadratic model of the cost at one point: what one evaluation leaves for the step."""
 
@@ -100,7 +115,7 @@ def begin(y: Flat, box: Box) -> Progress:
         curvature=jnp.zeros_like(y),
         steps=none,
         accepted=none,
-        reason=Reason.where(zero == 0, Reason.running, Reason.running),
+        reason=either(zero == 0, Reason.running, Reason.running),
     )
 
 
@@ -133,12 +148,13 @@ def advance(progress: Progress, evaluated: Model, box: Box, rules: Rules) -> Pro
     hopeless = jnp.abs(progress.predicted) <= 4 * _EPSILON * progress.model.cost
     unclipped = _norm((progress.trial - progress.y) / scale) >= 0.5 * progress.reach
     tiny = small_step | (hopeless & unclipped & ~accept & finite)
-    # Refusals alone made this step tiny: the model is wrong (a false derivative, a kink), and nothing has converged.
-    forced = ~accept & (progress.damping > 1e-3 * largest)
-    reason = Reason.where(~first & tiny, Reason.where(small_step, Reason.step, Reason.rounding), Reason.running)
-    reason = Reason.where(~first & tiny & forced, Reason.stalled, reason)
-    reason = Reason.where(optimality(y, model, box) <= rules.gtol, Reason.gradient, reason)
-    reason = Reason.where(first & ~finite, Reason.nonfinite, reason)
+    # Refusals alone made this step tiny, far from any minimum: the model is wrong (a false derivative, a kink).
+    found = optimality(y, model, box)
+    forced = ~accept & (progress.damping > 1e-3 * largest) & (found > 1e-6)
+    reason = either(~first & tiny, either(small_step, Reason.step, Reason.rounding), Reason.running)
+    reason = either(~first & tiny & forced, Reason.stalled, reason)
+    reason = either(found <= rules.gtol, Reason.gradient, reason)
+    reason = either(first & ~finite, Reason.nonfinite, reason)
 
     trial, predicted, reach = propose(y, model, box, scale, damping)
     return Progress(
@@ -197,10 +213,10 @@ def propose(y: Flat, model: Model, box: Box, scale: Flat, damping: Number) -> tu
 def _improves(progress: Progress, evaluated: Model, box: Box) -> Bool[Array, "*lanes"]:
     actual = progress.model.cost - evaluated.cost
     decreases = actual > 1e-4 * progress.predicted
-    # Close to the solution the decrease drowns in the rounding of the cost; the gradient still tells up from down.
-    blurred = (progress.predicted < 1e4 * _EPSILON * progress.model.cost) & (
-        jnp.abs(actual) < 1e4 * _EPSILON * progress.model.cost
-    )
+    # Close to the solution the decrease drowns in the rounding of the cost; the gradient still tells up from down. (Tips at
+    # 1 m that differ by 10 um lose five digits, hence the wide margin.)
+    margin = 1e6 * _EPSILON * progress.model.cost
+    blurred = (progress.predicted < margin) & (jnp.abs(actual) < margin)
     nearer = optimality(progress.trial, evaluated, box) < optimality(progress.y, progress.model, box)
     return (progress.predicted > 0) & jnp.where(blurred, nearer, decreases)
 

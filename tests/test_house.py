@@ -11,7 +11,7 @@ FLOORS = (
     {"arrays", "storage"},
     {"chain", "arm", "parameters", "capture", "arm_files", "manifest", "capture_files", "simulate"},
     {"metrics", "steps", "residuals", "solver"},
-    {"covariance", "scale", "checks", "evaluate", "calibrate", "calibration_files"},
+    {"covariance", "scale", "checks", "evaluate", "calibrate", "batch", "calibration_files"},
     {"cautions", "summary", "figures", "demo"},
     {"cli"},
 )
