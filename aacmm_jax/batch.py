@@ -5,6 +5,7 @@ lane whose problem has ended writes its result and takes the next problem of the
 The number of lanes, not the chunk, fixes the arithmetic: results are the same to the bit whatever the chunk.
 """
 
+import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -32,7 +33,7 @@ from .steps import Box, Reason, advance, begin, choose, either, numbers_of, reas
 # Lanes per loop. On a CPU 32 lanes of 70 poses fit the second-level cache; a GPU wants thousands.
 _LANES = {"cpu": 32}
 _LANES_ELSEWHERE = 4096
-_CHUNK_IN_LANES = 64
+_ROUNDS = 64  # problems a lane of one chunk takes at most, one after the other
 
 
 class ManyIdentifications(eqx.Module):
@@ -119,7 +120,8 @@ def identify_many(
     check_enough(capture, len(space.names) - int(space.lengths.any()))
     devices = jax.local_devices() if devices is None else list(devices)
     lanes = lanes or _LANES.get(devices[0].platform, _LANES_ELSEWHERE)
-    chunk = chunk or _CHUNK_IN_LANES * lanes
+    workers = _workers(devices)
+    chunk = chunk or _chunk(size, lanes, workers)
     shape = _Shape(
         sizes=capture.sizes,
         ends=tuple((int(a), int(b)) for a, b in capture.ends()),
@@ -131,7 +133,7 @@ def identify_many(
         max_steps=max_steps,
     )
     work = _Work(problems, shape, size, min(chunk, -(-size // lanes) * lanes))
-    pieces = _spread(work.run, range(0, size, work.chunk), devices)
+    pieces = _spread(work.run, range(0, size, work.chunk), devices, workers)
     return _assemble(pieces, space, hold, bool(capture.lengths))
 
 
@@ -161,10 +163,20 @@ class _Work(NamedTuple):
         return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(rows)], solved)
 
 
-def _spread(run: Callable, firsts: Iterable[int], devices: Sequence[Any]) -> list:
-    """Chunks over devices and cores. XLA leaves the interpreter's lock while it computes, so threads are enough."""
+def _workers(devices: Sequence[Any]) -> int:
+    """Chunks in work at a time: one a device; on a CPU, one a core."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    workers = len(devices) if devices[0].platform != "cpu" else max(len(devices), cores)
+    return len(devices) if devices[0].platform != "cpu" else max(len(devices), cores)
+
+
+def _chunk(size: int, lanes: int, workers: int) -> int:
+    """Problems per call: enough calls to keep every worker busy, and few different sizes, since each is compiled once."""
+    rounds = max(size // (2 * workers * lanes), 1)
+    return lanes * min(2 ** int(math.log2(rounds)), _ROUNDS)
+
+
+def _spread(run: Callable, firsts: Iterable[int], devices: Sequence[Any], workers: int) -> list:
+    """Chunks over devices and cores. XLA leaves the interpreter's lock while it computes, so threads are enough."""
     with ThreadPoolExecutor(workers) as pool:
         futures = [pool.submit(run, first, devices[i % len(devices)]) for i, first in enumerate(firsts)]
         return [future.result() for future in futures]

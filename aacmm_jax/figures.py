@@ -45,12 +45,12 @@ def plot_distances(record: CalibrationRecord, axes: Any) -> Any:
         style = _STYLE[stage] | {"label": f"{label} (mean {distances.mean():.3g} mm)"}
         axes.plot(np.arange(1, len(distances) + 1), distances, linestyle="none", markersize=3.5, **style)
     for border in np.cumsum(record.recording.capture.sizes)[:-1]:
-        axes.axvline(border + 0.5, color="0.8", linewidth=0.8, zorder=0)
+        axes.axvline(border + 0.5, color="0.3", linewidth=0.8, linestyle="--", zorder=0)
     axes.set_yscale("log")
-    axes.set_xlabel("pose (lines separate sockets)" if len(record.recording.capture.sizes) > 1 else "pose")
+    axes.set_xlabel("pose (dashed lines separate sockets)" if len(record.recording.capture.sizes) > 1 else "pose")
     axes.set_ylabel("distance from the socket's centroid [mm]")
-    axes.grid(True, which="major", alpha=0.3)
-    axes.legend(frameon=False, loc="center right")
+    axes.grid(True, which="major", axis="y", alpha=0.3)
+    axes.legend(loc="center right", framealpha=1, edgecolor="none")
     return axes
 
 

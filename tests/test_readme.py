@@ -16,9 +16,11 @@ def blocks(language: str) -> list[str]:
 
 
 def test_python_runs(capsys):
-    (code,) = blocks("python")
-    exec(compile(code, "README.md", "exec"), {})
-    assert "Converged" in capsys.readouterr().out
+    """The blocks continue one another, so they run as one program."""
+    exec(compile("\n".join(blocks("python")), "README.md", "exec"), {})
+    printed = capsys.readouterr().out
+    assert "Converged" in printed
+    assert "\nTrue " in printed
 
 
 def test_arm_file_is_read(tmp_path):
