@@ -1,13 +1,14 @@
 # make demo   set up and run the demonstration
 # make test   set up and run the tests
 # make check  lint and types
+# make bench  identifications a second, against every contender that is installed
 # Everything is installed into .venv in this folder.
 
 PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
 BIN := .venv/bin
 
-.PHONY: demo test check clean
+.PHONY: demo test check bench clean
 
 demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
@@ -19,6 +20,9 @@ check: .venv/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+bench: .venv/.test
+	$(BIN)/python benchmarks/throughput.py
 
 .venv/bin/python:
 	@test -n "$(PYTHON)" || { echo "aacmm_jax needs Python 3.11 or later; install it, or name one with make PYTHON=..."; exit 1; }
