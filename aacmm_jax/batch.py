@@ -109,7 +109,7 @@ def identify_many(
     may the capture (see `stack_captures`).
 
     Work is spread over all devices and, on a CPU, all cores; memory is bounded by the ``chunk`` (problems per call of the
-    compiled program). Failure is data (``result``); a start outside its box is clipped to it. Raises `InputError` for
+    compiled program, rounded up to whole rounds of the ``lanes``). Failure is data (``result``); a start outside its box is clipped to it. Raises `InputError` for
     shapes that do not fit, a lower bound above its upper one, and too few poses.
     """
     if space is None:
@@ -121,7 +121,7 @@ def identify_many(
     devices = jax.local_devices() if devices is None else list(devices)
     lanes = lanes or _LANES.get(devices[0].platform, _LANES_ELSEWHERE)
     workers = _workers(devices)
-    chunk = chunk or _chunk(size, lanes, workers)
+    chunk = _chunk(size, lanes, workers) if chunk is None else -(-chunk // lanes) * lanes  # whole rounds of the lanes
     shape = _Shape(
         sizes=capture.sizes,
         ends=tuple((int(a), int(b)) for a, b in capture.ends()),
@@ -286,7 +286,7 @@ def _figures(part: _Problems, parameters: Float[Array, "w p"], shape: _Shape) ->
             measurement = Measurement(empty, turns_of(empty), value, uncertainty, shape.sizes, shape.ends)
             return scale_of(t, measurement, sigma).value
 
-        k = jax.vmap(scale)(tips, nominal, u, jax.vmap(lambda t: repeatability(t, shape.sizes).sigma)(tips))
+        k = jax.vmap(scale)(tips, nominal, u, figures.sigma)
     side = jnp.where(parameters <= part.lower, -1, jnp.where(parameters >= part.upper, 1, 0))
     return figures.de, figures.deltam, k, jnp.where(jnp.asarray(shape.kept)[None], side, 0)
 
@@ -314,6 +314,8 @@ def _problems(
         raise InputError(
             "nothing is a batch: give start, lower or upper as (batch, p), a batch of arms or of captures; or use identify."
         )
+    if sizes == {0}:
+        raise InputError("the batch is empty; give at least one problem.")
     if len(sizes) > 1:
         numbers = " and ".join(map(str, sorted(sizes)))
         raise InputError(f"batches of {numbers} problems do not fit together; give each the same number.")

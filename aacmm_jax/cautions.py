@@ -6,6 +6,7 @@ import numpy as np
 
 from .calibrate import active_names
 from .calibration_files import CalibrationRecord
+from .checks import value_of
 from .covariance import length_covariance
 from .manifest import Recording
 from .parameters import Parameters, is_length
@@ -133,18 +134,11 @@ def _identifiability(record: CalibrationRecord) -> list[str]:
             "hold some (--held), or record poses that tell them apart."
         )
     scaled = [
-        name
-        for name in record.held
-        if is_length(name) and name != "d_1" and _value(record.recording.nominal.arm, name) not in (0.0, None)
+        name for name in record.held if is_length(name) and name != "d_1" and value_of(record.recording.nominal.arm, name) != 0
     ]
     if scaled:
         found.append(f"The scale fix divides every length by k, held ones too: {_some(scaled)}.")
     return found
-
-
-def _value(arm, name: str) -> float:
-    space = Parameters(arm, (name,))
-    return float(space.vector()[0])
 
 
 def _sides(record: CalibrationRecord) -> list[str]:

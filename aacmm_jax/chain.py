@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-KINDS = ("alpha", "a", "d", "theta", "beta", "probe")
 Turns = tuple[Float[Array, "n ... 1 N"], Float[Array, "n ... 1 N"]]
 
 

@@ -38,7 +38,7 @@ def held_length(space: Parameters, arm: Arm, hold: str | None) -> str | None:
     if not scale_is_free(arm, space):
         return None
     links = [name for name in lengths if not name.startswith("probe")] or lengths
-    return max(links, key=lambda name: np.abs(_value(arm, name)).max())
+    return max(links, key=lambda name: np.abs(value_of(arm, name)).max())
 
 
 def scale_is_free(arm: Arm, space: Parameters) -> bool:
@@ -48,7 +48,7 @@ def scale_is_free(arm: Arm, space: Parameters) -> bool:
     held. It can where the held ones are zero, or redundant with free ones (d_7 with a probe along the same axis).
     """
     held = [n for n in parameter_names(arm) if n not in space.names and is_length(n) and n != "d_1"]
-    held = [name for name in held if np.any(_value(arm, name) != 0)]
+    held = [name for name in held if np.any(value_of(arm, name) != 0)]
     if not held:
         return True
     if arm.alpha.ndim > 1:
@@ -58,12 +58,13 @@ def scale_is_free(arm: Arm, space: Parameters) -> bool:
         columns = np.asarray(arm.jacobian(poses, [*space.names, *held]))
         scale = np.asarray(space.scale)
     columns = (columns - columns.mean(axis=0)).reshape(-1, columns.shape[-1])
-    free, stretch = columns[:, : -len(held)] * scale, columns[:, -len(held) :] @ np.array([_value(arm, n) for n in held])
+    free, stretch = columns[:, : -len(held)] * scale, columns[:, -len(held) :] @ np.array([value_of(arm, n) for n in held])
     left = stretch - free @ np.linalg.lstsq(free, stretch, rcond=1e-10)[0]
     return bool(np.linalg.norm(left) <= 1e-6 * np.linalg.norm(stretch))
 
 
-def _value(arm: Arm, name: str) -> np.ndarray:
+def value_of(arm: Arm, name: str) -> np.ndarray:
+    """Value of a named parameter of a concrete arm, mm or rad; with the arm's batch, if it has one."""
     # Read with NumPy: under jit even a constant arm's values become tracers once JAX computes with them.
     kind, i = locate(arm, name)
     return np.asarray(getattr(arm, kind))[..., i]

@@ -1,8 +1,9 @@
 """The steps of the bounded Levenberg-Marquardt: from one evaluated model to the next trial, for any number of lanes.
 
-Minimises 1/2 |f(y)|^2 subject to lower <= y <= upper. Levenberg-Marquardt with an active set. A parameter that sits on a bound while the gradient pushes it outwards is
-left out of the damped step; the step is clipped to the box and judged by what the linear model predicts for the *clipped*
-step (a clipped step can point uphill, and is then refused). f is never evaluated outside the box.
+Minimises 1/2 |f(y)|^2 subject to lower <= y <= upper, with an active set: a parameter that sits on a bound while the
+gradient pushes it outwards is left out of the damped step; the step is clipped to the box and judged by what the linear
+model predicts for the *clipped* step (a clipped step can point uphill, and is then refused). f is never evaluated outside
+the box.
 Sources: Marquardt 1963; More 1978 (scaling, tests); Nielsen 1999 (damping); Bertsekas 1982 (active set of a projection).
 """
 

@@ -43,13 +43,15 @@ def test_equals_single_identifications(paper_arm, noisy_capture, box, starts, ho
         scaled, alone = many.parameters[i] / many.k[i], np.asarray(single.parameters) / float(single.scale.value)
         np.testing.assert_allclose(scaled[lengths], alone[lengths], rtol=0, atol=1e-7)
         np.testing.assert_array_equal(many.active[i], single.active)
+        assert many.k[i] == pytest.approx(float(single.scale.value), rel=1e-10)
 
 
 def test_the_chunk_changes_no_bit(paper_arm, noisy_capture, box, starts):
     whole = aj.identify_many(paper_arm, noisy_capture, *box, starts, lanes=8)
-    parts = aj.identify_many(paper_arm, noisy_capture, *box, starts, lanes=8, chunk=24)
-    for field in ("parameters", "de", "deltam", "k", "steps", "active"):
-        np.testing.assert_array_equal(getattr(whole, field), getattr(parts, field))
+    for chunk in (20, 24):  # 20 is no multiple of the lanes, and neither divides the batch
+        parts = aj.identify_many(paper_arm, noisy_capture, *box, starts, lanes=8, chunk=chunk)
+        for field in ("parameters", "de", "deltam", "k", "steps", "active"):
+            np.testing.assert_array_equal(getattr(whole, field), getattr(parts, field))
 
 
 def test_batches_of_arms_and_captures(paper_arm):
@@ -86,6 +88,7 @@ def test_failure_is_data(paper_arm, noisy_capture, box, starts):
     [
         ({"start": np.zeros((5, 20))}, r"start has shape \(5, 20\); give \(21,\) or \(batch, 21\)"),
         ({"start": None}, "nothing is a batch"),
+        ({"start": np.zeros((0, 21))}, "the batch is empty"),
         ({"lower": np.full((BATCH + 1, 21), -1e9)}, "batches of 50 and 51 problems do not fit together"),
         ({"upper": np.full(21, -1e9)}, "lower bound of alpha_1 is above its upper bound"),
     ],
