@@ -1,13 +1,11 @@
 """Calibration of articulated-arm coordinate measuring machines and other serial arms, differentiable throughout."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from . import _float64 as _float64  # isort: skip - must come before anything that makes an array
 from .arm import Arm as Arm
 from .arm import parameter_names as parameter_names
-from .arm_files import ArmSpecification as ArmSpecification
-from .arm_files import load_arm as load_arm
-from .arm_files import load_specification as load_specification
-from .arm_files import save_arm as save_arm
-from .arm_files import shipped_arms as shipped_arms
 from .batch import ManyIdentifications as ManyIdentifications
 from .batch import identify_many as identify_many
 from .batch import stack_captures as stack_captures
@@ -27,12 +25,12 @@ from .capture_files import save_capture as save_capture
 from .errors import InputError as InputError
 from .evaluate import Evaluation as Evaluation
 from .evaluate import evaluate as evaluate
-from .manifest import Recording as Recording
-from .manifest import read_manifest as read_manifest
 from .metrics import Repeatability as Repeatability
 from .metrics import repeatability as repeatability
 from .parameters import Bounds as Bounds
 from .parameters import Parameters as Parameters
+from .recording import ArmSpecification as ArmSpecification
+from .recording import Recording as Recording
 from .scale import Scale as Scale
 from .scale import fix_scale as fix_scale
 from .scale import scale_from_lengths as scale_from_lengths
@@ -41,3 +39,29 @@ from .simulate import simulate as simulate
 from .solver import BoundedLevenbergMarquardt as BoundedLevenbergMarquardt
 from .solver import least_squares as least_squares
 from .steps import Reason as Reason
+
+if TYPE_CHECKING:
+    from .arm_files import load_arm as load_arm
+    from .arm_files import load_specification as load_specification
+    from .arm_files import save_arm as save_arm
+    from .arm_files import shipped_arms as shipped_arms
+    from .manifest import read_manifest as read_manifest
+
+# Imported when first asked for: these need pydantic, which takes a tenth of the package's own import.
+_LATER = {
+    "load_arm": "arm_files",
+    "load_specification": "arm_files",
+    "save_arm": "arm_files",
+    "shipped_arms": "arm_files",
+    "read_manifest": "manifest",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    return getattr(import_module(f".{_LATER[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_LATER])

@@ -2,19 +2,17 @@
 
 import math
 import os
-from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from types import MappingProxyType
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
 
 from . import storage
-from .arm import Arm, is_single
+from .arm import Arm
 from .errors import InputError, nearest
-from .parameters import Bounds, Parameters
+from .recording import ArmSpecification, single
 
 _LENGTH_UNITS = {"mm": 1.0, "m": 1000.0}
 _ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180}
@@ -63,22 +61,6 @@ class _ArmModel(_Strict):
         if self.convention == "craig" and any(joint.beta for joint in self.joint):
             raise ValueError("beta is Hayati's angle of the standard form; leave it out of a craig table.")
         return self
-
-
-class ArmSpecification(NamedTuple):
-    """An arm as a file states it: the arm, its name, and how its maker would have it identified (mm, rad)."""
-
-    arm: Arm
-    name: str = ""
-    held: tuple[str, ...] | None = None  # None: the default of `Parameters.free_of`
-    length: float = 10.0  # half-width of the bounds of lengths
-    angle: float = 0.0175  # and of angles
-    override: Mapping[str, float] = MappingProxyType({})  # half-widths by parameter name
-
-    def bounds(self) -> Bounds:
-        """The box that the file proposes."""
-        space = Parameters.free_of(self.arm, held=self.held)
-        return Bounds.around(self.arm, space, length=self.length, angle=self.angle, override=self.override)
 
 
 def shipped_arms() -> tuple[str, ...]:
@@ -140,13 +122,6 @@ def _specification(path: Path) -> ArmSpecification:
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return specification
-
-
-def single(arm: Arm) -> Arm:
-    """The same arm, or `InputError` for a batch of arms: a file holds one."""
-    if not is_single(arm):
-        raise InputError("a file holds one arm, but this is a batch; take one of it first.")
-    return arm
 
 
 def save_arm(arm: Arm, path: str | os.PathLike, *, name: str = "", source: str = "") -> None:

@@ -35,6 +35,17 @@ def as_array(value: Numbers, what: str) -> Array:
     return jnp.asarray(array, dtype=jnp.float64)
 
 
+def joined(rows: Sequence[Array | np.ndarray], axis: int = 0, new: bool = False) -> Array:
+    """Arrays concatenated along an axis, or stacked along a new one; by NumPy where values are known.
+
+    At the edges a call of NumPy costs microseconds, and one of JAX outside jit a compiled kernel: 5 to 30 ms in every process.
+    """
+    known = is_concrete(*rows)
+    tools: Any = np if known else jnp
+    whole = (tools.stack if new else tools.concatenate)(rows, axis=axis)
+    return jax.device_put(whole) if known else whole
+
+
 def as_floats(value: Numbers, what: str) -> Array:
     """A finite float64 array, or `InputError` that names ``what``."""
     array = as_array(value, what)

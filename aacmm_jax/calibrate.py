@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from . import covariance
 from .arm import Arm
-from .arrays import Numbers, as_array
+from .arrays import Numbers, as_array, is_concrete
 from .capture import Capture
 from .checks import based_on, check_enough, check_fit, check_start, held_length
 from .errors import InputError
@@ -23,13 +23,14 @@ from .residuals import (
     repeatability_model,
     repeatability_residual,
 )
-from .scale import Scale, divide_lengths, scale_derivative, scale_of
+from .scale import Scale, divide_lengths, scale_and_shares
 from .solver import BoundedLevenbergMarquardt, least_squares
-from .steps import Reason
+from .steps import Reason, numbers_of
 
 # The boxes of this problem are small against its curvature, so the first steps can be nearly Gauss-Newton's.
 SOLVER = BoundedLevenbergMarquardt(initial_damping=1e-6)
 _MAX_STEPS = 300
+_GOOD = [int(reason._value) for reason in (Reason.gradient, Reason.step, Reason.rounding)]  # pyright: ignore
 
 
 class Identification(eqx.Module):
@@ -62,7 +63,7 @@ class Identification(eqx.Module):
         return self.bounds.space
 
     @property
-    def converged(self) -> Array:
+    def converged(self) -> Bool[Array | np.ndarray, "*lanes"]:
         """Whether the solve ended at a minimum."""
         return converged(self.result)
 
@@ -102,18 +103,21 @@ class Calibration(eqx.Module):
         return self.stage1.bounds
 
     @property
-    def converged(self) -> Array:
+    def converged(self) -> Bool[Array | np.ndarray, "*lanes"]:
         """Whether every solve ended at a minimum."""
-        return self.stage1.converged & converged(self.result)
+        both = self.stage1.converged & converged(self.result)
+        return np.asarray(both) if is_concrete(both) else both
 
     def active_names(self) -> dict[str, str]:
         """Parameters on a bound: name -> 'lower' or 'upper'."""
         return active_names(self.space, self.active)
 
 
-def converged(result: Reason) -> Array:
+def converged(result: Reason) -> Bool[Array | np.ndarray, "*lanes"]:
     """Whether a reason means that a minimum was reached."""
-    return (result == Reason.gradient) | (result == Reason.step) | (result == Reason.rounding)
+    number = numbers_of(result)
+    good = np.array(_GOOD, dtype=number.dtype)
+    return np.asarray(np.isin(np.asarray(number), good)) if is_concrete(number) else jnp.isin(number, good)
 
 
 def active_names(space: Parameters, active: Numbers) -> dict[str, str]:
@@ -141,14 +145,19 @@ def identify(
     leave open, such as the scale of noise-free data with nothing held). Failure to converge is
     data (``result``). Raises `InputError` for too few poses, a start outside the box, or names that do not fit.
     """
+    return _identify(*_checked(arm, capture, bounds, start), held_length(bounds.space, arm, hold), max_steps)
+
+
+def _checked(
+    arm: Arm, capture: Capture, bounds: Bounds, start: Numbers | None
+) -> tuple[Parameters, Measurement, Bounds, Float[Array, " p"]]:
     space = bounds.space
     vector = space.vector(arm) if start is None else as_array(start, "the start")
-    hold = held_length(space, arm, hold)
     check_fit(capture, space)
     check_start(bounds, vector, "the start" if start is not None else "the arm")
     # Repeatability does not see the scale: where lengths are free, it determines one parameter less.
     check_enough(capture, len(space.names) - int(space.lengths.any()))
-    return _identify(based_on(space, arm), Measurement.of(capture), bounds, vector, hold, max_steps)
+    return based_on(space, arm), Measurement.of(capture), bounds, vector
 
 
 def calibrate(
@@ -173,10 +182,7 @@ def calibrate(
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, from Python, identify for stage 1 alone)."
         )
-    stage1 = identify(arm, capture, bounds, hold=hold, start=start, max_steps=max_steps)
-    measurement = Measurement.of(capture)
-    space = based_on(bounds.space, arm)
-    return _finish(space.base if start is None else space.arm(start), measurement, stage1, method, max_steps)
+    return _calibrate(*_checked(arm, capture, bounds, start), held_length(bounds.space, arm, hold), method, max_steps)
 
 
 @eqx.filter_jit
@@ -228,17 +234,20 @@ def _scale(
     tips: Array, measurement: Measurement, space: Parameters, parameters: Array, spread: covariance.Covariance, sigma: Array
 ) -> Scale:
     """k with an uncertainty that holds that of the identified parameters too."""
-    scale = scale_of(tips, measurement, sigma)
-    rows = measured_lengths(parameters, space, measurement)[1]
-    by_parameters, variance = scale_derivative(tips, measurement, sigma, rows)
-    u = jnp.sqrt(by_parameters @ spread.matrix @ by_parameters + variance)
+    scale, by_lengths = scale_and_shares(tips, measurement, sigma)
+    by_parameters = by_lengths @ measured_lengths(parameters, space, measurement)[1]
+    u = jnp.sqrt(by_parameters @ spread.matrix @ by_parameters + scale.u**2)
     return eqx.tree_at(lambda s: s.u, scale, u)
 
 
 @eqx.filter_jit
-def _finish(arm: Arm, measurement: Measurement, stage1: Identification, method: str, max_steps: int) -> Calibration:
+def _calibrate(
+    space: Parameters, measurement: Measurement, bounds: Bounds, start: Array, hold: str | None, method: str, max_steps: int
+) -> Calibration:
+    stage1 = _identify(space, measurement, bounds, start, hold, max_steps)
     assert stage1.scale is not None
-    space, k = stage1.space, stage1.scale.value
+    arm, k = space.arm(start), stage1.scale.value
+    space = stage1.space
     if method == "joint":
         calibrated, parameters, active, steps, result, spread = _joint(arm, measurement, stage1, max_steps)
     else:
@@ -272,10 +281,10 @@ def _divided(measurement: Measurement, stage1: Identification, parameters: Array
     assert stage1.scale is not None
     tips = stage1.arm.position(measurement.q)
     space = Parameters(stage1.arm, stage1.space.names)
-    rows = measured_lengths(stage1.parameters, space, measurement)[1]
-    by_parameters, variance = scale_derivative(tips, measurement, stage1.after.sigma, rows)
+    scale, by_lengths = scale_and_shares(tips, measurement, stage1.after.sigma)
+    by_parameters = by_lengths @ measured_lengths(stage1.parameters, space, measurement)[1]
     before = covariance.Covariance(stage1.covariance, stage1.determined)
-    return covariance.after_division(before, by_parameters, variance, space, parameters, stage1.scale.value)
+    return covariance.after_division(before, by_parameters, scale.u**2, space, parameters, scale.value)
 
 
 def _joint(

@@ -6,12 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from . import storage
-from .arm_files import ArmSpecification
 from .calibrate import Calibration
 from .capture_files import arm_table, recording_of, recording_tables, specification_of
 from .evaluate import Evaluation, evaluate
-from .manifest import Recording
 from .parameters import Parameters, is_length
+from .recording import ArmSpecification, Recording
 from .steps import Reason
 from .storage import Table, Variable
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .arrays import Numbers, as_array, is_concrete
+from .arrays import Numbers, as_array, is_concrete, joined
 from .errors import InputError, nearest
 
 # Encoders of arms with unlimited joints count a few turns at most; readings beyond this are degrees taken for radians.
@@ -70,7 +70,7 @@ class Capture(eqx.Module):
                     f"socket '{name}' has {block.shape[1]} columns, but socket '{first}' has {width}; give one column a joint."
                 )
         _check_different(blocks)
-        self.q = jnp.concatenate(list(blocks.values()), axis=0)
+        self.q = joined(list(blocks.values()))
         self.names = tuple(blocks)
         self.sizes = tuple(block.shape[0] for block in blocks.values())
         self.lengths = tuple(lengths)
@@ -88,10 +88,11 @@ class Capture(eqx.Module):
         return self.q.shape[-1]
 
     @property
-    def sockets(self) -> dict[str, Float[Array, "m n"]]:
+    def sockets(self) -> dict[str, Float[Array | np.ndarray, "m n"]]:
         """Joint angles by socket, rad."""
+        q = np.asarray(self.q) if is_concrete(self.q) else self.q
         ends = np.cumsum(self.sizes)
-        return {name: self.q[end - size : end] for name, size, end in zip(self.names, self.sizes, ends, strict=True)}
+        return {name: q[end - size : end] for name, size, end in zip(self.names, self.sizes, ends, strict=True)}
 
     @property
     def owner(self) -> Int[np.ndarray, " N"]:
@@ -127,7 +128,7 @@ def _matching(names: Sequence[str], patterns: Iterable[str]) -> list[str]:
     return [name for name in names if name in chosen]
 
 
-def _checked_angles(name: str, angles: Numbers) -> Array:
+def _checked_angles(name: str, angles: Numbers) -> Array | np.ndarray:
     if not is_concrete(angles):
         array = jnp.asarray(angles, dtype=jnp.float64)
     else:
@@ -141,10 +142,10 @@ def _checked_angles(name: str, angles: Numbers) -> Array:
         )
     if is_concrete(array):
         _check_values(name, np.asarray(array))
-    return jnp.asarray(array)
+    return array
 
 
-def _check_different(blocks: Mapping[str, Array]) -> None:
+def _check_different(blocks: Mapping[str, Array | np.ndarray]) -> None:
     """Two sockets with the very same poses are one file given twice."""
     seen: dict[bytes, str] = {}
     for name, block in blocks.items():

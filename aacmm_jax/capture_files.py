@@ -8,10 +8,9 @@ import numpy as np
 
 from . import storage
 from .arm import Arm
-from .arm_files import ArmSpecification, single
 from .capture import Capture, ReferenceLength
 from .errors import InputError
-from .manifest import Recording
+from .recording import ArmSpecification, Recording, single
 from .storage import Table, Variable
 
 _KINDS = {"alpha": "link twist", "a": "link length", "d": "link offset", "theta": "joint zero offset", "beta": "Hayati's angle"}

@@ -7,10 +7,8 @@ import numpy as np
 from .calibrate import active_names
 from .calibration_files import CalibrationRecord
 from .checks import value_of
-from .covariance import length_covariance
-from .manifest import Recording
 from .parameters import Parameters, is_length
-from .residuals import Measurement
+from .recording import Recording
 
 _SUSPICIOUS_SCALE = 0.005  # a held link is not off by more than this; its nominal value or a reference length is wrong
 _PLAUSIBLE_SCALE = (0.5, 2.0)
@@ -80,10 +78,8 @@ def _bounds(record: CalibrationRecord) -> list[str]:
 
 def _data(record: CalibrationRecord) -> list[str]:
     capture = record.recording.capture
-    measurement = Measurement.of(capture)
-    tips = record.calibrated.arm.position(measurement.q)
-    spread = np.linalg.norm(np.asarray(measurement.centred(tips)), axis=1)
-    owner = np.repeat(np.arange(len(capture.sizes)), capture.sizes)
+    evaluation = record.evaluations()["calibrated"]
+    spread, owner = np.asarray(evaluation.distances), capture.owner
     first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
     found = []
     typical = float(np.median(spread))
@@ -92,11 +88,8 @@ def _data(record: CalibrationRecord) -> list[str]:
         worst = sorted(far, key=lambda i: -spread[i])
         names = [f"{capture.names[owner[i]]} pose {i - first[owner[i]] + 1} ({spread[i]:.3g} mm)" for i in worst]
         found.append(f"Poses far from their socket, where {typical:.2g} mm is typical: {_some(names)}; was the tip seated?")
-    evaluation = record.evaluations()["calibrated"]
-    centroids = evaluation.repeatability.centroids
-    variance = np.diag(np.asarray(length_covariance(centroids, measurement, evaluation.repeatability.sigma)))
     error = np.asarray(evaluation.error)
-    normalised = np.abs(error) / np.sqrt(variance + 1e-18)
+    normalised = np.abs(error) / np.hypot(np.asarray(evaluation.u), 1e-9)
     wrong = [
         f"{length.start} - {length.end} ({error[i]:+.3g} mm, {normalised[i]:.0f} times its uncertainty)"
         for i, length in enumerate(capture.lengths)

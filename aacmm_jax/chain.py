@@ -11,11 +11,14 @@ the chain.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from .arrays import is_concrete
 
 Turns = tuple[Float[Array, "n ... 1 N"], Float[Array, "n ... 1 N"]]
 
@@ -43,19 +46,25 @@ class Walked(NamedTuple):
     origin: Float[Array, "n ... 3 N"]
 
 
-def _rows(values: Float[Array, "... n"], rank: int) -> Float[Array, "n ... 1 N"]:
-    """Last axis first, the batch filled up with ones to ``rank`` axes, and an axis for components before the last."""
-    moved = jnp.moveaxis(values, -1, 0)
-    filled = moved.reshape(moved.shape[:1] + (1,) * (rank - moved.ndim + 1) + moved.shape[1:])
-    return jnp.expand_dims(filled, -2)
+def _rows(values: Any, rank: int) -> Any:
+    """``(..., n) -> (n, ..., 1, N)``: last axis first, the batch filled up with ones to ``rank`` axes, and an axis for
+    components before the last. Takes arrays of NumPy and of JAX.
+    """
+    moved = values.transpose(values.ndim - 1, *range(values.ndim - 1))
+    batch = (1,) * (rank - moved.ndim + 1) + moved.shape[1:]
+    return moved.reshape(*moved.shape[:1], *batch[:-1], 1, *batch[-1:])
 
 
 def turns_of(q: Float[Array, "... n"]) -> Turns:
     """Cosines and sines of joint angles, as `walk` takes them: computed once for many arms, they save half of its time."""
+    if is_concrete(q):  # at the edges, where NumPy saves compiling four kernels
+        rows = _rows(np.asarray(q), max(q.ndim - 1, 1))
+        return jax.device_put((np.cos(rows), np.sin(rows)))
     rows = _rows(q, max(q.ndim - 1, 1))
     return jnp.cos(rows), jnp.sin(rows)
 
 
+@jax.jit
 def walk(geometry: Geometry, turns: Turns) -> Walked:
     """Walk the chain from base to flange: T_i = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)].
 
@@ -120,6 +129,7 @@ def columns_of(walked: Walked) -> dict[str, Float[Array, "k ... 3 N"]]:
     return columns
 
 
+@partial(jax.jit, static_argnames=("entries",))
 def stacked_columns(walked: Walked, entries: tuple[tuple[str, int], ...]) -> Float[Array, "... p 3 N"]:
     """The Jacobian columns of named entries (kind and 0-based index; ``q`` counts as ``theta``), in their order."""
     columns = columns_of(walked)

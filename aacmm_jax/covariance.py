@@ -34,12 +34,9 @@ def length_covariance(
     Each length's own u, and the scatter of the poses over their number at each end. Lengths that share a socket share its
     scatter, so they are correlated.
     """
-    start, end = measurement.end_indices()
-    between = centroids[end] - centroids[start]
+    between = measurement.differences @ centroids
     direction = between / jnp.linalg.norm(between, axis=-1, keepdims=True)
-    sockets = np.eye(len(measurement.sizes))
-    sign = jnp.asarray(sockets[end] - sockets[start])
-    pull = sign[:, :, None] * direction[:, None, :]  # how a length follows each socket's centroid
+    pull = measurement.differences[:, :, None] * direction[:, None, :]  # how a length follows each socket's centroid
     share = jnp.asarray(1 / np.asarray(measurement.sizes, dtype=float))
     scatter = jnp.einsum("lsc,s,ksc->lk", pull, share, pull)
     # The floor (1e-12 mm) only keeps a noise-free simulation's weights finite.

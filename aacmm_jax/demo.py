@@ -13,7 +13,7 @@ from .capture import Capture
 from .capture_files import save_capture
 from .errors import InputError
 from .evaluate import evaluate
-from .manifest import Recording
+from .recording import Recording
 from .simulate import deviated, simulate
 from .summary import calibration_summary
 

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from .arm import Arm
 from .capture import Capture
+from .covariance import length_covariance
 from .errors import InputError
 from .metrics import Repeatability, repeatability
 from .residuals import Measurement
@@ -17,6 +18,8 @@ class Evaluation(eqx.Module):
     repeatability: Repeatability
     measured: Float[Array, " l"]  # reference lengths as the arm measures them
     error: Float[Array, " l"]  # measured - calibrated value
+    u: Float[Array, " l"]  # of error: the length's own u, and the scatter of the poses at its ends; NaN where unknown
+    distances: Float[Array, " N"]  # of every pose's tip from its socket's centroid
 
 
 def evaluate(arm: Arm, capture: Capture) -> Evaluation:
@@ -32,5 +35,10 @@ def evaluate(arm: Arm, capture: Capture) -> Evaluation:
 def evaluate_measurement(arm: Arm, measurement: Measurement) -> Evaluation:
     """`evaluate` for a capture already in the form that residuals take; nothing is checked."""
     tips = arm.position(measurement.q)
-    measured = measurement.distances(tips) if measurement.ends else jnp.zeros(0)
-    return Evaluation(repeatability(tips, measurement.sizes), measured, measured - measurement.nominal)
+    figures = repeatability(tips, measurement.sizes)
+    measured = u = jnp.zeros(0)
+    if measurement.ends:
+        measured = measurement.distances(tips)
+        u = jnp.sqrt(jnp.diagonal(length_covariance(figures.centroids, measurement, figures.sigma)))
+    distances = jnp.linalg.norm(measurement.centred(tips), axis=-1)
+    return Evaluation(figures, measured, measured - measurement.nominal, u, distances)

@@ -6,15 +6,16 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from . import storage
-from .arm_files import ArmSpecification, load_specification
+from .arm_files import load_specification
 from .capture import Capture, ReferenceLength
 from .errors import InputError
+from .recording import Recording
 
 _UNITS = {"rad": 1.0, "deg": math.pi / 180, "arcsec": math.pi / (180 * 3600)}
 _FIELD = re.compile(r"\{(\w+)\}")
@@ -68,15 +69,6 @@ class _Manifest(_Strict):
     angles: _Angles
     socket: Annotated[list[_Socket], Field(min_length=1)]
     length: list[_Length] = []
-
-
-class Recording(NamedTuple):
-    """A capture with the nominal arm that recorded it and, for a simulation, the true one."""
-
-    capture: Capture
-    nominal: ArmSpecification
-    true: ArmSpecification | None = None
-    seed: int | None = None
 
 
 def read_manifest(path: str | os.PathLike) -> Recording:

@@ -1,14 +1,18 @@
 """Which numbers of an arm are free, and within what bounds."""
 
 from collections.abc import Iterable, Mapping
+from functools import partial
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .arm import LENGTHS, Arm, locate, parameter_names, replace
-from .arrays import Numbers, as_array, is_concrete
+from .arrays import Numbers, as_array, is_concrete, joined
+from .chain import Geometry
 from .errors import InputError
 
 # Steps of about 1 mm and 1 mrad are comparable at the tip of an arm of about 1 m.
@@ -85,10 +89,11 @@ class Parameters(eqx.Module):
     def vector(self, arm: Arm | None = None) -> Float[Array, "... p"]:
         """The free parameters of an arm (by default the base arm) as ``(..., p)``, mm and rad."""
         arm = self.base if arm is None else arm
-        zero = jnp.zeros_like(arm.alpha)
-        values = {kind: getattr(arm, kind) for kind in ("alpha", "a", "d", "theta", "probe")}
-        values["beta"] = zero if arm.beta is None else arm.beta
-        return jnp.stack(jnp.broadcast_arrays(*(values[kind][..., i] for kind, i in self.entries())), axis=-1)
+        known = is_concrete(*arm.geometry)
+        tools: Any = np if known else jnp  # see `joined`
+        values = {kind: tools.asarray(getattr(arm, kind)) for kind in ("alpha", "a", "d", "theta", "probe")}
+        values["beta"] = tools.zeros_like(values["alpha"]) if arm.beta is None else tools.asarray(arm.beta)
+        return joined(tools.broadcast_arrays(*(values[kind][..., i] for kind, i in self.entries())), axis=-1, new=True)
 
     def arm(self, vector: Numbers) -> Arm:
         """The base arm with its free parameters taken from ``(p,)``. Use ``vmap`` for a batch of vectors."""
@@ -97,16 +102,27 @@ class Parameters(eqx.Module):
             raise InputError(
                 f"vector has shape {vector.shape}, but {len(self.names)} parameters are free; give one value each."
             )
-        kinds: dict[str, tuple[list[int], list[int]]] = {}
-        for position, (kind, i) in enumerate(self.entries()):
-            targets, sources = kinds.setdefault(kind, ([], []))
-            targets.append(i)
-            sources.append(position)
-        changes = {
-            kind: getattr(self.base, kind).at[..., jnp.array(targets)].set(vector[..., jnp.array(sources)])
-            for kind, (targets, sources) in kinds.items()
-        }
+        changes = placed(self.base.geometry, vector, self.entries())
         return replace(self.base, **changes)
+
+
+@partial(jax.jit, static_argnames=("entries",))
+def placed(
+    geometry: Geometry, vector: Float[Array, "... p"], entries: tuple[tuple[str, int], ...]
+) -> dict[str, Float[Array, "... n"]]:
+    """The kinds of parameters that ``vector`` holds some of, kind -> array, with its values put in their places."""
+    found = {}
+    for kind in dict.fromkeys(kind for kind, _ in entries):
+        held = getattr(geometry, kind)
+        sources = np.arange(held.shape[-1])
+        for position, (other, i) in enumerate(entries):
+            if other == kind:
+                sources[i] = held.shape[-1] + position
+        batch = np.broadcast_shapes(held.shape[:-1], vector.shape[:-1])
+        both = [jnp.broadcast_to(values, (*batch, values.shape[-1])) for values in (held, vector)]
+        # One gather from known positions: a third as many operations to trace and compile as a scatter.
+        found[kind] = jnp.concatenate(both, axis=-1).at[..., sources].get(mode="promise_in_bounds")
+    return found
 
 
 def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
@@ -167,6 +183,7 @@ class Bounds(eqx.Module):
             i = int(np.argmin(widths >= 0))
             raise InputError(f"half-width of {space.names[i]} is {widths[i]:g}; give zero or a positive number.")
         centre = space.vector(arm)
+        centre = np.asarray(centre) if is_concrete(centre) else centre
         return cls(space, centre - widths, centre + widths)
 
     def active(self, vector: Float[Array, "... p"]) -> "Array":

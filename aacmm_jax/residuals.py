@@ -3,8 +3,9 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
+from .arrays import joined
 from .capture import Capture
 from .chain import Geometry, Turns, stacked_columns, turns_of, walk
 from .parameters import Parameters
@@ -31,8 +32,10 @@ class Measurement(eqx.Module):
         return cls(
             q=capture.q,
             turns=turns_of(capture.q),
-            nominal=jnp.stack([length.value for length in capture.lengths]) if capture.lengths else jnp.zeros(0),
-            u=jnp.stack([length.u for length in capture.lengths]) if capture.lengths else jnp.zeros(0),
+            nominal=joined([length.value for length in capture.lengths], new=True)
+            if capture.lengths
+            else jnp.array(np.zeros(0)),
+            u=joined([length.u for length in capture.lengths], new=True) if capture.lengths else jnp.array(np.zeros(0)),
             sizes=capture.sizes,
             ends=tuple((int(start), int(end)) for start, end in capture.ends()),
         )
@@ -54,14 +57,14 @@ class Measurement(eqx.Module):
 
     def distances(self, tips: Float[Array, "N 3"]) -> Float[Array, " l"]:
         """Measured reference lengths: distances between the centroids of their end sockets, mm."""
-        start, end = self.end_indices()
-        centroids = self.centroids(tips)
-        return jnp.linalg.norm(centroids[end] - centroids[start], axis=-1)
+        return jnp.linalg.norm(self.differences @ self.centroids(tips), axis=-1)
 
-    def end_indices(self) -> tuple[Int[np.ndarray, " l"], Int[np.ndarray, " l"]]:
-        """Socket indices of the lengths' starts, and of their ends."""
+    @property
+    def differences(self) -> Float[Array, "l s"]:
+        """Matrix that takes socket centroids to the vectors between the ends of the lengths."""
         ends = np.asarray(self.ends, dtype=int).reshape(-1, 2)
-        return ends[:, 0], ends[:, 1]
+        sockets = np.eye(len(self.sizes))
+        return jnp.asarray(sockets[ends[:, 1]] - sockets[ends[:, 0]])
 
 
 def averaging_matrix(sizes: tuple[int, ...]) -> Float[np.ndarray, "s N"]:
@@ -117,13 +120,10 @@ def measured_lengths(
 ) -> tuple[Float[Array, " l"], Float[Array, "l p"]]:
     """Measured reference lengths, mm, and their analytic Jacobian by the free parameters."""
     walked = walk(space.arm(vector).geometry, measurement.turns)
-    averaging = jnp.asarray(measurement.averaging.T)
-    centroids, means = walked.tip @ averaging, stacked_columns(walked, space.entries()) @ averaging
-    start, end = measurement.end_indices()
-    between = centroids[:, end] - centroids[:, start]
-    distance = jnp.linalg.norm(between, axis=0)
-    direction = between / distance[None]
-    return distance, jnp.einsum("cl,pcl->lp", direction, means[:, :, end] - means[:, :, start])
+    between = (measurement.differences @ measurement.averaging).T
+    vectors, derivatives = walked.tip @ between, stacked_columns(walked, space.entries()) @ between
+    distance = jnp.linalg.norm(vectors, axis=0)
+    return distance, jnp.einsum("cl,pcl->lp", vectors / distance[None], derivatives)
 
 
 def model_of(geometry: Geometry, turns: Turns, sizes: tuple[int, ...], entries: tuple[tuple[str, int], ...]) -> Model:

@@ -69,22 +69,15 @@ def _fixed(arm: Arm, measurement: Measurement, sigma: float | Array | None) -> S
 
 def scale_of(tips: Float[Array, "N 3"], measurement: Measurement, sigma: Float[Array, ""]) -> Scale:
     """k from tips, given the standard deviation of a tip coordinate (NaN where unknown)."""
-    return Scale(*_estimate(tips, measurement, sigma)[:2], measurement.distances(tips), measurement.nominal)
+    return scale_and_shares(tips, measurement, sigma)[0]
 
 
-def scale_derivative(
-    tips: Float[Array, "N 3"], measurement: Measurement, sigma: Float[Array, ""], rows: Float[Array, "l p"]
-) -> tuple[Float[Array, " p"], Float[Array, ""]]:
-    """Derivative of k by the parameters, given that of the lengths, and the variance that the lengths themselves add."""
-    _, u, shares = _estimate(tips, measurement, sigma)
-    return (shares / measurement.nominal) @ rows, u**2
-
-
-def _estimate(
+def scale_and_shares(
     tips: Float[Array, "N 3"], measurement: Measurement, sigma: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, " l"]]:
-    """k, its standard uncertainty, and the share of each length in it."""
-    ratio = measurement.distances(tips) / measurement.nominal
+) -> tuple[Scale, Float[Array, " l"]]:
+    """k from tips, and its derivative by each measured length, 1/mm."""
+    measured = measurement.distances(tips)
+    ratio = measured / measurement.nominal
     known = jnp.where(jnp.isnan(sigma), 0.0, sigma)
     centroids = measurement.centroids(tips)
     plain = jnp.diagonal(length_covariance(centroids, measurement, known, ratio))
@@ -94,7 +87,7 @@ def _estimate(
     relative = share / measurement.nominal
     predicted = relative @ length_covariance(centroids, measurement, sigma, value) @ relative
     observed = jnp.sum(share * (ratio - value) ** 2) / max(ratio.shape[0] - 1, 1)
-    return value, jnp.sqrt(jnp.maximum(predicted, observed)), share
+    return Scale(value, jnp.sqrt(jnp.maximum(predicted, observed)), measured, measurement.nominal), relative
 
 
 def scale_from_lengths(measured: Numbers, nominal: Numbers, u: float = 0.0) -> Scale:

@@ -16,7 +16,7 @@ from optimistix.internal import implicit_jvp
 
 from .arrays import is_concrete
 from .errors import InputError
-from .steps import Box, Flat, Model, Progress, Reason, Rules, advance, begin, either, optimality
+from .steps import Box, Flat, Model, Progress, Reason, Rules, advance, begin, either
 
 
 def flat_box(y: PyTree[Array], lower: PyTree, upper: PyTree, scale: PyTree) -> Box:
@@ -76,7 +76,6 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return state.reason != Reason.running, failed
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        box = _box(y, options)
         # Optimistix itself stops, before any step, where y is not finite.
         unfinished = either(result == optx.RESULTS.nonfinite, Reason.nonfinite, Reason.max_steps)
         stats = {
@@ -84,7 +83,7 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             "num_accepted_steps": state.accepted,
             "cost": state.model.cost,
             "gradient": state.model.gradient,
-            "optimality": optimality(state.y, state.model, box),
+            "optimality": state.optimality,
         }
         return y, aux, stats
 

@@ -81,6 +81,7 @@ class Progress(eqx.Module):
 
     y: Flat  # accepted
     model: Model  # at y
+    optimality: Number  # at y; see `optimality`
     trial: Flat  # where the next evaluation happens
     predicted: Number  # decrease of the cost that the model promises for the trial
     reach: Number  # scaled length of the damped step before it was clipped to the box
@@ -108,6 +109,7 @@ def begin(y: Flat, box: Box) -> Progress:
     return Progress(
         y=y,
         model=Model(zero + jnp.inf, jnp.zeros_like(y), jnp.zeros((*y.shape, y.shape[-1]))),
+        optimality=zero + jnp.inf,
         trial=y,
         predicted=zero,
         reach=zero + jnp.inf,
@@ -133,8 +135,9 @@ def advance(progress: Progress, evaluated: Model, box: Box, rules: Rules) -> Pro
     """Judge the trial from its evaluated model, test for convergence, and propose the next trial."""
     first = progress.steps == 0
     finite = evaluated.finite()
-    accept = finite & (first | _improves(progress, evaluated, box))
-    y, model = choose(accept, (progress.trial, evaluated), (progress.y, progress.model))
+    reached = optimality(progress.trial, evaluated, box)
+    accept = finite & (first | _improves(progress, evaluated, reached))
+    y, model, found = choose(accept, (progress.trial, evaluated, reached), (progress.y, progress.model, progress.optimality))
     curvature = jnp.maximum(progress.curvature, jnp.diagonal(model.gram, axis1=-2, axis2=-1))
     scale = _scale(box, curvature)
 
@@ -150,7 +153,6 @@ def advance(progress: Progress, evaluated: Model, box: Box, rules: Rules) -> Pro
     unclipped = _norm((progress.trial - progress.y) / scale) >= 0.5 * progress.reach
     tiny = small_step | (hopeless & unclipped & ~accept & finite)
     # Refusals alone made this step tiny, far from any minimum: the model is wrong (a false derivative, a kink).
-    found = optimality(y, model, box)
     forced = ~accept & (progress.damping > 1e-3 * largest) & (found > 1e-6)
     reason = either(~first & tiny, either(small_step, Reason.step, Reason.rounding), Reason.running)
     reason = either(~first & tiny & forced, Reason.stalled, reason)
@@ -161,6 +163,7 @@ def advance(progress: Progress, evaluated: Model, box: Box, rules: Rules) -> Pro
     return Progress(
         y=y,
         model=model,
+        optimality=found,
         trial=trial,
         predicted=predicted,
         reach=reach,
@@ -211,15 +214,14 @@ def propose(y: Flat, model: Model, box: Box, scale: Flat, damping: Number) -> tu
     return choose(usable, (trial, predicted, reach), (y, jnp.zeros_like(predicted), jnp.full_like(reach, jnp.inf)))
 
 
-def _improves(progress: Progress, evaluated: Model, box: Box) -> Bool[Array, "*lanes"]:
+def _improves(progress: Progress, evaluated: Model, reached: Number) -> Bool[Array, "*lanes"]:
     actual = progress.model.cost - evaluated.cost
     decreases = actual > 1e-4 * progress.predicted
     # Close to the solution the decrease drowns in the rounding of the cost; the gradient still tells up from down. (Tips at
     # 1 m that differ by 10 um lose five digits, hence the wide margin.)
     margin = 1e6 * _EPSILON * progress.model.cost
     blurred = (progress.predicted < margin) & (jnp.abs(actual) < margin)
-    nearer = optimality(progress.trial, evaluated, box) < optimality(progress.y, progress.model, box)
-    return (progress.predicted > 0) & jnp.where(blurred, nearer, decreases)
+    return (progress.predicted > 0) & jnp.where(blurred, reached < progress.optimality, decreases)
 
 
 def _next_damping(progress: Progress, evaluated: Model, accept: Bool[Array, "*lanes"]) -> tuple[Number, Number]:

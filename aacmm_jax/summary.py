@@ -6,14 +6,13 @@ from typing import Any
 import numpy as np
 
 from .arm import Arm
-from .arm_files import ArmSpecification
 from .calibrate import active_names
 from .calibration_files import CalibrationRecord
 from .capture import Capture
 from .cautions import of_calibration, of_capture
 from .evaluate import Evaluation, evaluate
-from .manifest import Recording
 from .parameters import Parameters, is_length
+from .recording import ArmSpecification, Recording
 
 
 def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
@@ -91,7 +90,8 @@ def _length_figures(error: np.ndarray) -> dict[str, float]:
 def tables(capture: Capture, evaluation: Evaluation) -> dict[str, Any]:
     """Figures socket by socket and length by length."""
     spread = evaluation.repeatability
-    sockets = zip(capture.names, capture.sizes, spread.socket_de, spread.socket_deltam, spread.socket_rms, strict=True)
+    figures = (np.asarray(column) for column in (spread.socket_de, spread.socket_deltam, spread.socket_rms))
+    sockets = zip(capture.names, capture.sizes, *figures, strict=True)
     lengths = zip(capture.lengths, np.asarray(evaluation.measured), np.asarray(evaluation.error), strict=True)
     return {
         "sockets": [

@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "aacmm_jax"
 FLOORS = (
     {"errors", "_float64"},
     {"arrays", "storage"},
-    {"chain", "arm", "parameters", "capture", "arm_files", "manifest", "capture_files", "simulate"},
+    {"chain", "arm", "parameters", "capture", "recording", "arm_files", "manifest", "capture_files", "simulate"},
     {"metrics", "steps", "residuals", "solver"},
     {"covariance", "scale", "checks", "evaluate", "calibrate", "batch", "calibration_files"},
     {"cautions", "summary", "figures", "demo"},

@@ -1,5 +1,6 @@
 """The command line, ``aacmm``."""
 
+import gc
 import sys
 from typing import NoReturn
 
@@ -11,6 +12,9 @@ def main() -> None:
     debug = "--debug" in sys.argv
     if debug:
         sys.argv.remove("--debug")
+    # Tracing makes hundreds of thousands of objects that live to the end. Looking for garbage among them, now and when the
+    # interpreter ends, would take a sixth of a short command.
+    gc.set_threshold(200_000, 20, 20)
     try:
         from ..errors import InputError
         from .commands import app
@@ -38,6 +42,8 @@ def main() -> None:
         _fail(
             f"aacmm failed unexpectedly ({type(error).__name__}: {error}); run again with --debug and report what it shows.", 1
         )
+    finally:
+        gc.freeze()
 
 
 def _interrupted() -> NoReturn:

@@ -51,7 +51,7 @@ def prepare(
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(home / "aacmm_jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 @app.command(epilog="Example: aacmm demo my-demo --seed 7")
@@ -92,8 +92,8 @@ def simulate(
     """Make a capture with a simulated arm."""
     from ..arm_files import load_specification
     from ..capture_files import save_capture
-    from ..manifest import Recording
     from ..parameters import Parameters
+    from ..recording import Recording
     from ..simulate import deviated
     from ..simulate import simulate as run
     from ..summary import capture_summary

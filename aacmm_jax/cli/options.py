@@ -3,9 +3,9 @@
 import math
 from collections.abc import Sequence
 
-from ..arm_files import ArmSpecification
 from ..errors import InputError
 from ..parameters import Bounds, Parameters, is_length
+from ..recording import ArmSpecification
 
 
 def bounds(
