@@ -2,13 +2,14 @@
 # make test   set up and run the tests
 # make check  lint and types
 # make bench  identifications a second, against every contender that is installed
+# make peers  install the contenders that need a Python environment of their own
 # Everything is installed into .venv in this folder.
 
 PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
 BIN := .venv/bin
 
-.PHONY: demo test check bench clean
+.PHONY: demo test check bench peers clean
 
 demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
@@ -23,6 +24,13 @@ check: .venv/.dev
 
 bench: .venv/.test
 	$(BIN)/python benchmarks/throughput.py
+
+peers: benchmarks/peers/pybotics/.venv/.done benchmarks/peers/pinocchio/.venv/.done
+
+benchmarks/peers/%/.venv/.done: benchmarks/peers/%/requirements.txt
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check --requirement $<
+	touch $@
 
 .venv/bin/python:
 	@test -n "$(PYTHON)" || { echo "aacmm_jax needs Python 3.11 or later; install it, or name one with make PYTHON=..."; exit 1; }

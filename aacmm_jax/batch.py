@@ -9,6 +9,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -30,8 +31,9 @@ from .residuals import Measurement, model_of
 from .scale import scale_of
 from .steps import Box, Reason, advance, begin, choose, either, numbers_of, reasons
 
-# Lanes per loop. On a CPU 32 lanes of 70 poses fit the second-level cache; a GPU wants thousands.
-_LANES = {"cpu": 32}
+# Lanes per loop. On a CPU the columns of all lanes should fit the second-level cache (measured from 20 to 7,000 poses: five
+# times slower where they do not); a GPU wants thousands.
+_LANES_CPU, _POSES_IN_CACHE = 16, 2000
 _LANES_ELSEWHERE = 4096
 _ROUNDS = 64  # problems a lane of one chunk takes at most, one after the other
 
@@ -109,7 +111,8 @@ def identify_many(
     may the capture (see `stack_captures`).
 
     Work is spread over all devices and, on a CPU, all cores; memory is bounded by the ``chunk`` (problems per call of the
-    compiled program, rounded up to whole rounds of the ``lanes``). Failure is data (``result``); a start outside its box is clipped to it. Raises `InputError` for
+    compiled program). Failure is data (``result``);
+    a start outside its box is clipped to it. Raises `InputError` for
     shapes that do not fit, a lower bound above its upper one, and too few poses.
     """
     if space is None:
@@ -118,10 +121,13 @@ def identify_many(
     hold = held_length(space, arm, hold)
     check_fit(capture, space)
     check_enough(capture, len(space.names) - int(space.lengths.any()))
+    for what, number in (("chunk", chunk), ("lanes", lanes)):
+        if number is not None and number < 1:
+            raise InputError(f"{what} is {number}; give at least 1, or leave it out.")
     devices = jax.local_devices() if devices is None else list(devices)
-    lanes = lanes or _LANES.get(devices[0].platform, _LANES_ELSEWHERE)
+    lanes = lanes or _lanes(devices, sum(capture.sizes))
     workers = _workers(devices)
-    chunk = _chunk(size, lanes, workers) if chunk is None else -(-chunk // lanes) * lanes  # whole rounds of the lanes
+    pieces = _pieces(size, lanes, workers, chunk)
     shape = _Shape(
         sizes=capture.sizes,
         ends=tuple((int(a), int(b)) for a, b in capture.ends()),
@@ -132,9 +138,8 @@ def identify_many(
         lanes=lanes,
         max_steps=max_steps,
     )
-    work = _Work(problems, shape, size, min(chunk, -(-size // lanes) * lanes))
-    pieces = _spread(work.run, range(0, size, work.chunk), devices, workers)
-    return _assemble(pieces, space, hold, bool(capture.lengths))
+    work = _Work(problems, shape, _room(max(len(piece) for piece in pieces), lanes))
+    return _assemble(_spread(work.run, pieces, devices, workers), space, hold, bool(capture.lengths))
 
 
 def stack_captures(captures: Iterable[Capture]) -> Capture:
@@ -150,17 +155,22 @@ class _Work(NamedTuple):
 
     problems: _Problems
     shape: _Shape
-    size: int
-    chunk: int
+    room: int  # problems that the compiled program has room for
 
-    def run(self, first: int, device: Any) -> tuple[np.ndarray, ...]:
-        """Solve one chunk; the last one is filled up with its first problem, which is then left out again."""
-        rows = np.arange(first, min(first + self.chunk, self.size))
-        filled = np.concatenate([rows, np.full(self.chunk - len(rows), first)])
-        part = jax.tree.map(lambda leaf, many: leaf[filled] if many else leaf, self.problems, self.shape.batched)
+    def run(self, piece: range, device: Any) -> tuple[np.ndarray, ...]:
+        """Solve one chunk. What room is left is filled with its first problem, which is never begun."""
+        rows = np.full(self.room, piece.start)
+        rows[: len(piece)] = piece
+        part = jax.tree.map(lambda leaf, many: leaf[rows] if many else leaf, self.problems, self.shape.batched)
         with jax.default_device(device):
-            solved = _solve_chunk(jax.device_put(part, device), self.shape, self.chunk)
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(rows)], solved)
+            solved = _solve_chunk(*jax.device_put((part, np.asarray(len(piece))), device), self.shape, self.room)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(piece)], solved)
+
+
+def _lanes(devices: Sequence[Any], poses: int) -> int:
+    if devices[0].platform != "cpu":
+        return _LANES_ELSEWHERE
+    return min(_LANES_CPU, 2 ** max(round(math.log2(_POSES_IN_CACHE / poses)), 0))
 
 
 def _workers(devices: Sequence[Any]) -> int:
@@ -169,40 +179,49 @@ def _workers(devices: Sequence[Any]) -> int:
     return len(devices) if devices[0].platform != "cpu" else max(len(devices), cores)
 
 
-def _chunk(size: int, lanes: int, workers: int) -> int:
-    """Problems per call: enough calls to keep every worker busy, and few different sizes, since each is compiled once."""
-    rounds = max(size // (2 * workers * lanes), 1)
-    return lanes * min(2 ** int(math.log2(rounds)), _ROUNDS)
+def _pieces(size: int, lanes: int, workers: int, chunk: int | None) -> list[range]:
+    """The batch in chunks: of the given size; or as few as fill the workers evenly, since at the end of each some lanes idle."""
+    if chunk is None:
+        rounds = -(-size // (lanes * _ROUNDS))
+        calls = min(-(-rounds // workers) * workers, -(-size // lanes))
+        chunk = -(-size // calls)
+    return [range(first, min(first + chunk, size)) for first in range(0, size, chunk)]
 
 
-def _spread(run: Callable, firsts: Iterable[int], devices: Sequence[Any], workers: int) -> list:
+def _room(count: int, lanes: int) -> int:
+    """Whole rounds of the lanes, their number a power of two: each size is compiled once, so there should be few."""
+    return lanes * 2 ** math.ceil(math.log2(-(-count // lanes)))
+
+
+def _spread(run: Callable, pieces: Sequence[range], devices: Sequence[Any], workers: int) -> list:
     """Chunks over devices and cores. XLA leaves the interpreter's lock while it computes, so threads are enough."""
     with ThreadPoolExecutor(workers) as pool:
-        futures = [pool.submit(run, first, devices[i % len(devices)]) for i, first in enumerate(firsts)]
-        return [future.result() for future in futures]
+        futures = [pool.submit(run, piece, devices[i % len(devices)]) for i, piece in enumerate(pieces) if i > 0]
+        first = run(pieces[0], devices[0])  # here, since a thread takes a millisecond to start
+        return [first, *(future.result() for future in futures)]
 
 
-@eqx.filter_jit
-def _solve_chunk(problems: _Problems, shape: _Shape, count: int) -> tuple[Array, ...]:
-    ended = _work_off(problems, shape, count)
-    lane_problems = count // shape.lanes
+@partial(jax.jit, static_argnames=("shape", "room"))
+def _solve_chunk(problems: _Problems, count: Int[Array, ""], shape: _Shape, room: int) -> tuple[Array, ...]:
+    ended = _work_off(problems, shape, count, room)
+    rounds = room // shape.lanes
 
     def grouped(leaf: Array, many: bool) -> Array:
-        return leaf.reshape(lane_problems, shape.lanes, *leaf.shape[1:]) if many else leaf
+        return leaf.reshape(rounds, shape.lanes, *leaf.shape[1:]) if many else leaf
 
     groups = jax.tree.map(grouped, problems, shape.batched)
-    parameters = ended.parameters.reshape(lane_problems, shape.lanes, -1)
+    parameters = ended.parameters.reshape(rounds, shape.lanes, -1)
 
     def figures(row: Int[Array, ""]) -> tuple[Array, ...]:
         part = jax.tree.map(lambda leaf, many: leaf[row] if many else leaf, groups, shape.batched)
         return _figures(part, parameters[row], shape)
 
-    de, deltam, k, active = jax.lax.map(figures, jnp.arange(lane_problems))
-    flat = [leaf.reshape(count, *leaf.shape[2:]) for leaf in (de, deltam, k, active)]
+    de, deltam, k, active = jax.lax.map(figures, jnp.arange(rounds))
+    flat = [leaf.reshape(room, *leaf.shape[2:]) for leaf in (de, deltam, k, active)]
     return (ended.parameters, *flat[:3], ended.steps, numbers_of(ended.reason), flat[3])
 
 
-def _work_off(problems: _Problems, shape: _Shape, count: int) -> _Ended:
+def _work_off(problems: _Problems, shape: _Shape, count: Int[Array, ""], room: int) -> _Ended:
     """The loop over lanes; every lane takes the next problem of the chunk when its own has ended."""
     kept = np.flatnonzero(shape.kept)
     turns = turns_of(problems.q)
@@ -237,7 +256,7 @@ def _work_off(problems: _Problems, shape: _Shape, count: int) -> _Ended:
         late = progress.steps >= shape.max_steps
         done = (progress.reason != Reason.running) | late
         reason = either(late & (progress.reason == Reason.running), Reason.max_steps, progress.reason)
-        slot = jnp.where(done, index, count)
+        slot = jnp.where(done & (index < count), index, room)
         whole = lane_values(problems.start, shape.batched.start, now).at[:, kept].set(progress.y)
         ended = _Ended(
             ended.parameters.at[slot].set(whole, mode="drop"),
@@ -251,7 +270,7 @@ def _work_off(problems: _Problems, shape: _Shape, count: int) -> _Ended:
 
     first = jnp.arange(shape.lanes)
     p = len(shape.kept)
-    nothing = _Ended(jnp.zeros((count, p)), jnp.zeros(count, dtype=jnp.int64), reasons(jnp.zeros(count, dtype=jnp.int32)))
+    nothing = _Ended(jnp.zeros((room, p)), jnp.zeros(room, dtype=jnp.int64), reasons(jnp.zeros(room, dtype=jnp.int32)))
     carry = (begin(*starts(jnp.minimum(first, count - 1))), first, jnp.asarray(shape.lanes), nothing)
     return jax.lax.while_loop(more, once, carry)[3]
 

@@ -62,8 +62,8 @@ def simulate(
     key = jax.random.key(seed)
     reach_key, seat_key, encoder_key, length_key = jax.random.split(key, 4)
     owner = [name for name, count in counts.items() for _ in range(count)]
-    targets = jnp.stack([points[name] for name in owner])
-    targets = targets + seating * jax.random.normal(seat_key, targets.shape)
+    exact = jnp.asarray(np.repeat(np.stack([np.asarray(point) for point in points.values()]), list(counts.values()), axis=0))
+    targets = exact + seating * jax.random.normal(seat_key, exact.shape)
     references = _reference_lengths(points, lengths, length_key)
     angles = reach(arm, targets, reach_key, limits_array, labels=[f"socket '{name}'" for name in owner])
     angles = angles + encoder_arcsec * ARCSEC * jax.random.normal(encoder_key, angles.shape)

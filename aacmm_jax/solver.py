@@ -39,7 +39,8 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     The box comes in ``options``: ``lower``, ``upper`` (PyTrees like y, scalars, or None) and ``scale``, the natural step of
     each unknown (None: chosen from the columns of the Jacobian). ``normal``, a function of (y, args), may supply the `Model`
     where it can be had cheaper than from the Jacobian of the residual. ``stats`` of the solution holds ``reason``,
-    ``num_accepted_steps``, ``cost``, ``gradient`` and ``optimality``.
+    ``num_accepted_steps``, and ``cost``, ``gradient`` and ``optimality`` as last evaluated: at the solution, or where the last
+    step was too small to matter, one such step before it.
 
     Use it through `least_squares`, which also brings the adjoint that knows the bounds.
     """

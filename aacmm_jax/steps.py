@@ -80,8 +80,8 @@ class Progress(eqx.Module):
     """State of one solve, or of many side by side in lanes, between two evaluations."""
 
     y: Flat  # accepted
-    model: Model  # at y
-    optimality: Number  # at y; see `optimality`
+    model: Model  # at y (at the end perhaps one negligible step before it)
+    optimality: Number  # of the same point; see `optimality`
     trial: Flat  # where the next evaluation happens
     predicted: Number  # decrease of the cost that the model promises for the trial
     reach: Number  # scaled length of the damped step before it was clipped to the box
@@ -147,21 +147,23 @@ def advance(progress: Progress, evaluated: Model, box: Box, rules: Rules) -> Pro
     # Below this floor rounding in the Gram matrix can make it indefinite.
     damping = jnp.maximum(damping, 1e3 * _EPSILON * largest)
 
-    # Judged before clipping: a step that the box cuts to nothing says only that the damping is still too small.
-    small_step = progress.reach <= rules.rtol * _norm(y / scale) + rules.atol
+    trial, predicted, reach = propose(y, model, box, scale, damping)
+
+    # After progress the step to come is judged: where that is too small to matter it is taken unevaluated, which spares the
+    # last evaluation. After a refusal, the refused one. Both before clipping: a step that the box cuts to nothing says only
+    # that the damping is still too small.
+    small_step = jnp.where(accept, reach, progress.reach) <= rules.rtol * _norm(y / scale) + rules.atol
     hopeless = jnp.abs(progress.predicted) <= 4 * _EPSILON * progress.model.cost
     unclipped = _norm((progress.trial - progress.y) / scale) >= 0.5 * progress.reach
     tiny = small_step | (hopeless & unclipped & ~accept & finite)
     # Refusals alone made this step tiny, far from any minimum: the model is wrong (a false derivative, a kink).
     forced = ~accept & (progress.damping > 1e-3 * largest) & (found > 1e-6)
-    reason = either(~first & tiny, either(small_step, Reason.step, Reason.rounding), Reason.running)
-    reason = either(~first & tiny & forced, Reason.stalled, reason)
+    reason = either(tiny, either(small_step, Reason.step, Reason.rounding), Reason.running)
+    reason = either(tiny & forced, Reason.stalled, reason)
     reason = either(found <= rules.gtol, Reason.gradient, reason)
     reason = either(first & ~finite, Reason.nonfinite, reason)
-
-    trial, predicted, reach = propose(y, model, box, scale, damping)
     return Progress(
-        y=y,
+        y=choose(small_step & accept, trial, y),
         model=model,
         optimality=found,
         trial=trial,

@@ -26,7 +26,8 @@ def solve(problem):
         throw=False,
     )
     stats = solution.stats
-    return solution.value, stats["cost"], stats["optimality"], aj.converged(stats["reason"])
+    cost = 0.5 * jnp.sum(bounded_problems.residual(solution.value, problem) ** 2)
+    return solution.value, cost, stats["optimality"], aj.converged(stats["reason"])
 
 
 @pytest.mark.parametrize("third", range(3))

@@ -1,0 +1,55 @@
+"""The benchmark scripts run, measure the same thing for everybody, and name who is absent."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def contenders():
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    import contenders
+
+    return contenders
+
+
+def test_contenders_minimise_the_same_residual(contenders):
+    """NumPy's chain, the textbook chain and the package's agree; NumPy's Jacobian is its residual's derivative."""
+    task = contenders.Task()
+    vector = task.starts(1, 0)[0]
+    residual, jacobian = contenders.numpy_functions(task)
+    arm = task.space.arm(vector)
+    tips = np.asarray(arm.position(task.q))
+    np.testing.assert_allclose(residual(vector).reshape(-1, 3), tips - tips.mean(axis=0), atol=1e-9)
+    plain = jax.vmap(lambda row: contenders.product_of_matrices(arm, row))(task.capture.q)
+    np.testing.assert_allclose(plain, tips, atol=1e-9)
+    centred = np.asarray(arm.jacobian(task.q, task.space.names))
+    np.testing.assert_allclose(jacobian(vector), (centred - centred.mean(axis=0)).reshape(-1, 21), atol=1e-9)
+
+
+def test_a_part_runs_and_names_who_is_absent(tmp_path):
+    command = [
+        sys.executable,
+        ROOT / "benchmarks/throughput.py",
+        "--rounds",
+        "1",
+        "--only",
+        "kinematics",
+        "--results",
+        tmp_path,
+    ]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=tmp_path, timeout=300)
+    (file,) = tmp_path.glob("throughput-*.json")
+    rows = json.loads(file.read_text())["results"]["kinematics"]
+    peers = [row for row in rows if "Pinocchio" in row["what"]]
+    installed = (ROOT / "benchmarks/peers/pinocchio/.venv/bin/python").exists()
+    assert len(peers) == 3
+    assert all(row.get("absent", False) != installed for row in peers)
+    assert ("absent" in done.stdout) != installed
