@@ -1,7 +1,7 @@
 """Calibration of articulated-arm coordinate measuring machines and other serial arms, differentiable throughout."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+import typing as _typing
+from importlib import import_module as _import_module
 
 from . import _float64 as _float64  # isort: skip - must come before anything that makes an array
 from .arm import Arm as Arm
@@ -40,13 +40,6 @@ from .solver import BoundedLevenbergMarquardt as BoundedLevenbergMarquardt
 from .solver import least_squares as least_squares
 from .steps import Reason as Reason
 
-if TYPE_CHECKING:
-    from .arm_files import load_arm as load_arm
-    from .arm_files import load_specification as load_specification
-    from .arm_files import save_arm as save_arm
-    from .arm_files import shipped_arms as shipped_arms
-    from .manifest import read_manifest as read_manifest
-
 # Imported when first asked for: these need pydantic, which takes a tenth of the package's own import.
 _LATER = {
     "load_arm": "arm_files",
@@ -55,13 +48,23 @@ _LATER = {
     "shipped_arms": "arm_files",
     "read_manifest": "manifest",
 }
+_NOW = {name for name, value in globals().items() if not (name.startswith("_") or isinstance(value, type(_typing)))}
+__all__ = sorted(_NOW | set(_LATER))  # pyright: ignore[reportUnsupportedDunderAll]
 
+if _typing.TYPE_CHECKING:
+    from .arm_files import load_arm as load_arm
+    from .arm_files import load_specification as load_specification
+    from .arm_files import save_arm as save_arm
+    from .arm_files import shipped_arms as shipped_arms
+    from .manifest import read_manifest as read_manifest
+else:
 
-def __getattr__(name: str) -> Any:
-    if name not in _LATER:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    return getattr(import_module(f".{_LATER[name]}", __name__), name)
+    def __getattr__(name: str):
+        if name in _LATER.values():
+            return _import_module(f".{name}", __name__)
+        if name not in _LATER:
+            raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+        return getattr(_import_module(f".{_LATER[name]}", __name__), name)
 
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_LATER])
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *_LATER})

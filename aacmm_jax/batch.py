@@ -7,6 +7,7 @@ The number of lanes, not the chunk, fixes the arithmetic: results are the same t
 
 import math
 import os
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -194,11 +195,28 @@ def _room(count: int, lanes: int) -> int:
 
 
 def _spread(run: Callable, pieces: Sequence[range], devices: Sequence[Any], workers: int) -> list:
-    """Chunks over devices and cores. XLA leaves the interpreter's lock while it computes, so threads are enough."""
+    """Chunks over devices and cores, in their order. XLA leaves the interpreter's lock while it computes, so threads are enough.
+
+    The calling thread is one of the workers, since a new one takes a millisecond to start. A worker keeps its device.
+    """
+    following, failed, found = iter(range(len(pieces))), threading.Event(), {}
+
+    def work(worker: int) -> None:
+        try:
+            for i in following:
+                if failed.is_set():
+                    return
+                found[i] = run(pieces[i], devices[worker % len(devices)])
+        except BaseException:
+            failed.set()
+            raise
+
     with ThreadPoolExecutor(workers) as pool:
-        futures = [pool.submit(run, piece, devices[i % len(devices)]) for i, piece in enumerate(pieces) if i > 0]
-        first = run(pieces[0], devices[0])  # here, since a thread takes a millisecond to start
-        return [first, *(future.result() for future in futures)]
+        others = [pool.submit(work, worker) for worker in range(1, min(workers, len(pieces)))]
+        work(0)
+        for other in others:
+            other.result()
+    return [found[i] for i in range(len(pieces))]
 
 
 @partial(jax.jit, static_argnames=("shape", "room"))

@@ -39,13 +39,12 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     The box comes in ``options``: ``lower``, ``upper`` (PyTrees like y, scalars, or None) and ``scale``, the natural step of
     each unknown (None: chosen from the columns of the Jacobian). ``normal``, a function of (y, args), may supply the `Model`
     where it can be had cheaper than from the Jacobian of the residual. ``stats`` of the solution holds ``reason``,
-    ``num_accepted_steps``, and ``cost``, ``gradient`` and ``optimality`` as last evaluated: at the solution, or where the last
-    step was too small to matter, one such step before it.
+    ``num_accepted_steps``, ``cost``, ``gradient`` and ``optimality``.
 
     Use it through `least_squares`, which also brings the adjoint that knows the bounds.
     """
 
-    rtol: float = 1e-12  # on the step, relative to |y| (both scaled)
+    rtol: float = 1e-13  # on the step to come, relative to |y| (both scaled)
     atol: float = 0.0  # on the step, scaled
     gtol: float = 1e-10  # on the projected gradient: cosine between the residual and a column of J
     initial_damping: float = 1e-3  # relative to the largest curvature

@@ -80,8 +80,8 @@ class Progress(eqx.Module):
     """State of one solve, or of many side by side in lanes, between two evaluations."""
 
     y: Flat  # accepted
-    model: Model  # at y (at the end perhaps one negligible step before it)
-    optimality: Number  # of the same point; see `optimality`
+    model: Model  # at y
+    optimality: Number  # at y; see `optimality`
     trial: Flat  # where the next evaluation happens
     predicted: Number  # decrease of the cost that the model promises for the trial
     reach: Number  # scaled length of the damped step before it was clipped to the box
@@ -149,9 +149,9 @@ def advance(progress: Progress, evaluated: Model, box: Box, rules: Rules) -> Pro
 
     trial, predicted, reach = propose(y, model, box, scale, damping)
 
-    # After progress the step to come is judged: where that is too small to matter it is taken unevaluated, which spares the
-    # last evaluation. After a refusal, the refused one. Both before clipping: a step that the box cuts to nothing says only
-    # that the damping is still too small.
+    # After progress the step to come is judged: where that is too small to matter it is not taken, which spares the last
+    # evaluation. After a refusal, the refused one. Both before clipping: a step that the box cuts to nothing says only that
+    # the damping is still too small.
     small_step = jnp.where(accept, reach, progress.reach) <= rules.rtol * _norm(y / scale) + rules.atol
     hopeless = jnp.abs(progress.predicted) <= 4 * _EPSILON * progress.model.cost
     unclipped = _norm((progress.trial - progress.y) / scale) >= 0.5 * progress.reach
@@ -163,7 +163,7 @@ def advance(progress: Progress, evaluated: Model, box: Box, rules: Rules) -> Pro
     reason = either(found <= rules.gtol, Reason.gradient, reason)
     reason = either(first & ~finite, Reason.nonfinite, reason)
     return Progress(
-        y=choose(small_step & accept, trial, y),
+        y=y,
         model=model,
         optimality=found,
         trial=trial,

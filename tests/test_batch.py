@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import equinox as eqx
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax import batch
 
 from . import published
 
@@ -103,10 +106,13 @@ def test_bad_input(paper_arm, noisy_capture, box, starts, change, message):
 
 PROGRAM = """
 import sys
+import threading
+import time
 import jax
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
 import numpy as np
 import aacmm_jax as aj
+from aacmm_jax import batch
 from tests import published
 assert len(jax.devices()) == int(sys.argv[1])
 arm = aj.load_arm("cheng2018-simulation")
@@ -126,3 +132,27 @@ def test_the_number_of_devices_changes_nothing(tmp_path):
         subprocess.run(command, check=True, cwd=root, env=environment, timeout=300)
     one, two = (np.load(tmp_path / f"{devices}.npy") for devices in ("1", "2"))
     np.testing.assert_allclose(one, two, rtol=0, atol=1e-9)
+
+
+def test_no_more_chunks_in_work_than_workers_and_a_failure_stops_the_rest():
+    at_once, most, ran, lock = 0, 0, [], threading.Lock()
+
+    def run(piece, device):
+        nonlocal at_once, most
+        with lock:
+            at_once, most = at_once + 1, max(most, at_once + 1)
+        time.sleep(0.02)
+        with lock:
+            at_once -= 1
+            ran.append(piece.start)
+        if piece.start == 1:
+            raise RuntimeError("chunk 1")
+        return piece.start
+
+    pieces = [range(i, i + 1) for i in range(20)]
+    assert batch._spread(run, pieces[2:], ["one", "two"], 2) == list(range(2, 20))
+    assert most == 2
+    ran.clear()
+    with pytest.raises(RuntimeError, match="chunk 1"):
+        batch._spread(run, pieces, ["one"], 1)
+    assert ran == [0, 1]

@@ -186,3 +186,10 @@ def test_failure_is_data_and_an_exception_only_on_request(residual, start, reaso
     assert solution.result == (optx.RESULTS.nonlinear_max_steps_reached if result is None else result)
     with pytest.raises(eqx.EquinoxRuntimeError):
         aj.least_squares(residual, jnp.asarray(start), max_steps=steps)
+
+
+def test_the_solution_is_a_point_that_was_evaluated():
+    """A last step into where the residual does not exist is not taken unseen, however small it is."""
+    solution = aj.least_squares(lambda y, _: jnp.sqrt(y - 1.0), jnp.array([1.05]), throw=False)
+    assert np.all(np.isfinite(np.sqrt(np.asarray(solution.value) - 1.0)))
+    assert float(solution.stats["cost"]) == pytest.approx(0.5 * float(solution.value[0] - 1.0), rel=1e-12)

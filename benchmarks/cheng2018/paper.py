@@ -1,0 +1,123 @@
+"""Cheng et al. 2018 (doi 10.1155/2018/1760190): its printed numbers, its arms and boxes, and the rows of the reproduction."""
+
+import inspect
+import tomllib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+import aacmm_jax as aj
+
+HERE = Path(__file__).resolve().parent
+PUBLISHED: dict[str, Any] = tomllib.loads((HERE / "published.toml").read_text())
+NAMES: tuple[str, ...] = tuple(PUBLISHED["parameter_order"])
+POSES: int = PUBLISHED["simulation"]["poses"]
+SOCKET = (400.0, 200.0, 300.0)  # mm; the paper does not print where its simulated socket stood
+SETS = 1_000  # independent sets of poses
+
+
+class Row(NamedTuple):
+    """One published number and what became of it; each column holds text ready to print."""
+
+    what: str
+    printed: str
+    recomputed: str = "-"  # from the printed vectors
+    method: str = "-"  # the paper's method, rerun
+    toolkit: str = "-"
+    verdict: str = ""
+    where: str = ""  # line of code that made the row
+
+
+def row(what: str, printed: Any, *, recomputed: Any = "-", method: Any = "-", toolkit: Any = "-", verdict: str) -> Row:
+    """A row that knows the line of code it was made on."""
+    caller = inspect.stack()[1]
+    columns = (value if isinstance(value, str) else f"{value:.6g}" for value in (printed, recomputed, method, toolkit))
+    return Row(what, *columns, verdict, f"{Path(caller.filename).name}:{caller.lineno}")
+
+
+def vector(*keys: str) -> np.ndarray:
+    """A printed vector, in the paper's order."""
+    found: Any = PUBLISHED
+    for key in keys:
+        found = found[key]
+    return np.array(found, dtype=float)
+
+
+def simulated_arm() -> aj.Arm:
+    """Section 3's arm, as printed."""
+    return arm_of(vector("simulation", "nominal"))
+
+
+def arm_of(values: np.ndarray) -> aj.Arm:
+    """The arm with the paper's 21 parameters; the other four as the paper holds them."""
+    fixed = PUBLISHED["fixed"]
+    base = aj.Arm(
+        alpha=[0.0] * 5 + [fixed["alpha_6"]],
+        a=[0.0] * 5 + [fixed["a_6"]],
+        d=[fixed["d_1"]] + [0.0] * 5,
+        theta=[fixed["theta_1"]] + [0.0] * 5,
+        probe=[0.0, 0.0, 0.0],
+    )
+    return aj.Parameters(base, NAMES).arm(values)
+
+
+def is_length() -> np.ndarray:
+    """Which of the 21 are lengths."""
+    return aj.Parameters(simulated_arm(), NAMES).lengths
+
+
+def scale_to(values: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """The k for which k times the true lengths come closest; ``(..., 21) -> (...)``."""
+    lengths = truth[is_length()]
+    return values[..., is_length()] @ lengths / (lengths @ lengths)
+
+
+def pose_sets(count: int = SETS) -> np.ndarray:
+    """Independent sets of noise-free poses of the simulated arm on one point, ``(count, 70, 6)``: the first of ``SETS``."""
+    return np.asarray(aj.simulate(simulated_arm(), {"A": SOCKET}, poses=POSES * SETS, seed=1).q).reshape(SETS, POSES, 6)[:count]
+
+
+def box(*keys: str) -> tuple[np.ndarray, np.ndarray]:
+    """Printed bounds, repaired where print lost an element."""
+    return vector(*keys, "lower"), vector(*keys, "upper")
+
+
+def random_starts(lower: np.ndarray, upper: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Uniform in the box: the paper does not print where its searches began."""
+    return lower + (upper - lower) * np.random.default_rng(seed).uniform(size=(count, len(lower)))
+
+
+def figures_of(tips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """DE and Deltam (eq. 11-15) of tips ``(..., poses, 3)`` of one socket each, mm."""
+    from_centre = np.linalg.norm(tips - tips.mean(axis=-2, keepdims=True), axis=-1)
+    return from_centre.mean(axis=-1), np.max(np.ptp(tips, axis=-2), axis=-1) / 2
+
+
+def tips_of(values: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Tips of many arms, each on its own readings: ``(b, 21), (b, poses, 6) -> (b, poses, 3)``."""
+    arms = aj.Parameters(arm_of(vector("simulation", "nominal")), NAMES)
+    kinds = arms.arm(jnp.asarray(values))
+    return np.asarray(_positions(kinds, jnp.asarray(q)))
+
+
+def _positions(arms: aj.Arm, q: jnp.ndarray) -> jnp.ndarray:
+    spread = lambda leaf: jnp.broadcast_to(leaf, (q.shape[0], leaf.shape[-1]))[:, None, :]  # noqa: E731
+    whole = aj.Arm(
+        alpha=spread(arms.alpha), a=spread(arms.a), d=spread(arms.d), theta=spread(arms.theta), probe=spread(arms.probe)
+    )
+    return whole.position(q)
+
+
+def place(value: float, sample: np.ndarray) -> str:
+    """Where a printed number lies among many reruns: its percentile, and the middle 95 % of the sample."""
+    low, middle, high = (number(x) for x in np.percentile(sample, [2.5, 50, 97.5]))
+    share = 100 * np.mean(sample <= value)
+    inside = "within" if 2.5 <= share <= 97.5 else "outside"
+    return f"{inside} the 95 % of {len(sample):,} ({low} to {high}); {share:.0f} % are smaller, median {middle}"
+
+
+def number(value: float) -> str:
+    """Three digits, or three decimals where the value is large and its decimals are what matters."""
+    return f"{value:.3f}" if 100 <= abs(value) < 1000 else f"{value:.5f}" if 0.9 < abs(value) < 1.1 else f"{value:.3g}"
