@@ -2,6 +2,7 @@
 # make test   set up and run the tests
 # make check  lint and types
 # make bench  identifications a second, against every contender that is installed
+# make reproduce  Cheng et al. 2018, recomputed: benchmarks/cheng2018/REPRODUCTION.md (two minutes on 2 cores)
 # make peers  install the contenders that need a Python environment of their own
 # Everything is installed into .venv in this folder.
 
@@ -9,7 +10,7 @@ PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
 BIN := .venv/bin
 
-.PHONY: demo test check bench peers clean
+.PHONY: demo test check bench peers reproduce clean
 
 demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
@@ -24,6 +25,9 @@ check: .venv/.dev
 
 bench: .venv/.test
 	$(BIN)/python benchmarks/throughput.py
+
+reproduce: .venv/.test
+	$(BIN)/python benchmarks/cheng2018/reproduce.py
 
 peers: benchmarks/peers/pybotics/.venv/.done benchmarks/peers/pinocchio/.venv/.done
 

@@ -8,7 +8,7 @@ import aacmm_jax as aj
 from . import published
 from .refusals import assert_refused
 
-K = published.GAUGE_MEAN / published.GAUGE_NOMINAL
+K = published.LENGTH_MEAN / published.LENGTH_NOMINAL
 
 # Nominal standard D-H, deg and mm: alpha, a, d (shared/data/mukca/README.md, from the makers' Craig tables).
 MAKERS = {

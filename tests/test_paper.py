@@ -66,7 +66,7 @@ def test_scale_from_the_centre_of_the_second_box(paper_arm, paper_capture):
 def test_published_scale_gives_table_2():
     """Eq. 18 divided by the printed k gives all 11 lengths of Table 2; its angles do not follow from eq. 18 at all."""
     space = aj.Parameters.free_of(aj.load_arm("cheng2018-ra7125"))
-    scale = aj.scale_from_lengths(measured=published.GAUGE_MEAN, nominal=published.GAUGE_NOMINAL)
+    scale = aj.scale_from_lengths(measured=published.LENGTH_MEAN, nominal=published.LENGTH_NOMINAL)
     lengths = published.EQUATION_18[space.lengths] / float(scale.value)
     np.testing.assert_array_equal(np.round(lengths, 4), published.TABLE_2_LENGTHS)
     angles = np.rad2deg(published.EQUATION_18[~space.lengths])
@@ -75,12 +75,12 @@ def test_published_scale_gives_table_2():
 
 def test_scale_from_the_four_printed_lengths():
     """Their mean is 200.7585; the paper rounded it to 200.759 before dividing. The rounding is well inside u(k)."""
-    scale = aj.scale_from_lengths(measured=published.GAUGE_MEASURED, nominal=published.GAUGE_NOMINAL)
+    scale = aj.scale_from_lengths(measured=published.LENGTH_MEASURED, nominal=published.LENGTH_NOMINAL)
     assert float(scale.value) == pytest.approx(200.7585 / 201.513, rel=1e-15)
     # JCGM 100, 4.2.3: experimental standard deviation of the mean, relative to the nominal value.
-    expected = np.std(published.GAUGE_MEASURED, ddof=1) / 2 / published.GAUGE_NOMINAL
+    expected = np.std(published.LENGTH_MEASURED, ddof=1) / 2 / published.LENGTH_NOMINAL
     assert float(scale.u) == pytest.approx(expected, rel=1e-12)
-    assert abs(float(scale.value) - published.GAUGE_MEAN / published.GAUGE_NOMINAL) < float(scale.u)
+    assert abs(float(scale.value) - published.LENGTH_MEAN / published.LENGTH_NOMINAL) < float(scale.u)
     space = aj.Parameters.free_of(aj.load_arm("cheng2018-ra7125"))
     lengths = published.EQUATION_18[space.lengths] / float(scale.value)
     np.testing.assert_allclose(lengths, published.TABLE_2_LENGTHS, rtol=0, atol=0.002)

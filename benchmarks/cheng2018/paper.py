@@ -2,6 +2,7 @@
 
 import inspect
 import tomllib
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -76,7 +77,12 @@ def scale_to(values: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def pose_sets(count: int = SETS) -> np.ndarray:
     """Independent sets of noise-free poses of the simulated arm on one point, ``(count, 70, 6)``: the first of ``SETS``."""
-    return np.asarray(aj.simulate(simulated_arm(), {"A": SOCKET}, poses=POSES * SETS, seed=1).q).reshape(SETS, POSES, 6)[:count]
+    return _all_sets()[:count]
+
+
+@cache
+def _all_sets() -> np.ndarray:
+    return np.asarray(aj.simulate(simulated_arm(), {"A": SOCKET}, poses=POSES * SETS, seed=1).q).reshape(SETS, POSES, 6)
 
 
 def box(*keys: str) -> tuple[np.ndarray, np.ndarray]:

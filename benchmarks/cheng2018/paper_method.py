@@ -74,6 +74,17 @@ def problem(simulation: int, number: int) -> tuple[np.ndarray, np.ndarray, np.nd
     return pose_sets(number + 1)[number], lower, upper, random_starts(lower, upper, SETS, simulation)[number]
 
 
+def one_in_box(given: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    """`minimise` for one (readings, lower, upper, start): the parameters."""
+    return minimise(*given)[0]
+
+
+def many_in_boxes(problems: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Parameters that the method finds in many problems, spread over the cores."""
+    with ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn")) as pool:
+        return np.array(list(pool.map(one_in_box, problems)))
+
+
 def one(simulation: int, q: np.ndarray, number: int) -> dict[str, float]:
     """One rerun, as a row of the file."""
     lower, upper = box("simulation", str(simulation))

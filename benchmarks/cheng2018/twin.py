@@ -6,6 +6,7 @@ seating, and, as a part that no D-H model holds, every encoder by its eccentrici
 amplitude and a phase drawn for each twin.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import jax
@@ -57,6 +58,7 @@ def true_arm() -> aj.Arm:
     return aj.load_arm("cheng2018-ra7125")
 
 
+@cache
 def pool() -> Pool:
     arm = true_arm()
     count = POSES * _POOL

@@ -1,0 +1,312 @@
+"""The figures: the paper's 2, 3, 6 and 8 and its scale law, redrawn; and what it did not draw. Readable in grey."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import paper_method
+from paper import PUBLISHED, is_length, tips_of, vector
+from table1 import many_of
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+Table = list[dict[str, Any]]
+STYLE = {
+    "font.size": 9,
+    "axes.grid": True,
+    "grid.color": "0.88",
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "savefig.dpi": 200,
+    "figure.constrained_layout.use": True,
+}
+DARK, MIDDLE, LIGHT = "0.05", "0.45", "0.72"
+MARKS = (("o", DARK), ("^", MIDDLE), ("s", LIGHT), ("D", "0.3"), ("v", "0.6"))
+
+
+def column(table: Table, key: str) -> np.ndarray:
+    return np.array([line[key] for line in table])
+
+
+def simulation(number: int) -> Any:
+    """Figures 2 and 3: distance of every pose's tip from the centroid, by the paper's method and by this toolkit."""
+    q, lower, upper, start = paper_method.problem(number, 0)
+    values, _ = paper_method.minimise(q, lower, upper, start)
+    mine = many_of(q[None], lower, upper, start[None]).parameters[0]
+    figure, axes = plt.subplots(figsize=(4.6, 3.0))
+    pairs = (("paper's method, rerun", values, *MARKS[0]), ("this toolkit", mine, *MARKS[2]))
+    for name, found, marker, colour in pairs:
+        tips = tips_of(found[None], q[None])[0]
+        distance = np.linalg.norm(tips - tips.mean(axis=0), axis=1)
+        axes.plot(np.arange(1, len(q) + 1), distance, marker, color=colour, markeredgecolor=DARK, markersize=3.5, label=name)
+    axes.axhline(
+        PUBLISHED["simulation"][str(number)]["de"], color=DARK, linestyle="--", linewidth=0.9, label="mean printed in the paper"
+    )
+    axes.set(xlabel="pose", ylabel="distance from the centroid [mm]", yscale="log")
+    axes.legend(loc="center right", fontsize=7.5)
+    return figure
+
+
+def scale_law() -> Any:
+    """Identified over true length, for the five that are not zero: a constant, which is k."""
+    truth = vector("simulation", "nominal")
+    chosen = is_length() & (truth != 0)
+    figure, axes = plt.subplots(figsize=(4.6, 3.0))
+    for (marker, colour), number in zip(MARKS, (1, 2), strict=False):
+        values = vector("simulation", str(number), "identified")
+        k = values[is_length()] @ truth[is_length()] / (truth[is_length()] @ truth[is_length()])
+        axes.axhline(k, color=colour, linewidth=0.9, linestyle=("-", "--")[number - 1])
+        axes.plot(
+            truth[chosen],
+            (values / np.where(chosen, truth, 1))[chosen],
+            marker,
+            color=colour,
+            label=f"eq. {15 + number}, k = {k:.5f}",
+        )
+    axes.set(xlabel="true length [mm]", ylabel="identified / true length", xscale="log")
+    axes.legend(loc="center right")
+    return figure
+
+
+def distributions(runs: Table) -> Any:
+    """DE, Deltam and k of both simulations over the sets of poses; the printed values as lines."""
+    stored = paper_method.stored()
+    figure, grid = plt.subplots(2, 3, figsize=(7.0, 4.0))
+    truth = vector("simulation", "nominal")
+    for number, line in zip((1, 2), grid, strict=True):
+        printed = PUBLISHED["simulation"][str(number)]
+        values = vector("simulation", str(number), "identified")
+        k = values[is_length()] @ truth[is_length()] / (truth[is_length()] @ truth[is_length()])
+        theirs = [row for row in stored if row["simulation"] == number]
+        for axes, key, mark, label in zip(
+            line,
+            ("de_mm", "deltam_mm", "k"),
+            (printed["de"], printed["deltam"], k),
+            ("DE [mm]", "Deltam [mm]", "k"),
+            strict=True,
+        ):
+            sample = column(theirs, key)
+            bins: Any = np.geomspace(sample.min(), sample.max(), 40) if key != "k" else 40
+            axes.hist(sample, bins=bins, color=LIGHT, label="paper's method")
+            if key == "k":
+                mine = [row["k"] for row in runs if row["simulation"] == number]
+                axes.hist(mine, bins=40, histtype="step", color=DARK, linewidth=0.9, label="this toolkit")
+                axes.set_yscale("log")
+                axes.legend(fontsize=6.5, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, columnspacing=0.8)
+            else:
+                axes.set_xscale("log")
+            axes.axvline(mark, color=DARK, linestyle="--", linewidth=1.2)
+            axes.set(xlabel=f"{label}, simulation {number}", ylabel="runs")
+    return figure
+
+
+def box_and_scale(table: Table) -> Any:
+    """k against where the box of the lengths is centred, for several widths."""
+    figure, axes = plt.subplots(figsize=(4.6, 3.2))
+    widths = sorted({line["half_width_mm"] for line in table})
+    for i, ((marker, colour), width) in enumerate(zip(MARKS, widths, strict=True)):
+        part = [line for line in table if line["half_width_mm"] == width]
+        low, middle, high = (column(part, key) for key in ("k_low", "k_median", "k_high"))
+        inside = column(part, "truth_inside") > 0
+        x = column(part, "centre_shift_mm") + 0.22 * (i - 2)
+        axes.errorbar(x, middle, [middle - low, high - middle], fmt="none", ecolor=colour, elinewidth=1, capsize=2)
+        axes.plot(x[inside], middle[inside], marker, color=colour, markeredgecolor=DARK, label=f"+/-{width:g} mm")
+        axes.plot(x[~inside], middle[~inside], marker, markerfacecolor="white", markeredgecolor=colour)
+    axes.axhline(1, color=DARK, linewidth=0.8)
+    axes.set(xlabel="shift of the boxes' centre [mm] (open: the truth is outside)", ylabel="k, median and 95 %")
+    axes.legend(title="half-width", fontsize=7, title_fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+def repeatability(points: Table) -> Any:
+    """Figure 6: coordinates of the 70 tips about their centroid after stage 1, in a typical twin."""
+    figure, axes = plt.subplots(figsize=(4.6, 3.0))
+    for (marker, colour), key in zip(MARKS, ("x_mm", "y_mm", "z_mm"), strict=False):
+        axes.plot(
+            np.arange(1, len(points) + 1),
+            1e3 * column(points, key),
+            marker,
+            color=colour,
+            markersize=3.5,
+            label=key[0],
+            markeredgecolor=DARK,
+        )
+    for side in (-1, 1):
+        axes.axhline(side * 1e3 * PUBLISHED["experiment"]["deltam"], color=DARK, linestyle="--", linewidth=0.9)
+    axes.set(xlabel="pose of a typical twin (dashed: the printed Deltam)", ylabel="deviation from the centroid [um]")
+    axes.legend(ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.16))
+    return figure
+
+
+def plate(deviations: Table) -> Any:
+    """Figure 8: the plate at 30 places, in a typical twin, with the printed extremes."""
+    check = PUBLISHED["verification"]
+    figure, axes = plt.subplots(figsize=(4.6, 3.0))
+    values = 1e3 * column(deviations, "deviation_mm")
+    axes.vlines(column(deviations, "placement"), 0, values, color=MIDDLE, linewidth=0.9)
+    axes.plot(column(deviations, "placement"), values, "o", color=DARK, markersize=4)
+    for key in ("maximum", "minimum"):
+        axes.axhline(1e3 * (check[key] - check["nominal"]), color=DARK, linestyle="--", linewidth=0.9)
+    axes.axhline(0, color=DARK, linewidth=0.8)
+    axes.set(xlabel="placement of the plate (dashed: the printed extremes)", ylabel="deviation of 300.0005 mm [um]")
+    return figure
+
+
+def twins(table: Table) -> Any:
+    """Where the printed figures of the experiment lie among the twins."""
+    table3, check = PUBLISHED["table3"], PUBLISHED["verification"]
+    panels = (
+        ("deltam_Data1_mm", table3["Data1"], "Deltam, Data1 [mm]"),
+        ("deltam_Data2_mm", table3["Data2"], "Deltam, Data2 [mm]"),
+        ("deltam_Data3_mm", table3["Data3"], "Deltam, Data3 [mm]"),
+        ("plate_largest_mm", check["max_deviation"], "largest deviation on the plate [mm]"),
+        ("plate_range_mm", check["range"], "range on the plate [mm]"),
+        ("plate_two_rms_mm", check["two_rms"], "two RMS on the plate [mm]"),
+    )
+    figure, grid = plt.subplots(2, 3, figsize=(7.0, 3.8))
+    for axes, (key, printed, label) in zip(grid.ravel(), panels, strict=True):
+        values = column(table, key)
+        axes.hist(values, bins=np.linspace(values.min(), np.percentile(values, 99), 36), color=LIGHT)
+        axes.axvline(printed, color=DARK, linestyle="--", linewidth=1.2)
+        axes.set(xlabel=label, ylabel="twins")
+    return figure
+
+
+def stages(table: Table) -> Any:
+    """RMS on the plate by what was done."""
+    names = [key for key in table[0] if key != "twin"]
+    figure, axes = plt.subplots(figsize=(4.9, 2.6))
+    boxes = [column(table, name) for name in names]
+    axes.boxplot(
+        boxes,
+        orientation="horizontal",
+        tick_labels=names,
+        whis=(2.5, 97.5),
+        showfliers=False,
+        medianprops={"color": DARK, "linewidth": 1.6},
+    )
+    axes.set(xscale="log", xlabel="RMS deviation on the plate [mm]; whiskers: 95 %")
+    axes.invert_yaxis()
+    return figure
+
+
+def sliding(table: Table) -> Any:
+    """k by noise, every length free, for several boxes; and with one length held."""
+    figure, axes = plt.subplots(figsize=(4.6, 3.2))
+    widths = sorted({line["half_width_mm"] for line in table})
+    for (marker, colour), width in zip(MARKS, widths, strict=True):
+        part = [line for line in table if line["half_width_mm"] == width]
+        axes.plot(
+            column(part, "encoder_arcsec"),
+            column(part, "k_median_free"),
+            marker + "-",
+            color=colour,
+            markeredgecolor=DARK,
+            linewidth=0.9,
+            label=f"all free, +/-{width:g} mm",
+        )
+    held = [line for line in table if line["half_width_mm"] == widths[-1]]
+    axes.plot(
+        column(held, "encoder_arcsec"),
+        column(held, "k_median_held"),
+        "k--",
+        linewidth=1.4,
+        label=f"$d_3$ held, +/-{widths[-1]:g} mm",
+    )
+    axes.set(xlabel="encoder noise [arcsec]", ylabel="k of stage 1, median")
+    axes.legend(fontsize=7, loc="lower left", bbox_to_anchor=(0, 0.12))
+    return figure
+
+
+def buying(table: Table) -> Any:
+    """RMS of 300 mm lengths by poses, sockets and reference lengths."""
+    lengths = sorted({line["lengths"] for line in table})
+    figure, grid = plt.subplots(1, len(lengths), figsize=(7.0, 2.7), sharey=True)
+    for axes, count in zip(grid, lengths, strict=True):
+        for (marker, colour), sockets in zip(MARKS, sorted({line["sockets"] for line in table}), strict=False):
+            part = [line for line in table if line["sockets"] == sockets and line["lengths"] == count]
+            axes.plot(
+                column(part, "poses"),
+                1e3 * column(part, "rms_mm"),
+                marker + "-",
+                color=colour,
+                markeredgecolor=DARK,
+                linewidth=0.9,
+                label=f"{sockets} socket{'s' * (sockets > 1)}",
+            )
+        axes.set(xlabel=f"poses in all; {count} reference length{'s' * (count > 1)}", xscale="log", xticks=[16, 32, 70, 140])
+        axes.xaxis.set_major_formatter(matplotlib.ticker.ScalarFormatter())
+        axes.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
+    grid[0].set(ylabel="RMS error of 300 mm lengths [um]", ylim=(0, None))
+    grid[0].legend(fontsize=7)
+    return figure
+
+
+def references(table: Table) -> Any:
+    """u of k by how long the reference is, where it lies, and how well it is known."""
+    figure, grid = plt.subplots(1, 2, figsize=(7.0, 2.9), sharey=True)
+    exact = [line for line in table if line["u_mm"] == 0]
+    for (marker, colour), place in zip(MARKS, dict.fromkeys(line["place"] for line in exact), strict=False):
+        part = [line for line in exact if line["place"] == place]
+        grid[0].plot(
+            column(part, "length_mm"),
+            column(part, "u_k"),
+            marker + "-",
+            color=colour,
+            markeredgecolor=DARK,
+            linewidth=0.9,
+            label=place,
+        )
+    best = [line for line in table if line["place"] == "far, radial"]
+    for (marker, colour), u in zip(MARKS, sorted({line["u_mm"] for line in best}), strict=False):
+        part = [line for line in best if line["u_mm"] == u]
+        grid[1].plot(
+            column(part, "length_mm"),
+            column(part, "u_k"),
+            marker + "-",
+            color=colour,
+            markeredgecolor=DARK,
+            linewidth=0.9,
+            label=f"u = {1e3 * u:g} um",
+        )
+    for axes, what in zip(grid, ("exact, by place", "far, radial"), strict=True):
+        axes.set(xscale="log", yscale="log", xlabel=f"reference length [mm] ({what})", xticks=[50, 100, 200, 400])
+        axes.xaxis.set_major_formatter(matplotlib.ticker.ScalarFormatter())
+        axes.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
+        axes.legend(fontsize=7)
+    grid[0].set(ylabel="standard deviation of k")
+    return figure
+
+
+def draw(tables: dict[str, Table], folder: Path) -> dict[str, str]:
+    """Every figure as PNG into the folder; file name -> what it shows."""
+    figures: dict[str, Callable[[], Any]] = {
+        "figure2": lambda: simulation(1),
+        "figure3": lambda: simulation(2),
+        "scale_law": scale_law,
+        "distributions": lambda: distributions(tables["toolkit_1000_sets"]),
+        "k_against_box": lambda: box_and_scale(tables["k_against_box"]),
+        "figure6": lambda: repeatability(tables["figure6"]),
+        "figure8": lambda: plate(tables["figure8"]),
+        "twins": lambda: twins(tables["twins"]),
+        "stages": lambda: stages(tables["stages"]),
+        "noise_and_box": lambda: sliding(tables["noise_and_box"]),
+        "sockets_poses_lengths": lambda: buying(tables["sockets_poses_lengths"]),
+        "reference_lengths": lambda: references(tables["reference_lengths"]),
+    }
+    about = {
+        "figure2": simulation, "figure3": simulation, "scale_law": scale_law, "distributions": distributions, "k_against_box": box_and_scale,
+        "figure6": repeatability, "figure8": plate, "twins": twins, "stages": stages, "noise_and_box": sliding,
+        "sockets_poses_lengths": buying, "reference_lengths": references,
+    }  # fmt: skip
+    for name, make in figures.items():
+        with plt.rc_context(STYLE):
+            figure = make()
+            figure.savefig(folder / f"{name}.png", metadata={"Software": None})
+            plt.close(figure)
+    return {name: (function.__doc__ or "").strip() for name, function in about.items()}

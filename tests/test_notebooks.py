@@ -1,0 +1,27 @@
+"""The notebooks run from beginning to end, as a reader would run them."""
+
+import warnings
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_runs(path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the notebook machinery, not of the package: that runs in the kernel
+        import nbclient
+        import nbformat
+
+        notebook = nbformat.read(path, 4)
+        assert all(cell.get("outputs") or not cell.source for cell in notebook.cells[-1:] if cell.cell_type == "code")
+        nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(path.parent)}}).execute()
+
+
+def test_both_are_there_with_their_outputs():
+    assert [path.stem[:2] for path in NOTEBOOKS] == ["01", "02"]
+    for path in NOTEBOOKS:
+        assert '"image/png"' in path.read_text()
