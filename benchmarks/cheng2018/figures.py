@@ -1,4 +1,4 @@
-"""The figures: the paper's 2, 3, 6 and 8 and its scale law, redrawn; and what it did not draw. Readable in grey."""
+"""The figures: what the paper's 2, 3, 6 and 8 can be taken to show (the text does not say), its scale law, and what it did not draw. Readable in grey."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -35,7 +35,9 @@ def column(table: Table, key: str) -> np.ndarray:
 
 def simulation(number: int) -> Any:
     """Figures 2 and 3: distance of every pose's tip from the centroid, by the paper's method and by this toolkit."""
-    q, lower, upper, start = paper_method.problem(number, 0)
+    runs = [line for line in paper_method.stored() if line["simulation"] == number]
+    typical = sorted(runs, key=lambda line: line["de_mm"])[len(runs) // 2]
+    q, lower, upper, start = paper_method.problem(number, int(typical["set"]))
     values, _ = paper_method.minimise(q, lower, upper, start)
     mine = many_of(q[None], lower, upper, start[None]).parameters[0]
     figure, axes = plt.subplots(figsize=(4.6, 3.0))
@@ -47,7 +49,11 @@ def simulation(number: int) -> Any:
     axes.axhline(
         PUBLISHED["simulation"][str(number)]["de"], color=DARK, linestyle="--", linewidth=0.9, label="mean printed in the paper"
     )
-    axes.set(xlabel="pose", ylabel="distance from the centroid [mm]", yscale="log")
+    axes.set(
+        xlabel=f"pose of simulation {number}, the set whose DE is the median",
+        ylabel="distance from the centroid [mm]",
+        yscale="log",
+    )
     axes.legend(loc="center right", fontsize=7.5)
     return figure
 
@@ -106,39 +112,57 @@ def distributions(runs: Table) -> Any:
 
 
 def box_and_scale(table: Table) -> Any:
-    """k against where the box of the lengths is centred, for several widths."""
-    figure, axes = plt.subplots(figsize=(4.6, 3.2))
+    """k against the boxes of the lengths: this toolkit by where they are centred (left), the paper's method by their width (right)."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(7.2, 3.2), sharey=True, width_ratios=(1.5, 1))
     widths = sorted({line["half_width_mm"] for line in table})
     for i, ((marker, colour), width) in enumerate(zip(MARKS, widths, strict=True)):
         part = [line for line in table if line["half_width_mm"] == width]
         low, middle, high = (column(part, key) for key in ("k_low", "k_median", "k_high"))
         inside = column(part, "truth_inside") > 0
         x = column(part, "centre_shift_mm") + 0.22 * (i - 2)
-        axes.errorbar(x, middle, [middle - low, high - middle], fmt="none", ecolor=colour, elinewidth=1, capsize=2)
-        axes.plot(x[inside], middle[inside], marker, color=colour, markeredgecolor=DARK, label=f"+/-{width:g} mm")
-        axes.plot(x[~inside], middle[~inside], marker, markerfacecolor="white", markeredgecolor=colour)
-    axes.axhline(1, color=DARK, linewidth=0.8)
-    axes.set(xlabel="shift of the boxes' centre [mm] (open: the truth is outside)", ylabel="k, median and 95 %")
-    axes.legend(title="half-width", fontsize=7, title_fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        left.errorbar(x, middle, [middle - low, high - middle], fmt="none", ecolor=colour, elinewidth=1, capsize=2)
+        left.plot(x[inside], middle[inside], marker, color=colour, markeredgecolor=DARK, label=f"±{width:g} mm")
+        left.plot(x[~inside], middle[~inside], marker, markerfacecolor="white", markeredgecolor=colour)
+    for (marker, colour), shift in zip(
+        MARKS, sorted({line["centre_shift_mm"] for line in table if line["k_median_method"] > 0}), strict=False
+    ):
+        part = [line for line in table if line["centre_shift_mm"] == shift and line["truth_inside"]]
+        low, middle, high = (column(part, f"k_{key}_method") for key in ("lowest", "median", "highest"))
+        x = column(part, "half_width_mm") * (1 + 0.03 * np.sign(shift))
+        label = f"shifted by {shift:g} mm" if shift else "on the truth"
+        right.errorbar(
+            x,
+            middle,
+            [middle - low, high - middle],
+            fmt=marker,
+            color=colour,
+            markeredgecolor=DARK,
+            elinewidth=1,
+            capsize=2,
+            label=label,
+        )
+    for axes in (left, right):
+        axes.axhline(1, color=DARK, linewidth=0.8)
+    left.set(xlabel="shift of the boxes' centre [mm] (open: the truth is outside)", ylabel="k: median, and 95 % or extremes")
+    right.set(xlabel="half-width [mm]", xscale="log", xticks=widths)
+    right.xaxis.set_major_formatter(matplotlib.ticker.ScalarFormatter())
+    right.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
+    left.legend(fontsize=6.5, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    right.legend(fontsize=7, loc="lower left")
     return figure
 
 
 def repeatability(points: Table) -> Any:
-    """Figure 6: coordinates of the 70 tips about their centroid after stage 1, in a typical twin."""
+    """Figure 6: coordinates of the 70 tips about the middle of their range after stage 1, in a typical twin."""
     figure, axes = plt.subplots(figsize=(4.6, 3.0))
     for (marker, colour), key in zip(MARKS, ("x_mm", "y_mm", "z_mm"), strict=False):
-        axes.plot(
-            np.arange(1, len(points) + 1),
-            1e3 * column(points, key),
-            marker,
-            color=colour,
-            markersize=3.5,
-            label=key[0],
-            markeredgecolor=DARK,
-        )
+        values = 1e3 * column(points, key)
+        values = values - (values.max() + values.min()) / 2  # Deltam is a half range
+        style = {"color": colour, "markersize": 3.5, "markeredgecolor": DARK, "label": key[0]}
+        axes.plot(np.arange(1, len(points) + 1), values, marker, **style)
     for side in (-1, 1):
         axes.axhline(side * 1e3 * PUBLISHED["experiment"]["deltam"], color=DARK, linestyle="--", linewidth=0.9)
-    axes.set(xlabel="pose of a typical twin (dashed: the printed Deltam)", ylabel="deviation from the centroid [um]")
+    axes.set(xlabel="pose of a typical twin (dashed: the printed Deltam)", ylabel="deviation from mid-range [µm]")
     axes.legend(ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.16))
     return figure
 
@@ -153,7 +177,7 @@ def plate(deviations: Table) -> Any:
     for key in ("maximum", "minimum"):
         axes.axhline(1e3 * (check[key] - check["nominal"]), color=DARK, linestyle="--", linewidth=0.9)
     axes.axhline(0, color=DARK, linewidth=0.8)
-    axes.set(xlabel="placement of the plate (dashed: the printed extremes)", ylabel="deviation of 300.0005 mm [um]")
+    axes.set(xlabel="placement of the plate (dashed: the printed extremes)", ylabel="deviation from 300.0005 mm [µm]")
     return figure
 
 
@@ -171,9 +195,10 @@ def twins(table: Table) -> Any:
     figure, grid = plt.subplots(2, 3, figsize=(7.0, 3.8))
     for axes, (key, printed, label) in zip(grid.ravel(), panels, strict=True):
         values = column(table, key)
-        axes.hist(values, bins=np.linspace(values.min(), np.percentile(values, 99), 36), color=LIGHT)
+        axes.hist(values, bins=np.linspace(values.min(), values.max(), 48), color=LIGHT)
         axes.axvline(printed, color=DARK, linestyle="--", linewidth=1.2)
         axes.set(xlabel=label, ylabel="twins")
+    grid[0, 0].legend(["printed"], handlelength=1.4)
     return figure
 
 
@@ -208,7 +233,7 @@ def sliding(table: Table) -> Any:
             color=colour,
             markeredgecolor=DARK,
             linewidth=0.9,
-            label=f"all free, +/-{width:g} mm",
+            label=f"all free, ±{width:g} mm",
         )
     held = [line for line in table if line["half_width_mm"] == widths[-1]]
     axes.plot(
@@ -216,10 +241,11 @@ def sliding(table: Table) -> Any:
         column(held, "k_median_held"),
         "k--",
         linewidth=1.4,
-        label=f"$d_3$ held, +/-{widths[-1]:g} mm",
+        label=f"$d_3$ held, ±{widths[-1]:g} mm",
     )
     axes.set(xlabel="encoder noise [arcsec]", ylabel="k of stage 1, median")
-    axes.legend(fontsize=7, loc="lower left", bbox_to_anchor=(0, 0.12))
+    axes.set_xscale("symlog", linthresh=0.1)
+    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
@@ -242,7 +268,7 @@ def buying(table: Table) -> Any:
         axes.set(xlabel=f"poses in all; {count} reference length{'s' * (count > 1)}", xscale="log", xticks=[16, 32, 70, 140])
         axes.xaxis.set_major_formatter(matplotlib.ticker.ScalarFormatter())
         axes.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
-    grid[0].set(ylabel="RMS error of 300 mm lengths [um]", ylim=(0, None))
+    grid[0].set(ylabel="RMS error of 300 mm lengths [µm]", ylim=(0, None))
     grid[0].legend(fontsize=7)
     return figure
 
@@ -262,9 +288,9 @@ def references(table: Table) -> Any:
             linewidth=0.9,
             label=place,
         )
-    best = [line for line in table if line["place"] == "far, radial"]
-    for (marker, colour), u in zip(MARKS, sorted({line["u_mm"] for line in best}), strict=False):
-        part = [line for line in best if line["u_mm"] == u]
+    worst = [line for line in table if line["place"] == "far, tangential"]
+    for (marker, colour), u in zip(MARKS, sorted({line["u_mm"] for line in worst}), strict=False):
+        part = [line for line in worst if line["u_mm"] == u]
         grid[1].plot(
             column(part, "length_mm"),
             column(part, "u_k"),
@@ -272,9 +298,9 @@ def references(table: Table) -> Any:
             color=colour,
             markeredgecolor=DARK,
             linewidth=0.9,
-            label=f"u = {1e3 * u:g} um",
+            label=f"u = {1e3 * u:g}  µm",
         )
-    for axes, what in zip(grid, ("exact, by place", "far, radial"), strict=True):
+    for axes, what in zip(grid, ("exact, by place", "far, tangential"), strict=True):
         axes.set(xscale="log", yscale="log", xlabel=f"reference length [mm] ({what})", xticks=[50, 100, 200, 400])
         axes.xaxis.set_major_formatter(matplotlib.ticker.ScalarFormatter())
         axes.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())

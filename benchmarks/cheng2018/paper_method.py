@@ -47,7 +47,7 @@ def de_and_gradient(values: jax.Array, q: jax.Array) -> tuple[jax.Array, jax.Arr
 
     def de(point: jax.Array) -> jax.Array:
         tips = aj.Parameters(simulated_arm(), NAMES).arm(point).position(q)
-        return jnp.mean(jnp.linalg.norm(tips - jnp.mean(tips, axis=0), axis=-1))
+        return jnp.mean(jnp.linalg.norm(tips - jnp.mean(tips, axis=0, keepdims=True), axis=-1))
 
     return jax.value_and_grad(de)(values)
 
