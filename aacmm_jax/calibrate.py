@@ -28,7 +28,7 @@ from .solver import BoundedLevenbergMarquardt, least_squares
 from .steps import Reason, numbers_of
 
 # The boxes of this problem are small against its curvature, so the first steps can be nearly Gauss-Newton's.
-SOLVER = BoundedLevenbergMarquardt(initial_damping=1e-6)
+SOLVER = BoundedLevenbergMarquardt(rtol=1e-13, initial_damping=1e-6)
 _MAX_STEPS = 300
 _GOOD = [int(reason._value) for reason in (Reason.gradient, Reason.step, Reason.rounding)]  # pyright: ignore
 

@@ -44,7 +44,7 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     Use it through `least_squares`, which also brings the adjoint that knows the bounds.
     """
 
-    rtol: float = 1e-13  # on the step to come, relative to |y| (both scaled)
+    rtol: float = 1e-14  # on the step to come, relative to |y| (both scaled)
     atol: float = 0.0  # on the step, scaled
     gtol: float = 1e-10  # on the projected gradient: cosine between the residual and a column of J
     initial_damping: float = 1e-3  # relative to the largest curvature
