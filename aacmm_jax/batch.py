@@ -27,7 +27,7 @@ from .chain import Geometry, Turns, turns_of, walk
 from .checks import check_enough, check_fit, held_length
 from .errors import InputError
 from .metrics import repeatability
-from .parameters import Parameters
+from .parameters import Parameters, placed
 from .residuals import Measurement, model_of
 from .scale import scale_of
 from .steps import Box, Reason, advance, begin, choose, either, numbers_of, reasons
@@ -295,12 +295,7 @@ def _work_off(problems: _Problems, shape: _Shape, count: Int[Array, ""], room: i
 
 def _with_parameters(rows: Geometry, vector: Float[Array, "w p"], entries: tuple[tuple[str, int], ...]) -> Geometry:
     """Geometry of every lane ``(w, 1, n)`` with its free parameters from ``vector``; the axis of ones is for the poses."""
-    values = rows._asdict()
-    for kind in {kind for kind, _ in entries}:
-        places = [(i, position) for position, (k, i) in enumerate(entries) if k == kind]
-        targets, sources = (np.array(column) for column in zip(*places, strict=True))
-        values[kind] = values[kind].at[:, targets].set(vector[:, sources])
-    return jax.tree.map(lambda leaf: leaf[:, None, :], Geometry(**values))
+    return jax.tree.map(lambda leaf: leaf[:, None, :], rows._replace(**placed(rows, vector, entries)))
 
 
 def _figures(part: _Problems, parameters: Float[Array, "w p"], shape: _Shape) -> tuple[Array, ...]:

@@ -19,7 +19,12 @@ def test_every_public_name_is_there():
 
 
 @pytest.mark.parametrize(
-    "line", ["from aacmm_jax import *; load_arm('panda')", "import aacmm_jax; aacmm_jax.arm_files.load_arm('panda')"]
+    "line",
+    [
+        "from aacmm_jax import *; print(load_arm('panda').joints)",
+        "import aacmm_jax; print(aacmm_jax.arm_files.load_arm('panda').joints)",
+    ],
 )
 def test_late_names_in_a_fresh_process(line):
-    subprocess.run([sys.executable, "-c", line], check=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", line], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "7\n"), done.stderr
