@@ -33,6 +33,12 @@ def column(table: Table, key: str) -> np.ndarray:
     return np.array([line[key] for line in table])
 
 
+def joined_points(axes: Any, part: Table, x: str, y: str, mark: tuple[str, str], label: str, factor: float = 1.0) -> None:
+    """One series of a table, its points joined by a thin line."""
+    style = {"color": mark[1], "markeredgecolor": DARK, "linewidth": 0.9, "label": label}
+    axes.plot(column(part, x), factor * column(part, y), mark[0] + "-", **style)
+
+
 def simulation(number: int) -> Any:
     """Figures 2 and 3: distance of every pose's tip from the centroid, by the paper's method and by this toolkit."""
     runs = [line for line in paper_method.stored() if line["simulation"] == number]
@@ -226,15 +232,7 @@ def sliding(table: Table) -> Any:
     widths = sorted({line["half_width_mm"] for line in table})
     for (marker, colour), width in zip(MARKS, widths, strict=True):
         part = [line for line in table if line["half_width_mm"] == width]
-        axes.plot(
-            column(part, "encoder_arcsec"),
-            column(part, "k_median_free"),
-            marker + "-",
-            color=colour,
-            markeredgecolor=DARK,
-            linewidth=0.9,
-            label=f"all free, ±{width:g} mm",
-        )
+        joined_points(axes, part, "encoder_arcsec", "k_median_free", (marker, colour), f"all free, ±{width:g} mm")
     held = [line for line in table if line["half_width_mm"] == widths[-1]]
     axes.plot(
         column(held, "encoder_arcsec"),
@@ -256,15 +254,7 @@ def buying(table: Table) -> Any:
     for axes, count in zip(grid, lengths, strict=True):
         for (marker, colour), sockets in zip(MARKS, sorted({line["sockets"] for line in table}), strict=False):
             part = [line for line in table if line["sockets"] == sockets and line["lengths"] == count]
-            axes.plot(
-                column(part, "poses"),
-                1e3 * column(part, "rms_mm"),
-                marker + "-",
-                color=colour,
-                markeredgecolor=DARK,
-                linewidth=0.9,
-                label=f"{sockets} socket{'s' * (sockets > 1)}",
-            )
+            joined_points(axes, part, "poses", "rms_mm", (marker, colour), f"{sockets} socket{'s' * (sockets > 1)}", factor=1e3)
         axes.set(xlabel=f"poses in all; {count} reference length{'s' * (count > 1)}", xscale="log", xticks=[16, 32, 70, 140])
         axes.xaxis.set_major_formatter(matplotlib.ticker.ScalarFormatter())
         axes.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
@@ -279,27 +269,11 @@ def references(table: Table) -> Any:
     exact = [line for line in table if line["u_mm"] == 0]
     for (marker, colour), place in zip(MARKS, dict.fromkeys(line["place"] for line in exact), strict=False):
         part = [line for line in exact if line["place"] == place]
-        grid[0].plot(
-            column(part, "length_mm"),
-            column(part, "u_k"),
-            marker + "-",
-            color=colour,
-            markeredgecolor=DARK,
-            linewidth=0.9,
-            label=place,
-        )
+        joined_points(grid[0], part, "length_mm", "u_k", (marker, colour), place)
     worst = [line for line in table if line["place"] == "far, tangential"]
     for (marker, colour), u in zip(MARKS, sorted({line["u_mm"] for line in worst}), strict=False):
         part = [line for line in worst if line["u_mm"] == u]
-        grid[1].plot(
-            column(part, "length_mm"),
-            column(part, "u_k"),
-            marker + "-",
-            color=colour,
-            markeredgecolor=DARK,
-            linewidth=0.9,
-            label=f"u = {1e3 * u:g}  µm",
-        )
+        joined_points(grid[1], part, "length_mm", "u_k", (marker, colour), f"u = {1e3 * u:g} µm")
     for axes, what in zip(grid, ("exact, by place", "far, tangential"), strict=True):
         axes.set(xscale="log", yscale="log", xlabel=f"reference length [mm] ({what})", xticks=[50, 100, 200, 400])
         axes.xaxis.set_major_formatter(matplotlib.ticker.ScalarFormatter())

@@ -1,4 +1,4 @@
-"""Twins of section 4's experiment: the raw data are not public, so the arm is made up again, a thousand times.
+"""Twins of section 4's experiment: the recordings (figshare 6223811) could not be had, so the arm is made up again, a thousand times.
 
 Truth is the arm of eq. 18 after its scale fix. Every twin records what the paper did: three sockets of 70 poses, one length of
 201.513 mm measured four times at one place, a plate of 300.0005 mm at 30 places. Readings err by encoder noise, the tip by
@@ -16,9 +16,8 @@ from paper import NAMES, POSES, PUBLISHED, arm_of, box, figures_of, is_length, t
 from scipy.optimize import minimize
 
 import aacmm_jax as aj
-from aacmm_jax.simulate import reach
+from aacmm_jax.simulate import ARCSEC, reach
 
-ARCSEC = np.pi / (180 * 3600)
 # mm: three sockets well within the arm's reach of 1.4 m, since the paper does not print where its own stood.
 SOCKETS = {"Data1": (400.0, 200.0, 300.0), "Data2": (-350.0, 500.0, 150.0), "Data3": (600.0, -450.0, 550.0)}
 REFERENCE = PUBLISHED["experiment"]["length_reference"]["nominal"]
