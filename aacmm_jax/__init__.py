@@ -6,7 +6,9 @@ from importlib import import_module as _import_module
 from . import _float64 as _float64  # isort: skip - must come before anything that makes an array
 from .arm import Arm as Arm
 from .arm import parameter_names as parameter_names
+from .batch import ManyCalibrations as ManyCalibrations
 from .batch import ManyIdentifications as ManyIdentifications
+from .batch import calibrate_many as calibrate_many
 from .batch import identify_many as identify_many
 from .batch import stack_captures as stack_captures
 from .calibrate import Calibration as Calibration
@@ -40,13 +42,20 @@ from .solver import BoundedLevenbergMarquardt as BoundedLevenbergMarquardt
 from .solver import least_squares as least_squares
 from .steps import Reason as Reason
 
-# Imported when first asked for: these need pydantic, which takes a tenth of the package's own import.
+# Imported when first asked for: these need pydantic, which takes a tenth of the package's own import, and more.
 _LATER = {
     "load_arm": "arm_files",
     "load_specification": "arm_files",
     "save_arm": "arm_files",
     "shipped_arms": "arm_files",
     "read_manifest": "manifest",
+    "Study": "study.study",
+    "make_study": "study.study",
+    "read_study": "study.shipped",
+    "shipped_studies": "study.shipped",
+    "run_study": "study.run",
+    "open_study": "study.results",
+    "dask_executor": "study.executors",
 }
 _NOW = {name for name, value in globals().items() if not (name.startswith("_") or isinstance(value, type(_typing)))}
 __all__ = sorted(_NOW | set(_LATER))  # pyright: ignore[reportUnsupportedDunderAll]
@@ -57,6 +66,13 @@ if _typing.TYPE_CHECKING:
     from .arm_files import save_arm as save_arm
     from .arm_files import shipped_arms as shipped_arms
     from .manifest import read_manifest as read_manifest
+    from .study.executors import dask_executor as dask_executor
+    from .study.results import open_study as open_study
+    from .study.run import run_study as run_study
+    from .study.shipped import read_study as read_study
+    from .study.shipped import shipped_studies as shipped_studies
+    from .study.study import Study as Study
+    from .study.study import make_study as make_study
 else:
 
     def __getattr__(name: str):

@@ -1,8 +1,6 @@
-"""Stage 1 for many problems at once (`identify_many`): the engine under every Monte Carlo study.
+"""Thousands of calibrations at once (`identify_many`, `calibrate_many`): the engine under every Monte Carlo study.
 
-A chunk of problems is worked off by a fixed number of lanes. Every pass of the loop evaluates and advances all lanes; a
-lane whose problem has ended writes its result and takes the next problem of the chunk, so no problem waits for another.
-The number of lanes, not the chunk, fixes the arithmetic: results are the same to the bit whatever the chunk.
+The batch is cut into chunks, which are spread over devices and cores; `lanes` solves a chunk.
 """
 
 import math
@@ -10,27 +8,23 @@ import os
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .arm import Arm, replace
 from .arrays import Numbers, as_array
-from .calibrate import SOLVER, converged
+from .calibrate import converged
 from .capture import Capture
-from .chain import Geometry, Turns, turns_of, walk
 from .checks import check_enough, check_fit, held_length
 from .errors import InputError
-from .metrics import repeatability
-from .parameters import Parameters, placed
-from .residuals import Measurement, model_of
-from .scale import scale_of
-from .steps import Box, Reason, advance, begin, choose, either, numbers_of, reasons
+from .lanes import Problems, Shape, solve_chunk
+from .parameters import Parameters, is_length
+from .steps import Reason, reasons
 
 # Lanes per loop. On a CPU the columns of all lanes should fit the second-level cache (measured from 20 to 7,000 poses: five
 # times slower where they do not); a GPU wants thousands.
@@ -58,37 +52,28 @@ class ManyIdentifications(eqx.Module):
         return np.asarray(converged(self.result))
 
 
-class _Problems(NamedTuple):
-    """What may differ from problem to problem; a leaf either has the batch axis first, or is shared by all."""
+class ManyCalibrations(eqx.Module):
+    """Results of both stages, or of the joint solve, problem by problem, as NumPy arrays; mm and rad."""
 
-    start: Any  # (p,)
-    lower: Any  # (p,)
-    upper: Any  # (p,)
-    geometry: Any  # `Geometry` with (n,) leaves
-    q: Any  # (N, n)
-    nominal: Any  # (l,)
-    u: Any  # (l,)
+    parameters: Float[np.ndarray, "b p"]
+    k: Float[np.ndarray, " b"]  # of stage 1, by which its lengths were divided
+    de: Float[np.ndarray, " b"]  # mm
+    deltam: Float[np.ndarray, " b"]  # mm
+    steps: Int[np.ndarray, " b"]  # evaluations of all solves
+    result: Reason  # why the last solve ended
+    active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, in the last solve
+    stage1: ManyIdentifications
+    method: str = eqx.field(static=True)
 
+    @property
+    def space(self) -> Parameters:
+        """The free parameters."""
+        return self.stage1.space
 
-class _Shape(NamedTuple):
-    """What is the same for all problems and fixes the compiled program."""
-
-    sizes: tuple[int, ...]
-    ends: tuple[tuple[int, int], ...]
-    entries: tuple[tuple[str, int], ...]
-    kept: tuple[bool, ...]  # False for the length held in stage 1
-    scale: tuple[float, ...]
-    batched: _Problems  # booleans
-    lanes: int
-    max_steps: int
-
-
-class _Ended(NamedTuple):
-    """What one ended problem leaves."""
-
-    parameters: Float[Array, "b p"]
-    steps: Int[Array, " b"]
-    reason: Reason
+    @property
+    def converged(self) -> Bool[np.ndarray, " b"]:
+        """Which problems ended at a minimum in every solve."""
+        return self.stage1.converged & np.asarray(converged(self.result))
 
 
 def identify_many(
@@ -104,6 +89,7 @@ def identify_many(
     chunk: int | None = None,
     lanes: int | None = None,
     devices: Sequence[Any] | None = None,
+    workers: int | None = None,
 ) -> ManyIdentifications:
     """Stage 1 for a batch: what `identify` does, problem by problem, fast.
 
@@ -111,36 +97,55 @@ def identify_many(
     parameters of ``arm``); ``start`` defaults to the arm. ``arm`` may be a batch (every parameter ``(batch, n)``), and so
     may the capture (see `stack_captures`).
 
-    Work is spread over all devices and, on a CPU, all cores; memory is bounded by the ``chunk`` (problems per call of the
-    compiled program). Failure is data (``result``);
-    a start outside its box is clipped to it. Raises `InputError` for
+    Work is spread over all devices and, on a CPU, all cores (or ``workers`` threads); memory is bounded by the ``chunk``
+    (problems per call of the compiled program). Failure is data (``result``); a start outside its box is clipped to it. Raises `InputError` for
     shapes that do not fit, a lower bound above its upper one, and too few poses.
     """
-    if space is None:
-        space = Parameters.free_of(arm)
-    problems, batched, size = _problems(arm, capture, lower, upper, start, space)
-    hold = held_length(space, arm, hold)
-    check_fit(capture, space)
-    check_enough(capture, len(space.names) - int(space.lengths.any()))
-    for what, number in (("chunk", chunk), ("lanes", lanes)):
-        if number is not None and number < 1:
-            raise InputError(f"{what} is {number}; give at least 1, or leave it out.")
-    devices = jax.local_devices() if devices is None else list(devices)
-    lanes = lanes or _lanes(devices, sum(capture.sizes))
-    workers = _workers(devices)
-    pieces = _pieces(size, lanes, workers, chunk)
-    shape = _Shape(
-        sizes=capture.sizes,
-        ends=tuple((int(a), int(b)) for a, b in capture.ends()),
-        entries=space.entries(),
-        kept=tuple(name != hold for name in space.names),
-        scale=tuple(np.asarray(space.scale).tolist()),
-        batched=batched,
-        lanes=lanes,
-        max_steps=max_steps,
-    )
-    work = _Work(problems, shape, _room(max(len(piece) for piece in pieces), lanes))
-    return _assemble(_spread(work.run, pieces, devices, workers), space, hold, bool(capture.lengths))
+    work = _Work.of(arm, capture, lower, upper, start, space, hold, _Effort(max_steps, chunk, lanes, devices, workers))
+    return work.identified()
+
+
+def calibrate_many(
+    arm: Arm,
+    capture: Capture,
+    lower: Numbers,
+    upper: Numbers,
+    start: Numbers | None = None,
+    *,
+    method: Literal["two-stage", "joint"] = "two-stage",
+    space: Parameters | None = None,
+    hold: str | None = "longest",
+    max_steps: int = 300,
+    chunk: int | None = None,
+    lanes: int | None = None,
+    devices: Sequence[Any] | None = None,
+    workers: int | None = None,
+) -> ManyCalibrations:
+    """Both stages for a batch: what `calibrate` does, problem by problem, fast; arguments as for `identify_many`.
+
+    Raises `InputError` as `identify_many` does, and where the capture holds no reference length.
+    """
+    if method not in ("two-stage", "joint"):
+        raise InputError(f"method is '{method}'; it must be 'two-stage' or 'joint'.")
+    if not capture.lengths:
+        raise InputError("the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many.")
+    effort = _Effort(max_steps, chunk, lanes, devices, workers)
+    work = _Work.of(arm, capture, lower, upper, start, space, hold, effort)
+    stage1 = work.identified()
+    k = stage1.k
+    assert k is not None
+    # Every length but d_1, as in `divide_lengths`.
+    divided = np.array([is_length(name) and name != "d_1" for name in stage1.space.names])
+    scaled = np.where(divided, stage1.parameters / k[:, None], stage1.parameters)
+    if method == "two-stage":
+        # Divided by k, the whole arm shrinks about the base, so do distances between its tips.
+        return ManyCalibrations(
+            scaled, k, stage1.de / k, stage1.deltam / k, stage1.steps, stage1.result, stage1.active, stage1, method
+        )
+    work = _Work.of(arm, capture, lower, upper, scaled, stage1.space, None, effort, fitted=sum(work.shape.kept))
+    joint = work.identified()
+    steps = stage1.steps + joint.steps
+    return ManyCalibrations(joint.parameters, k, joint.de, joint.deltam, steps, joint.result, joint.active, stage1, method)
 
 
 def stack_captures(captures: Iterable[Capture]) -> Capture:
@@ -151,12 +156,69 @@ def stack_captures(captures: Iterable[Capture]) -> Capture:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *captures)
 
 
+class _Effort(NamedTuple):
+    """How much is computed at a time, and where."""
+
+    max_steps: int
+    chunk: int | None
+    lanes: int | None
+    devices: Sequence[Any] | None
+    workers: int | None
+
+
 class _Work(NamedTuple):
     """The whole batch on the host, and how a chunk of it is run on a device."""
 
-    problems: _Problems
-    shape: _Shape
+    problems: Problems
+    shape: Shape
+    pieces: list[range]
     room: int  # problems that the compiled program has room for
+    devices: list[Any]
+    workers: int
+    space: Parameters
+    hold: str | None
+
+    @classmethod
+    def of(
+        cls,
+        arm: Arm,
+        capture: Capture,
+        lower: Numbers,
+        upper: Numbers,
+        start: Numbers | None,
+        space: Parameters | None,
+        hold: str | None,
+        effort: _Effort,
+        fitted: int | None = None,
+    ) -> "_Work":
+        """Everything checked and laid out. ``fitted``: the joint solve, after a stage 1 of so many parameters."""
+        if space is None:
+            space = Parameters.free_of(arm)
+        problems, batched, size = _problems(arm, capture, lower, upper, start, space)
+        hold = held_length(space, arm, hold)
+        check_fit(capture, space)
+        check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
+        for what, number in (("chunk", effort.chunk), ("lanes", effort.lanes), ("workers", effort.workers)):
+            if number is not None and number < 1:
+                raise InputError(f"{what} is {number}; give at least 1, or leave it out.")
+        devices = jax.local_devices() if effort.devices is None else list(effort.devices)
+        lanes = effort.lanes or _lanes(devices, sum(capture.sizes))
+        workers = effort.workers or _workers(devices)
+        pieces = _pieces(size, lanes, workers, effort.chunk)
+        shape = Shape(
+            sizes=capture.sizes,
+            ends=tuple((int(a), int(b)) for a, b in capture.ends()),
+            entries=space.entries(),
+            kept=tuple(name != hold for name in space.names),
+            scale=tuple(np.asarray(space.scale).tolist()),
+            batched=batched,
+            lanes=lanes,
+            max_steps=effort.max_steps,
+            joint=fitted is not None,
+            fitted=fitted or 0,
+        )
+        room = _room(max(len(piece) for piece in pieces), lanes)
+        return cls(problems, shape, pieces, room, devices, workers, space, hold)
 
     def run(self, piece: range, device: Any) -> tuple[np.ndarray, ...]:
         """Solve one chunk. What room is left is filled with its first problem, which is never begun."""
@@ -164,8 +226,17 @@ class _Work(NamedTuple):
         rows[: len(piece)] = piece
         part = jax.tree.map(lambda leaf, many: leaf[rows] if many else leaf, self.problems, self.shape.batched)
         with jax.default_device(device):
-            solved = _solve_chunk(*jax.device_put((part, np.asarray(len(piece))), device), self.shape, self.room)
+            solved = solve_chunk(*jax.device_put((part, np.asarray(len(piece))), device), self.shape, self.room)
         return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(piece)], solved)
+
+    def identified(self) -> ManyIdentifications:
+        """All chunks solved."""
+        found = _spread(self.run, self.pieces, self.devices, self.workers)
+        parameters, de, deltam, k, steps, reason, active = (np.concatenate(column) for column in zip(*found, strict=True))
+        scale = k if self.shape.ends else None
+        return ManyIdentifications(
+            parameters, de, deltam, scale, steps, reasons(jnp.asarray(reason)), active, self.space, self.hold
+        )
 
 
 def _lanes(devices: Sequence[Any], poses: int) -> int:
@@ -219,113 +290,9 @@ def _spread(run: Callable, pieces: Sequence[range], devices: Sequence[Any], work
     return [found[i] for i in range(len(pieces))]
 
 
-@partial(jax.jit, static_argnames=("shape", "room"))
-def _solve_chunk(problems: _Problems, count: Int[Array, ""], shape: _Shape, room: int) -> tuple[Array, ...]:
-    ended = _work_off(problems, shape, count, room)
-    rounds = room // shape.lanes
-
-    def grouped(leaf: Array, many: bool) -> Array:
-        return leaf.reshape(rounds, shape.lanes, *leaf.shape[1:]) if many else leaf
-
-    groups = jax.tree.map(grouped, problems, shape.batched)
-    parameters = ended.parameters.reshape(rounds, shape.lanes, -1)
-
-    def figures(row: Int[Array, ""]) -> tuple[Array, ...]:
-        part = jax.tree.map(lambda leaf, many: leaf[row] if many else leaf, groups, shape.batched)
-        return _figures(part, parameters[row], shape)
-
-    de, deltam, k, active = jax.lax.map(figures, jnp.arange(rounds))
-    flat = [leaf.reshape(room, *leaf.shape[2:]) for leaf in (de, deltam, k, active)]
-    return (ended.parameters, *flat[:3], ended.steps, numbers_of(ended.reason), flat[3])
-
-
-def _work_off(problems: _Problems, shape: _Shape, count: Int[Array, ""], room: int) -> _Ended:
-    """The loop over lanes; every lane takes the next problem of the chunk when its own has ended."""
-    kept = np.flatnonzero(shape.kept)
-    turns = turns_of(problems.q)
-    scale = jnp.asarray(np.asarray(shape.scale)[kept])
-
-    def lane_values(leaf: Array, many: bool, index: Array) -> Array:
-        return leaf[index] if many else jnp.broadcast_to(leaf, (shape.lanes, *leaf.shape))
-
-    def starts(index: Array) -> tuple[Array, Box]:
-        start, lower, upper = (
-            lane_values(leaf, many, index)[:, kept] for leaf, many in zip(problems[:3], shape.batched[:3], strict=True)
-        )
-        return start, Box(lower, upper, jnp.broadcast_to(scale, start.shape))
-
-    def evaluate(trial: Array, index: Array):
-        held = lane_values(problems.start, shape.batched.start, index)
-        vector = held.at[:, kept].set(trial)
-        rows = jax.tree.map(lambda leaf, many: lane_values(leaf, many, index), problems.geometry, shape.batched.geometry)
-        lane_turns: Turns = (turns[0][:, index], turns[1][:, index]) if shape.batched.q else turns
-        entries = tuple(shape.entries[i] for i in kept)
-        return model_of(_with_parameters(rows, vector, shape.entries), lane_turns, shape.sizes, entries)
-
-    def more(carry) -> Bool[Array, ""]:
-        _, index, _, _ = carry
-        return jnp.any(index < count)
-
-    def once(carry):
-        progress, index, following, ended = carry
-        now = jnp.minimum(index, count - 1)  # a lane without work repeats the last problem; its result is dropped
-        _, box = starts(now)
-        progress = advance(progress, evaluate(progress.trial, now), box, SOLVER.rules)
-        late = progress.steps >= shape.max_steps
-        done = (progress.reason != Reason.running) | late
-        reason = either(late & (progress.reason == Reason.running), Reason.max_steps, progress.reason)
-        slot = jnp.where(done & (index < count), index, room)
-        whole = lane_values(problems.start, shape.batched.start, now).at[:, kept].set(progress.y)
-        ended = _Ended(
-            ended.parameters.at[slot].set(whole, mode="drop"),
-            ended.steps.at[slot].set(progress.steps, mode="drop"),
-            reasons(numbers_of(ended.reason).at[slot].set(numbers_of(reason), mode="drop")),
-        )
-        index = jnp.where(done, following + jnp.cumsum(done) - 1, index)
-        following = following + jnp.sum(done)
-        fresh = begin(*starts(jnp.minimum(index, count - 1)))
-        return choose(done, fresh, progress), index, following, ended
-
-    first = jnp.arange(shape.lanes)
-    p = len(shape.kept)
-    nothing = _Ended(jnp.zeros((room, p)), jnp.zeros(room, dtype=jnp.int64), reasons(jnp.zeros(room, dtype=jnp.int32)))
-    carry = (begin(*starts(jnp.minimum(first, count - 1))), first, jnp.asarray(shape.lanes), nothing)
-    return jax.lax.while_loop(more, once, carry)[3]
-
-
-def _with_parameters(rows: Geometry, vector: Float[Array, "w p"], entries: tuple[tuple[str, int], ...]) -> Geometry:
-    """Geometry of every lane ``(w, 1, n)`` with its free parameters from ``vector``; the axis of ones is for the poses."""
-    return jax.tree.map(lambda leaf: leaf[:, None, :], rows._replace(**placed(rows, vector, entries)))
-
-
-def _figures(part: _Problems, parameters: Float[Array, "w p"], shape: _Shape) -> tuple[Array, ...]:
-    """DE, Deltam, k and active bounds of one group of lanes."""
-
-    def lanes_of(leaf: Array, many: bool) -> Array:
-        return leaf if many else jnp.broadcast_to(leaf, (shape.lanes, *leaf.shape))
-
-    boxes = jax.tree.map(lanes_of, part[:4], shape.batched[:4])
-    part = part._replace(start=boxes[0], lower=boxes[1], upper=boxes[2], geometry=boxes[3])
-    tips = walk(_with_parameters(part.geometry, parameters, shape.entries), turns_of(part.q)).tip
-    tips = jnp.swapaxes(tips, -1, -2)
-    figures = jax.vmap(lambda t: repeatability(t, shape.sizes, fitted=sum(shape.kept)))(tips)
-    k = jnp.ones(shape.lanes)
-    if shape.ends:
-        nominal, u = (lanes_of(leaf, many) for leaf, many in zip(part[5:], shape.batched[5:], strict=True))
-
-        def scale(t: Array, value: Array, uncertainty: Array, sigma: Array) -> Array:
-            empty = jnp.zeros((t.shape[0], 1))
-            measurement = Measurement(empty, turns_of(empty), value, uncertainty, shape.sizes, shape.ends)
-            return scale_of(t, measurement, sigma).value
-
-        k = jax.vmap(scale)(tips, nominal, u, figures.sigma)
-    side = jnp.where(parameters <= part.lower, -1, jnp.where(parameters >= part.upper, 1, 0))
-    return figures.de, figures.deltam, k, jnp.where(jnp.asarray(shape.kept)[None], side, 0)
-
-
 def _problems(
     arm: Arm, capture: Capture, lower: Numbers, upper: Numbers, start: Numbers | None, space: Parameters
-) -> tuple[_Problems, _Problems, int]:
+) -> tuple[Problems, Problems, int]:
     """The batch on the host, which leaves are batched, and its size. Raises `InputError` where shapes do not fit."""
     p = len(space.names)
     given = {"start": space.vector(arm) if start is None else start, "lower": lower, "upper": upper}
@@ -338,8 +305,8 @@ def _problems(
     lengths = [[np.asarray(getattr(r, key)) for r in capture.lengths] for key in ("value", "u")]
     nominal, u = (np.stack(values, axis=-1) if values else np.zeros(0) for values in lengths)
     geometry = jax.tree.map(np.asarray, arm.geometry)
-    problems = _Problems(boxes["start"], boxes["lower"], boxes["upper"], geometry, np.asarray(capture.q), nominal, u)
-    ranks = _Problems(1, 1, 1, jax.tree.map(lambda _: 1, geometry), 2, 1, 1)
+    problems = Problems(boxes["start"], boxes["lower"], boxes["upper"], geometry, np.asarray(capture.q), nominal, u)
+    ranks = Problems(1, 1, 1, jax.tree.map(lambda _: 1, geometry), 2, 1, 1)
     batched = jax.tree.map(lambda leaf, rank: leaf.ndim > rank, problems, ranks)
     sizes = {leaf.shape[0] for leaf, many in zip(jax.tree.leaves(problems), jax.tree.leaves(batched), strict=True) if many}
     if not sizes:
@@ -358,10 +325,3 @@ def _problems(
             f"lower bound of {space.names[i]} is above its upper bound in problem {row + 1}; exchange or widen them."
         )
     return problems, batched, sizes.pop()
-
-
-def _assemble(pieces: list, space: Parameters, hold: str | None, has_lengths: bool) -> ManyIdentifications:
-    parameters, de, deltam, k, steps, reason, active = (np.concatenate(column) for column in zip(*pieces, strict=True))
-    return ManyIdentifications(
-        parameters, de, deltam, k if has_lengths else None, steps, reasons(jnp.asarray(reason)), active, space, hold
-    )

@@ -156,7 +156,7 @@ def _checked(
     check_fit(capture, space)
     check_start(bounds, vector, "the start" if start is not None else "the arm")
     # Repeatability does not see the scale: where lengths are free, it determines one parameter less.
-    check_enough(capture, len(space.names) - int(space.lengths.any()))
+    check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
     return based_on(space, arm), Measurement.of(capture), bounds, vector
 
 

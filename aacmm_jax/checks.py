@@ -96,11 +96,11 @@ def check_start(bounds: Bounds, vector: Array, what: str) -> None:
         )
 
 
-def check_enough(capture: Capture, unknowns: int) -> None:
+def check_enough(sizes: tuple[int, ...], unknowns: int) -> None:
     """A socket of m poses gives 3 (m - 1) equations: its own position takes three."""
-    equations = 3 * sum(size - 1 for size in capture.sizes)
+    equations = 3 * sum(size - 1 for size in sizes)
     if equations < unknowns:
-        sockets, poses = len(capture.sizes), sum(capture.sizes)
+        sockets, poses = len(sizes), sum(sizes)
         needed = -(-unknowns // 3) + sockets
         raise InputError(
             f"{poses} poses in {sockets} socket{'s' if sockets > 1 else ''} give {equations} equations, but {unknowns} unknowns "

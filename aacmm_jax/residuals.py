@@ -1,5 +1,7 @@
 """Measurement x arm -> residual: what the identifications minimise."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -62,15 +64,28 @@ class Measurement(eqx.Module):
     @property
     def differences(self) -> Float[Array, "l s"]:
         """Matrix that takes socket centroids to the vectors between the ends of the lengths."""
-        ends = np.asarray(self.ends, dtype=int).reshape(-1, 2)
-        sockets = np.eye(len(self.sizes))
-        return jnp.asarray(sockets[ends[:, 1]] - sockets[ends[:, 0]])
+        return jnp.asarray(differences_matrix(self.ends, len(self.sizes)))
+
+
+def differences_matrix(ends: tuple[tuple[int, int], ...], sockets: int) -> Float[np.ndarray, "l s"]:
+    """Matrix that takes socket centroids to the vectors between the ends of the lengths."""
+    pairs, unit = np.asarray(ends, dtype=int).reshape(-1, 2), np.eye(sockets)
+    return unit[pairs[:, 1]] - unit[pairs[:, 0]]
 
 
 def averaging_matrix(sizes: tuple[int, ...]) -> Float[np.ndarray, "s N"]:
     """Matrix whose product with poses in socket order gives each socket's mean."""
     owner = np.repeat(np.arange(len(sizes)), sizes)
     return (owner[None, :] == np.arange(len(sizes))[:, None]) / np.asarray(sizes, dtype=float)[:, None]
+
+
+class Weighing(NamedTuple):
+    """What a joint solve needs besides the poses: the lengths, and how both are weighed. Leading axes may be lanes."""
+
+    ends: tuple[tuple[int, int], ...]
+    nominal: Float[Array, "*lanes l"]  # mm
+    sigma: Float[Array, "*lanes"]  # standard deviation of a tip coordinate, mm
+    whitening: Float[Array, "*lanes l l"]  # inverse Cholesky factor of the lengths' covariance, 1/mm
 
 
 def repeatability_residual(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Float[Array, "N 3"]:
@@ -105,14 +120,9 @@ def joint_model(
 ) -> Model:
     """Cost, gradient and Gram matrix of `joint_residual`."""
     space, measurement, sigma, whitening = args
-    poses = repeatability_model(vector, (space, measurement))
-    distance, rows = measured_lengths(vector, space, measurement)
-    residual, rows = whitening @ (distance - measurement.nominal), whitening @ rows
-    return Model(
-        poses.cost / sigma**2 + 0.5 * jnp.dot(residual, residual),
-        poses.gradient / sigma**2 + rows.T @ residual,
-        poses.gram / sigma**2 + rows.T @ rows,
-    )
+    weighing = Weighing(measurement.ends, measurement.nominal, sigma, whitening)
+    geometry = space.arm(vector).geometry
+    return model_of(geometry, measurement.turns, measurement.sizes, space.entries(), weighing)
 
 
 def measured_lengths(
@@ -120,14 +130,18 @@ def measured_lengths(
 ) -> tuple[Float[Array, " l"], Float[Array, "l p"]]:
     """Measured reference lengths, mm, and their analytic Jacobian by the free parameters."""
     walked = walk(space.arm(vector).geometry, measurement.turns)
-    between = (measurement.differences @ measurement.averaging).T
-    vectors, derivatives = walked.tip @ between, stacked_columns(walked, space.entries()) @ between
-    distance = jnp.linalg.norm(vectors, axis=0)
-    return distance, jnp.einsum("cl,pcl->lp", vectors / distance[None], derivatives)
+    return _distances(walked.tip, stacked_columns(walked, space.entries()), measurement.sizes, measurement.ends)
 
 
-def model_of(geometry: Geometry, turns: Turns, sizes: tuple[int, ...], entries: tuple[tuple[str, int], ...]) -> Model:
-    """Cost, gradient and Gram matrix of the repeatability residual, for any batch of arms and poses that broadcast.
+def model_of(
+    geometry: Geometry,
+    turns: Turns,
+    sizes: tuple[int, ...],
+    entries: tuple[tuple[str, int], ...],
+    weighing: Weighing | None = None,
+) -> Model:
+    """Cost, gradient and Gram matrix of the repeatability residual, for any batch of arms and poses that broadcast; with
+    ``weighing``, of the joint residual of poses and lengths.
 
     The mean over a socket is taken off the Gram matrix as a correction of rank 3 a socket, J^T J - m mu^T mu, which spares
     a centred copy of the columns; the gradient needs none, because centred residuals sum to zero.
@@ -142,11 +156,33 @@ def model_of(geometry: Geometry, turns: Turns, sizes: tuple[int, ...], entries: 
     residual = residual.reshape(*residual.shape[:-2], -1)
     weighted = columns @ jnp.asarray((averaging * np.sqrt(np.asarray(sizes, dtype=float))[:, None]).T)
     weighted = weighted.reshape(*weighted.shape[:-2], -1)
-    return Model(
+    poses = Model(
         0.5 * jnp.sum(residual**2, axis=-1),
         (flat @ residual[..., None])[..., 0],
         flat @ jnp.swapaxes(flat, -1, -2) - weighted @ jnp.swapaxes(weighted, -1, -2),
     )
+    if weighing is None:
+        return poses
+    distance, rows = _distances(walked.tip, columns, sizes, weighing.ends)
+    off = (weighing.whitening @ (distance - weighing.nominal)[..., None])[..., 0]
+    rows = weighing.whitening @ rows
+    weight = 1 / weighing.sigma**2
+    return Model(
+        weight * poses.cost + 0.5 * jnp.sum(off**2, axis=-1),
+        weight[..., None] * poses.gradient + (off[..., None, :] @ rows)[..., 0, :],
+        weight[..., None, None] * poses.gram + jnp.swapaxes(rows, -1, -2) @ rows,
+    )
+
+
+def _distances(
+    tip: Float[Array, "*lanes 3 N"], columns: Float[Array, "*lanes p 3 N"], sizes: tuple[int, ...], ends: tuple
+) -> tuple[Float[Array, "*lanes l"], Float[Array, "*lanes l p"]]:
+    """Distances between the centroids of sockets, mm, and their derivatives."""
+    between = (differences_matrix(ends, len(sizes)) @ averaging_matrix(sizes)).T
+    vectors, derivatives = tip @ jnp.asarray(between), columns @ jnp.asarray(between)
+    distance = jnp.linalg.norm(vectors, axis=-2)
+    directions = vectors / distance[..., None, :]
+    return distance, jnp.einsum("...cl,...pcl->...lp", directions, derivatives)
 
 
 def _centred_rows(tip: Float[Array, "... 3 N"], averaging: np.ndarray) -> Float[Array, "... 3 N"]:

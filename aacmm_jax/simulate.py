@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +19,7 @@ from .parameters import Parameters
 ARCSEC = math.pi / (180 * 3600)  # rad
 _BATCH = 256  # candidates per call: one compiled shape for every number of poses
 _ROUNDS = 12
+_STEPS = 60  # of one attempt; five of six starts arrive
 _TOLERANCE = 1e-9  # mm
 
 
@@ -106,7 +107,7 @@ def reach(
             minval=limits[None, :, 0],
             maxval=limits[None, :, 1],
         )
-        solved, distance = (np.asarray(x) for x in _approach(arm.geometry, start, targets[tried], limits))
+        solved, distance = (np.asarray(x) for x in approach(arm.geometry, start, targets[tried], limits))
         successes = np.flatnonzero(distance <= _TOLERANCE)[::-1]
         angles[tried[successes]] = solved[successes]
         missing = np.setdiff1d(missing, tried[successes])
@@ -121,25 +122,48 @@ def reach(
     )
 
 
-@eqx.filter_jit
-def _approach(
-    geometry: chain.Geometry, q: Float[Array, "c n"], targets: Float[Array, "c 3"], limits: Float[Array, "n 2"]
+@partial(jax.jit, static_argnames=("steps",))
+def approach(
+    geometry: chain.Geometry,
+    q: Float[Array, "c n"],
+    targets: Float[Array, "c 3"],
+    limits: Float[Array, "n 2"],
+    steps: int = _STEPS,
 ) -> tuple[Float[Array, "c n"], Float[Array, " c"]]:
     """Damped least-norm steps (at most 0.5 rad a joint, within the limits) towards the targets; final distances."""
-    entries = tuple(("q", i) for i in range(q.shape[-1]))
-    low, high = limits[None, :, 0], limits[None, :, 1]
+    low, high = limits[:, 0, None, None], limits[:, 1, None, None]
+    wanted = targets.T
 
     def step(_, q):
-        gap = targets - chain.tip_position(geometry, q)
-        jacobian = chain.tip_jacobian(geometry, q, entries)
+        walked = chain.walk(geometry, (jnp.cos(q), jnp.sin(q)))
+        gap = wanted - walked.tip
         # The damping fades with the distance, so that the last steps are Newton's.
-        damping = 1e-2 * jnp.sum(gap**2, axis=-1) + 1e-12
-        square = jacobian @ jnp.swapaxes(jacobian, -1, -2) + damping[:, None, None] * jnp.eye(3)[None]
-        move = jnp.einsum("cin,ci->cn", jacobian, jnp.linalg.solve(square, gap[..., None])[..., 0])
-        return jnp.clip(q + jnp.clip(move, -0.5, 0.5), low, high)
+        damping = 1e-2 * jnp.sum(gap**2, axis=0) + 1e-12
+        moves = least_moves(chain.columns_of(walked)["theta"], damping)
+        return jnp.clip(q + jnp.clip(jnp.sum(moves * gap[None], axis=1, keepdims=True), -0.5, 0.5), low, high)
 
-    q = jax.lax.fori_loop(0, 60, step, q)
-    return q, jnp.linalg.norm(targets - chain.tip_position(geometry, q), axis=-1)
+    q = jax.lax.fori_loop(0, steps, step, q.T[:, None, :])
+    tip = chain.walk(geometry, (jnp.cos(q), jnp.sin(q))).tip
+    return q[:, 0].T, jnp.linalg.norm(wanted - tip, axis=0)
+
+
+def least_moves(columns: Float[Array, "n 3 N"], damping: Float[Array, " N"]) -> Float[Array, "n 3 N"]:
+    """Least change of every joint per mm that the tip shall move along each axis: J^T (J J^T + damping)^-1, pose by pose.
+
+    ``columns`` are the derivatives of the tip by the joints, mm. The inverse is written out (adjugate over determinant):
+    for matrices this small a call of a library costs ten times the arithmetic.
+    """
+    x, y, z = columns[:, 0], columns[:, 1], columns[:, 2]
+    xx, yy, zz = (jnp.sum(c * c, axis=0) + damping for c in (x, y, z))
+    xy, xz, yz = jnp.sum(x * y, axis=0), jnp.sum(x * z, axis=0), jnp.sum(y * z, axis=0)
+    adjugate = (
+        (yy * zz - yz * yz, yz * xz - xy * zz, xy * yz - yy * xz),
+        (yz * xz - xy * zz, xx * zz - xz * xz, xy * xz - xx * yz),
+        (xy * yz - yy * xz, xy * xz - xx * yz, xx * yy - xy * xy),
+    )
+    determinant = xx * adjugate[0][0] + xy * adjugate[0][1] + xz * adjugate[0][2]
+    rows = [[entry / determinant for entry in row] for row in adjugate]
+    return jnp.stack([x * row[0][None] + y * row[1][None] + z * row[2][None] for row in rows], axis=1)
 
 
 def _limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[Array, "n 2"]:

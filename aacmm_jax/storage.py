@@ -8,7 +8,7 @@ import os
 import secrets
 import sys
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
@@ -19,6 +19,7 @@ from .errors import InputError, nearest
 
 FORMAT = "aacmm_jax"
 FORMAT_VERSION = 1
+ELSEWHERE = "choose another output path"
 
 
 class Variable(NamedTuple):
@@ -38,7 +39,7 @@ class Table(NamedTuple):
 
 
 @contextlib.contextmanager
-def whole_file(path: str | os.PathLike) -> Iterator[Path]:
+def whole_file(path: str | os.PathLike, mend: str = ELSEWHERE) -> Iterator[Path]:
     """Write a file whole or not at all: yields a temporary path beside the target, renamed onto it at the end.
 
     Whatever goes wrong (Ctrl-C included), the temporary file is removed and an existing target stays as it was.
@@ -57,7 +58,7 @@ def whole_file(path: str | os.PathLike) -> Iterator[Path]:
         os.replace(temporary, target)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
-        raise InputError(f"{target} cannot be written: {reason}; choose another output path.") from error
+        raise InputError(f"{target} cannot be written: {reason}; {mend}.") from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
@@ -69,19 +70,74 @@ def write_text(path: str | os.PathLike, text: str) -> None:
         temporary.write_bytes(text.encode())
 
 
-def write_tables(path: str | os.PathLike, kind: str, tables: Mapping[str, Table], attributes: Mapping[str, Any]) -> None:
-    """Write an HDF5 file of tables that netCDF-4 readers (xarray) understand. ``kind`` says what the file is."""
+def write_tables(
+    path: str | os.PathLike,
+    kind: str,
+    tables: Mapping[str, Table],
+    attributes: Mapping[str, Any],
+    extend: Callable[[Any], None] | None = None,
+    mend: str = ELSEWHERE,
+) -> None:
+    """Write an HDF5 file of tables that netCDF-4 readers (xarray) understand. ``kind`` says what the file is.
+
+    ``extend`` is given the open file at the end, to add what does not fit into memory.
+    """
     import h5py
 
-    with whole_file(path) as temporary:
-        # HDF5 builds the file in memory and Python writes it: on a full disk the HDF5 library crashes the process.
-        with h5py.File(temporary.name, "w", driver="core", backing_store=False, track_order=True) as file:
+    with whole_file(path, mend) as temporary, _Unbroken(temporary) as stream:
+        with h5py.File(stream, "w", track_order=True) as file:
             _write_attributes(file, provenance(kind) | dict(attributes))
             for name, table in tables.items():
                 _write_group(file.create_group(name, track_order=True), table)
-            file.flush()
-            image = file.id.get_file_image()
-        temporary.write_bytes(image)
+            if extend is not None:
+                extend(file)
+        stream.check()
+
+
+class _Unbroken:
+    """A file that HDF5 writes through. Where a write fails (a full disk), the HDF5 library would crash the process: so the failure is kept,
+    HDF5 is left to believe in success, and `check` raises it."""
+
+    def __init__(self, path: Path):
+        self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 - closed on exit
+        self._failure: OSError | None = None
+        self.seek, self.tell, self.read, self.readinto = (
+            getattr(self._file, name) for name in ("seek", "tell", "read", "readinto")
+        )
+
+    def __enter__(self) -> "_Unbroken":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def check(self) -> None:
+        """Raise what went wrong, if anything did."""
+        if self._failure is not None:
+            raise self._failure
+
+    def _kept(self, work: Callable, given: Any) -> Any:
+        if self._failure is None:
+            try:
+                return work(given)
+            except OSError as failure:
+                self._failure = failure
+        return None
+
+    def write(self, content: Any) -> int:
+        """As a raw file's, but all is taken."""
+        left = memoryview(content).cast("B")
+        while len(left) and (taken := self._kept(self._file.write, left)):
+            left = left[taken:]
+        return len(content)
+
+    def truncate(self, size: int | None = None) -> int:
+        """As a raw file's."""
+        self._kept(self._file.truncate, size)
+        return size or 0
+
+    def flush(self) -> None:
+        """Nothing waits."""
 
 
 def storable(text: str) -> str:
@@ -142,8 +198,8 @@ class Stored(NamedTuple):
     table_attributes: dict[str, dict[str, Any]]
 
 
-def read_tables(path: str | os.PathLike, kinds: Sequence[str]) -> Stored:
-    """Read a file of tables whole. Raises `InputError` where it is missing, damaged, foreign, newer or of another kind."""
+def read_tables(path: str | os.PathLike, kinds: Sequence[str], without: Sequence[str] = ()) -> Stored:
+    """Read a file of tables whole, but for those named. Raises `InputError` where it is missing, damaged, foreign, newer or of another kind."""
     import h5py
 
     path = Path(path)
@@ -153,7 +209,7 @@ def read_tables(path: str | os.PathLike, kinds: Sequence[str]) -> Stored:
     with undamaged(path), h5py.File(path, "r") as file:
         attributes = {key: _plain(value) for key, value in file.attrs.items()}
         _check_kind(path, attributes, kinds)
-        groups = {name: group for name, group in file.items() if isinstance(group, h5py.Group)}
+        groups = {name: group for name, group in file.items() if isinstance(group, h5py.Group) and name not in without}
         tables = {name: {key: _values(item) for key, item in group.items()} for name, group in groups.items()}
         table_attributes = {name: {key: _plain(value) for key, value in group.attrs.items()} for name, group in groups.items()}
     return Stored(attributes, tables, table_attributes)
@@ -218,8 +274,6 @@ Model = TypeVar("Model")
 
 def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
     """Read a TOML file into a pydantic model. Raises `InputError` that names the file, the place and the mend."""
-    import pydantic
-
     path = Path(path)
     _check_readable(path)
     try:
@@ -228,20 +282,39 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
         raise InputError(f"{path} is not text in UTF-8, as TOML is; name a TOML file.") from error
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} is not valid TOML: {error}; mend it there.") from error
+    return validated(model, content, str(path))
+
+
+def validated(model: type[Model], content: Mapping[str, Any], where: str) -> Model:
+    """A pydantic model of tables. Raises `InputError`, one sentence that begins with ``where``."""
+    import pydantic
+
     try:
         return model.model_validate(content)  # type: ignore[attr-defined]
     except pydantic.ValidationError as error:
         # A misspelt key is also a missing one, and says more; an error inside a list says more than "not a number".
         worst = max(error.errors(), key=lambda found: (found["type"] == "extra_forbidden", len(found["loc"])))
-        raise InputError(f"{path}: {_explain(worst, model)}") from error
+        raise InputError(f"{where}: {_explain(worst, model, content)}") from error
 
 
-def _explain(error: Any, model: Any) -> str:
+def _written(steps: Sequence[Any], content: Any) -> list[Any]:
+    """The steps to a place that the writer wrote: others are pydantic's ("a number or a list"; one level of a list of levels)."""
+    kept = []
+    for step in steps:
+        inside = isinstance(content, list | tuple) if isinstance(step, int) else isinstance(content, Mapping)
+        if inside:
+            kept.append(step)
+            try:
+                content = content[step]
+            except (KeyError, IndexError):
+                content = None
+    return kept
+
+
+def _explain(error: Any, model: Any, content: Any) -> str:
     """One pydantic error as one sentence with its place, counting rows from 1 as people do."""
     kind, given, context = error["type"], error["input"], error.get("ctx", {})
-    steps = error["loc"]
-    if kind != "extra_forbidden":  # the last key is then the writer's; else some are pydantic's, for "a number or a list"
-        steps = [step for step in steps if step not in ("float", "constrained-float") and "[" not in str(step)]
+    steps = error["loc"] if kind == "missing" else _written(error["loc"], content)
     place = ""
     for step in steps:
         place += f" {step + 1}" if isinstance(step, int) else (f".{step}" if place else str(step))
@@ -253,10 +326,14 @@ def _explain(error: Any, model: Any) -> str:
         return f"{place}: {context['error']}" if place else str(context["error"])
     if kind in ("too_short", "too_long"):
         limit = f"at least {context['min_length']}" if kind == "too_short" else f"at most {context['max_length']}"
-        return f"'{place}' has {len(given)} entries; give {limit}."
+        return f"'{place}' has {len(given) or 'no'} entries; give {limit}."
     shown = "a table" if isinstance(given, dict) else "a list" if isinstance(given, list) else repr(given)
     mend = f"; write [[{place}]]" if kind == "list_type" and isinstance(given, dict) else ""
-    return f"'{place}' {error['msg'].replace('Input should', 'must').partition(', unable')[0]}, not {shown}{mend}."
+    wanted = {"tuple_type": "must be a list of numbers", "dict_type": "must be a table", "model_type": "must be a table"}.get(
+        kind
+    )
+    wanted = wanted or error["msg"].replace("Input should", "must").partition(", unable")[0]
+    return f"'{place}' {wanted}, not {shown}{mend}."
 
 
 def _known_keys(model: Any, steps: Sequence[Any]) -> list[str]:

@@ -11,8 +11,8 @@ FLOORS = (
     {"arrays", "storage"},
     {"chain", "arm", "parameters", "capture", "recording", "arm_files", "manifest", "capture_files", "simulate"},
     {"metrics", "steps", "residuals", "solver"},
-    {"covariance", "scale", "checks", "evaluate", "calibrate", "batch", "calibration_files"},
-    {"cautions", "summary", "figures", "demo"},
+    {"covariance", "scale", "checks", "evaluate", "calibrate", "lanes", "batch", "calibration_files"},
+    {"cautions", "summary", "figures", "demo", "study"},
     {"cli"},
 )
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name not in ("__init__.py", "__main__.py"))

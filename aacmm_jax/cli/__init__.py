@@ -17,7 +17,7 @@ def main() -> None:
     gc.set_threshold(200_000, 20, 20)
     try:
         from ..errors import InputError
-        from .commands import app
+        from .study_commands import app
     except ImportError as error:
         if debug:
             raise

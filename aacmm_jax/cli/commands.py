@@ -284,8 +284,11 @@ def export(
 @app.command(epilog="Example: aacmm show calibration.h5")
 def show(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Capture or calibration (HDF5), or an arm: TOML file or shipped name.")
+        Path,
+        typer.Argument(metavar="FILE", help="Capture, calibration or study (HDF5), or an arm: TOML file or shipped name."),
     ],
+    cell: Annotated[int | None, typer.Option(min=1, help="Of a study: one cell in full.")] = None,
+    figures: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Of a study: draw its figures as PNG.")] = None,
     as_json: Json = False,
 ) -> None:
     """Print what a file holds."""
@@ -299,7 +302,14 @@ def show(
     if file.suffix in ("", ".toml") and not (file.is_file() and file.suffix == ""):
         _show(arm_summary(load_specification(str(file))), as_json, display.arm)
         return
-    stored = storage.read_tables(file, ("capture", "calibration"))
+    stored = storage.read_tables(file, ("capture", "calibration", "study"), without=("trials",))
+    if stored.attributes["kind"] == "study":
+        from .study_commands import show_study
+
+        show_study(file, cell, figures, as_json)
+        return
+    if cell is not None or figures is not None:
+        raise InputError(f"{file} holds a {stored.attributes['kind']}; --cell and --figures are for studies.")
     if stored.attributes["kind"] == "capture":
         _show(capture_summary(load_capture(file)), as_json, display.capture)
     else:

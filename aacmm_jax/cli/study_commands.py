@@ -1,0 +1,150 @@
+"""The command ``study``, and what ``show`` does with a study's file."""
+
+import sys
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ..errors import InputError
+from .commands import Json, _busy, _show, app
+
+_INTERRUPTED = 130
+
+
+@app.command(
+    epilog="Examples: aacmm study bound-sensitivity -o study.h5; "
+    "aacmm study my-study.toml -o study.h5 --dask tcp://scheduler:8786; aacmm study --resume -o study.h5"
+)
+def study(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Study to write, or to go on with (HDF5).")],
+    specification: Annotated[
+        str | None,
+        typer.Argument(metavar="SPEC.toml", help="What to study: a TOML file, or a name that ships with the package."),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the study that the output holds.")] = False,
+    trials: Annotated[int | None, typer.Option(min=1, help="Trials in each cell, instead of the file's.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed, instead of the file's.")] = None,
+    chunk: Annotated[int | None, typer.Option(min=1, help="Trials in a block; changes no number. Default 1,000.")] = None,
+    dask: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Run on a Dask cluster: address of its scheduler, or 'local' for processes here."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Threads, or processes of --dask local. Default: one a core.")
+    ] = None,
+    shards: Annotated[
+        bool,
+        typer.Option("--shards", help="Dask workers write their blocks themselves, to the output's folder, which they share."),
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Run thousands of simulated calibrations; run again, it goes on where it was."""
+    from ..study.run import Progress, run_study
+    from ..study.store import read
+
+    if resume and not output.exists():
+        raise InputError(f"{output} does not exist, so there is nothing to resume; leave --resume out to begin.")
+    if specification is None:
+        if not resume:
+            raise InputError("name a specification, or use --resume to go on with the study that the output holds.")
+        asked = read(output).study
+    else:
+        asked = _asked(specification, trials, seed)
+    if shards and dask is None:
+        raise InputError("--shards is for the workers of --dask; leave it out, or name a cluster.")
+
+    def run(watch: Any) -> Any:
+        with _on(dask, workers) as (executor, count):
+            return run_study(asked, output, executor=executor, workers=count, chunk=chunk, shards=shards, watch=watch)
+
+    with _bar(asked) as show_progress:
+        outcome = run(lambda progress: show_progress(progress) if isinstance(progress, Progress) else None)
+    summary = {
+        "kind": "study",
+        "written": str(output),
+        "trials": outcome.total,
+        "trials_done": outcome.done,
+        "trials_this_run": outcome.ran,
+        "finished": outcome.finished,
+    }
+    _show(summary, as_json, lambda _: _ended(outcome, output))
+    if not outcome.finished:
+        sys.stderr.write(
+            f"Stopped; {outcome.done:,} of {outcome.total:,} trials are kept. Go on with: aacmm study --resume -o {output}\n"
+        )
+        raise typer.Exit(_INTERRUPTED)
+
+
+def _asked(specification: str, trials: int | None, seed: int | None) -> Any:
+    from ..study.shipped import read_study
+    from ..study.study import Study
+
+    asked = read_study(specification)
+    changes = {name: value for name, value in (("trials", trials), ("seed", seed)) if value is not None}
+    if not changes:
+        return asked
+    changed = type(asked.specification).model_validate(asked.specification.model_dump(exclude_unset=True) | changes)
+    return Study(changed, asked.nominal, asked.recording)
+
+
+@contextmanager
+def _on(dask: str | None, workers: int | None) -> Any:
+    if dask is None:
+        yield None, workers
+        return
+    from ..study.executors import dask_executor
+
+    with dask_executor(dask, workers) as (executor, count):
+        yield executor, count
+
+
+@contextmanager
+def _bar(asked: Any) -> Any:
+    """A progress bar with rate and time left, on standard error, where that is a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    total = asked.trials * len(asked.cells)
+    if not console.is_terminal:
+        with nullcontext():
+            yield lambda _: None
+        return
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("trials"), TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("Compiling", total=total, rate="")
+
+        def show(state: Any) -> None:
+            running = progress.tasks[0]
+            speed = running.speed
+            progress.update(task, description="Calibrating", completed=state.done, rate=f"{speed:,.0f}/s" if speed else "")
+
+        yield show
+
+
+def _ended(outcome: Any, output: Path) -> None:
+    if outcome.finished:
+        ran = f"{outcome.ran:,} trials run" if outcome.ran else "nothing was left to run"
+        print(f"Written: {output} ({outcome.total:,} trials, {ran}). See it with: aacmm show {output}")
+
+
+def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool) -> None:
+    """Print a study's results, and draw its figures."""
+    from ..study.figures import write_figures
+    from ..study.results import Results
+    from ..study.statistics import study_summary
+    from . import study_display
+
+    results = Results.of(file)
+    if cell is not None and cell > len(results.study.cells):
+        raise InputError(f"{file} has {len(results.study.cells)} cells, so there is no cell {cell}; name another.")
+    summary = _busy("Reading", lambda: study_summary(results, cell))
+    if figures is not None:
+        paths = _busy("Drawing", lambda: write_figures(results, figures))
+        summary["figures_written"] = [str(path) for path in paths]
+    _show(summary, as_json, study_display.study if cell is None else study_display.one_cell)

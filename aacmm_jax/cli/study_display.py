@@ -1,0 +1,202 @@
+"""A study's results on a terminal: means with the standard error of their last digits in parentheses."""
+
+import math
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+
+from .display import _console, _table
+
+_ARCSEC = 3600 * 180 / math.pi
+_MOST = 40  # cells in a table
+# Figure, heading, factor to the shown unit.
+_OVERVIEW = (
+    ("k", "k", 1.0),
+    ("de", "DE [mm]", 1.0),
+    ("deltam", "Deltam [mm]", 1.0),
+    ("length_error_stage1", "length error before [mm]", 1.0),
+    ("length_error", "and after [mm]", 1.0),
+    ("angle_error", "angle error [arcsec]", _ARCSEC),
+)
+_STAGE1 = (
+    ("scale", "scale", 1.0),
+    ("de_stage1", "DE [mm]", 1.0),
+    ("deltam_stage1", "Deltam [mm]", 1.0),
+    ("length_error_stage1", "length error [mm]", 1.0),
+    ("angle_error_stage1", "angle error [arcsec]", _ARCSEC),
+)
+_NAMES = {
+    "k": ("k = measured / nominal", 1.0),
+    "scale": ("scale of stage 1, found / true", 1.0),
+    "scale_error": ("scale after the fix, found / true - 1", 1.0),
+    "de_stage1": ("DE before the scale fix [mm]", 1.0),
+    "deltam_stage1": ("Deltam before the scale fix [mm]", 1.0),
+    "length_error_stage1": ("largest length error before the scale fix [mm]", 1.0),
+    "angle_error_stage1": ("largest angle error before the scale fix [arcsec]", _ARCSEC),
+    "de": ("DE after the scale fix [mm]", 1.0),
+    "deltam": ("Deltam after the scale fix [mm]", 1.0),
+    "length_error": ("largest length error after the scale fix [mm]", 1.0),
+    "angle_error": ("largest angle error after the scale fix [arcsec]", _ARCSEC),
+}
+
+
+def concise(value: float | None, se: float | None) -> str:
+    """A number with the standard error of its last digits in parentheses: 0.01068(3)."""
+    if value is None or math.isnan(value):
+        return "-"
+    if not se:
+        return f"{value:.4g}"
+    if not math.isfinite(se):
+        return f"{value:.4g}(?)"
+    magnitude = math.floor(math.log10(abs(value))) if value else 0
+    if magnitude < -4 and se < 1:
+        mantissa = concise(value / 10.0**magnitude, se / 10.0**magnitude)
+        return f"{mantissa}e{magnitude:+03d}"
+    decimals = max(-math.floor(math.log10(se)), 0)
+    digits = round(se * 10**decimals)
+    if digits == 10 and decimals > 0:  # 0.0096 is 0.01
+        decimals, digits = decimals - 1, 1
+    return f"{value:.{decimals}f}({digits})"
+
+
+def _both(pair: dict[str, Any] | None, factor: float = 1.0) -> str:
+    if pair is None or pair["value"] is None:
+        return "-"
+    return concise(factor * pair["value"], None if pair["se"] is None else factor * pair["se"])
+
+
+def _percent(pair: dict[str, Any]) -> str:
+    return _both(pair, 100.0)
+
+
+def _text(level: float | str) -> str:
+    return escape(level) if isinstance(level, str) else f"{level:g}"
+
+
+def _column(factor: str) -> str:
+    """Heading of a factor's column: bounds.length_mm is "bounds length [mm]"."""
+    table, _, name = factor.partition(".")
+    words, _, last = name.rpartition("_")
+    name = f"{words.replace('_', ' ')} [{last}]" if last in ("mm", "deg", "arcsec") else name.replace("_", " ")
+    return name if table in ("capture", "noise", "identification") else f"{table} {name}"
+
+
+def study(summary: dict[str, Any]) -> None:
+    """All cells: what converged, then every figure's mean; then spread and percentiles."""
+    console = _console()
+    _heading(console, summary)
+    cells = [cell for cell in summary["results"] if cell["trials_run"]]
+    if not cells:
+        console.print("No trial has ended yet.")
+        return
+    shown, factors = cells[:_MOST], list(summary["factors"])
+    names = [_column(name) for name in factors]
+    _identified(console, shown, names)
+    fixed = any("de" in cell["figures"] for cell in cells)
+    figures = _OVERVIEW if fixed else _STAGE1
+    table = _table("\nMeans over converged trials", "cell", *names, *(heading for _, heading, _ in figures))
+    for cell in shown:
+        values = (_both(_mean(cell, name), factor) for name, _, factor in figures)
+        table.add_row(str(cell["cell"]), *map(_text, cell["factors"].values()), *values)
+    console.print(table)
+    if len(cells) > 1:
+        _spreads(console, shown, ("length_error", "angle_error") if fixed else ("length_error_stage1", "angle_error_stage1"))
+    if len(cells) > len(shown):
+        console.print(f"\n{len(cells) - len(shown)} more cells: see them with --json, or aacmm_jax.open_study.")
+    console.print(
+        "\nDigits in parentheses: Monte Carlo standard error of the last digits. Length and angle error: the largest of all parameters'."
+    )
+    if len(cells) == 1:
+        _full(console, cells[0])
+    else:
+        console.print("One cell in full, with every parameter's bias and spread: --cell N. Figures: --figures FOLDER.")
+    _written(console, summary)
+
+
+def one_cell(summary: dict[str, Any]) -> None:
+    """One cell in full."""
+    console = _console()
+    _heading(console, summary)
+    for cell in summary["results"]:
+        levels = ", ".join(f"{name} {_text(level)}" for name, level in cell["factors"].items())
+        console.print(f"Cell {cell['cell']}{': ' + levels if levels else ''}")
+        if cell["trials_run"]:
+            _identified(console, [cell], [_column(name) for name in cell["factors"]])
+            _full(console, cell)
+        else:
+            console.print("No trial of it has ended yet.")
+    _written(console, summary)
+
+
+def _heading(console: Console, summary: dict[str, Any]) -> None:
+    console.print(
+        f"[bold]{escape(summary['name'] or 'Study')}[/bold] of {escape(summary['arm'])}: {summary['cells']} cells of "
+        f"{summary['trials']:,} trials, seed {summary['seed']}"
+    )
+    if not summary["finished"]:
+        console.print(f"[yellow]Not finished:[/yellow] {summary['trials_run']:,} trials so far.")
+
+
+def _identified(console: Console, cells: list[dict[str, Any]], names: list[str]) -> None:
+    table = _table(
+        "\nIdentifications", "cell", *names, "trials", "converged [%]", "truth in the box [%]", "on a bound [%]", "most often",
+    )  # fmt: skip
+    for cell in cells:
+        worst = max(cell["parameters"], key=lambda row: row["on_a_bound"]["value"], default=None)
+        often = f"{worst['parameter']} {_percent(worst['on_a_bound'])} %" if worst and worst["on_a_bound"]["value"] else ""
+        shares = (_percent(cell[key]) for key in ("converged", "truth_inside", "on_a_bound"))
+        table.add_row(str(cell["cell"]), *map(_text, cell["factors"].values()), f"{cell['trials_run']:,}", *shares, often)
+    console.print(table)
+    failed = {}
+    for cell in cells:
+        for reason in ("max_steps", "stalled", "nonfinite"):
+            failed[reason] = failed.get(reason, 0) + cell["reasons"][reason]
+    words = {
+        "max_steps": "reached the step limit",
+        "stalled": "stalled",
+        "nonfinite": "had a pose that the true arm could not take up",
+    }
+    for reason, count in failed.items():
+        if count:
+            console.print(f"[yellow]{count:,} trial{'s' if count > 1 else ''} {words[reason]};[/yellow] left out of the means.")
+
+
+def _mean(cell: dict[str, Any], name: str) -> dict[str, Any] | None:
+    return cell["figures"][name]["mean"] if name in cell["figures"] else None
+
+
+def _spreads(console: Console, cells: list[dict[str, Any]], names: tuple[str, ...]) -> None:
+    for name in names:
+        text, factor = _NAMES[name]
+        table = _table(f"\n{text[0].upper()}{text[1:]}", "cell", "mean", "spread", "5 %", "50 %", "95 %")
+        for cell in cells:
+            if name in cell["figures"]:
+                table.add_row(str(cell["cell"]), *_row(cell["figures"][name], factor))
+        if table.row_count:
+            console.print(table)
+
+
+def _row(figure: dict[str, Any], factor: float) -> list[str]:
+    return [_both(figure.get(key), factor) for key in ("mean", "spread", "p5", "p50", "p95")]
+
+
+def _full(console: Console, cell: dict[str, Any]) -> None:
+    table = _table("\nFigures over converged trials", "", "mean", "spread", "5 %", "50 %", "95 %")
+    for name, (text, factor) in _NAMES.items():
+        if name in cell["figures"]:
+            table.add_row(escape(text), *_row(cell["figures"][name], factor))
+    console.print(table)
+    table = _table(
+        "\nParameters: estimate less truth", "parameter", "unit", "bias", "spread", "on a bound [%]",
+    )  # fmt: skip
+    for row in cell["parameters"]:
+        factor, unit = (1.0, "mm") if row["unit"] == "mm" else (_ARCSEC, "arcsec")
+        numbers = (_both(row["bias"], factor), _both(row["spread"], factor), _percent(row["on_a_bound"]))
+        table.add_row(row["parameter"], unit, *numbers)
+    console.print(table)
+
+
+def _written(console: Console, summary: dict[str, Any]) -> None:
+    for path in summary.get("figures_written", ()):
+        console.print(f"Written: {escape(path)}")

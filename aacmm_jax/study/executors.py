@@ -1,0 +1,78 @@
+"""Dask as the executor of a study: a scheduler somewhere, or a cluster of processes on this machine."""
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from typing import Any
+
+import jax
+
+from ..errors import InputError
+
+_ATTEMPTS = 3  # of a block whose worker died, beyond the first
+
+
+@contextmanager
+def dask_executor(address: str, workers: int | None = None) -> Iterator[tuple[Executor, int]]:
+    """An executor on a Dask cluster, and its number of workers.
+
+    ``address``: of a scheduler (``tcp://host:8786``; or a scheduler file), or ``local`` for ``workers`` processes on this
+    machine (default: one a core), each kept to its share of the cores. Raises `InputError` where Dask is not installed, or
+    nobody answers.
+    """
+    try:
+        import distributed
+    except ImportError as error:
+        raise InputError("--dask needs Dask; install it with: pip install 'aacmm_jax[dask]'.") from error
+    with _client(distributed, address, workers) as client:
+        count = len(client.scheduler_info(n_workers=-1)["workers"])
+        if not count:
+            raise InputError(f"the Dask cluster at {address} has no workers; start some, for example: dask worker {address}")
+        yield client.get_executor(retries=_ATTEMPTS, pure=False), count
+
+
+@contextmanager
+def _client(distributed: Any, address: str, workers: int | None) -> Iterator[Any]:
+    if address != "local":
+        if workers is not None:
+            raise InputError("the workers of a running Dask cluster are its own; leave --workers out.")
+        target = {"scheduler_file": address} if os.path.isfile(address) else {"address": address}
+        try:
+            client = distributed.Client(**target, timeout=10)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise InputError(f"no Dask scheduler answers at {address}; start one, or use --dask local.") from error
+        with client:
+            yield client
+        return
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    count = workers or len(cores)
+    environment = {}
+    if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
+        # Programs that this process compiled need not be compiled again by every worker.
+        environment["JAX_COMPILATION_CACHE_DIR"] = jax.config.jax_compilation_cache_dir  # pyright: ignore
+        environment["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    with (
+        distributed.LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None, env=environment) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        client.register_plugin(_share_plugin(distributed)(cores, count))
+        yield client
+
+
+def _share_plugin(distributed: Any) -> Any:
+    """Keeps every worker to its share of the cores; else all would compute on all, and wait for one another."""
+
+    class Share(distributed.WorkerPlugin):
+        name = "aacmm-share"
+
+        def __init__(self, cores: list[int], count: int):
+            self.cores, self.count = cores, count
+
+        def setup(self, worker: Any) -> None:
+            if hasattr(os, "sched_setaffinity"):
+                number = int(worker.name) % self.count
+                share = self.cores[number * len(self.cores) // self.count : (number + 1) * len(self.cores) // self.count]
+                os.sched_setaffinity(0, share or self.cores)
+
+    return Share

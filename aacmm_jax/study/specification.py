@@ -1,0 +1,280 @@
+"""What a study asks: tables that people write in TOML or pass from Python. Any value may be a list; the study is their grid.
+
+Every number has its unit in its name. After validation every factor is a list, of one level where one value was given.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    model_validator,
+)
+
+from ..storage import validated
+
+# More cells than this are a slip of the pen: a grid of four factors with ten levels each.
+MOST_CELLS = 10_000
+MOST_TRIALS = 10**10
+
+
+def _depth(value: Any) -> int:
+    """How deep lists stand in lists."""
+    return 1 + max(map(_depth, value), default=0) if isinstance(value, list | tuple) else 0
+
+
+def _levels_of(natural: int) -> BeforeValidator:
+    """One level becomes a list of one. ``natural``: how deep lists stand in a single level."""
+    return BeforeValidator(
+        lambda value: value if isinstance(value, list | tuple) and (not value or _depth(value) > natural) else [value]
+    )
+
+
+def _different(levels: list) -> list:
+    for i, level in enumerate(levels):
+        if level in levels[:i]:
+            raise ValueError(f"the level {_label(level)} is given twice; give each once.")
+    return levels
+
+
+Level = TypeVar("Level")
+Levels = Annotated[list[Level], _levels_of(0), Field(min_length=1), AfterValidator(_different)]
+Finite = Annotated[FiniteFloat, Field(strict=False)]
+Amount = Annotated[NonNegativeFloat, Field(allow_inf_nan=False)]
+Positive = Annotated[PositiveFloat, Field(allow_inf_nan=False)]
+Pair = Annotated[tuple[Finite, Finite], AfterValidator(lambda pair: _ordered(pair))]
+Point = tuple[Finite, Finite, Finite]
+Points = Annotated[list[Point], Field(min_length=1)]
+Ends = tuple[Point, Point]
+
+
+def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    if not pair[0] < pair[1]:
+        raise ValueError(f"{pair[0]:g} to {pair[1]:g} is no range; give the lower number first.")
+    return pair
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Distribution(_Table):
+    """How far a kind of parameter may be off: uniform within a half-width, or normal with a standard deviation.
+
+    A plain number is a uniform half-width.
+    """
+
+    uniform: Amount | None = None
+    normal: Amount | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _plain(cls, value: Any) -> Any:
+        return {"uniform": value} if isinstance(value, int | float) else value
+
+    @model_validator(mode="after")
+    def _one(self) -> "Distribution":
+        if (self.uniform is None) == (self.normal is None):
+            raise ValueError("give either uniform (a half-width) or normal (a standard deviation).")
+        return self
+
+
+class Deviation(_Table):
+    """How the true arm differs from the nominal one, independently for every free parameter.
+
+    ``length_mm`` and ``angle_deg`` hold for all lengths and angles; a kind named apart takes precedence.
+    """
+
+    length_mm: Levels[Distribution] = [Distribution(uniform=0.0)]
+    angle_deg: Levels[Distribution] = [Distribution(uniform=0.0)]
+    a_mm: Levels[Distribution] | None = None
+    d_mm: Levels[Distribution] | None = None
+    probe_mm: Levels[Distribution] | None = None
+    alpha_deg: Levels[Distribution] | None = None
+    theta_deg: Levels[Distribution] | None = None
+    beta_deg: Levels[Distribution] | None = None
+
+
+class Region(_Table):
+    """Where sockets and reference lengths may stand, in the base frame: ranges of x, y, z, and of the distance from its origin."""
+
+    x_mm: Pair | None = None
+    y_mm: Pair | None = None
+    z_mm: Pair | None = None
+    distance_mm: Pair | None = None
+
+    @model_validator(mode="after")
+    def _bounded(self) -> "Region":
+        if self.distance_mm is None and None in (self.x_mm, self.y_mm, self.z_mm):
+            raise ValueError("a region needs distance_mm, or x_mm, y_mm and z_mm.")
+        return self
+
+
+class CaptureTable(_Table):
+    """What is recorded: ``positions_mm`` of fixed sockets, or a number of ``sockets`` at random in a ``region``, or the poses of
+    a capture ``file``. ``poses`` are those in each socket; ``pool`` how many the study makes for each socket to draw from."""
+
+    file: str | None = None
+    positions_mm: Annotated[list[Points], _levels_of(2), Field(min_length=1), AfterValidator(_different)] | None = None
+    sockets: Levels[PositiveInt] | None = None
+    poses: Levels[PositiveInt] = [70]
+    region: Levels[Region] | None = None
+    joint_limits_deg: Annotated[list[list[Pair]], _levels_of(2), Field(min_length=1)] | None = None
+    pool: PositiveInt = 32_768
+
+    @model_validator(mode="after")
+    def _one(self) -> "CaptureTable":
+        if sum(given is not None for given in (self.file, self.positions_mm, self.sockets)) != 1:
+            raise ValueError("give one of positions_mm, sockets (with a region) and file.")
+        if self.sockets is not None and self.region is None:
+            raise ValueError("sockets at random need a region.")
+        made = {"poses", "region", "joint_limits_deg", "pool"} & self.model_fields_set
+        if self.file is not None and made:
+            raise ValueError(f"{sorted(made)[0]} says how poses are made, but file gives them; leave one of the two out.")
+        if self.pool < 4096:
+            raise ValueError(f"pool is {self.pool}; give at least 4096 poses, or leave it out.")
+        return self
+
+
+class Noise(_Table):
+    """Standard deviations: of a reading, of a coordinate of the seat, and of both first harmonics of every encoder; and the step of a reading."""
+
+    encoder_arcsec: Levels[Amount] = [0.0]
+    resolution_arcsec: Levels[Amount] = [0.0]
+    seating_mm: Levels[Amount] = [0.0]
+    eccentricity_arcsec: Levels[Amount] = [0.0]
+
+
+class BoundsTable(_Table):
+    """The box of the identification: half-widths (default: those that the arm's file proposes) about the nominal arm, its centre shifted."""
+
+    length_mm: Levels[Amount] | None = None
+    angle_deg: Levels[Amount] | None = None
+    length_shift_mm: Levels[Finite] = [0.0]
+    angle_shift_deg: Levels[Finite] = [0.0]
+    override: dict[str, Amount] | None = None  # half-widths by name, mm or deg
+
+
+class Reference(_Table):
+    """The reference length: how long, at how many positions, with how many poses at each end, and its standard uncertainty.
+
+    It lies at random in the ``region`` (default: that of the capture), or where ``ends_mm`` says, whose distance it then has.
+    """
+
+    length_mm: Levels[Positive] | None = None
+    positions: Levels[PositiveInt] = [1]
+    ends_mm: Annotated[list[Annotated[list[Ends], Field(min_length=1)]], _levels_of(3), Field(min_length=1)] | None = None
+    poses: Levels[PositiveInt] = [5]
+    u_mm: Levels[Amount] = [0.0]
+    region: Levels[Region] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> "Reference":
+        if (self.length_mm is None) == (self.ends_mm is None):
+            raise ValueError("give either length_mm, for lengths at random in the region, or ends_mm.")
+        if self.ends_mm is not None and "positions" in self.model_fields_set:
+            raise ValueError("ends_mm says how many positions there are; leave positions out.")
+        for start, end in itertools.chain(*(self.ends_mm or [])):
+            if start == end:
+                raise ValueError("ends_mm holds two ends at the same place; move one of them.")
+        return self
+
+
+class Identification(_Table):
+    """How the arm is identified. ``start``: at the nominal arm, or at random in the box."""
+
+    method: Levels[Literal["stage1", "two-stage", "joint"]] | None = None
+    hold: Levels[str] = ["longest"]
+    start: Levels[Literal["nominal", "random"]] = ["nominal"]
+    held: list[str] | None = None
+    max_steps: PositiveInt = 300
+
+
+class Specification(_Table):
+    """A study. Lists anywhere (but in ``override`` and ``held``) are factors of the grid, the last varying fastest."""
+
+    name: str = ""
+    arm: str = ""
+    trials: Annotated[int, Field(ge=1)]  # in each cell
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    deviation: Deviation = Deviation()
+    capture: CaptureTable
+    noise: Noise = Noise()
+    bounds: BoundsTable = BoundsTable()
+    reference: Reference | None = None
+    identification: Identification = Identification()
+
+    @model_validator(mode="after")
+    def _sensible(self) -> "Specification":
+        sizes = {name: len(levels) for name, levels in self.factors().items()}
+        cells = math.prod(sizes.values())
+        if cells > MOST_CELLS:
+            grid = " x ".join(f"{size} of {name}" for name, size in sizes.items())
+            raise ValueError(f"the grid has {cells:,} cells ({grid}), more than {MOST_CELLS:,}; give shorter lists.")
+        if cells * self.trials > MOST_TRIALS:
+            raise ValueError(f"{cells} cells of {self.trials:,} trials are more than {MOST_TRIALS:,}; give fewer trials.")
+        if self.reference is None and set(self.identification.method or ()) & {"two-stage", "joint"}:
+            raise ValueError("method two-stage or joint needs a reference length; add a [reference], or use method = 'stage1'.")
+        bar = self.reference is not None and self.reference.length_mm is not None
+        if bar and self.reference.region is None and self.capture.region is None:  # pyright: ignore[reportOptionalMemberAccess]
+            raise ValueError("a reference length at random needs a region; give it in [reference], or say ends_mm.")
+        return self
+
+    @property
+    def methods(self) -> list[str]:
+        """The methods asked for; by default two-stage where there is a reference length, else stage 1 alone."""
+        return list(self.identification.method or ["stage1" if self.reference is None else "two-stage"])
+
+    def factors(self) -> dict[str, list]:
+        """What has more than one level: dotted name -> levels, in the order of the tables."""
+        return {name: levels for name, levels in self._levels() if len(levels) > 1}
+
+    def _levels(self) -> Iterator[tuple[str, list]]:
+        for table in ("deviation", "capture", "noise", "bounds", "reference", "identification"):
+            model = getattr(self, table)
+            for name in () if model is None else type(model).model_fields:
+                value = getattr(model, name)
+                if isinstance(value, list) and name != "held":
+                    yield f"{table}.{name}", value
+
+    def cells(self) -> list[dict[str, Any]]:
+        """Every cell of the grid: dotted name -> its level, of every factor and every constant."""
+        names, levels = zip(*self._levels(), strict=True)
+        return [dict(zip(names, chosen, strict=True)) for chosen in itertools.product(*levels)]
+
+
+def label(level: Any) -> float | str:
+    """A level as it stands in tables: a number as it is, anything else as a short text."""
+    if isinstance(level, Distribution) and level.uniform is not None:
+        return level.uniform
+    return float(level) if isinstance(level, int | float) else _label(level)
+
+
+def _label(level: Any) -> str:
+    if isinstance(level, BaseModel):
+        given = level.model_dump(exclude_none=True)
+        return ", ".join(f"{name} {_label(value)}" for name, value in given.items())
+    if isinstance(level, list | tuple):
+        return "(" + ", ".join(map(_label, level)) + ")"
+    return f"{level:g}" if isinstance(level, int | float) else str(level)
+
+
+def unit(name: str) -> str:
+    """The unit that a dotted name ends in; "1" for counts and choices."""
+    last = name.rpartition("_")[2]
+    return last if last in ("mm", "deg", "arcsec") else "1"
+
+
+def checked(**tables: Any) -> Specification:
+    """A specification from Python values, or `InputError` in one sentence."""
+    return validated(Specification, tables, "the study")

@@ -1,0 +1,173 @@
+"""What trials show of each cell, with Monte Carlo standard errors.
+
+Trials of a cell fall into groups that share nothing: each draws from its own pool of poses. Standard errors come from the
+scatter between groups, so they hold the whole Monte Carlo error, that of the finite pools included, and need no formula for
+the statistic: of large groups by their own values, of small ones by leaving out a group at a time (jackknife).
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..steps import Reason, numbers_of
+from .results import Results
+from .study import BATCHES
+
+FIGURES = {
+    "k": "k, measured / nominal",
+    "scale": "scale that stage 1 left, found / true",
+    "scale_error": "scale after the fix, found / true - 1",
+    "de_stage1": "DE before the scale fix",
+    "deltam_stage1": "Deltam before the scale fix",
+    "length_error_stage1": "largest length error before the scale fix",
+    "angle_error_stage1": "largest angle error before the scale fix",
+    "de": "DE after the scale fix",
+    "deltam": "Deltam after the scale fix",
+    "length_error": "largest length error after the scale fix",
+    "angle_error": "largest angle error after the scale fix",
+}
+PERCENTILES = (5, 50, 95)
+_LARGE = 100  # trials in a group
+
+
+def study_summary(results: Results, only: int | None = None) -> dict[str, Any]:
+    """A study, cell by cell (or one cell, counted from 1), with the unit in every key; what ``aacmm show --json`` prints."""
+    study = results.study
+    cells = [cell_summary(results, cell) for cell in range(len(study.cells)) if only is None or cell == only - 1]
+    return {
+        "kind": "study",
+        "name": study.specification.name,
+        "arm": study.nominal.name,
+        "seed": study.specification.seed,
+        "finished": results.finished,
+        "cells": len(study.cells),
+        "trials": study.trials,
+        "trials_run": sum(cell["trials_run"] for cell in cells),
+        "factors": study.factors,
+        "results": cells,
+    }
+
+
+def cell_summary(results: Results, cell: int) -> dict[str, Any]:
+    """One cell (counted from 0)."""
+    columns = results.columns(cell)
+    ran = columns["converged"] >= 0
+    columns = {name: values[ran] for name, values in columns.items()}
+    good = columns["converged"] == 1
+    levels = results.study.cells[cell]
+    labels = {name: _plain(levels[name], values) for name, values in results.study.factors.items()}
+    reasons = {name: int(number) for name, number in _reasons().items()}
+    found: dict[str, Any] = {
+        "cell": cell + 1,
+        "factors": labels,
+        "trials_run": int(ran.sum()),
+        "converged": statistic(np.mean, good.astype(float), columns["group"]),
+        "truth_inside": statistic(np.mean, columns["truth_inside"].astype(float), columns["group"]),
+        "reasons": {name: int(np.sum(columns["reason"] == number)) for name, number in reasons.items()},
+        "steps_mean": float(columns["steps"].mean()) if ran.any() else None,
+        "figures": {},
+    }
+    for name in FIGURES:
+        there = good & np.isfinite(columns[name])
+        if there.any():
+            found["figures"][name] = spread_of(columns[name][there], columns["group"][there])
+    return found | _parameters(results, cell)
+
+
+def _plain(level: Any, labels: list) -> float | str:
+    from .specification import label
+
+    return label(level) if isinstance(labels[0], float) else str(label(level))
+
+
+def _reasons() -> dict[str, int]:
+    names = ("gradient", "step", "rounding", "max_steps", "stalled", "nonfinite")
+    return {name: int(numbers_of(getattr(Reason, name))) for name in names}
+
+
+def spread_of(values: Float[np.ndarray, " t"], groups: Int[np.ndarray, " t"]) -> dict[str, Any]:
+    """Mean, spread (standard deviation) and percentiles, each with its standard error."""
+    found = {"mean": statistic(np.mean, values, groups)}
+    if len(values) > 1:
+        found["spread"] = statistic(lambda x: np.std(x, ddof=1 if len(x) > 1 else 0), values, groups)
+    percentiles = statistic(lambda x: np.percentile(x, PERCENTILES), values, groups)
+    for i, percentile in enumerate(PERCENTILES):
+        found[f"p{percentile}"] = {key: value[i] for key, value in percentiles.items()}
+    return found
+
+
+def statistic(function: Callable, values: np.ndarray, groups: Int[np.ndarray, " t"]) -> dict[str, Any]:
+    """A statistic of trials and its Monte Carlo standard error (None where there are too few groups to tell)."""
+    if not len(values):
+        return {"value": None, "se": None}
+    value = np.asarray(function(values))
+    if len(values) < BATCHES * _LARGE:
+        # Groups to leave out hold at least the root of all trials: fewer would not tell of a percentile (Shao and Wu 1989).
+        groups = groups % max(int(len(values) ** 0.5), 2)
+    members = [values[groups == group] for group in np.unique(groups)]
+    count = len(members)
+    if count < 2:
+        return {"value": value.tolist(), "se": [None] * len(value) if value.ndim else None}
+    if min(map(len, members)) >= _LARGE:
+        se = np.std([function(member) for member in members], axis=0, ddof=1) / np.sqrt(count)
+    else:
+        rest = [function(values[groups != group]) for group in np.unique(groups)]
+        se = np.sqrt((count - 1) / count * np.sum((rest - np.mean(rest, axis=0)) ** 2, axis=0))
+    return {"value": value.tolist(), "se": np.asarray(se).tolist()}
+
+
+def _parameters(results: Results, cell: int) -> dict[str, Any]:
+    """Bias and spread of every parameter and its share on a bound, from sums over pieces, group by group."""
+    space = results.study.space
+    names, lengths, groups = space.names, space.lengths, {}
+    for error, active, group in results.errors(cell):
+        for g in np.unique(group):
+            mine = group == g
+            sums = (mine.sum(), error[mine].sum(axis=0), (error[mine] ** 2).sum(axis=0), (active[mine] != 0).sum(axis=0))
+            extra = int(np.any(active[mine] != 0, axis=1).sum())
+            groups[g] = tuple(a + b for a, b in zip(groups.get(g, (0, 0, 0, 0, 0)), (*sums, extra), strict=True))
+    if not groups:
+        return {"on_a_bound": {"value": None, "se": None}, "parameters": []}
+    count, first, second, active, any_active = (np.array(column) for column in zip(*groups.values(), strict=True))
+
+    def moments(chosen: np.ndarray) -> np.ndarray:
+        n = max(count[chosen].sum(), 1)
+        mean = first[chosen].sum(axis=0) / n
+        spread = np.sqrt(np.maximum(second[chosen].sum(axis=0) / n - mean**2, 0) * n / max(n - 1, 1))
+        share = active[chosen].sum(axis=0) / n
+        return np.stack([mean, spread, share, np.full(len(names), any_active[chosen].sum() / n)])
+
+    value, se = moments(np.full(len(count), True)), np.full((4, len(names)), np.nan)
+    if len(count) > 1:
+        rest = np.array([moments(np.arange(len(count)) != g) for g in range(len(count))])
+        se = np.sqrt((len(count) - 1) / len(count) * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0))
+    both = lambda row, i: {"value": float(value[row, i]), "se": None if np.isnan(se[row, i]) else float(se[row, i])}  # noqa: E731
+    return {
+        "on_a_bound": both(3, 0),
+        "parameters": [
+            {
+                "parameter": name,
+                "unit": "mm" if lengths[i] else "rad",
+                "bias": both(0, i),
+                "spread": both(1, i),
+                "on_a_bound": both(2, i),
+            }
+            for i, name in enumerate(names)
+        ],
+    }
+
+
+def correlation(results: Results, cell: int) -> Float[np.ndarray, "p p"]:
+    """Correlation of the errors of the parameters over the converged trials of a cell (counted from 0); 0 where one never varies."""
+    count, first, second = 0, 0.0, 0.0
+    for error, _, _ in results.errors(cell):
+        count, first, second = count + len(error), first + error.sum(axis=0), second + error.T @ error
+    p = len(results.study.space.names)
+    if count < 2:
+        return np.full((p, p), np.nan)
+    covariance = second / count - np.outer(first / count, first / count)
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0))
+    both = np.outer(spread, spread)
+    return np.divide(covariance, both, out=np.zeros_like(both), where=both > 0)

@@ -1,0 +1,109 @@
+"""A block of trials, from keys to results: drawn, identified by one call, compared with the truth."""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from ..batch import calibrate_many, identify_many
+from ..capture import Capture, ReferenceLength
+from ..steps import numbers_of
+from .drawing import Drawn, draw, ends_of
+from .study import Setting, Study
+
+
+class Block(NamedTuple):
+    """Trials of some cells: all of one setting."""
+
+    first_cell: int
+    last_cell: int  # not included
+    first_trial: int
+    last_trial: int  # not included
+
+    @property
+    def size(self) -> int:
+        """How many trials it holds."""
+        return (self.last_cell - self.first_cell) * (self.last_trial - self.first_trial)
+
+
+def run_block(study: Study, block: Block, *, device: Any = None, workers: int | None = None) -> dict[str, np.ndarray]:
+    """Results of a block: name -> array ``(cells, trials, ...)``; what each is, `variables` in `store` says.
+
+    It depends on nothing but the study and which trials they are: not on the block, the machine's load, or the order.
+    """
+    cells = np.repeat(np.arange(block.first_cell, block.last_cell), block.last_trial - block.first_trial)
+    trials = np.tile(np.arange(block.first_trial, block.last_trial), block.last_cell - block.first_cell)
+    setting = study.settings[block.first_cell]
+    devices = jax.local_devices() if device is None else [device]
+    drawn = draw(study, setting, cells, trials, devices[0])
+    found = _identified(study, setting, drawn, devices, workers)
+    shape = (block.last_cell - block.first_cell, block.last_trial - block.first_trial)
+    return {name: values.reshape(*shape, *values.shape[1:]) for name, values in found.items()}
+
+
+def _identified(study: Study, setting: Setting, drawn: Drawn, devices: list[Any], workers: int | None) -> dict[str, np.ndarray]:
+    options = {
+        "space": study.space,
+        "hold": setting.hold,
+        "max_steps": study.specification.identification.max_steps,
+        "devices": devices,
+        "workers": workers,
+    }
+    capture = _capture(study, setting, drawn)
+    problem = (study.nominal.arm, capture, drawn.lower, drawn.upper, drawn.start)
+    if setting.method == "stage1":
+        many = stage1 = identify_many(*problem, **options)
+        k = np.full(len(many.de), np.nan) if many.k is None else many.k
+    else:
+        many = calibrate_many(*problem, method=setting.method, **options)  # pyright: ignore[reportArgumentType]
+        stage1, k = many.stage1, many.k
+    lengths = study.space.lengths
+    # How much too large stage 1 left the arm: the factor that best turns the true lengths into those found.
+    true = drawn.true[:, lengths]
+    scale = np.sum(stage1.parameters[:, lengths] * true, axis=1) / np.maximum(np.sum(true**2, axis=1), 1e-300)
+    fixed = setting.method != "stage1"
+    return {
+        "converged": many.converged.astype(np.int8),
+        "reason": np.asarray(numbers_of(many.result), dtype=np.int8),
+        "steps": many.steps.astype(np.int16),
+        "k": k,
+        "scale": scale,
+        "de_stage1": stage1.de,
+        "deltam_stage1": stage1.deltam,
+        "length_error_stage1": _largest(stage1.parameters - drawn.true, lengths),
+        "angle_error_stage1": _largest(stage1.parameters - drawn.true, ~lengths),
+        "de": many.de if fixed else np.full(len(k), np.nan),
+        "deltam": many.deltam if fixed else np.full(len(k), np.nan),
+        "length_error": _largest(many.parameters - drawn.true, lengths, fixed),
+        "angle_error": _largest(many.parameters - drawn.true, ~lengths, fixed),
+        "truth_inside": np.all((drawn.true >= drawn.lower) & (drawn.true <= drawn.upper), axis=1).astype(np.int8),
+        "active": many.active.astype(np.int8),
+        "estimate": many.parameters,
+        "true": drawn.true,
+    }
+
+
+def _largest(error: np.ndarray, which: np.ndarray, there: bool = True) -> np.ndarray:
+    return np.abs(error[:, which]).max(axis=1, initial=0.0) if there else np.full(len(error), np.nan)
+
+
+def _capture(study: Study, setting: Setting, drawn: Drawn) -> Capture:
+    """The trials' recordings as a batch."""
+    template = _template(study, setting)
+    lengths = tuple(
+        eqx.tree_at(lambda r: (r.value, r.u), length, (drawn.value[:, i], drawn.u[:, i]))
+        for i, length in enumerate(template.lengths)
+    )
+    return eqx.tree_at(lambda c: (c.q, c.lengths), template, (drawn.q, lengths))
+
+
+@lru_cache(maxsize=64)
+def _template(study: Study, setting: Setting) -> Capture:
+    """One recording of the right shape; its numbers do not matter."""
+    names = [f"{stand.name}{'ab'[end] if stand.ends == 2 else ''}" for stand in setting.stands for end in range(stand.ends)]
+    angles = np.random.default_rng(0).uniform(-1, 1, (sum(setting.sizes), study.nominal.arm.joints))
+    rows = np.split(angles, np.cumsum(setting.sizes)[:-1])
+    lengths = [ReferenceLength(names[a], names[b], 1.0) for a, b in ends_of(study, setting)]
+    return Capture(dict(zip(names, rows, strict=True)), lengths)
