@@ -39,7 +39,7 @@ def _client(distributed: Any, address: str, workers: int | None) -> Iterator[Any
             raise InputError("the workers of a running Dask cluster are its own; leave --workers out.")
         target = {"scheduler_file": address} if os.path.isfile(address) else {"address": address}
         try:
-            client = distributed.Client(**target, timeout=10)
+            client = distributed.Client(**target, timeout=5)
         except (OSError, TimeoutError, ValueError) as error:
             raise InputError(f"no Dask scheduler answers at {address}; start one, or use --dask local.") from error
         with client:

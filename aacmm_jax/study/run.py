@@ -71,6 +71,7 @@ def run_study(
     """
     path = Path(path)
     with _alone(path):
+        store.tidy(path)
         layout, chunk, finished = _opened(study, path, chunk)
         total = layout.cells * layout.trials
         if finished:
@@ -183,6 +184,10 @@ def _stopping() -> Iterator[threading.Event]:
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
     """While this process writes a study no other may."""
+    if not path.name or path.is_dir():
+        raise InputError(f"{path} cannot be written: it is a folder; choose another output path.")
+    if not path.parent.is_dir():
+        raise InputError(f"{path} cannot be written: no such file or directory; make the folder, or choose another output path.")
     lock = FileLock(path.with_name(f".{path.name}.lock"))
     try:
         lock.acquire(timeout=0)
@@ -229,6 +234,7 @@ def _difference(one: Study, other: Study) -> str:
     known, asked = (s.specification.model_dump(exclude={"name", "arm"}) for s in (one, other))
     for table, value in asked.items():
         if value != known[table]:
-            inner = [key for key in value or () if isinstance(known[table], dict) and known[table].get(key) != value[key]]
+            both = isinstance(value, dict) and isinstance(known[table], dict)
+            inner = [key for key in value if known[table].get(key) != value[key]] if both else []
             return f"{table}{'.' + inner[0] if inner else ''} differs"
     return "its arm or its capture differs"

@@ -6,6 +6,7 @@ as fill values). So nothing is ever appended to, a block is there wholly or not 
 write their blocks themselves. At the end the blocks are copied, still compressed, into one plain file.
 """
 
+import glob
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -198,6 +199,13 @@ def finish(path: Path, study: Study, layout: Layout, chunk: int) -> None:
 def clean(path: Path) -> None:
     """Remove the blocks of a finished study, which its file now holds."""
     shutil.rmtree(parts_of(path), ignore_errors=True)
+
+
+def tidy(path: Path) -> None:
+    """Remove what a killed process left unfinished: files that never got their name."""
+    for folder, name in ((path.parent, path.name), (parts_of(path), "*")):
+        for left in folder.glob(f".{glob.escape(name) if name != '*' else name}.????????.part"):
+            left.unlink(missing_ok=True)
 
 
 def _write(path: Path, study: Study, chunk: int, add_results: Callable[[Any, str], Any], finished: bool) -> None:

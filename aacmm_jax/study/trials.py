@@ -60,9 +60,10 @@ def _identified(study: Study, setting: Setting, drawn: Drawn, devices: list[Any]
         many = calibrate_many(*problem, method=setting.method, **options)  # pyright: ignore[reportArgumentType]
         stage1, k = many.stage1, many.k
     lengths = study.space.lengths
-    # How much too large stage 1 left the arm: the factor that best turns the true lengths into those found.
-    true = drawn.true[:, lengths]
-    scale = np.sum(stage1.parameters[:, lengths] * true, axis=1) / np.maximum(np.sum(true**2, axis=1), 1e-300)
+    # How much too large stage 1 left the arm: the factor that best turns the true lengths into those found. Rows are contiguous,
+    # so that each is summed in the same order however many there are.
+    true = np.where(lengths, drawn.true, 0.0)
+    scale = (stage1.parameters * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300)
     fixed = setting.method != "stage1"
     return {
         "converged": many.converged.astype(np.int8),

@@ -1,0 +1,179 @@
+"""What a study's results say: standard errors that are true, tables, figures, labelled data."""
+
+import json
+
+import matplotlib
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.cli.study_display import concise
+from aacmm_jax.study.results import Results
+from aacmm_jax.study.statistics import statistic, study_summary
+
+matplotlib.use("Agg")
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    study = aj.make_study(
+        name="a study",
+        arm="cheng2018-simulation",
+        trials=96,
+        seed=1,
+        capture={"positions_mm": [[400, 200, 300]], "poses": 20, "pool": 4096},
+        deviation={"length_mm": 1.0, "angle_deg": 0.1},
+        noise={"encoder_arcsec": 2.0, "seating_mm": 0.005},
+        reference={"length_mm": 300, "poses": 3, "u_mm": 0.002, "region": {"distance_mm": [300, 900]}},
+        bounds={"length_mm": [0.5, 5], "length_shift_mm": [0, 1]},
+    )
+    path = tmp_path_factory.mktemp("results") / "study.h5"
+    aj.run_study(study, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def summary(path):
+    return study_summary(Results.of(path))
+
+
+STATISTICS = {
+    "mean": (np.mean, lambda n: 1 / n**0.5),
+    "spread": (lambda x: np.std(x, ddof=1 if len(x) > 1 else 0), lambda n: 1 / (2 * n) ** 0.5),
+    "median": (np.median, lambda n: (np.pi / 2 / n) ** 0.5),
+    "95 %": (lambda x: np.percentile(x, 95), lambda n: (0.95 * 0.05 / n) ** 0.5 / 0.10314),
+}
+
+
+@pytest.mark.parametrize("name", STATISTICS)
+@pytest.mark.parametrize("count", [200, 1000, 6400])
+def test_standard_errors_are_those_of_theory(name, count):
+    """Normal trials, whose statistics' standard errors are known; over repeated studies, in the root mean square."""
+    function, theory = STATISTICS[name]
+    generator = np.random.default_rng(count)
+    repeats = 60 if count < 6400 else 20
+    found = [statistic(function, generator.normal(size=count), np.arange(count) % 32)["se"] for _ in range(repeats)]
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(theory(count), rel=0.2)
+
+
+def test_standard_errors_hold_what_a_group_shares():
+    """Trials of one pool that err together: the scatter between groups shows it, that between trials would not."""
+    generator = np.random.default_rng(0)
+    groups = np.arange(6400) % 32
+    found = [
+        statistic(np.mean, generator.normal(size=6400) + 0.3 * generator.normal(size=32)[groups], groups)["se"]
+        for _ in range(20)
+    ]
+    assert np.mean(found) == pytest.approx((1 / 6400 + 0.09 / 32) ** 0.5, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("value", "se", "text"),
+    [
+        (0.010684, 0.000031, "0.01068(3)"),
+        (1.0000335, 4.57e-5, "1.00003(5)"),
+        (3198.2, 36.1, "3198(36)"),
+        (0.9951, 0.0096, "1.00(1)"),
+        (-8.306e-7, 7.08e-7, "-8(7)e-07"),
+        (5.0, 0.0, "5"),
+        (5.0, None, "5"),
+        (None, None, "-"),
+        (float("nan"), 0.1, "-"),
+        (0.0, 0.02, "0.00(2)"),
+    ],
+)
+def test_concise_notation(value, se, text):
+    assert concise(value, se) == text
+
+
+def test_summary_says_what_the_arrays_say(path, summary):
+    data = aj.open_study(path)
+    assert summary["factors"] == {"bounds.length_mm": [0.5, 5.0], "bounds.length_shift_mm": [0.0, 1.0]}
+    assert summary["trials_run"] == 4 * 96
+    cell = summary["results"][3]
+    assert cell["factors"] == {"bounds.length_mm": 5.0, "bounds.length_shift_mm": 1.0}
+    picked = data.sel(bounds_length_mm=5.0, bounds_length_shift_mm=1.0).squeeze()
+    for name in ("k", "de", "length_error", "angle_error_stage1"):
+        figure = cell["figures"][name]
+        assert figure["mean"]["value"] == pytest.approx(picked[name].values.mean(), rel=1e-12)
+        assert figure["spread"]["value"] == pytest.approx(picked[name].values.std(ddof=1), rel=1e-9)
+        assert figure["p95"]["value"] == pytest.approx(np.percentile(picked[name].values, 95), rel=1e-12)
+    error = (picked.estimate - picked.true).values
+    for i, row in enumerate(cell["parameters"]):
+        assert row["parameter"] == str(picked.parameter.values[i])
+        assert row["bias"]["value"] == pytest.approx(error[:, i].mean(), abs=1e-15)
+        assert row["spread"]["value"] == pytest.approx(error[:, i].std(ddof=1), rel=1e-6)
+    narrow = summary["results"][1]  # +-0.5 mm about a centre 1 mm off: the truth is never inside
+    assert narrow["truth_inside"]["value"] == 0
+    assert narrow["on_a_bound"]["value"] == 1
+    assert cell["converged"]["value"] == 1
+
+
+def test_the_method_is_right(summary):
+    """In a wide box the scale fix leaves no bias in the scale, and every parameter's bias is within its standard error."""
+    cell = summary["results"][2]
+    scale = cell["figures"]["scale_error"]["mean"]
+    assert abs(scale["value"]) < 4 * scale["se"]
+    pulls = [row["bias"]["value"] / row["bias"]["se"] for row in cell["parameters"]]
+    assert np.max(np.abs(pulls)) < 5
+    assert cell["figures"]["length_error"]["p50"]["value"] < 0.1 * cell["figures"]["length_error_stage1"]["p50"]["value"]
+
+
+def test_labelled_data(path):
+    data = aj.open_study(path)
+    assert data.estimate.dims == ("cell", "trial", "parameter")
+    grid = data[["k", "length_error"]].unstack("cell")
+    assert grid.sizes == {"trial": 96, "bounds_length_mm": 2, "bounds_length_shift_mm": 2}
+    assert data.length_error.attrs["units"] == "mm"
+    assert data.attrs["seed"] == 1
+    assert data.attrs["finished"]
+
+
+def test_the_terminal_shows_all_of_it(path, aacmm, tmp_path):
+    done = aacmm("show", path, "--figures", "figures")
+    assert "a study of Cheng 2018, simulated arm: 4 cells of 96 trials, seed 1" in done.stdout
+    for heading in ("converged", "on a bound", "Deltam [mm]", "angle error", "95 %"):
+        assert heading in done.stdout
+    drawn = {item.name for item in (tmp_path / "figures").iterdir()}
+    assert drawn == {
+        "convergence.png",
+        "correlation.png",
+        "distributions_bounds_length_mm.png",
+        "distributions_bounds_length_shift_mm.png",
+        "error_against_bounds_length_mm.png",
+        "k_against_bounds_length_shift_mm.png",
+    }
+    one = aacmm("show", path, "--cell", 2)
+    assert "Parameters: estimate less truth" in one.stdout
+    assert "probe_z" in one.stdout
+    machine = json.loads(aacmm("show", path, "--json").stdout)
+    assert machine["results"][0]["figures"]["de"]["mean"]["se"] > 0
+    assert "no cell 5; name another" in aacmm("show", path, "--cell", 5, expect=2).stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("-o", "s.h5"), "name a specification, or use --resume"),
+        (("--resume", "-o", "s.h5"), "s.h5 does not exist, so there is nothing to resume; leave --resume out"),
+        (
+            ("bound-sensitivty", "-o", "s.h5"),
+            "neither a file nor a study that ships with the package; did you mean 'bound-sensitivity'",
+        ),
+        (("spec.toml", "-o", "s.h5"), "spec.toml: unknown key 'nose'; did you mean 'noise'"),
+        (("empty.toml", "-o", "s.h5"), "empty.toml: 'trials' is missing; add it"),
+        (("none.toml", "-o", "s.h5"), "none.toml does not exist; check the path"),
+        (("noise", "-o", "no/folder/s.h5"), "cannot be written: no such file or directory"),
+        (("noise", "-o", "."), "it is a folder"),
+        (("noise", "-o", "s.h5", "--shards"), "--shards is for the workers of --dask"),
+    ],
+    ids=str,
+)
+def test_the_command_refuses_in_one_sentence(aacmm, tmp_path, arguments, message):
+    (tmp_path / "spec.toml").write_text('arm = "panda"\ntrials = 1\n[capture]\npositions_mm = [[1, 2, 3]]\n[nose]\n')
+    (tmp_path / "empty.toml").write_text('arm = "panda"\n[capture]\npositions_mm = [[1, 2, 3]]\n')
+    done = aacmm("study", *arguments, expect=2)
+    assert message in done.stderr
+    assert done.stderr.startswith("Error: ")
+    assert done.stderr.count("\n") == 1
+    assert {item.name for item in tmp_path.iterdir()} == {"spec.toml", "empty.toml"}
