@@ -21,7 +21,7 @@ def test_notebook_runs(path):
         nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(path.parent)}}).execute()
 
 
-def test_both_are_there_with_their_outputs():
-    assert [path.stem[:2] for path in NOTEBOOKS] == ["01", "02"]
+def test_all_are_there_with_their_outputs():
+    assert [path.stem[:2] for path in NOTEBOOKS] == ["01", "02", "03"]
     for path in NOTEBOOKS:
         assert '"image/png"' in path.read_text()

@@ -202,7 +202,7 @@ def test_results_without_their_parts_are_missed(home, study, tmp_path):
     path = tmp_path / "s.h5"
     store.create(path, study, store.Layout.of(study, 16), 16)
     shutil.rmtree(store.parts_of(path))
-    with pytest.raises(aj.InputError, match=r"s\.h5\.parts, which holds its results, is not beside it"):
+    with pytest.raises(aj.InputError, match=r"results in the folder s\.h5\.parts, which is not beside it; put it there"):
         aj.open_study(path)
     with pytest.raises(aj.InputError, match="does not exist"):
         aj.open_study(tmp_path / "none.h5")
@@ -271,7 +271,10 @@ def test_a_full_disk_is_one_sentence_and_loses_nothing(home, cache, tmp_path):
         "os.execv(sys.executable, [sys.executable, '-m', 'aacmm_jax', *sys.argv[2:]])"
     )
     store.create(path, aj.read_study(home / "spec.toml"), store.Layout.of(aj.read_study(home / "spec.toml"), 60), 60)
-    for limit, what in ((10_000, "s.h5.parts/cell00000-trial0000000000.h5"), ((home / "whole.h5").stat().st_size - 10_000, "s.h5 cannot")):
+    for limit, what in (
+        (10_000, "s.h5.parts/cell00000-trial0000000000.h5"),
+        ((home / "whole.h5").stat().st_size - 10_000, "s.h5 cannot"),
+    ):
         done = subprocess.run(
             [sys.executable, "-c", limited, str(limit), "study", "spec.toml", "-o", str(path), "--workers", "1"],
             cwd=home, env=os.environ | {"PYTHONPATH": str(ROOT), "JAX_ENABLE_COMPILATION_CACHE": "0"}, capture_output=True, text=True, timeout=300,
@@ -306,6 +309,15 @@ def test_the_number_of_devices_changes_nothing(home, cache, tmp_path):
     with h5py.File(home / "whole.h5") as one, h5py.File(tmp_path / "s.h5") as two:
         for name in store.VARIABLES:
             np.testing.assert_allclose(one["trials"][name][()], two["trials"][name][()], rtol=0, atol=1e-9, err_msg=name)
+
+
+def test_parts_may_stay(home, study, tmp_path):
+    path = tmp_path / "s.h5"
+    assert aj.run_study(study, path, chunk=30, keep_parts=True).finished
+    assert aj.run_study(study, path).ran == 0
+    same(home / "whole.h5", path)
+    assert aj.open_study(path).attrs["finished"]
+    assert len(list(store.parts_of(path).iterdir())) == 8
 
 
 def test_any_executor(home, study, tmp_path):

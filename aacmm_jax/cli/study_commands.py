@@ -38,6 +38,9 @@ def study(
         bool,
         typer.Option("--shards", help="Dask workers write their blocks themselves, to the output's folder, which they share."),
     ] = False,
+    keep_parts: Annotated[
+        bool, typer.Option("--keep-parts", help="Leave the blocks in their folder at the end: for results too large to copy.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Run thousands of simulated calibrations; run again, it goes on where it was."""
@@ -57,7 +60,8 @@ def study(
 
     def run(watch: Any) -> Any:
         with _on(dask, workers) as (executor, count):
-            return run_study(asked, output, executor=executor, workers=count, chunk=chunk, shards=shards, watch=watch)
+            options = {"chunk": chunk, "shards": shards, "keep_parts": keep_parts}
+            return run_study(asked, output, executor=executor, workers=count, watch=watch, **options)
 
     with _bar(asked) as show_progress:
         outcome = run(lambda progress: show_progress(progress) if isinstance(progress, Progress) else None)

@@ -67,10 +67,9 @@ class Results(NamedTuple):
         """Raises `InputError` where the file is missing, damaged, no study, or has lost the folder of its blocks."""
         path = Path(path)
         kept = store.read(path)
-        if not kept.finished and not store.parts_of(path).is_dir():
+        if kept.virtual and not store.parts_of(path).is_dir():
             raise InputError(
-                f"{path} is of a study that has not ended, and {store.parts_of(path).name}, which holds its results, is not "
-                "beside it; put it there."
+                f"{path} has its results in the folder {store.parts_of(path).name}, which is not beside it; put it there."
             )
         return cls(path, kept.study, kept.finished)
 

@@ -55,6 +55,7 @@ def run_study(
     workers: int | None = None,
     chunk: int | None = None,
     shards: bool = False,
+    keep_parts: bool = False,
     watch: Callable[[Progress], None] | None = None,
 ) -> Outcome:
     """Run a study into an HDF5 file; where the file holds part of it already, go on from there.
@@ -63,6 +64,7 @@ def run_study(
       in this process, on all its cores and devices. A block is one call of `identify_many`.
     - ``chunk``: trials in a block, default 1,000 (65,536 on a GPU). It changes no number. What a file was begun with stays.
     - ``shards``: workers write their blocks themselves, into ``FILE.parts`` on a folder that all of them share.
+    - ``keep_parts``: leave the blocks in their folder at the end; the file stays virtual. For results too large to copy.
     - ``watch``: called with a `Progress` after every block.
 
     An interrupt (Ctrl-C, SIGTERM) lets the blocks in work end, keeps them, and returns an `Outcome` that is not finished;
@@ -75,7 +77,6 @@ def run_study(
         layout, chunk, finished = _opened(study, path, chunk)
         total = layout.cells * layout.trials
         if finished:
-            store.clean(path)
             return Outcome(path, total, total, 0)
         kept = set(store.finished_blocks(path, layout))
         missing = [block for block in layout.blocks() if block not in kept]
@@ -93,7 +94,7 @@ def run_study(
                 if watch is not None:
                     watch(Progress(done, total, before))
         if done == total:
-            store.finish(path, study, layout, chunk)
+            store.finish(path, study, layout, chunk, keep_parts)
         return Outcome(path, done, total, done - before)
 
 
@@ -187,7 +188,9 @@ def _alone(path: Path) -> Iterator[None]:
     if not path.name or path.is_dir():
         raise InputError(f"{path} cannot be written: it is a folder; choose another output path.")
     if not path.parent.is_dir():
-        raise InputError(f"{path} cannot be written: no such file or directory; make the folder, or choose another output path.")
+        raise InputError(
+            f"{path} cannot be written: no such file or directory; make the folder, or choose another output path."
+        )
     lock = FileLock(path.with_name(f".{path.name}.lock"))
     try:
         lock.acquire(timeout=0)
@@ -219,6 +222,8 @@ def _opened(study: Study, path: Path, chunk: int | None) -> tuple[Layout, int, b
     if kept.study != study:
         raise InputError(f"{path} holds another study ({_difference(kept.study, study)}); choose another output path.")
     if kept.finished:
+        if not kept.virtual:
+            store.clean(path)  # a kill may have left it
         return Layout.of(study, kept.chunk), kept.chunk, True
     if chunk is not None and chunk != kept.chunk:
         raise InputError(f"{path} was begun with chunks of {kept.chunk} trials; leave the chunk out to go on with them.")

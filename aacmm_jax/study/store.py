@@ -10,6 +10,7 @@ import glob
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -155,8 +156,6 @@ def _dataset(group: Any, name: str, layout: Layout, shape: tuple[int, ...]) -> A
 
 def create(path: Path, study: Study, layout: Layout, chunk: int) -> None:
     """The file of a study that begins, and the folder of its blocks."""
-    import h5py
-
     folder = parts_of(path)
     try:
         folder.mkdir(exist_ok=True)
@@ -165,22 +164,30 @@ def create(path: Path, study: Study, layout: Layout, chunk: int) -> None:
             f"{folder} cannot be made: {(error.strerror or str(error)).lower()}; choose another output path."
         ) from error
 
-    def add_results(group: Any, name: str) -> Any:
-        virtual = h5py.VirtualLayout(layout.shape(name), VARIABLES[name].dtype)
-        for block in layout.blocks():
-            cells, trials = slice(block.first_cell, block.last_cell), slice(block.first_trial, block.last_trial)
-            size = layout.shape(name, cells.stop - cells.start, trials.stop - trials.start)
-            # HDF5 reads % as the beginning of a pattern.
-            source = f"{folder.name}/{part_of(path, block).name}".replace("%", "%%")
-            virtual[cells, trials] = h5py.VirtualSource(source, name, size)
-        return group.create_virtual_dataset(name, virtual, fillvalue=fill_of(name))
-
-    _write(path, study, chunk, add_results, finished=False)
+    _write(path, study, chunk, partial(_add_virtual, path, layout), finished=False, virtual=True)
 
 
-def finish(path: Path, study: Study, layout: Layout, chunk: int) -> None:
-    """All blocks copied into one plain file; their folder removed."""
+def _add_virtual(path: Path, layout: Layout, group: Any, name: str) -> Any:
+    """An array of results that is put together from the blocks whenever it is read."""
     import h5py
+
+    virtual = h5py.VirtualLayout(layout.shape(name), VARIABLES[name].dtype)
+    for block in layout.blocks():
+        cells, trials = slice(block.first_cell, block.last_cell), slice(block.first_trial, block.last_trial)
+        size = layout.shape(name, cells.stop - cells.start, trials.stop - trials.start)
+        # HDF5 reads % as the beginning of a pattern.
+        source = f"{parts_of(path).name}/{part_of(path, block).name}".replace("%", "%%")
+        virtual[cells, trials] = h5py.VirtualSource(source, name, size)
+    return group.create_virtual_dataset(name, virtual, fillvalue=fill_of(name))
+
+
+def finish(path: Path, study: Study, layout: Layout, chunk: int, keep_parts: bool = False) -> None:
+    """All blocks copied into one plain file, and their folder removed; or, ``keep_parts``, left as they are."""
+    import h5py
+
+    if keep_parts:
+        _write(path, study, chunk, partial(_add_virtual, path, layout), finished=True, virtual=True)
+        return
 
     def add_results(group: Any, name: str) -> Any:
         dataset = _dataset(group, name, layout, layout.shape(name))
@@ -192,7 +199,7 @@ def finish(path: Path, study: Study, layout: Layout, chunk: int) -> None:
                 dataset.id.write_direct_chunk(offset, content, mask)
         return dataset
 
-    _write(path, study, chunk, add_results, finished=True)
+    _write(path, study, chunk, add_results, finished=True, virtual=False)
     clean(path)
 
 
@@ -208,13 +215,14 @@ def tidy(path: Path) -> None:
             left.unlink(missing_ok=True)
 
 
-def _write(path: Path, study: Study, chunk: int, add_results: Callable[[Any, str], Any], finished: bool) -> None:
+def _write(path: Path, study: Study, chunk: int, add_results: Callable, finished: bool, virtual: bool) -> None:
     attributes = {
         "name": study.specification.name,
         "seed": study.specification.seed,
         "digest": study.digest,
         "chunk": chunk,
         "finished": int(finished),
+        "virtual": int(virtual),
     }
 
     def extend(file: Any) -> None:
@@ -285,6 +293,7 @@ class Kept(NamedTuple):
     study: Study
     chunk: int
     finished: bool
+    virtual: bool  # the results lie in the folder of the blocks
     package_version: str
 
 
@@ -300,7 +309,9 @@ def read(path: Path) -> Kept:
         study = Study(specification, nominal, recording)
         if study.digest != attributes["digest"]:
             raise InputError(f"{path} is damaged or was edited: its specification does not match its results; make it again.")
-        return Kept(study, attributes["chunk"], bool(attributes["finished"]), attributes["package_version"])
+        return Kept(
+            study, attributes["chunk"], bool(attributes["finished"]), bool(attributes["virtual"]), attributes["package_version"]
+        )
 
 
 def finished_blocks(path: Path, layout: Layout) -> list[Block]:
