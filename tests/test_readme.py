@@ -15,12 +15,18 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
 
 
-def test_python_runs(capsys):
+def test_python_runs(capsys, tmp_path, monkeypatch):
     """The blocks continue one another, so they run as one program."""
+    monkeypatch.chdir(tmp_path)
     exec(compile("\n".join(blocks("python")), "README.md", "exec"), {})
     printed = capsys.readouterr().out
     assert "Converged" in printed
     assert "\nTrue " in printed
+
+
+def test_study_is_read(tmp_path):
+    (tmp_path / "study.toml").write_text(blocks("toml")[2])
+    assert len(aj.read_study(tmp_path / "study.toml").cells) == 6
 
 
 def test_arm_file_is_read(tmp_path):
