@@ -9,7 +9,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.cli.study_display import concise
 from aacmm_jax.study.results import Results
-from aacmm_jax.study.statistics import statistic, study_summary
+from aacmm_jax.study.statistics import spread_of, statistic, study_summary
 
 matplotlib.use("Agg")
 
@@ -30,6 +30,12 @@ def path(tmp_path_factory):
     path = tmp_path_factory.mktemp("results") / "study.h5"
     aj.run_study(study, path)
     return path
+
+
+def test_percentiles_are_numpys():
+    values = np.random.default_rng(0).normal(size=101)
+    found = spread_of(values, np.arange(101) % 32)
+    np.testing.assert_allclose([found[f"p{q}"]["value"] for q in (5, 50, 95)], np.percentile(values, (5, 50, 95)), rtol=1e-14)
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +71,16 @@ def test_standard_errors_hold_what_a_group_shares():
         for _ in range(20)
     ]
     assert np.mean(found) == pytest.approx((1 / 6400 + 0.09 / 32) ** 0.5, rel=0.1)
+
+
+@pytest.mark.parametrize("name", STATISTICS)
+@pytest.mark.parametrize("count", [640, 6400])
+def test_standard_errors_where_groups_differ_are_those_of_repetition(name, count):
+    """Half of the variance is between groups: against the scatter of the statistic itself over 300 repeated studies."""
+    function, generator, groups = STATISTICS[name][0], np.random.default_rng(count), np.arange(count) % 32
+    studies = [generator.normal(size=count) + generator.normal(size=32)[groups] for _ in range(300)]
+    found = [statistic(function, values, groups)["se"] for values in studies[:60]]
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(np.std([function(values) for values in studies]), rel=0.25)
 
 
 @pytest.mark.parametrize(
@@ -106,7 +122,7 @@ def test_summary_says_what_the_arrays_say(path, summary):
     narrow = summary["results"][1]  # +-0.5 mm about a centre 1 mm off: the truth is never inside
     assert narrow["truth_inside"]["value"] == 0
     assert narrow["on_a_bound"]["value"] == 1
-    assert cell["converged"]["value"] == 1
+    assert cell["converged"] == {"value": 1, "se": None}  # no scatter seen is not certainty
 
 
 def test_the_method_is_right(summary):

@@ -77,7 +77,7 @@ def test_what_a_toml_file_names_lies_beside_it(tmp_path, noisy_capture, paper_ar
             "has 39,601 cells .*more than 10,000",
         ),
         ({"trials": 0}, "'trials' must be greater than or equal to 1, not 0"),
-        ({"trials": 10**10, "bounds": {"length_mm": [1, 2]}}, "2 cells of 10,000,000,000 trials are more than"),
+        ({"trials": 2**32, "bounds": {"length_mm": [1, 2, 3]}}, "3 cells of 4,294,967,296 trials are more than"),
         ({"seed": -1}, "'seed' must be greater than or equal to 0"),
         ({"capture": {}}, "give one of positions_mm, sockets .* and file"),
         ({"capture": {"sockets": 2}}, "sockets at random need a region"),
@@ -86,6 +86,11 @@ def test_what_a_toml_file_names_lies_beside_it(tmp_path, noisy_capture, paper_ar
         ({"capture": CAPTURE | {"poses": 7}}, "7 poses in 1 socket give 18 equations, but 20 unknowns need at least 8 poses"),
         ({"capture": CAPTURE | {"poses": [70, 7]}}, "need at least 8 poses"),
         ({"capture": CAPTURE | {"poses": 3000}}, "3000 poses are more than the pool has"),
+        (
+            {"capture": {"sockets": 1, "region": {"distance_mm": [300, 900]}, "poses": 100, "pool": 4096}},
+            "room for less than two places of 100 poses .* give at least 8192",
+        ),
+        ({"trials": 2**33}, "'trials' must be less than or equal to 4294967296"),
         ({"capture": CAPTURE | {"joint_limits_deg": [[-10, 10]]}}, "limits"),
         ({"capture": {"file": "a.h5", "poses": 5}}, "a.h5 does not exist"),
         ({"reference": {"u_mm": 0.1}}, "give either length_mm, .* or ends_mm"),
@@ -115,8 +120,17 @@ def test_refused_in_one_sentence(tables, message):
     ("tables", "message"),
     [
         ({"capture": {"positions_mm": [[400, 200, 300], [3000, 0, 0]]}}, r"socket S2 at \(3000, 0, 0\) mm cannot be reached"),
+        (
+            {"capture": {"sockets": 1, "region": {"distance_mm": [300, 900]}, "poses": 100, "pool": 4096}},
+            "room for less than two places of 100 poses .* give at least 8192",
+        ),
+        ({"trials": 2**33}, "'trials' must be less than or equal to 4294967296"),
         ({"capture": CAPTURE | {"joint_limits_deg": [[-1, 1]] * 6}}, r"socket S1 at \(400, 200, 300\) mm cannot be reached"),
         ({"capture": {"sockets": 1, "region": {"distance_mm": [3000, 3100]}}}, "a socket finds no place in its region"),
+        (
+            {"reference": {"length_mm": 500, "region": {"x_mm": [300, 310], "y_mm": [0, 10], "z_mm": [0, 400]}}},
+            "a reference length of 500 mm finds no place in its region",
+        ),
         (
             {"reference": {"length_mm": 2900, "region": {"distance_mm": [100, 1000]}}},
             "a reference length of 2900 mm finds no place in its region",
@@ -124,6 +138,14 @@ def test_refused_in_one_sentence(tables, message):
     ],
     ids=str,
 )
+def test_a_narrow_region_is_found(tmp_path):
+    """A 300 mm length in a shell 20 mm thick: one candidate in thousands lies inside."""
+    region = {"distance_mm": [690, 710]}
+    for seed in range(3):
+        study = made(seed=seed, trials=1, reference={"length_mm": 300, "region": region}, capture=CAPTURE | {"pool": 4096})
+        assert aj.run_study(study, tmp_path / f"{seed}.h5").finished
+
+
 def test_out_of_reach_is_refused_before_work(tmp_path, tables, message):
     with pytest.raises(aj.InputError, match=message):
         aj.run_study(made(**tables), tmp_path / "s.h5")

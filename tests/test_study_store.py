@@ -201,11 +201,28 @@ def test_other_files_are_not_overwritten(study, tmp_path, noisy_capture):
 def test_results_without_their_parts_are_missed(home, study, tmp_path):
     path = tmp_path / "s.h5"
     store.create(path, study, store.Layout.of(study, 16), 16)
+    for use in (aj.open_study, lambda path: aj.run_study(study, path)):
+        path = path.rename(tmp_path / "t.h5")
+        with pytest.raises(
+            aj.InputError, match=r"t\.h5 was renamed, but its results lie in s\.h5\.parts; give it its name s\.h5"
+        ):
+            use(path)
+        path = path.rename(tmp_path / "s.h5")
     shutil.rmtree(store.parts_of(path))
-    with pytest.raises(aj.InputError, match=r"results in the folder s\.h5\.parts, which is not beside it; put it there"):
-        aj.open_study(path)
+    for use in (aj.open_study, lambda path: aj.run_study(study, path)):
+        with pytest.raises(aj.InputError, match=r"results in the folder s\.h5\.parts, which is not beside it; put it there"):
+            use(path)
     with pytest.raises(aj.InputError, match="does not exist"):
         aj.open_study(tmp_path / "none.h5")
+
+
+def test_blocks_of_a_study_whose_file_is_gone_are_not_taken_for_anothers(home, study, tmp_path):
+    path = tmp_path / "s.h5"
+    other = aj.Study(study.specification.model_copy(update={"seed": 6}), study.nominal)
+    aj.run_study(other, path, chunk=16, keep_parts=True)
+    path.unlink()
+    assert aj.run_study(study, path, chunk=16).ran == 240
+    same(home / "whole.h5", path)
 
 
 def test_a_moved_and_oddly_named_study_still_reads(home, study, tmp_path):
@@ -272,7 +289,7 @@ def test_a_full_disk_is_one_sentence_and_loses_nothing(home, cache, tmp_path):
     )
     store.create(path, aj.read_study(home / "spec.toml"), store.Layout.of(aj.read_study(home / "spec.toml"), 60), 60)
     for limit, what in (
-        (10_000, "s.h5.parts/cell00000-trial0000000000.h5"),
+        (10_000, "cell00000-trial0000000000.h5 cannot"),
         ((home / "whole.h5").stat().st_size - 10_000, "s.h5 cannot"),
     ):
         done = subprocess.run(
@@ -324,6 +341,11 @@ def test_any_executor(home, study, tmp_path):
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         assert aj.run_study(study, tmp_path / "s.h5", executor=pool, chunk=60).finished
     same(home / "whole.h5", tmp_path / "s.h5")
+    with (
+        ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as pool,
+        pytest.raises(aj.InputError, match="the executor forks, which JAX does not survive"),
+    ):
+        aj.run_study(study, tmp_path / "t.h5", executor=pool)
 
 
 def test_dask_workers_that_die_lose_nothing_and_shards_are_the_same(home, study, tmp_path):

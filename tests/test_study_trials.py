@@ -126,7 +126,7 @@ def test_reference_lengths_err_by_their_u():
 
 
 def test_starts_at_random_fill_the_box():
-    study = made(identification={"start": "random"}, bounds={"length_mm": 2.0, "length_shift_mm": 1.0})
+    study = made(identification={"start": "random", "hold": "none"}, bounds={"length_mm": 2.0, "length_shift_mm": 1.0})
     trials = drawn(study, 2000)
     share = (trials.start - trials.lower) / (trials.upper - trials.lower)
     assert share.min() >= 0
@@ -134,6 +134,9 @@ def test_starts_at_random_fill_the_box():
     assert share.mean() == pytest.approx(0.5, abs=0.01)
     d_3 = study.space.index("d_3")
     assert (trials.lower[0, d_3], trials.upper[0, d_3]) == (749.0, 753.0)
+    held = drawn(made(identification={"start": "random"}))
+    assert np.ptp(held.start, axis=0)[d_3] == 0
+    assert np.delete(np.ptp(held.start, axis=0), d_3).min() > 0
 
 
 def test_a_recording_lends_its_poses(noisy_capture):

@@ -43,6 +43,7 @@ class _Shape(NamedTuple):
     lengths: tuple[tuple[int, int], ...]  # first poses of both ends
     entries: tuple[tuple[str, int], ...]
     recorded: bool
+    held: int | None  # position of the length that stage 1 holds
     random_start: bool
     eccentric: bool
 
@@ -69,7 +70,7 @@ def draw(study: Study, setting: Setting, cells: Int[np.ndarray, " t"], trials: I
     return Drawn(*(np.asarray(leaf)[:count] for leaf in drawn))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)
 def _prepared(study: Study, setting: Setting, device: Any) -> tuple[_Shape, _Given]:
     """What all trials of a setting share, on the device."""
     pool = pool_of(study, setting)
@@ -86,7 +87,8 @@ def _shape(study: Study, setting: Setting, pool: Pool) -> _Shape:
     )
     starts = np.cumsum([0, *setting.sizes])
     ends = [(int(starts[a]), int(starts[b])) for a, b in ends_of(study, setting)]
-    return _Shape(stands, tuple(ends), study.space.entries(), setting.recorded, setting.random_start, study.eccentric)
+    held = None if setting.hold is None else study.space.index(setting.hold)
+    return _Shape(stands, tuple(ends), study.space.entries(), setting.recorded, held, setting.random_start, study.eccentric)
 
 
 def ends_of(study: Study, setting: Setting) -> list[tuple[int, int]]:
@@ -136,7 +138,8 @@ def _block(shape: _Shape, given: _Given, keys: Array, trials: Int[Array, " w"], 
     start = jnp.broadcast_to(given.nominal, true.shape)
     if shape.random_start:
         share = jax.vmap(lambda k: jax.random.uniform(k, (p,)))(parts[:, 6])
-        start = numbers.lower + share * (numbers.upper - numbers.lower)
+        free = jnp.asarray(np.arange(p) != (-1 if shape.held is None else shape.held))[None]
+        start = jnp.where(free, numbers.lower + share * (numbers.upper - numbers.lower), start)
     return Drawn(jnp.moveaxis(reading, 0, -1), true, numbers.lower, numbers.upper, start, value, u)
 
 

@@ -53,7 +53,7 @@ def _client(distributed: Any, address: str, workers: int | None) -> Iterator[Any
         environment["JAX_COMPILATION_CACHE_DIR"] = jax.config.jax_compilation_cache_dir  # pyright: ignore
         environment["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     with (
-        distributed.LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None, env=environment) as cluster,
+        distributed.LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0", env=environment) as cluster,
         distributed.Client(cluster) as client,
     ):
         client.register_plugin(_share_plugin(distributed)(cores, count))

@@ -27,6 +27,7 @@ _ROUNDS, _STEPS, _AT_ONCE = 100, 20, 2048
 _TOLERANCE = 1e-9  # mm
 # |J| |J^+| of a pose, 3 at best: beyond this the arm is so nearly straight that the tip can hardly be moved along it.
 _STRAIGHT = 30.0
+_CANDIDATES = 65_536  # places at a time; most may lie outside a narrow region
 _TRIED = 8  # poses tried at each end of a candidate placement
 
 
@@ -78,8 +79,10 @@ def _recorded(study: Study) -> Pool:
 @lru_cache(maxsize=16)
 def _stand_table(study: Study, stand: Stand, limits: tuple, choice: tuple[int, int]) -> np.ndarray:
     arm = study.nominal.arm
-    # The same stand has the same pool in every study of the same seed, whatever else varies.
-    key = jax.random.fold_in(jax.random.key(study.specification.seed), zlib.crc32(repr((stand, limits, choice)).encode()))
+    # The same stand has the same pool in every study of the same seed, whatever noise, bounds and methods are.
+    key = jax.random.fold_in(
+        jax.random.key(study.specification.seed, impl="threefry2x32"), zlib.crc32(repr((stand, limits, choice)).encode())
+    )
     placements, poses = choice
     if stand.points is not None:
         points = np.tile(np.array(stand.points), (BATCHES, 1))
@@ -93,7 +96,7 @@ def check_reach(study: Study) -> None:
     arm = study.nominal.arm
     for setting in dict.fromkeys(study.settings):
         for stand in () if setting.recorded else setting.stands:
-            limits, key = jnp.asarray(setting.limits), jax.random.key(study.specification.seed)
+            limits, key = jnp.asarray(setting.limits), jax.random.key(study.specification.seed, impl="threefry2x32")
             if stand.points is None:
                 _placed(arm, stand, limits, key, 1)
                 continue
@@ -184,7 +187,7 @@ def _placed(arm: Arm, stand: Stand, limits: Array, key: Array, count: int) -> np
     assert stand.region is not None
     found: list[np.ndarray] = []
     for number in range(_ROUNDS):
-        there = _candidates(stand, stand.region, jax.random.fold_in(key, 1000 + number), 2 * count)
+        there = _candidates(stand, stand.region, jax.random.fold_in(key, 1000 + number), _CANDIDATES)[: 2 * count + 64]
         if len(there):
             points = np.repeat(there.reshape(-1, 3), _TRIED, axis=0)
             _, good = _tried(arm, _uniform(jax.random.fold_in(key, 2000 + number), limits, len(points)), points, limits)

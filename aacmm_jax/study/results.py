@@ -25,7 +25,7 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
 
     Cells carry the levels of the study's factors: of one factor as the dimension itself, of several as a MultiIndex. So
     ``data.sel(bounds_length_mm=5)`` picks cells, and ``data.unstack("cell")`` makes every factor a dimension. Names, units
-    and long names are those of the file. A study that is running may be opened: trials not yet run are NaN, whole numbers -1.
+    and long names are those of the file. A study that is running may be opened: trials not yet run are NaN, whole numbers -1 (``active`` -128).
     Raises `InputError` where the file is missing, damaged or no study, or xarray is not installed.
     """
     try:
@@ -67,10 +67,7 @@ class Results(NamedTuple):
         """Raises `InputError` where the file is missing, damaged, no study, or has lost the folder of its blocks."""
         path = Path(path)
         kept = store.read(path)
-        if kept.virtual and not store.parts_of(path).is_dir():
-            raise InputError(
-                f"{path} has its results in the folder {store.parts_of(path).name}, which is not beside it; put it there."
-            )
+        store.check_parts(path, kept)
         return cls(path, kept.study, kept.finished)
 
     def column(self, name: str, cell: int) -> np.ndarray:
@@ -88,7 +85,6 @@ class Results(NamedTuple):
         with storage.undamaged(self.path), h5py.File(self.path, "r") as file:
             trials: Any = file["trials"]
             found = {name: np.asarray(trials[name][cell]) for name, kind in VARIABLES.items() if not kind.by_parameter}
-        found["scale_error"] = found["scale"] / found["k"] - 1
         return found | {"group": np.arange(self.study.trials) % BATCHES}
 
     def errors(self, cell: int) -> Iterator[tuple[Float[np.ndarray, "t p"], np.ndarray, np.ndarray]]:

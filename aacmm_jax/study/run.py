@@ -61,14 +61,15 @@ def run_study(
     """Run a study into an HDF5 file; where the file holds part of it already, go on from there.
 
     - ``executor``: any `concurrent.futures.Executor`, of ``workers`` workers (they need this package); by default threads
-      in this process, on all its cores and devices. A block is one call of `identify_many`.
+      in this process, on all its cores and devices. A block is one call of `identify_many`. (JAX does not survive a fork:
+      a `ProcessPoolExecutor` needs ``mp_context=multiprocessing.get_context("spawn")``.)
     - ``chunk``: trials in a block, default 1,000 (65,536 on a GPU). It changes no number. What a file was begun with stays.
     - ``shards``: workers write their blocks themselves, into ``FILE.parts`` on a folder that all of them share.
     - ``keep_parts``: leave the blocks in their folder at the end; the file stays virtual. For results too large to copy.
     - ``watch``: called with a `Progress` after every block.
 
     An interrupt (Ctrl-C, SIGTERM) lets the blocks in work end, keeps them, and returns an `Outcome` that is not finished;
-    a second one raises at once. Killed at any moment, nothing that was kept is lost. Raises `InputError` for a file of
+    a second one does not wait for them. Killed at any moment, nothing that was kept is lost. Raises `InputError` for a file of
     another study or one that another process is writing, and for a full disk; what is finished is then kept.
     """
     path = Path(path)
@@ -118,13 +119,23 @@ class _Place(NamedTuple):
 def _executor(executor: Executor | None, workers: int | None) -> Iterator[tuple[Executor, int, Callable[[int], _Place]]]:
     """The executor, its number of workers, and the place of the block submitted as number i."""
     if executor is not None:
+        context = getattr(executor, "_mp_context", None)
+        if context is not None and context.get_start_method() == "fork":
+            raise InputError(
+                "the executor forks, which JAX does not survive; give it mp_context=multiprocessing.get_context('spawn')."
+            )
         yield executor, workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1, lambda _: _Place()
         return
     devices = jax.local_devices()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = workers or (len(devices) if devices[0].platform != "cpu" else max(cores, len(devices)))
-    with ThreadPoolExecutor(count) as threads:
+    threads = ThreadPoolExecutor(count)
+    try:
         yield threads, count, lambda i: _Place(devices[i % len(devices)], 1)
+    except BaseException:
+        threads.shutdown(wait=False, cancel_futures=True)
+        raise
+    threads.shutdown()
 
 
 def _through(
@@ -142,6 +153,10 @@ def _through(
             while waiting and len(working) < ahead and not stopped.is_set():
                 number, block = waiting.popleft()
                 working[pool.submit(task, block, place(number))] = block
+            if stopped.is_set() and isinstance(pool, ThreadPoolExecutor):
+                # Those that have not begun. (Of a Dask future one cannot tell.)
+                for future in [future for future in working if future.cancel()]:
+                    del working[future]
             ended, _ = wait(working, timeout=0.2, return_when=FIRST_COMPLETED)
             for future in ended:
                 block = working.pop(future)
@@ -202,8 +217,9 @@ def _alone(path: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        lock.release()
+        # First removed, then released: the other way round, a third process could lock a new file while a second holds this one.
         Path(lock.lock_file).unlink(missing_ok=True)
+        lock.release()
 
 
 def _opened(study: Study, path: Path, chunk: int | None) -> tuple[Layout, int, bool]:
@@ -221,8 +237,9 @@ def _opened(study: Study, path: Path, chunk: int | None) -> tuple[Layout, int, b
     kept = store.read(path)
     if kept.study != study:
         raise InputError(f"{path} holds another study ({_difference(kept.study, study)}); choose another output path.")
+    store.check_parts(path, kept)
     if kept.finished:
-        if not kept.virtual:
+        if kept.parts is None:
             store.clean(path)  # a kill may have left it
         return Layout.of(study, kept.chunk), kept.chunk, True
     if chunk is not None and chunk != kept.chunk:

@@ -191,13 +191,13 @@ class Reference(_Table):
 
 
 class Identification(_Table):
-    """How the arm is identified. ``start``: at the nominal arm, or at random in the box."""
+    """How the arm is identified. ``start``: at the nominal arm, or at random in the box (but for the held length)."""
 
     method: Levels[Literal["stage1", "two-stage", "joint"]] | None = None
     hold: Levels[str] = ["longest"]
     start: Levels[Literal["nominal", "random"]] = ["nominal"]
     held: list[str] | None = None
-    max_steps: PositiveInt = 300
+    max_steps: Annotated[int, Field(ge=1, le=1_000_000)] = 300
 
 
 class Specification(_Table):
@@ -205,7 +205,7 @@ class Specification(_Table):
 
     name: str = ""
     arm: str = ""
-    trials: Annotated[int, Field(ge=1)]  # in each cell
+    trials: Annotated[int, Field(ge=1, le=2**32)]  # in each cell; keys count them in 32 bits
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     deviation: Deviation = Deviation()
     capture: CaptureTable

@@ -2,7 +2,7 @@
 
 Trials of a cell fall into groups that share nothing: each draws from its own pool of poses. Standard errors come from the
 scatter between groups, so they hold the whole Monte Carlo error, that of the finite pools included, and need no formula for
-the statistic: of large groups by their own values, of small ones by leaving out a group at a time (jackknife).
+the statistic: a group at a time is left out (delete-a-group jackknife).
 """
 
 from collections.abc import Callable
@@ -13,7 +13,6 @@ from jaxtyping import Float, Int
 
 from ..steps import Reason, numbers_of
 from .results import Results
-from .study import BATCHES
 
 FIGURES = {
     "k": "k, measured / nominal",
@@ -29,7 +28,6 @@ FIGURES = {
     "angle_error": "largest angle error after the scale fix",
 }
 PERCENTILES = (5, 50, 95)
-_LARGE = 100  # trials in a group
 
 
 def study_summary(results: Results, only: int | None = None) -> dict[str, Any]:
@@ -89,10 +87,12 @@ def _reasons() -> dict[str, int]:
 
 def spread_of(values: Float[np.ndarray, " t"], groups: Int[np.ndarray, " t"]) -> dict[str, Any]:
     """Mean, spread (standard deviation) and percentiles, each with its standard error."""
+    order = np.argsort(values)
+    values, groups = values[order], groups[order]
     found = {"mean": statistic(np.mean, values, groups)}
     if len(values) > 1:
         found["spread"] = statistic(lambda x: np.std(x, ddof=1 if len(x) > 1 else 0), values, groups)
-    percentiles = statistic(lambda x: np.percentile(x, PERCENTILES), values, groups)
+    percentiles = statistic(_percentiles, values, groups)
     for i, percentile in enumerate(PERCENTILES):
         found[f"p{percentile}"] = {key: value[i] for key, value in percentiles.items()}
     return found
@@ -103,19 +103,22 @@ def statistic(function: Callable, values: np.ndarray, groups: Int[np.ndarray, " 
     if not len(values):
         return {"value": None, "se": None}
     value = np.asarray(function(values))
-    if len(values) < BATCHES * _LARGE:
-        # Groups to leave out hold at least the root of all trials: fewer would not tell of a percentile (Shao and Wu 1989).
-        groups = groups % max(int(len(values) ** 0.5), 2)
-    members = [values[groups == group] for group in np.unique(groups)]
+    # Groups to leave out hold at least the root of all trials: fewer would not tell of a percentile (Shao and Wu 1989).
+    groups = groups % max(int(len(values) ** 0.5), 2)
+    members = np.unique(groups)
     count = len(members)
+    none = [None] * len(value) if value.ndim else None
     if count < 2:
-        return {"value": value.tolist(), "se": [None] * len(value) if value.ndim else None}
-    if min(map(len, members)) >= _LARGE:
-        se = np.std([function(member) for member in members], axis=0, ddof=1) / np.sqrt(count)
-    else:
-        rest = [function(values[groups != group]) for group in np.unique(groups)]
-        se = np.sqrt((count - 1) / count * np.sum((rest - np.mean(rest, axis=0)) ** 2, axis=0))
-    return {"value": value.tolist(), "se": np.asarray(se).tolist()}
+        return {"value": value.tolist(), "se": none}
+    rest = np.array([function(values[groups != group]) for group in members])
+    se = np.sqrt((count - 1) / count * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0))
+    # No scatter at all (every trial converged) says nothing of how far the value may be off.
+    return {"value": value.tolist(), "se": none if not np.any(se) else se.tolist()}
+
+
+def _percentiles(ordered: Float[np.ndarray, " t"]) -> Float[np.ndarray, " q"]:
+    """Percentiles of values in order, between neighbours linearly (as `numpy.percentile`, which would sort once more)."""
+    return np.interp(np.array(PERCENTILES) / 100 * (len(ordered) - 1), np.arange(len(ordered)), ordered)
 
 
 def _parameters(results: Results, cell: int) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ from .study import Setting, Study
 from .trials import Block
 
 _MEND = "free some space there, then run the same command again: what is finished is kept"
-NOT_RUN = -1  # of whole numbers; NaN of others
+NOT_RUN = -1  # of whole numbers; NaN of others, and -128 of active, where -1 is a bound
 
 
 class _Kind(NamedTuple):
@@ -42,11 +43,12 @@ class _Kind(NamedTuple):
 VARIABLES = {
     "converged": _Kind("i1", False, "1", "1 where every solve ended at a minimum, 0 where not, -1 not yet run"),
     "reason": _Kind("i1", False, "1", "why the last solve ended, see attribute reasons"),
-    "steps": _Kind("i2", False, "1", "evaluations of all solves"),
+    "steps": _Kind("i4", False, "1", "evaluations of all solves"),
     "k": _Kind("f8", False, "1", "k = measured / nominal, from the reference lengths"),
     "scale": _Kind(
         "f8", False, "1", "how much too large stage 1 left the arm: its lengths over the true ones, by least squares"
     ),
+    "scale_error": _Kind("f8", False, "1", "the same factor less 1, after the scale fix"),
     "de_stage1": _Kind("f8", False, "mm", "DE after stage 1"),
     "deltam_stage1": _Kind("f8", False, "mm", "Deltam after stage 1"),
     "length_error_stage1": _Kind("f8", False, "mm", "largest error of a length parameter after stage 1"),
@@ -56,7 +58,7 @@ VARIABLES = {
     "length_error": _Kind("f8", False, "mm", "largest error of a length parameter after the scale fix"),
     "angle_error": _Kind("f8", False, "rad", "largest error of an angle parameter after the scale fix"),
     "truth_inside": _Kind("i1", False, "1", "1 where the true arm lies inside the bounds"),
-    "active": _Kind("i1", True, "1", "-1 on the lower bound, +1 on the upper, 0 inside"),
+    "active": _Kind("i1", True, "1", "-1 on the lower bound, +1 on the upper, 0 inside, -128 not yet run"),
     "estimate": _Kind("f8", True, "mm or rad", "identified parameters, at the end"),
     "true": _Kind("f8", True, "mm or rad", "parameters of the true arm"),
 }
@@ -64,7 +66,7 @@ VARIABLES = {
 
 def fill_of(name: str) -> float:
     """What stands for a trial that has not run."""
-    return np.nan if VARIABLES[name].dtype == "f8" else NOT_RUN
+    return np.nan if VARIABLES[name].dtype == "f8" else -128 if name == "active" else NOT_RUN
 
 
 class Layout(NamedTuple):
@@ -75,16 +77,18 @@ class Layout(NamedTuple):
     parameters: int
     block_cells: int
     block_trials: int
+    mark: str  # in the names of the blocks: they belong to this study, cut up so, computed by this version
 
     @classmethod
     def of(cls, study: Study, chunk: int) -> "Layout":
         """Blocks of about ``chunk`` trials. Small cells share a block where one program serves them all."""
         cells, trials = len(study.cells), study.trials
+        mark = f"{study.digest[:12]}-{chunk}-{metadata.version('aacmm_jax')}"
         together = 1
         if trials < chunk:
-            together = max(n for n in range(1, max(chunk // trials, 1) + 1) if _uniform(study.settings, n))
+            together = max(n for n in range(1, min(max(chunk // trials, 1), cells) + 1) if _uniform(study.settings, n))
         # Blocks of nearly one size: a short last one would run the same compiled program for less.
-        return cls(cells, trials, len(study.space.names), together, -(-trials // -(-trials // chunk)))
+        return cls(cells, trials, len(study.space.names), together, -(-trials // -(-trials // chunk)), mark)
 
     def shape(self, name: str, cells: int | None = None, trials: int | None = None) -> tuple[int, ...]:
         """Shape of an array of results, of the whole study or of a part."""
@@ -109,9 +113,9 @@ def parts_of(path: Path) -> Path:
     return path.with_name(path.name + ".parts")
 
 
-def part_of(path: Path, block: Block) -> Path:
+def part_of(path: Path, block: Block, layout: Layout) -> Path:
     """File of one block."""
-    return parts_of(path) / f"cell{block.first_cell:05d}-trial{block.first_trial:010d}.h5"
+    return parts_of(path) / f"{layout.mark}-cell{block.first_cell:05d}-trial{block.first_trial:010d}.h5"
 
 
 Packed = dict[str, bytes]
@@ -134,7 +138,7 @@ def write_part(path: Path, block: Block, packed: Packed, layout: Layout) -> None
     """Keep a finished block: its file appears whole, or not at all."""
     import h5py
 
-    with storage.whole_file(part_of(path, block), _MEND) as temporary:
+    with storage.whole_file(part_of(path, block, layout), _MEND) as temporary:
         with h5py.File(temporary.name, "w", driver="core", backing_store=False) as file:
             for name, content in packed.items():
                 size = (block.last_cell - block.first_cell, block.last_trial - block.first_trial)
@@ -159,12 +163,15 @@ def create(path: Path, study: Study, layout: Layout, chunk: int) -> None:
     folder = parts_of(path)
     try:
         folder.mkdir(exist_ok=True)
+        for item in folder.glob("*.h5"):  # of a study whose file is gone
+            if not item.name.startswith(f"{layout.mark}-"):
+                item.unlink()
     except OSError as error:
         raise InputError(
             f"{folder} cannot be made: {(error.strerror or str(error)).lower()}; choose another output path."
         ) from error
 
-    _write(path, study, chunk, partial(_add_virtual, path, layout), finished=False, virtual=True)
+    _write(path, study, chunk, partial(_add_virtual, path, layout), finished=False)
 
 
 def _add_virtual(path: Path, layout: Layout, group: Any, name: str) -> Any:
@@ -176,7 +183,7 @@ def _add_virtual(path: Path, layout: Layout, group: Any, name: str) -> Any:
         cells, trials = slice(block.first_cell, block.last_cell), slice(block.first_trial, block.last_trial)
         size = layout.shape(name, cells.stop - cells.start, trials.stop - trials.start)
         # HDF5 reads % as the beginning of a pattern.
-        source = f"{parts_of(path).name}/{part_of(path, block).name}".replace("%", "%%")
+        source = f"{parts_of(path).name}/{part_of(path, block, layout).name}".replace("%", "%%")
         virtual[cells, trials] = h5py.VirtualSource(source, name, size)
     return group.create_virtual_dataset(name, virtual, fillvalue=fill_of(name))
 
@@ -186,20 +193,23 @@ def finish(path: Path, study: Study, layout: Layout, chunk: int, keep_parts: boo
     import h5py
 
     if keep_parts:
-        _write(path, study, chunk, partial(_add_virtual, path, layout), finished=True, virtual=True)
+        _write(path, study, chunk, partial(_add_virtual, path, layout), finished=True)
         return
 
     def add_results(group: Any, name: str) -> Any:
-        dataset = _dataset(group, name, layout, layout.shape(name))
-        for block in layout.blocks():
-            with h5py.File(part_of(path, block), "r") as part:
-                source = part[name].id
-                mask, content = source.read_direct_chunk((0,) * dataset.ndim)
-                offset = (block.first_cell, block.first_trial, 0)[: dataset.ndim]
-                dataset.id.write_direct_chunk(offset, content, mask)
-        return dataset
+        return _dataset(group, name, layout, layout.shape(name))
 
-    _write(path, study, chunk, add_results, finished=True, virtual=False)
+    def fill(group: Any) -> None:
+        for block in layout.blocks():
+            with h5py.File(part_of(path, block, layout), "r") as part:
+                for name in VARIABLES:
+                    source: Any = part[name]
+                    target = group[name]
+                    mask, content = source.id.read_direct_chunk((0,) * source.ndim)
+                    target.id.write_direct_chunk((block.first_cell, block.first_trial, 0)[: source.ndim], content, mask)
+
+    with storage.undamaged(parts_of(path)):
+        _write(path, study, chunk, add_results, fill, finished=True)
     clean(path)
 
 
@@ -215,14 +225,17 @@ def tidy(path: Path) -> None:
             left.unlink(missing_ok=True)
 
 
-def _write(path: Path, study: Study, chunk: int, add_results: Callable, finished: bool, virtual: bool) -> None:
+def _write(
+    path: Path, study: Study, chunk: int, add_results: Callable, fill: Callable | None = None, *, finished: bool
+) -> None:
+    """Write the study's file: with ``fill`` a plain one, else a virtual one."""
     attributes = {
         "name": study.specification.name,
         "seed": study.specification.seed,
         "digest": study.digest,
         "chunk": chunk,
         "finished": int(finished),
-        "virtual": int(virtual),
+        "parts": parts_of(path).name if fill is None else None,
     }
 
     def extend(file: Any) -> None:
@@ -234,6 +247,8 @@ def _write(path: Path, study: Study, chunk: int, add_results: Callable, finished
             dataset.attrs["units"], dataset.attrs["long_name"] = kind.units, kind.long_name
             for axis, dimension in enumerate(("cell", "trial", "parameter")[: dataset.ndim]):
                 dataset.dims[axis].attach_scale(group[dimension])
+        if fill is not None:
+            fill(group)
         members = [(name, getattr(Reason, name)) for name in Reason._name_to_item if name]  # pyright: ignore
         group["reason"].attrs["reasons"] = ", ".join(f"{int(numbers_of(item))}: {name}" for name, item in members)
 
@@ -293,7 +308,7 @@ class Kept(NamedTuple):
     study: Study
     chunk: int
     finished: bool
-    virtual: bool  # the results lie in the folder of the blocks
+    parts: str | None  # the folder of the blocks, where the results lie in it
     package_version: str
 
 
@@ -310,11 +325,23 @@ def read(path: Path) -> Kept:
         if study.digest != attributes["digest"]:
             raise InputError(f"{path} is damaged or was edited: its specification does not match its results; make it again.")
         return Kept(
-            study, attributes["chunk"], bool(attributes["finished"]), bool(attributes["virtual"]), attributes["package_version"]
+            study, attributes["chunk"], bool(attributes["finished"]), attributes.get("parts"), attributes["package_version"]
         )
+
+
+def check_parts(path: Path, kept: Kept) -> None:
+    """Raise `InputError` where results lie in a folder of blocks that is not there."""
+    if kept.parts is None:
+        return
+    if kept.parts != parts_of(path).name:
+        raise InputError(
+            f"{path} was renamed, but its results lie in {kept.parts}; give it its name {kept.parts.removesuffix('.parts')} again."
+        )
+    if not parts_of(path).is_dir():
+        raise InputError(f"{path} has its results in the folder {kept.parts}, which is not beside it; put it there.")
 
 
 def finished_blocks(path: Path, layout: Layout) -> list[Block]:
     """Blocks whose files are there."""
     names = {item.name for item in parts_of(path).glob("*.h5")} if parts_of(path).is_dir() else set()
-    return [block for block in layout.blocks() if part_of(path, block).name in names]
+    return [block for block in layout.blocks() if part_of(path, block, layout).name in names]

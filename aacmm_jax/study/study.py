@@ -88,7 +88,7 @@ class Study:
         self._check()
 
     def __reduce__(self):
-        return _restored, (self.digest, *self._contents)
+        return _restored, (self.digest + self.specification.name, *self._contents)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Study) and self.digest == other.digest
@@ -249,9 +249,15 @@ class Study:
             if setting.method != "stage1" and recorded and not self.capture.lengths:  # pyright: ignore
                 raise InputError("the capture file holds no reference length; use method = 'stage1', or another file.")
             for stand in () if recorded else setting.stands:
-                if stand.poses > pose_choice(self, stand)[1]:
+                placements, poses = pose_choice(self, stand)
+                if stand.points is None and placements < 2:
                     raise InputError(
-                        f"{stand.poses} poses are more than the pool has for a socket ({pose_choice(self, stand)[1]}); give a "
+                        f"a capture.pool of {self.specification.capture.pool} poses has room for less than two places of "
+                        f"{stand.poses} poses in each of its {BATCHES} parts; give at least {2 * BATCHES * stand.ends * poses}."
+                    )
+                if stand.poses > poses:
+                    raise InputError(
+                        f"{stand.poses} poses are more than the pool has for a socket ({poses}); give a "
                         f"larger capture.pool than {self.specification.capture.pool}."
                     )
         _ = self.numbers  # its checks
@@ -284,12 +290,12 @@ BATCHES = 32  # independent pools; trial t draws from pool t modulo this
 
 
 def pose_choice(study: Study, stand: Stand) -> tuple[int, int]:
-    """Placements of a stand in each batch's pool, and poses at each of its ends: powers of two."""
+    """Placements of a stand in each batch's pool, and poses at each of its ends (a power of two)."""
     share = study.specification.capture.pool // (BATCHES * stand.ends)
     if stand.points is not None:
         return 1, 2 ** int(math.log2(share))
-    poses = max(2 ** math.ceil(math.log2(2 * study.most_poses[stand.ends])), 16)
-    return max(share // poses, 1), poses
+    poses = max(2 ** math.ceil(math.log2(1.25 * study.most_poses[stand.ends])), 16)
+    return share // poses, poses
 
 
 def _centroids(arm: Arm, capture: Capture) -> list[Point]:

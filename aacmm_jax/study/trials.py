@@ -31,7 +31,8 @@ class Block(NamedTuple):
 def run_block(study: Study, block: Block, *, device: Any = None, workers: int | None = None) -> dict[str, np.ndarray]:
     """Results of a block: name -> array ``(cells, trials, ...)``; what each is, `variables` in `store` says.
 
-    It depends on nothing but the study and which trials they are: not on the block, the machine's load, or the order.
+    It depends on nothing but the study and which trials they are: not on the block, the machine's load, or the order; and on the
+    kind of processor to rounding.
     """
     cells = np.repeat(np.arange(block.first_cell, block.last_cell), block.last_trial - block.first_trial)
     trials = np.tile(np.arange(block.first_trial, block.last_trial), block.last_cell - block.first_cell)
@@ -63,14 +64,17 @@ def _identified(study: Study, setting: Setting, drawn: Drawn, devices: list[Any]
     # How much too large stage 1 left the arm: the factor that best turns the true lengths into those found. Rows are contiguous,
     # so that each is summed in the same order however many there are.
     true = np.where(lengths, drawn.true, 0.0)
-    scale = (stage1.parameters * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300)
+    scale, scale_after = (
+        (found.parameters * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300) for found in (stage1, many)
+    )
     fixed = setting.method != "stage1"
     return {
         "converged": many.converged.astype(np.int8),
         "reason": np.asarray(numbers_of(many.result), dtype=np.int8),
-        "steps": many.steps.astype(np.int16),
+        "steps": many.steps.astype(np.int32),
         "k": k,
         "scale": scale,
+        "scale_error": scale_after - 1 if fixed else np.full(len(k), np.nan),
         "de_stage1": stage1.de,
         "deltam_stage1": stage1.deltam,
         "length_error_stage1": _largest(stage1.parameters - drawn.true, lengths),
