@@ -95,12 +95,12 @@ def write_tables(
 
 
 class _Unbroken:
-    """A file that HDF5 writes through. Where a write fails (a full disk), the HDF5 library would crash the process: so the failure is kept,
-    HDF5 is left to believe in success, and `check` raises it."""
+    """A file that HDF5 writes through. Where a write fails (a full disk, an interrupt), the HDF5 library would crash the process: so the
+    failure is kept, HDF5 is left to believe in success, and `check` raises it."""
 
     def __init__(self, path: Path):
         self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 - closed on exit
-        self._failure: OSError | None = None
+        self._failure: BaseException | None = None
         self.seek, self.tell, self.read, self.readinto = (
             getattr(self._file, name) for name in ("seek", "tell", "read", "readinto")
         )
@@ -120,16 +120,20 @@ class _Unbroken:
         if self._failure is None:
             try:
                 return work(given)
-            except OSError as failure:
+            except BaseException as failure:
                 self._failure = failure
         return None
 
     def write(self, content: Any) -> int:
         """As a raw file's, but all is taken."""
         left = memoryview(content).cast("B")
-        while len(left) and (taken := self._kept(self._file.write, left)):
+        while len(left) and (taken := self._kept(self.put, left)):
             left = left[taken:]
         return len(content)
+
+    def put(self, content: memoryview) -> int:
+        """Write what the disk takes of it; how much that is."""
+        return self._file.write(content)
 
     def truncate(self, size: int | None = None) -> int:
         """As a raw file's."""
@@ -332,6 +336,8 @@ def _explain(error: Any, model: Any, content: Any) -> str:
     wanted = {"tuple_type": "must be a list of numbers", "dict_type": "must be a table", "model_type": "must be a table"}.get(
         kind
     )
+    if context.get("class_name") == "Distribution":
+        wanted = "must be a number, { uniform = ... } or { normal = ... }"
     wanted = wanted or error["msg"].replace("Input should", "must").partition(", unable")[0]
     return f"'{place}' {wanted}, not {shown}{mend}."
 

@@ -156,7 +156,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL + 'name = "{place}"', ["name '{place}'", "file 'a.csv' has no field", "use the same fields"]),
         (SMALL + 'files = ["a.csv"]', ["socket 1", "either file or files"]),
         (HEAD + ANGLES + '[[socket]]\nfiles = ["a.csv"]', ["socket 1", "needs a name"]),
-        (HEAD + ANGLES + '[[socket]]\nname = "a"\nfiles = []', ["'socket 1.files' has 0 entries", "give at least 1"]),
+        (HEAD + ANGLES + '[[socket]]\nname = "a"\nfiles = []', ["'socket 1.files' has no entries", "give at least 1"]),
         (SMALL + SOCKET, ["socket 'a' is defined twice", "in one [[socket]]"]),
         (SMALL + LENGTH, ["'a' to 'b'", "unknown socket 'b'", "known are a."]),
         (SMALL + LENGTH.replace("200.0", "-200.0"), ["'a' to 'b' is -200 mm", "positive"]),

@@ -16,6 +16,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 import aacmm_jax as aj
+from aacmm_jax import storage
 from aacmm_jax.arm_files import specification_toml
 
 from .refusals import assert_refused
@@ -191,17 +192,22 @@ def test_failure_midway_changes_nothing(tmp_path, monkeypatch, good, what, step,
     if existing:
         path.write_bytes(b"as it was")
     tables = iter(range(6))
-    originals = {"build": h5py.Group.create_dataset, "write": Path.write_bytes, "replace": os.replace}
+    places = {
+        "build": (h5py.Group, "create_dataset"),
+        "write": (Path, "write_bytes") if what == "arm" else (storage._Unbroken, "put"),
+        "replace": (os, "replace"),
+    }
+    owner, name = places[step]
+    original = getattr(owner, name)
 
     def failing(*arguments, **keywords):
         if step == "build" and next(tables) < 5:
-            return originals["build"](*arguments, **keywords)
+            return original(*arguments, **keywords)
         if step == "write":
             file, content = arguments
-            originals["write"](file, content[: len(content) // 2])
+            original(file, content[: len(content) // 2])
         raise error
 
-    owner, name = {"build": (h5py.Group, "create_dataset"), "write": (Path, "write_bytes"), "replace": (os, "replace")}[step]
     with monkeypatch.context() as patch:
         patch.setattr(owner, name, failing)
         if isinstance(error, OSError):

@@ -8,6 +8,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.cli.study_display import concise
+from aacmm_jax.study import store
 from aacmm_jax.study.results import Results
 from aacmm_jax.study.statistics import spread_of, statistic, study_summary
 
@@ -145,6 +146,19 @@ def test_labelled_data(path):
     assert data.attrs["finished"]
 
 
+def test_levels_that_differ_little_are_told_apart():
+    points = [[[400, 200, 300]], [[400.0001, 200, 300]]]
+    study = aj.make_study(arm="cheng2018-simulation", trials=1, capture={"positions_mm": points})
+    assert study.factors == {"capture.positions_mm": ["((400, 200, 300))", "((400.0001, 200, 300))"]}
+
+
+def test_a_study_that_has_just_begun_is_shown(aacmm, tmp_path):
+    study = aj.read_study("noise")
+    store.create(tmp_path / "s.h5", study, store.Layout.of(study, 1000), 1000)
+    assert "No trial has ended yet" in aacmm("show", "s.h5", "--figures", "f").stdout
+    assert "No trial of it has ended yet" in aacmm("show", "s.h5", "--cell", 3).stdout
+
+
 def test_the_terminal_shows_all_of_it(path, aacmm, tmp_path):
     done = aacmm("show", path, "--figures", "figures")
     assert "a study of Cheng 2018, simulated arm: 4 cells of 96 trials, seed 1" in done.stdout
@@ -178,6 +192,8 @@ def test_the_terminal_shows_all_of_it(path, aacmm, tmp_path):
         ),
         (("spec.toml", "-o", "s.h5"), "spec.toml: unknown key 'nose'; did you mean 'noise'"),
         (("empty.toml", "-o", "s.h5"), "empty.toml: 'trials' is missing; add it"),
+        (("noise", "-o", "s.h5", "--seed", 10**25), "noise: 'seed' must be"),
+        (("x" * 300, "-o", "s.h5"), "neither a file nor a study that ships"),
         (("none.toml", "-o", "s.h5"), "none.toml does not exist; check the path"),
         (("noise", "-o", "no/folder/s.h5"), "cannot be written: no such file or directory"),
         (("noise", "-o", "."), "it is a folder"),

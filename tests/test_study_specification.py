@@ -1,5 +1,6 @@
 """What a study asks: what is read, and what is refused before any work."""
 
+import numpy as np
 import pytest
 
 import aacmm_jax as aj
@@ -37,6 +38,16 @@ def test_lists_make_the_grid():
     assert (numbers.upper - numbers.lower)[0, d_3] == pytest.approx(2.0)
 
 
+def test_numpys_numbers_are_numbers():
+    study = made(noise={"encoder_arcsec": np.array([1, 2.0])}, deviation={"length_mm": np.float32(1), "angle_deg": np.int64(2)})
+    assert study.factors == {"noise.encoder_arcsec": [1.0, 2.0]}
+
+
+def test_a_recorded_capture_takes_any_method(noisy_capture, paper_arm):
+    study = made(arm=paper_arm, capture=noisy_capture, identification={"method": ["two-stage", "joint"]})
+    assert [setting.method for setting in study.settings] == ["two-stage", "joint"]
+
+
 @pytest.mark.parametrize("name", aj.shipped_studies())
 def test_shipped_studies_are_read(name):
     study = aj.read_study(name)
@@ -71,13 +82,13 @@ def test_what_a_toml_file_names_lies_beside_it(tmp_path, noisy_capture, paper_ar
         ({"noise": {"seating_mm": float("nan")}}, "'noise.seating_mm' must be a finite number, not nan"),
         ({"bounds": {"length_mm": []}}, "'bounds.length_mm' has no entries; give at least 1"),
         ({"bounds": {"length_mm": [2, 1, 2]}}, "bounds.length_mm: the level 2 is given twice"),
-        ({"bounds": {"override": {"d_33": 1}}}, "unknown parameter 'd_33'"),
+        ({"bounds": {"override": {"d_33": 1}}}, "bounds.override: unknown parameter 'd_33'"),
         (
             {"bounds": {"length_mm": list(range(1, 200)), "angle_deg": list(range(1, 200))}},
             "has 39,601 cells .*more than 10,000",
         ),
         ({"trials": 0}, "'trials' must be greater than or equal to 1, not 0"),
-        ({"trials": 2**32, "bounds": {"length_mm": [1, 2, 3]}}, "3 cells of 4,294,967,296 trials are more than"),
+        ({"trials": 10**8, "bounds": {"length_mm": list(range(101))}}, "101 cells of 100,000,000 trials are more than"),
         ({"seed": -1}, "'seed' must be greater than or equal to 0"),
         ({"capture": {}}, "give one of positions_mm, sockets .* and file"),
         ({"capture": {"sockets": 2}}, "sockets at random need a region"),
@@ -90,8 +101,11 @@ def test_what_a_toml_file_names_lies_beside_it(tmp_path, noisy_capture, paper_ar
             {"capture": {"sockets": 1, "region": {"distance_mm": [300, 900]}, "poses": 100, "pool": 4096}},
             "room for less than two places of 100 poses .* give at least 8192",
         ),
-        ({"trials": 2**33}, "'trials' must be less than or equal to 4294967296"),
-        ({"capture": CAPTURE | {"joint_limits_deg": [[-10, 10]]}}, "limits"),
+        ({"trials": 10**9}, "'trials' must be less than or equal to 100000000"),
+        ({"capture": CAPTURE | {"pool": 10**9}}, "pool is 1000000000; give 4096 to 16777216"),
+        ({"capture": CAPTURE | {"poses": 10**9}}, "'capture.poses' must be less than or equal to 100000"),
+        ({"capture": 5}, "capture is a int; give a table"),
+        ({"capture": CAPTURE | {"joint_limits_deg": [[-10, 10]]}}, "joint_limits_deg has 1 rows, but the arm has 6 joints"),
         ({"capture": {"file": "a.h5", "poses": 5}}, "a.h5 does not exist"),
         ({"reference": {"u_mm": 0.1}}, "give either length_mm, .* or ends_mm"),
         ({"reference": {"length_mm": 300}}, "a reference length at random needs a region"),
@@ -101,10 +115,14 @@ def test_what_a_toml_file_names_lies_beside_it(tmp_path, noisy_capture, paper_ar
             {"identification": {"method": "both"}},
             "'identification.method' must be 'stage1', 'two-stage' or 'joint', not 'both'",
         ),
-        ({"identification": {"hold": "d_33"}}, "unknown parameter 'd_33'"),
+        ({"identification": {"hold": "d_33"}}, "identification.hold: unknown parameter 'd_33'"),
         ({"identification": {"hold": "alpha_1"}}, "which is an angle"),
         ({"identification": {"held": ["x"]}}, "unknown parameter 'x'"),
         ({"deviation": {"length_mm": {"normal": 1, "uniform": 1}}}, "give either uniform .* or normal"),
+        (
+            {"deviation": {"length_mm": "x"}},
+            "'deviation.length_mm' must be a number, . uniform = ... . or . normal = ... ., not 'x'",
+        ),
         ({"deviation": {"length_mm": -1}}, "'deviation.length_mm' must be greater than or equal to 0, not -1"),
         ({"arm": "cheng2018"}, "neither a file nor an arm that ships"),
     ],
@@ -124,7 +142,10 @@ def test_refused_in_one_sentence(tables, message):
             {"capture": {"sockets": 1, "region": {"distance_mm": [300, 900]}, "poses": 100, "pool": 4096}},
             "room for less than two places of 100 poses .* give at least 8192",
         ),
-        ({"trials": 2**33}, "'trials' must be less than or equal to 4294967296"),
+        ({"trials": 10**9}, "'trials' must be less than or equal to 100000000"),
+        ({"capture": CAPTURE | {"pool": 10**9}}, "pool is 1000000000; give 4096 to 16777216"),
+        ({"capture": CAPTURE | {"poses": 10**9}}, "'capture.poses' must be less than or equal to 100000"),
+        ({"capture": 5}, "capture is a int; give a table"),
         ({"capture": CAPTURE | {"joint_limits_deg": [[-1, 1]] * 6}}, r"socket S1 at \(400, 200, 300\) mm cannot be reached"),
         ({"capture": {"sockets": 1, "region": {"distance_mm": [3000, 3100]}}}, "a socket finds no place in its region"),
         (

@@ -172,7 +172,7 @@ def test_a_second_run_at_the_same_time_is_refused(study, tmp_path):
         ({"seed": 6}, "s.h5 holds another study .seed differs.; choose another output"),
         ({"trials": 61}, "holds another study .trials differs."),
         ({"chunk": 20}, "was begun with chunks of 16 trials; leave the chunk out"),
-        ({"chunk": 0}, "chunk is 0; give at least 1"),
+        ({"chunk": 0}, "chunk is 0; give a whole number of at least 1"),
         ({"version": "9.9"}, "was begun with aacmm_jax .*; go on with that version"),
     ],
     ids=str,
@@ -334,7 +334,52 @@ def test_parts_may_stay(home, study, tmp_path):
     assert aj.run_study(study, path).ran == 0
     same(home / "whole.h5", path)
     assert aj.open_study(path).attrs["finished"]
-    assert len(list(store.parts_of(path).iterdir())) == 8
+    parts = sorted(store.parts_of(path).iterdir())
+    assert len(parts) == 8
+    parts[3].unlink()
+    with pytest.raises(aj.InputError, match=r"1 blocks are missing in s\.h5\.parts; put them there, or run the study again"):
+        aj.open_study(path)
+    assert aj.run_study(study, path).ran == 30
+    same(home / "whole.h5", path)
+
+
+def test_a_spoilt_block_runs_again(home, study, tmp_path):
+    """Whatever the disk did to it: a bit, the middle, the end, all of it."""
+    path = tmp_path / "s.h5"
+    aj.run_study(study, path, chunk=16, watch=interrupted_at(96))
+    parts = sorted(store.parts_of(path).glob("*.h5"))
+    assert len(parts) >= 6
+    whole = parts[0].read_bytes()
+    dataset = h5py.File(parts[0])["estimate"].id.get_chunk_info(0).byte_offset
+    spoilt = (
+        whole[: dataset + 9] + bytes([whole[dataset + 9] ^ 1]) + whole[dataset + 10 :], whole[:2000], whole[:500] + bytes(4000) + whole[4500:], b"",
+    )  # fmt: skip
+    for part, content in zip(parts, spoilt, strict=False):
+        part.write_bytes(content)
+    aj.run_study(study, path)
+    same(home / "whole.h5", path)
+
+
+def test_reading_needs_no_more_files_than_one(home, study, tmp_path):
+    """Where a process may open few files, HDF5 would show what it may not open as not run."""
+    path = tmp_path / "s.h5"
+    specification = study.specification.model_copy(update={"trials": 40})
+    aj.run_study(aj.Study(specification, study.nominal), path, chunk=1, keep_parts=True)
+    program = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_NOFILE, (60, int(sys.argv[2])))\n"
+        "import aacmm_jax as aj\n"
+        "from aacmm_jax.study.results import Results\n"
+        "from aacmm_jax.study.statistics import study_summary\n"
+        "print(study_summary(Results.of(sys.argv[1]))['trials_run'])\n"
+        "print((aj.open_study(sys.argv[1]).converged.values >= 0).sum())\n"
+    )
+    for hard, said in ((1000, ""), (60, "more files than this process may open (60)")):
+        done = subprocess.run(
+            [sys.executable, "-c", program, str(path), str(hard)],
+            env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=300,
+        )  # fmt: skip
+        assert done.stdout.split() == (["160"] if said else ["160", "160"])
+        assert said in done.stderr
 
 
 def test_any_executor(home, study, tmp_path):
@@ -383,6 +428,34 @@ def test_a_worker_that_fails_stops_the_study_and_keeps_the_rest(study, tmp_path,
     assert len(list(store.parts_of(tmp_path / "s.h5").glob("*.h5"))) == 4
     monkeypatch.setattr(run, "run_block", real)
     assert aj.run_study(study, tmp_path / "s.h5").ran == 120
+
+
+def test_an_interrupt_of_the_whole_terminal_reaches_no_dask_worker(home, cache, tmp_path):
+    """Ctrl-C goes to every process of the terminal."""
+    path = tmp_path / "s.h5"
+    options = ("--chunk", 4, "--trials", 900, "--dask", "local", "--workers", 1)
+    process = command(home, cache, "-o", path, *options, start_new_session=True)
+    until_parts(path, 2, process)
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 130, errors
+    assert "trials are kept. Go on with: aacmm study --resume" in errors
+    assert errors.count("\n") == 1, errors
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"workers": -1}, "workers is -1; give a whole number of at least 1"),
+        ({"chunk": 2.5}, "chunk is 2.5; give a whole number"),
+        ({"executor": "dask"}, "executor is a str; give a concurrent.futures.Executor"),
+    ],
+    ids=str,
+)
+def test_strange_arguments_are_refused_before_anything_is_written(study, tmp_path, options, message):
+    with pytest.raises(aj.InputError, match=message):
+        aj.run_study(study, tmp_path / "s.h5", **options)
+    assert not list(tmp_path.iterdir())
 
 
 def test_nobody_answers(aacmm, home):

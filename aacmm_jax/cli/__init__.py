@@ -7,6 +7,10 @@ from typing import NoReturn
 _INTERRUPTED = 130
 
 
+class Stopped(Exception):
+    """Work was interrupted and what is done is kept; the message says how to go on."""
+
+
 def main() -> None:
     """Run ``aacmm``. Exit codes: 0 done, 1 not achieved, 2 bad input, 130 interrupted. ``--debug`` shows tracebacks."""
     debug = "--debug" in sys.argv
@@ -32,6 +36,9 @@ def main() -> None:
         raise
     except KeyboardInterrupt:
         _interrupted()
+    except Stopped as stopped:
+        print(stopped, file=sys.stderr)
+        sys.exit(_INTERRUPTED)
     except InputError as error:
         if debug:
             raise

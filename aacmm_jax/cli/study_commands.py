@@ -1,6 +1,6 @@
 """The command ``study``, and what ``show`` does with a study's file."""
 
-import sys
+import shlex
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any
@@ -8,9 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from ..errors import InputError
+from . import Stopped
 from .commands import Json, _busy, _show, app
-
-_INTERRUPTED = 130
 
 
 @app.command(
@@ -52,6 +51,8 @@ def study(
     if specification is None:
         if not resume:
             raise InputError("name a specification, or use --resume to go on with the study that the output holds.")
+        if trials is not None or seed is not None:
+            raise InputError("--trials and --seed are those that the study was begun with; leave them out with --resume.")
         asked = read(output).study
     else:
         asked = _asked(specification, trials, seed)
@@ -75,13 +76,13 @@ def study(
     }
     _show(summary, as_json, lambda _: _ended(outcome, output))
     if not outcome.finished:
-        sys.stderr.write(
-            f"Stopped; {outcome.done:,} of {outcome.total:,} trials are kept. Go on with: aacmm study --resume -o {output}\n"
+        raise Stopped(
+            f"Stopped; {outcome.done:,} of {outcome.total:,} trials are kept. Go on with: aacmm study --resume -o {shlex.quote(str(output))}"
         )
-        raise typer.Exit(_INTERRUPTED)
 
 
 def _asked(specification: str, trials: int | None, seed: int | None) -> Any:
+    from ..storage import validated
     from ..study.shipped import read_study
     from ..study.study import Study
 
@@ -89,7 +90,7 @@ def _asked(specification: str, trials: int | None, seed: int | None) -> Any:
     changes = {name: value for name, value in (("trials", trials), ("seed", seed)) if value is not None}
     if not changes:
         return asked
-    changed = type(asked.specification).model_validate(asked.specification.model_dump(exclude_unset=True) | changes)
+    changed = validated(type(asked.specification), asked.specification.model_dump(exclude_unset=True) | changes, specification)
     return Study(changed, asked.nominal, asked.recording)
 
 

@@ -1,6 +1,8 @@
 """Dask as the executor of a study: a scheduler somewhere, or a cluster of processes on this machine."""
 
 import os
+import signal
+import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
@@ -40,7 +42,7 @@ def _client(distributed: Any, address: str, workers: int | None) -> Iterator[Any
         target = {"scheduler_file": address} if os.path.isfile(address) else {"address": address}
         try:
             client = distributed.Client(**target, timeout=5)
-        except (OSError, TimeoutError, ValueError) as error:
+        except Exception as error:  # of a dozen kinds: no such file or host, no answer, not a scheduler's file
             raise InputError(f"no Dask scheduler answers at {address}; start one, or use --dask local.") from error
         with client:
             yield client
@@ -52,12 +54,24 @@ def _client(distributed: Any, address: str, workers: int | None) -> Iterator[Any
         # Programs that this process compiled need not be compiled again by every worker.
         environment["JAX_COMPILATION_CACHE_DIR"] = jax.config.jax_compilation_cache_dir  # pyright: ignore
         environment["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
-    with (
-        distributed.LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0", env=environment) as cluster,
-        distributed.Client(cluster) as client,
-    ):
+    with _undisturbed():
+        cluster = distributed.LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0", env=environment)
+    with cluster, distributed.Client(cluster) as client:
         client.register_plugin(_share_plugin(distributed)(cores, count))
         yield client
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Processes started meanwhile ignore interrupts: Ctrl-C reaches all processes of a terminal, and the workers shall end their blocks."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    former = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, former)
 
 
 def _share_plugin(distributed: Any) -> Any:

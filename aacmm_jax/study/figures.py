@@ -33,7 +33,10 @@ def write_figures(results: Results, folder: Path) -> list[Path]:
             f"{folder} cannot be made: {(error.strerror or str(error)).lower()}; choose another folder."
         ) from error
     factors, made = results.study.factors, {}
+    converged = any(np.any(results.column("converged", cell) == 1) for cell in range(len(results.study.cells)))
     made["convergence"] = lambda: convergence_map(results)
+    if not converged:
+        factors = {}
     for factor in factors:
         made[f"distributions_{factor.replace('.', '_')}"] = lambda factor=factor: distributions(results, factor)
     for factor in _WIDTHS:
@@ -42,7 +45,8 @@ def write_figures(results: Results, folder: Path) -> list[Path]:
     for factor in _SHIFTS:
         if factor in factors:
             made[f"k_against_{factor.replace('.', '_')}"] = lambda factor=factor: scale_against(results, factor)
-    made["correlation"] = lambda: correlations(results, 1)
+    if converged:
+        made["correlation"] = lambda: correlations(results, 1)
     written = []
     for name, draw in made.items():
         figure = draw()

@@ -94,16 +94,22 @@ def _stand_table(study: Study, stand: Stand, limits: tuple, choice: tuple[int, i
 def check_reach(study: Study) -> None:
     """Raise `InputError` where a stand cannot be reached, or finds no place in its region: before any work."""
     arm = study.nominal.arm
-    for setting in dict.fromkeys(study.settings):
-        for stand in () if setting.recorded else setting.stands:
-            limits, key = jnp.asarray(setting.limits), jax.random.key(study.specification.seed, impl="threefry2x32")
-            if stand.points is None:
-                _placed(arm, stand, limits, key, 1)
-                continue
-            points = np.repeat(np.array(stand.points), _AT_ONCE // stand.ends // 4, axis=0)
-            _, good = _tried(arm, _uniform(key, limits, len(points)), points, limits)
-            if good.reshape(stand.ends, -1).mean(axis=1).min() < 0.05:
-                raise _out_of_reach(stand)
+    # Stands that differ in their name or their poses only are reached alike.
+    stands = {
+        (stand._replace(name=stand.name if stand.points else stand.name[0], poses=0), setting.limits)
+        for setting in dict.fromkeys(study.settings)
+        if not setting.recorded
+        for stand in setting.stands
+    }
+    for stand, wanted in sorted(stands, key=repr):
+        limits, key = jnp.asarray(wanted), jax.random.key(study.specification.seed, impl="threefry2x32")
+        if stand.points is None:
+            _placed(arm, stand, limits, key, 1)
+            continue
+        points = np.repeat(np.array(stand.points), _AT_ONCE // stand.ends // 4, axis=0)
+        _, good = _tried(arm, _uniform(key, limits, len(points)), points, limits)
+        if good.reshape(stand.ends, -1).mean(axis=1).min() < 0.05:
+            raise _out_of_reach(stand)
 
 
 def _out_of_reach(stand: Stand) -> InputError:

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -16,8 +16,6 @@ from .study import BATCHES, Study
 
 if TYPE_CHECKING:
     import xarray
-
-_AT_ONCE = 50_000  # trials whose parameters are in memory
 
 
 def open_study(path: str | os.PathLike) -> "xarray.Dataset":
@@ -34,6 +32,8 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
         raise InputError("open_study needs xarray; install it with: pip install 'aacmm_jax[data]'.") from error
     opened = Results.of(path)
     study = opened.study
+    if opened.kept.parts is not None:
+        _allow_files(len(store.finished_blocks(opened.path, store.Layout.of(study, opened.kept.chunk))), opened.path)
     with storage.undamaged(path):
         data = xarray.open_dataset(opened.path, group="trials", engine="h5netcdf")
         columns = store.factor_columns(study)
@@ -55,46 +55,70 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
     return data
 
 
+def _allow_files(count: int, path: Path) -> None:
+    """HDF5 opens the files of all blocks at once, and shows those that it may not open as not run: so see to it that it may."""
+    try:
+        import resource
+    except ImportError:  # not a system with such limits
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed = count + 200
+    if soft != resource.RLIM_INFINITY and soft < needed:
+        if hard != resource.RLIM_INFINITY and hard < needed:
+            raise InputError(
+                f"{path} lies in {count} blocks, more files than this process may open ({hard}); let the study end, or raise the limit."
+            )
+        resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+
+
 class Results(NamedTuple):
     """A study's file for reading."""
 
     path: Path
-    study: Study
-    finished: bool
+    kept: store.Kept
+
+    @property
+    def study(self) -> Study:
+        """What was asked."""
+        return self.kept.study
+
+    @property
+    def finished(self) -> bool:
+        """Whether every trial is there."""
+        return self.kept.finished
 
     @classmethod
     def of(cls, path: str | os.PathLike) -> "Results":
         """Raises `InputError` where the file is missing, damaged, no study, or has lost the folder of its blocks."""
-        path = Path(path)
+        path = Path(path).resolve()
         kept = store.read(path)
         store.check_parts(path, kept)
-        return cls(path, kept.study, kept.finished)
+        return cls(path, kept)
 
     def column(self, name: str, cell: int) -> np.ndarray:
         """One array of results of one cell (counted from 0)."""
-        import h5py
-
-        with storage.undamaged(self.path), h5py.File(self.path, "r") as file:
-            trials: Any = file["trials"]
-            return trials[name][cell]
+        return self._columns([name], cell)[name]
 
     def columns(self, cell: int) -> dict[str, np.ndarray]:
         """Everything of one cell that is one number a trial; ``group`` is the pool that a trial drew from."""
-        import h5py
-
-        with storage.undamaged(self.path), h5py.File(self.path, "r") as file:
-            trials: Any = file["trials"]
-            found = {name: np.asarray(trials[name][cell]) for name, kind in VARIABLES.items() if not kind.by_parameter}
+        found = self._columns([name for name, kind in VARIABLES.items() if not kind.by_parameter], cell)
         return found | {"group": np.arange(self.study.trials) % BATCHES}
+
+    def _columns(self, names: list[str], cell: int) -> dict[str, np.ndarray]:
+        found = {name: np.full(self.study.trials, store.fill_of(name), VARIABLES[name].dtype) for name in names}
+        with storage.undamaged(self.path):
+            for part, rows in store.rows_of(self.path, self.kept, names, cell):
+                for name in names:
+                    found[name][part] = rows[name]
+        return found
 
     def errors(self, cell: int) -> Iterator[tuple[Float[np.ndarray, "t p"], np.ndarray, np.ndarray]]:
         """Errors of the parameters of converged trials (estimate less truth), their active bounds and their groups, piece by piece."""
-        import h5py
-
-        with storage.undamaged(self.path), h5py.File(self.path, "r") as file:
-            trials: Any = file["trials"]
-            for first in range(0, self.study.trials, _AT_ONCE):
-                part = slice(first, min(first + _AT_ONCE, self.study.trials))
-                good = trials["converged"][cell, part] == 1
-                error = (trials["estimate"][cell, part] - trials["true"][cell, part])[good]
-                yield error, trials["active"][cell, part][good], (np.arange(part.start, part.stop) % BATCHES)[good]
+        with storage.undamaged(self.path):
+            for part, rows in store.rows_of(self.path, self.kept, ["converged", "estimate", "true", "active"], cell):
+                good = rows["converged"] == 1
+                yield (
+                    (rows["estimate"] - rows["true"])[good],
+                    rows["active"][good],
+                    (np.arange(part.start, part.stop) % BATCHES)[good],
+                )

@@ -72,15 +72,24 @@ def run_study(
     a second one does not wait for them. Killed at any moment, nothing that was kept is lost. Raises `InputError` for a file of
     another study or one that another process is writing, and for a full disk; what is finished is then kept.
     """
-    path = Path(path)
+    path = Path(path).resolve()
+    for what, number in (("workers", workers), ("chunk", chunk)):
+        if number is not None and (not isinstance(number, int) or number < 1):
+            raise InputError(f"{what} is {number!r}; give a whole number of at least 1, or leave it out.")
+    if executor is not None and not isinstance(executor, Executor):
+        raise InputError(f"executor is a {type(executor).__name__}; give a concurrent.futures.Executor, or leave it out.")
     with _alone(path):
         store.tidy(path)
         layout, chunk, finished = _opened(study, path, chunk)
         total = layout.cells * layout.trials
-        if finished:
+        if finished and not store.parts_of(path).is_dir():
             return Outcome(path, total, total, 0)
-        kept = set(store.finished_blocks(path, layout))
+        # Blocks of earlier runs are read through: one that the disk has spoilt runs again.
+        kept = {block for block in store.finished_blocks(path, layout) if store.sound(path, block, layout)}
         missing = [block for block in layout.blocks() if block not in kept]
+        if finished and not missing:
+            return Outcome(path, total, total, 0)
+        keep_parts = keep_parts or finished
         before = sum(block.size for block in kept)
         # Blocks of one setting follow one another, so that few pools are needed at a time.
         order = {setting: i for i, setting in enumerate(dict.fromkeys(study.settings))}
@@ -226,8 +235,6 @@ def _opened(study: Study, path: Path, chunk: int | None) -> tuple[Layout, int, b
     """The layout of a file that is there, or of one that is made; its chunk; and whether it is finished."""
     from importlib import metadata
 
-    if chunk is not None and chunk < 1:
-        raise InputError(f"chunk is {chunk}; give at least 1, or leave it out.")
     if not path.exists():
         check_reach(study)
         chunk = chunk or (_CHUNK_CPU if jax.local_devices()[0].platform == "cpu" else _CHUNK_ELSEWHERE)
@@ -237,10 +244,9 @@ def _opened(study: Study, path: Path, chunk: int | None) -> tuple[Layout, int, b
     kept = store.read(path)
     if kept.study != study:
         raise InputError(f"{path} holds another study ({_difference(kept.study, study)}); choose another output path.")
-    store.check_parts(path, kept)
-    if kept.finished:
-        if kept.parts is None:
-            store.clean(path)  # a kill may have left it
+    store.check_parts(path, kept._replace(finished=False))
+    if kept.finished and kept.parts is None:
+        store.clean(path)  # a kill may have left it
         return Layout.of(study, kept.chunk), kept.chunk, True
     if chunk is not None and chunk != kept.chunk:
         raise InputError(f"{path} was begun with chunks of {kept.chunk} trials; leave the chunk out to go on with them.")
@@ -248,7 +254,7 @@ def _opened(study: Study, path: Path, chunk: int | None) -> tuple[Layout, int, b
         raise InputError(
             f"{path} was begun with aacmm_jax {kept.package_version}; go on with that version, or choose another output path."
         )
-    return Layout.of(study, kept.chunk), kept.chunk, False
+    return Layout.of(study, kept.chunk), kept.chunk, kept.finished
 
 
 def _difference(one: Study, other: Study) -> str:

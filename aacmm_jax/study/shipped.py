@@ -22,7 +22,11 @@ def read_study(source: str | os.PathLike) -> Study:
     if isinstance(source, str) and source in shipped_studies():
         with resources.as_file(resources.files("aacmm_jax") / "studies" / f"{source}.toml") as path:
             return study_of_file(path)
-    if not Path(source).exists() and Path(source).suffix != ".toml":
+    try:
+        there = Path(source).exists()
+    except OSError:  # a name too long to be one
+        there = False
+    if not there and Path(source).suffix != ".toml":
         raise InputError(
             f"'{source}' is neither a file nor a study that ships with the package{nearest(str(source), shipped_studies())}"
         )

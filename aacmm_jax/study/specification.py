@@ -5,7 +5,7 @@ Every number has its unit in its name. After validation every factor is a list, 
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
@@ -26,6 +26,7 @@ from ..storage import validated
 # More cells than this are a slip of the pen: a grid of four factors with ten levels each.
 MOST_CELLS = 10_000
 MOST_TRIALS = 10**10
+MOST_POOL = 2**24
 
 
 def _depth(value: Any) -> int:
@@ -52,6 +53,7 @@ Levels = Annotated[list[Level], _levels_of(0), Field(min_length=1), AfterValidat
 Finite = Annotated[FiniteFloat, Field(strict=False)]
 Amount = Annotated[NonNegativeFloat, Field(allow_inf_nan=False)]
 Positive = Annotated[PositiveFloat, Field(allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1, le=100_000)]
 Pair = Annotated[tuple[Finite, Finite], AfterValidator(lambda pair: _ordered(pair))]
 Point = tuple[Finite, Finite, Finite]
 Points = Annotated[list[Point], Field(min_length=1)]
@@ -126,8 +128,8 @@ class CaptureTable(_Table):
 
     file: str | None = None
     positions_mm: Annotated[list[Points], _levels_of(2), Field(min_length=1), AfterValidator(_different)] | None = None
-    sockets: Levels[PositiveInt] | None = None
-    poses: Levels[PositiveInt] = [70]
+    sockets: Levels[Annotated[int, Field(ge=1, le=1000)]] | None = None
+    poses: Levels[Count] = [70]
     region: Levels[Region] | None = None
     joint_limits_deg: Annotated[list[list[Pair]], _levels_of(2), Field(min_length=1)] | None = None
     pool: PositiveInt = 32_768
@@ -141,8 +143,8 @@ class CaptureTable(_Table):
         made = {"poses", "region", "joint_limits_deg", "pool"} & self.model_fields_set
         if self.file is not None and made:
             raise ValueError(f"{sorted(made)[0]} says how poses are made, but file gives them; leave one of the two out.")
-        if self.pool < 4096:
-            raise ValueError(f"pool is {self.pool}; give at least 4096 poses, or leave it out.")
+        if not 4096 <= self.pool <= MOST_POOL:
+            raise ValueError(f"pool is {self.pool}; give 4096 to {MOST_POOL} poses, or leave it out.")
         return self
 
 
@@ -172,9 +174,9 @@ class Reference(_Table):
     """
 
     length_mm: Levels[Positive] | None = None
-    positions: Levels[PositiveInt] = [1]
+    positions: Levels[Annotated[int, Field(ge=1, le=1000)]] = [1]
     ends_mm: Annotated[list[Annotated[list[Ends], Field(min_length=1)]], _levels_of(3), Field(min_length=1)] | None = None
-    poses: Levels[PositiveInt] = [5]
+    poses: Levels[Count] = [5]
     u_mm: Levels[Amount] = [0.0]
     region: Levels[Region] | None = None
 
@@ -205,7 +207,7 @@ class Specification(_Table):
 
     name: str = ""
     arm: str = ""
-    trials: Annotated[int, Field(ge=1, le=2**32)]  # in each cell; keys count them in 32 bits
+    trials: Annotated[int, Field(ge=1, le=10**8)]  # in each cell
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     deviation: Deviation = Deviation()
     capture: CaptureTable
@@ -223,7 +225,11 @@ class Specification(_Table):
             raise ValueError(f"the grid has {cells:,} cells ({grid}), more than {MOST_CELLS:,}; give shorter lists.")
         if cells * self.trials > MOST_TRIALS:
             raise ValueError(f"{cells} cells of {self.trials:,} trials are more than {MOST_TRIALS:,}; give fewer trials.")
-        if self.reference is None and set(self.identification.method or ()) & {"two-stage", "joint"}:
+        if (
+            self.reference is None
+            and self.capture.file is None
+            and set(self.identification.method or ()) & {"two-stage", "joint"}
+        ):
             raise ValueError("method two-stage or joint needs a reference length; add a [reference], or use method = 'stage1'.")
         bar = self.reference is not None and self.reference.length_mm is not None
         if bar and self.reference.region is None and self.capture.region is None:  # pyright: ignore[reportOptionalMemberAccess]
@@ -266,7 +272,7 @@ def _label(level: Any) -> str:
         return ", ".join(f"{name} {_label(value)}" for name, value in given.items())
     if isinstance(level, list | tuple):
         return "(" + ", ".join(map(_label, level)) + ")"
-    return f"{level:g}" if isinstance(level, int | float) else str(level)
+    return repr(float(level)).removesuffix(".0") if isinstance(level, int | float) else str(level)
 
 
 def unit(name: str) -> str:
@@ -276,5 +282,13 @@ def unit(name: str) -> str:
 
 
 def checked(**tables: Any) -> Specification:
-    """A specification from Python values, or `InputError` in one sentence."""
-    return validated(Specification, tables, "the study")
+    """A specification from Python values, those of NumPy included, or `InputError` in one sentence."""
+    return validated(Specification, _python(tables), "the study")
+
+
+def _python(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _python(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_python(item) for item in value]
+    return value.tolist() if hasattr(value, "tolist") else value

@@ -6,10 +6,11 @@ as fill values). So nothing is ever appended to, a block is there wholly or not 
 write their blocks themselves. At the end the blocks are copied, still compressed, into one plain file.
 """
 
+import contextlib
 import glob
 import shutil
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -28,6 +29,7 @@ from .study import Setting, Study
 from .trials import Block
 
 _MEND = "free some space there, then run the same command again: what is finished is kept"
+MOST_BLOCKS = 1_000_000
 NOT_RUN = -1  # of whole numbers; NaN of others, and -128 of active, where -1 is a bound
 
 
@@ -83,6 +85,10 @@ class Layout(NamedTuple):
     def of(cls, study: Study, chunk: int) -> "Layout":
         """Blocks of about ``chunk`` trials. Small cells share a block where one program serves them all."""
         cells, trials = len(study.cells), study.trials
+        if len(study.cells) * -(-trials // chunk) > MOST_BLOCKS:
+            raise InputError(
+                f"chunks of {chunk} cut {cells} cells of {trials:,} trials into more than {MOST_BLOCKS:,} blocks; give larger ones."
+            )
         mark = f"{study.digest[:12]}-{chunk}-{metadata.version('aacmm_jax')}"
         together = 1
         if trials < chunk:
@@ -119,6 +125,7 @@ def part_of(path: Path, block: Block, layout: Layout) -> Path:
 
 
 Packed = dict[str, bytes]
+_AT_ONCE = 50_000  # trials in memory
 
 
 def pack(results: Mapping[str, np.ndarray], layout: Layout) -> Packed:
@@ -171,7 +178,12 @@ def create(path: Path, study: Study, layout: Layout, chunk: int) -> None:
             f"{folder} cannot be made: {(error.strerror or str(error)).lower()}; choose another output path."
         ) from error
 
-    _write(path, study, chunk, partial(_add_virtual, path, layout), finished=False)
+    try:
+        _write(path, study, chunk, partial(_add_virtual, path, layout), finished=False, mend=storage.ELSEWHERE)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # only where it is empty
+        raise
 
 
 def _add_virtual(path: Path, layout: Layout, group: Any, name: str) -> Any:
@@ -226,7 +238,14 @@ def tidy(path: Path) -> None:
 
 
 def _write(
-    path: Path, study: Study, chunk: int, add_results: Callable, fill: Callable | None = None, *, finished: bool
+    path: Path,
+    study: Study,
+    chunk: int,
+    add_results: Callable,
+    fill: Callable | None = None,
+    *,
+    finished: bool,
+    mend: str = _MEND,
 ) -> None:
     """Write the study's file: with ``fill`` a plain one, else a virtual one."""
     attributes = {
@@ -252,7 +271,7 @@ def _write(
         members = [(name, getattr(Reason, name)) for name in Reason._name_to_item if name]  # pyright: ignore
         group["reason"].attrs["reasons"] = ", ".join(f"{int(numbers_of(item))}: {name}" for name, item in members)
 
-    storage.write_tables(path, "study", _tables(study), attributes, extend, _MEND)
+    storage.write_tables(path, "study", _tables(study), attributes, extend, mend)
 
 
 def _tables(study: Study) -> dict[str, Table]:
@@ -339,6 +358,47 @@ def check_parts(path: Path, kept: Kept) -> None:
         )
     if not parts_of(path).is_dir():
         raise InputError(f"{path} has its results in the folder {kept.parts}, which is not beside it; put it there.")
+    layout = Layout.of(kept.study, kept.chunk)
+    missing = sum(1 for _ in layout.blocks()) - len(finished_blocks(path, layout))
+    if kept.finished and missing:
+        raise InputError(
+            f"{missing} blocks are missing in {kept.parts}; put them there, or run the study again with --resume to make them."
+        )
+
+
+def rows_of(path: Path, kept: Kept, names: Sequence[str], cell: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
+    """Results of one cell, piece by piece: which trials, and their arrays. One file is open at a time, however many blocks there are."""
+    import h5py
+
+    layout = Layout.of(kept.study, kept.chunk)
+    if kept.parts is None:
+        with h5py.File(path, "r") as file:
+            trials: Any = file["trials"]
+            for first in range(0, layout.trials, _AT_ONCE):
+                part = slice(first, min(first + _AT_ONCE, layout.trials))
+                yield part, {name: trials[name][cell, part] for name in names}
+        return
+    there = {item.name for item in parts_of(path).glob("*.h5")}
+    for block in layout.blocks():
+        if block.first_cell <= cell < block.last_cell and part_of(path, block, layout).name in there:
+            with h5py.File(part_of(path, block, layout), "r") as file:
+                arrays: Any = file
+                found = {name: arrays[name][cell - block.first_cell] for name in names}
+            yield slice(block.first_trial, block.last_trial), found
+
+
+def sound(path: Path, block: Block, layout: Layout) -> bool:
+    """Whether the file of a block can be read to the last bit (deflated arrays carry a checksum)."""
+    import h5py
+
+    try:
+        with h5py.File(part_of(path, block, layout), "r") as file:
+            arrays: Any = file
+            for name in VARIABLES:
+                zlib.decompress(arrays[name].id.read_direct_chunk((0,) * arrays[name].ndim)[1])
+    except Exception:  # a wrong byte surfaces as almost anything
+        return False
+    return True
 
 
 def finished_blocks(path: Path, layout: Layout) -> list[Block]:

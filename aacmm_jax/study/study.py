@@ -3,7 +3,8 @@
 import hashlib
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +25,15 @@ from ..simulate import ARCSEC
 from .specification import Point, Region, Specification, checked, label
 
 _KINDS = {"a": "a_mm", "d": "d_mm", "probe": "probe_mm", "alpha": "alpha_deg", "theta": "theta_deg", "beta": "beta_deg"}
+
+
+@contextmanager
+def _at(place: str) -> Iterator[None]:
+    """Names the place in the specification that a refusal is about."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{place}: {error}") from error
 
 
 class Stand(NamedTuple):
@@ -139,7 +149,8 @@ class Study:
     def space(self) -> Parameters:
         """The free parameters, on the nominal arm."""
         held = self.specification.identification.held
-        return Parameters.free_of(self.nominal.arm, held=self.nominal.held if held is None else held)
+        with _at("identification.held"):
+            return Parameters.free_of(self.nominal.arm, held=self.nominal.held if held is None else held)
 
     @cached_property
     def _lengths(self) -> Bool[np.ndarray, " p"]:
@@ -200,6 +211,11 @@ class Study:
             stands = [Stand(f"S{i + 1}", poses, None, region) for i in range(cell["capture.sockets"])]
         stands += _reference_stands(cell, region)
         degrees = cell.get("capture.joint_limits_deg")
+        if degrees is not None and len(degrees) != arm.joints:
+            raise InputError(
+                f"capture.joint_limits_deg has {len(degrees)} rows, but the arm has {arm.joints} joints; give [lowest, highest] "
+                "for each."
+            )
         rows = arm.limits if degrees is None else [[math.radians(x) for x in pair] for pair in degrees]
         limits = checked_limits([(-math.pi, math.pi)] * arm.joints if rows is None else rows, arm.joints)
         return Setting(tuple(stands), tuple((float(a), float(b)) for a, b in limits), hold, method, random_start, False)
@@ -211,7 +227,8 @@ class Study:
         return "two-stage" if has_lengths else "stage1"
 
     def _hold(self, hold: str) -> str | None:
-        return held_length(self.space, self.nominal.arm, None if hold == "none" else hold)
+        with _at("identification.hold"):
+            return held_length(self.space, self.nominal.arm, None if hold == "none" else hold)
 
     def _numbers(self, cell: Mapping[str, Any]) -> tuple:
         space, nominal, table = self.space, self.nominal, self.specification.bounds
@@ -224,7 +241,8 @@ class Study:
         half = np.where(self._lengths, length, angle)
         for name, value in (nominal.override if table.override is None else table.override).items():
             if table.override is not None or name in space.names:
-                half[space.index(name)] = value if table.override is None else value * factor[space.index(name)]
+                with _at("bounds.override"):
+                    half[space.index(name)] = value if table.override is None else value * factor[space.index(name)]
         shift = np.where(self._lengths, cell["bounds.length_shift_mm"], math.radians(cell["bounds.angle_shift_deg"]))
         noise = [cell[f"noise.{name}"] for name in ("encoder_arcsec", "resolution_arcsec", "seating_mm", "eccentricity_arcsec")]
         return (
@@ -367,7 +385,9 @@ def make_study(
     recording = None
     if isinstance(capture, Capture):
         recording, capture = Recording(capture, nominal), {"file": "(in memory)"}
-    elif "file" in capture:
+    elif not isinstance(capture, Mapping):
+        raise InputError(f"capture is a {type(capture).__name__}; give a table (positions_mm, sockets or file), or a Capture.")
+    elif capture.get("file") is not None:
         recording = load_capture(capture["file"])
-    specification = checked(name=name, arm=nominal.name, trials=trials, seed=seed, capture=capture, **tables)
+    specification = checked(name=storage.storable(name), arm=nominal.name, trials=trials, seed=seed, capture=capture, **tables)
     return Study(specification, nominal, recording)
