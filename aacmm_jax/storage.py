@@ -77,30 +77,43 @@ def write_tables(
     attributes: Mapping[str, Any],
     extend: Callable[[Any], None] | None = None,
     mend: str = ELSEWHERE,
+    streamed: bool = False,
 ) -> None:
     """Write an HDF5 file of tables that netCDF-4 readers (xarray) understand. ``kind`` says what the file is.
 
-    ``extend`` is given the open file at the end, to add what does not fit into memory.
+    ``extend`` is given the open file at the end, to add to it. ``streamed``: more than memory holds.
     """
     import h5py
 
-    with whole_file(path, mend) as temporary, _Unbroken(temporary) as stream:
-        with h5py.File(stream, "w", track_order=True) as file:
-            _write_attributes(file, provenance(kind) | dict(attributes))
-            for name, table in tables.items():
-                _write_group(file.create_group(name, track_order=True), table)
-            if extend is not None:
-                extend(file)
-        stream.check()
+    def fill(file: Any) -> None:
+        _write_attributes(file, provenance(kind) | dict(attributes))
+        for name, table in tables.items():
+            _write_group(file.create_group(name, track_order=True), table)
+        if extend is not None:
+            extend(file)
+
+    with whole_file(path, mend) as temporary:
+        if streamed:
+            with _Unbroken(temporary) as stream:
+                with h5py.File(stream, "w", track_order=True) as file:
+                    fill(file)
+                stream.check()
+            return
+        # HDF5 builds the file in memory and Python writes it: on a full disk the HDF5 library crashes the process.
+        with h5py.File(temporary.name, "w", driver="core", backing_store=False, track_order=True) as file:
+            fill(file)
+            file.flush()
+            image = file.id.get_file_image()
+        temporary.write_bytes(image)
 
 
 class _Unbroken:
-    """A file that HDF5 writes through. Where a write fails (a full disk, an interrupt), the HDF5 library would crash the process: so the
-    failure is kept, HDF5 is left to believe in success, and `check` raises it."""
+    """A file that HDF5 writes through. Where a write fails (a full disk), the HDF5 library would crash the process: so the failure
+    is kept, HDF5 is left to believe in success, and `check` raises it. Interrupts must be kept away meanwhile."""
 
     def __init__(self, path: Path):
         self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 - closed on exit
-        self._failure: BaseException | None = None
+        self._failure: OSError | None = None
         self.seek, self.tell, self.read, self.readinto = (
             getattr(self._file, name) for name in ("seek", "tell", "read", "readinto")
         )
@@ -120,20 +133,16 @@ class _Unbroken:
         if self._failure is None:
             try:
                 return work(given)
-            except BaseException as failure:
+            except OSError as failure:
                 self._failure = failure
         return None
 
     def write(self, content: Any) -> int:
         """As a raw file's, but all is taken."""
         left = memoryview(content).cast("B")
-        while len(left) and (taken := self._kept(self.put, left)):
+        while len(left) and (taken := self._kept(self._file.write, left)):
             left = left[taken:]
         return len(content)
-
-    def put(self, content: memoryview) -> int:
-        """Write what the disk takes of it; how much that is."""
-        return self._file.write(content)
 
     def truncate(self, size: int | None = None) -> int:
         """As a raw file's."""

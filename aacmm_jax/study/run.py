@@ -95,16 +95,17 @@ def run_study(
         order = {setting: i for i, setting in enumerate(dict.fromkeys(study.settings))}
         missing.sort(key=lambda block: order[study.settings[block.first_cell]])
         done = before
-        with _stopping() as stopped, _executor(executor, workers) as (pool, count, place):
-            task = partial(_work, study, layout, path.absolute() if shards else None)
-            for block, packed in _through(pool, task, missing, _AHEAD * count, stopped, place):
-                if packed is not None:
-                    store.write_part(path, block, packed, layout)
-                done += block.size
-                if watch is not None:
-                    watch(Progress(done, total, before))
-        if done == total:
-            store.finish(path, study, layout, chunk, keep_parts)
+        with _stopping() as stopped:
+            with _executor(executor, workers) as (pool, count, place):
+                task = partial(_work, study, layout, path if shards else None)
+                for block, packed in _through(pool, task, missing, _AHEAD * count, stopped, place):
+                    if packed is not None:
+                        store.write_part(path, block, packed, layout)
+                    done += block.size
+                    if watch is not None:
+                        watch(Progress(done, total, before))
+            if done == total:  # still with interrupts kept away, since HDF5 does not bear them
+                store.finish(path, study, layout, chunk, keep_parts)
         return Outcome(path, done, total, done - before)
 
 

@@ -271,7 +271,7 @@ def _write(
         members = [(name, getattr(Reason, name)) for name in Reason._name_to_item if name]  # pyright: ignore
         group["reason"].attrs["reasons"] = ", ".join(f"{int(numbers_of(item))}: {name}" for name, item in members)
 
-    storage.write_tables(path, "study", _tables(study), attributes, extend, mend)
+    storage.write_tables(path, "study", _tables(study), attributes, extend, mend, streamed=fill is not None)
 
 
 def _tables(study: Study) -> dict[str, Table]:
