@@ -13,6 +13,7 @@ from . import storage
 from .arm import Arm
 from .errors import InputError, nearest
 from .recording import ArmSpecification, single
+from .toml import read_toml
 
 _LENGTH_UNITS = {"mm": 1.0, "m": 1000.0}
 _ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180}
@@ -88,7 +89,7 @@ def load_specification(source: str | os.PathLike) -> ArmSpecification:
 
 
 def _specification(path: Path) -> ArmSpecification:
-    model = storage.read_toml(path, _ArmModel)
+    model = read_toml(path, _ArmModel)
     length, angle = _LENGTH_UNITS[model.length_unit], _ANGLE_UNITS[model.angle_unit]
     rows = model.joint
     links = [(row.alpha, row.a) for row in rows]

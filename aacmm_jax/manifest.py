@@ -16,6 +16,7 @@ from .arm_files import load_specification
 from .capture import Capture, ReferenceLength
 from .errors import InputError
 from .recording import Recording
+from .toml import read_toml
 
 _UNITS = {"rad": 1.0, "deg": math.pi / 180, "arcsec": math.pi / (180 * 3600)}
 _FIELD = re.compile(r"\{(\w+)\}")
@@ -81,7 +82,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     Raises `InputError` that names the file, the place in it and the mend.
     """
     path = Path(path)
-    model = storage.read_toml(path, _Manifest)
+    model = read_toml(path, _Manifest)
     try:
         nominal = load_specification(_arm_source(path, model.arm))
         joints = nominal.arm.joints

@@ -8,7 +8,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "aacmm_jax"
 FLOORS = (
     {"errors", "_float64"},
-    {"arrays", "storage"},
+    {"arrays", "storage", "toml"},
     {"chain", "arm", "parameters", "capture", "recording", "arm_files", "manifest", "capture_files", "simulate"},
     {"metrics", "steps", "residuals", "solver"},
     {"covariance", "scale", "checks", "evaluate", "calibrate", "lanes", "batch", "calibration_files"},

@@ -82,9 +82,9 @@ def study(
 
 
 def _asked(specification: str, trials: int | None, seed: int | None) -> Any:
-    from ..storage import validated
     from ..study.shipped import read_study
     from ..study.study import Study
+    from ..toml import validated
 
     asked = read_study(specification)
     changes = {name: value for name, value in (("trials", trials), ("seed", seed)) if value is not None}

@@ -21,7 +21,7 @@ from pydantic import (
     model_validator,
 )
 
-from ..storage import validated
+from ..toml import validated
 
 # More cells than this are a slip of the pen: a grid of four factors with ten levels each.
 MOST_CELLS = 10_000

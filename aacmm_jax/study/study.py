@@ -22,6 +22,7 @@ from ..errors import InputError, nearest
 from ..parameters import Parameters, is_length
 from ..recording import ArmSpecification, Recording, single
 from ..simulate import ARCSEC
+from ..toml import read_toml
 from .specification import Point, Region, Specification, checked, label
 
 _KINDS = {"a": "a_mm", "d": "d_mm", "probe": "probe_mm", "alpha": "alpha_deg", "theta": "theta_deg", "beta": "beta_deg"}
@@ -344,7 +345,7 @@ def study_of_file(path: str | os.PathLike) -> Study:
     Raises `InputError` that names the file, the place in it and the mend.
     """
     path = Path(path)
-    specification = storage.read_toml(path, Specification)
+    specification = read_toml(path, Specification)
     if not specification.arm and specification.capture.file is None:
         raise InputError(f"{path}: 'arm' is missing; add it.")
     try:
