@@ -213,8 +213,8 @@ def dask() -> dict:
     found = {}
     with tempfile.TemporaryDirectory() as folder:
         for count in (1, 2):
-            address = f"tcp://127.0.0.1:{8786 + count}"
-            port = str(8786 + count)
+            address = f"tcp://127.0.0.1:{8900 + count}"
+            port = str(8900 + count)
             started = [
                 subprocess.Popen(
                     ["dask", "scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"],
