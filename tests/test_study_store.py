@@ -39,6 +39,15 @@ method = "stage1"
 """
 
 
+@pytest.fixture(scope="module", autouse=True)
+def compiled(cache):
+    """Every process that a test starts keeps its compiled programs for the next."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(cache / "aacmm_jax"))
+        patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+        yield
+
+
 @pytest.fixture(scope="module")
 def home(tmp_path_factory) -> Path:
     """A folder with the specification, and the study run through at once."""
@@ -95,7 +104,7 @@ def interrupted_at(count: int):
     return watch
 
 
-@pytest.mark.parametrize("chunk", [1, 7, 60, 500])
+@pytest.mark.parametrize("chunk", [1, 7, 500])
 def test_the_chunk_changes_no_bit(home, study, tmp_path, chunk):
     trials = study.trials if chunk > 1 else 3
     if chunk == 1:
@@ -241,7 +250,7 @@ def test_a_moved_and_oddly_named_study_still_reads(home, study, tmp_path):
 def test_killed_and_resumed_it_is_the_same(home, cache, tmp_path):
     """SIGKILL at random moments of the real command, start-up and finishing included."""
     path, generator = tmp_path / "s.h5", np.random.default_rng(1)
-    kills, blocks = 8, 16
+    kills, blocks = 6, 16
     for number in range(kills):
         process = command(home, cache, "-o", path, "--chunk", 16)
         until_parts(path, 1 + number * blocks // kills, process)
@@ -287,7 +296,7 @@ def test_a_full_disk_is_one_sentence_and_loses_nothing(home, cache, tmp_path):
         "import os, resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2); "
         "os.execv(sys.executable, [sys.executable, '-m', 'aacmm_jax', *sys.argv[2:]])"
     )
-    store.create(path, aj.read_study(home / "spec.toml"), store.Layout.of(aj.read_study(home / "spec.toml"), 60), 60)
+    store.create(path, aj.read_study(home / "spec.toml"), store.Layout.of(aj.read_study(home / "spec.toml"), 16), 16)
     for limit, what in (
         (10_000, "cell00000-trial0000000000.h5 cannot"),
         ((home / "whole.h5").stat().st_size - 10_000, "s.h5 cannot"),
@@ -313,7 +322,7 @@ import jax
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
 import aacmm_jax as aj
 assert len(jax.devices()) == int(sys.argv[1])
-aj.run_study(aj.read_study(sys.argv[2]), sys.argv[3], chunk=20)
+aj.run_study(aj.read_study(sys.argv[2]), sys.argv[3], chunk=16)
 """
 
 
@@ -330,16 +339,16 @@ def test_the_number_of_devices_changes_nothing(home, cache, tmp_path):
 
 def test_parts_may_stay(home, study, tmp_path):
     path = tmp_path / "s.h5"
-    assert aj.run_study(study, path, chunk=30, keep_parts=True).finished
+    assert aj.run_study(study, path, chunk=16, keep_parts=True).finished
     assert aj.run_study(study, path).ran == 0
     same(home / "whole.h5", path)
     assert aj.open_study(path).attrs["finished"]
     parts = sorted(store.parts_of(path).iterdir())
-    assert len(parts) == 8
+    assert len(parts) == 16
     parts[3].unlink()
     with pytest.raises(aj.InputError, match=r"1 blocks are missing in s\.h5\.parts; put them there, or run the study again"):
         aj.open_study(path)
-    assert aj.run_study(study, path).ran == 30
+    assert aj.run_study(study, path).ran == 15
     same(home / "whole.h5", path)
 
 
@@ -384,7 +393,7 @@ def test_reading_needs_no_more_files_than_one(home, study, tmp_path):
 
 def test_any_executor(home, study, tmp_path):
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        assert aj.run_study(study, tmp_path / "s.h5", executor=pool, chunk=60).finished
+        assert aj.run_study(study, tmp_path / "s.h5", executor=pool, chunk=16).finished
     same(home / "whole.h5", tmp_path / "s.h5")
     with (
         ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as pool,
@@ -424,8 +433,8 @@ def test_a_worker_that_fails_stops_the_study_and_keeps_the_rest(study, tmp_path,
 
     monkeypatch.setattr(run, "run_block", fails)
     with pytest.raises(RuntimeError, match=r"failed on its worker .MemoryError: no room.; finished blocks are kept"):
-        aj.run_study(study, tmp_path / "s.h5", chunk=30, workers=1)
-    assert len(list(store.parts_of(tmp_path / "s.h5").glob("*.h5"))) == 4
+        aj.run_study(study, tmp_path / "s.h5", chunk=16, workers=1)
+    assert len(list(store.parts_of(tmp_path / "s.h5").glob("*.h5"))) == 8
     monkeypatch.setattr(run, "run_block", real)
     assert aj.run_study(study, tmp_path / "s.h5").ran == 120
 

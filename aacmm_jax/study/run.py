@@ -168,7 +168,8 @@ def _through(
                 for future in [future for future in working if future.cancel()]:
                     del working[future]
             ended, _ = wait(working, timeout=0.2, return_when=FIRST_COMPLETED)
-            for future in ended:
+            # What has ended well is kept first, even where another block failed at the same moment.
+            for future in sorted(ended, key=lambda future: future.exception() is not None):
                 block = working.pop(future)
                 try:
                     result = future.result()
