@@ -11,10 +11,7 @@ from .batch import ManyIdentifications as ManyIdentifications
 from .batch import calibrate_many as calibrate_many
 from .batch import identify_many as identify_many
 from .batch import stack_captures as stack_captures
-from .calibrate import Calibration as Calibration
-from .calibrate import Identification as Identification
 from .calibrate import calibrate as calibrate
-from .calibrate import converged as converged
 from .calibrate import identify as identify
 from .calibration_files import CalibrationRecord as CalibrationRecord
 from .calibration_files import load_calibration as load_calibration
@@ -24,15 +21,22 @@ from .capture import Capture as Capture
 from .capture import ReferenceLength as ReferenceLength
 from .capture_files import load_capture as load_capture
 from .capture_files import save_capture as save_capture
+from .errors import IdentifiabilityWarning as IdentifiabilityWarning
 from .errors import InputError as InputError
 from .evaluate import Evaluation as Evaluation
 from .evaluate import evaluate as evaluate
 from .metrics import Repeatability as Repeatability
 from .metrics import repeatability as repeatability
+from .noise import Noise as Noise
+from .observability import Observability as Observability
+from .observability import observe as observe
 from .parameters import Bounds as Bounds
 from .parameters import Parameters as Parameters
 from .recording import ArmSpecification as ArmSpecification
 from .recording import Recording as Recording
+from .results import Calibration as Calibration
+from .results import Identification as Identification
+from .results import converged as converged
 from .scale import Scale as Scale
 from .scale import fix_scale as fix_scale
 from .scale import scale_from_lengths as scale_from_lengths
@@ -41,6 +45,10 @@ from .simulate import simulate as simulate
 from .solver import BoundedLevenbergMarquardt as BoundedLevenbergMarquardt
 from .solver import least_squares as least_squares
 from .steps import Reason as Reason
+from .uncertainty import Uncertainty as Uncertainty
+from .uncertainty import Volume as Volume
+from .uncertainty import over_volume as over_volume
+from .uncertainty import uncertainty_of as uncertainty_of
 
 # Imported when first asked for: these need pydantic, which takes a tenth of the package's own import, and more.
 _LATER = {

@@ -18,12 +18,13 @@ from jaxtyping import Bool, Float, Int
 
 from .arm import Arm, replace
 from .arrays import Numbers, as_array
-from .calibrate import converged
 from .capture import Capture
 from .checks import check_enough, check_fit, held_length
 from .errors import InputError
 from .lanes import Problems, Shape, solve_chunk
+from .noise import Noise
 from .parameters import Parameters, is_length
+from .results import converged
 from .steps import Reason, reasons
 
 # Lanes per loop. On a CPU the columns of all lanes should fit the second-level cache (measured from 20 to 7,000 poses: five
@@ -85,6 +86,7 @@ def identify_many(
     *,
     space: Parameters | None = None,
     hold: str | None = "longest",
+    noise: Noise | None = None,
     max_steps: int = 300,
     chunk: int | None = None,
     lanes: int | None = None,
@@ -97,12 +99,12 @@ def identify_many(
     parameters of ``arm``); ``start`` defaults to the arm. ``arm`` may be a batch (every parameter ``(batch, n)``), and so
     may the capture (see `stack_captures`).
 
-    Work is spread over all devices and, on a CPU, all cores (or ``workers`` threads); memory is bounded by the ``chunk``
+    With ``noise`` poses are weighed by it, as in `identify`. Work is spread over all devices and, on a CPU, all cores (or ``workers`` threads); memory is bounded by the ``chunk``
     (problems per call of the compiled program). Failure is data (``result``); a start outside its box is clipped to it. Raises `InputError` for
     shapes that do not fit, a lower bound above its upper one, and too few poses.
     """
-    work = _Work.of(arm, capture, lower, upper, start, space, hold, _Effort(max_steps, chunk, lanes, devices, workers))
-    return work.identified()
+    effort = _Effort(max_steps, chunk, lanes, devices, workers)
+    return _Work.of(arm, capture, lower, upper, start, space, hold, noise, effort).identified()
 
 
 def calibrate_many(
@@ -115,6 +117,7 @@ def calibrate_many(
     method: Literal["two-stage", "joint"] = "two-stage",
     space: Parameters | None = None,
     hold: str | None = "longest",
+    noise: Noise | None = None,
     max_steps: int = 300,
     chunk: int | None = None,
     lanes: int | None = None,
@@ -130,7 +133,7 @@ def calibrate_many(
     if not capture.lengths:
         raise InputError("the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many.")
     effort = _Effort(max_steps, chunk, lanes, devices, workers)
-    work = _Work.of(arm, capture, lower, upper, start, space, hold, effort)
+    work = _Work.of(arm, capture, lower, upper, start, space, hold, noise, effort)
     stage1 = work.identified()
     k = stage1.k
     assert k is not None
@@ -142,7 +145,8 @@ def calibrate_many(
         return ManyCalibrations(
             scaled, k, stage1.de / k, stage1.deltam / k, stage1.steps, stage1.result, stage1.active, stage1, method
         )
-    work = _Work.of(arm, capture, lower, upper, scaled, stage1.space, None, effort, fitted=sum(work.shape.kept))
+    fitted = sum(work.shape.kept)
+    work = _Work.of(arm, capture, lower, upper, scaled, stage1.space, None, noise, effort, fitted)
     joint = work.identified()
     steps = stage1.steps + joint.steps
     return ManyCalibrations(joint.parameters, k, joint.de, joint.deltam, steps, joint.result, joint.active, stage1, method)
@@ -177,6 +181,7 @@ class _Work(NamedTuple):
     workers: int
     space: Parameters
     hold: str | None
+    noise: Noise | None
 
     @classmethod
     def of(
@@ -188,6 +193,7 @@ class _Work(NamedTuple):
         start: Numbers | None,
         space: Parameters | None,
         hold: str | None,
+        noise: Noise | None,
         effort: _Effort,
         fitted: int | None = None,
     ) -> "_Work":
@@ -197,6 +203,8 @@ class _Work(NamedTuple):
         problems, batched, size = _problems(arm, capture, lower, upper, start, space)
         hold = held_length(space, arm, hold)
         check_fit(capture, space)
+        if noise is not None:
+            noise.check(arm.joints)
         check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
         for what, number in (("chunk", effort.chunk), ("lanes", effort.lanes), ("workers", effort.workers)):
             if number is not None and number < 1:
@@ -218,7 +226,7 @@ class _Work(NamedTuple):
             fitted=fitted or 0,
         )
         room = _room(max(len(piece) for piece in pieces), lanes)
-        return cls(problems, shape, pieces, room, devices, workers, space, hold)
+        return cls(problems, shape, pieces, room, devices, workers, space, hold, noise)
 
     def run(self, piece: range, device: Any) -> tuple[np.ndarray, ...]:
         """Solve one chunk. What room is left is filled with its first problem, which is never begun."""
@@ -226,7 +234,8 @@ class _Work(NamedTuple):
         rows[: len(piece)] = piece
         part = jax.tree.map(lambda leaf, many: leaf[rows] if many else leaf, self.problems, self.shape.batched)
         with jax.default_device(device):
-            solved = solve_chunk(*jax.device_put((part, np.asarray(len(piece))), device), self.shape, self.room)
+            given = jax.device_put((part, np.asarray(len(piece)), self.noise), device)
+            solved = solve_chunk(*given, self.shape, self.room)
         return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(piece)], solved)
 
     def identified(self) -> ManyIdentifications:

@@ -6,11 +6,12 @@ from typing import NamedTuple
 import numpy as np
 
 from . import storage
-from .calibrate import Calibration
 from .capture_files import arm_table, recording_of, recording_tables, specification_of
 from .evaluate import Evaluation, evaluate
+from .noise import Noise
 from .parameters import Parameters, is_length
 from .recording import ArmSpecification, Recording
+from .results import Calibration
 from .steps import Reason
 from .storage import Table, Variable
 
@@ -32,6 +33,11 @@ class CalibrationRecord(NamedTuple):
     active: np.ndarray
     covariance: np.ndarray
     determined: np.ndarray  # False where only a combination with others is determined
+    open: np.ndarray  # projector onto the directions that are not determined, in steps of 1 mm and 1 mrad
+    noise: Noise  # given, or estimated from the residuals
+    form: str  # what the covariance takes errors of tips for: covariance.FORMS
+    freedom: float  # degrees of freedom behind the covariance
+    misfit: float | None  # residuals in units of the given noise
     k: float
     u_k: float
     method: str
@@ -70,6 +76,11 @@ def record_of(calibration: Calibration, recording: Recording) -> CalibrationReco
         active=np.asarray(calibration.active),
         covariance=np.asarray(calibration.covariance),
         determined=np.asarray(calibration.determined),
+        open=np.asarray(calibration.spread.open),
+        noise=calibration.noise,
+        form=calibration.form,
+        freedom=calibration.freedom,
+        misfit=None if stage1.misfit is None else float(stage1.misfit),
         k=float(calibration.scale.value),
         u_k=float(calibration.scale.u),
         method=calibration.method,
@@ -98,6 +109,11 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
         "hold": record.hold,
         "scale_k": record.k,
         "scale_u": record.u_k,
+        "encoder_arcsec": np.asarray(record.noise.encoder_arcsec),
+        "seating_mm": float(record.noise.seating),
+        "form": record.form,
+        "freedom": record.freedom,
+        "misfit": record.misfit,
         "steps": record.steps,
         "converged": record.converged,
         "reason": record.reason,
@@ -129,6 +145,15 @@ def _record(path: str | os.PathLike, stored: storage.Stored) -> CalibrationRecor
         active=table["active"],
         covariance=table["covariance"],
         determined=table["determined"].astype(bool),
+        # Files of version 0.1 and before have none of the following.
+        open=table.get("open", np.zeros_like(table["covariance"])),
+        noise=Noise(
+            encoder_arcsec=np.squeeze(np.atleast_1d(attributes.get("encoder_arcsec", 0.0))),
+            seating=attributes.get("seating_mm", 0.0),
+        ),
+        form=attributes.get("form", "common"),
+        freedom=float(attributes.get("freedom", np.inf)),
+        misfit=attributes.get("misfit"),
         k=attributes["scale_k"],
         u_k=attributes["scale_u"],
         method=attributes["method"],
@@ -154,6 +179,9 @@ def _parameter_table(record: CalibrationRecord) -> Table:
         ),
         "active": Variable(("parameter",), record.active, "1", "-1 on the lower bound, +1 on the upper"),
         "determined": Variable(("parameter",), record.determined.astype(np.int8), "1", "0: only a combination is determined"),
+        "open": Variable(
+            ("parameter", "parameter_2"), record.open, "1", "projector onto what is not determined, in mm and mrad"
+        ),
         "covariance": Variable(("parameter", "parameter_2"), record.covariance, "products of units", "covariance"),
     }
     for stage, vector in record.vectors().items():

@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 
-from .calibrate import active_names
 from .calibration_files import CalibrationRecord
 from .checks import value_of
+from .observability import observe
 from .parameters import Parameters, is_length
 from .recording import Recording
+from .results import active_names
 
 _SUSPICIOUS_SCALE = 0.005  # a held link is not off by more than this; its nominal value or a reference length is wrong
 _PLAUSIBLE_SCALE = (0.5, 2.0)
@@ -108,11 +109,15 @@ def _data(record: CalibrationRecord) -> list[str]:
 
 
 def _identifiability(record: CalibrationRecord) -> list[str]:
-    found = []
-    if not all(record.determined):
-        names = [name for name, known in zip(record.names, record.determined, strict=True) if not known]
+    seen = observe(record.calibrated.arm, record.recording.capture, Parameters(record.calibrated.arm, record.names))
+    found = seen.sentences()
+    weak = [name for name, known in zip(record.names, record.determined, strict=True) if not known]
+    # Those that no noise-free capture could determine either are told above; the rest are lost in the noise.
+    lost = np.abs(seen.null).max(axis=1, initial=0.0) > 1e-3
+    weak = [name for name in weak if not lost[record.names.index(name)]]
+    if weak:
         found.append(
-            f"Not determined one by one, only together: {_some(names, 12)}. Tip positions are right, but these have no uncertainty of "
+            f"Not determined one by one, only together: {_some(weak, 12)}. Tip positions are right, but these have no uncertainty of "
             "their own; hold the redundant ones (--held)."
         )
     u, width = np.sqrt(np.diag(record.covariance)), (record.upper - record.lower) / 2

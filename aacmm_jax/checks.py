@@ -7,7 +7,9 @@ from jaxtyping import Array
 from .arm import Arm, locate, parameter_names
 from .arrays import is_concrete
 from .capture import Capture
+from .covariance import FORMS, Form
 from .errors import InputError
+from .noise import Noise
 from .parameters import Bounds, Parameters, is_length
 
 
@@ -106,3 +108,18 @@ def check_enough(sizes: tuple[int, ...], unknowns: int) -> None:
             f"{poses} poses in {sockets} socket{'s' if sockets > 1 else ''} give {equations} equations, but {unknowns} unknowns "
             f"need at least {needed} poses; record more poses or hold more parameters."
         )
+
+
+def check_form(form: Form | None, noise: Noise | None, joints: int) -> Form:
+    """What errors of tips are taken for: by default the noise that is given, else one estimated from the residuals."""
+    if noise is not None:
+        noise.check(joints)
+    if form is None:
+        return "estimated" if noise is None else "given"
+    if form not in FORMS:
+        raise InputError(f"form is '{form}'; it must be one of {', '.join(FORMS)}.")
+    if form == "given" and noise is None:
+        raise InputError("form='given' needs the noise; give noise=aj.Noise(encoder_arcsec=..., seating=...).")
+    if form == "estimated" and noise is not None:
+        raise InputError("the noise is given, so it is not estimated; leave out noise, or choose another form.")
+    return form

@@ -1,4 +1,4 @@
-"""The one exception that people see, and the wording helpers it needs."""
+"""The one exception and the one warning that people see, and the wording helpers they need."""
 
 import difflib
 from collections.abc import Iterable
@@ -9,6 +9,10 @@ class InputError(ValueError):
 
     Commands turn it into exit code 2 and one sentence; in Python it is an ordinary ``ValueError``.
     """
+
+
+class IdentifiabilityWarning(UserWarning):
+    """Some of the free parameters cannot be determined by the data that are given; the message names the directions."""
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

@@ -18,10 +18,12 @@ from .calibrate import SOLVER
 from .chain import Geometry, Turns, turns_of, walk
 from .covariance import LEAST_SIGMA, length_covariance
 from .metrics import repeatability
+from .noise import Noise, tip_covariances
 from .parameters import placed
 from .residuals import Measurement, Weighing, model_of
 from .scale import scale_of
 from .steps import Box, Reason, advance, begin, choose, either, numbers_of, reasons
+from .weights import Weights
 
 
 class Problems(NamedTuple):
@@ -60,16 +62,32 @@ class _Ended(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("shape", "room"))
-def solve_chunk(problems: Problems, count: Int[Array, ""], shape: Shape, room: int) -> tuple[Array, ...]:
+def solve_chunk(problems: Problems, count: Int[Array, ""], noise: Noise | None, shape: Shape, room: int) -> tuple[Array, ...]:
     """Solve the first ``count`` of ``room`` problems: parameters, DE, Deltam, k, steps, reasons, active bounds."""
-    turns = turns_of(problems.q)
-    weights = None
+    batch = _Batch(problems, turns_of(problems.q), None, None)
+    start = jnp.broadcast_to(problems.start, (room, len(shape.kept)))
+    if noise is not None:
+        batch = batch._replace(weights=_by_groups(partial(_weights, noise), batch, start, shape))
     if shape.joint:
-        start = jnp.broadcast_to(problems.start, (room, len(shape.kept)))
-        weights = _by_groups(_weights, problems, turns, start, shape)
-    ended = _work_off(problems, turns, weights, shape, count, room)
-    de, deltam, k, active = _by_groups(_figures, problems, turns, ended.parameters, shape)
+        batch = batch._replace(weighing=_by_groups(_weighing, batch, start, shape))
+    ended = _work_off(batch, shape, count, room)
+    de, deltam, k, active = _by_groups(_figures, batch, ended.parameters, shape)
     return ended.parameters, de, deltam, k, ended.steps, numbers_of(ended.reason), active
+
+
+class _Batch(NamedTuple):
+    """A chunk, or a group of lanes taken from it."""
+
+    problems: Problems
+    turns: Turns
+    weights: Weights | None  # of poses, where the noise is given
+    weighing: tuple[Array, Array] | None  # of a joint solve: sigma and whitening
+
+    def taken(self, shape: Shape, index: Int[Array, " w"]) -> "_Batch":
+        """The problems of an index, one a lane."""
+        turns = (self.turns[0][:, index], self.turns[1][:, index]) if shape.batched.q else self.turns
+        rest = jax.tree.map(lambda leaf: leaf[index], (self.weights, self.weighing))
+        return _Batch(_taken(self.problems, shape, index), turns, *rest)
 
 
 def _taken(problems: Problems, shape: Shape, index: Int[Array, " w"]) -> Problems:
@@ -82,41 +100,34 @@ def _taken(problems: Problems, shape: Shape, index: Int[Array, " w"]) -> Problem
     return jax.tree.map(lanes_of, problems, shape.batched)._replace(q=q)
 
 
-def _turns_of(turns: Turns, shape: Shape, index: Int[Array, " w"]) -> Turns:
-    return (turns[0][:, index], turns[1][:, index]) if shape.batched.q else turns
+def _by_groups(work: Callable, batch: _Batch, parameters: Float[Array, "room p"], shape: Shape) -> Any:
+    """``work(batch, parameters, shape)`` for all, as many at a time as there are lanes."""
 
-
-def _by_groups(
-    work: Callable, problems: Problems, turns: Turns, parameters: Float[Array, "room p"], shape: Shape
-) -> tuple[Array, ...]:
-    """``work(problems, turns, parameters, shape)`` for all, as many at a time as there are lanes."""
-
-    def group(row: Int[Array, ""]) -> tuple[Array, ...]:
+    def group(row: Int[Array, ""]) -> Any:
         index = row * shape.lanes + jnp.arange(shape.lanes)
-        return work(_taken(problems, shape, index), _turns_of(turns, shape, index), parameters[index], shape)
+        return work(batch.taken(shape, index), parameters[index], shape)
 
     found = jax.lax.map(group, jnp.arange(parameters.shape[0] // shape.lanes))
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
 
 
-def _work_off(
-    problems: Problems, turns: Turns, weights: tuple[Array, ...] | None, shape: Shape, count: Int[Array, ""], room: int
-) -> _Ended:
+def _work_off(batch: _Batch, shape: Shape, count: Int[Array, ""], room: int) -> _Ended:
     """The loop over lanes; every lane takes the next problem of the chunk when its own has ended."""
     kept = np.flatnonzero(shape.kept)
     entries = tuple(shape.entries[i] for i in kept)
     scale = jnp.asarray(np.asarray(shape.scale)[kept])
 
     def starts(index: Array) -> tuple[Array, Box]:
-        part = _taken(problems, shape, index)
+        part = _taken(batch.problems, shape, index)
         start = part.start[:, kept]
         return start, Box(part.lower[:, kept], part.upper[:, kept], jnp.broadcast_to(scale, start.shape))
 
     def evaluate(trial: Array, index: Array):
-        part = _taken(problems, shape, index)
-        geometry = _with_parameters(part.geometry, part.start.at[:, kept].set(trial), shape.entries)
-        weighing = None if weights is None else Weighing(shape.ends, part.nominal, *(leaf[index] for leaf in weights))
-        return model_of(geometry, _turns_of(turns, shape, index), shape.sizes, entries, weighing)
+        part = batch.taken(shape, index)
+        problems = part.problems
+        geometry = _with_parameters(problems.geometry, problems.start.at[:, kept].set(trial), shape.entries)
+        weighing = None if part.weighing is None else Weighing(shape.ends, problems.nominal, *part.weighing)
+        return model_of(geometry, part.turns, shape.sizes, entries, weighing, part.weights)
 
     def more(carry) -> Bool[Array, ""]:
         _, index, _, _ = carry
@@ -131,7 +142,7 @@ def _work_off(
         done = (progress.reason != Reason.running) | late
         reason = either(late & (progress.reason == Reason.running), Reason.max_steps, progress.reason)
         slot = jnp.where(done & (index < count), index, room)
-        whole = _taken(problems, shape, now).start.at[:, kept].set(progress.y)
+        whole = _taken(batch.problems, shape, now).start.at[:, kept].set(progress.y)
         ended = _Ended(
             ended.parameters.at[slot].set(whole, mode="drop"),
             ended.steps.at[slot].set(progress.steps, mode="drop"),
@@ -154,38 +165,47 @@ def _with_parameters(rows: Geometry, vector: Float[Array, "w p"], entries: tuple
     return jax.tree.map(lambda leaf: leaf[:, None, :], rows._replace(**placed(rows, vector, entries)))
 
 
-def _tips(part: Problems, turns: Turns, parameters: Float[Array, "w p"], shape: Shape) -> Float[Array, "w N 3"]:
-    return jnp.swapaxes(walk(_with_parameters(part.geometry, parameters, shape.entries), turns).tip, -1, -2)
+def _tips(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> Float[Array, "w N 3"]:
+    geometry = _with_parameters(part.problems.geometry, parameters, shape.entries)
+    return jnp.swapaxes(walk(geometry, part.turns).tip, -1, -2)
 
 
-def _measurement(nominal: Float[Array, " l"], u: Float[Array, " l"], shape: Shape) -> Measurement:
+def _measurement(nominal: Float[Array, " l"], u: Float[Array, " l"], weights: Weights | None, shape: Shape) -> Measurement:
     """The lengths of one problem; its poses are known by their tips already."""
     empty = jnp.zeros((sum(shape.sizes), 1))
-    return Measurement(empty, turns_of(empty), nominal, u, shape.sizes, shape.ends)
+    return Measurement(empty, turns_of(empty), nominal, u, shape.sizes, shape.ends, weights)
 
 
-def _figures(part: Problems, turns: Turns, parameters: Float[Array, "w p"], shape: Shape) -> tuple[Array, ...]:
+def _figures(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> tuple[Array, ...]:
     """DE, Deltam, k and active bounds of one group of lanes."""
-    tips = _tips(part, turns, parameters, shape)
+    problems, tips = part.problems, _tips(part, parameters, shape)
     figures = jax.vmap(lambda t: repeatability(t, shape.sizes, fitted=sum(shape.kept)))(tips)
     k = jnp.ones(shape.lanes)
     if shape.ends:
 
-        def scale(t: Array, value: Array, uncertainty: Array, sigma: Array) -> Array:
-            return scale_of(t, _measurement(value, uncertainty, shape), sigma).value
+        def scale(t: Array, value: Array, uncertainty: Array, sigma: Array, weights: Weights | None) -> Array:
+            return scale_of(t, _measurement(value, uncertainty, weights, shape), sigma).value
 
-        k = jax.vmap(scale)(tips, part.nominal, part.u, figures.sigma)
-    side = jnp.where(parameters <= part.lower, -1, jnp.where(parameters >= part.upper, 1, 0))
+        k = jax.vmap(scale)(tips, problems.nominal, problems.u, figures.sigma, part.weights)
+    side = jnp.where(parameters <= problems.lower, -1, jnp.where(parameters >= problems.upper, 1, 0))
     return figures.de, figures.deltam, k, jnp.where(jnp.asarray(shape.kept)[None], side, 0)
 
 
-def _weights(part: Problems, turns: Turns, start: Float[Array, "w p"], shape: Shape) -> tuple[Array, ...]:
+def _weights(noise: Noise, part: _Batch, start: Float[Array, "w p"], shape: Shape) -> Weights:
+    """Weights of poses by the noise, in the arm at the start of one group of lanes."""
+    geometry = _with_parameters(part.problems.geometry, start, shape.entries)
+    return Weights.of(tip_covariances(geometry, part.turns, noise), shape.sizes)
+
+
+def _weighing(part: _Batch, start: Float[Array, "w p"], shape: Shape) -> tuple[Array, Array]:
     """What weighs poses and lengths in a joint solve, from the scatter at its start: sigma and whitening of every lane."""
 
-    def weights(t: Array, value: Array, uncertainty: Array) -> tuple[Array, Array]:
+    def weighing(t: Array, value: Array, uncertainty: Array, weights: Weights | None) -> tuple[Array, Array]:
         figures = repeatability(t, shape.sizes, fitted=shape.fitted)
         sigma = jnp.maximum(figures.sigma, LEAST_SIGMA)
-        spread = length_covariance(figures.centroids, _measurement(value, uncertainty, shape), sigma)
-        return sigma, jnp.linalg.inv(jnp.linalg.cholesky(spread))
+        measurement = _measurement(value, uncertainty, weights, shape)
+        spread = length_covariance(measurement.centroids(t), measurement, sigma)
+        counted = sigma if weights is None else jnp.ones_like(sigma)
+        return counted, jnp.linalg.inv(jnp.linalg.cholesky(spread))
 
-    return jax.vmap(weights)(_tips(part, turns, start, shape), part.nominal, part.u)
+    return jax.vmap(weighing)(_tips(part, start, shape), part.problems.nominal, part.problems.u, part.weights)

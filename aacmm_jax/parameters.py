@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from .arm import LENGTHS, Arm, locate, parameter_names, replace
 from .arrays import Numbers, as_array, is_concrete, joined
+from .capture import Capture
 from .chain import Geometry
 from .errors import InputError
 
@@ -59,6 +60,20 @@ class Parameters(eqx.Module):
         if not wanted:
             raise InputError("every parameter is held, so nothing is left to identify; hold fewer.")
         return cls(base=arm, names=tuple(wanted))
+
+    @classmethod
+    def independent(cls, arm: Arm, capture: Capture) -> "Parameters":
+        """A largest set of free parameters that a capture can determine; what is redundant is held at its nominal value.
+
+        For the paper's arm with a reference length these are its 21; without, the longest link is held too. Where neighbouring
+        axes are nearly parallel, d of the first is held and Hayati's beta freed in its place.
+        """
+        from .independence import independent_names  # that room builds on simulate, which builds on this one
+
+        base, names = independent_names(arm, capture)
+        if not names:
+            raise InputError("the capture determines no parameter at all; record more poses in its sockets.")
+        return cls(base=base, names=tuple(name for name in parameter_names(base) if name in names))
 
     @property
     def held(self) -> tuple[str, ...]:

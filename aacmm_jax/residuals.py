@@ -10,15 +10,17 @@ from jaxtyping import Array, Float
 from .arrays import joined
 from .capture import Capture
 from .chain import Geometry, Turns, stacked_columns, turns_of, walk
+from .noise import Noise, tip_covariances
 from .parameters import Parameters
 from .steps import Model
+from .weights import Weights, membership
 
 
 class Measurement(eqx.Module):
     """A capture in the form that residuals take: all poses, which socket each belongs to, and the lengths.
 
     ``sizes`` and ``ends`` are static: they fix the shape of the problem, as the number of poses does. ``turns`` are the
-    cosines and sines of q, which every evaluation needs and none changes.
+    cosines and sines of q, which every evaluation needs and none changes. With ``weights``, centroids are weighted means.
     """
 
     q: Float[Array, "N n"]
@@ -27,6 +29,7 @@ class Measurement(eqx.Module):
     u: Float[Array, " l"]  # their standard uncertainties, mm
     sizes: tuple[int, ...] = eqx.field(static=True)
     ends: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    weights: Weights | None = None  # None: every pose weighs the same
 
     @classmethod
     def of(cls, capture: Capture) -> "Measurement":
@@ -42,20 +45,38 @@ class Measurement(eqx.Module):
             ends=tuple((int(start), int(end)) for start, end in capture.ends()),
         )
 
+    def weighed(self, geometry: Geometry, noise: Noise | None) -> "Measurement":
+        """The same with poses weighed by the inverse covariance that ``noise`` gives their tips in an arm about this one."""
+        if noise is None:
+            return self
+        weights = Weights.of(tip_covariances(geometry, self.turns, noise), self.sizes)
+        return eqx.tree_at(lambda m: m.weights, self, weights, is_leaf=lambda leaf: leaf is None)
+
     @property
     def averaging(self) -> Float[np.ndarray, "s N"]:
         """Matrix that takes tips to socket centroids."""
         return averaging_matrix(self.sizes)
 
     # Sums over sockets are products with this matrix: sockets are few, and a scatter would not vectorise.
-    def centroids(self, tips: Float[Array, "N k"]) -> Float[Array, "s k"]:
-        """Mean of each socket's rows."""
+    def centroids(self, tips: Float[Array, "N 3"]) -> Float[Array, "s 3"]:
+        """Mean of each socket's tips."""
+        if self.weights is not None:
+            return self.weights.centroids(tips.T, self.sizes).T
         return jnp.asarray(self.averaging) @ tips
 
-    def centred(self, tips: Float[Array, "N k"]) -> Float[Array, "N k"]:
-        """Rows less the mean of their socket: eliminates the sockets' unknown positions."""
-        spread = jnp.asarray((self.averaging > 0).astype(float))
-        return tips - spread.T @ self.centroids(tips)
+    def centred(self, tips: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
+        """Tips less the mean of their socket: eliminates the sockets' unknown positions."""
+        return tips - jnp.asarray(membership(self.sizes).T) @ self.centroids(tips)
+
+    def whitened(self, centred: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
+        """Centred tips as a least squares counts them: in standard deviations where there are weights, else in mm."""
+        return centred if self.weights is None else self.weights.whiten(centred.T).T
+
+    def centroid_covariances(self, sigma: Float[Array, ""]) -> Float[Array, "s 3 3"]:
+        """Covariance of each socket's mean, mm^2: what the weights say, or ``sigma``^2 of a tip coordinate over the poses."""
+        if self.weights is not None:
+            return jnp.einsum("abs,cbs->sac", self.weights.spread, self.weights.spread)
+        return sigma**2 * jnp.asarray(np.eye(3)[None] / np.asarray(self.sizes, dtype=float)[:, None, None])
 
     def distances(self, tips: Float[Array, "N 3"]) -> Float[Array, " l"]:
         """Measured reference lengths: distances between the centroids of their end sockets, mm."""
@@ -89,9 +110,10 @@ class Weighing(NamedTuple):
 
 
 def repeatability_residual(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Float[Array, "N 3"]:
-    """Distance vectors of all tips from their socket's centroid, mm (Cheng et al. 2018, eq. 13-14, by component)."""
+    """Distance vectors of all tips from their socket's centroid, mm (Cheng et al. 2018, eq. 13-14, by component); whitened
+    where the measurement has weights."""
     space, measurement = args
-    return measurement.centred(space.arm(vector).position(measurement.q))
+    return measurement.whitened(measurement.centred(space.arm(vector).position(measurement.q)))
 
 
 def joint_residual(
@@ -105,13 +127,16 @@ def joint_residual(
     """
     space, measurement, sigma, whitening = args
     tips = space.arm(vector).position(measurement.q)
-    return measurement.centred(tips) / sigma, whitening @ (measurement.distances(tips) - measurement.nominal)
+    return measurement.whitened(measurement.centred(tips)) / sigma, whitening @ (
+        measurement.distances(tips) - measurement.nominal
+    )
 
 
 def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Model:
     """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic columns."""
     space, measurement = args
-    return model_of(space.arm(vector).geometry, measurement.turns, measurement.sizes, space.entries())
+    geometry = space.arm(vector).geometry
+    return model_of(geometry, measurement.turns, measurement.sizes, space.entries(), weights=measurement.weights)
 
 
 def joint_model(
@@ -122,7 +147,7 @@ def joint_model(
     space, measurement, sigma, whitening = args
     weighing = Weighing(measurement.ends, measurement.nominal, sigma, whitening)
     geometry = space.arm(vector).geometry
-    return model_of(geometry, measurement.turns, measurement.sizes, space.entries(), weighing)
+    return model_of(geometry, measurement.turns, measurement.sizes, space.entries(), weighing, measurement.weights)
 
 
 def measured_lengths(
@@ -130,7 +155,8 @@ def measured_lengths(
 ) -> tuple[Float[Array, " l"], Float[Array, "l p"]]:
     """Measured reference lengths, mm, and their analytic Jacobian by the free parameters."""
     walked = walk(space.arm(vector).geometry, measurement.turns)
-    return _distances(walked.tip, stacked_columns(walked, space.entries()), measurement.sizes, measurement.ends)
+    columns = stacked_columns(walked, space.entries())
+    return _distances(walked.tip, columns, measurement.sizes, measurement.ends, measurement.weights)
 
 
 def model_of(
@@ -139,23 +165,29 @@ def model_of(
     sizes: tuple[int, ...],
     entries: tuple[tuple[str, int], ...],
     weighing: Weighing | None = None,
+    weights: Weights | None = None,
 ) -> Model:
     """Cost, gradient and Gram matrix of the repeatability residual, for any batch of arms and poses that broadcast; with
-    ``weighing``, of the joint residual of poses and lengths.
+    ``weighing``, of the joint residual of poses and lengths; with ``weights``, of whitened poses.
 
     The mean over a socket is taken off the Gram matrix as a correction of rank 3 a socket, J^T J - m mu^T mu, which spares
     a centred copy of the columns; the gradient needs none, because centred residuals sum to zero.
     """
     walked = walk(geometry, turns)
-    averaging = averaging_matrix(sizes)
     columns = stacked_columns(walked, entries)
-    flat = columns.reshape(*columns.shape[:-2], -1)
     # Centred twice: the rounding that one pass leaves in the mean (1e-13 mm) would otherwise be multiplied by the columns'
     # means, and near a perfect fit outweigh the gradient.
-    residual = _centred_rows(_centred_rows(walked.tip, averaging), averaging)
+    averaging = averaging_matrix(sizes)
+    residual = _centred_rows(walked.tip, averaging)
+    if weights is None:
+        residual, counted = _centred_rows(residual, averaging), columns
+        shifts = columns @ jnp.asarray((averaging * np.sqrt(np.asarray(sizes, dtype=float))[:, None]).T)
+    else:
+        residual, counted = weights.centred(weights.whiten(residual), sizes), weights.whiten(columns)
+        shifts = weights.sums(counted, sizes)
     residual = residual.reshape(*residual.shape[:-2], -1)
-    weighted = columns @ jnp.asarray((averaging * np.sqrt(np.asarray(sizes, dtype=float))[:, None]).T)
-    weighted = weighted.reshape(*weighted.shape[:-2], -1)
+    flat = counted.reshape(*counted.shape[:-2], -1)
+    weighted = shifts.reshape(*shifts.shape[:-2], -1)
     poses = Model(
         0.5 * jnp.sum(residual**2, axis=-1),
         (flat @ residual[..., None])[..., 0],
@@ -163,7 +195,7 @@ def model_of(
     )
     if weighing is None:
         return poses
-    distance, rows = _distances(walked.tip, columns, sizes, weighing.ends)
+    distance, rows = _distances(walked.tip, columns, sizes, weighing.ends, weights)
     off = (weighing.whitening @ (distance - weighing.nominal)[..., None])[..., 0]
     rows = weighing.whitening @ rows
     weight = 1 / weighing.sigma**2
@@ -175,11 +207,19 @@ def model_of(
 
 
 def _distances(
-    tip: Float[Array, "*lanes 3 N"], columns: Float[Array, "*lanes p 3 N"], sizes: tuple[int, ...], ends: tuple
+    tip: Float[Array, "*lanes 3 N"],
+    columns: Float[Array, "*lanes p 3 N"],
+    sizes: tuple[int, ...],
+    ends: tuple[tuple[int, int], ...],
+    weights: Weights | None,
 ) -> tuple[Float[Array, "*lanes l"], Float[Array, "*lanes l p"]]:
     """Distances between the centroids of sockets, mm, and their derivatives."""
-    between = (differences_matrix(ends, len(sizes)) @ averaging_matrix(sizes)).T
-    vectors, derivatives = tip @ jnp.asarray(between), columns @ jnp.asarray(between)
+    between = differences_matrix(ends, len(sizes)).T
+    if weights is None:
+        between = averaging_matrix(sizes).T @ between
+        vectors, derivatives = tip @ jnp.asarray(between), columns @ jnp.asarray(between)
+    else:
+        vectors, derivatives = (weights.centroids(rows, sizes) @ jnp.asarray(between) for rows in (tip, columns))
     distance = jnp.linalg.norm(vectors, axis=-2)
     directions = vectors / distance[..., None, :]
     return distance, jnp.einsum("...cl,...pcl->...lp", directions, derivatives)

@@ -14,9 +14,9 @@ from .arm import Arm, checked_limits, is_single
 from .arrays import Numbers, as_floats
 from .capture import Capture, ReferenceLength
 from .errors import InputError, nearest
+from .noise import ARCSEC
 from .parameters import Parameters
 
-ARCSEC = math.pi / (180 * 3600)  # rad
 _BATCH = 256  # candidates per call: one compiled shape for every number of poses
 _ROUNDS = 12
 _STEPS = 60  # of one attempt; five of six starts arrive
@@ -57,7 +57,7 @@ def simulate(
         raise InputError("simulate takes one arm, not a batch; take one of it first.")
     if not sockets:
         raise InputError("simulate needs at least one socket with its position.")
-    limits_array = _limits(arm, limits)
+    limits_array = limits_of(arm, limits)
     points = {name: _point(name, point) for name, point in sockets.items()}
     counts = _counts(points, poses)
     key = jax.random.key(seed)
@@ -166,7 +166,8 @@ def least_moves(columns: Float[Array, "n 3 N"], damping: Float[Array, " N"]) -> 
     return jnp.stack([x * row[0][None] + y * row[1][None] + z * row[2][None] for row in rows], axis=1)
 
 
-def _limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[Array, "n 2"]:
+def limits_of(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[Array, "n 2"]:
+    """Lowest and highest reading of each joint: those given, else the arm's own, else half a turn each way; rad."""
     rows = limits if limits is not None else arm.limits
     if rows is None:
         rows = [(-math.pi, math.pi)] * arm.joints

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 from .arm import Arm
-from .calibrate import active_names
 from .calibration_files import CalibrationRecord
 from .capture import Capture
 from .cautions import of_calibration, of_capture
 from .evaluate import Evaluation, evaluate
 from .parameters import Parameters, is_length
 from .recording import ArmSpecification, Recording
+from .results import active_names
 
 
 def arm_summary(specification: ArmSpecification) -> dict[str, Any]:

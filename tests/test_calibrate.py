@@ -10,7 +10,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.checks import scale_is_free
-from aacmm_jax.simulate import ARCSEC
+from aacmm_jax.noise import ARCSEC
 
 
 @pytest.fixture(scope="module")

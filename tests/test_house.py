@@ -6,14 +6,17 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "aacmm_jax"
-FLOORS = (
-    {"errors", "_float64"},
-    {"arrays", "storage", "toml"},
-    {"chain", "arm", "parameters", "capture", "recording", "arm_files", "manifest", "capture_files", "simulate"},
-    {"metrics", "steps", "residuals", "solver"},
-    {"covariance", "scale", "checks", "evaluate", "calibrate", "lanes", "batch", "calibration_files"},
-    {"cautions", "summary", "figures", "demo", "study"},
-    {"cli"},
+FLOORS = tuple(
+    set(line.split())
+    for line in """
+    errors _float64
+    arrays storage toml
+    chain arm parameters capture recording arm_files manifest capture_files noise simulate independence
+    metrics steps weights residuals solver
+    covariance scale propagation observability checks results evaluate calibrate lanes batch calibration_files uncertainty
+    cautions summary figures demo study
+    cli
+    """.strip().splitlines()
 )
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name not in ("__init__.py", "__main__.py"))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.simulate import ARCSEC
+from aacmm_jax.noise import ARCSEC
 from aacmm_jax.study import drawing, pools
 from aacmm_jax.study.trials import Block, run_block
 

@@ -19,9 +19,9 @@ from ..capture import Capture
 from ..capture_files import load_capture
 from ..checks import check_enough, held_length
 from ..errors import InputError, nearest
+from ..noise import ARCSEC
 from ..parameters import Parameters, is_length
 from ..recording import ArmSpecification, Recording, single
-from ..simulate import ARCSEC
 from ..toml import read_toml
 from .specification import Point, Region, Specification, checked, label
 

@@ -1,0 +1,149 @@
+"""What an identification and a calibration return."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .arm import Arm
+from .arrays import Numbers, is_concrete
+from .covariance import Covariance, Form
+from .metrics import Repeatability
+from .noise import Noise
+from .parameters import Bounds, Parameters
+from .scale import Scale
+from .steps import Reason, numbers_of
+
+_GOOD = [int(reason._value) for reason in (Reason.gradient, Reason.step, Reason.rounding)]  # pyright: ignore
+
+
+class Identification(eqx.Module):
+    """Result of stage 1. A PyTree: under ``eqx.filter_vmap`` every array gains the batch axis.
+
+    ``parameters``, ``active`` and ``covariance`` are in the order of ``space.names``; mm and rad.
+    """
+
+    arm: Arm
+    parameters: Float[Array, " p"]
+    de: Float[Array, ""]  # mean distance from the centroid, mm
+    deltam: Float[Array, ""]  # largest half range, mm
+    active: Int[Array, " p"]  # -1 on the lower bound, +1 on the upper, 0 inside
+    steps: Int[Array, ""]  # evaluations
+    result: Reason  # why it ended
+    optimality: Float[Array, ""]  # projected gradient as a cosine; 0 at a minimum
+    scale: Scale | None  # k of this arm, where the capture holds reference lengths
+    spread: Covariance  # with the scale as it was held; rows of active and held parameters are 0
+    before: Repeatability  # the start
+    after: Repeatability
+    # Root mean square of the residuals in units of what the given noise predicts (1 where it is right); None without.
+    misfit: Float[Array, ""] | None
+    bounds: Bounds
+    hold: str | None = eqx.field(static=True)
+    form: Form = eqx.field(static=True)  # what the covariance takes errors of tips for
+    freedom: float = eqx.field(static=True)  # degrees of freedom behind the covariance; infinite where the noise was given
+
+    @property
+    def covariance(self) -> Float[Array, "*lanes p p"]:
+        """Covariance of the parameters; that of what is determined, where not all is."""
+        return self.spread.matrix
+
+    @property
+    def determined(self) -> Bool[Array, "*lanes p"]:
+        """Which parameters are determined one by one, and not only in combination with others."""
+        return self.spread.determined
+
+    @property
+    def noise(self) -> Noise:
+        """Noise of readings and seat: as given, or as estimated from the residuals."""
+        return self.spread.noise
+
+    @property
+    def space(self) -> Parameters:
+        """The free parameters."""
+        return self.bounds.space
+
+    @property
+    def converged(self) -> Bool[Array | np.ndarray, "*lanes"]:
+        """Whether the solve ended at a minimum."""
+        return converged(self.result)
+
+    def active_names(self) -> dict[str, str]:
+        """Parameters on a bound: name -> 'lower' or 'upper'."""
+        return active_names(self.space, self.active)
+
+
+class Calibration(eqx.Module):
+    """Result of both stages, or of the joint solve. ``covariance`` is in the order of ``space.names``; mm and rad."""
+
+    arm: Arm
+    parameters: Float[Array, " p"]
+    scale: Scale  # k of stage 1, by which its lengths were divided
+    de: Float[Array, ""]
+    deltam: Float[Array, ""]
+    active: Int[Array, " p"]
+    steps: Int[Array, ""]
+    result: Reason
+    spread: Covariance
+    before: Repeatability
+    after: Repeatability
+    length_before: Float[Array, " l"]  # measured reference lengths, mm: at the start
+    length_after: Float[Array, " l"]  # by the calibrated arm
+    stage1: Identification
+    method: str = eqx.field(static=True)
+
+    @property
+    def covariance(self) -> Float[Array, "*lanes p p"]:
+        """Covariance of the parameters; that of what is determined, where not all is."""
+        return self.spread.matrix
+
+    @property
+    def determined(self) -> Bool[Array, "*lanes p"]:
+        """Which parameters are determined one by one, and not only in combination with others."""
+        return self.spread.determined
+
+    @property
+    def noise(self) -> Noise:
+        """Noise of readings and seat: as given, or as estimated from the residuals."""
+        return self.spread.noise
+
+    @property
+    def form(self) -> Form:
+        """What the covariance takes errors of tips for."""
+        return self.stage1.form
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom behind the covariance; infinite where the noise was given."""
+        return self.stage1.freedom
+
+    @property
+    def space(self) -> Parameters:
+        """The free parameters."""
+        return self.stage1.space
+
+    @property
+    def bounds(self) -> Bounds:
+        """The box of the identification."""
+        return self.stage1.bounds
+
+    @property
+    def converged(self) -> Bool[Array | np.ndarray, "*lanes"]:
+        """Whether every solve ended at a minimum."""
+        both = self.stage1.converged & converged(self.result)
+        return np.asarray(both) if is_concrete(both) else both
+
+    def active_names(self) -> dict[str, str]:
+        """Parameters on a bound: name -> 'lower' or 'upper'."""
+        return active_names(self.space, self.active)
+
+
+def converged(result: Reason) -> Bool[Array | np.ndarray, "*lanes"]:
+    """Whether a reason means that a minimum was reached."""
+    number = numbers_of(result)
+    good = np.array(_GOOD, dtype=number.dtype)
+    return np.asarray(np.isin(np.asarray(number), good)) if is_concrete(number) else jnp.isin(number, good)
+
+
+def active_names(space: Parameters, active: Numbers) -> dict[str, str]:
+    """Parameters on a bound: name -> 'lower' or 'upper'."""
+    return {name: "lower" if side < 0 else "upper" for name, side in zip(space.names, np.asarray(active), strict=True) if side}
