@@ -1,6 +1,6 @@
 """Which parameters a capture can tell apart at all: the tips' derivatives, made consistent, and a choice of independent ones."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +28,7 @@ def settled(arm: Arm, capture: Capture, stands: Arm | None = None) -> Float[np.n
     q = np.asarray(capture.q)
     owner = capture.owner
     by = arm if stands is None else stands
-    tips = _in_blocks(lambda rows: np.asarray(by.position(rows)), q)
+    tips = in_blocks(lambda rows: np.asarray(by.position(rows)), q)
     sizes = np.asarray(capture.sizes)
     sums = np.stack([np.bincount(owner, weights=tips[:, axis]) for axis in range(3)], axis=1)
     targets = (sums / sizes[:, None])[owner]
@@ -46,13 +46,13 @@ def moved_onto(
         found, distance = approach(arm.geometry, jnp.asarray(rows[:, :-3]), jnp.asarray(rows[:, -3:]), allowed)
         return np.hstack([np.asarray(found), np.asarray(distance)[:, None]])
 
-    found = _in_blocks(moved, np.hstack([q, targets]))
+    found = in_blocks(moved, np.hstack([q, targets]))
     return found[:, :-1], found[:, -1] <= _SETTLED
 
 
 def columns_at(arm: Arm, q: Float[np.ndarray, "N n"], names: Sequence[str]) -> Float[np.ndarray, "N 3 p"]:
     """Derivatives of the tips by named parameters at poses."""
-    return _in_blocks(lambda rows: np.asarray(arm.jacobian(rows, names)), q)
+    return in_blocks(lambda rows: np.asarray(arm.jacobian(rows, names)), q)
 
 
 def equations(
@@ -63,7 +63,7 @@ def equations(
     owner, sizes = capture.owner, np.asarray(capture.sizes, dtype=float)
     starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
     means = np.add.reduceat(columns, starts, axis=0) / sizes[:, None, None]
-    tips = _in_blocks(lambda rows: np.asarray(arm.position(rows)), q)
+    tips = in_blocks(lambda rows: np.asarray(arm.position(rows)), q)
     centroids = np.add.reduceat(tips, starts, axis=0) / sizes[:, None]
     ends = capture.ends()
     between = centroids[ends[:, 1]] - centroids[ends[:, 0]]
@@ -133,7 +133,7 @@ def _order(arm: Arm, parallel: list[int]) -> list[str]:
     return [name for i, name in enumerate(order) if name not in last or i == len(order) - 1]
 
 
-def _in_blocks(work, rows: np.ndarray) -> np.ndarray:
+def in_blocks(work: Callable[[np.ndarray], np.ndarray], rows: np.ndarray) -> np.ndarray:
     """``work`` on whole blocks of rows; the last is filled up with its first row."""
     pieces = []
     for first in range(0, len(rows), _BLOCK):

@@ -151,11 +151,13 @@ def _rows(
         return np.concatenate([poses.reshape(-1, len(scale)), lengths]) * scale
     moved = Capture({name: q[capture.owner == i] for i, name in enumerate(capture.names)}, capture.lengths)
     measurement = Measurement.of(moved).weighed(arm.geometry, noise)
-    return np.asarray(_whitened(arm, space, measurement))
+    return np.asarray(whitened_equations(arm, space, measurement))
 
 
 @eqx.filter_jit
-def _whitened(arm: Arm, space: Parameters, measurement: Measurement) -> Float[Array, "rows p"]:
+def whitened_equations(arm: Arm, space: Parameters, measurement: Measurement) -> Float[Array, "rows p"]:
+    """Derivatives of everything measured by the free parameters, in natural steps and in standard deviations; the measurement
+    carries its weights."""
     linear = linearised(arm, space, measurement, jnp.zeros(len(space.names), dtype=bool))
     lengths = weighing(arm, measurement, jnp.zeros(())).whitening @ linear.lengths
     return jnp.concatenate([linear.counted.reshape(linear.counted.shape[0], -1).T, lengths])

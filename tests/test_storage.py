@@ -27,7 +27,7 @@ LOAD = {"capture": aj.load_capture, "calibration": aj.load_calibration}
 def good(tmp_path_factory) -> SimpleNamespace:
     """A small calibration and its capture, in Python and in files that no test changes."""
     arm = aj.Arm(
-        alpha=[np.pi / 2, 0.0, -1.0],
+        alpha=[np.pi / 2, 0.4, -1.0],
         a=[10.0, 400.0, 300.0],
         d=[300.0, 20.0, 10.0],
         probe=[1.0, 2.0, 100.0],

@@ -1,0 +1,146 @@
+"""Cross-validation: the arm identified without some of the sockets, and tried on them. The figure that a user should trust."""
+
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .arm import Arm
+from .calibrate import calibrate
+from .capture import Capture
+from .chain import turns_of
+from .errors import InputError
+from .evaluate import evaluate
+from .noise import Noise, tip_covariances
+from .parameters import Bounds
+from .uncertainty import Uncertainty, uncertainty_of
+
+
+class LeftOut(NamedTuple):
+    """One group of sockets that an arm was not identified from; mm."""
+
+    sockets: tuple[str, ...]
+    rms: float  # distance from the socket's centroid, found
+    rms_predicted: float  # root of the mean square that the uncertainty predicts
+    length_error: Float[np.ndarray, " l"]
+    length_u: Float[np.ndarray, " l"]  # standard uncertainty of that error, predicted
+    converged: bool
+
+
+class CrossValidation(NamedTuple):
+    """Every group of sockets left out once."""
+
+    groups: tuple[LeftOut, ...]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square distance from the socket's centroid over all groups, mm."""
+        return float(np.sqrt(np.mean([group.rms**2 for group in self.groups])))
+
+    @property
+    def rms_predicted(self) -> float:
+        """What the uncertainties of the calibrations without them predicted, mm."""
+        return float(np.sqrt(np.mean([group.rms_predicted**2 for group in self.groups])))
+
+    @property
+    def length_rms(self) -> float:
+        """Root mean square error of the reference lengths, mm."""
+        errors = np.concatenate([group.length_error for group in self.groups])
+        return float(np.sqrt(np.mean(errors**2)))
+
+    @property
+    def length_u(self) -> float:
+        """Root mean square of the predicted standard uncertainties of these errors, mm."""
+        return float(np.sqrt(np.mean(np.concatenate([group.length_u for group in self.groups]) ** 2)))
+
+    @property
+    def excess(self) -> float:
+        """By how much errors exceed what was predicted, the worse of both figures: 1 where the uncertainty is honest."""
+        ratios = [self.rms / self.rms_predicted] if self.rms_predicted > 0 else []
+        ratios += [self.length_rms / self.length_u] if self.length_u > 0 else []
+        return max(ratios, default=float("nan"))
+
+
+def groups_of(capture: Capture) -> tuple[tuple[str, ...], ...]:
+    """Sockets that reference lengths join: they stand or fall together."""
+    group = list(range(len(capture.names)))
+    for start, end in capture.ends():
+        old, new = group[end], group[start]
+        group = [new if number == old else number for number in group]
+    return tuple(
+        tuple(name for name, number in zip(capture.names, group, strict=True) if number == wanted)
+        for wanted in dict.fromkeys(group)
+    )
+
+
+def can_cross_validate(capture: Capture) -> bool:
+    """Whether each group can be left out with a length to spare for the scale, and is worth trying."""
+    with_lengths = {group for group in groups_of(capture) if any(length.start in group for length in capture.lengths)}
+    return len(with_lengths) >= 2
+
+
+def cross_validate(
+    arm: Arm,
+    capture: Capture,
+    bounds: Bounds,
+    *,
+    method: Literal["two-stage", "joint"] = "two-stage",
+    hold: str | None = "longest",
+    noise: Noise | None = None,
+) -> CrossValidation:
+    """Calibrate once without each group of sockets that reference lengths join, and try the result on that group.
+
+    Where errors exceed what the uncertainty predicts, the model misses something (joints that give, eccentric encoders) that
+    poses alike to those identified from do not show. Raises `InputError` where fewer than two groups hold a reference length.
+    """
+    if not can_cross_validate(capture):
+        raise InputError(
+            "cross-validation leaves sockets out with their reference lengths, so it needs two groups of sockets that each hold "
+            "one; place the reference length somewhere else too."
+        )
+    found = []
+    for group in groups_of(capture):
+        rest = capture.select(without=list(group)) if len(group) < len(capture.names) else capture
+        result = calibrate(arm, rest, bounds, method=method, hold=hold, noise=noise)
+        left = capture.select(only=list(group))
+        found.append(_tried(uncertainty_of(result), left, group, bool(result.converged)))
+    return CrossValidation(tuple(found))
+
+
+def _tried(uncertainty: Uncertainty, left: Capture, group: tuple[str, ...], converged: bool) -> LeftOut:
+    evaluation = evaluate(uncertainty.arm, left)
+    predicted, length_u = predicted_errors(uncertainty, left)
+    return LeftOut(
+        sockets=group,
+        rms=float(evaluation.repeatability.rms),
+        rms_predicted=float(predicted),
+        length_error=np.asarray(evaluation.error),
+        length_u=np.asarray(length_u),
+        converged=converged,
+    )
+
+
+def predicted_errors(uncertainty: Uncertainty, capture: Capture) -> tuple[Float[Array, ""], Float[Array, " l"]]:
+    """What an arm's uncertainty and the readings' noise predict on a capture it was not identified from, mm: the RMS distance
+    from the sockets' centroids, and the standard uncertainty of the error of every reference length."""
+    arm, owner = uncertainty.arm, capture.owner
+    sizes = np.asarray(capture.sizes, dtype=float)
+    slopes = np.asarray(arm.jacobian(capture.q, uncertainty.names))
+    averaging = (owner[None, :] == np.arange(len(sizes))[:, None]) / sizes[:, None]
+    means = np.einsum("sN,Ncp->scp", averaging, slopes)
+    centred = slopes - means[owner]
+    matrix = np.asarray(uncertainty.covariance)
+    reading = np.asarray(tip_covariances(arm.geometry, turns_of(capture.q), uncertainty.noise))
+    squares = np.einsum("Ncp,pr,Ncr->N", centred, matrix, centred) + np.einsum("ccN->N", reading) * (1 - 1 / sizes[owner])
+    spread = sizes[owner] > 1
+    centroids = averaging @ np.asarray(arm.position(capture.q))
+    ends = capture.ends()
+    between = centroids[ends[:, 1]] - centroids[ends[:, 0]]
+    direction = between / np.linalg.norm(between, axis=1, keepdims=True)
+    along = np.einsum("lc,lcp->lp", direction, means[ends[:, 1]] - means[ends[:, 0]])
+    of_means = np.einsum("sN,cdN->scd", averaging**2, reading)
+    scatter = np.einsum("lc,lcd,ld->l", direction, of_means[ends[:, 0]] + of_means[ends[:, 1]], direction)
+    own = np.array([float(length.u) for length in capture.lengths])
+    variance = np.einsum("lp,pr,lr->l", along, matrix, along) + scatter + own**2
+    return jnp.sqrt(jnp.asarray(squares[spread].mean() if spread.any() else np.nan)), jnp.asarray(np.sqrt(variance))
