@@ -52,6 +52,11 @@ from .uncertainty import uncertainty_of as uncertainty_of
 
 # Imported when first asked for: these need pydantic, which takes a tenth of the package's own import, and more.
 _LATER = {
+    "plan": "planning",
+    "Plan": "planning",
+    "monte_carlo": "sampling",
+    "bootstrap": "sampling",
+    "cross_validate": "validation",
     "load_arm": "arm_files",
     "load_specification": "arm_files",
     "save_arm": "arm_files",
@@ -74,6 +79,10 @@ if _typing.TYPE_CHECKING:
     from .arm_files import save_arm as save_arm
     from .arm_files import shipped_arms as shipped_arms
     from .manifest import read_manifest as read_manifest
+    from .planning import Plan as Plan
+    from .planning import plan as plan
+    from .sampling import bootstrap as bootstrap
+    from .sampling import monte_carlo as monte_carlo
     from .study.executors import dask_executor as dask_executor
     from .study.results import open_study as open_study
     from .study.run import run_study as run_study
@@ -81,6 +90,7 @@ if _typing.TYPE_CHECKING:
     from .study.shipped import shipped_studies as shipped_studies
     from .study.study import Study as Study
     from .study.study import make_study as make_study
+    from .validation import cross_validate as cross_validate
 else:
 
     def __getattr__(name: str):

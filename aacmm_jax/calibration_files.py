@@ -1,6 +1,7 @@
 """A finished calibration as plain tables: made from a `Calibration`, written to and read from HDF5."""
 
 import os
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from .evaluate import Evaluation, evaluate
 from .noise import Noise
 from .parameters import Parameters, is_length
 from .recording import ArmSpecification, Recording
-from .results import Calibration
+from .results import Calibration, CrossValidation, LeftOut
 from .steps import Reason
 from .storage import Table, Variable
 
@@ -44,6 +45,10 @@ class CalibrationRecord(NamedTuple):
     steps: int
     converged: bool
     reason: str
+    validation: CrossValidation | None = None
+    # Monte Carlo after JCGM 101: quantity, estimate, u, low, high, linear_u, agrees; and what to say of it.
+    sampled: Mapping[str, np.ndarray] | None = None
+    sampled_says: str | None = None
 
     def vectors(self) -> dict[str, np.ndarray]:
         """Free parameters of the nominal arm, after stage 1, and calibrated; and of the true arm of a simulation."""
@@ -102,7 +107,12 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
         reference[f"measured_{stage}"] = Variable(
             ("length",), np.asarray(evaluation.measured), "mm", f"length as the {stage} arm measures it"
         )
+    if record.validation is not None:
+        tables["cross_validation"] = _validation_table(record)
+    if record.sampled is not None:
+        tables["monte_carlo"] = _sampled_table(record)
     attributes = {
+        "sampled_says": record.sampled_says,
         "seed": record.recording.seed,
         "method": record.method,
         "held": ",".join(record.held),
@@ -160,6 +170,9 @@ def _record(path: str | os.PathLike, stored: storage.Stored) -> CalibrationRecor
         steps=attributes["steps"],
         converged=bool(attributes["converged"]),
         reason=attributes["reason"],
+        validation=_validation_of(stored),
+        sampled=stored.tables.get("monte_carlo"),
+        sampled_says=attributes.get("sampled_says"),
     )
 
 
@@ -186,6 +199,65 @@ def _parameter_table(record: CalibrationRecord) -> Table:
     }
     for stage, vector in record.vectors().items():
         variables[stage] = Variable(("parameter",), vector, both, f"value in the {stage} arm")
+    return Table(variables)
+
+
+def _validation_table(record: CalibrationRecord) -> Table:
+    assert record.validation is not None
+    groups = record.validation.groups
+    number = np.concatenate([np.full(len(group.length_error), i) for i, group in enumerate(groups)])
+    variables = {
+        "group": Variable(("group",), [",".join(group.sockets) for group in groups], "", "sockets left out together"),
+        "rms": Variable(("group",), [group.rms for group in groups], "mm", "RMS distance from the centroid, found"),
+        "rms_predicted": Variable(("group",), [group.rms_predicted for group in groups], "mm", "the same, predicted"),
+        "converged": Variable(("group",), [int(group.converged) for group in groups], "1", "1: the others converged"),
+        "number": Variable(("error",), number, "1", "which group a length is of, from 0"),
+        "length_error": Variable(
+            ("error",), np.concatenate([group.length_error for group in groups]), "mm", "error of a length left out"
+        ),
+        "length_u": Variable(
+            ("error",), np.concatenate([group.length_u for group in groups]), "mm", "its standard uncertainty, predicted"
+        ),
+    }
+    return Table(variables)
+
+
+def _validation_of(stored: storage.Stored) -> CrossValidation | None:
+    table = stored.tables.get("cross_validation")
+    if table is None:
+        return None
+    groups = []
+    for i, names in enumerate(table["group"]):
+        of = table["number"] == i
+        groups.append(
+            LeftOut(
+                sockets=tuple(str(names).split(",")),
+                rms=float(table["rms"][i]),
+                rms_predicted=float(table["rms_predicted"][i]),
+                length_error=table["length_error"][of],
+                length_u=table["length_u"][of],
+                converged=bool(table["converged"][i]),
+            )
+        )
+    return CrossValidation(tuple(groups))
+
+
+def _sampled_table(record: CalibrationRecord) -> Table:
+    assert record.sampled is not None
+    texts = {
+        "estimate": "value of the calibration",
+        "u": "standard uncertainty by Monte Carlo",
+        "low": "lower end of the Monte Carlo interval",
+        "high": "upper end of the Monte Carlo interval",
+        "linear_u": "standard uncertainty by the law of propagation",
+    }
+    variables = {
+        "quantity": Variable(("quantity",), [str(x) for x in record.sampled["quantity"]], "", "parameter, k or length")
+    }
+    for name, text in texts.items():
+        variables[name] = Variable(("quantity",), record.sampled[name], "mm or rad; 1 for k", text)
+    agrees = np.asarray(record.sampled["agrees"], dtype=np.int8)
+    variables["agrees"] = Variable(("quantity",), agrees, "1", "1: the linear interval is within the tolerance of JCGM 101")
     return Table(variables)
 
 

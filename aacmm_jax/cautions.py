@@ -15,6 +15,7 @@ _SUSPICIOUS_SCALE = 0.005  # a held link is not off by more than this; its nomin
 _PLAUSIBLE_SCALE = (0.5, 2.0)
 _LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 where the D-H model misses something
 _POSE_OUTLIER = 8.0  # in median distances
+_HONEST = 1.5  # errors may exceed their prediction by so much before it is said
 _NAMED = 5  # how many of a kind are named
 
 
@@ -44,7 +45,28 @@ def of_capture(recording: Recording) -> list[str]:
 def of_calibration(record: CalibrationRecord) -> list[str]:
     """Everything about a calibration that should be read before its numbers."""
     found = [] if record.converged else [record.reason]
+    found += _validation(record)
     return [*found, *_scale(record), *of_capture(record.recording), *_bounds(record), *_data(record), *_identifiability(record)]
+
+
+def _validation(record: CalibrationRecord) -> list[str]:
+    """What cross-validation found, where it contradicts the uncertainty; and noise that the residuals contradict."""
+    found = []
+    validation = record.validation
+    if validation is not None and validation.excess > _HONEST:
+        found.append(
+            f"Sockets left out one placement after the other err {validation.excess:.1f} times as much as their uncertainty predicts "
+            f"({validation.rms:.3g} mm RMS against {validation.rms_predicted:.3g}, lengths {validation.length_rms:.3g} mm against "
+            f"{validation.length_u:.3g}): errors of neighbouring poses are alike, so the D-H model misses something (joints that "
+            "give way, eccentric encoders). Trust the cross-validated figures; every u below is too small."
+        )
+    if record.misfit is not None and not 1 / _HONEST < record.misfit < _HONEST:
+        word = "larger" if record.misfit > 1 else "smaller"
+        found.append(
+            f"Residuals are {record.misfit:.2g} times what the given noise predicts, {word} than they should be: check the noise, or "
+            "leave it out to have it estimated."
+        )
+    return found
 
 
 def _scale(record: CalibrationRecord) -> list[str]:

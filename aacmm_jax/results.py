@@ -1,4 +1,6 @@
-"""What an identification and a calibration return."""
+"""What an identification, a calibration and a cross-validation return."""
+
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -147,3 +149,48 @@ def converged(result: Reason) -> Bool[Array | np.ndarray, "*lanes"]:
 def active_names(space: Parameters, active: Numbers) -> dict[str, str]:
     """Parameters on a bound: name -> 'lower' or 'upper'."""
     return {name: "lower" if side < 0 else "upper" for name, side in zip(space.names, np.asarray(active), strict=True) if side}
+
+
+class LeftOut(NamedTuple):
+    """One group of sockets that an arm was not identified from; mm."""
+
+    sockets: tuple[str, ...]
+    rms: float  # distance from the socket's centroid, found
+    rms_predicted: float  # root of the mean square that the uncertainty predicts
+    length_error: Float[np.ndarray, " l"]
+    length_u: Float[np.ndarray, " l"]  # standard uncertainty of that error, predicted
+    converged: bool
+
+
+class CrossValidation(NamedTuple):
+    """Every group of sockets left out once."""
+
+    groups: tuple[LeftOut, ...]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square distance from the socket's centroid over all groups, mm."""
+        return float(np.sqrt(np.mean([group.rms**2 for group in self.groups])))
+
+    @property
+    def rms_predicted(self) -> float:
+        """What the uncertainties of the calibrations without them predicted, mm."""
+        return float(np.sqrt(np.mean([group.rms_predicted**2 for group in self.groups])))
+
+    @property
+    def length_rms(self) -> float:
+        """Root mean square error of the reference lengths, mm."""
+        errors = np.concatenate([group.length_error for group in self.groups])
+        return float(np.sqrt(np.mean(errors**2)))
+
+    @property
+    def length_u(self) -> float:
+        """Root mean square of the predicted standard uncertainties of these errors, mm."""
+        return float(np.sqrt(np.mean(np.concatenate([group.length_u for group in self.groups]) ** 2)))
+
+    @property
+    def excess(self) -> float:
+        """By how much errors exceed what was predicted, the worse of both figures: 1 where the uncertainty is honest."""
+        ratios = [self.rms / self.rms_predicted] if self.rms_predicted > 0 else []
+        ratios += [self.length_rms / self.length_u] if self.length_u > 0 else []
+        return max(ratios, default=float("nan"))

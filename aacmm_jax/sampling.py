@@ -49,6 +49,11 @@ class Sampled(NamedTuple):
         ])  # fmt: skip
         return np.all(np.abs(off) <= self.tolerance, axis=0)
 
+    def table(self) -> dict[str, np.ndarray]:
+        """The distribution in a few columns, as calibration files keep it."""
+        columns = {name: getattr(self, name) for name in ("estimate", "u", "low", "high", "linear_u", "agrees")}
+        return {"quantity": np.array(self.quantities), **columns}
+
     def sentences(self) -> list[str]:
         """Whether the linear result may be used, and where not."""
         found = [] if self.stable else [f"After {self.trials} trials the intervals are not yet stable; allow more."]

@@ -10,9 +10,13 @@ from .calibration_files import CalibrationRecord
 from .capture import Capture
 from .cautions import of_calibration, of_capture
 from .evaluate import Evaluation, evaluate
+from .observability import observe
 from .parameters import Parameters, is_length
 from .recording import ArmSpecification, Recording
-from .results import active_names
+from .results import CrossValidation, active_names
+from .uncertainty import over_volume, uncertainty_of
+
+_CORRELATED = 0.95
 
 
 def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
@@ -143,11 +147,46 @@ def calibration_summary(record: CalibrationRecord) -> dict[str, Any]:
         **{stage: figures(evaluation) for stage, evaluation in evaluations.items()},
         **tables(record.recording.capture, evaluations["calibrated"]),
         "parameters": parameters,
+        "uncertainty": uncertainty_summary(record),
+        "cross_validation": None if record.validation is None else _validation_summary(record.validation),
+        "monte_carlo": record.sampled_says,
         "warnings": of_calibration(record),
     }
     if "true" in vectors:
         summary["truth"] = {stage: truth_errors(record, vectors, stage) for stage in ("nominal", "stage1", "calibrated")}
     return summary
+
+
+def uncertainty_summary(record: CalibrationRecord) -> dict[str, Any]:
+    """What the uncertainty comes from and what it means for lengths all over the volume; standard uncertainties (k = 1)."""
+    uncertainty = uncertainty_of(record)
+    noise = record.noise
+    encoder = np.asarray(noise.encoder_arcsec)
+    seen = observe(record.calibrated.arm, record.recording.capture, Parameters(record.calibrated.arm, record.names))
+    return {
+        "form": record.form,
+        "encoder_arcsec": encoder.tolist(),
+        "seating_mm": float(noise.seating),
+        "misfit": record.misfit,
+        "coverage_factor_95": uncertainty.factor(0.95),
+        "volume": over_volume(uncertainty).summary,
+        "correlated": [{"one": one, "other": other, "r": r} for one, other, r in uncertainty.correlated(_CORRELATED)],
+        "rank": seen.rank,
+        "parameters": len(seen.names),
+        "condition": seen.condition,
+        "indices": seen.indices,
+    }
+
+
+def _validation_summary(validation: CrossValidation) -> dict[str, Any]:
+    return {
+        "groups": len(validation.groups),
+        "rms_mm": validation.rms,
+        "rms_predicted_mm": validation.rms_predicted,
+        "length_error_rms_mm": validation.length_rms,
+        "length_u_mm": validation.length_u,
+        "excess": validation.excess,
+    }
 
 
 def active_names_of(record: CalibrationRecord, active: np.ndarray) -> dict[str, str]:

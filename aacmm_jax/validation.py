@@ -1,6 +1,6 @@
 """Cross-validation: the arm identified without some of the sockets, and tried on them. The figure that a user should trust."""
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,52 +14,8 @@ from .errors import InputError
 from .evaluate import evaluate
 from .noise import Noise, tip_covariances
 from .parameters import Bounds
+from .results import CrossValidation, LeftOut
 from .uncertainty import Uncertainty, uncertainty_of
-
-
-class LeftOut(NamedTuple):
-    """One group of sockets that an arm was not identified from; mm."""
-
-    sockets: tuple[str, ...]
-    rms: float  # distance from the socket's centroid, found
-    rms_predicted: float  # root of the mean square that the uncertainty predicts
-    length_error: Float[np.ndarray, " l"]
-    length_u: Float[np.ndarray, " l"]  # standard uncertainty of that error, predicted
-    converged: bool
-
-
-class CrossValidation(NamedTuple):
-    """Every group of sockets left out once."""
-
-    groups: tuple[LeftOut, ...]
-
-    @property
-    def rms(self) -> float:
-        """Root mean square distance from the socket's centroid over all groups, mm."""
-        return float(np.sqrt(np.mean([group.rms**2 for group in self.groups])))
-
-    @property
-    def rms_predicted(self) -> float:
-        """What the uncertainties of the calibrations without them predicted, mm."""
-        return float(np.sqrt(np.mean([group.rms_predicted**2 for group in self.groups])))
-
-    @property
-    def length_rms(self) -> float:
-        """Root mean square error of the reference lengths, mm."""
-        errors = np.concatenate([group.length_error for group in self.groups])
-        return float(np.sqrt(np.mean(errors**2)))
-
-    @property
-    def length_u(self) -> float:
-        """Root mean square of the predicted standard uncertainties of these errors, mm."""
-        return float(np.sqrt(np.mean(np.concatenate([group.length_u for group in self.groups]) ** 2)))
-
-    @property
-    def excess(self) -> float:
-        """By how much errors exceed what was predicted, the worse of both figures: 1 where the uncertainty is honest."""
-        ratios = [self.rms / self.rms_predicted] if self.rms_predicted > 0 else []
-        ratios += [self.length_rms / self.length_u] if self.length_u > 0 else []
-        return max(ratios, default=float("nan"))
 
 
 def groups_of(capture: Capture) -> tuple[tuple[str, ...], ...]:

@@ -3,13 +3,14 @@
 import json
 import math
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
 import typer
 
-from ..errors import InputError
+from ..errors import IdentifiabilityWarning, InputError
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -170,6 +171,22 @@ def calibrate(
         list[str] | None,
         typer.Option(metavar="NAME=WIDTH", help="Half-width of one parameter's bounds, mm or deg; repeatable."),
     ] = None,
+    encoder_arcsec: Annotated[
+        float | None, typer.Option(min=0, help="Known standard deviation of a reading: weighs poses. Default: estimated.")
+    ] = None,
+    seating_mm: Annotated[
+        float | None, typer.Option(min=0, help="Known standard deviation, a coordinate, of the seat. Default: estimated.")
+    ] = None,
+    cross_validate: Annotated[
+        bool | None,
+        typer.Option(
+            help="Leave out placements of the reference length one after the other. Default: yes, for a recorded capture of several."
+        ),
+    ] = None,
+    monte_carlo: Annotated[
+        bool, typer.Option("--monte-carlo", help="Check the uncertainties by Monte Carlo (JCGM 101); up to a minute.")
+    ] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Refuse parameters that the data cannot determine.")] = False,
     figure: Annotated[Path | None, typer.Option(help="Draw the residuals pose by pose as PNG.")] = None,
     max_steps: Annotated[int, typer.Option(min=1, help="Step limit of each solve.")] = 300,
     as_json: Json = False,
@@ -188,18 +205,29 @@ def calibrate(
     recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
     bounds = options.bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])
     recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
-    result = _busy(
-        "Calibrating",
-        lambda: run(
-            bounds.space.base,
-            recording.capture,
-            bounds,
-            method=method,
-            hold=None if hold == "none" else hold,
-            max_steps=max_steps,
-        ),
-    )
-    record = record_of(result, recording)
+    solving = {
+        "method": method,
+        "hold": None if hold == "none" else hold,
+        "noise": options.noise(encoder_arcsec, seating_mm),
+    }
+    capture_used = recording.capture
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", IdentifiabilityWarning)  # the summary says it
+        result = _busy(
+            "Calibrating",
+            lambda: run(bounds.space.base, capture_used, bounds, **solving, max_steps=max_steps, strict=strict),
+        )
+        record = record_of(result, recording)
+        if cross_validate or (cross_validate is None and recording.true is None and _several(capture_used)):
+            from ..validation import cross_validate as validated
+
+            found = _busy("Cross-validating", lambda: validated(bounds.space.base, capture_used, bounds, **solving))
+            record = record._replace(validation=found)
+    if monte_carlo:
+        from ..sampling import monte_carlo as sample
+
+        sampled = _busy("Drawing trials", lambda: sample(result, capture_used))
+        record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
     save_calibration(output, record)
     if figure is not None:
         from ..figures import calibration_figure
@@ -314,6 +342,15 @@ def show(
         _show(capture_summary(load_capture(file)), as_json, display.capture)
     else:
         _show(calibration_summary(load_calibration(file)), as_json, display.calibration)
+
+
+def _several(capture: Any) -> bool:
+    """Whether the reference length stood in several placements, so that each can be left out."""
+    if len(capture.lengths) < 2:
+        return False
+    from ..validation import can_cross_validate
+
+    return can_cross_validate(capture)
 
 
 def _busy(what: str, work: Callable[[], Any]) -> Any:

@@ -98,13 +98,63 @@ def calibration(summary: dict[str, Any]) -> None:
     held = f"{summary['hold']} held meanwhile" if summary["hold"] else "no length held"
     console.print(f"Scale of stage 1: k = {summary['scale_k']:.8f}, u(k) = {summary['scale_u']:.1e} ({held})")
     _warnings(console, summary)
+    _validated(console, summary["cross_validation"])
     _stages(console, "\nOn the poses it was identified from [mm]", summary, ("nominal", "stage1", "calibrated"))
     if "truth" in summary:
         _truth(console, summary["truth"])
     _parameters(console, summary["parameters"])
     if summary["lengths"]:
         _lengths(console, summary["lengths"], fitted=len(summary["lengths"]) == 1)
+    _uncertainty(console, summary)
     _written(console, summary)
+
+
+def _validated(console: Console, found: dict[str, Any] | None) -> None:
+    """Cross-validation, before everything that was fitted."""
+    if found is None:
+        return
+    title = f"\nCross-validated: each of {found['groups']} placements left out once [mm]"
+    table = _table(title, "", "found", "predicted by u")
+    table.add_row(
+        "RMS distance of poses from their socket's centroid", _number(found["rms_mm"]), _number(found["rms_predicted_mm"])
+    )
+    table.add_row("RMS error of reference lengths", _number(found["length_error_rms_mm"]), _number(found["length_u_mm"]))
+    console.print(table)
+
+
+def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
+    """What the uncertainties rest on, and what they come to over the volume, expanded to 95 %."""
+    found = summary["uncertainty"]
+    volume, factor = found["volume"], found["coverage_factor_95"]
+    title = f"\nExpanded uncertainty over the working volume (95 %, k = {factor:.2f}) [mm]"
+    table = _table(title, "", "median", "95 % of places", "largest")
+    length = f"{volume['length_mm']:g} mm length"
+    for key, text in (
+        ("u_tip", "tip position, along its worst direction: from the calibration"),
+        ("u_length", f"{length}: from the calibration"),
+        ("u_length_reading", f"{length}: with the noise of both readings"),
+    ):
+        cells = (_number(factor * volume[f"{key}_{which}_mm"]) for which in ("median", "95", "largest"))
+        table.add_row(text, *cells)
+    console.print(table)
+    encoder = found["encoder_arcsec"]
+    told = ", ".join(f"{x:.3g}" for x in encoder) if isinstance(encoder, list) else f"{encoder:.3g}"
+    noise = f"encoders {told} arcsec, seat {1e3 * found['seating_mm']:.3g} um"
+    source = {
+        "given": f"Noise as given: {noise}; residuals are {found['misfit'] or 0:.2f} times what it predicts.",
+        "estimated": f"Noise estimated from the residuals: {noise}.",
+        "common": f"One variance for all poses: {1e3 * found['seating_mm']:.3g} um a coordinate.",
+        "robust": "Each pose's own residual stands for its error (robust form).",
+    }[found["form"]]
+    pairs = [f"{row['one']} with {row['other']} ({row['r']:+.3f})" for row in found["correlated"][:6]]
+    console.print(source + (f" Strongly correlated: {', '.join(pairs)}." if pairs else ""), soft_wrap=False)
+    o = found["indices"]
+    console.print(
+        f"Observability: rank {found['rank']} of {found['parameters']}, condition {found['condition']:.3g}, "
+        + ", ".join(f"{name} = {o[name]:.3g}" for name in o)
+    )
+    if summary["monte_carlo"]:
+        console.print(f"Monte Carlo (JCGM 101): {summary['monte_carlo']}")
 
 
 def evaluation(summary: dict[str, Any]) -> None:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 from ..errors import InputError
+from ..noise import Noise
 from ..parameters import Bounds, Parameters, is_length
 from ..recording import ArmSpecification
 
@@ -34,6 +35,16 @@ def bounds(
         angle=nominal.angle if angle_deg is None else math.radians(angle_deg),
         override=override,
     )
+
+
+def noise(encoder_arcsec: float | None, seating_mm: float | None) -> Noise | None:
+    """The noise that is known: both of its parts, or none."""
+    if encoder_arcsec is None and seating_mm is None:
+        return None
+    if encoder_arcsec is None or seating_mm is None:
+        missing = "--seating-mm" if seating_mm is None else "--encoder-arcsec"
+        raise InputError(f"{missing} is missing: give both standard deviations, or neither to have both estimated.")
+    return Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm)
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -1,0 +1,105 @@
+"""The command ``plan``."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from ..errors import InputError
+from .commands import Json, _length_option, _show, _socket_option
+from .study_commands import app
+
+
+@app.command(epilog="Examples: aacmm plan my-arm.toml --sockets 4 --poses 30 -o plan.csv; "
+             "aacmm plan my-arm.toml --socket A=400,200,300 --socket B=700,500,500 --length A,B,0.002 --poses 25 -o plan.csv")  # fmt: skip
+def plan(
+    arm: Annotated[str, typer.Argument(metavar="ARM", help="Arm: a TOML file or a name that ships with the package.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Plan to write (CSV): a pose a row, angles in degrees.")],
+    poses: Annotated[int, typer.Option(min=2, help="Poses in all sockets together.")] = 30,
+    sockets: Annotated[
+        int | None, typer.Option(min=1, help="Sockets to place, two by two as ends of the reference length. Default 4.")
+    ] = None,
+    socket: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=X,Y,Z", help="Instead: a socket that stands there, mm; repeatable.")
+    ] = None,
+    length: Annotated[
+        list[str] | None,
+        typer.Option(metavar="A,B[,U]", help="Reference length between two such sockets, u in mm; repeatable."),
+    ] = None,
+    length_mm: Annotated[
+        str, typer.Option(metavar="L or L:M", help="The reference length to place; a range lets its length be chosen.")
+    ] = "500",
+    u_mm: Annotated[float, typer.Option(help="Standard uncertainty of the reference length.")] = 0.002,
+    encoder_arcsec: Annotated[float, typer.Option(min=0, help="Standard deviation of a reading.")] = 2.0,
+    seating_mm: Annotated[float, typer.Option(min=0, help="Standard deviation, a coordinate, of the seat.")] = 0.005,
+    criterion: Annotated[
+        Literal["length", "A", "D", "E"],
+        typer.Option(help="Largest uncertainty of a length over the volume, or A, D, E of the parameters."),
+    ] = "length",
+    region: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="AXIS=LOW:HIGH", help="Where sockets may stand: x, y, z or distance, mm; repeatable. Default z=0:."
+        ),
+    ] = None,
+    margin_deg: Annotated[float, typer.Option(min=0, help="How far from their limits joints stay.")] = 5.0,
+    candidates: Annotated[int, typer.Option(min=100, help="Poses to choose from.")] = 3000,
+    seed: Annotated[int, typer.Option(min=0, help="Seed.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Choose poses, sockets and the place of the reference length before the arm is touched."""
+    from ..arm_files import load_specification
+    from ..noise import Noise
+    from ..parameters import Parameters
+    from ..plan_files import plan_summary, save_plan
+    from ..planning import plan as run
+    from . import plan_display
+
+    specification = load_specification(arm)
+    if socket and sockets is not None:
+        raise InputError("--sockets places sockets and --socket says where they stand; give one of the two.")
+    if length and not socket:
+        raise InputError("--length is between sockets that stand (--socket); to place a reference length, use --length-mm.")
+    points = dict(_socket_option(text) for text in socket or ())
+    if len(points) < len(socket or ()):
+        raise InputError("a socket is named twice in --socket; give each its own name.")
+    with plan_display.progress() as tell:
+        found = run(
+            specification.arm,
+            sockets=points or (4 if sockets is None else sockets),
+            poses=poses,
+            length=_range("--length-mm", length_mm),
+            u=u_mm,
+            lengths=[_length_option(text) for text in length or ()],
+            region=dict(_axis(text) for text in region) if region else None,
+            space=Parameters.free_of(specification.arm, held=specification.held),
+            noise=Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm),
+            criterion=criterion,
+            margin=math.radians(margin_deg),
+            candidates=candidates,
+            seed=seed,
+            tell=tell,
+        )
+    save_plan(output, found)
+    summary: dict[str, Any] = plan_summary(found, specification.name) | {"written": str(output)}
+    _show(summary, as_json, plan_display.plan)
+
+
+def _range(option: str, text: str) -> tuple[float, float]:
+    low, colon, high = text.partition(":")
+    try:
+        return float(low), float(high if colon else low)
+    except ValueError as error:
+        raise InputError(f"{option} '{text}' is not of the form L or L:M, in mm.") from error
+
+
+def _axis(text: str) -> tuple[str, tuple[float, float]]:
+    axis, _, values = text.partition("=")
+    low, colon, high = values.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        return axis, (float(low or -math.inf), float(high or math.inf))
+    except ValueError as error:
+        raise InputError(f"--region '{text}' is not of the form AXIS=LOW:HIGH, in mm; for example z=0:800.") from error

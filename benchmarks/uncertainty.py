@@ -1,0 +1,324 @@
+"""Are the uncertainties right? Coverage of 95 % intervals, planning against random poses, and real captures.
+
+``python benchmarks/uncertainty.py [PART ...]`` runs the parts named (default: all but ``real``, which needs the captures:
+``real --captures FOLDER``) and writes ``results/uncertainty-DATE-PART.json``. About 20 minutes on two cores in all.
+"""
+
+import argparse
+import datetime
+import json
+import math
+import time
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import aacmm_jax as aj
+from aacmm_jax.independence import moved_onto
+from aacmm_jax.noise import ARCSEC
+from aacmm_jax.sampling import batch_of
+from aacmm_jax.study.drawing import draw
+from aacmm_jax.uncertainty import check_lengths
+
+NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
+SIZES, NAMES = (70, 5, 5), ("S", "A", "B")
+ENDS = [[[400, 200, 300], [700, 500, 500]]]
+
+
+def study_of(trials: int, length_bound: float) -> aj.Study:
+    """The paper's arm off by up to 1 mm and 0.1 deg; 70 poses in a socket, five at each end of one length with u = 2 um."""
+    return aj.make_study(
+        arm="cheng2018-simulation",
+        trials=trials,
+        seed=3,
+        deviation={"length_mm": 1.0, "angle_deg": 0.1},
+        capture={"positions_mm": [[400, 200, 300]], "poses": 70},
+        noise={"encoder_arcsec": 2, "seating_mm": 0.005},
+        reference={"ends_mm": [[ENDS[0][0], ENDS[0][1]]], "poses": 5, "u_mm": 0.002},
+        bounds={"length_mm": length_bound},
+        identification={"method": "joint"},
+    )
+
+
+def drawn_of(study: aj.Study, trials: int):
+    """Readings, true parameters and certified values of every trial."""
+    return draw(study, study.settings[0], np.zeros(trials, int), np.arange(trials), jax.local_devices()[0])
+
+
+def capture_of(q, value) -> aj.Capture:
+    """One trial's capture."""
+    ends = np.cumsum(SIZES)
+    sockets = {name: q[end - size : end] for name, size, end in zip(NAMES, SIZES, ends, strict=True)}
+    return aj.Capture(sockets, [aj.ReferenceLength("A", "B", value, 0.002)])
+
+
+def lengths_over_volume(arm: aj.Arm) -> tuple[np.ndarray, np.ndarray]:
+    """Sixty lengths of 300 mm and twenty of any length, all over the volume."""
+    pairs = [check_lengths(arm, 60, length=300.0, seed=5), check_lengths(arm, 20, length=None, seed=6)]
+    return tuple(np.concatenate(column) for column in zip(*pairs, strict=True))
+
+
+def calibrated(study, drawn, lengths, method, noise, form, hold="d_3"):
+    """Every trial by `aj.calibrate`: normalised errors of parameters, k and lengths, the factor, and which are active."""
+    arm, space = study.nominal.arm, study.space
+    bounds = aj.Bounds(space, drawn.lower[0], drawn.upper[0])
+    start, end = (jnp.asarray(q) for q in lengths)
+    factor = []
+
+    def one(row):
+        q, value, true = row
+        result = aj.calibrate(arm, capture_of(q, value), bounds, method=method, noise=noise, form=form, hold=hold)
+        uncertainty = aj.uncertainty_of(result)
+        factor.append(uncertainty.factor(0.95))
+
+        def measured(vector):
+            body = space.arm(vector)
+            return jnp.linalg.norm(body.position(start) - body.position(end), axis=-1)
+
+        k = arm.d[2] / true[space.index("d_3")]
+        errors = jnp.concatenate([
+            result.parameters - true, jnp.stack([result.scale.value - k]), measured(result.parameters) - measured(true)
+        ])  # fmt: skip
+        u = jnp.concatenate([
+            jnp.sqrt(jnp.diagonal(result.covariance)), jnp.stack([result.scale.u]), uncertainty.length(start, end)
+        ])  # fmt: skip
+        return errors, u, result.active, result.converged
+
+    rows = (jnp.asarray(drawn.q), jnp.asarray(drawn.value[:, 0]), jnp.asarray(drawn.true))
+    found = jax.jit(lambda r: jax.lax.map(one, r, batch_size=16))(rows)
+    errors, u, active, good = (np.asarray(x) for x in found)
+    return errors, u, factor[0], active, good
+
+
+def coverage_row(inside: np.ndarray, names: tuple[str, ...]) -> dict:
+    """Coverage in per cent: parameters, k, lengths; with the least and most covered."""
+    share = 100 * np.nanmean(inside, axis=0)
+    p = len(names)
+    return {
+        "parameters": [round(float(share[:p].min()), 2), round(float(share[:p].max()), 2)],
+        "least": names[int(np.argmin(share[:p]))],
+        "k": round(float(share[p]), 2),
+        "lengths": [round(float(share[p + 1 :].min()), 2), round(float(share[p + 1 :].max()), 2)],
+        "standard_error": round(100 * math.sqrt(0.95 * 0.05 / len(inside)), 2),
+    }
+
+
+def coverage(trials: int = 10_000) -> dict:
+    """How often 95 % intervals hold the truth, for each view of the errors and each method."""
+    study = study_of(trials, 10.0)
+    drawn, lengths = drawn_of(study, trials), lengths_over_volume(study.nominal.arm)
+    found = {"trials": trials}
+    for method in ("joint", "two-stage"):
+        for noise, form in ((NOISE, "given"), (None, "estimated"), (None, "common"), (None, "robust")):
+            begun = time.perf_counter()
+            errors, u, factor, active, good = calibrated(study, drawn, lengths, method, noise, form)
+            row = coverage_row(np.abs(errors) <= factor * u, study.space.names)
+            row |= {"factor": round(factor, 3), "converged": float(good.mean()), "active": int(np.any(active, axis=1).sum())}
+            row["seconds"] = round(time.perf_counter() - begun, 1)
+            found[f"{method}, {form}"] = row
+            print(method, form, row, flush=True)
+    return found
+
+
+def sampled(trials: int = 10_000, draws: int = 199, length_bound: float = 10.0) -> dict:
+    """Monte Carlo intervals: of each calibration, 199 repetitions about its own result; the interval is between the 5th and the
+    195th, which holds one more independent draw in 190 of 200 cases."""
+    study = study_of(trials, length_bound)
+    drawn, lengths = drawn_of(study, trials), lengths_over_volume(study.nominal.arm)
+    arm, space = study.nominal.arm, study.space
+    random = np.random.default_rng(8)
+    owner = np.repeat(np.arange(3), SIZES)
+    averaging = (owner[None] == np.arange(3)[:, None]) / np.array(SIZES)[:, None]
+    bounds = aj.Bounds(space, drawn.lower[0], drawn.upper[0])
+    template = capture_of(jnp.asarray(drawn.q[0]), 1.0)
+    many = aj.calibrate_many(
+        arm, batch_of(template, drawn.q, drawn.value), bounds.lower, bounds.upper, method="joint", noise=NOISE
+    )
+    start, end = (jnp.asarray(q) for q in lengths)
+
+    @jax.jit
+    def outputs(vectors):
+        def one(vector):
+            body = space.arm(vector)
+            return jnp.linalg.norm(body.position(start) - body.position(end), axis=-1)
+
+        return jax.lax.map(one, vectors, batch_size=256)
+
+    inside, at_once, done = [], 50, 0
+    begun = time.perf_counter()
+    while done < trials:
+        readings, values = [], []
+        for i in range(done, min(done + at_once, trials)):
+            body = space.arm(many.parameters[i])
+            centroids = averaging @ np.asarray(body.position(drawn.q[i]))
+            exact, _ = moved_onto(body, drawn.q[i], centroids[owner])
+            moves = np.linalg.pinv(np.asarray(body.jacobian(exact, [f"q_{j}" for j in range(1, 7)])))
+            seats = 0.005 * random.normal(size=(draws, len(owner), 3))
+            q = exact + np.einsum("Nic,tNc->tNi", moves, seats) + 2 * ARCSEC * random.normal(size=(draws, *exact.shape))
+            readings.append(q)
+            size = np.linalg.norm(centroids[2] - centroids[1])
+            values.append(size + 0.002 * random.normal(size=(draws, 1)))
+        again = aj.calibrate_many(
+            arm,
+            batch_of(template, np.concatenate(readings), np.concatenate(values)),
+            bounds.lower,
+            bounds.upper,
+            many.stage1.parameters[done],
+            method="joint",
+            noise=NOISE,
+        )
+        count = len(readings)
+        found = np.hstack([again.parameters, again.k[:, None], np.asarray(outputs(jnp.asarray(again.parameters)))])
+        found = np.sort(found.reshape(count, draws, -1), axis=1)
+        true = drawn.true[done : done + count]
+        k = float(arm.d[2]) / true[:, space.index("d_3")]
+        truth = np.hstack([true, k[:, None], np.asarray(outputs(jnp.asarray(true)))])
+        inside.append((found[:, 4] <= truth) & (truth <= found[:, 194]))
+        done += count
+        if done % 1000 == 0:
+            print(done, round(time.perf_counter() - begun), "s", flush=True)
+    row = coverage_row(np.concatenate(inside).astype(float), space.names)
+    print("sampled", row, flush=True)
+    return {"trials": trials, "draws": draws, "joint, given": row}
+
+
+def bounded(trials: int = 10_000) -> dict:
+    """Boxes as narrow as the arm's errors, or narrower: coverage of parameters that are inside, and of lengths."""
+    found = {"trials": trials}
+    for width in (1.0, 0.9):
+        study = study_of(trials, width)
+        drawn, lengths = drawn_of(study, trials), lengths_over_volume(study.nominal.arm)
+        p = len(study.space.names)
+        for method, hold in (("joint", "d_3"), ("two-stage", None)):
+            errors, u, factor, active, good = calibrated(study, drawn, lengths, method, NOISE, "given", hold)
+            held = np.any(active != 0, axis=1)
+            outside = np.any((drawn.true < drawn.lower) | (drawn.true > drawn.upper), axis=1)
+            inside = (np.abs(errors) <= factor * u).astype(float)
+            inside[:, :p][active != 0] = np.nan  # on a bound: flagged, no interval is claimed
+            row = {"active": round(100 * float(held.mean()), 1), "truth_outside": round(100 * float(outside.mean()), 1)}
+            for what, rows in (("none active", ~held), ("active, truth inside", held & ~outside), ("truth outside", outside)):
+                if rows.sum() > 50:
+                    row[what] = coverage_row(inside[rows], study.space.names)
+            found[f"half-width {width} mm, {method}, hold {hold}"] = row
+            print(width, method, row, flush=True)
+    return found
+
+
+def planned(sets: int = 100) -> dict:
+    """Planned poses against 70 random ones: the largest uncertainty of 400 lengths of 300 mm, by formula and by simulation."""
+    arm = aj.load_arm("cheng2018-simulation")
+    space = aj.Parameters.free_of(arm)
+    start, end = check_lengths(arm, 400, length=300.0, seed=99)
+    found = {"plans": []}
+    for seed in range(3):
+        begun = time.perf_counter()
+        plan = aj.plan(arm, sockets=4, poses=25, seed=seed)
+        seconds = time.perf_counter() - begun
+        row = {"seed": seed, "seconds": round(seconds, 1)} | judged(arm, space, plan.capture(), start, end, 1000)
+        found["plans"].append(row)
+        print("plan", row, flush=True)
+    given = {"S": (400, 200, 300), "A": (400, 200, 300), "B": (700, 500, 500)}
+    planned_sockets = plan.sockets
+    for name, sockets, poses, lengths in (
+        ("70 random: 60 and 10 in the demonstration's sockets", {k: given[k] for k in "AB"}, {"A": 60, "B": 10}, [("A", "B", 0.002)]),
+        ("70 random: 35 and 35 in the demonstration's sockets", {k: given[k] for k in "AB"}, 35, [("A", "B", 0.002)]),
+        ("70 random in the last plan's sockets", planned_sockets, dict(zip("ABCD", (18, 18, 17, 17))), [("A", "B", 0.002), ("C", "D", 0.002)]),
+        ("25 random in the last plan's sockets", planned_sockets, dict(zip("ABCD", (7, 6, 6, 6))), [("A", "B", 0.002), ("C", "D", 0.002)]),
+    ):  # fmt: skip
+        rows = [
+            judged(arm, space, aj.simulate(arm, sockets, poses=poses, lengths=[(*pair[:2], 0.0) for pair in lengths], seed=s), start, end, 100)
+            for s in range(sets)
+        ]  # fmt: skip
+        found[name] = {key: round(float(np.median([row[key] for row in rows])), 2) for key in rows[0]}
+        print(name, found[name], flush=True)
+    return found
+
+
+def judged(arm, space, capture, start, end, draws) -> dict:
+    """Largest standard uncertainty of lengths, um: predicted, and found in simulated calibrations."""
+    lengths = [aj.ReferenceLength(r.start, r.end, r.value, 0.002) for r in capture.lengths]
+    capture = aj.Capture(capture.sockets, lengths)
+    bounds = aj.Bounds.around(arm, space)
+    result = aj.calibrate(arm, capture, bounds, method="joint", noise=NOISE)
+    predicted = 1e3 * np.asarray(aj.uncertainty_of(result).length(start, end))
+    random = np.random.default_rng(1)
+    moves = np.linalg.pinv(np.asarray(arm.jacobian(capture.q, [f"q_{j}" for j in range(1, 7)])))
+    seats = 0.005 * random.normal(size=(draws, *capture.q.shape[:1], 3))
+    q = np.asarray(capture.q) + np.einsum("Nic,tNc->tNi", moves, seats) + 2 * ARCSEC * random.normal(size=(draws, *capture.q.shape))
+    values = np.array([float(r.value) for r in lengths]) + 0.002 * random.normal(size=(draws, len(lengths)))
+    many = aj.calibrate_many(arm, batch_of(capture, q, values), bounds.lower, bounds.upper, method="joint", noise=NOISE)
+    measured = _measured(space, jnp.asarray(many.parameters), jnp.asarray(start), jnp.asarray(end))
+    off = 1e3 * (np.asarray(measured) - np.linalg.norm(np.asarray(arm.position(start)) - np.asarray(arm.position(end)), axis=1))
+    rms = np.sqrt(np.mean(off**2, axis=0))
+    # The largest of 400 estimates is too large by chance: the length of the largest prediction is looked at too.
+    at = int(np.argmax(predicted))
+    return {"largest_predicted": round(float(predicted.max()), 2), "found_there": round(float(rms[at]), 2),
+            "median_predicted": round(float(np.median(predicted)), 2), "median_found": round(float(np.median(rms)), 2),
+            "largest_found": round(float(rms.max()), 2)}  # fmt: skip
+
+
+@eqx.filter_jit
+def _measured(space, vectors, start, end):
+    def one(vector):
+        body = space.arm(vector)
+        return jnp.linalg.norm(body.position(start) - body.position(end), axis=-1)
+
+    return jax.lax.map(one, vectors, batch_size=100)
+
+
+def real(folder: Path) -> dict:
+    """Recorded captures: what the placements identified from predict of the placement left out, and what is found there."""
+    from aacmm_jax.validation import cross_validate
+
+    found = {}
+    for name, arm, bound in (("panda_2_clean", "panda", None), ("panda_6", "panda", 10.0), ("kuka_14", "iiwa14", None)):
+        places = sorted(path.name for path in (folder / name).iterdir() if path.is_dir())
+        sockets = {
+            f"{place}/{hole}": np.loadtxt(folder / name / place / f"hole_{hole}.csv", delimiter=",")
+            for place in places
+            for hole in (0, 1)
+        }
+        capture = aj.Capture(sockets, [aj.ReferenceLength(f"{p}/0", f"{p}/1", 50.0, 0.01) for p in places])
+        nominal = aj.load_specification(arm)
+        nominal = nominal if bound is None else nominal._replace(length=bound)
+        for method in ("two-stage", "joint"):
+            checked = cross_validate(nominal.arm, capture, nominal.bounds(), method=method, hold="d_3")
+            row = {
+                "rms_mm": checked.rms,
+                "rms_predicted_mm": checked.rms_predicted,
+                "length_error_rms_mm": checked.length_rms,
+                "length_u_mm": checked.length_u,
+                "excess": checked.excess,
+            }
+            found[f"{name}, {method}"] = {key: round(value, 3) for key, value in row.items()}
+            print(name, method, found[f"{name}, {method}"], flush=True)
+    return found
+
+
+PARTS = {"coverage": coverage, "sampled": sampled, "bounded": bounded, "planned": planned}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", nargs="*", choices=[*PARTS, "real", []], default=[])
+    parser.add_argument("--captures", type=Path, help="folder of the MUKCa captures, for the part real")
+    parser.add_argument("--trials", type=int, help="instead of 10,000")
+    given = parser.parse_args()
+    for part in given.part or list(PARTS):
+        if part == "real":
+            if given.captures is None:
+                parser.error("the part real needs --captures FOLDER")
+            found = real(given.captures)
+        elif part == "planned" or given.trials is None:
+            found = PARTS[part]()
+        else:
+            found = PARTS[part](given.trials)
+        path = Path(__file__).parent / "results" / f"uncertainty-{datetime.date.today()}-{part}.json"
+        path.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
