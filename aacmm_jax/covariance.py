@@ -206,8 +206,8 @@ def tip_errors(
     cofactors = jnp.stack([jnp.cross(redundancy[(i + 1) % 3], redundancy[(i + 2) % 3], axis=0) for i in range(3)])
     determinant = jnp.sum(redundancy[0] * cofactors[0], axis=0)
     enough = determinant > _LEAST_REDUNDANCY
-    alone = jnp.einsum("ibN,iN->bN", cofactors, linear.residual) / jnp.where(enough, determinant, 1.0)
-    return jnp.where(enough, alone[:, None, :] * alone[None, :, :], common), as_seat
+    alone = jnp.einsum("ibN,iN->bN", cofactors, linear.residual) / jnp.where(enough, determinant, 1.0)[None]
+    return jnp.where(enough[None, None], alone[:, None, :] * alone[None, :, :], common), as_seat
 
 
 def _components(

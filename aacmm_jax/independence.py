@@ -1,12 +1,13 @@
 """Which parameters a capture can tell apart at all: the tips' derivatives, made consistent, and a choice of independent ones."""
 
+import math
 from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .arm import Arm, locate, replace
+from .arm import LENGTHS, Arm, locate, replace
 from .capture import Capture
 from .errors import InputError
 from .parameters import Parameters
@@ -14,6 +15,7 @@ from .simulate import approach
 
 _BLOCK = 256  # poses at a time: one compiled program for captures of every size
 _SETTLED = 1e-6  # mm
+_OFF_AXIS = 5.0  # mm
 _INDEPENDENT = 1e-6  # of a column's size must stand apart from the columns chosen before it
 NEARLY_PARALLEL = 0.02  # |sin alpha|, about 1 degree
 
@@ -98,22 +100,32 @@ def independent_names(arm: Arm, capture: Capture) -> tuple[Arm, tuple[str, ...]]
     if parallel and arm.beta is None:
         arm = replace(arm, beta=jnp.zeros_like(arm.alpha))
     order = _order(arm, parallel)
-    beside = jittered(arm, Parameters(arm, tuple(order)))
-    poses, lengths = equations(beside, capture, order, settled(beside, capture, arm))
+    taken: tuple[str, ...] = ()
+    for _ in range(5):
+        # Out of a special position, but with what is held at its nominal value, which may make others redundant in its turn.
+        beside = jittered(arm, Parameters(arm, taken or tuple(order)))
+        before, taken = taken, _independent(beside, arm, capture, order)
+        if taken == before or not taken:
+            break
+    return arm, taken
+
+
+def _independent(arm: Arm, stands: Arm, capture: Capture, order: list[str]) -> tuple[str, ...]:
+    """Those whose columns stand apart from the columns of those before them; poses hold sockets where another arm puts them."""
+    poses, lengths = equations(arm, capture, order, settled(arm, capture, stands))
     rows = np.concatenate([poses.reshape(-1, len(order)), lengths])
-    # Scaled to 1 mm and 1 mrad, so that "small" means small at the tip.
-    largest = np.linalg.norm(rows, axis=0)
     basis = np.zeros((rows.shape[0], 0))
     taken = []
-    for i in range(len(order)):
-        column = rows[:, i]
+    for name, whole in zip(order, rows.T, strict=True):
+        column = whole
         for _ in range(2):  # twice is enough for orthogonality to rounding
             column = column - basis @ (basis.T @ column)
-        unit = 1.0 if locate(arm, order[i])[0] in ("a", "d", "probe") else 1e3
-        if np.linalg.norm(column) > max(_INDEPENDENT * largest[i], 1e-7 * unit) and basis.shape[1] < rows.shape[0]:
-            taken.append(i)
-            basis = np.hstack([basis, (column / np.linalg.norm(column))[:, None]])
-    return arm, tuple(order[i] for i in taken)
+        least = 1e-7 * (1.0 if locate(arm, name)[0] in LENGTHS else 1e3)  # small at the tip for steps of 1 mm and 1 mrad
+        size = float(np.linalg.norm(column))
+        if size > max(_INDEPENDENT * float(np.linalg.norm(whole)), least) and basis.shape[1] < rows.shape[0]:
+            taken.append(name)
+            basis = np.hstack([basis, column[:, None] / size])
+    return tuple(taken)
 
 
 def _order(arm: Arm, parallel: list[int]) -> list[str]:
@@ -126,7 +138,11 @@ def _order(arm: Arm, parallel: list[int]) -> list[str]:
     angles = [f"{kind}_{i}" for i in range(1, n) for kind in ("alpha", "theta")]
     # Of what lies beyond the last joint, the probe comes before the link, since probes are changed.
     tip = {"probe_z": float(arm.probe[2]), f"d_{n}": values["d"][-1]}
-    wrist = [f"theta_{n}", "probe_x", "probe_y", *(name for name, value in tip.items() if value == 0), f"a_{n}", f"alpha_{n}"]
+    # theta of the last joint is seen by a tip that stands off its axis; near the axis x and y of the probe are.
+    x, y, z = np.asarray(arm.probe)
+    off = math.hypot(float(arm.a[-1]) + x, y * math.cos(float(arm.alpha[-1])) - z * math.sin(float(arm.alpha[-1])))
+    wrist = [f"theta_{n}", "probe_x", "probe_y"] if off > _OFF_AXIS else ["probe_x", "probe_y", f"theta_{n}"]
+    wrist += [*(name for name, value in tip.items() if value == 0), f"a_{n}", f"alpha_{n}"]
     last = [max(nonzero, key=lambda name: abs(dict(lengths)[name]))] if nonzero else []
     nonzero += [name for name, value in tip.items() if value != 0]
     order = [*nonzero, *angles, *(f"beta_{i}" for i in parallel), *zero, *wrist, *last]

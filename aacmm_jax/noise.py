@@ -40,7 +40,9 @@ class Noise(eqx.Module):
 
     def check(self, joints: int) -> None:
         """Raise `InputError` where nothing can be weighed by it: no noise at all, or another number of encoders than joints."""
-        if is_concrete(self.encoder, self.seating) and not (np.any(np.asarray(self.encoder)) or np.any(np.asarray(self.seating))):
+        if is_concrete(self.encoder, self.seating) and not (
+            np.any(np.asarray(self.encoder)) or np.any(np.asarray(self.seating))
+        ):
             raise InputError(
                 "noise is zero everywhere, so nothing can be weighed by it; give a standard deviation, or no noise."
             )

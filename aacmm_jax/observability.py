@@ -238,7 +238,7 @@ def _remedy(arm: Arm, capture: Capture, space: Parameters, wanted: int) -> str:
     far = {f"\0{i}": q[None] for i, q in enumerate(draw(4))}
     one = [ReferenceLength("\0000", "\0001", 1.0)]
     two = [*one, ReferenceLength("\0002", "\0003", 1.0)]
-    again = {f"\0 {name}": _varied(arm, q[0], random) for name, q in list(capture.sockets.items())[:1]}
+    again = {f"\0 {name}": _varied(arm, np.asarray(q)[0], random) for name, q in list(capture.sockets.items())[:1]}
     length = "a second position of the reference length" if capture.lengths else "a reference length"
     for text, sockets, lengths in (
         (f"{length[0].upper()}{length[1:]} would determine them.", far, one),

@@ -1,5 +1,6 @@
 """Places for sockets and reference lengths, poses that reach them, and the information these would add."""
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -105,7 +106,7 @@ def places(
     for _ in range(60):
         middle = np.asarray(scene.arm.position(scene.draw(40 * count * (pairs + 1))))
         turn = scene.random.normal(size=middle.shape)
-        size = np.exp(scene.random.uniform(*np.log(length), len(middle)))[:, None]
+        size = np.exp(scene.random.uniform(math.log(length[0]), math.log(length[1]), len(middle)))[:, None]
         half = 0.5 * size * turn / np.linalg.norm(turn, axis=1, keepdims=True)
         both = np.stack([middle - half, middle + half], axis=1)
         both = both[_inside(both, region).all(axis=1)]

@@ -269,7 +269,7 @@ def _sorted(q: Float[np.ndarray, "N n"], owner: Int[np.ndarray, " N"]) -> tuple[
     """Socket after socket, and in each from pose to nearest pose, so that the arm moves little."""
     order: list[int] = []
     for socket in range(owner.max() + 1):
-        left = list(np.flatnonzero(owner == socket))
+        left = np.flatnonzero(owner == socket).tolist()
         here = min(left, key=lambda i: np.abs(q[i]).sum())
         while left:
             left.remove(here)

@@ -163,7 +163,7 @@ def uncertainty_summary(record: CalibrationRecord) -> dict[str, Any]:
     noise = record.noise
     encoder = np.asarray(noise.encoder_arcsec)
     seen = observe(record.calibrated.arm, record.recording.capture, Parameters(record.calibrated.arm, record.names))
-    return {
+    found = {
         "form": record.form,
         "encoder_arcsec": encoder.tolist(),
         "seating_mm": float(noise.seating),
@@ -176,6 +176,10 @@ def uncertainty_summary(record: CalibrationRecord) -> dict[str, Any]:
         "condition": seen.condition,
         "indices": seen.indices,
     }
+    # JSON has no infinity; what is not determined has no number.
+    found["volume"] = {key: value if np.isfinite(value) else None for key, value in found["volume"].items()}
+    found["condition"] = found["condition"] if np.isfinite(found["condition"]) else None
+    return found
 
 
 def _validation_summary(validation: CrossValidation) -> dict[str, Any]:

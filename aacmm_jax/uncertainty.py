@@ -104,7 +104,7 @@ class Uncertainty(eqx.Module):
 
     def _lost(self, slope: Float[Array, "... k p"]) -> Array:
         """Which rows follow a direction that is open."""
-        inside = (slope * self.space.scale) @ self.open
+        inside = slope @ (self.space.scale[:, None] * self.open)
         return jnp.sqrt(jnp.sum(inside**2, axis=-1)) > _REACHED
 
 
@@ -182,8 +182,7 @@ def _volume(uncertainty: Uncertainty, start: Array, end: Array) -> tuple[Array, 
     largest = jnp.sqrt(jnp.linalg.eigvalsh(finite)[..., -1])
     largest = jnp.where(jnp.all(jnp.isfinite(spread), axis=(-1, -2)), largest, jnp.inf)
     tips = jnp.stack([uncertainty.arm.position(q) for q in (start, end)])
-    lengths = (uncertainty.length(start, end, reading=reading) for reading in (False, True))
-    return tips, largest, *lengths
+    return tips, largest, uncertainty.length(start, end), uncertainty.length(start, end, reading=True)
 
 
 def default_length(arm: Arm) -> float:

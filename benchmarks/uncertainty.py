@@ -247,7 +247,11 @@ def judged(arm, space, capture, start, end, draws) -> dict:
     random = np.random.default_rng(1)
     moves = np.linalg.pinv(np.asarray(arm.jacobian(capture.q, [f"q_{j}" for j in range(1, 7)])))
     seats = 0.005 * random.normal(size=(draws, *capture.q.shape[:1], 3))
-    q = np.asarray(capture.q) + np.einsum("Nic,tNc->tNi", moves, seats) + 2 * ARCSEC * random.normal(size=(draws, *capture.q.shape))
+    q = (
+        np.asarray(capture.q)
+        + np.einsum("Nic,tNc->tNi", moves, seats)
+        + 2 * ARCSEC * random.normal(size=(draws, *capture.q.shape))
+    )
     values = np.array([float(r.value) for r in lengths]) + 0.002 * random.normal(size=(draws, len(lengths)))
     many = aj.calibrate_many(arm, batch_of(capture, q, values), bounds.lower, bounds.upper, method="joint", noise=NOISE)
     measured = _measured(space, jnp.asarray(many.parameters), jnp.asarray(start), jnp.asarray(end))

@@ -134,8 +134,8 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
         ("u_length", f"{length}: from the calibration"),
         ("u_length_reading", f"{length}: with the noise of both readings"),
     ):
-        cells = (_number(factor * volume[f"{key}_{which}_mm"]) for which in ("median", "95", "largest"))
-        table.add_row(text, *cells)
+        values = [volume[f"{key}_{which}_mm"] for which in ("median", "95", "largest")]
+        table.add_row(text, *("not determined" if value is None else _number(factor * value) for value in values))
     console.print(table)
     encoder = found["encoder_arcsec"]
     told = ", ".join(f"{x:.3g}" for x in encoder) if isinstance(encoder, list) else f"{encoder:.3g}"
@@ -150,7 +150,7 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
     console.print(source + (f" Strongly correlated: {', '.join(pairs)}." if pairs else ""), soft_wrap=False)
     o = found["indices"]
     console.print(
-        f"Observability: rank {found['rank']} of {found['parameters']}, condition {found['condition']:.3g}, "
+        f"Observability: rank {found['rank']} of {found['parameters']}, condition {found['condition'] or math.inf:.3g}, "
         + ", ".join(f"{name} = {o[name]:.3g}" for name in o)
     )
     if summary["monte_carlo"]:

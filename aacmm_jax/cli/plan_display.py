@@ -43,8 +43,10 @@ def plan(summary: dict[str, Any]) -> None:
             f"Reference length {escape(row['from'])} - {escape(row['to'])}: {row['value_mm']:.1f} mm, u = {1e3 * row['u_mm']:.3g} um"
         )
     length = f"{summary['check_length_mm']:g} mm"
-    title = f"\nStandard uncertainty that the calibration adds to lengths of {length} over the volume [um]"
-    table = _table(title, "", "median", "largest")
+    console.print(
+        f"\n[bold]Standard uncertainty that the calibration adds to lengths of {length} over the volume \\[um][/bold]"
+    )
+    table = _table("", "", "median", "largest")
     for key, text in (
         ("predicted", "this plan"),
         ("loose", "this plan, joints kept to about 5 deg only"),
