@@ -55,6 +55,7 @@ _LATER = {
     "plan": "planning",
     "Plan": "planning",
     "monte_carlo": "sampling",
+    "Sampled": "sampling",
     "bootstrap": "sampling",
     "cross_validate": "validation",
     "load_arm": "arm_files",
@@ -81,6 +82,7 @@ if _typing.TYPE_CHECKING:
     from .manifest import read_manifest as read_manifest
     from .planning import Plan as Plan
     from .planning import plan as plan
+    from .sampling import Sampled as Sampled
     from .sampling import bootstrap as bootstrap
     from .sampling import monte_carlo as monte_carlo
     from .study.executors import dask_executor as dask_executor

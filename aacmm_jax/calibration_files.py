@@ -35,6 +35,7 @@ class CalibrationRecord(NamedTuple):
     covariance: np.ndarray
     determined: np.ndarray  # False where only a combination with others is determined
     open: np.ndarray  # projector onto the directions that are not determined, in steps of 1 mm and 1 mrad
+    stretch: np.ndarray  # of lengths that were held but divided by k: see covariance.Covariance
     noise: Noise  # given, or estimated from the residuals
     form: str  # what the covariance takes errors of tips for: covariance.FORMS
     freedom: float  # degrees of freedom behind the covariance
@@ -82,6 +83,7 @@ def record_of(calibration: Calibration, recording: Recording) -> CalibrationReco
         covariance=np.asarray(calibration.covariance),
         determined=np.asarray(calibration.determined),
         open=np.asarray(calibration.spread.open),
+        stretch=np.asarray(calibration.spread.stretch),
         noise=calibration.noise,
         form=calibration.form,
         freedom=calibration.freedom,
@@ -123,6 +125,7 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
         "seating_mm": float(record.noise.seating),
         "form": record.form,
         "freedom": record.freedom,
+        "stretch_variance": float(record.stretch[-1]),
         "misfit": record.misfit,
         "steps": record.steps,
         "converged": record.converged,
@@ -157,6 +160,7 @@ def _record(path: str | os.PathLike, stored: storage.Stored) -> CalibrationRecor
         determined=table["determined"].astype(bool),
         # Files of version 0.1 and before have none of the following.
         open=table.get("open", np.zeros_like(table["covariance"])),
+        stretch=np.append(table.get("stretch", np.zeros(len(table["covariance"]))), attributes.get("stretch_variance", 0.0)),
         noise=Noise(
             encoder_arcsec=np.squeeze(np.atleast_1d(attributes.get("encoder_arcsec", 0.0))),
             seating=attributes.get("seating_mm", 0.0),
@@ -192,6 +196,7 @@ def _parameter_table(record: CalibrationRecord) -> Table:
         ),
         "active": Variable(("parameter",), record.active, "1", "-1 on the lower bound, +1 on the upper"),
         "determined": Variable(("parameter",), record.determined.astype(np.int8), "1", "0: only a combination is determined"),
+        "stretch": Variable(("parameter",), record.stretch[:-1], both, "covariance with the relative error of held lengths"),
         "open": Variable(
             ("parameter", "parameter_2"), record.open, "1", "projector onto what is not determined, in mm and mrad"
         ),
@@ -208,15 +213,20 @@ def _validation_table(record: CalibrationRecord) -> Table:
     number = np.concatenate([np.full(len(group.length_error), i) for i, group in enumerate(groups)])
     variables = {
         "group": Variable(("group",), [",".join(group.sockets) for group in groups], "", "sockets left out together"),
+        "poses": Variable(("group",), [group.poses for group in groups], "1", "poses in sockets with more than one"),
         "rms": Variable(("group",), [group.rms for group in groups], "mm", "RMS distance from the centroid, found"),
         "rms_predicted": Variable(("group",), [group.rms_predicted for group in groups], "mm", "the same, predicted"),
         "converged": Variable(("group",), [int(group.converged) for group in groups], "1", "1: the others converged"),
-        "number": Variable(("error",), number, "1", "which group a length is of, from 0"),
+        "left_out_length": Variable(("left_out_length",), np.arange(len(number)), "1", "lengths left out, one after the other"),
+        "number": Variable(("left_out_length",), number, "1", "which group a length is of, from 0"),
         "length_error": Variable(
-            ("error",), np.concatenate([group.length_error for group in groups]), "mm", "error of a length left out"
+            ("left_out_length",), np.concatenate([group.length_error for group in groups]), "mm", "error of a length left out"
         ),
         "length_u": Variable(
-            ("error",), np.concatenate([group.length_u for group in groups]), "mm", "its standard uncertainty, predicted"
+            ("left_out_length",),
+            np.concatenate([group.length_u for group in groups]),
+            "mm",
+            "its standard uncertainty, predicted",
         ),
     }
     return Table(variables)
@@ -232,6 +242,7 @@ def _validation_of(stored: storage.Stored) -> CrossValidation | None:
         groups.append(
             LeftOut(
                 sockets=tuple(str(names).split(",")),
+                poses=int(table["poses"][i]),
                 rms=float(table["rms"][i]),
                 rms_predicted=float(table["rms_predicted"][i]),
                 length_error=table["length_error"][of],

@@ -53,7 +53,7 @@ def _validation(record: CalibrationRecord) -> list[str]:
     """What cross-validation found, where it contradicts the uncertainty; and noise that the residuals contradict."""
     found = []
     validation = record.validation
-    if validation is not None and validation.excess > _HONEST:
+    if validation is not None and validation.surprising:
         found.append(
             f"Sockets left out one placement after the other err {validation.excess:.1f} times as much as their uncertainty predicts "
             f"({validation.rms:.3g} mm RMS against {validation.rms_predicted:.3g}, lengths {validation.length_rms:.3g} mm against "

@@ -46,6 +46,9 @@ class Covariance(NamedTuple):
     determined: Bool[Array, " p"]  # one by one, and not only in combination with others
     open: Float[Array, "p p"]  # projector onto the directions that are not determined, in natural steps
     noise: Noise  # given, or as estimated: one encoder for all
+    # Where the scale fix divided lengths that were held, they err by one common factor: its covariance with the parameters,
+    # and, last, its variance (relative); else 0.
+    stretch: Float[Array, " p+1"]
 
 
 class Linear(NamedTuple):
@@ -194,13 +197,15 @@ def tip_errors(
     if form == "estimated":
         unit = encoder_part(geometry, measurement.turns, jnp.asarray(ARCSEC))
         arcsec2, seat2 = _components(linear, measurement, unit, sigma, inverse)
-        found = Noise(encoder_arcsec=jnp.sqrt(arcsec2), seating=jnp.sqrt(seat2))
+        found = Noise(encoder_arcsec=_root(arcsec2), seating=_root(seat2))
         return arcsec2 * unit + seat2 * jnp.asarray(np.eye(3)[:, :, None]), found
     as_seat = Noise(seating=sigma) if noise is None else noise
     if form == "common":
         if noise is None:
             return common, as_seat
-        return sigma**2 * tip_covariances(geometry, measurement.turns, noise), noise
+        return sigma**2 * tip_covariances(geometry, measurement.turns, noise), Noise(
+            encoder_arcsec=sigma * noise.encoder_arcsec, seating=sigma * noise.seating
+        )
     redundancy = jnp.eye(3)[:, :, None] - linear.shares + jnp.einsum("paN,pbN->abN", linear.columns, gains.tips)
     # What the residual would be had the pose not taken part: redundancy^-1 r, by Cramer's rule.
     cofactors = jnp.stack([jnp.cross(redundancy[(i + 1) % 3], redundancy[(i + 2) % 3], axis=0) for i in range(3)])
@@ -255,6 +260,11 @@ def _components(
         jnp.where(apart & (encoder > 0), jnp.maximum(seat, 0.0), everything),
     )
     return encoder, seat
+
+
+def _root(value: Float[Array, ""]) -> Float[Array, ""]:
+    # The square root has no derivative at 0, where a variance that would be negative is put.
+    return jnp.where(value > 0, jnp.sqrt(jnp.where(value > 0, value, 1.0)), 0.0)
 
 
 def _trace(matrices: Float[Array, "3 3 k"]) -> Float[Array, ""]:

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .errors import InputError
+
 
 class Candidates(NamedTuple):
     """Rows of information that each candidate pose would add, whitened, and the socket that it is of.
@@ -83,7 +85,7 @@ def exchange(
         information += candidates.rows[best].T @ candidates.rows[best]
         if tell:
             tell(0.3 * (number + 1) / count)
-    best_value, best_chosen = np.inf, list(chosen)
+    best_value, best_chosen = goal.value(covariance_of(information, candidates.parameters)), list(chosen)
     for sweep in range(sweeps):
         for place in range(count):
             old = chosen[place]
@@ -135,4 +137,6 @@ def _best(candidates: Candidates, information: np.ndarray, goal: Goal, allowed: 
         weighed = inverse[:, :p] @ goal.weighed(inverse[:p, :p]) @ inverse[:p]
         outer = (flat @ weighed).reshape(candidates.rows.shape) @ candidates.rows.transpose(0, 2, 1)
         gain = np.trace(np.linalg.solve(inner, outer), axis1=1, axis2=2)
+    if not (allowed.any() and np.all(np.isfinite(gain))):
+        raise InputError("there are fewer candidate poses than poses to choose, or they add nothing; ask for more candidates.")
     return int(np.argmax(np.where(allowed, gain, -np.inf)))

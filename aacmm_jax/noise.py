@@ -11,6 +11,7 @@ from .arrays import Numbers, as_floats, is_concrete
 from .chain import Geometry, Turns, columns_of, walk
 from .errors import InputError
 
+_MOST = {"encoder_arcsec": 36_000.0, "seating": 100.0}  # ten degrees; mm
 ARCSEC = math.pi / (180 * 3600)  # rad
 
 
@@ -30,8 +31,12 @@ class Noise(eqx.Module):
         for what, values in (("encoder_arcsec", self.encoder), ("seating", self.seating)):
             if values.ndim > (what == "encoder_arcsec"):
                 raise InputError(f"{what} has shape {values.shape}; give one number{', or one a joint' * ('enc' in what)}.")
-            if is_concrete(values) and not np.all(np.isfinite(np.asarray(values)) & (np.asarray(values) >= 0)):
-                raise InputError(f"{what} must be a standard deviation: zero or positive, and finite.")
+            if values.size == 0:
+                raise InputError(f"{what} is empty; give one number, or one a joint.")
+            if is_concrete(values) and np.any(np.asarray(values) < 0):
+                raise InputError(f"{what} must be a standard deviation: zero or positive.")
+            if is_concrete(values) and np.any(np.asarray(values) > _MOST[what]):
+                raise InputError(f"{what} is over {_MOST[what]:g}, which no arm's is; is it in another unit?")
 
     @property
     def encoder_arcsec(self) -> Float[Array, "..."]:

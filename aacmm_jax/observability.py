@@ -95,6 +95,8 @@ def observe(arm: Arm, capture: Capture, space: Parameters | None = None, *, nois
     """
     space = Parameters.free_of(arm) if space is None else space
     check_fit(capture, space)
+    if noise is not None:
+        noise.check(arm.joints)
     base = space.arm(space.vector(arm))
     spectrum = _spectrum(base, base, capture, space, noise)
     if spectrum.rank < len(space.names):

@@ -30,6 +30,7 @@ _PLACES, _TRIED_WELL, _MOVED, _AT_FIRST = 500, 8, 40, 1000
 _POWER = 8.0  # nearly the largest
 _RANDOM_SETS, _LOOSE_SETS = 50, 10
 _LOOSE = math.radians(5)
+_U = (1e-6, 100.0)  # mm
 _LEAST = 2  # poses in a socket: one shows no scatter
 
 
@@ -121,7 +122,7 @@ def plan(
         noise=noise,
         criterion=criterion,
         check_length=check_length,
-        **_predictions(scene, place, given, q, owner, check_length, seed),
+        **_predictions(scene, place, given, q, owner, check_length, np.asarray(limits_of(arm, limits)), seed),
     )
     unseen = observe(arm, found.capture(), space)
     if unseen.rank < len(space.names):
@@ -141,6 +142,10 @@ def _scene(
 ) -> Scene:
     if not is_single(arm):
         raise InputError("plan takes one arm, not a batch; take one of it first.")
+    if arm.joints < 3 or links_of(arm) == 0:
+        raise InputError("this arm reaches no volume (three joints and some link are the least), so there is nothing to plan.")
+    if seed < 0:
+        raise InputError(f"seed is {seed}; give zero or a positive number.")
     if criterion not in CRITERIA:
         raise InputError(f"criterion is '{criterion}'; it must be one of {', '.join(CRITERIA)}.")
     noise.check(arm.joints)
@@ -171,12 +176,15 @@ def _choices(
     scene: Scene, sockets: Any, poses: int, length: Any, u: float, lengths: Sequence[tuple], region: Any
 ) -> tuple[list[str], list[Place]]:
     """Names of the sockets, and the places to choose from: one, where they are given."""
-    if not (math.isfinite(u) and u > 0):
-        raise InputError(f"u of the reference length is {u:g} mm; give its standard uncertainty, more than zero.")
+    for own in (u, *(float(pair[2]) for pair in lengths if len(pair) > 2)):
+        if not _U[0] <= own <= _U[1]:
+            raise InputError(
+                f"u of a reference length is {own:g} mm; give its standard uncertainty, from {_U[0]:g} to {_U[1]:g} mm."
+            )
     number = len(sockets) if isinstance(sockets, Mapping) else sockets
     if number < 1 or poses < _LEAST * number:
         raise InputError(f"{poses} poses are too few for {number} sockets: at least {_LEAST} in each, and one socket at least.")
-    unknowns = len(scene.space.names) + 3 * number - number // 2
+    unknowns = len(scene.space.names) + 3 * number - (len(lengths) if isinstance(sockets, Mapping) else number // 2)
     if 3 * poses < unknowns:
         raise InputError(
             f"{poses} poses in {number} sockets give fewer equations than the {unknowns} unknowns; take {-(-unknowns // 3)} at least."
@@ -190,11 +198,24 @@ def _choices(
                     raise InputError(
                         f"reference length {pair[0]}, {pair[1]} names the unknown socket '{end}'{nearest(end, names)}"
                     )
+        if len({frozenset(pair[:2]) for pair in lengths}) < len(lengths):
+            raise InputError("a reference length is named twice; its certified value counts once, so name it once.")
+        if any(len(set(pair[:2])) < 2 for pair in lengths):
+            raise InputError("a reference length joins a socket to itself; name two different sockets.")
+        for i, one in enumerate(names):
+            for other in names[:i]:
+                if np.linalg.norm(np.asarray(points[one] - points[other])) < 1:
+                    raise InputError(f"sockets '{other}' and '{one}' stand in one place; move one, or take them as one.")
         ends = tuple((names.index(pair[0]), names.index(pair[1])) for pair in lengths)
         own = tuple(float(pair[2]) if len(pair) > 2 else u for pair in lengths)
         return names, [Place(np.array([np.asarray(point) for point in points.values()]), ends, own)]
     if lengths:
         raise InputError("lengths are between sockets that are given; with a number of sockets, give length and u.")
+    for axis, (least, most) in region.items():
+        if not least < most:
+            raise InputError(
+                f"the region's {axis} is {least:g} to {most:g} mm, which is no range; give the lower number first."
+            )
     low, high = (length, length) if isinstance(length, int | float) else length
     if not 0 < low <= high < 2 * links_of(scene.arm):
         raise InputError(
@@ -280,10 +301,17 @@ def _sorted(q: Float[np.ndarray, "N n"], owner: Int[np.ndarray, " N"]) -> tuple[
 
 
 def _predictions(
-    scene: Scene, place: Place, given: _Given, q: np.ndarray, owner: np.ndarray, length: float, seed: int
+    scene: Scene,
+    place: Place,
+    given: _Given,
+    q: np.ndarray,
+    owner: np.ndarray,
+    length: float,
+    allowed: np.ndarray,
+    seed: int,
 ) -> dict[str, Prediction]:
     """Of the plan, of random poses in its sockets, of the plan carried out loosely, and of ten poses more."""
-    functions = _functions(scene.arm, scene.space, _CHECKED, length, scene.limits, seed + 2)
+    functions = _functions(scene.arm, scene.space, _CHECKED, length, allowed, seed + 2)
 
     def of(rows: np.ndarray) -> Prediction:
         information = given.candidates.base + np.einsum("cki,ckj->ij", rows, rows)

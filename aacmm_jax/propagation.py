@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .arm import Arm
+from .arm import Arm, parameter_names
 from .covariance import (
     LEAST_SIGMA,
     Covariance,
@@ -22,7 +22,7 @@ from .covariance import (
     tip_errors,
 )
 from .noise import Noise
-from .parameters import Parameters
+from .parameters import Parameters, is_length
 from .residuals import Measurement, Weighing
 from .scale import Scale, scale_and_shares
 
@@ -93,7 +93,17 @@ def of_division(
         -shift[:, None] * by_k.lengths[None],
     )
     matrix = covariance_of(gains, before.linear, measurement, before.errors) + surplus * shift[:, None] * shift[None, :]
-    return before._replace(gains=gains, spread=before.spread._replace(matrix=_in_units(matrix, space)))
+    spread = before.spread._replace(matrix=_in_units(matrix, space))
+    if any(is_length(name) and name not in ("d_1", *space.names) for name in parameter_names(arm)):
+        # Held lengths are divided too: they err by -dk / k, all alike.
+        both = Gains(
+            jnp.concatenate([gains.tips, -by_k.tips[None] / k.value]),
+            jnp.concatenate([gains.lengths, -by_k.lengths[None] / k.value]),
+        )
+        row = covariance_of(both, before.linear, measurement, before.errors)[-1]
+        row = row + surplus * jnp.append(shift, 1 / k.value) / k.value
+        spread = spread._replace(stretch=row * jnp.append(space.scale, 1.0))
+    return before._replace(gains=gains, spread=spread)
 
 
 def scale(tips: Float[Array, "N 3"], measurement: Measurement, propagated: Propagated, sigma: Float[Array, ""]) -> Scale:
@@ -142,7 +152,7 @@ def _propagated(
     errors, behind = tip_errors(form, arm, measurement, linear, gains, inverse, _typical(linear, measurement, sigma), noise)
     matrix = _in_units(covariance_of(gains, linear, measurement, errors), space)
     determined = fixed | (jnp.diagonal(lost) < 1e-6)
-    return Propagated(linear, gains, errors, Covariance(matrix, determined, lost, behind))
+    return Propagated(linear, gains, errors, Covariance(matrix, determined, lost, behind, jnp.zeros(len(space.names) + 1)))
 
 
 def _typical(linear: Linear, measurement: Measurement, sigma: Float[Array, ""]) -> Float[Array, ""]:

@@ -1,5 +1,6 @@
 """What an identification, a calibration and a cross-validation return."""
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -152,9 +153,10 @@ def active_names(space: Parameters, active: Numbers) -> dict[str, str]:
 
 
 class LeftOut(NamedTuple):
-    """One group of sockets that an arm was not identified from; mm."""
+    """One group of sockets that an arm was not identified from; mm. Infinite predictions: the others leave something open."""
 
     sockets: tuple[str, ...]
+    poses: int  # in sockets with more than one
     rms: float  # distance from the socket's centroid, found
     rms_predicted: float  # root of the mean square that the uncertainty predicts
     length_error: Float[np.ndarray, " l"]
@@ -163,34 +165,66 @@ class LeftOut(NamedTuple):
 
 
 class CrossValidation(NamedTuple):
-    """Every group of sockets left out once."""
+    """Every group of sockets left out once. Figures are of what the remaining groups determine."""
 
     groups: tuple[LeftOut, ...]
 
     @property
     def rms(self) -> float:
-        """Root mean square distance from the socket's centroid over all groups, mm."""
-        return float(np.sqrt(np.mean([group.rms**2 for group in self.groups])))
+        """Root mean square distance from the socket's centroid over the poses of all groups, mm."""
+        return self._pooled([group.rms for group in self.groups])
 
     @property
     def rms_predicted(self) -> float:
         """What the uncertainties of the calibrations without them predicted, mm."""
-        return float(np.sqrt(np.mean([group.rms_predicted**2 for group in self.groups])))
+        return self._pooled([group.rms_predicted for group in self.groups])
+
+    def _pooled(self, values: list[float]) -> float:
+        counted = [
+            (group.poses, value)
+            for group, value in zip(self.groups, values, strict=True)
+            if group.poses and np.isfinite(group.rms_predicted)
+        ]
+        total = sum(poses for poses, _ in counted)
+        return float(np.sqrt(sum(poses * value**2 for poses, value in counted) / total)) if total else float("nan")
+
+    def _lengths(self) -> tuple[np.ndarray, np.ndarray]:
+        errors, u = (np.concatenate([getattr(group, what) for group in self.groups]) for what in ("length_error", "length_u"))
+        return errors[np.isfinite(u)], u[np.isfinite(u)]
 
     @property
     def length_rms(self) -> float:
         """Root mean square error of the reference lengths, mm."""
-        errors = np.concatenate([group.length_error for group in self.groups])
-        return float(np.sqrt(np.mean(errors**2)))
+        errors, _ = self._lengths()
+        return float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan")
 
     @property
     def length_u(self) -> float:
         """Root mean square of the predicted standard uncertainties of these errors, mm."""
-        return float(np.sqrt(np.mean(np.concatenate([group.length_u for group in self.groups]) ** 2)))
+        _, u = self._lengths()
+        return float(np.sqrt(np.mean(u**2))) if len(u) else float("nan")
+
+    @property
+    def open(self) -> int:
+        """How many groups the others cannot predict, because without them something is not determined."""
+        return sum(not np.all(np.isfinite(group.length_u)) or group.rms_predicted == np.inf for group in self.groups)
+
+    def ratios(self) -> list[tuple[float, int]]:
+        """Found over predicted, of poses and of lengths, and from how many numbers each; those that are known."""
+        pairs = [
+            (self.rms, self.rms_predicted, 3 * sum(group.poses for group in self.groups)),
+            (self.length_rms, self.length_u, len(self._lengths()[0])),
+        ]
+        return [(found / predicted, count) for found, predicted, count in pairs if predicted > 0 and np.isfinite(found)]
 
     @property
     def excess(self) -> float:
-        """By how much errors exceed what was predicted, the worse of both figures: 1 where the uncertainty is honest."""
-        ratios = [self.rms / self.rms_predicted] if self.rms_predicted > 0 else []
-        ratios += [self.length_rms / self.length_u] if self.length_u > 0 else []
-        return max(ratios, default=float("nan"))
+        """By how much errors exceed what was predicted, the worse of both figures: about 1 where the uncertainty is honest."""
+        return max((ratio for ratio, _ in self.ratios()), default=float("nan"))
+
+    @property
+    def surprising(self) -> bool:
+        """Whether errors exceed their prediction by half, and by more than chance would allow in one case of a hundred."""
+        from scipy import stats
+
+        return any(ratio > max(1.5, math.sqrt(stats.chi2.ppf(0.99, count) / count)) for ratio, count in self.ratios())

@@ -3,9 +3,11 @@
 import math
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from .arm import Arm
 from .batch import calibrate_many
@@ -15,6 +17,7 @@ from .independence import settled
 from .noise import Noise
 from .parameters import Parameters
 from .results import Calibration
+from .scale import divide_lengths
 from .uncertainty import check_lengths, default_length, uncertainty_of
 
 _LENGTHS = 24  # lengths over the volume that are followed besides the parameters and k
@@ -30,7 +33,7 @@ class Sampled(NamedTuple):
     quantities: tuple[str, ...]
     estimate: Float[np.ndarray, " q"]  # of the calibration itself
     u: Float[np.ndarray, " q"]
-    low: Float[np.ndarray, " q"]  # shortest-tail-free interval: equal shares on both sides
+    low: Float[np.ndarray, " q"]  # equal shares beyond both ends
     high: Float[np.ndarray, " q"]
     linear_u: Float[np.ndarray, " q"]  # what the law of propagation says
     factor: float  # of the linear interval
@@ -94,10 +97,16 @@ def monte_carlo(
     """
     if digits not in (1, 2):
         raise InputError(f"digits is {digits}; give 1 or 2 significant digits of the uncertainty.")
-    if not 0 < level < 1:
-        raise InputError(f"level is {level:g}; give a share between 0 and 1, for example 0.95.")
+    if not 0 < level <= 0.9999:
+        raise InputError(f"level is {level:g}; give a share between 0 and 0.9999, for example 0.95.")
+    if not isinstance(result, Calibration):
+        raise InputError("monte_carlo repeats a whole calibration; give the result of aj.calibrate.")
+    if noise is not None:
+        noise.check(result.arm.joints)
     noise = result.noise if noise is None else noise
     block = max(math.ceil(100 / (1 - level)), 10_000)
+    if most < block:
+        raise InputError(f"most is {most}, but one block of trials has {block}; allow that many at least.")
     task = _Task.of(result, capture, lengths)
     exact, moves = _exact(result.arm, capture)
     true_lengths = np.asarray(_lengths_by(result.arm, capture))
@@ -105,13 +114,21 @@ def monte_carlo(
     stable = False
     while sum(map(len, drawn)) + failed < most and not stable:
         random = np.random.default_rng([seed, len(drawn)])
-        seats = float(noise.seating) * random.normal(size=(block, *exact.shape[:1], 3))
-        readings = exact + np.einsum("Nic,tNc->tNi", moves, seats)
-        readings += np.asarray(noise.encoder) * random.normal(size=readings.shape)
-        values = true_lengths + task.u * random.normal(size=(block, len(task.u)))
-        found, lost = task.solved(readings, values)
+        pieces = []
+        for count in _slices(block, exact.size):
+            # Noise estimated with few degrees of freedom is itself uncertain: its scale is drawn too, which gives Student's t
+            # (JCGM 101, 6.4.9).
+            known = math.isinf(result.freedom)
+            level_of = 1.0 if known else np.sqrt(result.freedom / random.chisquare(result.freedom, size=(count, 1, 1)))
+            seats = float(noise.seating) * level_of * random.normal(size=(count, *exact.shape[:1], 3))
+            readings = exact + np.einsum("Nic,tNc->tNi", moves, seats)
+            readings += np.asarray(noise.encoder) * level_of * random.normal(size=readings.shape)
+            values = true_lengths + task.u * random.normal(size=(count, len(task.u)))
+            solved, lost = task.solved(readings, values)
+            pieces.append(solved)
+            failed += lost
+        found = np.concatenate(pieces)
         drawn.append(found)
-        failed += lost
         if len(found) < 10:
             raise InputError("hardly any Monte Carlo trial converges; widen the bounds, or look at the calibration first.")
         low, high = np.quantile(found, [(1 - level) / 2, (1 + level) / 2], axis=0)
@@ -156,11 +173,17 @@ def _unsettled(blocks: list[np.ndarray]) -> Float[np.ndarray, " q"]:
     return 2 * np.std(blocks, axis=0, ddof=1).max(axis=0) / math.sqrt(count)
 
 
+def _slices(block: int, numbers: int) -> list[int]:
+    """A block of trials in pieces whose readings take 200 MB at most."""
+    most = max(int(2.5e7 / numbers), 1)
+    return [min(most, block - first) for first in range(0, block, most)]
+
+
 def _exact(arm: Arm, capture: Capture) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n 3"]]:
     """Poses that hold their socket exactly, and the least change of the joints for each mm that the tip shall move."""
     q = settled(arm, capture)
     by_joints = np.asarray(arm.jacobian(q, [f"q_{i}" for i in range(1, arm.joints + 1)]))
-    return q, np.linalg.pinv(by_joints)
+    return q, np.linalg.pinv(by_joints, rcond=1e-8)
 
 
 def _lengths_by(arm: Arm, capture: Capture) -> np.ndarray:
@@ -181,6 +204,10 @@ class _Task(NamedTuple):
 
     @classmethod
     def of(cls, result: Calibration, capture: Capture, lengths: tuple[np.ndarray, np.ndarray] | None) -> "_Task":
+        if lengths is not None and (
+            len(lengths) != 2 or np.ndim(lengths[0]) != 2 or np.shape(lengths[0]) != np.shape(lengths[1])
+        ):
+            raise InputError("lengths must be two arrays of poses, (v, n) each: where each length starts, and where it ends.")
         start, end = lengths or check_lengths(result.arm, _LENGTHS, length=default_length(result.arm))
         u = np.array([float(length.u) for length in capture.lengths])
         return cls(result, capture, np.asarray(start), np.asarray(end), u)
@@ -188,7 +215,7 @@ class _Task(NamedTuple):
     def solved(self, q: Float[np.ndarray, "t N n"], values: Float[np.ndarray, "t l"]) -> tuple[np.ndarray, int]:
         """Outputs of the trials that converged ``(t, q)``, and how many did not."""
         result = self.result
-        given = result.noise if result.form == "given" else None
+        given = None if result.stage1.misfit is None else result.noise  # weighed as the calibration was
         many = calibrate_many(
             result.stage1.arm,
             batch_of(self.capture, q, values),
@@ -201,19 +228,20 @@ class _Task(NamedTuple):
             noise=given,
         )
         good = many.converged
-        found = np.hstack([many.parameters, many.k[:, None], self._measured(many.parameters)])
+        lengths = self._measured(many.stage1.parameters if self.divided else many.parameters, many.k)
+        found = np.hstack([many.parameters, many.k[:, None], lengths])
         return found[good], int(np.sum(~good))
 
-    def _measured(self, parameters: Float[np.ndarray, "t p"]) -> Float[np.ndarray, "t v"]:
-        """The followed lengths by each trial's arm."""
-        arms = self.result.space.arm
-        import jax
+    @property
+    def divided(self) -> bool:
+        """Whether the scale fix divided every length, held ones too."""
+        return self.result.method == "two-stage"
 
-        def one(vector):
-            arm = arms(vector)
-            return jnp.linalg.norm(arm.position(self.start) - arm.position(self.end), axis=-1)
-
-        return np.asarray(jax.jit(lambda rows: jax.lax.map(one, rows, batch_size=256))(jnp.asarray(parameters)))
+    def _measured(self, parameters: Float[np.ndarray, "t p"], k: Float[np.ndarray, " t"]) -> Float[np.ndarray, "t v"]:
+        """The followed lengths by each trial's arm: of the joint solve, or of stage 1 and divided by k."""
+        base = Parameters(self.result.stage1.arm if self.divided else self.result.arm, self.result.space.names)
+        ends = (jnp.asarray(self.start), jnp.asarray(self.end))
+        return np.asarray(_lengths_of(base, jnp.asarray(parameters), jnp.asarray(k), ends, self.divided))
 
     def sampled(self, result: Calibration, values: np.ndarray, stable: bool, failed: int, level: float, digits: int) -> Sampled:
         """The trials' distribution beside the linear result."""
@@ -221,9 +249,9 @@ class _Task(NamedTuple):
         u_length = np.asarray(linear.length(self.start, self.end))
         u = values.std(axis=0, ddof=1)
         low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
-        estimate = np.concatenate(
-            [result.parameters, [result.scale.value], self._measured(np.asarray(result.parameters)[None])[0]]
-        )
+        start, end = (np.asarray(result.arm.position(q)) for q in (self.start, self.end))
+        lengths = np.linalg.norm(start - end, axis=1)
+        estimate = np.concatenate([result.parameters, [result.scale.value], lengths])
         return Sampled(
             quantities=(*result.space.names, "k", *(f"length {i + 1}" for i in range(len(self.start)))),
             estimate=estimate,
@@ -241,10 +269,18 @@ class _Task(NamedTuple):
         )
 
 
+@eqx.filter_jit
+def _lengths_of(space: Parameters, parameters: Array, k: Array, ends: tuple[Array, Array], divided: bool) -> Array:
+    def one(row: tuple[Array, Array]) -> Array:
+        arm = space.arm(row[0])
+        arm = divide_lengths(arm, row[1]) if divided else arm
+        return jnp.linalg.norm(arm.position(ends[0]) - arm.position(ends[1]), axis=-1)
+
+    return jax.lax.map(one, (parameters, k), batch_size=256)
+
+
 def batch_of(capture: Capture, q: Float[np.ndarray, "t N n"], values: Float[np.ndarray, "t l"]) -> Capture:
     """A batch of captures like this one with other readings and certified lengths; nothing is checked."""
-    import equinox as eqx
-
     names = range(len(capture.lengths))
     leaves = lambda c: [c.q, *(c.lengths[i].value for i in names), *(c.lengths[i].u for i in names)]  # noqa: E731
     spread = [jnp.asarray(np.broadcast_to(np.asarray(length.u), len(q))) for length in capture.lengths]

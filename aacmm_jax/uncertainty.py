@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .arm import Arm
-from .arrays import Numbers
+from .arm import Arm, parameter_names
+from .arrays import Numbers, is_concrete
 from .calibration_files import CalibrationRecord
 from .chain import turns_of
 from .errors import InputError
 from .independence import moved_onto
 from .noise import Noise, tip_covariances
-from .parameters import Parameters
+from .parameters import Parameters, is_length
 from .results import Calibration, Identification
 from .simulate import limits_of
 
@@ -34,6 +34,7 @@ class Uncertainty(eqx.Module):
 
     arm: Arm
     covariance: Float[Array, "p p"]
+    stretch: Float[Array, " p+1"]  # of lengths that were held but divided by k (see `covariance.Covariance`)
     open: Float[Array, "p p"]  # projector onto undetermined directions, natural steps
     noise: Noise
     u_k: Float[Array, ""] | None
@@ -60,6 +61,8 @@ class Uncertainty(eqx.Module):
 
     def correlated(self, least: float = 0.9) -> list[tuple[str, str, float]]:
         """Pairs of parameters whose correlation is at least so strong, the strongest first: (name, name, correlation)."""
+        if not 0 <= least <= 1:
+            raise InputError(f"least is {least:g}; give a correlation between 0 and 1.")
         table = np.asarray(self.correlation)
         pairs = [(i, j) for i in range(len(table)) for j in range(i) if abs(table[i, j]) >= least]
         found = [(self.names[j], self.names[i], float(table[i, j])) for i, j in pairs]
@@ -76,26 +79,50 @@ class Uncertainty(eqx.Module):
 
     def tip(self, q: Numbers, *, reading: bool = False) -> Float[Array, "... 3 3"]:
         """Covariance of the tip's position in the base frame at joint angles ``(..., n)``, mm^2."""
-        q = self.arm._checked(q)
-        slope = self.arm.jacobian(q, self.names)
-        spread = slope @ self.covariance @ jnp.swapaxes(slope, -1, -2)
-        if reading:
-            spread = spread + self._read(q)
-        return jnp.where(self._lost(slope)[..., None], jnp.inf, spread)
+        q = self._poses(q)
+        spread = self.spread_of(self.slopes(q))
+        return spread + self._read(q) if reading else spread
 
     def length(self, start: Numbers, end: Numbers, *, reading: bool = False) -> Float[Array, "..."]:
         """Standard uncertainty of the distance between the tips at two poses, ``(..., n)`` each, mm."""
-        start, end = self.arm._checked(start), self.arm._checked(end)
+        start, end = self._poses(start), self._poses(end)
+        try:
+            np.broadcast_shapes(start.shape, end.shape)
+        except ValueError as error:
+            raise InputError(f"the poses have shapes {start.shape} and {end.shape}; give as many ends as starts.") from error
         between = self.arm.position(end) - self.arm.position(start)
+        if is_concrete(between) and np.any(np.linalg.norm(between, axis=-1) < 1e-6):
+            raise InputError("both poses put the tip in the same place, so there is no length between them; give others.")
         direction = between / jnp.linalg.norm(between, axis=-1, keepdims=True)
-        slope = self.arm.jacobian(end, self.names) - self.arm.jacobian(start, self.names)
-        along = jnp.einsum("...c,...cp->...p", direction, slope)
-        variance = jnp.einsum("...p,pr,...r->...", along, self.covariance, along)
+        along = jnp.einsum("...c,...cp->...p", direction, self.slopes(end) - self.slopes(start))
+        variance = self.spread_of(along[..., None, :])[..., 0, 0]
         if reading:
             both = self._read(start) + self._read(end)
             variance = variance + jnp.einsum("...c,...cd,...d->...", direction, both, direction)
-        lost = self._lost(along[..., None, :])[..., 0]
-        return jnp.where(lost, jnp.inf, jnp.sqrt(variance))
+        return jnp.sqrt(variance)
+
+    def slopes(self, q: Float[Array, "... n"]) -> Float[Array, "... 3 p+1"]:
+        """Derivatives of the tip by the free parameters and, last, by a stretch of the lengths that were held."""
+        free = self.arm.jacobian(q, self.names)
+        held = [n for n in parameter_names(self.arm) if is_length(n) and n not in ("d_1", *self.names)]
+        if not held:
+            return jnp.concatenate([free, jnp.zeros((*free.shape[:-1], 1))], axis=-1)
+        values = Parameters(self.arm, tuple(held)).vector()
+        return jnp.concatenate([free, (self.arm.jacobian(q, held) @ values)[..., None]], axis=-1)
+
+    def spread_of(self, slopes: Float[Array, "... k p+1"]) -> Float[Array, "... k k"]:
+        """Covariance of functions with these derivatives (as `slopes` gives them); infinite where they follow what is open."""
+        p = len(self.names)
+        upper = jnp.concatenate([self.covariance, self.stretch[:-1, None]], axis=1)
+        whole = jnp.concatenate([upper, self.stretch[None]])
+        spread = slopes @ whole @ jnp.swapaxes(slopes, -1, -2)
+        return jnp.where(self._lost(slopes[..., :p])[..., None], jnp.inf, spread)
+
+    def _poses(self, q: Numbers) -> Float[Array, "... n"]:
+        q = self.arm._checked(q)
+        if is_concrete(q) and not np.all(np.isfinite(np.asarray(q))):
+            raise InputError("a joint angle is not finite; give angles in rad.")
+        return q
 
     def _read(self, q: Float[Array, "... n"]) -> Float[Array, "... 3 3"]:
         flat = q.reshape(-1, q.shape[-1])
@@ -114,6 +141,7 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         return Uncertainty(
             arm=result.calibrated.arm,
             covariance=jnp.asarray(result.covariance),
+            stretch=jnp.asarray(result.stretch),
             open=jnp.asarray(result.open),
             noise=result.noise,
             u_k=jnp.asarray(result.u_k),
@@ -124,6 +152,7 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
     return Uncertainty(
         arm=result.arm,
         covariance=result.covariance,
+        stretch=result.spread.stretch,
         open=result.spread.open,
         noise=result.noise,
         u_k=None if scale is None else scale.u,
@@ -155,7 +184,7 @@ class Volume(NamedTuple):
             values = getattr(self, name)
             found |= {
                 f"{name}_median_mm": float(np.median(values)),
-                f"{name}_95_mm": float(np.quantile(values, 0.95)),
+                f"{name}_95_mm": float(np.quantile(values, 0.95, method="higher")),  # no sum, so infinite ones are allowed
                 f"{name}_largest_mm": float(np.max(values)),
             }
         return found
@@ -168,6 +197,8 @@ def over_volume(
 
     Points are where random poses within the joint limits take the tip. Raises `InputError` where no length fits.
     """
+    if not isinstance(uncertainty, Uncertainty):
+        raise InputError("over_volume takes an uncertainty; make one of a calibration with aj.uncertainty_of(result).")
     length = default_length(uncertainty.arm) if length is None else length
     start, end = check_lengths(uncertainty.arm, points, length=length, limits=limits, seed=seed)
     tips, spread, plain, read = _volume(uncertainty, jnp.asarray(start), jnp.asarray(end))
@@ -204,7 +235,10 @@ def check_lengths(
         raise InputError(f"a length of {length:g} mm does not fit into the volume of this arm; give a shorter one.")
     if count < 1:
         raise InputError(f"{count} points cannot be looked at; give at least one.")
-    random, allowed = np.random.default_rng(seed), np.asarray(limits_of(arm, limits))
+    random, allowed = (
+        np.random.default_rng(seed),
+        np.asarray(limits_of(arm, None if limits is None else np.asarray(limits).tolist())),
+    )
     draw = lambda m: random.uniform(allowed[:, 0], allowed[:, 1], (m, arm.joints))  # noqa: E731
     if length is None:
         return draw(count), draw(count)

@@ -30,10 +30,14 @@ def groups_of(capture: Capture) -> tuple[tuple[str, ...], ...]:
     )
 
 
-def can_cross_validate(capture: Capture) -> bool:
-    """Whether each group can be left out with a length to spare for the scale, and is worth trying."""
-    with_lengths = {group for group in groups_of(capture) if any(length.start in group for length in capture.lengths)}
-    return len(with_lengths) >= 2
+def can_cross_validate(capture: Capture, parameters: int) -> bool:
+    """Whether each group can be left out, and what remains holds a reference length and enough poses for so many parameters."""
+    groups = groups_of(capture)
+    with_lengths = {group for group in groups if any(length.start in group for length in capture.lengths)}
+    if len(with_lengths) < 2:
+        return False
+    poses = {group: sum(capture.sizes[capture.names.index(name)] - 1 for name in group) for group in groups}
+    return 3 * (sum(poses.values()) - max(poses.values())) >= parameters
 
 
 def cross_validate(
@@ -50,18 +54,25 @@ def cross_validate(
     Where errors exceed what the uncertainty predicts, the model misses something (joints that give, eccentric encoders) that
     poses alike to those identified from do not show. Raises `InputError` where fewer than two groups hold a reference length.
     """
-    if not can_cross_validate(capture):
+    if not can_cross_validate(capture, len(bounds.space.names)):
         raise InputError(
-            "cross-validation leaves sockets out with their reference lengths, so it needs two groups of sockets that each hold "
-            "one; place the reference length somewhere else too."
+            "cross-validation leaves sockets out with their reference lengths, so it needs two groups of sockets that each hold a "
+            "length, and without the largest of them poses enough for the parameters; place the reference length somewhere else too, "
+            "or do without (--no-cross-validate)."
         )
     found = []
     for group in groups_of(capture):
-        rest = capture.select(without=list(group)) if len(group) < len(capture.names) else capture
+        rest = _part(capture, tuple(name for name in capture.names if name not in group))
         result = calibrate(arm, rest, bounds, method=method, hold=hold, noise=noise)
-        left = capture.select(only=list(group))
+        left = _part(capture, group)
         found.append(_tried(uncertainty_of(result), left, group, bool(result.converged)))
     return CrossValidation(tuple(found))
+
+
+def _part(capture: Capture, names: tuple[str, ...]) -> Capture:
+    """Sockets by their exact names, which `Capture.select` would take for patterns."""
+    lengths = [length for length in capture.lengths if length.start in names and length.end in names]
+    return Capture({name: q for name, q in capture.sockets.items() if name in names}, lengths)
 
 
 def _tried(uncertainty: Uncertainty, left: Capture, group: tuple[str, ...], converged: bool) -> LeftOut:
@@ -69,6 +80,7 @@ def _tried(uncertainty: Uncertainty, left: Capture, group: tuple[str, ...], conv
     predicted, length_u = predicted_errors(uncertainty, left)
     return LeftOut(
         sockets=group,
+        poses=sum(size for size in left.sizes if size > 1),
         rms=float(evaluation.repeatability.rms),
         rms_predicted=float(predicted),
         length_error=np.asarray(evaluation.error),
@@ -82,14 +94,14 @@ def predicted_errors(uncertainty: Uncertainty, capture: Capture) -> tuple[Float[
     from the sockets' centroids, and the standard uncertainty of the error of every reference length."""
     arm, owner = uncertainty.arm, capture.owner
     sizes = np.asarray(capture.sizes, dtype=float)
-    slopes = np.asarray(arm.jacobian(capture.q, uncertainty.names))
+    slopes = np.asarray(uncertainty.slopes(capture.q))
     averaging = (owner[None, :] == np.arange(len(sizes))[:, None]) / sizes[:, None]
     means = np.einsum("sN,Ncp->scp", averaging, slopes)
     centred = slopes - means[owner]
-    matrix = np.asarray(uncertainty.covariance)
     reading = np.asarray(tip_covariances(arm.geometry, turns_of(capture.q), uncertainty.noise))
-    squares = np.einsum("Ncp,pr,Ncr->N", centred, matrix, centred) + np.einsum("ccN->N", reading) * (1 - 1 / sizes[owner])
-    spread = sizes[owner] > 1
+    squares = np.trace(np.asarray(uncertainty.spread_of(jnp.asarray(centred))), axis1=1, axis2=2)
+    squares = squares + np.einsum("ccN->N", reading) * (1 - 1 / sizes[owner])
+    scattered = sizes[owner] > 1
     centroids = averaging @ np.asarray(arm.position(capture.q))
     ends = capture.ends()
     between = centroids[ends[:, 1]] - centroids[ends[:, 0]]
@@ -98,5 +110,5 @@ def predicted_errors(uncertainty: Uncertainty, capture: Capture) -> tuple[Float[
     of_means = np.einsum("sN,cdN->scd", averaging**2, reading)
     scatter = np.einsum("lc,lcd,ld->l", direction, of_means[ends[:, 0]] + of_means[ends[:, 1]], direction)
     own = np.array([float(length.u) for length in capture.lengths])
-    variance = np.einsum("lp,pr,lr->l", along, matrix, along) + scatter + own**2
-    return jnp.sqrt(jnp.asarray(squares[spread].mean() if spread.any() else np.nan)), jnp.asarray(np.sqrt(variance))
+    variance = np.asarray(uncertainty.spread_of(jnp.asarray(along[:, None, :])))[:, 0, 0] + scatter + own**2
+    return jnp.sqrt(jnp.asarray(squares[scattered].mean() if scattered.any() else np.nan)), jnp.asarray(np.sqrt(variance))

@@ -193,7 +193,7 @@ def bounded(trials: int = 10_000) -> dict:
         drawn, lengths = drawn_of(study, trials), lengths_over_volume(study.nominal.arm)
         p = len(study.space.names)
         for method, hold in (("joint", "d_3"), ("two-stage", None)):
-            errors, u, factor, active, good = calibrated(study, drawn, lengths, method, NOISE, "given", hold)
+            errors, u, factor, active, _ = calibrated(study, drawn, lengths, method, NOISE, "given", hold)
             held = np.any(active != 0, axis=1)
             outside = np.any((drawn.true < drawn.lower) | (drawn.true > drawn.upper), axis=1)
             inside = (np.abs(errors) <= factor * u).astype(float)
@@ -225,8 +225,8 @@ def planned(sets: int = 100) -> dict:
     for name, sockets, poses, lengths in (
         ("70 random: 60 and 10 in the demonstration's sockets", {k: given[k] for k in "AB"}, {"A": 60, "B": 10}, [("A", "B", 0.002)]),
         ("70 random: 35 and 35 in the demonstration's sockets", {k: given[k] for k in "AB"}, 35, [("A", "B", 0.002)]),
-        ("70 random in the last plan's sockets", planned_sockets, dict(zip("ABCD", (18, 18, 17, 17))), [("A", "B", 0.002), ("C", "D", 0.002)]),
-        ("25 random in the last plan's sockets", planned_sockets, dict(zip("ABCD", (7, 6, 6, 6))), [("A", "B", 0.002), ("C", "D", 0.002)]),
+        ("70 random in the last plan's sockets", planned_sockets, {"A": 18, "B": 18, "C": 17, "D": 17}, [("A", "B", 0.002), ("C", "D", 0.002)]),
+        ("25 random in the last plan's sockets", planned_sockets, {"A": 7, "B": 6, "C": 6, "D": 6}, [("A", "B", 0.002), ("C", "D", 0.002)]),
     ):  # fmt: skip
         rows = [
             judged(arm, space, aj.simulate(arm, sockets, poses=poses, lengths=[(*pair[:2], 0.0) for pair in lengths], seed=s), start, end, 100)

@@ -218,7 +218,9 @@ def calibrate(
             lambda: run(bounds.space.base, capture_used, bounds, **solving, max_steps=max_steps, strict=strict),
         )
         record = record_of(result, recording)
-        if cross_validate or (cross_validate is None and recording.true is None and _several(capture_used)):
+        if cross_validate or (
+            cross_validate is None and recording.true is None and _several(capture_used, len(bounds.space.names))
+        ):
             from ..validation import cross_validate as validated
 
             found = _busy("Cross-validating", lambda: validated(bounds.space.base, capture_used, bounds, **solving))
@@ -344,13 +346,13 @@ def show(
         _show(calibration_summary(load_calibration(file)), as_json, display.calibration)
 
 
-def _several(capture: Any) -> bool:
+def _several(capture: Any, parameters: int) -> bool:
     """Whether the reference length stood in several placements, so that each can be left out."""
     if len(capture.lengths) < 2:
         return False
     from ..validation import can_cross_validate
 
-    return can_cross_validate(capture)
+    return can_cross_validate(capture, parameters)
 
 
 def _busy(what: str, work: Callable[[], Any]) -> Any:

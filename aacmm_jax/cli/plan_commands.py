@@ -1,6 +1,7 @@
 """The command ``plan``."""
 
 import math
+import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -45,6 +46,9 @@ def plan(
     ] = None,
     margin_deg: Annotated[float, typer.Option(min=0, help="How far from their limits joints stay.")] = 5.0,
     candidates: Annotated[int, typer.Option(min=100, help="Poses to choose from.")] = 3000,
+    check_length_mm: Annotated[
+        float | None, typer.Option(help="Lengths that predictions are of. Default 300, or half of a small arm's reach.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed.")] = 0,
     as_json: Json = False,
 ) -> None:
@@ -61,6 +65,12 @@ def plan(
         raise InputError("--sockets places sockets and --socket says where they stand; give one of the two.")
     if length and not socket:
         raise InputError("--length is between sockets that stand (--socket); to place a reference length, use --length-mm.")
+    if region and socket:
+        raise InputError("--region is for sockets that are placed; with --socket they stand where you say.")
+    axes = [_axis(text) for text in region or ()]
+    if len(dict(axes)) < len(axes):
+        raise InputError("an axis is named twice in --region; give each one range.")
+    _check_output(output, arm)
     points = dict(_socket_option(text) for text in socket or ())
     if len(points) < len(socket or ()):
         raise InputError("a socket is named twice in --socket; give each its own name.")
@@ -72,18 +82,30 @@ def plan(
             length=_range("--length-mm", length_mm),
             u=u_mm,
             lengths=[_length_option(text) for text in length or ()],
-            region=dict(_axis(text) for text in region) if region else None,
+            region=dict(axes) if axes else None,
             space=Parameters.free_of(specification.arm, held=specification.held),
             noise=Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm),
             criterion=criterion,
             margin=math.radians(margin_deg),
             candidates=candidates,
+            check_length=check_length_mm,
             seed=seed,
             tell=tell,
         )
     save_plan(output, found)
     summary: dict[str, Any] = plan_summary(found, specification.name) | {"written": str(output)}
     _show(summary, as_json, plan_display.plan)
+
+
+def _check_output(output: Path, arm: str) -> None:
+    """Raise `InputError` for an output that could not be written, before half a minute of work."""
+    if output.exists() and Path(arm).exists() and output.samefile(arm):
+        raise InputError(f"{output} is the arm itself; choose another output.")
+    folder = output.parent
+    if output.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise InputError(
+            f"{output} cannot be written: it is a folder, or its folder is missing or protected; name another file."
+        )
 
 
 def _range(option: str, text: str) -> tuple[float, float]:
