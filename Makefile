@@ -1,5 +1,5 @@
 # make demo   set up and run the demonstration
-# make test   set up and run the tests
+# make test   set up and run the tests (make test-slow: those that take long)
 # make check  lint and types
 # make bench  identifications a second, against every contender that is installed
 # make reproduce  Cheng et al. 2018, recomputed: benchmarks/cheng2018/REPRODUCTION.md (two minutes on 2 cores)
@@ -10,13 +10,16 @@ PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
 BIN := .venv/bin
 
-.PHONY: demo test check bench peers reproduce clean
+.PHONY: demo test test-slow check bench peers reproduce clean
 
 demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
 
 test: .venv/.test
 	$(BIN)/python -m pytest -n auto --dist loadscope
+
+test-slow: .venv/.test
+	$(BIN)/python -m pytest -n auto --dist loadscope -m slow
 
 check: .venv/.dev
 	$(BIN)/ruff check .

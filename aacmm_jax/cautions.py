@@ -61,10 +61,11 @@ def _validation(record: CalibrationRecord) -> list[str]:
             "give way, eccentric encoders). Trust the cross-validated figures; every u below is too small."
         )
     if record.misfit is not None and not 1 / _HONEST < record.misfit < _HONEST:
-        word = "larger" if record.misfit > 1 else "smaller"
+        word = "small" if record.misfit > 1 else "large"
+        factor = max(record.misfit, 1 / record.misfit)
         found.append(
-            f"Residuals are {record.misfit:.2g} times what the given noise predicts, {word} than they should be: check the noise, or "
-            "leave it out to have it estimated."
+            f"Residuals are {record.misfit:.2g} times what the given noise predicts, and every uncertainty below rests on that noise: it is "
+            f"about {factor:.2g} times too {word}. Check the noise, or leave it out to have it estimated."
         )
     return found
 
@@ -125,6 +126,13 @@ def _data(record: CalibrationRecord) -> list[str]:
         found.append(
             f"Only {freedom} more equations than unknowns: the small residuals are the fit's own doing; record more poses."
         )
+    error, u = np.asarray(evaluation.error), np.asarray(evaluation.u)
+    birge = float(np.sqrt(np.sum((error / u) ** 2) / (len(error) - 1))) if len(error) > 1 and np.all(u > 0) else 0.0
+    if birge > _HONEST:
+        found.append(
+            f"The {len(error)} reference lengths disagree {birge:.2g} times as much as their u and the scatter of the poses allow (Birge "
+            "ratio); u(k) has been enlarged by as much. Look for a wrong length, or for errors that the D-H model does not hold."
+        )
     if len(capture.lengths) == 1:
         found.append("One reference length fixes the scale, so its own error says nothing; keep another for checking.")
     return found
@@ -139,8 +147,8 @@ def _identifiability(record: CalibrationRecord) -> list[str]:
     weak = [name for name in weak if not lost[record.names.index(name)]]
     if weak:
         found.append(
-            f"Not determined one by one, only together: {_some(weak, 12)}. Tip positions are right, but these have no uncertainty of "
-            "their own; hold the redundant ones (--held)."
+            f"Hardly determined one by one, only together: {_some(weak, 12)}. The tips and lengths that follow from them are (see their "
+            "uncertainty), but these have none of their own; hold the redundant ones (--held)."
         )
     u, width = np.sqrt(np.diag(record.covariance)), (record.upper - record.lower) / 2
     loose = [

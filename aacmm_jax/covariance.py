@@ -28,6 +28,7 @@ FORMS = ("given", "estimated", "common", "robust")
 LEAST_SIGMA = 1e-9
 # A direction whose standard uncertainty exceeds 10 mm or 10 mrad is not determined, whatever its eigenvalue.
 _LEAST_INFORMATION = 1e-2
+_NULL = 1e-12  # eigenvalues of the information below this, of the largest, are zero
 # Of a pose that fixes its own socket nearly alone, the residual says nothing: the robust form takes the common variance there.
 _LEAST_REDUNDANCY = 0.05
 
@@ -48,7 +49,7 @@ class Covariance(NamedTuple):
     noise: Noise  # given, or as estimated: one encoder for all
     # Where the scale fix divided lengths that were held, they err by one common factor: its covariance with the parameters,
     # and, last, its variance (relative); else 0.
-    stretch: Float[Array, " p+1"]
+    stretch: Float[Array, " w"]
 
 
 class Linear(NamedTuple):
@@ -142,19 +143,25 @@ def gains_of(
     return Gains(by_tips - jnp.einsum("pl,lcN->pcN", by_lengths, linear.lengths_by_tips), by_lengths)
 
 
-def inverted(information: Float[Array, "p p"], fixed: Bool[Array, " p"]) -> tuple[Float[Array, "p p"], Float[Array, "p p"]]:
-    """Inverse on the identifiable subspace, and the projector onto what is not determined; natural steps."""
+def inverted(
+    information: Float[Array, "p p"], fixed: Bool[Array, " p"]
+) -> tuple[Float[Array, "p p"], Float[Array, "p p"], Bool[Array, " p"]]:
+    """Inverse on the identifiable subspace, the projector onto what the data leave open, and which parameters are determined one
+    by one; natural steps. A direction that is hardly seen keeps its large variance: what does not follow it is not spoilt.
+    """
     free = ~fixed
     # One decomposition, and what follows from it one after the other: jaxlib's batched LAPACK calls wait for each other's threads,
     # and on two cores two that may run at the same time can wait for ever.
     information = information + jnp.diag(jnp.where(fixed, 1.0 + jnp.max(jnp.abs(information)), 0.0))
-    # Only a mask and a basis come from the eigenvectors: their derivative is infinite where eigenvalues repeat.
+    # Only masks and a basis come from the eigenvectors: their derivative is infinite where eigenvalues repeat.
     values, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(information))
-    known = values > jnp.maximum(1e-12 * values[-1], _LEAST_INFORMATION)
+    known = values > _NULL * values[-1]
     seen, lost = jnp.where(known[None, :], vectors, 0.0), jnp.where(known[None, :], 0.0, vectors)
     inner = seen.T @ information @ seen + jnp.diag(jnp.where(known, 0.0, 1.0))
     inverse = seen @ jnp.linalg.inv(inner) @ seen.T
-    return jnp.where(free[:, None] & free[None, :], inverse, 0.0), lost @ lost.T
+    hardly = jnp.where((values > _LEAST_INFORMATION)[None, :] & known[None, :], 0.0, vectors)
+    determined = fixed | (jnp.sum(hardly**2, axis=1) < 1e-6)
+    return jnp.where(free[:, None] & free[None, :], inverse, 0.0), lost @ lost.T, determined
 
 
 def covariance_of(

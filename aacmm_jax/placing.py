@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial.transform import Rotation
 
 from .arm import Arm
-from .chain import Geometry, turns_of
+from .chain import Geometry, turns_of, walk
 from .errors import InputError
 from .exchange import Candidates, Goal, covariance_of
 from .independence import columns_at, in_blocks, moved_onto
@@ -21,7 +21,7 @@ from .uncertainty import links_of
 from .weights import inverse_root
 
 _TRIES = 24  # poses tried in each socket of a place
-_REACHED = 0.5  # of them must arrive
+_REACHED = 0.25  # of them must arrive
 _SHIFT, _TURN = 0.05, 0.4  # of the links' sum; rad
 _PRIOR = 1e-4  # nobody is in doubt by more than 100 mm or 100 mrad: keeps the first sums invertible
 
@@ -35,6 +35,7 @@ class Scene(NamedTuple):
     limits: Float[np.ndarray, "n 2"]
     goal: Goal
     random: np.random.Generator
+    above: float  # mm: no joint and no tip below
 
     def draw(self, count: int) -> Float[np.ndarray, "c n"]:
         """Poses at random within the limits."""
@@ -53,7 +54,19 @@ def poses_at(scene: Scene, points: Float[np.ndarray, "s 3"], each: int) -> tuple
     """Poses from ``each`` random starts for each socket that arrived within the limits, and the socket of each."""
     owner = np.repeat(np.arange(len(points)), each)
     q, arrived = moved_onto(scene.arm, scene.draw(len(owner)), points[owner], scene.limits)
-    return q[arrived], owner[arrived]
+    good = arrived & (lowest(scene.arm, q) >= scene.above)
+    return q[good], owner[good]
+
+
+def lowest(arm: Arm, q: Float[np.ndarray, "c n"]) -> Float[np.ndarray, " c"]:
+    """Height of each pose's lowest joint or tip in the base frame, mm; the base itself left out."""
+    return in_blocks(lambda rows: np.asarray(_lowest(arm.geometry, jnp.asarray(rows))), q)
+
+
+@jax.jit
+def _lowest(geometry: Geometry, q: Array) -> Float[Array, " c"]:
+    walked = walk(geometry, turns_of(q))
+    return jnp.minimum(jnp.min(walked.origin[:, 2], axis=0), walked.tip[2])
 
 
 def candidates_of(scene: Scene, place: Place, q: Float[np.ndarray, "c n"], owner: Int[np.ndarray, " c"]) -> Candidates:

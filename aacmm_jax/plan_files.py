@@ -8,22 +8,31 @@ import numpy as np
 from . import storage
 from .planning import MORE, Plan, Prediction
 
+_DIRECTION = ("probe_direction_x", "probe_direction_y", "probe_direction_z")  # the last frame's z axis
+
 
 def save_plan(path: str | os.PathLike, plan: Plan) -> None:
-    """Write a plan as CSV: a row a pose, with its socket, where that stands (mm), and the joints' readings (deg)."""
+    """Write a plan as CSV: a row a pose, with its socket, where that stands (mm), the joints' readings (deg), and the direction in which
+    the probe points."""
     storage.write_text(path, plan_csv(plan))
 
 
 def plan_csv(plan: Plan) -> str:
     """The poses of a plan in the order in which to take them."""
     joints = plan.arm.joints
-    lines = [",".join(["pose", "socket", "x_mm", "y_mm", "z_mm", *(f"q_{i}_deg" for i in range(1, joints + 1))])]
+    lines = [",".join(["pose", "socket", "x_mm", "y_mm", "z_mm", *(f"q_{i}_deg" for i in range(1, joints + 1)), *_DIRECTION])]
     names = list(plan.sockets)
-    for number, (q, owner) in enumerate(zip(np.degrees(plan.q), plan.owner, strict=True), start=1):
+    directions = np.asarray(plan.arm.pose(plan.q))[:, :3, 2]
+    rows = zip(np.degrees(plan.q), plan.owner, directions, strict=True)
+    for number, (q, owner, direction) in enumerate(rows, start=1):
         point = plan.sockets[names[owner]]
         label = names[owner]
         label = '"' + label.replace('"', '""') + '"' if any(c in label for c in ',"\n') else label
-        lines.append(",".join([str(number), label, *(f"{x:.3f}" for x in point), *(f"{x:.4f}" for x in q)]))
+        lines.append(
+            ",".join(
+                [str(number), label, *(f"{x:.3f}" for x in point), *(f"{x:.3f}" for x in q), *(f"{x:.2f}" for x in direction)]
+            )
+        )
     return "\n".join(lines) + "\n"
 
 

@@ -16,7 +16,7 @@ from .independence import columns_at, moved_onto
 from .noise import Noise
 from .observability import observe
 from .parameters import Parameters
-from .placing import Place, Scene, beside, candidates_of, places, poses_at, worth
+from .placing import Place, Scene, beside, candidates_of, lowest, places, poses_at, worth
 from .refining import refined
 from .simulate import limits_of
 from .uncertainty import check_lengths, default_length, links_of
@@ -76,6 +76,7 @@ def plan(
     noise: Noise = NOISE,
     criterion: Criterion = "length",
     margin: float = math.radians(5),
+    above: float = 0.0,
     limits: Sequence[Sequence[float]] | None = None,
     candidates: int = 3000,
     check_length: float | None = None,
@@ -93,6 +94,8 @@ def plan(
     - ``criterion``: "length" (the largest uncertainty of a length over the volume), or A, D, E of the parameters' covariance in
       natural steps (1 mm, 1 mrad).
     - ``margin``: how far from their limits joints stay, rad. ``limits`` as in `simulate`.
+    - ``above``: height in the base frame, mm, below which no joint and no tip comes (the table; ``-math.inf`` where there is none).
+      Obstacles, the arm's own body and the side from which a socket can be entered are not looked at.
     - ``candidates``: poses to choose from. ``check_length``: mm; predictions are of such lengths (as in `over_volume`).
     - ``tell`` is called with what is being done and the share of it that is done.
 
@@ -102,7 +105,7 @@ def plan(
     tell = tell or (lambda what, share: None)
     space = Parameters.free_of(arm) if space is None else space
     check_length = default_length(arm) if check_length is None else check_length
-    scene = _scene(arm, space, noise, criterion, margin, limits, check_length, seed)
+    scene = _scene(arm, space, noise, criterion, (margin, above), limits, check_length, seed)
     region = {"z": (0.0, np.inf)} if region is None else region
     names, choices = _choices(scene, sockets, poses, length, u, lengths, region)
     tell("Placing the sockets", 0.0)
@@ -135,11 +138,12 @@ def _scene(
     space: Parameters,
     noise: Noise,
     criterion: str,
-    margin: float,
+    room: tuple[float, float],
     limits: Any,
     check_length: float,
     seed: int,
 ) -> Scene:
+    margin, above = room
     if not is_single(arm):
         raise InputError("plan takes one arm, not a batch; take one of it first.")
     if arm.joints < 3 or links_of(arm) == 0:
@@ -158,7 +162,7 @@ def _scene(
     functions = _functions(arm, space, _CHECKS, check_length, allowed, seed + 1)
     kind = {"length": "functions", "D": "determinant"}.get(criterion, "trace")
     goal = Goal(kind, functions, {"A": 0.0}.get(criterion, _POWER))  # pyright: ignore[reportArgumentType]
-    return Scene(arm, space, noise, inner, goal, np.random.default_rng(seed))
+    return Scene(arm, space, noise, inner, goal, np.random.default_rng(seed), above)
 
 
 def _functions(
@@ -332,7 +336,7 @@ def _predictions(
     loose = []
     for _ in range(_LOOSE_SETS):
         near, arrived = moved_onto(scene.arm, q + _LOOSE * scene.random.normal(size=q.shape), place.points[owner], scene.limits)
-        near = np.where(arrived[:, None], near, q)
+        near = np.where((arrived & (lowest(scene.arm, near) >= scene.above))[:, None], near, q)
         loose.append(of(candidates_of(scene, place, near, owner).rows))
     base = pool.base + np.einsum("cki,ckj->ij", planned.rows, planned.rows)
     added = exchange(pool._replace(base=base), MORE, scene.goal, least=0, sweeps=1)

@@ -147,11 +147,10 @@ def _propagated(
     counted = sigma if measurement.weights is None else jnp.ones_like(sigma)
     linear = linearised(arm, space, measurement, fixed)
     information = information_of(linear, counted, whitening)
-    inverse, lost = inverted(information, fixed)
+    inverse, lost, determined = inverted(information, fixed)
     gains = gains_of(linear, measurement, inverse, counted, whitening)
     errors, behind = tip_errors(form, arm, measurement, linear, gains, inverse, _typical(linear, measurement, sigma), noise)
     matrix = _in_units(covariance_of(gains, linear, measurement, errors), space)
-    determined = fixed | (jnp.diagonal(lost) < 1e-6)
     return Propagated(linear, gains, errors, Covariance(matrix, determined, lost, behind, jnp.zeros(len(space.names) + 1)))
 
 

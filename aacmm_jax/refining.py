@@ -13,7 +13,7 @@ from .chain import columns_of, turns_of, walk
 from .independence import moved_onto
 from .observability import whitened_equations
 from .parameters import Parameters
-from .placing import Place, Scene
+from .placing import Place, Scene, lowest
 from .residuals import Measurement
 from .simulate import least_moves
 
@@ -80,7 +80,7 @@ def refined(
         both, q.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, callback=told, options={"maxiter": _STEPS}
     )
     better, arrived = moved_onto(scene.arm, solution.x.reshape(q.shape), targets, scene.limits)
-    better = np.where(arrived[:, None], better, q)
+    better = np.where((arrived & (lowest(scene.arm, better) >= scene.above))[:, None], better, q)
     return better if both(better.ravel())[0] <= both(q.ravel())[0] else q
 
 

@@ -96,7 +96,8 @@ def tables(capture: Capture, evaluation: Evaluation) -> dict[str, Any]:
     spread = evaluation.repeatability
     figures = (np.asarray(column) for column in (spread.socket_de, spread.socket_deltam, spread.socket_rms))
     sockets = zip(capture.names, capture.sizes, *figures, strict=True)
-    lengths = zip(capture.lengths, np.asarray(evaluation.measured), np.asarray(evaluation.error), strict=True)
+    columns = (np.asarray(column) for column in (evaluation.measured, evaluation.error, evaluation.u))
+    lengths = zip(capture.lengths, *columns, strict=True)
     return {
         "sockets": [
             {"socket": name, "poses": size, "de_mm": float(de), "deltam_mm": float(deltam), "rms_mm": float(rms)}
@@ -109,8 +110,9 @@ def tables(capture: Capture, evaluation: Evaluation) -> dict[str, Any]:
                 "value_mm": float(length.value),
                 "measured_mm": float(measured),
                 "error_mm": float(error),
+                "error_u_mm": float(u) if np.isfinite(u) else None,
             }
-            for length, measured, error in lengths
+            for length, measured, error, u in lengths
         ],
     }
 

@@ -34,7 +34,7 @@ class Uncertainty(eqx.Module):
 
     arm: Arm
     covariance: Float[Array, "p p"]
-    stretch: Float[Array, " p+1"]  # of lengths that were held but divided by k (see `covariance.Covariance`)
+    stretch: Float[Array, " w"]  # of lengths that were held but divided by k (see `covariance.Covariance`)
     open: Float[Array, "p p"]  # projector onto undetermined directions, natural steps
     noise: Noise
     u_k: Float[Array, ""] | None
@@ -101,7 +101,7 @@ class Uncertainty(eqx.Module):
             variance = variance + jnp.einsum("...c,...cd,...d->...", direction, both, direction)
         return jnp.sqrt(variance)
 
-    def slopes(self, q: Float[Array, "... n"]) -> Float[Array, "... 3 p+1"]:
+    def slopes(self, q: Float[Array, "... n"]) -> Float[Array, "... 3 w"]:
         """Derivatives of the tip by the free parameters and, last, by a stretch of the lengths that were held."""
         free = self.arm.jacobian(q, self.names)
         held = [n for n in parameter_names(self.arm) if is_length(n) and n not in ("d_1", *self.names)]
@@ -110,7 +110,7 @@ class Uncertainty(eqx.Module):
         values = Parameters(self.arm, tuple(held)).vector()
         return jnp.concatenate([free, (self.arm.jacobian(q, held) @ values)[..., None]], axis=-1)
 
-    def spread_of(self, slopes: Float[Array, "... k p+1"]) -> Float[Array, "... k k"]:
+    def spread_of(self, slopes: Float[Array, "... k w"]) -> Float[Array, "... k k"]:
         """Covariance of functions with these derivatives (as `slopes` gives them); infinite where they follow what is open."""
         p = len(self.names)
         upper = jnp.concatenate([self.covariance, self.stretch[:-1, None]], axis=1)

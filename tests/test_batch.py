@@ -124,6 +124,7 @@ np.save(sys.argv[2], many.parameters)
 """
 
 
+@pytest.mark.slow
 def test_the_number_of_devices_changes_nothing(tmp_path):
     root = Path(__file__).resolve().parents[1]
     for devices in ("1", "2"):

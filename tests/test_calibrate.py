@@ -226,6 +226,7 @@ def test_hayatis_angle_tells_parallel_axes_apart():
     assert float(result.arm.beta[1]) == pytest.approx(2e-3, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_uncertainties_are_those_that_trials_show(paper_arm, space, bounds):
     """150 simulated calibrations with lengths that share sockets: normalised errors of every parameter, of k and of a length
     elsewhere have a root mean square near 1, for each method and whether a length is held or not."""

@@ -9,7 +9,15 @@ ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+# A small version of what the long ones show is in the other tests.
+SLOW = ("01", "03")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=pytest.mark.slow if path.stem[:2] in SLOW else ()) for path in NOTEBOOKS],
+    ids=lambda path: path.stem,
+)
 def test_notebook_runs(path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the notebook machinery, not of the package: that runs in the kernel
@@ -22,6 +30,6 @@ def test_notebook_runs(path):
 
 
 def test_all_are_there_with_their_outputs():
-    assert [path.stem[:2] for path in NOTEBOOKS] == ["01", "02", "03"]
+    assert [path.stem[:2] for path in NOTEBOOKS] == ["01", "02", "03", "04"]
     for path in NOTEBOOKS:
         assert '"image/png"' in path.read_text()

@@ -99,6 +99,17 @@ def test_poses_can_be_taken(paper_arm, given):
     np.testing.assert_allclose(paper_arm.position(given.q), points[given.owner], atol=1e-5)
     assert np.abs(given.q).max() <= np.radians(175) + 1e-12
     assert np.all(np.diff(given.owner) >= 0)
+    heights = [paper_arm.position(given.q)[:, 2]]
+    for joint in range(1, 6):  # origins of the frames: arms cut off after each joint
+        part = aj.Arm(
+            alpha=paper_arm.alpha[:joint],
+            a=paper_arm.a[:joint],
+            d=paper_arm.d[:joint],
+            theta=paper_arm.theta[:joint],
+            probe=(0, 0, 0),
+        )
+        heights.append(part.position(given.q[:, :joint])[:, 2])
+    assert np.min(heights) >= -1e-6
     assert np.bincount(given.owner).min() >= 2
     (length,) = given.lengths
     assert (length.start, length.end, float(length.u)) == ("A", "B", 0.003)
@@ -151,10 +162,13 @@ def test_the_same_seed_gives_the_same_plan(paper_arm, quick):
 def test_files(given, tmp_path):
     save_plan(tmp_path / "plan.csv", given)
     lines = (tmp_path / "plan.csv").read_text().splitlines()
-    assert lines[0] == "pose,socket,x_mm,y_mm,z_mm,q_1_deg,q_2_deg,q_3_deg,q_4_deg,q_5_deg,q_6_deg"
+    assert (
+        lines[0]
+        == "pose,socket,x_mm,y_mm,z_mm,q_1_deg,q_2_deg,q_3_deg,q_4_deg,q_5_deg,q_6_deg,probe_direction_x,probe_direction_y,probe_direction_z"
+    )
     assert len(lines) == 21
-    angles = np.array([[float(cell) for cell in line.split(",")[5:]] for line in lines[1:]])
-    np.testing.assert_allclose(np.radians(angles), given.q, atol=1e-6)
+    angles = np.array([[float(cell) for cell in line.split(",")[5:11]] for line in lines[1:]])
+    np.testing.assert_allclose(np.radians(angles), given.q, atol=1e-5)
     named = given._replace(sockets={'left, "low"': (1.0, 2.0, 3.0), "B": (4.0, 5.0, 6.0)})
     assert '1,"left, ""low""",1.000' in plan_csv(named)
     summary = plan_summary(given, "an arm")
@@ -166,12 +180,21 @@ REFUSED = {
     "equations": ({"poses": 9, "sockets": 4}, "take 11 at least"),
     "criterion": ({"criterion": "B"}, None),
     "margin": ({"margin": 4.0}, "no room within its limits"),
-    "u": ({"u": 0.0}, "more than zero"),
+    "u": ({"u": 0.0}, "u of a reference length is 0 mm"),
     "length": ({"length": 9000.0}, "does not fit this arm"),
     "range": ({"length": (500.0, 300.0)}, "does not fit this arm"),
     "region": ({"region": {"r": (0.0, 1.0)}}, "no 'r'"),
     "far region": ({"region": {"x": (5000.0, 6000.0)}}, "no place for the sockets"),
     "far socket": ({"sockets": {"A": (5000, 0, 0), "B": (400, 200, 300)}}, "cannot be reached"),
+    "no u": (
+        {"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}, "lengths": [("A", "B", 0.0)]},
+        "u of a reference length is 0",
+    ),
+    "twice": ({"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}, "lengths": [("A", "B"), ("B", "A")]}, "named twice"),
+    "itself": ({"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}, "lengths": [("A", "A")]}, "joins a socket to itself"),
+    "one place": ({"sockets": {"A": (400, 200, 300), "B": (400, 200, 300)}, "lengths": [("A", "B")]}, "stand in one place"),
+    "no range": ({"region": {"z": (10.0, 0.0)}}, "which is no range"),
+    "under the table": ({"above": 2000.0}, "can be reached well"),
     "no length": ({"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}}, "determine the parameters.*the scale"),
     "unknown end": ({"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}, "lengths": [("A", "C")]}, "unknown socket 'C'"),
     "lengths without sockets": ({"lengths": [("A", "B")]}, "between sockets that are given"),

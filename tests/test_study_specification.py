@@ -134,6 +134,7 @@ def test_refused_in_one_sentence(tables, message):
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_a_narrow_region_is_found(tmp_path):
     """A 300 mm length in a shell 20 mm thick: one candidate in thousands lies inside."""
     region = {"distance_mm": [690, 710]}

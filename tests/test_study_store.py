@@ -269,6 +269,7 @@ def test_killed_and_resumed_it_is_the_same(home, cache, tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["s.h5"]
 
 
+@pytest.mark.slow
 def test_an_interrupt_finishes_the_blocks_in_work_and_says_how_to_go_on(home, cache, tmp_path):
     path = tmp_path / "s.h5"
     process = command(home, cache, "-o", path, "--chunk", 4, "--trials", 600, "--workers", 1)
@@ -289,6 +290,7 @@ def test_an_interrupt_finishes_the_blocks_in_work_and_says_how_to_go_on(home, ca
     assert f'"trials_this_run": {2400 - 4 * kept}' in output
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_sentence_and_loses_nothing(home, cache, tmp_path):
     """A limit on the size of files fails a write as a full disk does: first of a block, then of the file at the end."""
     path = tmp_path / "s.h5"
@@ -326,6 +328,7 @@ aj.run_study(aj.read_study(sys.argv[2]), sys.argv[3], chunk=16)
 """
 
 
+@pytest.mark.slow
 def test_the_number_of_devices_changes_nothing(home, cache, tmp_path):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     subprocess.run(

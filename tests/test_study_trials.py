@@ -125,6 +125,7 @@ def test_reference_lengths_err_by_their_u():
     np.testing.assert_array_equal(trials.u, 0.01)
 
 
+@pytest.mark.slow
 def test_starts_at_random_fill_the_box():
     study = made(identification={"start": "random", "hold": "none"}, bounds={"length_mm": 2.0, "length_shift_mm": 1.0})
     trials = drawn(study, 2000)

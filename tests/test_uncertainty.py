@@ -222,6 +222,7 @@ def test_intervals_and_correlations(result):
         given.factor(95)
 
 
+@pytest.mark.slow
 def test_degrees_of_freedom_follow_the_form(paper_arm, capture, bounds):
     """43 poses in three sockets give 120 equations, less the 20 that stage 1 fits."""
     for form, freedom in (("estimated", 100), ("common", 100), ("robust", 40 - 20 / 3)):
@@ -230,6 +231,7 @@ def test_degrees_of_freedom_follow_the_form(paper_arm, capture, bounds):
         assert uncertainty.factor(0.95) == pytest.approx(stats.t.ppf(0.975, freedom))
 
 
+@pytest.mark.slow
 def test_estimated_noise_is_that_of_the_simulation(paper_arm, bounds):
     """Over 30 captures: encoders of 4 arcsec and a seat of 10 um, from the residuals alone."""
     found = []

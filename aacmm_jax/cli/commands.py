@@ -184,9 +184,11 @@ def calibrate(
         ),
     ] = None,
     monte_carlo: Annotated[
-        bool, typer.Option("--monte-carlo", help="Check the uncertainties by Monte Carlo (JCGM 101); up to a minute.")
+        bool, typer.Option("--monte-carlo", help="Check the uncertainties by Monte Carlo (JCGM 101); a minute or two.")
     ] = False,
-    strict: Annotated[bool, typer.Option("--strict", help="Refuse parameters that the data cannot determine.")] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Refuse parameters that such data could not determine even without noise.")
+    ] = False,
     figure: Annotated[Path | None, typer.Option(help="Draw the residuals pose by pose as PNG.")] = None,
     max_steps: Annotated[int, typer.Option(min=1, help="Step limit of each solve.")] = 300,
     as_json: Json = False,

@@ -126,8 +126,8 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
     """What the uncertainties rest on, and what they come to over the volume, expanded to 95 %."""
     found = summary["uncertainty"]
     volume, factor = found["volume"], found["coverage_factor_95"]
-    title = f"\nExpanded uncertainty over the working volume (95 %, k = {factor:.2f}) [mm]"
-    table = _table(title, "", "median", "95 % of places", "largest")
+    title = f"\nExpanded uncertainty U over the working volume (95 %, coverage factor {factor:.2f}) [mm]"
+    table = _table(title, "", "median", "95th percentile", "largest")
     length = f"{volume['length_mm']:g} mm length"
     for key, text in (
         ("u_tip", "tip position, along its worst direction: from the calibration"),
@@ -137,12 +137,13 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
         values = [volume[f"{key}_{which}_mm"] for which in ("median", "95", "largest")]
         table.add_row(text, *("not determined" if value is None else _number(factor * value) for value in values))
     console.print(table)
+    console.print("At 400 places that random poses reach within the joint limits; u of the parameters carries over to them.")
     encoder = found["encoder_arcsec"]
     told = ", ".join(f"{x:.3g}" for x in encoder) if isinstance(encoder, list) else f"{encoder:.3g}"
     noise = f"encoders {told} arcsec, seat {1e3 * found['seating_mm']:.3g} um"
     source = {
         "given": f"Noise as given: {noise}; residuals are {found['misfit'] or 0:.2f} times what it predicts.",
-        "estimated": f"Noise estimated from the residuals: {noise}.",
+        "estimated": f"Noise estimated from the residuals: {noise} (their sum is better known than each).",
         "common": f"One variance for all poses: {1e3 * found['seating_mm']:.3g} um a coordinate.",
         "robust": "Each pose's own residual stands for its error (robust form).",
     }[found["form"]]
@@ -228,7 +229,9 @@ def _warnings(console: Console, summary: dict[str, Any]) -> None:
 
 def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
     """Every parameter in its own unit, to the digits that its standard uncertainty allows (two of the uncertainty's)."""
-    table = _table("\nParameters", "parameter", "unit", "nominal", "calibrated", "change", "u", "bound")
+    table = _table(
+        "\nParameters, with standard uncertainty u", "parameter", "unit", "nominal", "calibrated", "change", "u", "bound"
+    )
     for row in rows:
         factor, unit = (1.0, "mm") if row["unit"] == "mm" else (180 / math.pi, "deg")
         nominal, value = factor * row["nominal"], factor * row["calibrated"]
@@ -246,10 +249,16 @@ def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
 
 def _lengths(console: Console, rows: list[dict[str, Any]], *, fitted: bool = False) -> None:
     """Reference lengths; the error of a single one that fixed the scale is not shown, since it is zero by construction."""
-    table = _table("\nReference lengths", "between", "value [mm]", "measured [mm]", "error [mm]")
+    table = _table("\nReference lengths", "between", "value [mm]", "measured [mm]", "error [mm]", "u of error [mm]")
     for row in rows:
         error = "fixed the scale" if fitted else _number(row["error_mm"])
-        table.add_row(escape(f"{row['from']} - {row['to']}"), _number(row["value_mm"]), _number(row["measured_mm"]), error)
+        table.add_row(
+            escape(f"{row['from']} - {row['to']}"),
+            _number(row["value_mm"]),
+            _number(row["measured_mm"]),
+            error,
+            _number(row["error_u_mm"]),
+        )
     console.print(table)
 
 

@@ -45,6 +45,9 @@ def plan(
         ),
     ] = None,
     margin_deg: Annotated[float, typer.Option(min=0, help="How far from their limits joints stay.")] = 5.0,
+    above_mm: Annotated[
+        float, typer.Option(help="Height, in the base frame, below which no joint and no tip comes: the table.")
+    ] = 0.0,
     candidates: Annotated[int, typer.Option(min=100, help="Poses to choose from.")] = 3000,
     check_length_mm: Annotated[
         float | None, typer.Option(help="Lengths that predictions are of. Default 300, or half of a small arm's reach.")
@@ -87,6 +90,7 @@ def plan(
             noise=Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm),
             criterion=criterion,
             margin=math.radians(margin_deg),
+            above=above_mm,
             candidates=candidates,
             check_length=check_length_mm,
             seed=seed,

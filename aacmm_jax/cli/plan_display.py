@@ -60,4 +60,8 @@ def plan(summary: dict[str, Any]) -> None:
         f"{1e3 * summary['seating_mm']:g} um (--method joint --encoder-arcsec {summary['encoder_arcsec']:g} --seating-mm "
         f"{summary['seating_mm']:g})."
     )
+    console.print(
+        "Looked at: joint limits, reach, and that nothing comes below the table. Not looked at: obstacles, the arm's own body, and from "
+        "which side a socket can be entered (the plan's file has the probe's direction)."
+    )
     _written(console, summary)
