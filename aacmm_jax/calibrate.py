@@ -116,7 +116,8 @@ def calibrate(
 
 def _check_identifiable(arm: Arm, capture: Capture, bounds: Bounds, strict: bool) -> None:
     """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; traced values are not looked at."""
-    if not is_single(arm) or not is_concrete(*jax.tree.leaves((arm, capture, bounds))):
+    # Inside jit or vmap even what is constant becomes a tracer once JAX computes with it.
+    if not is_single(arm) or not is_concrete(jnp.negative(0.0), *jax.tree.leaves((arm, capture, bounds))):
         return
     sentences = observe(arm, capture, bounds.space).sentences()
     if sentences and strict:

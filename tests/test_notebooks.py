@@ -10,7 +10,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 # A small version of what the long ones show is in the other tests.
-SLOW = ("01", "03")
+SLOW = ("01", "03", "04")
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,10 @@ def test_unseen_placements(aacmm, manifest, name):
     manifest(name)
     aacmm("import", f"{name}.toml", "-o", "capture.h5")
     without = [item for place in places for item in ("--without", f"{place}/*")]
-    aacmm("calibrate", "capture.h5", "-o", "calibration.h5", *without, *options)
+    crossed = () if name == "panda_6" else ("--no-cross-validate",)  # one of them as a user would run it
+    done = aacmm("calibrate", "capture.h5", "-o", "calibration.h5", *without, *options, *crossed, "--json")
+    validation = json.loads(done.stdout)["cross_validation"]
+    assert (validation is None) == bool(crossed)
     result = json.loads(aacmm("evaluate", "calibration.h5", "capture.h5", "--json").stdout)
     held_out = result["held_out"]
     assert {row["socket"].split("/")[0] for row in held_out["sockets"]} == set(places)
@@ -64,7 +67,7 @@ def test_free_lengths_shrink_the_arm_and_the_result_says_so(aacmm, manifest):
     manifest(name)
     aacmm("import", f"{name}.toml", "-o", "capture.h5")
     without = ["--without", "mid_left/*", "--without", "mid_right/*"]
-    done = aacmm("calibrate", "capture.h5", "-o", "calibration.h5", *without, "--hold", "none", "--json")
+    done = aacmm("calibrate", "capture.h5", "-o", "calibration.h5", *without, "--hold", "none", "--no-cross-validate", "--json")
     result = json.loads(done.stdout)
     assert result["scale_k"] == pytest.approx(0.947, abs=5e-4)
     assert result["active_stage1"] == {"d_5": "lower"}
