@@ -26,7 +26,7 @@ CRITERIA = ("length", "A", "D", "E")
 NOISE = Noise(encoder_arcsec=2.0, seating=0.005)  # of a small commercial arm
 MORE = 10  # poses
 _CHECKS, _CHECKED = 300, 400  # lengths that the criterion looks at; predictions look at others, and more
-_PLACES, _TRIED_WELL, _MOVED, _AT_FIRST = 500, 8, 40, 1000
+_PLACES, _TRIED_WELL, _MOVED, _AT_FIRST = 600, 10, 110, 1000
 _POWER = 8.0  # nearly the largest
 _RANDOM_SETS, _LOOSE_SETS = 50, 10
 _LOOSE = math.radians(5)
