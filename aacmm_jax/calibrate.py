@@ -168,7 +168,7 @@ def _stage1(task: _Task) -> tuple[Identification, propagation.Propagated]:
     after = repeatability(tips, measurement.sizes, fitted=int(kept.sum()))
     active = jnp.where(jnp.asarray(kept), bounds.active(parameters), 0)
     fixed = (active != 0) | ~jnp.asarray(kept)
-    propagated = propagation.of_poses(identified, space, measurement, fixed, after.sigma, task.form, task.noise)
+    propagated = propagation.of_solve(identified, space, measurement, fixed, after.sigma, task.form, task.noise)
     identification = Identification(
         arm=identified,
         parameters=parameters,
@@ -256,5 +256,5 @@ def _joint(arm: Arm, stage1: Identification, task: _Task) -> tuple[Arm, Array, A
     stats, active = solution.stats, stage1.bounds.active(solution.value)
     found = space.arm(solution.value)
     sigma = stage1.after.sigma / k
-    spread = propagation.of_joint(found, space, measurement, active != 0, sigma, task.form, task.noise, weighing).spread
+    spread = propagation.of_solve(found, space, measurement, active != 0, sigma, task.form, task.noise, weighing).spread
     return found, solution.value, active, stage1.steps + stats["num_steps"], stats["reason"], spread

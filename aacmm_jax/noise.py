@@ -35,8 +35,6 @@ class Noise(eqx.Module):
                 raise InputError(f"{what} is empty; give one number, or one a joint.")
             if is_concrete(values) and np.any(np.asarray(values) < 0):
                 raise InputError(f"{what} must be a standard deviation: zero or positive.")
-            if is_concrete(values) and np.any(np.asarray(values) > _MOST[what]):
-                raise InputError(f"{what} is over {_MOST[what]:g}, which no arm's is; is it in another unit?")
 
     @property
     def encoder_arcsec(self) -> Float[Array, "..."]:
@@ -44,13 +42,17 @@ class Noise(eqx.Module):
         return self.encoder / ARCSEC
 
     def check(self, joints: int) -> None:
-        """Raise `InputError` where nothing can be weighed by it: no noise at all, or another number of encoders than joints."""
+        """Raise `InputError` where nothing can be weighed by it: no noise at all, absurdly much, or another number of encoders than joints."""
         if is_concrete(self.encoder, self.seating) and not (
             np.any(np.asarray(self.encoder)) or np.any(np.asarray(self.seating))
         ):
             raise InputError(
                 "noise is zero everywhere, so nothing can be weighed by it; give a standard deviation, or no noise."
             )
+        # Not in the constructor: residuals of a calibration that failed may be as large, and its file must still be read.
+        for what, values in (("encoder_arcsec", self.encoder_arcsec), ("seating", self.seating)):
+            if is_concrete(values) and np.any(np.asarray(values) > _MOST[what]):
+                raise InputError(f"{what} is over {_MOST[what]:g}, which no arm's is; is it in another unit?")
         if self.encoder.ndim and self.encoder.shape != (joints,):
             raise InputError(
                 f"encoder_arcsec has {self.encoder.shape[0]} values, but the arm has {joints} joints; give one number, or one a joint."

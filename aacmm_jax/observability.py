@@ -257,7 +257,7 @@ def _remedy(arm: Arm, capture: Capture, space: Parameters, wanted: int) -> str:
 
 
 def _varied(arm: Arm, q: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Thirty poses that hold the tip where ``q`` holds it."""
+    """Poses that hold the tip where ``q`` holds it."""
     poses = q + random.uniform(-1.5, 1.5, (60, arm.joints))
     poses, reached = moved_onto(arm, poses, np.tile(np.asarray(arm.position(q)), (60, 1)))
     return poses[reached] if reached.any() else q[None]

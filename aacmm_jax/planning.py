@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .arm import Arm, is_single
-from .arrays import Numbers, as_floats
+from .arrays import Numbers
 from .capture import Capture, ReferenceLength
 from .errors import InputError, nearest
 from .exchange import Candidates, Goal, covariance_of, exchange
@@ -18,7 +18,7 @@ from .observability import observe
 from .parameters import Parameters
 from .placing import Place, Scene, beside, candidates_of, lowest, places, poses_at, worth
 from .refining import refined
-from .simulate import limits_of
+from .simulate import limits_of, socket_point
 from .uncertainty import check_lengths, default_length, links_of
 
 Criterion = Literal["length", "A", "D", "E"]
@@ -194,7 +194,7 @@ def _choices(
             f"{poses} poses in {number} sockets give fewer equations than the {unknowns} unknowns; take {-(-unknowns // 3)} at least."
         )
     if isinstance(sockets, Mapping):
-        points = {name: as_floats(point, f"position of socket '{name}'") for name, point in sockets.items()}
+        points = {name: socket_point(name, point) for name, point in sockets.items()}
         names = list(points)
         for pair in lengths:
             for end in pair[:2]:

@@ -36,7 +36,7 @@ class Propagated(NamedTuple):
     spread: Covariance
 
 
-def of_poses(
+def of_solve(
     arm: Arm,
     space: Parameters,
     measurement: Measurement,
@@ -44,23 +44,20 @@ def of_poses(
     sigma: Float[Array, ""],
     form: Form,
     noise: Noise | None,
+    weighing: Weighing | None = None,
 ) -> Propagated:
-    """Of stage 1: from the poses alone; ``fixed`` parameters were held, or are on a bound."""
-    return _propagated(arm, space, measurement, fixed, sigma, form, noise, None)
-
-
-def of_joint(
-    arm: Arm,
-    space: Parameters,
-    measurement: Measurement,
-    fixed: Bool[Array, " p"],
-    sigma: Float[Array, ""],
-    form: Form,
-    noise: Noise | None,
-    weighing: Weighing,
-) -> Propagated:
-    """Of the joint solve."""
-    return _propagated(arm, space, measurement, fixed, sigma, form, noise, weighing.whitening)
+    """Of one least squares: of the poses alone (stage 1), or with ``weighing`` of poses and lengths (the joint solve); ``fixed``
+    parameters were held, or are on a bound."""
+    whitening = None if weighing is None else weighing.whitening
+    sigma = jnp.maximum(sigma, LEAST_SIGMA)
+    counted = sigma if measurement.weights is None else jnp.ones_like(sigma)
+    linear = linearised(arm, space, measurement, fixed)
+    information = information_of(linear, counted, whitening)
+    inverse, lost, determined = inverted(information, fixed)
+    gains = gains_of(linear, measurement, inverse, counted, whitening)
+    errors, behind = tip_errors(form, arm, measurement, linear, gains, inverse, _typical(linear, measurement, sigma), noise)
+    matrix = _in_units(covariance_of(gains, linear, measurement, errors), space)
+    return Propagated(linear, gains, errors, Covariance(matrix, determined, lost, behind, jnp.zeros(len(space.names) + 1)))
 
 
 def weighing(arm: Arm, measurement: Measurement, sigma: Float[Array, ""]) -> Weighing:
@@ -131,27 +128,6 @@ def _scale_gains(
     predicted = by_lengths @ length_covariance(centroids, measurement, sigma, k.value) @ by_lengths
     surplus = jnp.maximum(k.u**2 - predicted, 0.0)
     return k, _ScaleGains(by_tips, -by_lengths * k.measured / k.nominal), surplus
-
-
-def _propagated(
-    arm: Arm,
-    space: Parameters,
-    measurement: Measurement,
-    fixed: Bool[Array, " p"],
-    sigma: Float[Array, ""],
-    form: Form,
-    noise: Noise | None,
-    whitening: Float[Array, "l l"] | None,
-) -> Propagated:
-    sigma = jnp.maximum(sigma, LEAST_SIGMA)
-    counted = sigma if measurement.weights is None else jnp.ones_like(sigma)
-    linear = linearised(arm, space, measurement, fixed)
-    information = information_of(linear, counted, whitening)
-    inverse, lost, determined = inverted(information, fixed)
-    gains = gains_of(linear, measurement, inverse, counted, whitening)
-    errors, behind = tip_errors(form, arm, measurement, linear, gains, inverse, _typical(linear, measurement, sigma), noise)
-    matrix = _in_units(covariance_of(gains, linear, measurement, errors), space)
-    return Propagated(linear, gains, errors, Covariance(matrix, determined, lost, behind, jnp.zeros(len(space.names) + 1)))
 
 
 def _typical(linear: Linear, measurement: Measurement, sigma: Float[Array, ""]) -> Float[Array, ""]:

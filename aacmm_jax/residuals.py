@@ -96,8 +96,7 @@ def differences_matrix(ends: tuple[tuple[int, int], ...], sockets: int) -> Float
 
 def averaging_matrix(sizes: tuple[int, ...]) -> Float[np.ndarray, "s N"]:
     """Matrix whose product with poses in socket order gives each socket's mean."""
-    owner = np.repeat(np.arange(len(sizes)), sizes)
-    return (owner[None, :] == np.arange(len(sizes))[:, None]) / np.asarray(sizes, dtype=float)[:, None]
+    return membership(sizes) / np.asarray(sizes, dtype=float)[:, None]
 
 
 class Weighing(NamedTuple):

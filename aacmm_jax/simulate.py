@@ -58,7 +58,7 @@ def simulate(
     if not sockets:
         raise InputError("simulate needs at least one socket with its position.")
     limits_array = limits_of(arm, limits)
-    points = {name: _point(name, point) for name, point in sockets.items()}
+    points = {name: socket_point(name, point) for name, point in sockets.items()}
     counts = _counts(points, poses)
     key = jax.random.key(seed)
     reach_key, seat_key, encoder_key, length_key = jax.random.split(key, 4)
@@ -174,7 +174,8 @@ def limits_of(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[Array
     return jnp.asarray(checked_limits(rows, arm.joints))
 
 
-def _point(name: str, point: Numbers) -> Float[Array, " 3"]:
+def socket_point(name: str, point: Numbers) -> Float[Array, " 3"]:
+    """A socket's position, mm, or `InputError` that names the socket."""
     array = as_floats(point, f"position of socket '{name}'")
     if array.shape != (3,):
         raise InputError(f"position of socket '{name}' has shape {array.shape}; give its three coordinates (x, y, z) in mm.")

@@ -48,7 +48,10 @@ class Uncertainty(eqx.Module):
 
     @property
     def u(self) -> Float[Array, " p"]:
-        """Standard uncertainty of each free parameter; infinite where only a combination is determined, 0 on a bound."""
+        """Standard uncertainty of each free parameter; infinite where only a combination is determined.
+
+        0 on a bound; but after two stages lengths there follow k, and have its uncertainty.
+        """
         alone = jnp.sqrt(jnp.diagonal(self.covariance))
         return jnp.where(jnp.diagonal(self.open) > 1e-6, jnp.inf, alone)
 

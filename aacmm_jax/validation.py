@@ -14,6 +14,7 @@ from .errors import InputError
 from .evaluate import evaluate
 from .noise import Noise, tip_covariances
 from .parameters import Bounds
+from .residuals import averaging_matrix
 from .results import CrossValidation, LeftOut
 from .uncertainty import Uncertainty, uncertainty_of
 
@@ -95,7 +96,7 @@ def predicted_errors(uncertainty: Uncertainty, capture: Capture) -> tuple[Float[
     arm, owner = uncertainty.arm, capture.owner
     sizes = np.asarray(capture.sizes, dtype=float)
     slopes = np.asarray(uncertainty.slopes(capture.q))
-    averaging = (owner[None, :] == np.arange(len(sizes))[:, None]) / sizes[:, None]
+    averaging = averaging_matrix(capture.sizes)
     means = np.einsum("sN,Ncp->scp", averaging, slopes)
     centred = slopes - means[owner]
     reading = np.asarray(tip_covariances(arm.geometry, turns_of(capture.q), uncertainty.noise))

@@ -186,6 +186,7 @@ REFUSED = {
     "region": ({"region": {"r": (0.0, 1.0)}}, "no 'r'"),
     "far region": ({"region": {"x": (5000.0, 6000.0)}}, "no place for the sockets"),
     "far socket": ({"sockets": {"A": (5000, 0, 0), "B": (400, 200, 300)}}, "cannot be reached"),
+    "two coordinates": ({"sockets": {"A": (400, 200), "B": (400, 300, 300)}}, "give its three coordinates"),
     "no u": (
         {"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}, "lengths": [("A", "B", 0.0)]},
         "u of a reference length is 0",

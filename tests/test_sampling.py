@@ -187,5 +187,8 @@ def test_files_keep_all_of_it(arm, bounds, capture, sampled, tmp_path):
         np.testing.assert_array_equal(found.length_error, kept.length_error)
     np.testing.assert_array_equal(loaded.sampled["high"], sampled.high)
     assert loaded.sampled_says == "It agrees."
+    # A calibration that failed leaves residuals of any size; its file is read all the same.
+    aj.save_calibration(tmp_path / "failed.h5", record._replace(noise=aj.Noise(encoder_arcsec=1e6, seating=500.0)))
+    assert float(aj.load_calibration(tmp_path / "failed.h5").noise.seating) == 500.0
     again = aj.uncertainty_of(loaded)
     np.testing.assert_allclose(again.u, aj.uncertainty_of(result).u)

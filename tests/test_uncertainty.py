@@ -108,11 +108,11 @@ def test_gains_are_derivatives_of_the_whole_calibration(paper_arm, space, bounds
         measurement = Measurement.of(capture).weighed(scaled.geometry, noise)
         weighing = propagation.weighing(scaled, measurement, sigma)
         none = jnp.zeros(21, dtype=bool)
-        whole = propagation.of_joint(found.arm, space, measurement, none, sigma, form, noise, weighing)
+        whole = propagation.of_solve(found.arm, space, measurement, none, sigma, form, noise, weighing)
     else:
         measurement = Measurement.of(capture).weighed(paper_arm.geometry, noise)
         held, sigma = jnp.asarray([name == "d_3" for name in space.names]), stage1.after.sigma
-        whole = propagation.of_poses(stage1.arm, space, measurement, held, sigma, form, noise)
+        whole = propagation.of_solve(stage1.arm, space, measurement, held, sigma, form, noise)
         whole = propagation.of_division(whole, stage1.arm, space, measurement, sigma, found.parameters)
     by_joints = stage1.arm.jacobian(capture.q, [f"q_{i}" for i in range(1, 7)])
     moved = np.einsum("Nai,tNi->taN", by_joints, turns)
@@ -273,6 +273,10 @@ REFUSED = {
     "negative": (lambda arm, capture, bounds: aj.Noise(encoder_arcsec=-1), "zero or positive"),
     "not finite": (lambda arm, capture, bounds: aj.Noise(seating=np.inf), "not finite"),
     "nothing": (lambda arm, capture, bounds: aj.calibrate(arm, capture, bounds, noise=aj.Noise()), "noise is zero everywhere"),
+    "another unit": (
+        lambda arm, capture, bounds: aj.identify(arm, capture, bounds, noise=aj.Noise(encoder_arcsec=1e5)),
+        "in another unit",
+    ),
     "joints": (
         lambda arm, capture, bounds: aj.identify(arm, capture, bounds, noise=aj.Noise(encoder_arcsec=[1, 2])),
         "2 values, but the arm has 6 joints",
