@@ -33,6 +33,7 @@ from .observability import observe as observe
 from .parameters import Bounds as Bounds
 from .parameters import Parameters as Parameters
 from .recording import ArmSpecification as ArmSpecification
+from .recording import ProbedSphere as ProbedSphere
 from .recording import Recording as Recording
 from .results import Calibration as Calibration
 from .results import Identification as Identification
@@ -70,21 +71,50 @@ _LATER = {
     "run_study": "study.run",
     "open_study": "study.results",
     "dask_executor": "study.executors",
+    "accept": "acceptance",
+    "measured_by": "acceptance",
+    "Measured": "acceptance",
+    "decide": "decision",
+    "Limit": "decision",
+    "fit_sphere": "spheres",
+    "enclosing_sphere": "spheres",
+    "reach_of": "volume",
+    "read_points": "points_files",
+    "acceptance_procedure": "procedure",
+    "record_procedure": "procedure",
+    "EvaluationRecord": "evaluation_files",
+    "evaluation_of": "evaluation_files",
+    "save_evaluation": "evaluation_files",
+    "load_evaluation": "evaluation_files",
 }
 _NOW = {name for name, value in globals().items() if not (name.startswith("_") or isinstance(value, type(_typing)))}
 __all__ = sorted(_NOW | set(_LATER))  # pyright: ignore[reportUnsupportedDunderAll]
 
 if _typing.TYPE_CHECKING:
+    from .acceptance import Measured as Measured
+    from .acceptance import accept as accept
+    from .acceptance import measured_by as measured_by
     from .arm_files import load_arm as load_arm
     from .arm_files import load_specification as load_specification
     from .arm_files import save_arm as save_arm
     from .arm_files import shipped_arms as shipped_arms
+    from .decision import Limit as Limit
+    from .decision import decide as decide
+    from .evaluation_files import EvaluationRecord as EvaluationRecord
+    from .evaluation_files import evaluation_of as evaluation_of
+    from .evaluation_files import load_evaluation as load_evaluation
+    from .evaluation_files import save_evaluation as save_evaluation
     from .manifest import read_manifest as read_manifest
     from .planning import Plan as Plan
     from .planning import plan as plan
+    from .points_files import read_points as read_points
+    from .procedure import acceptance_procedure as acceptance_procedure
+    from .procedure import record_procedure as record_procedure
     from .sampling import Sampled as Sampled
     from .sampling import bootstrap as bootstrap
     from .sampling import monte_carlo as monte_carlo
+    from .spheres import enclosing_sphere as enclosing_sphere
+    from .spheres import fit_sphere as fit_sphere
     from .study.executors import dask_executor as dask_executor
     from .study.results import open_study as open_study
     from .study.run import run_study as run_study
@@ -93,6 +123,7 @@ if _typing.TYPE_CHECKING:
     from .study.study import Study as Study
     from .study.study import make_study as make_study
     from .validation import cross_validate as cross_validate
+    from .volume import reach_of as reach_of
 else:
 
     def __getattr__(name: str):

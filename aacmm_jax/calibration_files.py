@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from . import storage
-from .capture_files import arm_table, recording_of, recording_tables, specification_of
+from .capture_files import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .evaluate import Evaluation, evaluate
 from .noise import Noise
 from .parameters import Parameters, is_length
@@ -113,9 +113,8 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
         tables["cross_validation"] = _validation_table(record)
     if record.sampled is not None:
         tables["monte_carlo"] = _sampled_table(record)
-    attributes = {
+    attributes = recording_attributes(record.recording) | {
         "sampled_says": record.sampled_says,
-        "seed": record.recording.seed,
         "method": record.method,
         "held": ",".join(record.held),
         "hold": record.hold,

@@ -1,7 +1,7 @@
 """Captures in HDF5: the poses, the reference lengths, the nominal arm and, for a simulation, the true one."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from . import storage
 from .arm import Arm
 from .capture import Capture, ReferenceLength
 from .errors import InputError
-from .recording import ArmSpecification, Recording, single
+from .recording import ArmSpecification, ProbedSphere, Recording, checked_sphere, single
 from .storage import Table, Variable
 
 _KINDS = {"alpha": "link twist", "a": "link length", "d": "link offset", "theta": "joint zero offset", "beta": "Hayati's angle"}
@@ -18,7 +18,7 @@ _KINDS = {"alpha": "link twist", "a": "link length", "d": "link offset", "theta"
 
 def save_capture(path: str | os.PathLike, recording: Recording) -> None:
     """Write a capture with its arms to HDF5, whole or not at all."""
-    storage.write_tables(path, "capture", recording_tables(recording), {"seed": recording.seed})
+    storage.write_tables(path, "capture", recording_tables(recording), recording_attributes(recording))
 
 
 def load_capture(path: str | os.PathLike) -> Recording:
@@ -26,6 +26,11 @@ def load_capture(path: str | os.PathLike) -> Recording:
     stored = storage.read_tables(path, ("capture", "calibration"))
     with storage.undamaged(path):
         return recording_of(path, stored)
+
+
+def recording_attributes(recording: Recording) -> dict[str, Any]:
+    """Root attributes of a file that holds a recording."""
+    return {"seed": recording.seed, "sources": list(recording.sources) or None}
 
 
 def recording_tables(recording: Recording) -> dict[str, Table]:
@@ -54,7 +59,44 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     }
     if recording.true is not None:
         tables["true_arm"] = arm_table(recording.true)
+    if recording.spheres:
+        tables["sphere"] = _sphere_table(recording.spheres)
     return tables
+
+
+def _sphere_table(spheres: Sequence[ProbedSphere]) -> Table:
+    """Touched spheres, one row a touch; what belongs to a sphere stands in every row of it."""
+    rows = [(sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group]
+    each = {
+        "sphere": ([sphere.name for sphere, *_ in rows], "", "reference sphere"),
+        "test": ([sphere.test for sphere, *_ in rows], "", "acceptance test that the sphere was touched for"),
+        "group": ([number for _, number, _ in rows], "1", "repeat, or orientation of the wrist"),
+        "diameter": ([sphere.diameter for sphere, *_ in rows], "mm", "calibrated diameter"),
+        "u": ([sphere.u for sphere, *_ in rows], "mm", "standard uncertainty of the diameter"),
+        "stylus": ([sphere.stylus for sphere, *_ in rows], "mm", "diameter of the probe's ball"),
+    }
+    variables = {name: Variable(("touch",), *column) for name, column in each.items()}
+    variables["touch"] = Variable(("touch",), np.arange(1, len(rows) + 1), "1", "touch number")
+    joints = rows[0][2].shape[0]
+    variables["joint"] = Variable(("joint",), np.arange(1, joints + 1), "1", "joint number")
+    variables["angle"] = Variable(("touch", "joint"), np.array([q for *_, q in rows]), "rad", "joint angle as read")
+    return Table(variables)
+
+
+def _spheres_of(path: str | os.PathLike, stored: storage.Stored) -> tuple[ProbedSphere, ...]:
+    table = stored.tables.get("sphere")
+    if table is None:
+        return ()
+    storage.need(path, table, "sphere", "test", "group", "diameter", "u", "stylus", "angle", of="entry")
+    keys = list(zip(table["sphere"].tolist(), table["test"].tolist(), strict=True))
+    found = []
+    for name, test in dict.fromkeys(keys):
+        rows = np.array([key == (name, test) for key in keys])
+        first = int(rows.argmax())
+        groups = tuple(table["angle"][rows & (table["group"] == number)] for number in np.unique(table["group"][rows]))
+        numbers = (float(table[what][first]) for what in ("diameter", "u", "stylus"))
+        found.append(ProbedSphere(str(name), test, groups, *numbers))
+    return tuple(found)
 
 
 def recording_of(path: str | os.PathLike, stored: storage.Stored) -> Recording:
@@ -74,7 +116,14 @@ def recording_of(path: str | os.PathLike, stored: storage.Stored) -> Recording:
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     true = specification_of(path, stored, "true_arm") if "true_arm" in stored.tables else None
-    return Recording(capture, specification_of(path, stored, "nominal_arm"), true, stored.attributes.get("seed"))
+    try:
+        spheres = tuple(checked_sphere(sphere, capture.joints) for sphere in _spheres_of(path, stored))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    sources = tuple(stored.attributes.get("sources") or ())
+    return Recording(
+        capture, specification_of(path, stored, "nominal_arm"), true, stored.attributes.get("seed"), spheres, sources
+    )
 
 
 def arm_table(specification: ArmSpecification) -> Table:

@@ -4,7 +4,7 @@ import glob
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -15,7 +15,7 @@ from . import storage
 from .arm_files import load_specification
 from .capture import Capture, ReferenceLength
 from .errors import InputError
-from .recording import Recording
+from .recording import ProbedSphere, Recording, SphereTest, checked_sphere
 from .toml import read_toml
 
 _UNITS = {"rad": 1.0, "deg": math.pi / 180, "arcsec": math.pi / (180 * 3600)}
@@ -65,11 +65,51 @@ class _Length(_Strict):
     u: NonNegativeFloat = 0.0
 
 
-class _Manifest(_Strict):
+class _Sphere(_Strict):
+    name: str
+    test: SphereTest
+    file: str | None = None
+    files: Annotated[list[str], Field(min_length=1)] | None = None
+    diameter: PositiveFloat
+    u: NonNegativeFloat = 0.0
+    stylus: NonNegativeFloat = 0.0
+
+    @model_validator(mode="after")
+    def _one(self) -> "_Sphere":
+        if (self.file is None) == (self.files is None):
+            raise ValueError("a sphere needs either file or files (one for each repeat, or orientation).")
+        return self
+
+    @property
+    def paths(self) -> list[str]:
+        return [self.file] if self.file is not None else list(self.files or ())
+
+
+class _Points(_Strict):
+    unit: Literal["mm", "m", "um", "inch"]
+    columns: Annotated[list[PositiveInt], Field(min_length=3, max_length=3)] | None = None
+    reach: PositiveFloat | None = None  # mm
+    shoulder: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] = [0.0, 0.0, 0.0]  # mm
+
+
+class _Recorded(_Strict):
+    """What manifests of poses and of points have in common."""
+
+    socket: list[_Socket] = []
+    length: list[_Length] = []
+    sphere: list[_Sphere] = []
+
+
+class _Manifest(_Recorded):
     arm: str
     angles: _Angles
-    socket: Annotated[list[_Socket], Field(min_length=1)]
-    length: list[_Length] = []
+    socket: Annotated[list[_Socket], Field(min_length=1)]  # pyright: ignore[reportGeneralTypeIssues]
+
+
+class PointsManifest(_Recorded):
+    """A manifest of points instead of poses."""
+
+    points: _Points
 
 
 def read_manifest(path: str | os.PathLike) -> Recording:
@@ -90,24 +130,45 @@ def read_manifest(path: str | os.PathLike) -> Recording:
             raise InputError(
                 f"angles.columns picks {len(model.angles.columns)} columns, but the arm has {joints} joints; pick one a joint."
             )
-        sockets: dict[str, np.ndarray] = {}
-        fields: list[dict[str, str]] = []
-        for entry in model.socket:
-            for name, files, values in _expand(path.parent, entry):
-                if name in sockets:
-                    raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
-                tables = [storage.read_numbers(file, model.angles.columns) for file in files]
-                for file, table in zip(files, tables, strict=True):
-                    if table.shape[1] != joints:
-                        raise InputError(
-                            f"{file} has {table.shape[1]} columns, but the arm has {joints} joints; give one column a joint, "
-                            "or pick them with columns = [...] in [angles]."
-                        )
-                sockets[name] = _radians(np.concatenate(tables), model.angles)
-                fields.append(values)
-        return Recording(Capture(sockets, _lengths(model.length, fields)), nominal)
+        files = [path]
+
+        def angles(file: Path) -> np.ndarray:
+            files.append(file)
+            table = storage.read_numbers(file, model.angles.columns)
+            if table.shape[1] != joints:
+                raise InputError(
+                    f"{file} has {table.shape[1]} columns, but the arm has {joints} joints; give one column a joint, "
+                    "or pick them with columns = [...] in [angles]."
+                )
+            return _radians(table, model.angles)
+
+        sockets, lengths, spheres = recorded(path.parent, model, angles)
+        sources = tuple(storage.fingerprint(file) for file in files)
+        return Recording(Capture(sockets, lengths), nominal, spheres=spheres, sources=sources)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def recorded(
+    folder: Path, model: _Recorded, read: Callable[[Path], np.ndarray]
+) -> tuple[dict[str, np.ndarray], list[ReferenceLength], tuple[ProbedSphere, ...]]:
+    """The sockets, lengths and spheres that a manifest names, each file read by ``read``."""
+    sockets: dict[str, np.ndarray] = {}
+    fields: list[dict[str, str]] = []
+    for entry in model.socket:
+        for name, files, values in _expand(folder, entry):
+            if name in sockets:
+                raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
+            sockets[name] = np.concatenate([read(file) for file in files])
+            fields.append(values)
+    spheres = []
+    for entry in model.sphere:
+        if any((entry.name, entry.test) == (other.name, other.test) for other in spheres):
+            raise InputError(f"sphere '{entry.name}' is defined twice for one test; give its files in one [[sphere]].")
+        groups = tuple(read(folder / file) for file in entry.paths)
+        sphere = ProbedSphere(entry.name, entry.test, groups, entry.diameter, entry.u, entry.stylus)
+        spheres.append(checked_sphere(sphere))
+    return sockets, _lengths(model.length, fields), tuple(spheres)
 
 
 def _arm_source(manifest: Path, arm: str) -> str | Path:

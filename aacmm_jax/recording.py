@@ -2,9 +2,13 @@
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Float
 
 from .arm import Arm, is_single
+from .arrays import as_floats
 from .capture import Capture
 from .errors import InputError
 from .parameters import Bounds, Parameters
@@ -26,6 +30,25 @@ class ArmSpecification(NamedTuple):
         return Bounds.around(self.arm, space, length=self.length, angle=self.angle, override=self.override)
 
 
+SphereTest = Literal["effective-diameter", "probing", "articulation"]
+SPHERE_TESTS = get_args(SphereTest)
+
+
+class ProbedSphere(NamedTuple):
+    """A reference sphere as it was touched, for acceptance tests; it takes no part in a calibration. mm and rad.
+
+    ``groups`` are joint angles ``(m, n)`` or points ``(m, 3)`` of the probe's centre, one group for each sphere that is fitted: the repeats of
+    ASME's effective diameter, the 25 points of ISO's probing test, or the orientations of its articulation test.
+    """
+
+    name: str
+    test: SphereTest
+    groups: tuple[Float[np.ndarray, "m n"], ...]
+    diameter: float  # calibrated
+    u: float = 0.0  # standard uncertainty of the diameter
+    stylus: float = 0.0  # diameter of the ball of the probe; 0 where points lie on the sphere itself
+
+
 class Recording(NamedTuple):
     """A capture with the nominal arm that recorded it and, for a simulation, the true one."""
 
@@ -33,6 +56,28 @@ class Recording(NamedTuple):
     nominal: ArmSpecification
     true: ArmSpecification | None = None
     seed: int | None = None
+    spheres: tuple[ProbedSphere, ...] = ()
+    sources: tuple[str, ...] = ()  # files that it was read from: name and SHA-256, the latest first
+
+
+def checked_sphere(sphere: ProbedSphere, columns: int | None = None) -> ProbedSphere:
+    """The same sphere with its groups as arrays, or `InputError` that names it."""
+    where = f"sphere '{sphere.name}'"
+    if sphere.test not in SPHERE_TESTS:
+        raise InputError(f"{where}: test is '{sphere.test}'; it must be one of {', '.join(SPHERE_TESTS)}.")
+    for what, value, least in (("diameter", sphere.diameter, 1e-6), ("u", sphere.u, 0.0), ("stylus", sphere.stylus, 0.0)):
+        if not (np.isfinite(value) and value >= least):
+            raise InputError(f"{where}: {what} is {value:g} mm; it must be {'positive' if least else 'zero or positive'}.")
+    groups = tuple(np.asarray(as_floats(group, where)) for group in sphere.groups)
+    for group in groups:
+        if group.ndim != 2 or not len(group) or (columns is not None and group.shape[1] != columns):
+            raise InputError(
+                f"{where} has a group of shape {group.shape}; give one row a touched point"
+                + (f" and {columns} columns." if columns is not None else ".")
+            )
+    if not groups:
+        raise InputError(f"{where} has no touched points; give at least one group.")
+    return sphere._replace(groups=groups)
 
 
 def single(arm: Arm) -> Arm:

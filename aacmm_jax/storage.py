@@ -6,6 +6,7 @@ import datetime
 import math
 import os
 import secrets
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -159,19 +160,41 @@ def storable(text: str) -> str:
     return text
 
 
+def fingerprint(path: str | os.PathLike) -> str:
+    """A file's name and SHA-256, by which it can be told from every other."""
+    import hashlib
+
+    path = Path(path)
+    check_readable(path)
+    return storable_name(f"{path.name} (SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()})")
+
+
+def storable_name(text: str) -> str:
+    """A name from the file system or the command line in a form that HDF5 can hold: bytes that are not UTF-8 are written out."""
+    return text.encode(errors="backslashreplace").decode()
+
+
+def _versions() -> str:
+    import platform
+    from importlib import metadata
+
+    others = (f"{name} {metadata.version(name)}" for name in ("jax", "equinox", "optimistix", "numpy"))
+    return ", ".join([f"Python {platform.python_version()}", *others])
+
+
 def provenance(kind: str) -> dict[str, Any]:
     """Root attributes of every file: what it is, and what made it."""
     from importlib import metadata
 
-    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]) if sys.argv and sys.argv[0] else "python"
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]) if sys.argv and sys.argv[0] else "python"
     return {
         "format": FORMAT,
         "kind": kind,
         "format_version": FORMAT_VERSION,
         "package_version": metadata.version("aacmm_jax"),
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        # Arguments that are not UTF-8 arrive as surrogates, which HDF5 cannot hold.
-        "command": command.encode(errors="backslashreplace").decode(),
+        "versions": _versions(),
+        "command": storable_name(command),  # arguments that are not UTF-8 arrive as surrogates
     }
 
 

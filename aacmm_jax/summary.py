@@ -1,15 +1,13 @@
 """What files hold, as plain dictionaries with the unit in every key: printed by the command line, and its ``--json``."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from .arm import Arm
 from .calibration_files import CalibrationRecord
 from .capture import Capture
 from .cautions import of_calibration, of_capture
-from .evaluate import Evaluation, evaluate
+from .evaluate import Evaluation
 from .observability import observe
 from .parameters import Parameters, is_length
 from .recording import ArmSpecification, Recording
@@ -81,10 +79,11 @@ def figures(evaluation: Evaluation) -> dict[str, Any]:
     numbers = {"de_mm": spread.de, "deltam_mm": spread.deltam, "rms_mm": spread.rms}
     # With one pose in every socket there is no repeatability to speak of.
     found: dict[str, Any] = {key: float(value) for key, value in numbers.items() if np.isfinite(value)}
-    return found | (_length_figures(error) if len(error) else {})
+    return found | (length_figures(error) if len(error) else {})
 
 
-def _length_figures(error: np.ndarray) -> dict[str, float]:
+def length_figures(error: np.ndarray) -> dict[str, float]:
+    """Mean absolute and largest error of lengths, mm."""
     return {
         "length_error_mean_absolute_mm": float(np.mean(np.abs(error))),
         "length_error_largest_mm": float(np.max(np.abs(error))),
@@ -208,78 +207,3 @@ def truth_errors(record: CalibrationRecord, vectors: dict[str, np.ndarray], stag
         "length_error_largest_mm": float(difference[length].max(initial=0.0)),
         "angle_error_largest_rad": float(difference[~length].max(initial=0.0)),
     }
-
-
-def evaluation_summary(record: CalibrationRecord, recording: Recording) -> dict[str, Any]:
-    """The nominal and the calibrated arm on a capture, apart for what was identified from and what was held out.
-
-    A length counts as held out where at least one of its ends was never identified from.
-    """
-    capture = recording.capture
-    known = record.recording.capture.sockets
-    used = {
-        name
-        for name, q in capture.sockets.items()
-        if any(np.array_equal(np.asarray(q), np.asarray(other)) for other in known.values())
-    }
-    summary: dict[str, Any] = {"kind": "evaluation", "arm": record.recording.nominal.name, "warnings": []}
-    if not _same(recording.nominal.arm, record.recording.nominal.arm):
-        summary["warnings"].append(
-            f"The capture is of '{recording.nominal.name}', but the calibration of '{record.recording.nominal.name}'; "
-            "is it the same arm?"
-        )
-    whole = {stage: evaluate(specification.arm, capture) for stage, specification in _arms(record).items()}
-    rows = tables(capture, whole["calibrated"])
-    for group in ("held_out", "identified_from"):
-        wanted = group == "identified_from"
-        names = [name for name in capture.names if (name in used) == wanted]
-        lengths = [i for i, length in enumerate(capture.lengths) if (length.start in used and length.end in used) == wanted]
-        if not names and not lengths:
-            summary[group] = None
-            continue
-        part = Capture({name: capture.sockets[name] for name in names}) if names else None
-        summary[group] = {
-            stage: _grouped(None if part is None else evaluate(specification.arm, part), whole[stage], lengths)
-            for stage, specification in _arms(record).items()
-        }
-        summary[group]["sockets"] = [row for row in rows["sockets"] if row["socket"] in names]
-        summary[group]["lengths"] = [rows["lengths"][i] for i in lengths]
-    return summary
-
-
-def _grouped(part: Evaluation | None, whole: Evaluation, lengths: list[int]) -> dict[str, Any]:
-    """Repeatability of a group's own sockets, and errors of the lengths that count for it."""
-    found = {} if part is None else figures(part)
-    return found | (_length_figures(np.asarray(whole.error)[lengths]) if lengths else {})
-
-
-def _same(one: Arm, other: Arm) -> bool:
-    return one.joints == other.joints and all(
-        np.array_equal(np.asarray(getattr(one, kind)), np.asarray(getattr(other, kind)))
-        for kind in ("alpha", "a", "d", "theta", "probe")
-    )
-
-
-def _arms(record: CalibrationRecord) -> dict[str, ArmSpecification]:
-    return {"nominal": record.recording.nominal, "calibrated": record.calibrated}
-
-
-_LIMITED = {"rms_mm": "RMS distance", "deltam_mm": "Deltam", "length_error_largest_mm": "largest length error"}
-
-
-def exceeded(summary: dict[str, Any], limits: Sequence[tuple[str, float | None]]) -> tuple[list[str], list[str]]:
-    """Sentences on limits kept and limits exceeded by the calibrated arm, over held-out data where there are any."""
-    kept, failed = [], []
-    for key, limit in limits:
-        if limit is None:
-            continue
-        groups = [group for group in ("held_out", "identified_from") if summary[group] and key in summary[group]["calibrated"]]
-        if not groups:
-            failed.append(f"{_LIMITED[key]} has a limit of {limit:g} mm, but there is nothing to measure it on.")
-            continue
-        value = summary[groups[0]]["calibrated"][key]
-        where = "held-out data" if groups[0] == "held_out" else "the data identified from"
-        relation = "within" if value <= limit else "over"
-        verdict = f"{_LIMITED[key]} on {where} is {value:.4f} mm, {relation} the limit of {limit:g} mm."
-        (kept if value <= limit else failed).append(verdict)
-    return kept, failed

@@ -12,6 +12,8 @@ import typer
 
 from ..errors import IdentifiabilityWarning, InputError
 
+_U_ARTEFACT = 0.001  # mm
+
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -74,7 +76,9 @@ def demo(
 def simulate(
     arm: Annotated[str, typer.Argument(metavar="ARM", help="Nominal arm: a TOML file or a name that ships with the package.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Capture to write (HDF5).")],
-    socket: Annotated[list[str], typer.Option(metavar="NAME=X,Y,Z", help="A socket and its position in mm; repeatable.")],
+    socket: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=X,Y,Z", help="A socket and its position in mm; repeatable.")
+    ] = None,
     poses: Annotated[
         list[str] | None, typer.Option(metavar="N or NAME=N", help="Poses a socket; repeatable. Default 70.")
     ] = None,
@@ -87,6 +91,12 @@ def simulate(
     true_arm: Annotated[str | None, typer.Option(help="Arm that makes the poses, where it is not the nominal one.")] = None,
     deviate_length_mm: Annotated[float, typer.Option(min=0, help="Draw the true arm: lengths off by up to this.")] = 0.0,
     deviate_angle_deg: Annotated[float, typer.Option(min=0, help="Draw the true arm: angles off by up to this.")] = 0.0,
+    acceptance: Annotated[
+        Literal["asme", "iso"] | None,
+        typer.Option(
+            help="Instead of sockets: the acceptance test that 'aacmm plan --acceptance' plans; artefacts with u = 1 um."
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of poses and noise.")] = 0,
     as_json: Json = False,
 ) -> None:
@@ -106,9 +116,27 @@ def simulate(
         space = Parameters.free_of(true.arm, held=true.held)
         drawn = deviated(space, length=deviate_length_mm, angle=math.radians(deviate_angle_deg), seed=seed)
         true = true._replace(arm=drawn, name=f"{true.name}, deviated")
-    points = dict(_socket_option(text) for text in socket)
-    if len(points) < len(socket):
-        raise InputError("a socket is named twice in --socket; give each its own name.")
+    if acceptance is not None:
+        if socket or poses or length or resolution_arcsec:
+            raise InputError("--acceptance brings its own sockets, poses and lengths; leave the options that give them out.")
+        noise = {"encoder_arcsec": encoder_arcsec, "seating": seating_mm, "u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
+
+        def taken() -> Recording:
+            from ..procedure import acceptance_procedure, record_procedure
+
+            return record_procedure(acceptance_procedure(nominal.arm, acceptance), nominal, true, **noise, seed=seed)
+
+        recording = _busy("Simulating", taken)
+        save_capture(output, recording)
+        _show(capture_summary(recording) | {"written": str(output)}, as_json, display.capture)
+        return
+    points = dict(_socket_option(text) for text in socket or ())
+    if not points or len(points) < len(socket or ()):
+        raise InputError(
+            "a socket is named twice in --socket; give each its own name."
+            if points
+            else "give --socket NAME=X,Y,Z, or --acceptance."
+        )
     capture = _busy(
         "Simulating",
         lambda: run(
@@ -198,13 +226,16 @@ def calibrate(
     from ..calibration_files import record_of, save_calibration
     from ..capture_files import load_capture
     from ..cautions import plausible
+    from ..storage import fingerprint
     from ..summary import calibration_summary
     from . import display, options
 
     if output.exists() and output.samefile(capture):
         raise InputError(f"{output} is the capture itself; choose another output, so that held-out sockets are not lost.")
     recording = load_capture(capture)
-    recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
+    recording = recording._replace(
+        capture=recording.capture.select(only or None, without or ()), sources=(fingerprint(capture), *recording.sources)
+    )
     bounds = options.bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])
     recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
     solving = {
@@ -242,82 +273,13 @@ def calibrate(
         raise typer.Exit(1)
 
 
-@app.command(epilog="Example: aacmm evaluate calibration.h5 capture.h5 --max-rms-mm 0.05")
-def evaluate(
-    calibration: CalibrationFile,
-    capture: CaptureFile,
-    only: Only = None,
-    without: Without = None,
-    max_rms_mm: Annotated[float | None, typer.Option(min=0, help="Exit with code 1 where the RMS distance is larger.")] = None,
-    max_deltam_mm: Annotated[float | None, typer.Option(min=0, help="Exit with code 1 where Deltam is larger.")] = None,
-    max_length_error_mm: Annotated[
-        float | None, typer.Option(min=0, help="Exit with code 1 where any length's error is larger.")
-    ] = None,
-    as_json: Json = False,
-) -> None:
-    """Try a calibration on a capture: sockets it was identified from, and sockets it has never seen."""
-    from ..calibration_files import load_calibration
-    from ..capture_files import load_capture
-    from ..summary import evaluation_summary, exceeded
-    from . import display
-
-    record = load_calibration(calibration)
-    recording = load_capture(capture)
-    recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
-    summary = _busy("Evaluating", lambda: evaluation_summary(record, recording))
-    limits = (("rms_mm", max_rms_mm), ("deltam_mm", max_deltam_mm), ("length_error_largest_mm", max_length_error_mm))
-    summary["kept"], summary["failed"] = exceeded(summary, limits)
-    _show(summary, as_json, display.evaluation)
-    if summary["failed"]:
-        raise typer.Exit(1)
-
-
-@app.command(epilog="Example: aacmm export calibration.h5 --format toml -o arm.toml")
-def export(
-    calibration: CalibrationFile,
-    form: Annotated[
-        Literal["toml", "json", "csv"],
-        typer.Option("--format", help="toml: an arm file; json: everything; csv: the parameters."),
-    ] = "toml",
-    which: Annotated[
-        Literal["calibrated", "nominal", "true"], typer.Option("--arm", help="Which arm, for toml; true: of a simulation.")
-    ] = "calibrated",
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="File to write; standard output without it.")] = None,
-) -> None:
-    """Write a calibrated arm for other programs."""
-    from .. import storage
-    from ..arm_files import specification_toml
-    from ..calibration_files import load_calibration
-    from ..summary import calibration_summary, parameters_csv
-
-    record = load_calibration(calibration)
-    arms = {"calibrated": record.calibrated, "nominal": record.recording.nominal, "true": record.recording.true}
-    arm = arms[which]
-    if arm is None:
-        raise InputError(f"{calibration} is not of a simulation, so it holds no true arm.")
-    if not record.converged:
-        typer.echo(f"Warning: {calibration} did not converge: {record.reason}", err=True)
-    source = (
-        f"calibrated from {sum(record.recording.capture.sizes)} poses, {record.method}, k = {record.k:.8f}"
-        if which == "calibrated"
-        else ""
-    )
-    text = {
-        "toml": lambda: specification_toml(arm, source=source),
-        "json": lambda: json.dumps(calibration_summary(record), indent=2) + "\n",
-        "csv": lambda: parameters_csv(record),
-    }[form]()
-    if output is None:
-        typer.echo(text, nl=False)
-    else:
-        storage.write_text(output, text)
-
-
 @app.command(epilog="Example: aacmm show calibration.h5")
 def show(
     file: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="Capture, calibration or study (HDF5), or an arm: TOML file or shipped name."),
+        typer.Argument(
+            metavar="FILE", help="Capture, calibration, evaluation or study (HDF5), or an arm: TOML file or shipped name."
+        ),
     ],
     cell: Annotated[int | None, typer.Option(min=1, help="Of a study: one cell in full.")] = None,
     figures: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Of a study: draw its figures as PNG.")] = None,
@@ -329,12 +291,12 @@ def show(
     from ..calibration_files import load_calibration
     from ..capture_files import load_capture
     from ..summary import arm_summary, calibration_summary, capture_summary
-    from . import display
+    from . import acceptance_display, display
 
     if file.suffix in ("", ".toml") and not (file.is_file() and file.suffix == ""):
         _show(arm_summary(load_specification(str(file))), as_json, display.arm)
         return
-    stored = storage.read_tables(file, ("capture", "calibration", "study"), without=("trials",))
+    stored = storage.read_tables(file, ("capture", "calibration", "evaluation", "study"), without=("trials",))
     if stored.attributes["kind"] == "study":
         from .study_commands import show_study
 
@@ -342,7 +304,12 @@ def show(
         return
     if cell is not None or figures is not None:
         raise InputError(f"{file} holds a {stored.attributes['kind']}; --cell and --figures are for studies.")
-    if stored.attributes["kind"] == "capture":
+    if stored.attributes["kind"] == "evaluation":
+        from ..evaluation_files import load_evaluation
+        from ..evaluation_summary import evaluation_summary
+
+        _show(evaluation_summary(load_evaluation(file)), as_json, acceptance_display.evaluation)
+    elif stored.attributes["kind"] == "capture":
         _show(capture_summary(load_capture(file)), as_json, display.capture)
     else:
         _show(calibration_summary(load_calibration(file)), as_json, display.calibration)

@@ -158,29 +158,6 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
         console.print(f"Monte Carlo (JCGM 101): {summary['monte_carlo']}")
 
 
-def evaluation(summary: dict[str, Any]) -> None:
-    """One evaluation: held-out sockets first, since they are what counts."""
-    console = _console()
-    console.print(f"[bold]{escape(summary['arm'])}[/bold]")
-    _warnings(console, summary)
-    for group, text in (("held_out", "Sockets never identified from"), ("identified_from", "Sockets identified from")):
-        part = summary[group]
-        if part is None:
-            continue
-        _stages(console, f"\n{text} [mm]", part, ("nominal", "calibrated"))
-        table = _table("", "socket", "poses", "DE [mm]", "Deltam [mm]", "RMS [mm]")
-        for row in part["sockets"]:
-            cells = (_number(row[key]) for key in ("de_mm", "deltam_mm", "rms_mm"))
-            table.add_row(escape(row["socket"]), str(row["poses"]), *cells)
-        console.print(table)
-        if part["lengths"]:
-            _lengths(console, part["lengths"])
-    for sentence in summary["kept"]:
-        console.print(f"[green]Passed:[/green] {sentence}")
-    for sentence in summary["failed"]:
-        console.print(f"[red]Failed:[/red] {sentence}")
-
-
 def demo(summary: dict[str, Any]) -> None:
     """The demonstration: before, stage 1 and stage 2 against the truth."""
     console = _console()

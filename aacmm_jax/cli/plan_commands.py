@@ -8,11 +8,12 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ..errors import InputError
-from .commands import Json, _length_option, _show, _socket_option
+from .commands import Json, _busy, _length_option, _show, _socket_option
 from .study_commands import app
 
 
 @app.command(epilog="Examples: aacmm plan my-arm.toml --sockets 4 --poses 30 -o plan.csv; "
+             "aacmm plan my-arm.toml --acceptance iso -o acceptance.csv --manifest acceptance.toml; "
              "aacmm plan my-arm.toml --socket A=400,200,300 --socket B=700,500,500 --length A,B,0.002 --poses 25 -o plan.csv")  # fmt: skip
 def plan(
     arm: Annotated[str, typer.Argument(metavar="ARM", help="Arm: a TOML file or a name that ships with the package.")],
@@ -52,16 +53,25 @@ def plan(
     check_length_mm: Annotated[
         float | None, typer.Option(help="Lengths that predictions are of. Default 300, or half of a small arm's reach.")
     ] = None,
+    acceptance: Annotated[
+        Literal["asme", "iso"] | None,
+        typer.Option(help="Instead: the poses of an acceptance test, ASME B89.4.22 or ISO 10360-12."),
+    ] = None,
+    sphere_mm: Annotated[float, typer.Option(help="Of an acceptance test: diameter of the sphere.")] = 25.0,
+    stylus_mm: Annotated[float, typer.Option(min=0, help="Of an acceptance test: diameter of the probe's ball.")] = 6.0,
+    manifest: Annotated[
+        Path | None, typer.Option(help="Of an acceptance test: write the manifest (TOML) that its readings are imported with.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed.")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Choose poses, sockets and the place of the reference length before the arm is touched."""
+    """Choose poses, sockets and the place of the reference length before the arm is touched; or the poses of an acceptance test."""
     from ..arm_files import load_specification
     from ..noise import Noise
     from ..parameters import Parameters
     from ..plan_files import plan_summary, save_plan
     from ..planning import plan as run
-    from . import plan_display
+    from . import acceptance_display, plan_display
 
     specification = load_specification(arm)
     if socket and sockets is not None:
@@ -70,6 +80,17 @@ def plan(
         raise InputError("--length is between sockets that stand (--socket); to place a reference length, use --length-mm.")
     if region and socket:
         raise InputError("--region is for sockets that are placed; with --socket they stand where you say.")
+    if acceptance is not None:
+        if socket or sockets is not None or length or region:
+            raise InputError(
+                "--acceptance places its own sockets and bars; leave --socket, --sockets, --length and --region out."
+            )
+        _check_output(output, arm)
+        room = {"above": above_mm, "margin": math.radians(margin_deg), "diameter": sphere_mm, "stylus": stylus_mm, "seed": seed}
+        _show(_procedure(specification, arm, acceptance, output, manifest, room), as_json, acceptance_display.procedure)
+        return
+    if manifest is not None:
+        raise InputError("--manifest goes with --acceptance; a plan for a calibration is in its CSV whole.")
     axes = [_axis(text) for text in region or ()]
     if len(dict(axes)) < len(axes):
         raise InputError("an axis is named twice in --region; give each one range.")
@@ -99,6 +120,27 @@ def plan(
     save_plan(output, found)
     summary: dict[str, Any] = plan_summary(found, specification.name) | {"written": str(output)}
     _show(summary, as_json, plan_display.plan)
+
+
+def _procedure(
+    specification: Any, arm: str, standard: Any, output: Path, manifest: Path | None, room: dict[str, Any]
+) -> dict[str, Any]:
+    """Plan an acceptance test and write it."""
+    from ..procedure import acceptance_procedure
+    from ..procedure_files import procedure_csv, procedure_manifest, procedure_summary
+    from ..storage import write_text
+
+    if manifest is not None:
+        _check_output(manifest, arm)
+        if manifest == output:
+            raise InputError(f"{output} is given for the plan and for the manifest; choose another for one of them.")
+    found = _busy("Planning", lambda: acceptance_procedure(specification.arm, standard, **room))
+    write_text(output, procedure_csv(found))
+    written = str(output)
+    if manifest is not None:
+        write_text(manifest, procedure_manifest(found, arm))
+        written += f", {manifest}"
+    return procedure_summary(found, specification.name) | {"written": written}
 
 
 def _check_output(output: Path, arm: str) -> None:

@@ -1,0 +1,149 @@
+"""What is done with a calibration: ``evaluate``, ``export``."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from ..errors import InputError
+from .commands import CalibrationFile, Json, Only, Without, _busy, _show
+from .plan_commands import app
+
+
+@app.command(
+    epilog="Examples: aacmm evaluate calibration.h5 capture.h5 --mpe Deltam=0.05 --mpe E_Uni=0.025+L/40000; aacmm evaluate points.toml"
+)
+def evaluate(
+    calibration: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CALIBRATION.h5", help="Calibration written by calibrate; or alone a manifest (TOML) of points."
+        ),
+    ],
+    capture: Annotated[Path | None, typer.Argument(metavar="CAPTURE.h5", help="Capture written by import or simulate.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Evaluation to write (HDF5), for aacmm report.")] = None,
+    only: Only = None,
+    without: Without = None,
+    mpe: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FIGURE=A[+L/K]",
+            help="Limit of an acceptance figure in mm, decided by ISO 14253-1; repeatable. Exit code 1 where one is not met.",
+        ),
+    ] = None,
+    test_u_mm: Annotated[
+        float, typer.Option(min=0, help="Standard uncertainty that seat, fixture and temperature add to every test value.")
+    ] = 0.0,
+    max_rms_mm: Annotated[float | None, typer.Option(min=0, help="Exit with code 1 where the RMS distance is larger.")] = None,
+    max_deltam_mm: Annotated[float | None, typer.Option(min=0, help="Exit with code 1 where Deltam is larger.")] = None,
+    max_length_error_mm: Annotated[
+        float | None, typer.Option(min=0, help="Exit with code 1 where any length's error is larger.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Try a calibration on a capture, with sockets it has never seen, and run every acceptance test that the capture holds."""
+    from ..acceptance import FIGURES
+    from ..decision import read_limits
+    from . import acceptance_display
+
+    limits = read_limits(mpe or [], FIGURES)
+    maxima = {"rms_mm": max_rms_mm, "deltam_mm": max_deltam_mm, "length_error_largest_mm": max_length_error_mm}
+    maxima = {name: value for name, value in maxima.items() if value is not None}
+    if capture is None:
+        if output is not None or maxima or only or without:
+            raise InputError(
+                "with a manifest of points there are only --mpe, --test-u-mm and --json; name a calibration and a capture for more."
+            )
+        summary = _evaluated_points(calibration, limits, test_u_mm)
+        _show(summary, as_json, acceptance_display.points)
+    else:
+        summary = _evaluated(calibration, capture, output, (only, without), limits, test_u_mm, maxima)
+        _show(summary, as_json, acceptance_display.evaluation)
+    undecided = [test for test in summary["acceptance"] if test["decision"] in ("fails", "undecided")]
+    if summary["failed"] or undecided:
+        raise typer.Exit(1)
+
+
+def _evaluated(
+    calibration: Path, capture: Path, output: Path | None, choice: tuple, limits: Any, u_test: float, maxima: dict[str, float]
+) -> dict[str, Any]:
+    from ..calibration_files import load_calibration
+    from ..capture_files import load_capture
+    from ..evaluation_files import evaluation_of, save_evaluation
+    from ..evaluation_summary import evaluation_summary
+    from ..storage import fingerprint
+
+    if output is not None:
+        for given in (calibration, capture):
+            if output.exists() and given.exists() and output.samefile(given):
+                raise InputError(f"{output} is one of the files to evaluate; choose another output.")
+    record, recording = load_calibration(calibration), load_capture(capture)
+    recording = recording._replace(
+        capture=recording.capture.select(choice[0] or None, choice[1] or ()),
+        sources=(fingerprint(calibration), fingerprint(capture), *recording.sources),
+    )
+    found = evaluation_of(record, recording, limits=limits, u_test=u_test, maxima=maxima)
+    summary = _busy("Evaluating", lambda: evaluation_summary(found))
+    if output is not None:
+        save_evaluation(output, found)
+        summary["written"] = str(output)
+    return summary
+
+
+def _evaluated_points(manifest: Path, limits: Any, u_test: float) -> dict[str, Any]:
+    from ..acceptance import accept
+    from ..evaluation_summary import acceptance_summary
+    from ..points_files import read_points
+
+    if manifest.suffix != ".toml":
+        raise InputError(f"{manifest} alone cannot be evaluated; name a capture too, or a manifest (TOML) of points.")
+    tests = accept(read_points(manifest), limits, u_test)
+    return {
+        "kind": "acceptance",
+        "points": str(manifest),
+        "failed": [],
+        "acceptance": acceptance_summary(tests),
+        "u_test_mm": u_test,
+    }
+
+
+@app.command(epilog="Example: aacmm export calibration.h5 --format toml -o arm.toml")
+def export(
+    calibration: CalibrationFile,
+    form: Annotated[
+        Literal["toml", "json", "csv"],
+        typer.Option("--format", help="toml: an arm file; json: everything; csv: the parameters."),
+    ] = "toml",
+    which: Annotated[
+        Literal["calibrated", "nominal", "true"], typer.Option("--arm", help="Which arm, for toml; true: of a simulation.")
+    ] = "calibrated",
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="File to write; standard output without it.")] = None,
+) -> None:
+    """Write a calibrated arm for other programs."""
+    from .. import storage
+    from ..arm_files import specification_toml
+    from ..calibration_files import load_calibration
+    from ..summary import calibration_summary, parameters_csv
+
+    record = load_calibration(calibration)
+    arms = {"calibrated": record.calibrated, "nominal": record.recording.nominal, "true": record.recording.true}
+    arm = arms[which]
+    if arm is None:
+        raise InputError(f"{calibration} is not of a simulation, so it holds no true arm.")
+    if not record.converged:
+        typer.echo(f"Warning: {calibration} did not converge: {record.reason}", err=True)
+    source = (
+        f"calibrated from {sum(record.recording.capture.sizes)} poses, {record.method}, k = {record.k:.8f}"
+        if which == "calibrated"
+        else ""
+    )
+    text = {
+        "toml": lambda: specification_toml(arm, source=source),
+        "json": lambda: json.dumps(calibration_summary(record), indent=2) + "\n",
+        "csv": lambda: parameters_csv(record),
+    }[form]()
+    if output is None:
+        typer.echo(text, nl=False)
+    else:
+        storage.write_text(output, text)

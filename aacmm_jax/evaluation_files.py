@@ -1,0 +1,153 @@
+"""An evaluation: a calibrated arm tried on a capture, within what limits; in HDF5."""
+
+import math
+import os
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from . import storage
+from .acceptance import AcceptanceTest, Measured, accept, measured_by
+from .arm import Arm
+from .calibration_files import CalibrationRecord
+from .capture_files import arm_table, recording_attributes, recording_of, recording_tables, specification_of
+from .decision import Limit
+from .recording import ArmSpecification, Recording
+from .storage import Table, Variable
+
+
+class EvaluationRecord(NamedTuple):
+    """What an evaluation is of; its figures follow from that."""
+
+    recording: Recording  # the capture, with the nominal arm of the calibration
+    calibrated: ArmSpecification
+    used: frozenset[str]  # sockets that the calibration was identified from
+    warnings: tuple[str, ...] = ()
+    limits: Mapping[str, Limit] = MappingProxyType({})  # MPE by the name of a figure (`acceptance.FIGURES`)
+    u_test: float = 0.0  # standard uncertainty that seat, fixture and temperature add, mm
+    maxima: Mapping[str, float] = MappingProxyType({})  # plain limits on rms_mm, deltam_mm, length_error_largest_mm
+
+    def arms(self) -> dict[str, ArmSpecification]:
+        """The arm as found and as left."""
+        return {"nominal": self.recording.nominal, "calibrated": self.calibrated}
+
+    def unseen(self) -> list[int]:
+        """Which lengths have an end that was never identified from."""
+        lengths = self.recording.capture.lengths
+        return [i for i, length in enumerate(lengths) if not {length.start, length.end} <= self.used]
+
+    def measured(self, arm: Arm) -> Measured:
+        """What acceptance tests look at: what the calibration has not seen; all, where it has seen everything."""
+        whole = measured_by(arm, self.recording)
+        if not self.independent:
+            return whole
+        return whole._replace(lengths=tuple(whole.lengths[i] for i in self.unseen()), known=self.used)
+
+    @property
+    def independent(self) -> bool:
+        """Whether there is anything that the calibration has not seen."""
+        new = set(self.recording.capture.names) - self.used
+        return bool(new or self.unseen() or self.recording.spheres)
+
+    def acceptance(self) -> dict[str, list[AcceptanceTest]]:
+        """Every test that the capture allows, as found and as left."""
+        return {stage: accept(self.measured(arm.arm), self.limits, self.u_test) for stage, arm in self.arms().items()}
+
+
+def evaluation_of(
+    record: CalibrationRecord,
+    recording: Recording,
+    *,
+    limits: Mapping[str, Limit] | None = None,
+    u_test: float = 0.0,
+    maxima: Mapping[str, float] | None = None,
+) -> EvaluationRecord:
+    """A calibration tried on a capture. Sockets count as identified from where the calibration holds the very same poses."""
+    known = [np.asarray(q) for q in record.recording.capture.sockets.values()]
+    sockets = recording.capture.sockets
+    used = {name for name, q in sockets.items() if any(np.array_equal(np.asarray(q), other) for other in known)}
+    warnings = []
+    if not _same(recording.nominal.arm, record.recording.nominal.arm):
+        warnings.append(
+            f"The capture is of '{recording.nominal.name}', but the calibration of '{record.recording.nominal.name}'; is it the same arm?"
+        )
+    found = EvaluationRecord(
+        recording._replace(nominal=record.recording.nominal),
+        record.calibrated,
+        frozenset(used),
+        tuple(warnings),
+        dict(limits or {}),
+        u_test,
+        dict(maxima or {}),
+    )
+    if not found.independent:
+        note = "The arm was identified from all of this capture, so its figures flatter it; take sockets and lengths that it has not seen."
+        found = found._replace(warnings=(*warnings, note))
+    return found
+
+
+def _same(one: Arm, other: Arm) -> bool:
+    return one.joints == other.joints and all(
+        np.array_equal(np.asarray(getattr(one, kind)), np.asarray(getattr(other, kind)))
+        for kind in ("alpha", "a", "d", "theta", "probe")
+    )
+
+
+def save_evaluation(path: str | os.PathLike, record: EvaluationRecord) -> None:
+    """Write an evaluation to HDF5, whole or not at all."""
+    tables = recording_tables(record.recording)
+    tables["calibrated_arm"] = arm_table(record.calibrated)
+    tables["used"] = Table({"used": Variable(("used",), sorted(record.used), "", "socket that the arm was identified from")})
+    tables["limits"] = Table(
+        {
+            "figure": Variable(("figure",), list(record.limits), "", "figure of an acceptance test"),
+            "fixed": Variable(("figure",), [limit.fixed for limit in record.limits.values()], "mm", "MPE at length 0"),
+            "per_length": Variable(
+                ("figure",), [1 / limit.divisor for limit in record.limits.values()], "1", "what MPE grows by with the length"
+            ),
+        }
+    )
+    tables["figures"] = _figure_table(record)
+    attributes = recording_attributes(record.recording) | {
+        "warnings": list(record.warnings) or None,
+        "u_test_mm": record.u_test,
+        **{f"most_{name}": value for name, value in record.maxima.items()},
+    }
+    storage.write_tables(path, "evaluation", tables, attributes)
+
+
+def _figure_table(record: EvaluationRecord) -> Table:
+    """The results, for other programs; this package computes them again."""
+    rows = [(stage, test, figure) for stage, tests in record.acceptance().items() for test in tests for figure in test.figures]
+    columns = {
+        "arm": ([stage for stage, *_ in rows], "", "arm that measured"),
+        "standard": ([test.standard for _, test, _ in rows], "", "standard of the test"),
+        "name": ([figure.name for *_, figure in rows], "", "figure"),
+        "value": ([figure.value for *_, figure in rows], "mm", "value of the worst part"),
+        "expanded": ([figure.worst.expanded for *_, figure in rows], "mm", "expanded uncertainty, coverage factor 2"),
+        "limit": ([math.nan if figure.worst.limit is None else figure.worst.limit for *_, figure in rows], "mm", "MPE"),
+        "decision": ([figure.decision or "" for *_, figure in rows], "", "decision by ISO 14253-1"),
+        "where": ([figure.worst.where for *_, figure in rows], "", "what gave the worst part"),
+    }
+    row = {"row": Variable(("row",), np.arange(1, len(rows) + 1), "1", "row number")}
+    return Table(row | {name: Variable(("row",), *column) for name, column in columns.items()})
+
+
+def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
+    """Read an evaluation. Raises `InputError` where the file is missing, damaged, foreign, newer or no evaluation."""
+    stored = storage.read_tables(path, ("evaluation",))
+    storage.need(path, stored.tables, "calibrated_arm", "used", "limits")
+    with storage.undamaged(path):
+        limits, attributes = stored.tables["limits"], stored.attributes
+        pairs = zip(limits["figure"], limits["fixed"], limits["per_length"], strict=True)
+        return EvaluationRecord(
+            recording_of(path, stored),
+            specification_of(path, stored, "calibrated_arm"),
+            frozenset(str(name) for name in stored.tables["used"]["used"]),
+            tuple(attributes.get("warnings") or ()),
+            {str(name): Limit(float(fixed), 1 / float(slope) if slope > 0 else math.inf) for name, fixed, slope in pairs},
+            float(attributes["u_test_mm"]),
+            {name.removeprefix("most_"): float(value) for name, value in attributes.items() if name.startswith("most_")},
+        )
