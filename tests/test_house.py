@@ -15,7 +15,7 @@ FLOORS = tuple(
     metrics steps weights residuals solver
     covariance scale propagation observability checks results evaluate calibrate lanes batch calibration_files uncertainty sampling validation exchange placing refining planning plan_files volume spheres decision acceptance procedure procedure_files points_files evaluation_files
     cautions summary evaluation_summary figures demo study
-    cli
+    cli report
     """.strip().splitlines()
 )
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name not in ("__init__.py", "__main__.py"))

@@ -35,6 +35,14 @@ def evaluation(summary: dict[str, Any]) -> None:
     _written(console, summary)
 
 
+def report(summary: dict[str, Any]) -> None:
+    """A report that was written."""
+    console = _console()
+    console.print(f"[bold]{escape(summary['title'])}[/bold]: {escape(summary['verdict'])}")
+    _warnings(console, summary)
+    console.print(f"Written: {escape(summary['written'])} ({summary['bytes'] / 1e6:.1f} MB; open it in a browser, print it from there)")
+
+
 def points(summary: dict[str, Any]) -> None:
     """Acceptance tests of points."""
     console = _console()

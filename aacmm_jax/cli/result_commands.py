@@ -1,4 +1,4 @@
-"""What is done with a calibration: ``evaluate``, ``export``."""
+"""What is done with a calibration: ``evaluate``, ``report``, ``export``."""
 
 import json
 from pathlib import Path
@@ -63,6 +63,19 @@ def evaluate(
     undecided = [test for test in summary["acceptance"] if test["decision"] in ("fails", "undecided")]
     if summary["failed"] or undecided:
         raise typer.Exit(1)
+
+
+@app.command(epilog="Example: aacmm report calibration.h5 -o report.html")
+def report(
+    file: Annotated[Path, typer.Argument(metavar="FILE.h5", help="A calibration, an evaluation (aacmm evaluate -o) or a study.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Report to write: one HTML file that needs no network.")],
+    as_json: Json = False,
+) -> None:
+    """Write a report that can be handed on: warnings, results, uncertainty, charts and tables in one HTML file, which prints well."""
+    from ..report import write_report
+    from . import acceptance_display
+
+    _show(_busy("Writing the report", lambda: write_report(file, output)), as_json, acceptance_display.report)
 
 
 def _evaluated(

@@ -1,0 +1,100 @@
+"""One HTML page that holds everything: text, charts, the arm to be turned, style and program; nothing is fetched."""
+
+import base64
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+from .. import storage
+from ..errors import InputError
+from .parts import Arms, Chart, Report, Table
+
+_FOLDER = Path(__file__).parent
+KINDS = ("calibration", "evaluation", "study")
+
+
+def write_report(source: str | os.PathLike, target: str | os.PathLike) -> dict[str, Any]:
+    """Write the report of a calibration, an evaluation or a study (HDF5) as one HTML file, whole or not at all.
+
+    Returns what was written, and what it warns of. Raises `InputError` where the file cannot be read, or the report not written.
+    """
+    source, target = Path(source), Path(target)
+    if target.exists() and source.exists() and target.samefile(source):
+        raise InputError(f"{target} is the file that the report is of; choose another output.")
+    page, report = report_of(source)
+    storage.write_text(target, page)
+    return {
+        "kind": "report",
+        "of": str(source),
+        "title": report.title,
+        "verdict": report.verdict,
+        "warnings": report.warnings,
+        "bytes": len(page.encode()),
+        "written": str(target),
+    }
+
+
+def report_of(source: Path) -> tuple[str, Report]:
+    """The page of a file, and the report that it shows."""
+    stored = storage.read_tables(source, KINDS, without=("trials",))
+    kind = stored.attributes["kind"]
+    if kind == "calibration":
+        from ..calibration_files import load_calibration
+        from .calibration import calibration_report
+
+        report, _ = calibration_report(load_calibration(source))
+    elif kind == "evaluation":
+        from ..evaluation_files import load_evaluation
+        from .evaluation import evaluation_report
+
+        report, _ = evaluation_report(load_evaluation(source))
+    else:
+        from ..study.results import Results
+        from .study import study_report
+
+        report, _ = study_report(Results.of(source))
+    return page_of(report, made_by(source, stored.attributes)), report
+
+
+def made_by(source: Path, attributes: dict[str, Any]) -> list[tuple[str, str]]:
+    """How the file came about, and how to make it again."""
+    entries = [
+        ("File", storage.fingerprint(source)),
+        ("Made on", str(attributes["created"])),
+        ("Command", str(attributes["command"])),
+        ("aacmm_jax", str(attributes["package_version"])),
+        ("With", attributes.get("versions") or "not recorded"),
+        ("Seed", "none" if attributes.get("seed") is None else str(attributes["seed"])),
+    ]
+    entries += [("From" if i == 0 else "", str(line)) for i, line in enumerate(attributes.get("sources") or ["not recorded"])]
+    return entries
+
+
+def page_of(report: Report, origin: list[tuple[str, str]]) -> str:
+    """The HTML of a report. Everything that people wrote is shown as text: Jinja escapes it, and only this page's own programs run."""
+    import jinja2
+    from plotly.offline import get_plotlyjs
+
+    template = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined).from_string(
+        (_FOLDER / "page.html").read_text(encoding="utf-8")
+    )
+    programs = [get_plotlyjs(), (_FOLDER / "page.js").read_text(encoding="utf-8")]
+    blocks = [block for section in report.sections for block in section.blocks]
+    return template.render(
+        report=report,
+        origin=origin,
+        is_chart=lambda block: isinstance(block, Chart),
+        is_table=lambda block: isinstance(block, Table),
+        is_arms=lambda block: isinstance(block, Arms),
+        charts={block.id: block.figure for block in blocks if isinstance(block, Chart)},
+        scenes={block.id: block.data for block in blocks if isinstance(block, Arms)},
+        style=(_FOLDER / "page.css").read_text(encoding="utf-8"),
+        programs=programs,
+        hashes=[_hash(program) for program in programs],
+    )
+
+
+def _hash(program: str) -> str:
+    """By which the page's content security policy knows a program of its own."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(program.encode()).digest()).decode()

@@ -1,0 +1,57 @@
+"""The arm in its poses, as points in space: what the report turns under the mouse."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..arm import Arm
+from ..capture import Capture
+from ..chain import turns_of, walk
+from ..volume import reach_of
+
+_MOST = 150  # poses that a page holds
+
+
+def scene_of(arm: Arm, capture: Capture, distances: np.ndarray) -> dict[str, Any]:
+    """Sockets, and up to 150 poses as lines from joint to joint, mm; each with its tip's distance from its socket's centroid."""
+    owner = capture.owner
+    chosen = _chosen(np.asarray(capture.sizes))
+    q = np.asarray(capture.q)[chosen]
+    lines = _lines(arm, q)
+    first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
+    tips = np.asarray(arm.position(capture.q))
+    return {
+        "sockets": [
+            {"name": name, "at": np.round(tips[owner == i].mean(axis=0), 1).tolist()} for i, name in enumerate(capture.names)
+        ],
+        "poses": [
+            {
+                "label": f"{capture.names[owner[i]]}, pose {i - first[owner[i]] + 1}",
+                "points": np.round(line, 1).tolist(),
+                "distance": float(f"{distances[i]:.4g}"),
+            }
+            for i, line in zip(chosen, lines, strict=True)
+        ],
+        "reach": round(reach_of(arm).radius, 1),
+        "all": len(capture.q),
+    }
+
+
+def _chosen(sizes: np.ndarray) -> np.ndarray:
+    """Which poses: all, or evenly spread ones of every socket."""
+    total = int(sizes.sum())
+    if total <= _MOST:
+        return np.arange(total)
+    return np.unique(np.linspace(0, total - 1, _MOST).round().astype(int))
+
+
+def _lines(arm: Arm, q: np.ndarray) -> np.ndarray:
+    """Corners of the arm ``(m, 2 n + 2, 3)``: the base, for each joint the end of its offset and of its link, and the tip."""
+    walked = walk(arm.geometry, turns_of(jnp.asarray(q)))
+    before, after = (np.asarray(x).reshape(arm.joints, 3, -1) for x in (walked.origin_before, walked.origin))
+    axis = np.asarray(walked.z_before).reshape(arm.joints, 3, -1)
+    corners = before + np.asarray(arm.d)[:, None, None] * axis
+    tip = np.asarray(walked.tip).reshape(1, 3, -1)
+    both = np.stack([corners, after], axis=1).reshape(2 * arm.joints, 3, -1)
+    return np.concatenate([np.zeros_like(tip), both, tip]).transpose(2, 0, 1)
