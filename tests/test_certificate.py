@@ -22,6 +22,7 @@ from .refusals import assert_refused
 CREATED = "2026-03-05T10:11:12+00:00"
 DCC, SI = "{https://ptb.de/dcc}", "{https://ptb.de/si}"
 MM, RAD = r"\milli\metre", r"\radian"
+COVERAGE = ("Factor", "Probability")
 PARAMETERS = "Denavit-Hartenberg parameters"
 
 # All that can be stated, as people write it.
@@ -213,8 +214,12 @@ def test_elements_stand_in_the_order_of_the_schema(certificates, kind):
 
 
 def test_numbers_read_back_exactly(record):
-    values = values_of_dcc(dcc(record, About(), created=CREATED))
+    text = dcc(record, About(), created=CREATED)
+    values = values_of_dcc(text)
     factor = stats.t.ppf(0.975, record.freedom)
+    coverage = {name: {x.text for x in ElementTree.fromstring(text).iter(f"{SI}coverage{name}")} for name in COVERAGE}
+    assert coverage["Probability"] == {"0.95"}
+    np.testing.assert_allclose([float(x or "") for x in coverage["Factor"]], [factor], rtol=1e-12)
     arms = {"As found": record.recording.nominal.arm, "As left": record.calibrated.arm}
     held = set(record.held)
     for stage, arm in arms.items():
@@ -346,8 +351,13 @@ def test_nothing_is_made_up(record):
     assert [text for name, text in core if name.endswith("Date")] == ["2026-03-05"] * 2
     for part in ("calibrationLaboratory", "customer", "respPersons"):
         assert set(contents(text, f"*/dcc:{part}")) == {"not stated"}
+    # The schema wants an address, and the Schematron rules a condition: where there is none, they say so.
+    for place in ("dcc:calibrationLaboratory/dcc:contact", "dcc:customer"):
+        assert contents(text, f"*/{place}/dcc:location/dcc:further") == ["not stated"]
+    assert contents(text, "*/dcc:measurementResult/dcc:influenceConditions/*/dcc:data") == ["not stated"] * 2
     assert contents(text, "*/dcc:items/dcc:item/dcc:name")[0] == "small & fine"
-    assert "not stated" in contents(text, "*/dcc:measurementResult/dcc:influenceConditions")
+    status = [element.text for element in root.iter(f"{DCC}status")]
+    assert status == ["beforeAdjustment", "afterAdjustment"]
     names = contents(text, "*/dcc:statements/dcc:statement/dcc:name")
     assert not {"Conformity", "Simulation", "Files", "Remarks"} & set(names)
     assert names[:2] == ["Scale", "Uncertainty"]
