@@ -15,6 +15,7 @@ from .errors import InputError
 from .evaluate import evaluate
 from .recording import Recording
 from .simulate import deviated, simulate
+from .storage import fingerprint
 from .summary import calibration_summary
 
 _DEVIATION_MM, _DEVIATION_DEG = 1.0, 0.1
@@ -47,8 +48,9 @@ def run(folder: Path, seed: int) -> dict[str, Any]:
         seed=seed,
     )
     recording = Recording(capture, nominal, true, seed)
-    record = record_of(calibrate(nominal.arm, capture, bounds), recording)
     save_capture(folder / "capture.h5", recording)
+    recording = recording._replace(sources=(fingerprint(folder / "capture.h5"),))
+    record = record_of(calibrate(nominal.arm, capture, bounds), recording)
     save_calibration(folder / "calibration.h5", record)
     save_arm(nominal.arm, folder / "nominal.toml", name=nominal.name)
     save_arm(true.arm, folder / "true.toml", name=true.name)

@@ -40,7 +40,9 @@ def report(summary: dict[str, Any]) -> None:
     console = _console()
     console.print(f"[bold]{escape(summary['title'])}[/bold]: {escape(summary['verdict'])}")
     _warnings(console, summary)
-    console.print(f"Written: {escape(summary['written'])} ({summary['bytes'] / 1e6:.1f} MB; open it in a browser, print it from there)")
+    console.print(
+        f"Written: {escape(summary['written'])} ({summary['bytes'] / 1e6:.1f} MB; open it in a browser, print it from there)"
+    )
 
 
 def points(summary: dict[str, Any]) -> None:

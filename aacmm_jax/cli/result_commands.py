@@ -67,15 +67,23 @@ def evaluate(
 
 @app.command(epilog="Example: aacmm report calibration.h5 -o report.html")
 def report(
-    file: Annotated[Path, typer.Argument(metavar="FILE.h5", help="A calibration, an evaluation (aacmm evaluate -o) or a study.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE.h5", help="A calibration, an evaluation (aacmm evaluate -o) or a study.")
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Report to write: one HTML file that needs no network.")],
+    about: About = None,
     as_json: Json = False,
 ) -> None:
     """Write a report that can be handed on: warnings, results, uncertainty, charts and tables in one HTML file, which prints well."""
+    from ..about import read_about
     from ..report import write_report
     from . import acceptance_display
 
-    _show(_busy("Writing the report", lambda: write_report(file, output)), as_json, acceptance_display.report)
+    _show(
+        _busy("Writing the report", lambda: write_report(file, output, None if about is None else read_about(about))),
+        as_json,
+        acceptance_display.report,
+    )
 
 
 def _evaluated(
@@ -121,19 +129,27 @@ def _evaluated_points(manifest: Path, limits: Any, u_test: float) -> dict[str, A
     }
 
 
-@app.command(epilog="Example: aacmm export calibration.h5 --format toml -o arm.toml")
+@app.command(
+    epilog="Examples: aacmm export calibration.h5 --format toml -o arm.toml; aacmm export calibration.h5 --format dcc --about laboratory.toml -o certificate.xml"
+)
 def export(
     calibration: CalibrationFile,
     form: Annotated[
-        Literal["toml", "json", "csv"],
-        typer.Option("--format", help="toml: an arm file; json: everything; csv: the parameters."),
+        Literal["toml", "json", "csv", "dcc"],
+        typer.Option(
+            "--format",
+            help="toml: an arm file; json: everything; csv: the parameters; dcc: a Digital Calibration Certificate (XML).",
+        ),
     ] = "toml",
     which: Annotated[
         Literal["calibrated", "nominal", "true"], typer.Option("--arm", help="Which arm, for toml; true: of a simulation.")
     ] = "calibrated",
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File to write; standard output without it.")] = None,
+    about: About = None,
 ) -> None:
     """Write a calibrated arm for other programs."""
+    if about is not None and form != "dcc":
+        raise InputError("--about is for certificates; give it with --format dcc.")
     from .. import storage
     from ..arm_files import specification_toml
     from ..calibration_files import load_calibration
@@ -155,8 +171,26 @@ def export(
         "toml": lambda: specification_toml(arm, source=source),
         "json": lambda: json.dumps(calibration_summary(record), indent=2) + "\n",
         "csv": lambda: parameters_csv(record),
+        "dcc": lambda: _certificate(calibration, record, about),
     }[form]()
     if output is None:
         typer.echo(text, nl=False)
     else:
         storage.write_text(output, text)
+
+
+def _certificate(calibration: Path, record: Any, about: Path | None) -> str:
+    from .. import storage
+    from ..about import About as Stated
+    from ..about import read_about
+    from ..certificate import dcc
+
+    made = storage.read_tables(calibration, ("calibration",)).attributes
+    sources = [storage.fingerprint(calibration), *record.recording.sources]
+    return dcc(
+        record,
+        Stated() if about is None else read_about(about),
+        created=made["created"],
+        sources=sources,
+        command=made["command"],
+    )

@@ -39,12 +39,11 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
     if record.sampled is not None:
         sections.insert(7, _sampled(record))
     good = record.converged
-    verdict = "Converged" if good else "Did not converge: the parameters below are not to be used"
     report = Report(
         title="Calibration of " + (record.recording.nominal.name or "an arm"),
         subtitle=f"{_METHODS[record.method]}; {summary['poses']} poses in {len(summary['sockets_used'])} sockets, "
         f"{len(summary['lengths'])} reference length{'' if len(summary['lengths']) == 1 else 's'}",
-        verdict=f"{verdict} ({record.reason})",
+        verdict=record.reason if good else f"Not to be used. {record.reason}",
         verdict_mark="good" if good and not summary["warnings"] else "unsure" if good else "bad",
         warnings=summary["warnings"],
         facts=_facts(summary, factor),
@@ -53,7 +52,10 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
     return report, summary
 
 
-_METHODS = {"two-stage": "Identification from repeatability, then a scale fix", "joint": "Joint least squares of poses and lengths"}
+_METHODS = {
+    "two-stage": "Identification from repeatability, then a scale fix",
+    "joint": "Joint least squares of poses and lengths",
+}
 
 
 def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
@@ -61,17 +63,27 @@ def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
     facts = []
     validated = summary["cross_validation"]
     if validated is not None and validated["rms_mm"] == validated["rms_mm"]:
-        facts.append(("Left-out placements, RMS distance", f"{shown(validated['rms_mm'])} mm (predicted {shown(validated['rms_predicted_mm'])})"))
+        facts.append(
+            (
+                "Left-out placements, RMS distance",
+                f"{shown(validated['rms_mm'])} mm (predicted {shown(validated['rms_predicted_mm'])})",
+            )
+        )
     if "de_mm" in left:
         facts.append(("DE, as found → as left", f"{shown(found['de_mm'])} → {shown(left['de_mm'])} mm"))
         facts.append(("Δm, as found → as left", f"{shown(found['deltam_mm'])} → {shown(left['deltam_mm'])} mm"))
     volume = summary["uncertainty"]["volume"]
     largest, median = volume["u_length_largest_mm"], volume["u_length_median_mm"]
     if median is not None and largest is not None:
-        facts.append((f"U of a {volume['length_mm']:g} mm length (95 %)", f"median {shown(factor * median)}, largest {shown(factor * largest)} mm"))
+        facts.append(
+            (
+                f"U of a {volume['length_mm']:g} mm length (95 %)",
+                f"median {shown(factor * median)}, largest {shown(factor * largest)} mm",
+            )
+        )
     else:
         facts.append((f"U of a {volume['length_mm']:g} mm length", "not determined everywhere"))
-    facts.append(("Scale k of stage 1", f"{summary['scale_k']:.7f} ± {factor * summary['scale_u']:.1e} (95 %)"))
+    facts.append(("Scale k of stage 1", f"{summary['scale_k']:.7f} ± {factor * summary['scale_u']:.7f} (95 %)"))
     return facts
 
 
@@ -102,9 +114,11 @@ def _found_and_left(record: CalibrationRecord, summary: dict[str, Any], evaluati
     blocks: list = ["As found is the nominal arm, as left the calibrated one, both on the poses that were identified from."]
     if summary["cross_validation"] is not None:
         blocks.append(_validated(summary["cross_validation"]))
-    blocks.append(figures_table("Figures as found and as left [mm]", summary, stages))
+    blocks.append(figures_table("Figures as found and as left [mm]", summary, stages, fixed_scale=len(summary["lengths"]) == 1))
     pair = {"as found": evaluations["nominal"], "as left": evaluations["calibrated"]}
-    blocks.append(residual_chart("found-left", "Distance of every pose from its socket's centroid", record.recording.capture, pair))
+    blocks.append(
+        residual_chart("found-left", "Distance of every pose from its socket's centroid", record.recording.capture, pair)
+    )
     if "truth" in summary:
         rows = [
             [text(title), *(number(scale * summary["truth"][stage][key]) for stage in stages)]
@@ -119,10 +133,16 @@ def _found_and_left(record: CalibrationRecord, summary: dict[str, Any], evaluati
 
 def _validated(found: dict[str, Any]) -> Table:
     rows = [
-        [text("RMS distance of poses from their socket's centroid"), number(found["rms_mm"]), number(found["rms_predicted_mm"])],
+        [
+            text("RMS distance of poses from their socket's centroid"),
+            number(found["rms_mm"]),
+            number(found["rms_predicted_mm"]),
+        ],
         [text("RMS error of reference lengths"), number(found["length_error_rms_mm"]), number(found["length_u_mm"])],
     ]
-    return Table(f"Cross-validated: each of {found['groups']} placements left out once [mm]", ("", "found", "predicted by u"), rows)
+    return Table(
+        f"Cross-validated: each of {found['groups']} placements left out once [mm]", ("", "found", "predicted by u"), rows
+    )
 
 
 def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation], factor: float) -> Section:
@@ -158,7 +178,13 @@ def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict
     figure = {"data": traces, "layout": charts.layout("reference length", "measured − value [mm]", shapes=shapes)}
     if len(names) <= 12:
         figure["layout"]["xaxis"] |= {"tickvals": places, "ticktext": [charts.plain(name) for name in names]}
-    chart = Chart("lengths", "Errors of the reference lengths", "Measured less calibrated value, before and after the scale fix.", figure, table)
+    chart = Chart(
+        "lengths",
+        "Errors of the reference lengths",
+        "Measured less calibrated value, before and after the scale fix.",
+        figure,
+        table,
+    )
     return Section("scale", "Scale, and what it corrected", [words, chart])
 
 
@@ -181,19 +207,40 @@ def _parameters(record: CalibrationRecord, summary: dict[str, Any], factor: floa
                 text(state, "unsure" if state else ""),
             ]
         )
-        plotted[row["unit"]].append((row["parameter"], row["calibrated"] - row["nominal"], None if row["u"] is None else row["u"]))
+        plotted[row["unit"]].append(
+            (row["parameter"], row["calibrated"] - row["nominal"], None if row["u"] is None else row["u"])
+        )
     columns = ("parameter", "unit", "as found", "as left", "change", "U (95 %)", "")
     table = Table("Parameters", columns, rows)
-    blocks: list = [f"U is the expanded uncertainty, coverage factor {factor:.2f}. A parameter on a bound, or that the data determine only together with others, has none of its own."]
-    for unit, title, scale, label in (("mm", "Change of length parameters", 1.0, "mm"), ("rad", "Change of angle parameters", ARCSEC, "arcsec")):
+    blocks: list = [
+        f"U is the expanded uncertainty, coverage factor {factor:.2f}. A parameter on a bound, or that the data determine only together with others, has none of its own."
+    ]
+    for unit, title, scale, label in (
+        ("mm", "Change of length parameters", 1.0, "mm"),
+        ("rad", "Change of angle parameters", ARCSEC, "arcsec"),
+    ):
         if plotted[unit]:
             names, changes, u = zip(*plotted[unit], strict=True)
             bars = [np.nan if x is None else factor * scale * x for x in u]
             y = [scale * x for x in changes]
-            hover = [f"{name}: {shown(value)} ± {'–' if math.isnan(bar) else shown(bar)} {label}" for name, value, bar in zip(names, y, bars, strict=True)]
+            hover = [
+                f"{name}: {shown(value)} ± {'–' if math.isnan(bar) else shown(bar)} {label}"
+                for name, value, bar in zip(names, y, bars, strict=True)
+            ]
             trace = charts.dots("as left − as found, with U", names, y, charts.DARK, "circle", hover=hover, bars=bars)
-            figure = {"data": [trace], "layout": charts.layout("", f"change [{label}]", shapes=charts.horizontal([0.0], "solid"), showlegend=False)}
-            blocks.append(Chart(f"change-{unit}", title, "As left less as found; bars are U (95 %), smaller than the mark where none is seen.", figure, height=320))
+            figure = {
+                "data": [trace],
+                "layout": charts.layout("", f"change [{label}]", shapes=charts.horizontal([0.0], "solid"), showlegend=False),
+            }
+            blocks.append(
+                Chart(
+                    f"change-{unit}",
+                    title,
+                    "As left less as found; bars are U (95 %), smaller than the mark where none is seen.",
+                    figure,
+                    height=320,
+                )
+            )
     return Section("parameters", "Parameters", [*blocks, table])
 
 
@@ -218,7 +265,13 @@ def _volume(volume: Volume, summary: dict[str, Any], factor: float) -> Section:
     found = summary["uncertainty"]["volume"]
     length = f"{volume.length:g} mm length"
     rows = [
-        [text(title), *(number(None if found[f"{key}_{which}_mm"] is None else factor * found[f"{key}_{which}_mm"]) for which in ("median", "95", "largest"))]
+        [
+            text(title),
+            *(
+                number(None if found[f"{key}_{which}_mm"] is None else factor * found[f"{key}_{which}_mm"])
+                for which in ("median", "95", "largest")
+            ),
+        ]
         for key, title in (
             ("u_tip", "tip position, along its worst direction: from the calibration"),
             ("u_length", f"{length}: from the calibration"),
@@ -233,8 +286,13 @@ def _volume(volume: Volume, summary: dict[str, Any], factor: float) -> Section:
     radius = np.hypot(volume.start[:, 0], volume.start[:, 1])
     known = np.isfinite(expanded)
     scale = expanded[known] / max(float(expanded[known].max(initial=0.0)), 1e-12)
-    hover = [f"({', '.join(f'{x:.0f}' for x in point)}) mm: U = {shown(value)} mm" for point, value in zip(volume.start[known], expanded[known], strict=True)]
-    trace = charts.dots("U of a length that starts here", radius[known], volume.start[known, 2], charts.DARK, "circle", hover=hover)
+    hover = [
+        f"({', '.join(f'{x:.0f}' for x in point)}) mm: U = {shown(value)} mm"
+        for point, value in zip(volume.start[known], expanded[known], strict=True)
+    ]
+    trace = charts.dots(
+        "U of a length that starts here", radius[known], volume.start[known, 2], charts.DARK, "circle", hover=hover
+    )
     trace["marker"] |= {
         "size": [round(float(x), 1) for x in 4 + 10 * scale],
         "color": [float(f"{x:.4g}") for x in expanded[known]],
@@ -244,7 +302,12 @@ def _volume(volume: Volume, summary: dict[str, Any], factor: float) -> Section:
     }
     figure = {"data": [trace], "layout": charts.layout("distance from the first axis [mm]", "height [mm]", showlegend=False)}
     data = [
-        [*(number(float(x), 0) for x in point), number(factor * float(tip)), number(factor * float(own)), number(factor * float(read))]
+        [
+            *(number(float(x), 0) for x in point),
+            number(factor * float(tip)),
+            number(factor * float(own)),
+            number(factor * float(read)),
+        ]
         for point, tip, own, read in zip(volume.start, volume.u_tip, volume.u_length, volume.u_length_reading, strict=True)
     ]
     columns = ("x [mm]", "y [mm]", "z [mm]", "U of the tip [mm]", f"U of a {length} [mm]", "with readings [mm]")
@@ -277,7 +340,9 @@ def _correlations(record: CalibrationRecord, uncertainty: Any) -> Section:
     figure = {"data": charts.heatmap(names, table), "layout": charts.layout("", "")}
     figure["layout"]["yaxis"] |= {"autorange": "reversed", "showgrid": False, "tickfont": {"size": 10}}
     figure["layout"]["xaxis"] |= {"showgrid": False, "tickangle": -90, "tickfont": {"size": 10}}
-    return Section("correlations", "Correlations", [Chart("correlations", "Correlation of the parameters", words, figure, behind, 520)])
+    return Section(
+        "correlations", "Correlations", [Chart("correlations", "Correlation of the parameters", words, figure, behind, 520)]
+    )
 
 
 def _observability(record: CalibrationRecord) -> Section:
@@ -297,14 +362,25 @@ def _observability(record: CalibrationRecord) -> Section:
     rows += [[text(name), text(f"{value:.3g}"), text(f"{meanings[name]}; larger is better")] for name, value in indices.items()]
     order = list(range(1, len(seen.singular) + 1))
     values = np.maximum(seen.singular, 1e-12 * seen.singular.max())
-    behind = Table("Singular values", ("number", "value"), [[number(i, 0), number(float(value), 6)] for i, value in zip(order, seen.singular, strict=True)])
+    behind = Table(
+        "Singular values",
+        ("number", "value"),
+        [[number(i, 0), number(float(value), 6)] for i, value in zip(order, seen.singular, strict=True)],
+    )
     trace = charts.dots("singular value", order, values, charts.DARK, "circle")
-    figure = {"data": [trace], "layout": charts.layout("number", "singular value", yaxis={"type": "log"}, showlegend=False)}
+    figure = {
+        "data": [trace],
+        "layout": charts.layout("number", "singular value", yaxis=charts.logarithmic(values), showlegend=False),
+    }
     words = "How strongly the data see each independent direction of the parameters, in steps of 1 mm and 1 mrad."
     return Section(
         "observability",
         "Observability",
-        [" ".join(sentences), Table("Figures", ("", "value", "meaning"), rows), Chart("singular", "Singular values", words, figure, behind, 300)],
+        [
+            " ".join(sentences),
+            Table("Figures", ("", "value", "meaning"), rows),
+            Chart("singular", "Singular values", words, figure, behind, 300),
+        ],
     )
 
 
@@ -323,7 +399,10 @@ def _bounds(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
                 text(name),
                 text(unit),
                 *(number(scale * x) for x in (record.lower[i], vector[i], record.upper[i])),
-                text(f"on the {side} bound" + ("" if name in summary["active"] else " in stage 1") if side else "", "unsure" if side else ""),
+                text(
+                    f"on the {side} bound" + ("" if name in summary["active"] else " in stage 1") if side else "",
+                    "unsure" if side else "",
+                ),
             ]
         )
     active = sorted({*summary["active"], *stage1})
@@ -337,7 +416,9 @@ def _bounds(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     figure = {"data": [trace], "layout": charts.layout("", "place in its bounds", yaxis=axis, showlegend=False, shapes=shapes)}
     table = Table("Bounds", ("parameter", "unit", "lower", "as left", "upper", ""), rows)
     words_chart = "Where each parameter lies between its bounds; diamonds are on one."
-    return Section("bounds", "Bounds", [words, Chart("bounds", "Place of every parameter in its bounds", words_chart, figure, table, 300)])
+    return Section(
+        "bounds", "Bounds", [words, Chart("bounds", "Place of every parameter in its bounds", words_chart, figure, table, 300)]
+    )
 
 
 def _sampled(record: CalibrationRecord) -> Section:
@@ -347,7 +428,9 @@ def _sampled(record: CalibrationRecord) -> Section:
     for i, name in enumerate(found["quantity"]):
         values = (float(found[key][i]) for key in ("estimate", "u", "linear_u", "low", "high"))
         agrees = bool(found["agrees"][i])
-        rows.append([text(name), *(number(value, 6) for value in values), text("yes" if agrees else "no", "" if agrees else "unsure")])
+        rows.append(
+            [text(name), *(number(value, 6) for value in values), text("yes" if agrees else "no", "" if agrees else "unsure")]
+        )
     columns = ("quantity", "value", "u by Monte Carlo", "u by propagation", "from", "to", "agree")
     return Section(
         "monte-carlo",

@@ -13,7 +13,14 @@ _FONT = {"family": "system-ui, sans-serif", "size": 13, "color": "#1a1a1a"}
 
 def layout(x: str, y: str, **more: Any) -> dict[str, Any]:
     """Layout with titled axes; tight, so that it also fits a narrow screen."""
-    axis = {"showgrid": True, "gridcolor": "#dde2e8", "zeroline": False, "linecolor": "#555", "ticks": "outside", "automargin": True}
+    axis = {
+        "showgrid": True,
+        "gridcolor": "#dde2e8",
+        "zeroline": False,
+        "linecolor": "#555",
+        "ticks": "outside",
+        "automargin": True,
+    }
     found: dict[str, Any] = {
         "xaxis": axis | {"title": {"text": x, "standoff": 8}},
         "yaxis": axis | {"title": {"text": y, "standoff": 6}},
@@ -30,7 +37,16 @@ def layout(x: str, y: str, **more: Any) -> dict[str, Any]:
 
 
 def dots(
-    name: str, x: Sequence[Any], y: Any, color: str, symbol: str, *, hover: Sequence[str] = (), bars: Any = None, size: int = 7, **more: Any
+    name: str,
+    x: Sequence[Any],
+    y: Any,
+    color: str,
+    symbol: str,
+    *,
+    hover: Sequence[str] = (),
+    bars: Any = None,
+    size: int = 7,
+    **more: Any,
 ) -> dict[str, Any]:
     """Markers, perhaps with error bars."""
     trace: dict[str, Any] = {
@@ -48,26 +64,48 @@ def dots(
     return trace | more
 
 
+def logarithmic(*values: Any) -> dict[str, Any]:
+    """A logarithmic axis with plain numbers at every decade, and at 2 and 5 where there are few decades."""
+    every = np.concatenate([np.asarray(part, dtype=float).ravel() for part in values])
+    every = every[np.isfinite(every) & (every > 0)]
+    low, high = (float(every.min()), float(every.max())) if len(every) else (0.1, 1.0)
+    first, last = int(np.floor(np.log10(low))), int(np.ceil(np.log10(high)))
+    steps = (1, 2, 5) if last - first <= 3 else (1,)
+    marks = [step * 10.0**power for power in range(first, last + 1) for step in steps]
+    return {
+        "type": "log",
+        "tickvals": marks,
+        "ticktext": [f"{mark:g}" for mark in marks],
+        "range": [float(np.log10(low / 1.4)), float(np.log10(high * 1.4))],
+    }
+
+
 def vertical(positions: Sequence[float]) -> list[dict[str, Any]]:
     """Thin vertical lines over the whole height."""
     line = {"color": "#777", "width": 1, "dash": "dot"}
-    return [{"type": "line", "xref": "x", "yref": "paper", "x0": at, "x1": at, "y0": 0, "y1": 1, "line": line} for at in positions]
+    return [
+        {"type": "line", "xref": "x", "yref": "paper", "x0": at, "x1": at, "y0": 0, "y1": 1, "line": line} for at in positions
+    ]
 
 
 def horizontal(positions: Sequence[float], dash: str = "dash") -> list[dict[str, Any]]:
     """Thin horizontal lines over the whole width."""
     line = {"color": "#444", "width": 1, "dash": dash}
-    return [{"type": "line", "xref": "paper", "yref": "y", "x0": 0, "x1": 1, "y0": at, "y1": at, "line": line} for at in positions]
+    return [
+        {"type": "line", "xref": "paper", "yref": "y", "x0": 0, "x1": 1, "y0": at, "y1": at, "line": line} for at in positions
+    ]
 
 
 def heatmap(names: Sequence[str], table: np.ndarray) -> list[dict[str, Any]]:
     """Correlations: darker is stronger, and the sign is written in where it matters."""
     strength = np.abs(table)
     written = [
-        ["" if i == j or strength[i, j] < 0.5 else ("+" if table[i, j] > 0 else "−") for j in range(len(names))] for i in range(len(names))
+        ["" if i == j or strength[i, j] < 0.5 else ("+" if table[i, j] > 0 else "−") for j in range(len(names))]
+        for i in range(len(names))
     ]
     hover = [
-        [f"{plain(one)} with {plain(other)}: {table[i, j]:+.3f}" for j, other in enumerate(names)] for i, one in enumerate(names)
+        [f"{plain(one)} with {plain(other)}: {table[i, j]:+.3f}" for j, other in enumerate(names)]
+        for i, one in enumerate(names)
     ]
     labels = [plain(name) for name in names]
     return [

@@ -43,7 +43,9 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
                 "Residuals by socket and pose",
                 [
                     socket_table(capture, evaluations["calibrated"]),
-                    residual_chart("residuals", "Residuals as left", capture, {"as left": evaluations["calibrated"]}, mark=True),
+                    residual_chart(
+                        "residuals", "Residuals as left", capture, {"as left": evaluations["calibrated"]}, mark=True
+                    ),
                 ],
             ),
             Section("arm", "The arm in its poses", [_arms(record, evaluations["calibrated"])]),
@@ -88,7 +90,11 @@ def _decision(figure: Figure | dict[str, Any]) -> Cell:
 def _acceptance(record: EvaluationRecord, tests: dict[str, list[AcceptanceTest]], summary: dict[str, Any]) -> list:
     blocks: list = [
         "Every figure is of single readings. U is what the tester brings (artefacts"
-        + (f", and {shown(1000 * record.u_test, 1)} µm of standard uncertainty stated for seat, fixture and temperature" if record.u_test else "")
+        + (
+            f", and {shown(1000 * record.u_test, 1)} µm of standard uncertainty stated for seat, fixture and temperature"
+            if record.u_test
+            else ""
+        )
         + "), with coverage factor 2. A figure conforms where |value| ≤ MPE − U, fails where |value| ≥ MPE + U, and is undecided between (ISO 14253-1)."
     ]
     if not summary["acceptance"]:
@@ -98,7 +104,7 @@ def _acceptance(record: EvaluationRecord, tests: dict[str, list[AcceptanceTest]]
             [
                 text(figure["name"]),
                 text(FIGURES[figure["name"]]),
-                number(figure["as_found_mm"]),
+                number(figure["as_found_mm"], mark="bad" if figure["as_found_decision"] == "fails" else ""),
                 number(figure["value_mm"]),
                 number(figure["expanded_mm"]),
                 number(figure["limit_mm"]),
@@ -112,7 +118,15 @@ def _acceptance(record: EvaluationRecord, tests: dict[str, list[AcceptanceTest]]
         if test["missing"]:
             blocks.append(f"This was not the full procedure; it also needs {'; '.join(test['missing'])}.")
     parts = [
-        [text(test.standard), text(figure.name), text(part.where), number(part.value), number(part.expanded), number(part.limit), _part(part.decision)]
+        [
+            text(test.standard),
+            text(figure.name),
+            text(part.where),
+            number(part.value),
+            number(part.expanded),
+            number(part.limit),
+            _part(part.decision),
+        ]
         for test in tests["calibrated"]
         for figure in test.figures
         for part in figure.parts
@@ -142,7 +156,13 @@ def _margins(tests: list[AcceptanceTest]) -> Chart:
     hover = [f"{figure.name}: {shown(figure.value)} mm at {figure.worst.where}" for figure in shown_figures]
     trace = charts.dots("as left", names, shares, charts.DARK, "square", hover=hover, bars=bars)
     layout = charts.layout("", y, shapes=shapes, showlegend=False, yaxis={"rangemode": "tozero"})
-    return Chart("margins", "Figures against their limits" if limited else "Figures", words, {"data": [trace], "layout": layout}, height=320)
+    return Chart(
+        "margins",
+        "Figures against their limits" if limited else "Figures",
+        words,
+        {"data": [trace], "layout": layout},
+        height=320,
+    )
 
 
 def _found_and_left(record: EvaluationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation]) -> list:
@@ -151,7 +171,9 @@ def _found_and_left(record: EvaluationRecord, summary: dict[str, Any], evaluatio
         if summary[group] is not None:
             blocks.append(figures_table(f"{title} [mm]", summary[group], _STAGES))
     pair = {_STAGES[stage]: evaluation for stage, evaluation in evaluations.items()}
-    blocks.append(residual_chart("found-left", "Distance of every pose from its socket's centroid", record.recording.capture, pair))
+    blocks.append(
+        residual_chart("found-left", "Distance of every pose from its socket's centroid", record.recording.capture, pair)
+    )
     if record.used:
         blocks.append(f"Identified from were: {', '.join(sorted(record.used))}. All else the calibration has never seen.")
     return blocks
@@ -167,11 +189,21 @@ def _lengths(record: EvaluationRecord, tests: list[AcceptanceTest], left: Evalua
     if figure is not None:
         blocks.append(_length_chart(figure, capture))
     rows = [
-        {"from": length.start, "to": length.end, "value_mm": float(length.value), "error_mm": float(left.error[i]), "error_u_mm": _known(left.u[i])}
+        {
+            "from": length.start,
+            "to": length.end,
+            "value_mm": float(length.value),
+            "error_mm": float(left.error[i]),
+            "error_u_mm": _known(left.u[i]),
+        }
         for i, length in enumerate(capture.lengths)
     ]
     columns = ("between", "value", "as found", "as left", "U of error")
-    table = Table("Lengths between the centroids of their sockets [mm]", columns, length_rows(rows, 2.0, {"as found": np.asarray(found.error)}))
+    table = Table(
+        "Lengths between the centroids of their sockets [mm]",
+        columns,
+        length_rows(rows, 2.0, {"as found": np.asarray(found.error)}),
+    )
     return [Section("lengths", "Lengths", [*blocks, table])]
 
 
@@ -190,9 +222,14 @@ def _length_chart(figure: Figure, capture: Capture) -> Chart:
     if limits:
         x, y = [length for length, _ in limits], np.array([limit for _, limit in limits])
         line = {"mode": "lines", "line": {"color": "#444", "dash": "dash", "width": 1.5}}
-        traces += [charts.dots("MPE", x, y, "#444", "circle", **line), charts.dots("MPE", x, -y, "#444", "circle", showlegend=False, **line)]
+        traces += [
+            charts.dots("MPE", x, y, "#444", "circle", **line),
+            charts.dots("MPE", x, -y, "#444", "circle", showlegend=False, **line),
+        ]
     layout = charts.layout("length [mm]", "measured − value [mm]", shapes=charts.horizontal([0.0], "dot"))
-    words = "Errors of the reference lengths, each reading by itself, by the calibrated arm" + (", within their limits." if limits else ".")
+    words = "Errors of the reference lengths, each reading by itself, by the calibrated arm" + (
+        ", within their limits." if limits else "."
+    )
     return Chart("length-errors", "Errors of lengths", words.replace("within", "and"), {"data": traces, "layout": layout})
 
 

@@ -8,21 +8,24 @@ from typing import Any
 
 from .. import storage
 from ..errors import InputError
+from .about import about_section
 from .parts import Arms, Chart, Report, Table
 
 _FOLDER = Path(__file__).parent
 KINDS = ("calibration", "evaluation", "study")
 
 
-def write_report(source: str | os.PathLike, target: str | os.PathLike) -> dict[str, Any]:
+def write_report(source: str | os.PathLike, target: str | os.PathLike, about: Any = None) -> dict[str, Any]:
     """Write the report of a calibration, an evaluation or a study (HDF5) as one HTML file, whole or not at all.
+
+    ``about`` (an `about.About`) adds laboratory, customer, item, persons, dates and artefacts.
 
     Returns what was written, and what it warns of. Raises `InputError` where the file cannot be read, or the report not written.
     """
     source, target = Path(source), Path(target)
     if target.exists() and source.exists() and target.samefile(source):
         raise InputError(f"{target} is the file that the report is of; choose another output.")
-    page, report = report_of(source)
+    page, report = report_of(source, about)
     storage.write_text(target, page)
     return {
         "kind": "report",
@@ -35,7 +38,7 @@ def write_report(source: str | os.PathLike, target: str | os.PathLike) -> dict[s
     }
 
 
-def report_of(source: Path) -> tuple[str, Report]:
+def report_of(source: Path, about: Any = None) -> tuple[str, Report]:
     """The page of a file, and the report that it shows."""
     stored = storage.read_tables(source, KINDS, without=("trials",))
     kind = stored.attributes["kind"]
@@ -54,6 +57,8 @@ def report_of(source: Path) -> tuple[str, Report]:
         from .study import study_report
 
         report, _ = study_report(Results.of(source))
+    if about is not None:
+        report = report._replace(sections=[about_section(about), *report.sections])
     return page_of(report, made_by(source, stored.attributes)), report
 
 
@@ -76,9 +81,9 @@ def page_of(report: Report, origin: list[tuple[str, str]]) -> str:
     import jinja2
     from plotly.offline import get_plotlyjs
 
-    template = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined).from_string(
-        (_FOLDER / "page.html").read_text(encoding="utf-8")
-    )
+    template = jinja2.Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    ).from_string((_FOLDER / "page.html").read_text(encoding="utf-8"))
     programs = [get_plotlyjs(), (_FOLDER / "page.js").read_text(encoding="utf-8")]
     blocks = [block for section in report.sections for block in section.blocks]
     return template.render(

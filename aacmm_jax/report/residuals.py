@@ -21,10 +21,16 @@ _FAR = 4.0  # median distances
 _LEAST = 1e-5  # mm: what a logarithmic axis shows of a distance of zero
 
 
-def figures_table(caption: str, summary: Mapping[str, Any], stages: Mapping[str, str]) -> Table:
-    """Repeatability and length errors, one column an arm."""
-    first = next(iter(stages))
-    rows = [[text(title), *(number(summary[stage].get(key)) for stage in stages)] for key, title in _FIGURES if key in summary[first]]
+def figures_table(caption: str, summary: Mapping[str, Any], stages: Mapping[str, str], *, fixed_scale: bool = False) -> Table:
+    """Repeatability and length errors, one column an arm; the error of a single length that fixed the scale is none."""
+    first, last = next(iter(stages)), list(stages)[-1]
+
+    def cell(stage: str, key: str) -> Cell:
+        if fixed_scale and stage == last and key.startswith("length"):
+            return text("fixed the scale")
+        return number(summary[stage].get(key))
+
+    rows = [[text(title), *(cell(stage, key) for stage in stages)] for key, title in _FIGURES if key in summary[first]]
     return Table(caption, ("", *stages.values()), rows)
 
 
@@ -66,11 +72,13 @@ def residual_chart(
         traces.append(charts.dots(name, poses.tolist(), np.maximum(distances, _LEAST), color, symbol, hover=hover, size=5))
         if mark:
             far = outliers(distances)
-            marked = charts.dots("far from its socket", poses[far].tolist(), distances[far], charts.WARM, "diamond-open", size=13)
+            marked = charts.dots(
+                "far from its socket", poses[far].tolist(), distances[far], charts.WARM, "diamond-open", size=13
+            )
             traces += [marked | {"text": [charts.plain(hover[i]) for i in far], "hoverinfo": "text"}] if len(far) else []
     borders = [] if len(capture.sizes) > 40 else charts.vertical((np.cumsum(capture.sizes)[:-1] + 0.5).tolist())
     x = "pose, socket after socket" if len(capture.sizes) > 1 else "pose"
-    layout = charts.layout(x, "distance [mm]", yaxis={"type": "log", "exponentformat": "power", "dtick": 1}, shapes=borders)
+    layout = charts.layout(x, "distance [mm]", yaxis=charts.logarithmic(*(trace["y"] for trace in traces)), shapes=borders)
     last = np.asarray(list(evaluations.values())[-1].distances)
     rows = [
         [

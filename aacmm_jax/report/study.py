@@ -40,7 +40,11 @@ def study_report(results: Results) -> tuple[Report, dict[str, Any]]:
         verdict_mark="good" if summary["finished"] and share > 0.999 and not warnings else "unsure",
         warnings=warnings,
         facts=[
-            ("Factors", "; ".join(f"{name}: {', '.join(_level(x) for x in levels)}" for name, levels in summary["factors"].items()) or "none varied"),
+            (
+                "Factors",
+                "; ".join(f"{name}: {', '.join(_level(x) for x in levels)}" for name, levels in summary["factors"].items())
+                or "none varied",
+            ),
             ("Seed", str(summary["seed"])),
         ],
         sections=[
@@ -55,14 +59,18 @@ def study_report(results: Results) -> tuple[Report, dict[str, Any]]:
 def _warnings(summary: dict[str, Any]) -> list[str]:
     found = []
     if not summary["finished"]:
-        found.append("The study is not finished; the same command goes on where it was. Figures are of the trials that were run.")
+        found.append(
+            "The study is not finished; the same command goes on where it was. Figures are of the trials that were run."
+        )
     for cell in summary["results"]:
         if cell["trials_run"] and (cell["converged"]["value"] or 0.0) < 0.99:
             found.append(
                 f"Cell {cell['cell']}: only {100 * cell['converged']['value']:.3g} % of {cell['trials_run']} trials converged; its figures are of those."
             )
         if (cell["truth_inside"]["value"] or 0.0) < 1.0 and cell["trials_run"]:
-            found.append(f"Cell {cell['cell']}: the true arm lies inside the bounds in {100 * cell['truth_inside']['value']:.3g} % of the trials.")
+            found.append(
+                f"Cell {cell['cell']}: the true arm lies inside the bounds in {100 * cell['truth_inside']['value']:.3g} % of the trials."
+            )
     return found[:12] + ([f"And {len(found) - 12} more of this kind; see the table of cells."] if len(found) > 12 else [])
 
 
@@ -95,7 +103,10 @@ def _cell_table(summary: dict[str, Any]) -> Table:
     for cell in summary["results"]:
         share = cell["converged"]["value"]
         levels = [
-            Cell(_level(cell["factors"][name]), float(cell["factors"][name]) if isinstance(cell["factors"][name], float) else None)
+            Cell(
+                _level(cell["factors"][name]),
+                float(cell["factors"][name]) if isinstance(cell["factors"][name], float) else None,
+            )
             for name in names
         ]
         rows.append(
@@ -108,7 +119,9 @@ def _cell_table(summary: dict[str, Any]) -> Table:
                 number(cell["steps_mean"], 1),
             ]
         )
-    return Table("Trials by cell", ("cell", *names, "trials run", "converged [%]", "truth in the box [%]", "mean evaluations"), rows)
+    return Table(
+        "Trials by cell", ("cell", *names, "trials run", "converged [%]", "truth in the box [%]", "mean evaluations"), rows
+    )
 
 
 def _figure_section(summary: dict[str, Any], name: str, factor: float, unit: str) -> Section:
@@ -116,26 +129,51 @@ def _figure_section(summary: dict[str, Any], name: str, factor: float, unit: str
     labels = _labels(summary)[:_MOST_CELLS]
     cells = [(label, cell["figures"].get(name)) for label, cell in zip(labels, summary["results"], strict=False)]
     rows = [
-        [text(label), *(_uncertain(None if found is None else found[key], factor) for key in ("mean", "spread", "p5", "p50", "p95"))]
+        [
+            text(label),
+            *(_uncertain(None if found is None else found[key], factor) for key in ("mean", "spread", "p5", "p50", "p95")),
+        ]
         for label, found in cells
     ]
     there = [(i + 1, label, found) for i, (label, found) in enumerate(cells) if found is not None]
     places = [place for place, *_ in there]
     low, middle, high = (np.array([factor * found[key]["value"] for *_, found in there]) for key in ("p5", "p50", "p95"))
-    hover = [f"{label}: median {shown(float(m))} {unit}, 5 % {shown(float(a))}, 95 % {shown(float(b))}" for (_, label, _), a, m, b in zip(there, low, middle, high, strict=True)]
+    hover = [
+        f"{label}: median {shown(float(m))} {unit}, 5 % {shown(float(a))}, 95 % {shown(float(b))}"
+        for (_, label, _), a, m, b in zip(there, low, middle, high, strict=True)
+    ]
     trace = charts.dots("median, 5 to 95 %", places, middle, charts.DARK, "square", hover=hover)
     error = {"type": "data", "symmetric": False, "color": charts.DARK, "thickness": 1.4, "width": 5}
     trace["error_y"] = error | {"array": (high - middle).tolist(), "arrayminus": (middle - low).tolist()}
     title = FIGURES[name]
-    heading = f"{title[0].upper()}{title[1:]}"
-    axis: dict[str, Any] = {"dtick": 1} if len(places) <= 24 else {}
+    heading = title if name == "k" else f"{title[0].upper()}{title[1:]}"
+    axis, axis_title = _cell_axis(summary, places)
     # Positive figures over a wide span of cells are read on a logarithmic axis.
     wide = len(low) > 0 and low.min() > 0 and high.max() > 20 * low.min()
-    layout = charts.layout("cell", f"{unit or name}", xaxis=axis, yaxis={"type": "log"} if wide else {}, showlegend=False)
+    layout = charts.layout(
+        axis_title, f"{unit or name}", xaxis=axis, yaxis=charts.logarithmic(low, high) if wide else {}, showlegend=False
+    )
     unit_text = f" [{unit}]" if unit else ""
-    behind = Table(f"{heading}{unit_text}; ± one Monte Carlo standard error", ("cell", "mean", "spread", "5 %", "50 %", "95 %"), rows)
+    behind = Table(
+        f"{heading}{unit_text}; ± one Monte Carlo standard error", ("cell", "mean", "spread", "5 %", "50 %", "95 %"), rows
+    )
     words = "Squares are medians, bars reach from the 5th to the 95th percentile of the converged trials."
-    return Section(f"figure-{name}", heading, [Chart(f"chart-{name}", f"{heading}{unit_text}", words, {"data": [trace], "layout": layout}, behind, 320)])
+    return Section(
+        f"figure-{name}",
+        heading,
+        [Chart(f"chart-{name}", f"{heading}{unit_text}", words, {"data": [trace], "layout": layout}, behind, 320)],
+    )
+
+
+def _cell_axis(summary: dict[str, Any], places: list[int]) -> tuple[dict[str, Any], str]:
+    """Cells along the axis, with the levels of what was varied where there is room to write them."""
+    varied = [name for name, levels in summary["factors"].items() if len(levels) > 1]
+    if not varied or len(places) > 16:
+        return ({"dtick": 1} if len(places) <= 24 else {}), "cell"
+    cells = {cell["cell"]: cell["factors"] for cell in summary["results"]}
+    ticks = [f"{place}<br>" + "<br>".join(charts.plain(_level(cells[place][name]))[:14] for name in varied) for place in places]
+    title = "cell, and under it " + ", ".join(charts.plain(name.split(".")[-1].replace("_", " ")) for name in varied)
+    return {"tickvals": places, "ticktext": ticks, "tickangle": 0}, title
 
 
 def _parameter_sections(summary: dict[str, Any]) -> list[Section]:
@@ -144,8 +182,17 @@ def _parameter_sections(summary: dict[str, Any]) -> list[Section]:
     for label, cell in zip(_labels(summary), summary["results"], strict=True):
         for row in cell.get("parameters", [])[: 4000 // max(summary["cells"], 1)]:
             factor, unit = (ARCSEC, "arcsec") if row.get("unit") == "rad" else (1.0, "mm")
-            rows.append([text(label), text(row["parameter"]), text(unit), *(_uncertain(row.get(key), factor) for key in ("bias", "spread"))])
+            rows.append(
+                [
+                    text(label),
+                    text(row["parameter"]),
+                    text(unit),
+                    *(_uncertain(row.get(key), factor) for key in ("bias", "spread")),
+                ]
+            )
     if not rows:
         return []
-    table = Table("Errors of the parameters; ± one Monte Carlo standard error", ("cell", "parameter", "unit", "bias", "spread"), rows)
+    table = Table(
+        "Errors of the parameters; ± one Monte Carlo standard error", ("cell", "parameter", "unit", "bias", "spread"), rows
+    )
     return [Section("parameters", "Parameters", [table])]
