@@ -13,8 +13,8 @@ FLOORS = tuple(
     arrays storage toml
     chain arm parameters capture recording arm_files manifest capture_files noise simulate independence
     metrics steps weights residuals solver
-    covariance scale propagation observability checks results evaluate calibrate lanes batch calibration_files uncertainty sampling validation exchange placing refining planning plan_files
-    cautions summary figures demo study
+    covariance scale propagation observability checks results evaluate calibrate lanes batch calibration_files uncertainty sampling validation exchange placing refining planning plan_files differences drift
+    cautions summary figures demo study drift_summary drift_figure
     cli
     """.strip().splitlines()
 )
