@@ -283,11 +283,8 @@ def _shared(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str
         both = [_values(record.calibrated.arm, old.names) for record in (old, new)]
         same = old.names == new.names and np.array_equal(both[0], both[1])
         what = "are one and the same calibration" if same else "are of the same capture"
-        return f"{_capital(labels[0])} and {labels[1]} {what}, so they are not independent and say nothing about drift."
-    return (
-        f"{_capital(labels[0])} and {labels[1]} share {common} of {len(rows[1])} poses, so they are not independent: the uncertainties of the "
-        "changes are wrong."
-    )
+        return f"Not independent: {labels[0]} and {labels[1]} {what}, so this says nothing about drift."
+    return f"Not independent: {labels[0]} and {labels[1]} share {common} of {len(rows[1])} poses, so the uncertainties of the changes are wrong."
 
 
 def _other_arm(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str]) -> str:
@@ -385,7 +382,3 @@ def in_words(name: str, value: float, sign: str = "+") -> str:
 
 def _some(items: list[str]) -> str:
     return ", ".join(items[:_NAMED]) + (f" and {len(items) - _NAMED} more" if len(items) > _NAMED else "")
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

@@ -79,7 +79,7 @@ def plot_changes(table: Trend, axes: Any, places: np.ndarray | None = None) -> A
     drift = table.drifts[-1]
     axes.set_title(
         f"Change of {len(table.names)} parameters from the first calibration; band: expanded uncertainty ({100 * drift.level:g} %)\n"
-        f"named: beyond the band at the end; open circles: beyond it earlier{_left_out(drift)}",
+        f"named: beyond the band at the end (at most {_MOST}); open circles: other values beyond it{_left_out(drift)}",
         fontsize=9.5, loc="left",
     )  # fmt: skip
     return axes
@@ -116,15 +116,16 @@ def plot_parameters(drift: Drift, axes: Any) -> Any:
     axes.vlines(places, 0, ratio, color=np.where(moved, _DARK, _LIGHT), linewidth=1.2)
     axes.plot(places[~moved], ratio[~moved], "o", color="white", markeredgecolor="0.35", markersize=6)
     axes.plot(places[moved], ratio[moved], "s", color=_DARK, markersize=6)
+    crowded = np.any(np.diff(places[moved]) < 3)
     for place in places[moved]:
         text = in_words(drift.names[chosen[place]], float(drift.change[chosen[place]]))
         axes.annotate(
             text, (place, ratio[place]), xytext=(0, 7 if ratio[place] > 0 else -7), textcoords="offset points", fontsize=8, color=_DARK,
-            ha="center", va="bottom" if ratio[place] > 0 else "top",
+            ha="center", rotation=90 if crowded else 0, va="bottom" if ratio[place] > 0 else "top",
         )  # fmt: skip
     axes.set_xticks(places, [drift.names[i] for i in chosen], rotation=60, ha="right", rotation_mode="anchor", fontsize=8)
     axes.set_xlim(-0.8, max(len(chosen), 1) - 0.2)
-    axes.margins(y=0.15)
+    axes.margins(y=0.3 if crowded else 0.15)
     axes.set_ylabel("change / expanded uncertainty")
     axes.set_title(
         f"New less old calibration: {int(moved.sum())} of {len(chosen)} parameters beyond the band, their expanded uncertainty "
@@ -181,7 +182,8 @@ def _band(axes: Any, most: float) -> None:
     """The band within which a change is no more than its expanded uncertainty; logarithmic beyond, where changes are far out."""
     if most > _FAR:
         axes.set_yscale("symlog", linthresh=2, linscale=1.2)
-        ticks = [value for value in (2, 5, 10, 20, 50, 100, 200, 500, 1000, 10000) if value < 2 * most]
+        steps = (2, 5, 10, 20) if most < 40 else (10, 100, 1000, 10_000, 100_000)
+        ticks = [value for value in steps if value < 2 * most]
         values = [-value for value in reversed(ticks)] + [-1, 0, 1] + ticks
         axes.set_yticks(values, [f"{value:g}" for value in values])
         axes.minorticks_off()

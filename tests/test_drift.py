@@ -29,7 +29,7 @@ from aacmm_jax.scale import divide_lengths
 from .refusals import assert_refused
 
 SOCKETS = {"A": (400, 200, 300), "B": (700, 500, 500)}
-PAIRS = 60
+PAIRS, OTHERS = 60, 12
 MOVED = {"theta_4": 20 * ARCSEC, "a_2": 0.05}
 
 
@@ -52,13 +52,13 @@ def moved_arm(space, changes):
 
 @pytest.fixture(scope="module")
 def calibrated(paper_arm, specification, space):
-    """Calibrations, noise estimated, of the paper's arm (120) and of one with two parameters moved (20), each of its own capture."""
+    """Calibrations, noise estimated, of the paper's arm (120) and of one with two parameters moved (12), each of its own capture."""
     bounds = aj.Bounds.around(paper_arm, space)
     captures = [
         aj.simulate(
             arm, SOCKETS, poses={"A": 50, "B": 10}, lengths=[("A", "B", 0.002)], encoder_arcsec=2.0, seating=0.005, seed=seed
         )
-        for arm, seeds in ((paper_arm, range(2 * PAIRS)), (moved_arm(space, MOVED), range(2 * PAIRS, 2 * PAIRS + 20)))
+        for arm, seeds in ((paper_arm, range(2 * PAIRS)), (moved_arm(space, MOVED), range(2 * PAIRS, 2 * PAIRS + OTHERS)))
         for seed in seeds
     ]
 
@@ -147,12 +147,24 @@ def test_parameters_against_numbers_worked_out_by_hand(old, new):
     )
 
 
-def test_estimated_noise_takes_f(old, new):
-    """Both of the same size and 40 degrees of freedom each: 80 together, as for two pooled variances."""
-    found = compare(certain(old, 0.003, 40.0), certain(shifted(old, {"d_3": 0.02}, recording=new.recording), 0.003, 40.0))
-    assert found.joint.freedom == pytest.approx(80)
-    assert found.joint.p == pytest.approx(stats.f.sf((0.02**2 / 18e-6) / 21, 21, 80), rel=1e-6)
-    np.testing.assert_allclose(found.expanded / found.u, stats.t.ppf(0.975, 80))
+@pytest.mark.parametrize(
+    ("u", "freedom", "expected"),
+    [((0.003, 0.003), (40.0, 40.0), 80.0), ((0.003, 0.004), (40.0, 90.0), 625 / (81 / 40 + 256 / 90))],
+)
+def test_estimated_noise_takes_f(old, new, u, freedom, expected):
+    """Two alike with 40 degrees of freedom each have 80 together, as two pooled variances; else Welch and Satterthwaite."""
+    end = shifted(old, {"d_3": 0.02}, recording=new.recording)
+    found = compare(certain(old, u[0], freedom[0]), certain(end, u[1], freedom[1]))
+    assert found.joint.freedom == pytest.approx(expected)
+    assert found.joint.p == pytest.approx(stats.f.sf(0.02**2 / (u[0] ** 2 + u[1] ** 2) / 21, 21, expected), rel=1e-6)
+    np.testing.assert_allclose(found.expanded / found.u, stats.t.ppf(0.975, expected))
+
+
+def test_robust_covariances_take_hotelling(old, new):
+    """T^2 with 80 degrees of freedom of 21 parameters is 80 * 21 / 60 times F with 21 and 60."""
+    end = shifted(old, {"d_3": 0.02}, recording=new.recording, form="robust")
+    found = compare(certain(old, 0.003, 40.0)._replace(form="robust"), certain(end, 0.003, 40.0))
+    assert found.joint.p == pytest.approx(stats.f.sf(0.02**2 / 18e-6 * 60 / (80 * 21), 21, 60), rel=1e-6)
 
 
 def test_only_what_both_determine_is_tested(old, new):
@@ -212,6 +224,18 @@ def test_lengths_are_those_of_the_two_arms(old, new):
     length = eqx.filter_jit(lambda uncertainty: uncertainty.length(found.q, found.q_end))
     each = [np.asarray(length(aj.uncertainty_of(record))) for record in (old, new)]
     np.testing.assert_allclose(found.u, np.hypot(*each), rtol=1e-9)
+
+    space = aj.Parameters(old.calibrated.arm, old.names)  # of both arms: what is held is alike
+
+    @jax.jit
+    @jax.grad
+    def slope(vector):
+        arm = space.arm(vector)
+        return jnp.mean(jnp.linalg.norm(arm.position(found.q_end) - arm.position(found.q), axis=-1))
+
+    means = [slope(space.vector(record.calibrated.arm)) for record in (old, new)]
+    variance = sum(float(g @ record.covariance @ g) for g, record in zip(means, (old, new), strict=True))
+    assert found.u_size == pytest.approx(math.sqrt(variance) / 250, rel=1e-6)
     assert found.largest == found.change[np.argmax(np.abs(found.change))]
     assert found.rms == pytest.approx(float(np.sqrt(np.mean((by[1] - by[0]) ** 2))))
 
@@ -251,9 +275,9 @@ def test_chance_alone_flags_one_parameter_in_twenty(calibrated):
 
 
 def test_true_changes_are_found(calibrated, paper_arm, space):
-    """theta_4 moved by 20 arcsec and a_2 by 0.05 mm, 20 times: both are flagged and named alone, and lengths change as the true ones."""
+    """theta_4 moved by 20 arcsec and a_2 by 0.05 mm, 12 times: both are flagged and named alone, and lengths change as the true ones."""
     other = moved_arm(space, MOVED)
-    found = [compare(calibrated[i], calibrated[2 * PAIRS + i], points=40) for i in range(20)]
+    found = [compare(calibrated[i], calibrated[2 * PAIRS + i], points=40) for i in range(OTHERS)]
     for name in MOVED:
         assert np.mean([drift.moved[space.index(name)] for drift in found]) > 0.9
     rest = [i for i, name in enumerate(space.names) if name not in MOVED]
@@ -293,9 +317,12 @@ CAUTIONS = {
         "Failed: the new calibration. Not converged.",
     ),
     "implausible": (lambda o, n: n._replace(k=25.4), "Implausible: the new calibration, with k = 25.4."),
-    "itself": (lambda o, n: o, "are one and the same calibration, so they are not independent"),
-    "same capture": (lambda o, n: n._replace(recording=o.recording), "are of the same capture, so they are not independent"),
-    "shared poses": (half_shared, "share 30 of 60 poses, so they are not independent"),
+    "itself": (lambda o, n: o, "Not independent: the old calibration and the new calibration are one and the same calibration"),
+    "same capture": (
+        lambda o, n: n._replace(recording=o.recording),
+        "Not independent: the old calibration and the new calibration are of the same capture",
+    ),
+    "shared poses": (half_shared, "share 30 of 60 poses, so the uncertainties of the changes are wrong"),
     "nominal": (
         other_nominal,
         "The nominal arms differ in d_3 ('Cheng 2018, simulated arm' of the old calibration, 'another arm'",
