@@ -86,11 +86,22 @@ _LATER = {
     "evaluation_of": "evaluation_files",
     "save_evaluation": "evaluation_files",
     "load_evaluation": "evaluation_files",
+    "compare": "drift",
+    "Drift": "drift",
+    "Trend": "drift",
+    "About": "about",
+    "read_about": "about",
+    "dcc": "certificate",
+    "values_of_dcc": "certificate",
+    "write_report": "report",
 }
 _NOW = {name for name, value in globals().items() if not (name.startswith("_") or isinstance(value, type(_typing)))}
 __all__ = sorted(_NOW | set(_LATER))  # pyright: ignore[reportUnsupportedDunderAll]
 
 if _typing.TYPE_CHECKING:
+    from . import plot as plot
+    from .about import About as About
+    from .about import read_about as read_about
     from .acceptance import Measured as Measured
     from .acceptance import accept as accept
     from .acceptance import measured_by as measured_by
@@ -98,8 +109,13 @@ if _typing.TYPE_CHECKING:
     from .arm_files import load_specification as load_specification
     from .arm_files import save_arm as save_arm
     from .arm_files import shipped_arms as shipped_arms
+    from .certificate import dcc as dcc
+    from .certificate import values_of_dcc as values_of_dcc
     from .decision import Limit as Limit
     from .decision import decide as decide
+    from .drift import Drift as Drift
+    from .drift import Trend as Trend
+    from .drift import compare as compare
     from .evaluation_files import EvaluationRecord as EvaluationRecord
     from .evaluation_files import evaluation_of as evaluation_of
     from .evaluation_files import load_evaluation as load_evaluation
@@ -110,6 +126,7 @@ if _typing.TYPE_CHECKING:
     from .points_files import read_points as read_points
     from .procedure import acceptance_procedure as acceptance_procedure
     from .procedure import record_procedure as record_procedure
+    from .report import write_report as write_report
     from .sampling import Sampled as Sampled
     from .sampling import bootstrap as bootstrap
     from .sampling import monte_carlo as monte_carlo
@@ -127,7 +144,7 @@ if _typing.TYPE_CHECKING:
 else:
 
     def __getattr__(name: str):
-        if name in _LATER.values():
+        if name in _LATER.values() or name == "plot":
             return _import_module(f".{name}", __name__)
         if name not in _LATER:
             raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

@@ -5,23 +5,17 @@ import math
 import numpy as np
 
 from .calibration_files import CalibrationRecord
-from .checks import value_of
+from .checks import plausible, value_of
 from .observability import observe
 from .parameters import Parameters, is_length
 from .recording import Recording
 from .results import active_names
 
 _SUSPICIOUS_SCALE = 0.005  # a held link is not off by more than this; its nominal value or a reference length is wrong
-_PLAUSIBLE_SCALE = (0.5, 2.0)
 _LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 where the D-H model misses something
 _POSE_OUTLIER = 8.0  # in median distances
 _HONEST = 1.5  # errors may exceed their prediction by so much before it is said
 _NAMED = 5  # how many of a kind are named
-
-
-def plausible(k: float) -> bool:
-    """Whether a scale can be a calibration's at all, and not a mistaken unit or socket."""
-    return _PLAUSIBLE_SCALE[0] <= k <= _PLAUSIBLE_SCALE[1]
 
 
 def of_capture(recording: Recording) -> list[str]:

@@ -12,6 +12,8 @@ from .errors import InputError
 from .noise import Noise
 from .parameters import Bounds, Parameters, is_length
 
+_PLAUSIBLE_SCALE = (0.5, 2.0)
+
 
 def based_on(space: Parameters, arm: Arm) -> Parameters:
     """The free parameters on the given arm: held values come from the arm that is calibrated, not from the space's base."""
@@ -123,3 +125,8 @@ def check_form(form: Form | None, noise: Noise | None, joints: int) -> Form:
     if form == "estimated" and noise is not None:
         raise InputError("the noise is given, so it is not estimated; leave out noise, or choose another form.")
     return form
+
+
+def plausible(k: float) -> bool:
+    """Whether a scale can be a calibration's at all, and not a mistaken unit or socket."""
+    return _PLAUSIBLE_SCALE[0] <= k <= _PLAUSIBLE_SCALE[1]

@@ -21,7 +21,7 @@ def main() -> None:
     gc.set_threshold(200_000, 20, 20)
     try:
         from ..errors import InputError
-        from .result_commands import app
+        from .compare_commands import app
     except ImportError as error:
         if debug:
             raise

@@ -10,6 +10,11 @@ from ..errors import InputError
 from .commands import CalibrationFile, Json, Only, Without, _busy, _show
 from .plan_commands import app
 
+About = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.toml", help="Laboratory, customer, item, persons, dates, as a certificate states them."),
+]
+
 
 @app.command(
     epilog="Examples: aacmm evaluate calibration.h5 capture.h5 --mpe Deltam=0.05 --mpe E_Uni=0.025+L/40000; aacmm evaluate points.toml"

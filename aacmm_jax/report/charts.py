@@ -38,7 +38,7 @@ def layout(x: str, y: str, **more: Any) -> dict[str, Any]:
 
 def dots(
     name: str,
-    x: Sequence[Any],
+    x: Any,
     y: Any,
     color: str,
     symbol: str,

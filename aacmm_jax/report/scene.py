@@ -2,12 +2,11 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..arm import Arm
 from ..capture import Capture
-from ..chain import turns_of, walk
+from ..poses import corners
 from ..volume import reach_of
 
 _MOST = 150  # poses that a page holds
@@ -18,7 +17,7 @@ def scene_of(arm: Arm, capture: Capture, distances: np.ndarray) -> dict[str, Any
     owner = capture.owner
     chosen = _chosen(np.asarray(capture.sizes))
     q = np.asarray(capture.q)[chosen]
-    lines = _lines(arm, q)
+    lines = corners(arm, q)
     first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
     tips = np.asarray(arm.position(capture.q))
     return {
@@ -39,19 +38,8 @@ def scene_of(arm: Arm, capture: Capture, distances: np.ndarray) -> dict[str, Any
 
 
 def _chosen(sizes: np.ndarray) -> np.ndarray:
-    """Which poses: all, or evenly spread ones of every socket."""
+    """Which poses: all, or some evenly spread over them."""
     total = int(sizes.sum())
     if total <= _MOST:
         return np.arange(total)
     return np.unique(np.linspace(0, total - 1, _MOST).round().astype(int))
-
-
-def _lines(arm: Arm, q: np.ndarray) -> np.ndarray:
-    """Corners of the arm ``(m, 2 n + 2, 3)``: the base, for each joint the end of its offset and of its link, and the tip."""
-    walked = walk(arm.geometry, turns_of(jnp.asarray(q)))
-    before, after = (np.asarray(x).reshape(arm.joints, 3, -1) for x in (walked.origin_before, walked.origin))
-    axis = np.asarray(walked.z_before).reshape(arm.joints, 3, -1)
-    corners = before + np.asarray(arm.d)[:, None, None] * axis
-    tip = np.asarray(walked.tip).reshape(1, 3, -1)
-    both = np.stack([corners, after], axis=1).reshape(2 * arm.joints, 3, -1)
-    return np.concatenate([np.zeros_like(tip), both, tip]).transpose(2, 0, 1)
