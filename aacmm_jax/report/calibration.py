@@ -8,7 +8,7 @@ import numpy as np
 from ..calibration_files import CalibrationRecord
 from ..evaluate import Evaluation
 from ..summary import calibration_summary
-from ..uncertainty import uncertainty_of
+from ..uncertainty import over_volume, uncertainty_of
 from . import charts
 from .knowledge import bounds_section, correlations_section, observability_section, sampled_section, volume_section
 from .parts import ARCSEC, Arms, Chart, Report, Section, Table, decimals_of, number, shown, text
