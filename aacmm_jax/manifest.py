@@ -143,7 +143,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
             return _radians(table, model.angles)
 
         sockets, lengths, spheres = recorded(path.parent, model, angles)
-        sources = tuple(storage.fingerprint(file) for file in files)
+        sources = tuple(storage.fingerprint(file, path.parent) for file in files)
         return Recording(Capture(sockets, lengths), nominal, spheres=spheres, sources=sources)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

@@ -160,13 +160,15 @@ def storable(text: str) -> str:
     return text
 
 
-def fingerprint(path: str | os.PathLike) -> str:
-    """A file's name and SHA-256, by which it can be told from every other."""
+def fingerprint(path: str | os.PathLike, beside: str | os.PathLike | None = None) -> str:
+    """A file's name and SHA-256, by which it can be told from every other; with its folders below ``beside``, where it lies there."""
     import hashlib
 
     path = Path(path)
     check_readable(path)
-    return storable_name(f"{path.name} (SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()})")
+    below = beside is not None and path.is_relative_to(beside)
+    name = path.relative_to(beside).as_posix() if below and beside is not None else path.name
+    return storable_name(f"{name} (SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()})")
 
 
 def storable_name(text: str) -> str:

@@ -175,7 +175,7 @@ def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict
     ]
     shapes = charts.horizontal([0.0], "solid")
     figure = {"data": traces, "layout": charts.layout("reference length", "measured − value [mm]", shapes=shapes)}
-    if len(names) <= 12:
+    if len(names) <= 12 and max(map(len, names)) <= 12:
         figure["layout"]["xaxis"] |= {"tickvals": places, "ticktext": [charts.plain(name) for name in names]}
     chart = Chart(
         "lengths",
@@ -227,6 +227,7 @@ def _parameters(record: CalibrationRecord, summary: dict[str, Any], factor: floa
                 for name, value, bar in zip(names, y, bars, strict=True)
             ]
             trace = charts.dots("as left − as found, with U", names, y, charts.DARK, "circle", hover=hover, bars=bars)
+            trace["marker"]["symbol"] = ["x-thin" if math.isnan(bar) else "circle" for bar in bars]
             figure = {
                 "data": [trace],
                 "layout": charts.layout("", f"change [{label}]", shapes=charts.horizontal([0.0], "solid"), showlegend=False),
@@ -235,7 +236,7 @@ def _parameters(record: CalibrationRecord, summary: dict[str, Any], factor: floa
                 Chart(
                     f"change-{unit}",
                     title,
-                    "As left less as found; bars are U (95 %), smaller than the mark where none is seen.",
+                    "As left less as found; bars are U (95 %), smaller than the mark where none is seen. Crosses have no U of their own.",
                     figure,
                     height=320,
                 )

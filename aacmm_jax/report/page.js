@@ -22,6 +22,12 @@
     place.dataset.drawn = "yes";
   }
 
+  // Lists of files are folded on the screen, and open on paper.
+  const folded = () => [...document.querySelectorAll(".origin details:not([open])")];
+  let opened = [];
+  window.addEventListener("beforeprint", () => { opened = folded(); for (const one of opened) one.open = true; });
+  window.addEventListener("afterprint", () => { for (const one of opened) one.open = false; });
+
   // Tables: a heading sorts by its column, and once more the other way round.
   for (const button of document.querySelectorAll("button.sort")) {
     button.addEventListener("click", () => {

@@ -62,21 +62,20 @@ def report_of(source: Path, about: Any = None) -> tuple[str, Report]:
     return page_of(report, made_by(source, stored.attributes)), report
 
 
-def made_by(source: Path, attributes: dict[str, Any]) -> list[tuple[str, str]]:
+def made_by(source: Path, attributes: dict[str, Any]) -> list[tuple[str, list[str]]]:
     """How the file came about, and how to make it again."""
-    entries = [
-        ("File", storage.fingerprint(source)),
-        ("Made on", str(attributes["created"])),
-        ("Command", str(attributes["command"])),
-        ("aacmm_jax", str(attributes["package_version"])),
-        ("With", attributes.get("versions") or "not recorded"),
-        ("Seed", "none" if attributes.get("seed") is None else str(attributes["seed"])),
+    return [
+        ("File", [storage.fingerprint(source)]),
+        ("Made on", [str(attributes["created"])]),
+        ("Command", [str(attributes["command"])]),
+        ("aacmm_jax", [str(attributes["package_version"])]),
+        ("With", [attributes.get("versions") or "not recorded"]),
+        ("Seed", ["none" if attributes.get("seed") is None else str(attributes["seed"])]),
+        ("From", [str(line) for line in attributes.get("sources") or ["not recorded"]]),
     ]
-    entries += [("From" if i == 0 else "", str(line)) for i, line in enumerate(attributes.get("sources") or ["not recorded"])]
-    return entries
 
 
-def page_of(report: Report, origin: list[tuple[str, str]]) -> str:
+def page_of(report: Report, origin: list[tuple[str, list[str]]]) -> str:
     """The HTML of a report. Everything that people wrote is shown as text: Jinja escapes it, and only this page's own programs run."""
     import jinja2
     from plotly.offline import get_plotlyjs
