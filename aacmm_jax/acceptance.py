@@ -51,8 +51,9 @@ class Part(NamedTuple):
     where: str
     value: float
     expanded: float  # U of the test value, coverage factor 2
-    limit: float | None  # MPE
-    decision: Decision | None  # None without a limit
+    length: float = 0.0  # calibrated length that was measured, where it is one: limits may grow with it
+    limit: float | None = None  # MPE
+    decision: Decision | None = None  # None without a limit
 
 
 class Figure(NamedTuple):
@@ -132,16 +133,15 @@ def accept(measured: Measured, limits: Mapping[str, Limit] | None = None, u_test
             raise InputError(f"there is no figure '{name}'; limits can be given for {', '.join(FIGURES)}.")
         if name not in there:
             raise InputError(f"a limit is given for {name} ({FIGURES[name]}), but the capture holds nothing to measure it on.")
-    lengths = {_between(length): float(length.value) for length in measured.lengths}
-    return [test._replace(figures=tuple(_decided(figure, limits, lengths) for figure in test.figures)) for test in tests]
+    return [test._replace(figures=tuple(_decided(figure, limits) for figure in test.figures)) for test in tests]
 
 
-def _decided(figure: Figure, limits: Mapping[str, Limit], lengths: Mapping[str, float]) -> Figure:
+def _decided(figure: Figure, limits: Mapping[str, Limit]) -> Figure:
     if figure.name not in limits:
         return figure
     parts = []
     for part in figure.parts:
-        limit = limits[figure.name].at(lengths.get(part.where.partition(", reading")[0], 0.0))
+        limit = limits[figure.name].at(part.length)
         parts.append(part._replace(limit=limit, decision=decide(part.value, limit, part.expanded)))
     return figure._replace(parts=tuple(parts))
 
@@ -197,39 +197,47 @@ def articulated_location(groups: Sequence[Numbers]) -> float:
 
 
 def _part(where: str, value: float, *u: float) -> Part:
-    return Part(where, value, FACTOR * math.sqrt(sum(own**2 for own in u)), None, None)
+    return Part(where, value, FACTOR * math.sqrt(sum(own**2 for own in u)))
 
 
-def _between(length: ReferenceLength) -> str:
-    return f"{length.start} - {length.end}"
+class _Reading(NamedTuple):
+    """One reading of a length, mm."""
+
+    where: str
+    deviation: float
+    u: float
+    length: float
+
+    def part(self, u_test: float) -> Part:
+        return _part(self.where, self.deviation, self.u, u_test)._replace(length=self.length)
 
 
-def _readings(measured: Measured) -> list[tuple[str, float, float]]:
-    """Every length as single readings: where, deviation, u. The i-th pose at one end goes with the i-th at the other."""
+def _readings(measured: Measured) -> list[_Reading]:
+    """Every length as single readings. The i-th pose at one end goes with the i-th at the other."""
     found = []
     for length in measured.lengths:
         start, end = (measured.sockets[name] for name in (length.start, length.end))
         pairs = min(len(start), len(end))
         values = np.linalg.norm(end[:pairs] - start[:pairs], axis=1) - float(length.value)
         for number, value in enumerate(values, start=1):
-            where = _between(length) + (f", reading {number}" if pairs > 1 else "")
-            found.append((where, float(value), float(length.u)))
+            where = f"{length.start} - {length.end}" + (f", reading {number}" if pairs > 1 else "")
+            found.append(_Reading(where, float(value), float(length.u), float(length.value)))
     return found
 
 
-def _summed(readings: list[tuple[str, float, float]], u_test: float, names: tuple[str, str, str]) -> tuple[Figure, ...]:
+def _summed(readings: list[_Reading], u_test: float, names: tuple[str, str, str]) -> tuple[Figure, ...]:
     """Largest deviation, range and twice the RMS.
 
     Lengths of one artefact share their calibration's error, others do not, and nothing says which do; so U of the range takes them as
     independent, and U of the RMS as one (by Cauchy and Schwarz it cannot be larger).
     """
-    deviations = np.array([value for _, value, _ in readings])
-    u = np.array([own for *_, own in readings])
+    deviations = np.array([reading.deviation for reading in readings])
+    u = np.array([reading.u for reading in readings])
     least, most = readings[int(deviations.argmin())], readings[int(deviations.argmax())]
-    largest = Figure(names[0], tuple(_part(where, value, own, u_test) for where, value, own in readings))
+    largest = Figure(names[0], tuple(reading.part(u_test) for reading in readings))
     if len(readings) < 2:
         return (largest,)
-    span = _part(f"{least[0]} to {most[0]}", most[1] - least[1], least[2], most[2], u_test, u_test)
+    span = _part(f"{least.where} to {most.where}", most.deviation - least.deviation, least.u, most.u, u_test, u_test)
     square = _part(f"{len(readings)} readings", two_rms(deviations), 2 * float(np.sqrt(np.mean(u**2))), 2 * u_test)
     return largest, Figure(names[1], (span,)), Figure(names[2], (square,))
 
@@ -338,7 +346,7 @@ def iso_length(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None
 
     The range is taken as twice the reach. Background knowledge.
     """
-    parts = [_part(where, value, u, u_test) for where, value, u in _readings(measured)]
+    parts = [reading.part(u_test) for reading in _readings(measured)]
     missing = []
     values = np.sort([float(length.value) for length in measured.lengths])
     bars = np.split(values, np.flatnonzero(np.diff(values) > _ALIKE * values[1:]) + 1) if len(values) else []

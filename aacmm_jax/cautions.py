@@ -6,7 +6,7 @@ import numpy as np
 
 from .calibration_files import CalibrationRecord
 from .checks import plausible, value_of
-from .observability import observe
+from .observability import Observability, observe
 from .parameters import Parameters, is_length
 from .recording import Recording
 from .results import active_names
@@ -36,11 +36,18 @@ def of_capture(recording: Recording) -> list[str]:
     return found
 
 
-def of_calibration(record: CalibrationRecord) -> list[str]:
-    """Everything about a calibration that should be read before its numbers."""
+def of_calibration(record: CalibrationRecord, seen: Observability | None = None) -> list[str]:
+    """Everything about a calibration that should be read before its numbers. ``seen`` saves looking again: see `observed`."""
     found = [] if record.converged else [record.reason]
     found += _validation(record)
-    return [*found, *_scale(record), *of_capture(record.recording), *_bounds(record), *_data(record), *_identifiability(record)]
+    found += [*_scale(record), *of_capture(record.recording), *_bounds(record), *_data(record)]
+    return found + _identifiability(record, observed(record) if seen is None else seen)
+
+
+def observed(record: CalibrationRecord) -> Observability:
+    """What the data of a calibration determine, about the calibrated arm."""
+    arm = record.calibrated.arm
+    return observe(arm, record.recording.capture, Parameters(arm, record.names))
 
 
 def _validation(record: CalibrationRecord) -> list[str]:
@@ -132,8 +139,7 @@ def _data(record: CalibrationRecord) -> list[str]:
     return found
 
 
-def _identifiability(record: CalibrationRecord) -> list[str]:
-    seen = observe(record.calibrated.arm, record.recording.capture, Parameters(record.calibrated.arm, record.names))
+def _identifiability(record: CalibrationRecord, seen: Observability) -> list[str]:
     found = seen.sentences()
     weak = [name for name, known in zip(record.names, record.determined, strict=True) if not known]
     # Those that no noise-free capture could determine either are told above; the rest are lost in the noise.

@@ -6,13 +6,13 @@ import numpy as np
 
 from .calibration_files import CalibrationRecord
 from .capture import Capture
-from .cautions import of_calibration, of_capture
+from .cautions import observed, of_calibration, of_capture
 from .evaluate import Evaluation
-from .observability import observe
+from .observability import Observability
 from .parameters import Parameters, is_length
 from .recording import ArmSpecification, Recording
 from .results import CrossValidation, active_names
-from .uncertainty import over_volume, uncertainty_of
+from .uncertainty import Volume, over_volume, uncertainty_of
 
 _CORRELATED = 0.95
 
@@ -116,8 +116,14 @@ def tables(capture: Capture, evaluation: Evaluation) -> dict[str, Any]:
     }
 
 
-def calibration_summary(record: CalibrationRecord) -> dict[str, Any]:
-    """A calibration: what was done, before and after, the scale, the parameters, and what to be wary of."""
+def calibration_summary(
+    record: CalibrationRecord, seen: Observability | None = None, volume: Volume | None = None
+) -> dict[str, Any]:
+    """A calibration: what was done, before and after, the scale, the parameters, and what to be wary of.
+
+    ``seen`` (`cautions.observed`) and ``volume`` (`over_volume`) are worked out where they are not given.
+    """
+    seen = observed(record) if seen is None else seen
     evaluations, vectors = record.evaluations(), record.vectors()
     u = np.sqrt(np.diag(record.covariance))
     parameters = [
@@ -148,29 +154,28 @@ def calibration_summary(record: CalibrationRecord) -> dict[str, Any]:
         **{stage: figures(evaluation) for stage, evaluation in evaluations.items()},
         **tables(record.recording.capture, evaluations["calibrated"]),
         "parameters": parameters,
-        "uncertainty": uncertainty_summary(record),
+        "uncertainty": uncertainty_summary(record, seen, volume),
         "cross_validation": None if record.validation is None else _validation_summary(record.validation),
         "monte_carlo": record.sampled_says,
-        "warnings": of_calibration(record),
+        "warnings": of_calibration(record, seen),
     }
     if "true" in vectors:
         summary["truth"] = {stage: truth_errors(record, vectors, stage) for stage in ("nominal", "stage1", "calibrated")}
     return summary
 
 
-def uncertainty_summary(record: CalibrationRecord) -> dict[str, Any]:
+def uncertainty_summary(record: CalibrationRecord, seen: Observability, volume: Volume | None = None) -> dict[str, Any]:
     """What the uncertainty comes from and what it means for lengths all over the volume; standard uncertainties (k = 1)."""
     uncertainty = uncertainty_of(record)
     noise = record.noise
     encoder = np.asarray(noise.encoder_arcsec)
-    seen = observe(record.calibrated.arm, record.recording.capture, Parameters(record.calibrated.arm, record.names))
     found = {
         "form": record.form,
         "encoder_arcsec": encoder.tolist(),
         "seating_mm": float(noise.seating),
         "misfit": record.misfit,
         "coverage_factor_95": uncertainty.factor(0.95),
-        "volume": over_volume(uncertainty).summary,
+        "volume": (over_volume(uncertainty) if volume is None else volume).summary,
         "correlated": [{"one": one, "other": other, "r": r} for one, other, r in uncertainty.correlated(_CORRELATED)],
         "rank": seen.rank,
         "parameters": len(seen.names),

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration_files import CalibrationRecord
+from ..cautions import observed
 from ..evaluate import Evaluation
 from ..summary import calibration_summary
 from ..uncertainty import over_volume, uncertainty_of
@@ -18,10 +19,10 @@ from .scene import scene_of
 
 def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any]]:
     """The report, without what names its file; and the summary that it was made from."""
-    summary = calibration_summary(record)
-    evaluations = record.evaluations()
-    uncertainty = uncertainty_of(record)
+    uncertainty, seen = uncertainty_of(record), observed(record)
     volume = over_volume(uncertainty)
+    summary = calibration_summary(record, seen, volume)
+    evaluations = record.evaluations()
     factor = uncertainty.factor(0.95)
     sections = [
         _data(record, summary),
@@ -32,7 +33,7 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
         Section("arm", "The arm in its poses", [_arms(record, evaluations["calibrated"])]),
         volume_section(volume, summary, factor),
         correlations_section(record, uncertainty),
-        observability_section(record),
+        observability_section(seen),
         bounds_section(record, summary),
     ]
     if record.sampled is not None:

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 
 from ..acceptance import FIGURES, AcceptanceTest, Figure
-from ..capture import Capture
 from ..evaluate import Evaluation, evaluate
 from ..evaluation_files import EvaluationRecord
 from ..evaluation_summary import evaluation_summary
@@ -187,7 +186,7 @@ def _lengths(record: EvaluationRecord, tests: list[AcceptanceTest], left: Evalua
     figure = next((figure for test in tests for figure in test.figures if figure.name == "E_Uni"), None)
     blocks: list = []
     if figure is not None:
-        blocks.append(_length_chart(figure, capture))
+        blocks.append(_length_chart(figure))
     rows = [
         {
             "from": length.start,
@@ -211,9 +210,8 @@ def _known(u: Any) -> float | None:
     return float(u) if np.isfinite(u) else None
 
 
-def _length_chart(figure: Figure, capture: Capture) -> Chart:
-    values = {f"{length.start} - {length.end}": float(length.value) for length in capture.lengths}
-    lengths = [values[part.where.partition(", reading")[0]] for part in figure.parts]
+def _length_chart(figure: Figure) -> Chart:
+    lengths = [part.length for part in figure.parts]
     hover = [f"{part.where}: {shown(part.value, signed=True)} mm" for part in figure.parts]
     trace = charts.dots("single readings, with U", lengths, [part.value for part in figure.parts], charts.DARK, "circle",
                         hover=hover, bars=[part.expanded for part in figure.parts], size=5)  # fmt: skip

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from ..calibration_files import CalibrationRecord
-from ..observability import observe
-from ..parameters import Parameters, is_length
+from ..observability import Observability
+from ..parameters import is_length
 from ..uncertainty import Uncertainty, Volume
 from . import charts
 from .parts import Chart, Section, Table, number, shown, text
@@ -99,10 +99,8 @@ def correlations_section(record: CalibrationRecord, uncertainty: Uncertainty) ->
     )
 
 
-def observability_section(record: CalibrationRecord) -> Section:
+def observability_section(seen: Observability) -> Section:
     """What the data determine, and how strongly."""
-    arm = record.calibrated.arm
-    seen = observe(arm, record.recording.capture, Parameters(arm, record.names))
     sentences = seen.sentences() or [f"These data determine all {len(seen.names)} parameters."]
     indices = seen.indices
     meanings = {
