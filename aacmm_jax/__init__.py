@@ -89,6 +89,7 @@ _LATER = {
     "compare": "drift",
     "Drift": "drift",
     "Trend": "drift",
+    "trend": "drift",
     "About": "about",
     "read_about": "about",
     "dcc": "certificate",
@@ -116,6 +117,7 @@ if _typing.TYPE_CHECKING:
     from .drift import Drift as Drift
     from .drift import Trend as Trend
     from .drift import compare as compare
+    from .drift import trend as trend
     from .evaluation_files import EvaluationRecord as EvaluationRecord
     from .evaluation_files import evaluation_of as evaluation_of
     from .evaluation_files import load_evaluation as load_evaluation

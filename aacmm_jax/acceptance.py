@@ -12,99 +12,33 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from .acceptance_figures import FIGURES as FIGURES
+from .acceptance_figures import AcceptanceTest as AcceptanceTest
+from .acceptance_figures import Figure as Figure
+from .acceptance_figures import Measured as Measured
+from .acceptance_figures import Part as Part
+from .acceptance_figures import articulated_location as articulated_location
+from .acceptance_figures import form_error as form_error
+from .acceptance_figures import half_range as half_range
+from .acceptance_figures import size_error as size_error
+from .acceptance_figures import spat as spat
+from .acceptance_figures import two_rms as two_rms
 from .arm import Arm
-from .arrays import Numbers
 from .capture import ReferenceLength
-from .decision import Decision, Limit, decide, worst
+from .decision import Limit, decide
 from .errors import InputError
 from .recording import ProbedSphere, Recording
-from .spheres import enclosing_sphere, fit_sphere, points_of
-from .volume import Reach, reach_of
+from .volume import Reach as Reach
+from .volume import reach_of
 
 FACTOR = 2.0  # coverage factor of the expanded uncertainties
-FIGURES = {
-    "Deltam": "largest half range of a coordinate in a socket",
-    "Length": "largest deviation of a length",
-    "Length_Range": "largest less smallest deviation of lengths",
-    "Length_2RMS": "twice the RMS deviation of lengths",
-    "D_Eff": "largest error of the effective diameter",
-    "SPAT": "largest distance from the mean point",
-    "SPAT_2s": "twice the standard deviation about the mean point",
-    "Volumetric": "largest deviation of a bar",
-    "Volumetric_Range": "largest less smallest deviation of bars",
-    "Volumetric_2RMS": "twice the RMS deviation of bars",
-    "P_Size": "size error of a sphere of 25 points (P_Size.Sph.1x25)",
-    "P_Form": "form error of a sphere of 25 points (P_Form.Sph.1x25)",
-    "L_Dia": "sphere round five centres, each from its own orientation (L_Dia.5x5.Art)",
-    "E_Uni": "length error, single readings (E_Uni)",
-}
 ZONES = ((0.0, 0.2), (0.2, 0.8), (0.8, 1.0))  # of the reach
 BARS = ((0.5, 0.75), (1.2, 1.5))  # of the reach
 SPAT_POSES, POSITIONS, REPEATS = 10, 20, 3
-UNI_LENGTHS, UNI_POSITIONS, _UNI_LONGEST = 5, 7, 0.66
+UNI_LENGTHS, UNI_POSITIONS, UNI_LONGEST = 5, 7, 0.66
+_CHECKS = 30  # of a length, in different places: Cheng et al. 2018, section 4.4
+_SPHERES = (10.0, 51.0)  # mm: 10 to 50 after ASME B89.4.22, 10 to 51 after ISO 10360 (background knowledge)
 _ALIKE = 0.01  # lengths that differ by less are of one artefact
-
-
-class Part(NamedTuple):
-    """One measurement that a figure rests on: a socket, a length, a sphere. mm."""
-
-    where: str
-    value: float
-    expanded: float  # U of the test value, coverage factor 2
-    length: float = 0.0  # calibrated length that was measured, where it is one: limits may grow with it
-    limit: float | None = None  # MPE
-    decision: Decision | None = None  # None without a limit
-
-
-class Figure(NamedTuple):
-    """One figure of a test; its name is a key of `FIGURES`."""
-
-    name: str
-    parts: tuple[Part, ...]
-
-    @property
-    def worst(self) -> Part:
-        """The part nearest to its limit, or beyond it; without limits the largest."""
-        return max(self.parts, key=lambda part: abs(part.value) - (part.limit or 0.0) + part.expanded)
-
-    @property
-    def value(self) -> float:
-        """Value of the worst part, mm."""
-        return self.worst.value
-
-    @property
-    def decision(self) -> Decision | None:
-        """What all parts come to together."""
-        return worst([part.decision for part in self.parts if part.decision is not None])
-
-
-class AcceptanceTest(NamedTuple):
-    """What one test found, and what its full procedure would have needed besides (nothing, where it is complete)."""
-
-    standard: str
-    title: str
-    figures: tuple[Figure, ...]
-    missing: tuple[str, ...]
-
-    @property
-    def decision(self) -> Decision | None:
-        """What all figures come to together; None without limits."""
-        return worst([figure.decision for figure in self.figures if figure.decision is not None])
-
-
-class Measured(NamedTuple):
-    """Points in mm, as an arm measures them or as they were recorded: what acceptance tests look at."""
-
-    sockets: Mapping[str, Float[np.ndarray, "m 3"]]
-    lengths: tuple[ReferenceLength, ...] = ()
-    spheres: tuple[ProbedSphere, ...] = ()  # with groups of points
-    reach: Reach | None = None
-    known: frozenset[str] = frozenset()  # sockets that the arm was identified from: their repeatability is no test
-
-    @property
-    def tested(self) -> dict[str, Float[np.ndarray, "m 3"]]:
-        """The sockets whose repeatability counts."""
-        return {name: points for name, points in self.sockets.items() if name not in self.known}
 
 
 def measured_by(arm: Arm, recording: Recording) -> Measured:
@@ -117,6 +51,12 @@ def measured_by(arm: Arm, recording: Recording) -> Measured:
     return Measured(sockets, recording.capture.lengths, spheres, reach_of(arm))
 
 
+def unstated(tests: Sequence[AcceptanceTest]) -> list[str]:
+    """Figures that were decided although nothing of their uncertainty was stated."""
+    figures = (figure for test in tests for figure in test.figures)
+    return [figure.name for figure in figures if figure.decision is not None and figure.worst.expanded == 0]
+
+
 def accept(measured: Measured, limits: Mapping[str, Limit] | None = None, u_test: float = 0.0) -> list[AcceptanceTest]:
     """Every test that the measured points allow.
 
@@ -126,13 +66,20 @@ def accept(measured: Measured, limits: Mapping[str, Limit] | None = None, u_test
     if not (math.isfinite(u_test) and u_test >= 0):
         raise InputError(f"the uncertainty of the test is {u_test:g} mm; it must be zero or positive.")
     tests = [test for run in _TESTS if (test := run(measured, u_test)) is not None]
+    if measured.seen:
+        tests = [
+            test._replace(missing=("sockets and lengths that the arm was not identified from", *test.missing)) for test in tests
+        ]
     limits = dict(limits or {})
     there = {figure.name for test in tests for figure in test.figures}
     for name in limits:
         if name not in FIGURES:
             raise InputError(f"there is no figure '{name}'; limits can be given for {', '.join(FIGURES)}.")
         if name not in there:
-            raise InputError(f"a limit is given for {name} ({FIGURES[name]}), but the capture holds nothing to measure it on.")
+            unseen = " that the calibration has not seen" if measured.known else ""
+            raise InputError(
+                f"a limit is given for {name} ({FIGURES[name]}), but the capture holds nothing{unseen} to measure it on."
+            )
     return [test._replace(figures=tuple(_decided(figure, limits) for figure in test.figures)) for test in tests]
 
 
@@ -141,59 +88,13 @@ def _decided(figure: Figure, limits: Mapping[str, Limit]) -> Figure:
         return figure
     parts = []
     for part in figure.parts:
-        limit = limits[figure.name].at(part.length)
+        if part.length is None and math.isfinite(limits[figure.name].divisor):
+            raise InputError(
+                f"the limit of {figure.name} grows with a length, but the figure is of none; give it as a number alone."
+            )
+        limit = limits[figure.name].at(part.length or 0.0)
         parts.append(part._replace(limit=limit, decision=decide(part.value, limit, part.expanded)))
     return figure._replace(parts=tuple(parts))
-
-
-# --- Figures of points ---------------------------------------------------------------------------------------------------
-
-
-def half_range(points: Numbers) -> float:
-    """Deltam: the largest over axes of (max - min) / 2 of the points ``(m, 3)`` of one socket, mm (Cheng et al. 2018, eq. 11-12)."""
-    return float(np.ptp(points_of(points, "points of a socket"), axis=0).max() / 2)
-
-
-def spat(points: Numbers) -> tuple[float, float]:
-    """ASME B89.4.22-2004, single-point articulation: largest distance of points ``(m, 3)`` from their mean, and 2 s, mm.
-
-    s = sqrt(sum of squared distances / (m - 1)). From background knowledge of the standard.
-    """
-    given = points_of(points, "points of a socket")
-    if len(given) < 2:
-        raise InputError("one point has no scatter; articulate the arm about the socket and take at least two.")
-    distances = np.linalg.norm(given - given.mean(axis=0), axis=1)
-    return float(distances.max()), 2 * math.sqrt(float(distances @ distances) / (len(given) - 1))
-
-
-def two_rms(deviations: Numbers) -> float:
-    """Twice the root mean square of deviations from the calibrated values, mm (ASME B89.4.22; Cheng et al. 2018, section 4.4)."""
-    given = np.asarray(deviations, dtype=float)
-    return 2 * math.sqrt(float(np.mean(given**2)))
-
-
-def size_error(points: Numbers, diameter: float, stylus: float = 0.0) -> float:
-    """Diameter of the least-squares sphere, less that of the probe's ball, less the calibrated one, mm.
-
-    With 25 points P_Size.Sph.1x25 (ISO 10360-12:2016), with 9 the error of the effective diameter (ASME B89.4.22-2004).
-    """
-    return 2 * fit_sphere(points).radius - stylus - diameter
-
-
-def form_error(points: Numbers) -> float:
-    """P_Form.Sph.1x25 (ISO 10360-12:2016): span of the points' distances from the centre of the least-squares sphere, mm."""
-    return fit_sphere(points).form
-
-
-def articulated_location(groups: Sequence[Numbers]) -> float:
-    """L_Dia.5x5.Art (ISO 10360-12:2016): diameter, mm, of the smallest sphere round the centres of spheres fitted to each group.
-
-    One group of five points for each of five orientations of the wrist; from background knowledge of the standard.
-    """
-    return 2 * enclosing_sphere([fit_sphere(group).centre for group in groups])[1]
-
-
-# --- Tests -----------------------------------------------------------------------------------------------------------------
 
 
 def _part(where: str, value: float, *u: float) -> Part:
@@ -254,8 +155,10 @@ def jjf_1408(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None:
     readings = _readings(measured)
     if readings:
         figures += _summed(readings, u_test, ("Length", "Length_Range", "Length_2RMS"))
-    missing = [] if several else ["a socket held in several poses"]
-    missing += [] if len(readings) >= 30 else [f"30 readings of a length ({len(readings)} are there)"]
+    enough = any(len(points) >= SPAT_POSES for points in several.values())
+    missing = [] if enough else [f"a socket held in {SPAT_POSES} poses or more"]
+    placements = len(_placements(measured.lengths))
+    missing += [] if placements >= _CHECKS else [f"a length in {_CHECKS} places ({placements} are there)"]
     return _test("JJF 1408", "single point and length, as in Cheng et al. 2018", figures, missing)
 
 
@@ -268,8 +171,6 @@ def asme_diameter(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | N
             value = size_error(group, sphere.diameter, sphere.stylus)
             parts.append(_part(f"{sphere.name}, repeat {number}", value, sphere.u, u_test))
         missing += _wanted(sphere, groups=REPEATS, points=9, of="repeats")
-        if not 10 <= sphere.diameter <= 50:
-            missing.append(f"a sphere of 10 to 50 mm ('{sphere.name}' has {sphere.diameter:g} mm)")
     return _test("ASME B89.4.22", "effective diameter", [Figure("D_Eff", tuple(parts))] if parts else [], missing)
 
 
@@ -304,8 +205,14 @@ def asme_volumetric(measured: Measured, u_test: float = 0.0) -> AcceptanceTest |
     range, and twice the RMS. Background knowledge."""
     readings = _readings(measured)
     missing = []
-    if len(measured.lengths) < POSITIONS:
-        missing.append(f"{POSITIONS} positions of the bars ({len(measured.lengths)} are there)")
+    lengths = _placements(measured.lengths)
+    if len(lengths) < POSITIONS:
+        missing.append(f"{POSITIONS} positions of the bars ({len(lengths)} are there)")
+    sizes = _bars(lengths)
+    if len(sizes) != len(BARS):
+        missing.append(f"two bars, no fewer and no more ({len(sizes)} are there)")
+    elif min(map(len, sizes)) < POSITIONS // 4:
+        missing.append(f"each bar in {POSITIONS // 4} positions or more")
     if measured.reach is None:
         missing.append("the reach of the arm, to judge the bars' lengths")
     else:
@@ -320,13 +227,16 @@ def asme_volumetric(measured: Measured, u_test: float = 0.0) -> AcceptanceTest |
 
 
 def iso_probing(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None:
-    """ISO 10360-12:2016, probing size and form: 25 points on a sphere. Found in public sources."""
+    """ISO 10360-12:2016, probing size and form: 25 points on a sphere. Found in public sources.
+
+    Half of the sphere's own form error counts as a standard uncertainty of the form found (as ISO/TS 23165; background knowledge).
+    """
     size, form, missing = [], [], []
     for sphere in (sphere for sphere in measured.spheres if sphere.test == "probing"):
         for number, group in enumerate(sphere.groups, start=1):
             where = sphere.name + (f", repeat {number}" if len(sphere.groups) > 1 else "")
             size.append(_part(where, size_error(group, sphere.diameter, sphere.stylus), sphere.u, u_test))
-            form.append(_part(where, form_error(group), u_test))
+            form.append(_part(where, form_error(group), sphere.form / 2, u_test))
         missing += _wanted(sphere, groups=1, points=25, of="groups")
     figures = [Figure(name, tuple(parts)) for name, parts in (("P_Size", size), ("P_Form", form)) if parts]
     return _test("ISO 10360-12", "probing size and form", figures, missing)
@@ -336,7 +246,7 @@ def iso_articulation(measured: Measured, u_test: float = 0.0) -> AcceptanceTest 
     """ISO 10360-12:2016, articulated location L_Dia.5x5.Art: 5 points in each of 5 orientations. Background knowledge."""
     parts, missing = [], []
     for sphere in (sphere for sphere in measured.spheres if sphere.test == "articulation"):
-        parts.append(_part(sphere.name, articulated_location(sphere.groups), u_test))
+        parts.append(_part(sphere.name, articulated_location(sphere.groups), sphere.form / 2, u_test))
         missing += _wanted(sphere, groups=5, points=5, of="orientations")
     return _test("ISO 10360-12", "articulated location", [Figure("L_Dia", tuple(parts))] if parts else [], missing)
 
@@ -344,21 +254,23 @@ def iso_articulation(measured: Measured, u_test: float = 0.0) -> AcceptanceTest 
 def iso_length(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None:
     """ISO 10360-12:2016, length error E_Uni: 5 lengths in 7 positions, 3 readings each; the longest at least 66 % of the range.
 
-    The range is taken as twice the reach. Background knowledge.
+    The range is taken as twice the reach. Background knowledge. What the standard allows of repeating a reading is not applied.
     """
     parts = [reading.part(u_test) for reading in _readings(measured)]
     missing = []
-    values = np.sort([float(length.value) for length in measured.lengths])
-    bars = np.split(values, np.flatnonzero(np.diff(values) > _ALIKE * values[1:]) + 1) if len(values) else []
+    values = [float(length.value) for length in measured.lengths]
+    placed = _placements(measured.lengths)
+    bars = _bars(placed)
     positions = [len(bar) for bar in bars]
-    if len(bars) < UNI_LENGTHS or min(positions, default=0) < UNI_POSITIONS or len(parts) < REPEATS * len(values):
+    repeats = min((min(len(measured.sockets[name]) for name in (length.start, length.end)) for length in placed), default=0)
+    if len(bars) < UNI_LENGTHS or min(positions, default=0) < UNI_POSITIONS or repeats < REPEATS:
         missing.append(
             f"{UNI_LENGTHS} lengths in {UNI_POSITIONS} positions, {REPEATS} readings each: 105 in all ({len(parts)} readings of {len(bars)} {'length' if len(bars) == 1 else 'lengths'} are there)"
         )
     if measured.reach is None:
         missing.append("the reach of the arm, to judge the longest length")
-    elif len(values) and values[-1] < _UNI_LONGEST * 2 * measured.reach.radius:
-        missing.append(f"a length of {_UNI_LONGEST * 2 * measured.reach.radius:.0f} mm or more (66 % of the range)")
+    elif values and max(values) < UNI_LONGEST * 2 * measured.reach.radius:
+        missing.append(f"a length of {UNI_LONGEST * 2 * measured.reach.radius:.0f} mm or more (66 % of the range)")
     return _test("ISO 10360-12", "length error", [Figure("E_Uni", tuple(parts))] if parts else [], missing)
 
 
@@ -371,8 +283,21 @@ def _test(standard: str, title: str, figures: Sequence[Figure], missing: list[st
     return AcceptanceTest(standard, title, tuple(figures), tuple(missing)) if figures else None
 
 
+def _placements(lengths: Sequence[ReferenceLength]) -> list[ReferenceLength]:
+    """Lengths between different pairs of sockets."""
+    return list({frozenset((length.start, length.end)): length for length in lengths}.values())
+
+
+def _bars(lengths: Sequence[ReferenceLength]) -> list[Float[np.ndarray, " k"]]:
+    """Calibrated lengths, those of one artefact (alike to 1 %) together."""
+    values = np.sort([float(length.value) for length in lengths])
+    return np.split(values, np.flatnonzero(np.diff(values) > _ALIKE * values[1:]) + 1) if len(values) else []
+
+
 def _wanted(sphere: ProbedSphere, *, groups: int, points: int, of: str) -> list[str]:
     found = []
+    if not _SPHERES[0] <= sphere.diameter <= _SPHERES[1]:
+        found.append(f"a sphere of {_SPHERES[0]:g} to {_SPHERES[1]:g} mm ('{sphere.name}' has {sphere.diameter:g} mm)")
     if len(sphere.groups) < groups:
         found.append(f"{groups} {of} of sphere '{sphere.name}' ({len(sphere.groups)} are there)")
     short = min(len(group) for group in sphere.groups)

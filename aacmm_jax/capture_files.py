@@ -30,7 +30,7 @@ def load_capture(path: str | os.PathLike) -> Recording:
 
 def recording_attributes(recording: Recording) -> dict[str, Any]:
     """Root attributes of a file that holds a recording."""
-    return {"seed": recording.seed, "sources": list(recording.sources) or None}
+    return {"seed": recording.seed, "sources": list(recording.sources) or None, "measured": recording.measured or None}
 
 
 def recording_tables(recording: Recording) -> dict[str, Table]:
@@ -46,26 +46,38 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
                 "socket": Variable(("pose",), owner, "", "socket that held the tip"),
             }
         ),
-        "reference": Table(
-            {
-                "length": Variable(("length",), np.arange(1, len(capture.lengths) + 1), "1", "reference length number"),
-                "start": Variable(("length",), [length.start for length in capture.lengths], "", "socket at one end"),
-                "end": Variable(("length",), [length.end for length in capture.lengths], "", "socket at the other end"),
-                "value": Variable(("length",), [float(length.value) for length in capture.lengths], "mm", "calibrated length"),
-                "u": Variable(("length",), [float(length.u) for length in capture.lengths], "mm", "standard uncertainty"),
-            }
-        ),
+        "reference": reference_table(capture.lengths),
         "nominal_arm": arm_table(recording.nominal),
     }
     if recording.true is not None:
         tables["true_arm"] = arm_table(recording.true)
     if recording.spheres:
-        tables["sphere"] = _sphere_table(recording.spheres)
+        tables["sphere"] = sphere_table(recording.spheres)
     return tables
 
 
-def _sphere_table(spheres: Sequence[ProbedSphere]) -> Table:
-    """Touched spheres, one row a touch; what belongs to a sphere stands in every row of it."""
+def reference_table(lengths: Sequence[ReferenceLength]) -> Table:
+    """Reference lengths, one row each."""
+    columns = {
+        "length": (np.arange(1, len(lengths) + 1), "1", "reference length number"),
+        "start": ([length.start for length in lengths], "", "socket at one end"),
+        "end": ([length.end for length in lengths], "", "socket at the other end"),
+        "value": ([float(length.value) for length in lengths], "mm", "calibrated length"),
+        "u": ([float(length.u) for length in lengths], "mm", "standard uncertainty"),
+    }
+    return Table({name: Variable(("length",), *column) for name, column in columns.items()})
+
+
+def lengths_of(path: str | os.PathLike, stored: storage.Stored) -> list[ReferenceLength]:
+    """The reference lengths that a file holds."""
+    table = stored.tables["reference"]
+    storage.need(path, table, "start", "end", "value", "u", of="entry")
+    rows = zip(table["start"], table["end"], table["value"], table["u"], strict=True)
+    return [ReferenceLength(str(start), str(end), float(value), float(u)) for start, end, value, u in rows]
+
+
+def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False) -> Table:
+    """Touched spheres, by poses or points, one row a touch; what belongs to a sphere stands in every row of it."""
     rows = [(sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group]
     each = {
         "sphere": ([sphere.name for sphere, *_ in rows], "", "reference sphere"),
@@ -74,27 +86,33 @@ def _sphere_table(spheres: Sequence[ProbedSphere]) -> Table:
         "diameter": ([sphere.diameter for sphere, *_ in rows], "mm", "calibrated diameter"),
         "u": ([sphere.u for sphere, *_ in rows], "mm", "standard uncertainty of the diameter"),
         "stylus": ([sphere.stylus for sphere, *_ in rows], "mm", "diameter of the probe's ball"),
+        "form": ([sphere.form for sphere, *_ in rows], "mm", "calibrated form error"),
     }
     variables = {name: Variable(("touch",), *column) for name, column in each.items()}
     variables["touch"] = Variable(("touch",), np.arange(1, len(rows) + 1), "1", "touch number")
-    joints = rows[0][2].shape[0]
-    variables["joint"] = Variable(("joint",), np.arange(1, joints + 1), "1", "joint number")
-    variables["angle"] = Variable(("touch", "joint"), np.array([q for *_, q in rows]), "rad", "joint angle as read")
+    values = np.array([touched for *_, touched in rows])
+    if points:
+        variables["axis"] = Variable(("axis",), ["x", "y", "z"], "", "axis")
+        variables["position"] = Variable(("touch", "axis"), values, "mm", "centre of the probe")
+    else:
+        variables["joint"] = Variable(("joint",), np.arange(1, values.shape[1] + 1), "1", "joint number")
+        variables["angle"] = Variable(("touch", "joint"), values, "rad", "joint angle as read")
     return Table(variables)
 
 
-def _spheres_of(path: str | os.PathLike, stored: storage.Stored) -> tuple[ProbedSphere, ...]:
+def spheres_of(path: str | os.PathLike, stored: storage.Stored, entry: str = "angle") -> tuple[ProbedSphere, ...]:
+    """The touched spheres that a file holds, by their ``angle`` or ``position``."""
     table = stored.tables.get("sphere")
     if table is None:
         return ()
-    storage.need(path, table, "sphere", "test", "group", "diameter", "u", "stylus", "angle", of="entry")
+    storage.need(path, table, "sphere", "test", "group", "diameter", "u", "stylus", "form", entry, of="entry")
     keys = list(zip(table["sphere"].tolist(), table["test"].tolist(), strict=True))
     found = []
     for name, test in dict.fromkeys(keys):
         rows = np.array([key == (name, test) for key in keys])
         first = int(rows.argmax())
-        groups = tuple(table["angle"][rows & (table["group"] == number)] for number in np.unique(table["group"][rows]))
-        numbers = (float(table[what][first]) for what in ("diameter", "u", "stylus"))
+        groups = tuple(table[entry][rows & (table["group"] == number)] for number in np.unique(table["group"][rows]))
+        numbers = (float(table[what][first]) for what in ("diameter", "u", "stylus", "form"))
         found.append(ProbedSphere(str(name), test, groups, *numbers))
     return tuple(found)
 
@@ -102,28 +120,23 @@ def _spheres_of(path: str | os.PathLike, stored: storage.Stored) -> tuple[Probed
 def recording_of(path: str | os.PathLike, stored: storage.Stored) -> Recording:
     """The recording that a file's tables hold."""
     storage.need(path, stored.tables, "capture", "reference", "nominal_arm")
-    poses, reference = stored.tables["capture"], stored.tables["reference"]
+    poses = stored.tables["capture"]
     storage.need(path, poses, "angle", "socket", of="entry")
-    storage.need(path, reference, "start", "end", "value", "u", of="entry")
     owner = np.asarray(poses["socket"]).astype(str)
     names = list(dict.fromkeys(owner.tolist()))
-    rows = zip(reference["start"], reference["end"], reference["value"], reference["u"], strict=True)
     try:
-        capture = Capture(
-            {name: poses["angle"][owner == name] for name in names},
-            [ReferenceLength(str(start), str(end), float(value), float(u)) for start, end, value, u in rows],
-        )
+        capture = Capture({name: poses["angle"][owner == name] for name in names}, lengths_of(path, stored))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     true = specification_of(path, stored, "true_arm") if "true_arm" in stored.tables else None
     try:
-        spheres = tuple(checked_sphere(sphere, capture.joints) for sphere in _spheres_of(path, stored))
+        spheres = tuple(checked_sphere(sphere, capture.joints) for sphere in spheres_of(path, stored))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     sources = tuple(stored.attributes.get("sources") or ())
-    return Recording(
-        capture, specification_of(path, stored, "nominal_arm"), true, stored.attributes.get("seed"), spheres, sources
-    )
+    attributes = stored.attributes
+    nominal = specification_of(path, stored, "nominal_arm")
+    return Recording(capture, nominal, true, attributes.get("seed"), spheres, sources, attributes.get("measured", ""))
 
 
 def arm_table(specification: ArmSpecification) -> Table:

@@ -2,20 +2,22 @@
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
 from . import storage
-from .acceptance import AcceptanceTest, Measured, accept, measured_by
+from .acceptance import AcceptanceTest, Measured, accept, measured_by, unstated
 from .arm import Arm
 from .calibration_files import CalibrationRecord
 from .capture_files import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .decision import Limit
 from .recording import ArmSpecification, Recording
 from .storage import Table, Variable
+
+SIMULATED = "The readings are simulated: no real arm was measured."
 
 
 class EvaluationRecord(NamedTuple):
@@ -42,7 +44,7 @@ class EvaluationRecord(NamedTuple):
         """What acceptance tests look at: what the calibration has not seen; all, where it has seen everything."""
         whole = measured_by(arm, self.recording)
         if not self.independent:
-            return whole
+            return whole._replace(seen=True)
         return whole._replace(lengths=tuple(whole.lengths[i] for i in self.unseen()), known=self.used)
 
     @property
@@ -64,11 +66,19 @@ def evaluation_of(
     u_test: float = 0.0,
     maxima: Mapping[str, float] | None = None,
 ) -> EvaluationRecord:
-    """A calibration tried on a capture. Sockets count as identified from where the calibration holds the very same poses."""
-    known = [np.asarray(q) for q in record.recording.capture.sockets.values()]
-    sockets = recording.capture.sockets
-    used = {name for name, q in sockets.items() if any(np.array_equal(np.asarray(q), other) for other in known)}
+    """A calibration tried on a capture. A socket counts as identified from where the calibration holds any of its poses."""
+    known = {row.tobytes() for row in np.asarray(record.recording.capture.q)}
+    shared = {name: sum(row.tobytes() in known for row in np.asarray(q)) for name, q in recording.capture.sockets.items()}
+    used = {name for name, count in shared.items() if count}
     warnings = []
+    if recording.true is not None:
+        warnings.append(SIMULATED)
+    sizes = dict(zip(recording.capture.names, recording.capture.sizes, strict=True))
+    partly = [f"{name} ({shared[name]} of {sizes[name]} poses)" for name in sizes if 0 < shared[name] < sizes[name]]
+    if partly:
+        warnings.append(
+            f"The arm was identified from some poses of {', '.join(partly)}; these sockets count as identified from."
+        )
     if not _same(recording.nominal.arm, record.recording.nominal.arm):
         warnings.append(
             f"The capture is of '{recording.nominal.name}', but the calibration of '{record.recording.nominal.name}'; is it the same arm?"
@@ -83,9 +93,23 @@ def evaluation_of(
         dict(maxima or {}),
     )
     if not found.independent:
-        note = "The arm was identified from all of this capture, so its figures flatter it; take sockets and lengths that it has not seen."
-        found = found._replace(warnings=(*warnings, note))
-    return found
+        warnings.append(
+            "The arm was identified from all of this capture, so its figures flatter it and are no test; take sockets and lengths "
+            "that it has not seen."
+        )
+    warnings += bare_warning(found.acceptance()["calibrated"])
+    return found._replace(warnings=tuple(warnings))
+
+
+def bare_warning(tests: Sequence[AcceptanceTest]) -> list[str]:
+    """A sentence on figures that were decided although nothing of their uncertainty was stated; none without them."""
+    bare = unstated(tests)
+    if not bare:
+        return []
+    return [
+        f"Nothing was stated of the uncertainty of {', '.join(bare)}, so U is 0 and the decision rests on that; state what seat, fixture "
+        "and temperature bring (--test-u-mm)."
+    ]
 
 
 def _same(one: Arm, other: Arm) -> bool:
@@ -100,15 +124,7 @@ def save_evaluation(path: str | os.PathLike, record: EvaluationRecord) -> None:
     tables = recording_tables(record.recording)
     tables["calibrated_arm"] = arm_table(record.calibrated)
     tables["used"] = Table({"used": Variable(("used",), sorted(record.used), "", "socket that the arm was identified from")})
-    tables["limits"] = Table(
-        {
-            "figure": Variable(("figure",), list(record.limits), "", "figure of an acceptance test"),
-            "fixed": Variable(("figure",), [limit.fixed for limit in record.limits.values()], "mm", "MPE at length 0"),
-            "per_length": Variable(
-                ("figure",), [1 / limit.divisor for limit in record.limits.values()], "1", "what MPE grows by with the length"
-            ),
-        }
-    )
+    tables["limits"] = limit_table(record.limits)
     tables["figures"] = _figure_table(record)
     attributes = recording_attributes(record.recording) | {
         "warnings": list(record.warnings) or None,
@@ -116,6 +132,23 @@ def save_evaluation(path: str | os.PathLike, record: EvaluationRecord) -> None:
         **{f"most_{name}": value for name, value in record.maxima.items()},
     }
     storage.write_tables(path, "evaluation", tables, attributes)
+
+
+def limit_table(limits: Mapping[str, Limit]) -> Table:
+    """Limits by the name of a figure."""
+    columns = {
+        "figure": (list(limits), "", "figure of an acceptance test"),
+        "fixed": ([limit.fixed for limit in limits.values()], "mm", "MPE at length 0"),
+        "divisor": ([limit.divisor for limit in limits.values()], "1", "MPE grows by the length over this"),
+    }
+    return Table({name: Variable(("figure",), *column) for name, column in columns.items()})
+
+
+def limits_in(stored: storage.Stored) -> dict[str, Limit]:
+    """The limits that a file holds."""
+    table = stored.tables["limits"]
+    rows = zip(table["figure"], table["fixed"], table["divisor"], strict=True)
+    return {str(name): Limit(float(fixed), float(divisor)) for name, fixed, divisor in rows}
 
 
 def _figure_table(record: EvaluationRecord) -> Table:
@@ -140,14 +173,13 @@ def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
     stored = storage.read_tables(path, ("evaluation",))
     storage.need(path, stored.tables, "calibrated_arm", "used", "limits")
     with storage.undamaged(path):
-        limits, attributes = stored.tables["limits"], stored.attributes
-        pairs = zip(limits["figure"], limits["fixed"], limits["per_length"], strict=True)
+        attributes = stored.attributes
         return EvaluationRecord(
             recording_of(path, stored),
             specification_of(path, stored, "calibrated_arm"),
             frozenset(str(name) for name in stored.tables["used"]["used"]),
             tuple(attributes.get("warnings") or ()),
-            {str(name): Limit(float(fixed), 1 / float(slope) if slope > 0 else math.inf) for name, fixed, slope in pairs},
+            limits_in(stored),
             float(attributes["u_test_mm"]),
             {name.removeprefix("most_"): float(value) for name, value in attributes.items() if name.startswith("most_")},
         )

@@ -8,6 +8,7 @@ from .acceptance import FIGURES, AcceptanceTest, Figure, Part
 from .capture import Capture
 from .evaluate import Evaluation, evaluate
 from .evaluation_files import EvaluationRecord
+from .points_evaluation import PointsRecord
 from .summary import figures, length_figures, tables
 
 _LIMITED = {"rms_mm": "RMS distance", "deltam_mm": "Deltam", "length_error_largest_mm": "largest length error"}
@@ -47,6 +48,24 @@ def evaluation_summary(record: EvaluationRecord) -> dict[str, Any]:
     return summary
 
 
+def points_summary(record: PointsRecord) -> dict[str, Any]:
+    """Acceptance tests of points."""
+    sockets = record.measured.sockets
+    return {
+        "kind": "acceptance",
+        "points": sum(map(len, sockets.values()))
+        + sum(len(group) for sphere in record.measured.spheres for group in sphere.groups),
+        "sockets": len(sockets),
+        "lengths": len(record.measured.lengths),
+        "spheres": len(record.measured.spheres),
+        "warnings": record.warnings(),
+        "kept": [],
+        "failed": [],
+        "acceptance": acceptance_summary(record.acceptance()),
+        "u_test_mm": record.u_test,
+    }
+
+
 def acceptance_summary(tests: list[AcceptanceTest], before: list[AcceptanceTest] | None = None) -> list[dict[str, Any]]:
     """Acceptance tests, with the figures of the arm as found beside those as left where both are given."""
     earlier = {(test.title, figure.name): figure for test in before or () for figure in test.figures}
@@ -70,6 +89,7 @@ def _figure(figure: Figure, earlier: Figure | None) -> dict[str, Any]:
         **_part(figure.worst),
         "as_found_mm": None if earlier is None else earlier.value,
         "as_found_decision": None if earlier is None else earlier.decision,
+        "failing": figure.failing,
         "parts": [_part(part) | {"decision": part.decision} for part in figure.parts],
     }
 

@@ -1,5 +1,6 @@
 """The capture manifest: a short TOML file that says which text files hold which socket, in which unit, and the lengths."""
 
+import datetime
 import glob
 import math
 import os
@@ -73,6 +74,7 @@ class _Sphere(_Strict):
     diameter: PositiveFloat
     u: NonNegativeFloat = 0.0
     stylus: NonNegativeFloat = 0.0
+    form: NonNegativeFloat = 0.0
 
     @model_validator(mode="after")
     def _one(self) -> "_Sphere":
@@ -89,12 +91,21 @@ class _Points(_Strict):
     unit: Literal["mm", "m", "um", "inch"]
     columns: Annotated[list[PositiveInt], Field(min_length=3, max_length=3)] | None = None
     reach: PositiveFloat | None = None  # mm
-    shoulder: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] = [0.0, 0.0, 0.0]  # mm
+    shoulder: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None  # mm
+
+    @model_validator(mode="after")
+    def _both(self) -> "_Points":
+        if (self.reach is None) != (self.shoulder is None):
+            raise ValueError(
+                "give reach and shoulder together: the zones of a test are counted from the shoulder, in the points' frame."
+            )
+        return self
 
 
 class _Recorded(_Strict):
     """What manifests of poses and of points have in common."""
 
+    date: datetime.date | None = None  # when it was recorded
     socket: list[_Socket] = []
     length: list[_Length] = []
     sphere: list[_Sphere] = []
@@ -144,7 +155,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
 
         sockets, lengths, spheres = recorded(path.parent, model, angles)
         sources = tuple(storage.fingerprint(file, path.parent) for file in files)
-        return Recording(Capture(sockets, lengths), nominal, spheres=spheres, sources=sources)
+        return Recording(Capture(sockets, lengths), nominal, spheres=spheres, sources=sources, measured=str(model.date or ""))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -166,9 +177,9 @@ def recorded(
         if any((entry.name, entry.test) == (other.name, other.test) for other in spheres):
             raise InputError(f"sphere '{entry.name}' is defined twice for one test; give its files in one [[sphere]].")
         groups = tuple(read(folder / file) for file in entry.paths)
-        sphere = ProbedSphere(entry.name, entry.test, groups, entry.diameter, entry.u, entry.stylus)
+        sphere = ProbedSphere(entry.name, entry.test, groups, entry.diameter, entry.u, entry.stylus, entry.form)
         spheres.append(checked_sphere(sphere))
-    return sockets, _lengths(model.length, fields), tuple(spheres)
+    return sockets, _lengths(model.length, fields, sockets), tuple(spheres)
 
 
 def _arm_source(manifest: Path, arm: str) -> str | Path:
@@ -236,8 +247,8 @@ def _fill(text: str, values: Mapping[str, str]) -> str:
     return _FIELD.sub(lambda field: values[field.group(1)], text)
 
 
-def _lengths(entries: list[_Length], fields: list[dict[str, str]]) -> list[ReferenceLength]:
-    """Reference lengths; one with fields in braces stands for every combination that the sockets' files showed."""
+def _lengths(entries: list[_Length], fields: list[dict[str, str]], sockets: Mapping[str, np.ndarray]) -> list[ReferenceLength]:
+    """Reference lengths; one with fields in braces stands for every combination of them that the sockets' files showed."""
     lengths = []
     for entry in entries:
         names = set(_FIELD.findall(entry.start + entry.end))
@@ -249,8 +260,8 @@ def _lengths(entries: list[_Length], fields: list[dict[str, str]]) -> list[Refer
             raise InputError(
                 f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; name the fields alike."
             )
-        for choice in sorted(choices):
-            lengths.append(
-                ReferenceLength(_fill(entry.start, dict(choice)), _fill(entry.end, dict(choice)), entry.value, entry.u)
-            )
+        pairs = [(_fill(entry.start, dict(choice)), _fill(entry.end, dict(choice))) for choice in sorted(choices)]
+        # A field may also stand in the names of sockets that have nothing to do with this length.
+        there = [pair for pair in pairs if pair[0] in sockets or pair[1] in sockets]
+        lengths += [ReferenceLength(*pair, entry.value, entry.u) for pair in there or pairs]
     return lengths

@@ -1,12 +1,13 @@
 """Acceptance tests before they are taken: where sockets, spheres and bars stand, and which poses to take; and such a test simulated."""
 
 import math
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from .acceptance import BARS, POSITIONS, REPEATS, SPAT_POSES, UNI_LENGTHS, UNI_POSITIONS, ZONES, percent
+from .acceptance import BARS, POSITIONS, REPEATS, SPAT_POSES, UNI_LENGTHS, UNI_LONGEST, UNI_POSITIONS, ZONES, percent
 from .arm import Arm, is_single
 from .capture import Capture, ReferenceLength
 from .errors import InputError
@@ -71,13 +72,14 @@ def acceptance_procedure(
     margin: float = math.radians(5),
     diameter: float = 25.0,
     stylus: float = 6.0,
+    bars: Sequence[float] | None = None,
     seed: int = 0,
 ) -> Procedure:
     """The poses of an acceptance test: of ASME B89.4.22 ("asme": effective diameter, single-point articulation, volumetric) or ISO 10360-12
     ("iso": probing, articulated location, length error), as `acceptance` describes them.
 
     Joints stay ``margin`` (rad) from their limits, and no joint and no tip comes below ``above`` (mm, base frame). ``diameter`` of the sphere and
-    ``stylus`` of the probe's ball are in mm. Raises `InputError` where the arm cannot take such a test.
+    ``stylus`` of the probe's ball are in mm. ``bars``: the lengths at hand, mm: two for "asme", five for "iso" (default: fitting ones). Raises `InputError` where the arm cannot take such a test.
     """
     if standard not in ("asme", "iso"):
         raise InputError(f"acceptance is '{standard}'; it must be asme or iso.")
@@ -97,7 +99,34 @@ def acceptance_procedure(
         )
     room = _Room(arm, reach, allowed + margin * np.array([1.0, -1.0]), above, np.random.default_rng(seed))
     make = _asme if standard == "asme" else _iso
-    return Procedure(arm, standard, reach, *(tuple(part) for part in make(room, diameter, stylus)))
+    lengths, words = _bar_lengths(standard, reach, bars)
+    *parts, left_out = make(room, diameter, stylus, lengths)
+    return Procedure(arm, standard, reach, *(tuple(part) for part in parts), left_out=(*words, *left_out))
+
+
+def _bar_lengths(standard: Standard, reach: Reach, bars: Sequence[float] | None) -> tuple[list[float], list[str]]:
+    """Lengths of the bars, and sentences on those that do not fit the standard."""
+    if bars is None:
+        if standard == "asme":
+            return [round(float(np.mean(bar)) * reach.radius) for bar in BARS], []
+        return [round(_LONGEST_SHARE * 2 * reach.radius * number / UNI_LENGTHS) for number in range(1, UNI_LENGTHS + 1)], []
+    wanted = len(BARS) if standard == "asme" else UNI_LENGTHS
+    lengths = sorted(float(bar) for bar in bars)
+    if len(lengths) != wanted or not all(math.isfinite(bar) and bar > 0 for bar in lengths):
+        raise InputError(
+            f"{len(lengths)} bars are given, but the {standard} test takes {wanted} positive lengths; give as many."
+        )
+    words = []
+    for bar, length in zip(BARS, lengths, strict=True) if standard == "asme" else ():
+        if not bar[0] <= length / reach.radius <= bar[1]:
+            words.append(
+                f"A bar of {length:g} mm is not {percent(bar)} of the reach ({bar[0] * reach.radius:.0f} to {bar[1] * reach.radius:.0f} mm)."
+            )
+    if standard == "iso" and lengths[-1] < UNI_LONGEST * 2 * reach.radius:
+        words.append(
+            f"The longest bar, {lengths[-1]:g} mm, is under 66 % of the range ({UNI_LONGEST * 2 * reach.radius:.0f} mm)."
+        )
+    return lengths, words
 
 
 class _OutOfReach(InputError):
@@ -153,7 +182,7 @@ def _spread(rows: Float[np.ndarray, "c k"], count: int) -> Int[np.ndarray, " m"]
     return np.array(chosen)
 
 
-def _asme(room: _Room, diameter: float, stylus: float) -> tuple[list, ...]:
+def _asme(room: _Room, diameter: float, stylus: float, bars: list[float]) -> tuple[list, ...]:
     items, left_out = [], []
     for zone, name in zip(ZONES, ("near", "middle", "far"), strict=True):
         try:
@@ -169,22 +198,21 @@ def _asme(room: _Room, diameter: float, stylus: float) -> tuple[list, ...]:
     sphere = Artefact("sphere", "effective-diameter", middle, diameter, stylus)
     touches = [_touched(room, sphere, "effective diameter", 9, number) for number in (1, 2, 3)]
     lengths = []
-    for number, bar in enumerate(BARS, start=1):
-        ends, pairs = _bars(room, f"bar{number}", float(np.mean(bar)) * room.reach.radius, POSITIONS // 2, 1, "volumetric")
+    for number, length in enumerate(bars, start=1):
+        ends, pairs = _bars(room, f"bar{number}", length, POSITIONS // 2, 1, "volumetric")
         items += ends
         lengths += pairs
     return items, touches, lengths, [sphere], left_out
 
 
-def _iso(room: _Room, diameter: float, stylus: float) -> tuple[list, ...]:
+def _iso(room: _Room, diameter: float, stylus: float, bars: list[float]) -> tuple[list, ...]:
     point, _ = room.place(ZONES[1])
     probing = Artefact("sphere", "probing", point, diameter, stylus)
     location = probing._replace(test="articulation")
     touches = [_touched(room, probing, "probing size and form", 25, 1)]
     touches += [_touched(room, location, "articulated location", 5, number, orientation=number) for number in range(1, 6)]
     items, lengths = [], []
-    for number in range(1, UNI_LENGTHS + 1):
-        length = _LONGEST_SHARE * 2 * room.reach.radius * number / UNI_LENGTHS
+    for number, length in enumerate(bars, start=1):
         ends, pairs = _bars(room, f"bar{number}", length, UNI_POSITIONS, REPEATS, "length error")
         items += ends
         lengths += pairs
@@ -193,7 +221,6 @@ def _iso(room: _Room, diameter: float, stylus: float) -> tuple[list, ...]:
 
 def _bars(room: _Room, name: str, length: float, positions: int, repeats: int, test: str) -> tuple[list, list]:
     """Both ends of a bar in positions that differ much in place and direction, each end in as many poses as there are repeats."""
-    length = round(length)
     start, end = check_lengths(room.arm, 300, length=length, limits=room.limits, seed=int(room.random.integers(2**31)))
     good = np.minimum(lowest(room.arm, start), lowest(room.arm, end)) >= room.above
     start, end = start[good], end[good]
@@ -244,10 +271,12 @@ def _touched(room: _Room, sphere: Artefact, test: str, count: int, number: int, 
         wish = outside
     else:
         turn = 2 * np.pi * orientation / 5
-        wish = towards @ -np.array([0.6 * np.cos(turn), 0.6 * np.sin(turn), 0.8]) + np.where(outside > -0.2, 0.0, -2.0)
+        wish = towards @ -np.array([0.6 * np.cos(turn), 0.6 * np.sin(turn), 0.8])
+    # A probe that comes along the surface still touches with its ball; from below it, it would come through the sphere.
+    wish = np.where((outside > 0.02) | (size[:, 0] == 0), wish, -np.inf)
     rows = []
     for i in range(count):
-        here = np.flatnonzero(owner == i)
+        here = np.flatnonzero((owner == i) & np.isfinite(wish))
         if not len(here):
             raise InputError(
                 f"the sphere at ({', '.join(f'{x:.0f}' for x in sphere.centre)}) mm cannot be touched all round; give another seed."

@@ -42,6 +42,7 @@ def procedure_manifest(procedure: Procedure, arm: str) -> str:
         f"# {TITLES[procedure.standard]}, as planned. Put the calibrated values and standard uncertainties of your artefacts in, record a file for each",
         "# socket and group of touches (one row a pose, in the order of the plan), then: aacmm import THIS.toml -o acceptance.h5",
         f"arm = {_quoted(arm)}",
+        "# date = 2026-01-31   # when it was recorded",
         "",
         "[angles]",
         'unit = "deg"',
@@ -58,7 +59,7 @@ def procedure_manifest(procedure: Procedure, arm: str) -> str:
                 "",
                 "[[length]]",
                 *ends,
-                f"value = {value:.1f}   # mm: the calibrated length",
+                f"value = {value:g}   # mm: the calibrated length",
                 "u = 0.002   # mm: its standard uncertainty",
             ]
     for sphere in procedure.spheres:
@@ -69,7 +70,10 @@ def procedure_manifest(procedure: Procedure, arm: str) -> str:
             f"diameter = {sphere.diameter:g}   # mm: the calibrated diameter",
             "u = 0.0005   # mm: its standard uncertainty",
         ]
-        lines.append(f"stylus = {sphere.stylus:g}   # mm: diameter of the probe's ball")
+        lines += [
+            f"stylus = {sphere.stylus:g}   # mm: diameter of the probe's ball",
+            "form = 0.0   # mm: its calibrated form error",
+        ]
     return "\n".join(lines) + "\n"
 
 

@@ -47,6 +47,7 @@ class ProbedSphere(NamedTuple):
     diameter: float  # calibrated
     u: float = 0.0  # standard uncertainty of the diameter
     stylus: float = 0.0  # diameter of the ball of the probe; 0 where points lie on the sphere itself
+    form: float = 0.0  # calibrated form error of the sphere
 
 
 class Recording(NamedTuple):
@@ -58,6 +59,7 @@ class Recording(NamedTuple):
     seed: int | None = None
     spheres: tuple[ProbedSphere, ...] = ()
     sources: tuple[str, ...] = ()  # files that it was read from: name and SHA-256, the latest first
+    measured: str = ""  # day on which it was recorded, ISO 8601; empty where that is not stated
 
 
 def checked_sphere(sphere: ProbedSphere, columns: int | None = None) -> ProbedSphere:
@@ -65,7 +67,12 @@ def checked_sphere(sphere: ProbedSphere, columns: int | None = None) -> ProbedSp
     where = f"sphere '{sphere.name}'"
     if sphere.test not in SPHERE_TESTS:
         raise InputError(f"{where}: test is '{sphere.test}'; it must be one of {', '.join(SPHERE_TESTS)}.")
-    for what, value, least in (("diameter", sphere.diameter, 1e-6), ("u", sphere.u, 0.0), ("stylus", sphere.stylus, 0.0)):
+    for what, value, least in (
+        ("diameter", sphere.diameter, 1e-6),
+        ("u", sphere.u, 0.0),
+        ("stylus", sphere.stylus, 0.0),
+        ("form", sphere.form, 0.0),
+    ):
         if not (np.isfinite(value) and value >= least):
             raise InputError(f"{where}: {what} is {value:g} mm; it must be {'positive' if least else 'zero or positive'}.")
     groups = tuple(np.asarray(as_floats(group, where)) for group in sphere.groups)

@@ -9,6 +9,7 @@ from .arrays import Numbers, as_floats
 from .errors import InputError
 
 _LEAST = 4  # points that a sphere needs
+_ONE_PLACE = 1e-7  # of the points' spread
 
 
 class FittedSphere(NamedTuple):
@@ -62,14 +63,19 @@ def enclosing_sphere(points: Numbers) -> tuple[Float[np.ndarray, " 3"], float]:
     """Centre and radius, mm, of the smallest sphere that holds all points ``(m, 3)`` (Welzl's algorithm, by the package miniball)."""
     import miniball
 
-    given = np.unique(points_of(points, "points"), axis=0)
+    given = points_of(points, "points")
     middle = given.mean(axis=0)
     size = float(np.abs(given - middle).max())
     if size == 0:
         return middle, 0.0
-    found: Any = miniball.get_bounding_ball((given - middle) / size, rng=np.random.default_rng(0))
-    centre, squared = found
-    return middle + size * centre, float(size * np.sqrt(squared))
+    # Two points in nearly one place would make the algorithm's small systems singular; all points count again in the radius.
+    apart: list[np.ndarray] = []
+    for point in (given - middle) / size:
+        if all(np.linalg.norm(point - other) > _ONE_PLACE for other in apart):
+            apart.append(point)
+    found: Any = miniball.get_bounding_ball(np.array(apart), rng=np.random.default_rng(0))
+    centre = middle + size * found[0]
+    return centre, float(np.linalg.norm(given - centre, axis=1).max())
 
 
 def points_of(points: Numbers, what: str) -> Float[np.ndarray, "m 3"]:

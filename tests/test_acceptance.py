@@ -217,9 +217,9 @@ def test_an_arm_that_is_too_large_measures_everything_too_large(recorded):
         for figure in test.figures:
             for part in figure.parts:
                 expected = {
-                    "E_Uni": 1e-4 * part.length,
-                    "Volumetric": 1e-4 * part.length,
-                    "Length": 1e-4 * part.length,
+                    "E_Uni": 1e-4 * (part.length or 0.0),
+                    "Volumetric": 1e-4 * (part.length or 0.0),
+                    "Length": 1e-4 * (part.length or 0.0),
                     "D_Eff": 1e-4 * 31.0,  # of the sphere and of the probe's ball
                     "P_Size": 1e-4 * 31.0,
                     "Length_Range": 1e-4 * (max(lengths) - min(lengths)),
@@ -268,7 +268,7 @@ def test_a_probe_that_is_off_scatters_tips_on_a_sphere(cheng):
             1000.0,
             {
                 "single-point articulation": ["at 0 to 20 %", "at 80 to 100 %"],
-                "volumetric": ["20 positions", "500 to 750 mm", "1200 to 1500 mm"],
+                "volumetric": ["20 positions", "two bars, no fewer", "500 to 750 mm", "1200 to 1500 mm"],
                 "length error": ["105 in all (1 readings of 1 length", "1320 mm"],
             },
         ),
@@ -350,6 +350,7 @@ POINTS = """
 [points]
 unit = "um"
 reach = 1000
+shoulder = [0, 0, 0]
 [[socket]]
 name = "{end}"
 file = "{end}.txt"

@@ -9,7 +9,7 @@ import pytest
 
 import aacmm_jax as aj
 
-COMMANDS = ("demo", "simulate", "import", "calibrate", "evaluate", "export", "show", "plan", "compare")
+COMMANDS = ("demo", "simulate", "import", "calibrate", "evaluate", "export", "show", "plan", "compare", "report")
 SIMULATE = (
     *("simulate", "cheng2018-simulation", "-o", "capture.h5", "--seed", 4),
     *("--socket", "A=400,200,300", "--socket", "B=600,200,300", "--socket", "C=500,400,400"),

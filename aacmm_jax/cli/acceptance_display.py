@@ -48,8 +48,12 @@ def report(summary: dict[str, Any]) -> None:
 def points(summary: dict[str, Any]) -> None:
     """Acceptance tests of points."""
     console = _console()
-    console.print(f"[bold]{escape(summary['points'])}[/bold]: points as they were recorded")
+    console.print(
+        f"{summary['points']} points: {summary['sockets']} sockets, {summary['lengths']} lengths, {summary['spheres']} spheres"
+    )
+    _warnings(console, summary)
     _acceptance(console, summary)
+    _written(console, summary)
 
 
 def _acceptance(console: Console, summary: dict[str, Any]) -> None:
@@ -69,7 +73,12 @@ def _acceptance(console: Console, summary: dict[str, Any]) -> None:
             cells += [_number(figure["value_mm"]), _number(figure["expanded_mm"])]
             if limited:
                 decision = figure["decision"]
-                cells += [_number(figure["limit_mm"]), f"[{_STYLES[decision]}]{decision or '-'}[/]"]
+                count = (
+                    f" ({figure['failing']} of {len(figure['parts'])})"
+                    if figure["failing"] and len(figure["parts"]) > 1
+                    else ""
+                )
+                cells += [_number(figure["limit_mm"]), f"[{_STYLES[decision]}]{decision or '-'}{count}[/]"]
             table.add_row(test["standard"], figure["name"], *cells, escape(figure["where"]))
     for column in table.columns[1], table.columns[-1]:
         column.justify = "left"

@@ -291,7 +291,7 @@ def show(
     from ..calibration_files import load_calibration
     from ..capture_files import load_capture
     from ..summary import arm_summary, calibration_summary, capture_summary
-    from . import acceptance_display, display
+    from . import display
 
     if file.suffix in ("", ".toml") and not (file.is_file() and file.suffix == ""):
         _show(arm_summary(load_specification(str(file))), as_json, display.arm)
@@ -305,10 +305,9 @@ def show(
     if cell is not None or figures is not None:
         raise InputError(f"{file} holds a {stored.attributes['kind']}; --cell and --figures are for studies.")
     if stored.attributes["kind"] == "evaluation":
-        from ..evaluation_files import load_evaluation
-        from ..evaluation_summary import evaluation_summary
+        from .result_commands import show_evaluation
 
-        _show(evaluation_summary(load_evaluation(file)), as_json, acceptance_display.evaluation)
+        show_evaluation(file, stored.attributes.get("of") == "points", as_json)
     elif stored.attributes["kind"] == "capture":
         _show(capture_summary(load_capture(file)), as_json, display.capture)
     else:

@@ -38,6 +38,8 @@ def _table(title: str, *columns: str) -> Table:
 def _number(value: float | None, decimals: int = 4) -> str:
     if value is None:
         return "-"
+    if abs(value) < 1e-9:  # mm: rounding
+        value = 0.0
     small = value != 0 and abs(value) < 0.5 * 10**-decimals
     return f"{value:.1e}" if small else f"{value:.{decimals}f}"
 
@@ -99,14 +101,20 @@ def calibration(summary: dict[str, Any]) -> None:
     console.print(f"Scale of stage 1: k = {summary['scale_k']:.8f}, u(k) = {summary['scale_u']:.1e} ({held})")
     _warnings(console, summary)
     _validated(console, summary["cross_validation"])
-    _stages(console, "\nOn the poses it was identified from [mm]", summary, ("nominal", "stage1", "calibrated"))
+    stages = ("nominal", "stage1", "calibrated")
+    _stages(console, "\nOn the poses it was identified from [mm]", summary, stages, fitted=fixed_scale(summary))
     if "truth" in summary:
         _truth(console, summary["truth"])
     _parameters(console, summary["parameters"])
     if summary["lengths"]:
-        _lengths(console, summary["lengths"], fitted=len(summary["lengths"]) == 1)
+        _lengths(console, summary["lengths"], fitted=fixed_scale(summary))
     _uncertainty(console, summary)
     _written(console, summary)
+
+
+def fixed_scale(summary: dict[str, Any]) -> bool:
+    """Whether a single length fixed the scale exactly, so that its own error is zero by construction."""
+    return summary["method"] == "two-stage" and len(summary["lengths"]) == 1
 
 
 def _validated(console: Console, found: dict[str, Any] | None) -> None:
@@ -182,12 +190,13 @@ def demo(summary: dict[str, Any]) -> None:
     console.print(f"Files in {escape(summary['folder'])}: {', '.join(escape(name) for name in summary['files'])}")
 
 
-def _stages(console: Console, title: str, figures: dict[str, Any], stages: tuple[str, ...]) -> None:
+def _stages(console: Console, title: str, figures: dict[str, Any], stages: tuple[str, ...], *, fitted: bool = False) -> None:
     names = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
     table = _table(title, "", *(names[stage] for stage in stages))
     for key, text in _FIGURES:
         if key in figures[stages[0]]:
-            table.add_row(escape(text), *(_number(figures[stage][key]) for stage in stages))
+            cells = [_number(figures[stage][key]) for stage in stages]
+            table.add_row(escape(text), *cells[:-1], "by fit" if fitted and key.startswith("length") else cells[-1])
     console.print(table)
 
 

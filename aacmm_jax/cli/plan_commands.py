@@ -59,6 +59,10 @@ def plan(
     ] = None,
     sphere_mm: Annotated[float, typer.Option(help="Of an acceptance test: diameter of the sphere.")] = 25.0,
     stylus_mm: Annotated[float, typer.Option(min=0, help="Of an acceptance test: diameter of the probe's ball.")] = 6.0,
+    bar_mm: Annotated[
+        list[float] | None,
+        typer.Option(help="Of an acceptance test: length of a bar at hand; twice for asme, five times for iso."),
+    ] = None,
     manifest: Annotated[
         Path | None, typer.Option(help="Of an acceptance test: write the manifest (TOML) that its readings are imported with.")
     ] = None,
@@ -86,7 +90,14 @@ def plan(
                 "--acceptance places its own sockets and bars; leave --socket, --sockets, --length and --region out."
             )
         _check_output(output, arm)
-        room = {"above": above_mm, "margin": math.radians(margin_deg), "diameter": sphere_mm, "stylus": stylus_mm, "seed": seed}
+        room = {
+            "above": above_mm,
+            "margin": math.radians(margin_deg),
+            "diameter": sphere_mm,
+            "stylus": stylus_mm,
+            "seed": seed,
+            "bars": bar_mm or None,
+        }
         _show(_procedure(specification, arm, acceptance, output, manifest, room), as_json, acceptance_display.procedure)
         return
     if manifest is not None:

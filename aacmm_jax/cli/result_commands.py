@@ -56,11 +56,11 @@ def evaluate(
     maxima = {"rms_mm": max_rms_mm, "deltam_mm": max_deltam_mm, "length_error_largest_mm": max_length_error_mm}
     maxima = {name: value for name, value in maxima.items() if value is not None}
     if capture is None:
-        if output is not None or maxima or only or without:
+        if maxima or only or without:
             raise InputError(
-                "with a manifest of points there are only --mpe, --test-u-mm and --json; name a calibration and a capture for more."
+                "with a manifest of points there are only --mpe, --test-u-mm, --output and --json; name a calibration and a capture for more."
             )
-        summary = _evaluated_points(calibration, limits, test_u_mm)
+        summary = _evaluated_points(calibration, output, limits, test_u_mm)
         _show(summary, as_json, acceptance_display.points)
     else:
         summary = _evaluated(calibration, capture, output, (only, without), limits, test_u_mm, maxima)
@@ -91,6 +91,19 @@ def report(
     )
 
 
+def show_evaluation(file: Path, of_points: bool, as_json: bool) -> None:
+    """What an evaluation's file holds, printed."""
+    from ..evaluation_files import load_evaluation
+    from ..evaluation_summary import evaluation_summary, points_summary
+    from ..points_evaluation import load_points
+    from . import acceptance_display
+
+    if of_points:
+        _show(points_summary(load_points(file)), as_json, acceptance_display.points)
+    else:
+        _show(evaluation_summary(load_evaluation(file)), as_json, acceptance_display.evaluation)
+
+
 def _evaluated(
     calibration: Path, capture: Path, output: Path | None, choice: tuple, limits: Any, u_test: float, maxima: dict[str, float]
 ) -> dict[str, Any]:
@@ -117,21 +130,21 @@ def _evaluated(
     return summary
 
 
-def _evaluated_points(manifest: Path, limits: Any, u_test: float) -> dict[str, Any]:
-    from ..acceptance import accept
-    from ..evaluation_summary import acceptance_summary
+def _evaluated_points(manifest: Path, output: Path | None, limits: Any, u_test: float) -> dict[str, Any]:
+    from ..evaluation_summary import points_summary
+    from ..points_evaluation import PointsRecord, save_points
     from ..points_files import read_points
 
     if manifest.suffix != ".toml":
         raise InputError(f"{manifest} alone cannot be evaluated; name a capture too, or a manifest (TOML) of points.")
-    tests = accept(read_points(manifest), limits, u_test)
-    return {
-        "kind": "acceptance",
-        "points": str(manifest),
-        "failed": [],
-        "acceptance": acceptance_summary(tests),
-        "u_test_mm": u_test,
-    }
+    if output is not None and output.exists() and manifest.exists() and output.samefile(manifest):
+        raise InputError(f"{output} is the manifest itself; choose another output.")
+    record = PointsRecord(read_points(manifest), limits, u_test)
+    summary = points_summary(record)
+    if output is not None:
+        save_points(output, record)
+        summary["written"] = str(output)
+    return summary
 
 
 @app.command(

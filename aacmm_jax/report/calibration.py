@@ -114,7 +114,7 @@ def _found_and_left(record: CalibrationRecord, summary: dict[str, Any], evaluati
     blocks: list = ["As found is the nominal arm, as left the calibrated one, both on the poses that were identified from."]
     if summary["cross_validation"] is not None:
         blocks.append(_validated(summary["cross_validation"]))
-    blocks.append(figures_table("Figures as found and as left [mm]", summary, stages, fixed_scale=len(summary["lengths"]) == 1))
+    blocks.append(figures_table("Figures as found and as left [mm]", summary, stages, fixed_scale=_fixed(record)))
     pair = {"as found": evaluations["nominal"], "as left": evaluations["calibrated"]}
     blocks.append(
         residual_chart("found-left", "Distance of every pose from its socket's centroid", record.recording.capture, pair)
@@ -145,6 +145,11 @@ def _validated(found: dict[str, Any]) -> Table:
     )
 
 
+def _fixed(record: CalibrationRecord) -> bool:
+    """Whether a single length fixed the scale exactly, so that its own error is zero by construction."""
+    return record.method == "two-stage" and len(record.recording.capture.lengths) == 1
+
+
 def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation], factor: float) -> Section:
     k, u = record.k, record.u_k
     words = (
@@ -154,10 +159,10 @@ def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict
     )
     if record.method == "joint":
         words = (
-            f"Poses and reference lengths were fitted together. The arm that poses alone give measures the lengths k = {k:.8f} times too long; "
-            f"u(k) = {u:.1e}."
+            f"Poses and reference lengths were fitted together. By the arm that poses alone give, they measure k = {k:.8f} times their calibrated "
+            f"value, with u(k) = {u:.1e}."
         )
-    single = len(summary["lengths"]) == 1
+    single = _fixed(record)
     errors = {stage: np.asarray(evaluations[stage].error) for stage in ("nominal", "stage1", "calibrated")}
     if not single:
         words += " A length's U holds what its certificate says and the scatter of the poses at its ends."
@@ -195,7 +200,9 @@ def _parameters(record: CalibrationRecord, summary: dict[str, Any], factor: floa
         u = None if row["u"] is None else factor * scale * row["u"]
         decimals = decimals_of(u)
         change = scale * (row["calibrated"] - row["nominal"])
-        state = f"on the {row['bound']} bound" if row["bound"] else "" if u else "only with others"
+        state = "" if u else "only with others"
+        if row["bound"]:
+            state = f"on the {row['bound']} bound" + (" of stage 1; U is that of k" if u else "")
         rows.append(
             [
                 text(row["parameter"]),

@@ -211,7 +211,7 @@ def _known(u: Any) -> float | None:
 
 
 def _length_chart(figure: Figure) -> Chart:
-    lengths = [part.length for part in figure.parts]
+    lengths = [part.length or 0.0 for part in figure.parts]
     hover = [f"{part.where}: {shown(part.value, signed=True)} mm" for part in figure.parts]
     trace = charts.dots("single readings, with U", lengths, [part.value for part in figure.parts], charts.DARK, "circle",
                         hover=hover, bars=[part.expanded for part in figure.parts], size=5)  # fmt: skip

@@ -2,9 +2,9 @@
 
 import html
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+_NOTHING = 1e-9  # mm: rounding
 ARCSEC = 3600 * 180 / math.pi
 
 
@@ -84,6 +84,8 @@ def number(value: float | None, decimals: int = 4, *, signed: bool = False, mark
 def shown(value: float, decimals: int = 4, *, signed: bool = False) -> str:
     """A number with so many decimals; in powers of ten where these would hide it."""
     sign = "+" if signed else ""
+    if abs(value) < _NOTHING:
+        value = 0.0
     if value != 0 and abs(value) < 0.5 * 10**-decimals:
         return f"{value:{sign}.1e}".replace("-", "−")
     return f"{value:{sign}.{decimals}f}".replace("-", "−")
@@ -99,8 +101,3 @@ def decimals_of(u: float | None, otherwise: int = 4) -> int:
 def plain(value: object) -> str:
     """Text for Plotly, which takes some tags for formatting: names are shown as they are."""
     return html.escape(str(value), quote=False)
-
-
-def rows_of(dictionaries: Sequence[dict[str, Any]], *cells: Any) -> list[list[Cell]]:
-    """One row for each dictionary, its cells made by functions of it."""
-    return [[make(row) for make in cells] for row in dictionaries]
