@@ -5,8 +5,9 @@ that these describe. Every figure is of single readings, never of means: a test 
 the tester brings (artefacts, and what is stated besides); the arm's own scatter is what is tested (ISO 14253-5 and ISO/TS 23165 see it so).
 """
 
+import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,8 +27,9 @@ from .acceptance_figures import two_rms as two_rms
 from .arm import Arm
 from .capture import ReferenceLength
 from .decision import Limit, decide
-from .errors import InputError
-from .recording import ProbedSphere, Recording
+from .errors import InputError, nearest
+from .recording import ProbedSphere, Recording, checked_sphere
+from .spheres import points_of
 from .volume import Reach as Reach
 from .volume import reach_of
 
@@ -38,6 +40,9 @@ SPAT_POSES, POSITIONS, REPEATS = 10, 20, 3
 UNI_LENGTHS, UNI_POSITIONS, UNI_LONGEST = 5, 7, 0.66
 _CHECKS = 30  # of a length, in different places: Cheng et al. 2018, section 4.4
 _SPHERES = (10.0, 51.0)  # mm: 10 to 50 after ASME B89.4.22, 10 to 51 after ISO 10360 (background knowledge)
+_FAR = 1e6  # mm: no arm reaches a kilometre
+_LEAST_DIVISOR = 1e-3
+_FIXED = 4  # points that a sphere goes through exactly: they have no form error
 _ALIKE = 0.01  # lengths that differ by less are of one artefact
 
 
@@ -57,30 +62,64 @@ def unstated(tests: Sequence[AcceptanceTest]) -> list[str]:
     return [figure.name for figure in figures if figure.decision is not None and figure.worst.expanded == 0]
 
 
-def accept(measured: Measured, limits: Mapping[str, Limit] | None = None, u_test: float = 0.0) -> list[AcceptanceTest]:
+def accept(measured: Measured, limits: Mapping[str, Limit | float] | None = None, u_test: float = 0.0) -> list[AcceptanceTest]:
     """Every test that the measured points allow.
 
-    ``limits``: MPE by the name of a figure (a key of `FIGURES`). ``u_test``: standard uncertainty, mm, that the seat, fixture and temperature add
-    to every test value. Raises `InputError` for a limit whose figure cannot be had from these points.
+    ``limits``: MPE by the name of a figure (a key of `FIGURES`), a `Limit` or a number of mm. ``u_test``: standard uncertainty, mm, that the
+    seat, fixture and temperature add to every test value. Raises `InputError` for points that are none, and for a limit whose figure cannot
+    be had from these points, or that grows with a length where the figure is of none.
     """
-    if not (math.isfinite(u_test) and u_test >= 0):
-        raise InputError(f"the uncertainty of the test is {u_test:g} mm; it must be zero or positive.")
+    measured = _checked(measured)
+    u_test = _number(u_test, "the standard uncertainty of the test")
+    given = {name: _limit(name, limit) for name, limit in (limits or {}).items()}
     tests = [test for run in _TESTS if (test := run(measured, u_test)) is not None]
     if measured.seen:
-        tests = [
-            test._replace(missing=("sockets and lengths that the arm was not identified from", *test.missing)) for test in tests
-        ]
-    limits = dict(limits or {})
+        unseen = "sockets and lengths that the arm was not identified from"
+        tests = [test._replace(missing=(unseen, *test.missing)) for test in tests]
     there = {figure.name for test in tests for figure in test.figures}
-    for name in limits:
-        if name not in FIGURES:
-            raise InputError(f"there is no figure '{name}'; limits can be given for {', '.join(FIGURES)}.")
+    for name in given:
         if name not in there:
             unseen = " that the calibration has not seen" if measured.known else ""
             raise InputError(
                 f"a limit is given for {name} ({FIGURES[name]}), but the capture holds nothing{unseen} to measure it on."
             )
-    return [test._replace(figures=tuple(_decided(figure, limits) for figure in test.figures)) for test in tests]
+    return [test._replace(figures=tuple(_decided(figure, given) for figure in test.figures)) for test in tests]
+
+
+def _checked(measured: Measured) -> Measured:
+    sockets = {name: points_of(points, f"the points of socket '{name}'") for name, points in measured.sockets.items()}
+    for length in measured.lengths:
+        for end in (length.start, length.end):
+            if end not in sockets:
+                raise InputError(
+                    f"length '{length.start}' to '{length.end}' names the unknown socket '{end}'{nearest(end, sockets)}"
+                )
+    spheres = tuple(checked_sphere(sphere, 3) for sphere in measured.spheres)
+    for name, points in (*sockets.items(), *((sphere.name, group) for sphere in spheres for group in sphere.groups)):
+        if np.abs(points).max() > _FAR:
+            raise InputError(f"'{name}' holds a coordinate beyond {_FAR:g} mm; give points in mm.")
+    return measured._replace(sockets=sockets, spheres=spheres)
+
+
+def _number(value: float, what: str) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what} is {value!r}; give a number of mm.") from error
+    if not 0 <= number <= _FAR:
+        raise InputError(f"{what} is {number:g} mm; it must be zero or positive, and finite.")
+    return number
+
+
+def _limit(name: str, limit: Limit | float) -> Limit:
+    if name not in FIGURES:
+        raise InputError(f"there is no figure '{name}'{nearest(name, list(FIGURES))}")
+    fixed, divisor = limit if isinstance(limit, Limit) else (limit, math.inf)
+    if not divisor >= _LEAST_DIVISOR:
+        raise InputError(
+            f"the limit of {name} grows by the length over {divisor:g}; give a divisor of {_LEAST_DIVISOR:g} or more."
+        )
+    return Limit(_number(fixed, f"the limit of {name}"), divisor)
 
 
 def _decided(figure: Figure, limits: Mapping[str, Limit]) -> Figure:
@@ -168,7 +207,8 @@ def asme_diameter(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | N
     parts, missing = [], []
     for sphere in spheres:
         for number, group in enumerate(sphere.groups, start=1):
-            value = size_error(group, sphere.diameter, sphere.stylus)
+            with _of(sphere, number):
+                value = size_error(group, sphere.diameter, sphere.stylus)
             parts.append(_part(f"{sphere.name}, repeat {number}", value, sphere.u, u_test))
         missing += _wanted(sphere, groups=REPEATS, points=9, of="repeats")
     return _test("ASME B89.4.22", "effective diameter", [Figure("D_Eff", tuple(parts))] if parts else [], missing)
@@ -235,8 +275,10 @@ def iso_probing(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | Non
     for sphere in (sphere for sphere in measured.spheres if sphere.test == "probing"):
         for number, group in enumerate(sphere.groups, start=1):
             where = sphere.name + (f", repeat {number}" if len(sphere.groups) > 1 else "")
-            size.append(_part(where, size_error(group, sphere.diameter, sphere.stylus), sphere.u, u_test))
-            form.append(_part(where, form_error(group), sphere.form / 2, u_test))
+            with _of(sphere, number):
+                size.append(_part(where, size_error(group, sphere.diameter, sphere.stylus), sphere.u, u_test))
+            if len(group) > _FIXED:
+                form.append(_part(where, form_error(group), sphere.form / 2, u_test))
         missing += _wanted(sphere, groups=1, points=25, of="groups")
     figures = [Figure(name, tuple(parts)) for name, parts in (("P_Size", size), ("P_Form", form)) if parts]
     return _test("ISO 10360-12", "probing size and form", figures, missing)
@@ -246,7 +288,9 @@ def iso_articulation(measured: Measured, u_test: float = 0.0) -> AcceptanceTest 
     """ISO 10360-12:2016, articulated location L_Dia.5x5.Art: 5 points in each of 5 orientations. Background knowledge."""
     parts, missing = [], []
     for sphere in (sphere for sphere in measured.spheres if sphere.test == "articulation"):
-        parts.append(_part(sphere.name, articulated_location(sphere.groups), sphere.form / 2, u_test))
+        if len(sphere.groups) > 1:  # the sphere round one centre is always zero
+            with _of(sphere):
+                parts.append(_part(sphere.name, articulated_location(sphere.groups), sphere.form / 2, u_test))
         missing += _wanted(sphere, groups=5, points=5, of="orientations")
     return _test("ISO 10360-12", "articulated location", [Figure("L_Dia", tuple(parts))] if parts else [], missing)
 
@@ -281,6 +325,16 @@ _TESTS: tuple[Callable[[Measured, float], AcceptanceTest | None], ...] = (
 
 def _test(standard: str, title: str, figures: Sequence[Figure], missing: list[str]) -> AcceptanceTest | None:
     return AcceptanceTest(standard, title, tuple(figures), tuple(missing)) if figures else None
+
+
+@contextlib.contextmanager
+def _of(sphere: ProbedSphere, group: int | None = None) -> Iterator[None]:
+    """Say which sphere, and which of its groups, something is wrong with."""
+    try:
+        yield
+    except InputError as error:
+        where = f"sphere '{sphere.name}'" + ("" if group is None else f", group {group}")
+        raise InputError(f"{where}: {error}") from error
 
 
 def _placements(lengths: Sequence[ReferenceLength]) -> list[ReferenceLength]:

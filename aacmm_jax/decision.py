@@ -33,6 +33,12 @@ def decide(error: float, limit: float, expanded: float = 0.0) -> Decision:
     expanded uncertainty U (coverage factor 2) of the test value; all in mm. The guard band is U itself, as in the editions
     up to 2013; that of 2017 allows 0.83 U by default, so that whatever conforms here conforms there too.
     """
+    try:
+        error, limit, expanded = float(error), float(limit), float(expanded)
+    except (TypeError, ValueError) as wrong:
+        raise InputError(
+            f"error, limit and expanded uncertainty are {error!r}, {limit!r}, {expanded!r}; give numbers of mm."
+        ) from wrong
     for what, value in (("limit", limit), ("expanded uncertainty", expanded)):
         if not (math.isfinite(value) and value >= 0):
             raise InputError(f"the {what} is {value:g} mm; it must be zero or positive.")
@@ -67,7 +73,7 @@ def read_limits(texts: list[str], known: Mapping[str, str]) -> dict[str, Limit]:
             limit = Limit(float(match["fixed"]), float(match["divisor"]) if match["divisor"] else math.inf)
         except ValueError as error:
             raise InputError(f"--mpe '{text}': '{value}' is not A or A+L/K with numbers in mm.") from error
-        if not (math.isfinite(limit.fixed) and limit.fixed >= 0 and limit.divisor > 0):
-            raise InputError(f"--mpe '{text}': a limit must be zero or positive, and K positive.")
+        if not (0 <= limit.fixed <= 1e6 and limit.divisor >= 1e-3):
+            raise InputError(f"--mpe '{text}': a limit must be zero or positive and finite, and K at least 0.001.")
         found[name] = limit
     return found

@@ -9,14 +9,16 @@ from typing import NamedTuple
 import numpy as np
 
 from . import storage
-from .acceptance import AcceptanceTest, Measured, accept, measured_by, unstated
+from .acceptance import FIGURES, AcceptanceTest, Measured, accept, measured_by, unstated
 from .arm import Arm
 from .calibration_files import CalibrationRecord
 from .capture_files import arm_table, recording_attributes, recording_of, recording_tables, specification_of
+from .checks import plausible
 from .decision import Limit
 from .recording import ArmSpecification, Recording
 from .storage import Table, Variable
 
+MAXIMA = ("rms_mm", "deltam_mm", "length_error_largest_mm")
 SIMULATED = "The readings are simulated: no real arm was measured."
 
 
@@ -71,6 +73,9 @@ def evaluation_of(
     shared = {name: sum(row.tobytes() in known for row in np.asarray(q)) for name, q in recording.capture.sockets.items()}
     used = {name for name, count in shared.items() if count}
     warnings = []
+    if not record.converged or not plausible(record.k):
+        reason = record.reason if not record.converged else f"k = {record.k:.6g} is the scale of no arm."
+        warnings.append(f"The calibration failed, so its figures mean nothing: {reason}")
     if recording.true is not None:
         warnings.append(SIMULATED)
     sizes = dict(zip(recording.capture.names, recording.capture.sizes, strict=True))
@@ -148,7 +153,10 @@ def limits_in(stored: storage.Stored) -> dict[str, Limit]:
     """The limits that a file holds."""
     table = stored.tables["limits"]
     rows = zip(table["figure"], table["fixed"], table["divisor"], strict=True)
-    return {str(name): Limit(float(fixed), float(divisor)) for name, fixed, divisor in rows}
+    found = {str(name): Limit(float(fixed), float(divisor)) for name, fixed, divisor in rows}
+    if not all(name in FIGURES and 0 <= limit.fixed < math.inf and limit.divisor > 0 for name, limit in found.items()):
+        raise ValueError("a limit that this package would not have written")  # `storage.undamaged` says what that means
+    return found
 
 
 def _figure_table(record: EvaluationRecord) -> Table:
@@ -174,12 +182,15 @@ def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
     storage.need(path, stored.tables, "calibrated_arm", "used", "limits")
     with storage.undamaged(path):
         attributes = stored.attributes
+        maxima = {name.removeprefix("most_"): float(value) for name, value in attributes.items() if name.startswith("most_")}
+        if not set(maxima) <= set(MAXIMA) or not all(0 <= value < math.inf for value in maxima.values()):
+            raise ValueError("a limit that this package would not have written")
         return EvaluationRecord(
             recording_of(path, stored),
             specification_of(path, stored, "calibrated_arm"),
             frozenset(str(name) for name in stored.tables["used"]["used"]),
-            tuple(attributes.get("warnings") or ()),
+            tuple(map(str, np.atleast_1d(attributes.get("warnings") or []))),
             limits_in(stored),
             float(attributes["u_test_mm"]),
-            {name.removeprefix("most_"): float(value) for name, value in attributes.items() if name.startswith("most_")},
+            maxima,
         )

@@ -59,7 +59,7 @@ def procedure_manifest(procedure: Procedure, arm: str) -> str:
                 "",
                 "[[length]]",
                 *ends,
-                f"value = {value:g}   # mm: the calibrated length",
+                f"value = {value!r}   # mm: the calibrated length",
                 "u = 0.002   # mm: its standard uncertainty",
             ]
     for sphere in procedure.spheres:
@@ -67,11 +67,11 @@ def procedure_manifest(procedure: Procedure, arm: str) -> str:
         files = ", ".join(_quoted(file_of(procedure, item)) for item in of)
         lines += ["", "[[sphere]]", f"name = {_quoted(sphere.name)}", f"test = {_quoted(sphere.test)}", f"files = [{files}]"]
         lines += [
-            f"diameter = {sphere.diameter:g}   # mm: the calibrated diameter",
+            f"diameter = {sphere.diameter!r}   # mm: the calibrated diameter",
             "u = 0.0005   # mm: its standard uncertainty",
         ]
         lines += [
-            f"stylus = {sphere.stylus:g}   # mm: diameter of the probe's ball",
+            f"stylus = {sphere.stylus!r}   # mm: diameter of the probe's ball",
             "form = 0.0   # mm: its calibrated form error",
         ]
     return "\n".join(lines) + "\n"

@@ -271,21 +271,26 @@ def check_readable(path: Path) -> None:
         raise InputError(f"{path} does not exist; check the path.") from error
     except IsADirectoryError as error:
         raise InputError(f"{path} is a folder; name a file.") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {(error.strerror or str(error)).lower()}; name another file.") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{str(path)!r} cannot be read: {reason.lower()}; name another file.") from error
 
 
 def _check_kind(path: Path, attributes: Mapping[str, Any], kinds: Sequence[str]) -> None:
     wanted = " or ".join(kinds)
     if attributes.get("format") != FORMAT:
         raise InputError(f"{path} is HDF5, but was not written by aacmm; name a {wanted} file.")
+    for name in ("created", "command", "package_version", "kind"):
+        if not isinstance(attributes.get(name), str):
+            raise InputError(f"{path} lacks the attribute '{name}'; it is damaged or was edited, make it again.")
     version = attributes["format_version"]
     if version > FORMAT_VERSION:
         raise InputError(
             f"{path} has format version {version}, newer than this package reads ({FORMAT_VERSION}); update aacmm_jax."
         )
     if attributes["kind"] not in kinds:
-        raise InputError(f"{path} holds a {attributes['kind']}; name a {wanted} file.")
+        article = "an" if attributes["kind"][:1] in "aeiou" else "a"
+        raise InputError(f"{path} holds {article} {attributes['kind']}; name a {wanted} file.")
 
 
 def need(path: str | os.PathLike, names: Mapping[str, Any], *needed: str, of: str = "table") -> None:

@@ -60,6 +60,9 @@ def _acceptance(console: Console, summary: dict[str, Any]) -> None:
     """One row a figure, with its worst part; then what full procedures would need."""
     tests = summary["acceptance"]
     if not tests:
+        console.print(
+            "There is nothing here that an acceptance test looks at: no socket of several poses, no length, no sphere."
+        )
         return
     before = any(figure["as_found_mm"] is not None for test in tests for figure in test["figures"])
     limited = any(figure["limit_mm"] is not None for test in tests for figure in test["figures"])

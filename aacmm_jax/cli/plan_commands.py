@@ -143,15 +143,21 @@ def _procedure(
 
     if manifest is not None:
         _check_output(manifest, arm)
-        if manifest == output:
+        if manifest.resolve() == output.resolve():
             raise InputError(f"{output} is given for the plan and for the manifest; choose another for one of them.")
     found = _busy("Planning", lambda: acceptance_procedure(specification.arm, standard, **room))
     write_text(output, procedure_csv(found))
     written = str(output)
     if manifest is not None:
-        write_text(manifest, procedure_manifest(found, arm))
+        write_text(manifest, procedure_manifest(found, _arm_beside(manifest, arm)))
         written += f", {manifest}"
     return procedure_summary(found, specification.name) | {"written": written}
+
+
+def _arm_beside(manifest: Path, arm: str) -> str:
+    """An arm as a manifest names it: a shipped name as it is, a file from the manifest's folder."""
+    file = Path(arm)
+    return Path(os.path.relpath(file, manifest.parent)).as_posix() if file.is_file() else arm
 
 
 def _check_output(output: Path, arm: str) -> None:

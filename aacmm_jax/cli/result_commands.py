@@ -168,6 +168,9 @@ def export(
     """Write a calibrated arm for other programs."""
     if about is not None and form != "dcc":
         raise InputError("--about is for certificates; give it with --format dcc.")
+    for given in (calibration, about):
+        if output is not None and given is not None and output.exists() and given.exists() and output.samefile(given):
+            raise InputError(f"{output} is what the export is made from; choose another output.")
     from .. import storage
     from ..arm_files import specification_toml
     from ..calibration_files import load_calibration
