@@ -151,3 +151,18 @@ def read_about(path: str | os.PathLike) -> About:
     """Read the TOML file about a certificate: ``[laboratory]``, ``[customer]``, ``[item]``, ``[[person]]``, ``[certificate]``,
     ``[[reference]]``, ``[conformity]``. Raises `InputError` that names the file, the place in it and the mend."""
     return read_toml(path, About)
+
+
+def check_conformity(about: About, *, simulated: bool, decision: str | None = None, tested: bool = False) -> None:
+    """Refuse a statement of conformity that the data contradict: of a simulated arm, or other than what an evaluation decided."""
+    if about.conformity is None:
+        return
+    verdict = about.conformity.verdict
+    if simulated:
+        raise InputError("conformity is stated of a simulated arm, which conforms to nothing; leave [conformity] out.")
+    passes = {"pass": ("conforms",), "fail": ("fails",)}.get(verdict)
+    if tested and passes is not None and decision not in passes:
+        came = {"conforms": "every limit is kept", "fails": "a limit is not kept", "undecided": "a limit is undecided"}
+        raise InputError(
+            f"conformity.verdict is '{verdict}', but of this evaluation {came.get(decision or '', 'no limit was given')}; mend the statement."
+        )

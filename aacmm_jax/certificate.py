@@ -7,7 +7,7 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from .about import NOT_STATED, About, held_by_xml
+from .about import NOT_STATED, About, check_conformity, held_by_xml
 from .calibration_files import CalibrationRecord
 from .cautions import of_calibration, plausible
 from .certificate_results import add_results, uncertainty_says
@@ -43,13 +43,15 @@ def dcc(record: CalibrationRecord, about: About, *, created: str, sources: Seque
         raise InputError(
             f"k = {record.k:.6g} is the scale of no arm, so there is no certificate; mend the lengths and calibrate."
         )
+    check_conformity(about, simulated=record.recording.true is not None)
     _check_texts(record, sources, command)
     root = Element("dcc:digitalCalibrationCertificate")
     for name, value in (("xmlns:dcc", DCC), ("xmlns:si", SI), ("xmlns:xsi", XSI)):
         root.set(name, value)
     root.set("xsi:schemaLocation", f"{DCC} {DCC}/v{VERSION}/dcc.xsd")
     root.set("schemaVersion", VERSION)
-    identifier = _administrative(put(root, "administrativeData"), record, about, _day(created), sources)
+    day = _day(record.recording.measured or created)
+    identifier = _administrative(put(root, "administrativeData"), record, about, day, sources)
     add_results(put(root, "measurementResults"), record, about, command)
     identifier.text = about.certificate.number or str(uuid.uuid5(uuid.NAMESPACE_URL, written(root)))
     return written(root)

@@ -67,7 +67,8 @@ def _measurement(measurement: Element, record: CalibrationRecord, about: About, 
     results = put(measurement, "results")
     factor = uncertainty_of(record).factor(LEVEL)
     _repeatability(results, stage)
-    _lengths(results, lengths, stage, factor)
+    fixed = stage.name == "As left" and record.method == "two-stage" and len(lengths) == 1
+    _lengths(results, lengths, stage, factor, fixed)
     _parameters(results, record, stage, factor)
     if stage.name == "As left":
         _scale(results, record, factor)
@@ -149,7 +150,7 @@ def _length_name(number: int, length: ReferenceLength) -> str:
     return f"{number}: {length.start} - {length.end}"
 
 
-def _lengths(results: Element, lengths: Sequence[ReferenceLength], stage: _Stage, factor: float) -> None:
+def _lengths(results: Element, lengths: Sequence[ReferenceLength], stage: _Stage, factor: float, fixed: bool) -> None:
     data = _result(
         results,
         "Reference lengths",
@@ -160,11 +161,19 @@ def _lengths(results: Element, lengths: Sequence[ReferenceLength], stage: _Stage
     for number, (length, measured, error, error_u) in enumerate(zip(lengths, *columns, strict=True), start=1):
         row = put(data, "list")
         theirs(row, "name", _length_name(number, length))
-        for name, refers, value, u in (
+        entries = [
             ("calibrated value", "basic_referenceValue", length.value, float(length.u)),
             ("measured value", "basic_measuredValue", measured, math.nan),
             ("error", "basic_measurementError", error, float(error_u)),
-        ):
+        ]
+        if fixed:  # zero by construction: no measurement
+            ours(
+                row,
+                "description",
+                "This length fixed the scale, so that the arm measures it as calibrated by construction; no error was measured.",
+            )
+            entries = entries[:1]
+        for name, refers, value, u in entries:
             quantity = put(row, "quantity", refers=refers)
             ours(quantity, "name", name)
             if name == "calibrated value" and u == 0:
@@ -199,9 +208,12 @@ def _knowledge(record: CalibrationRecord, name: str, unchanged: bool) -> tuple[s
     if name not in record.names:
         return f"Not identified: held at its nominal value{'' if unchanged else ', and divided by k as all lengths are'}", None
     i = record.names.index(name)
-    if record.active[i]:
-        return f"On its {'lower' if record.active[i] < 0 else 'upper'} bound, so it has no uncertainty of its own", None
     u = float(np.sqrt(record.covariance[i, i]))
+    if record.active[i]:
+        bound = f"On its {'lower' if record.active[i] < 0 else 'upper'} bound"
+        if is_length(name) and record.method == "two-stage" and u > 0 and _is_known(u):  # such a length still follows k
+            return f"{bound} in stage 1; the uncertainty is that of k", u
+        return f"{bound}, so it has no uncertainty of its own", None
     if not (record.determined[i] and _is_known(u)):
         return "Determined only together with other parameters, so it has no uncertainty of its own", None
     return "", u

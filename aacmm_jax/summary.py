@@ -99,8 +99,10 @@ def tables(capture: Capture, evaluation: Evaluation) -> dict[str, Any]:
     lengths = zip(capture.lengths, *columns, strict=True)
     return {
         "sockets": [
-            {"socket": name, "poses": size, "de_mm": float(de), "deltam_mm": float(deltam), "rms_mm": float(rms)}
-            for name, size, de, deltam, rms in sockets
+            {"socket": name, "poses": size}
+            # One pose shows no scatter.
+            | dict(zip(("de_mm", "deltam_mm", "rms_mm"), map(float, spread) if size > 1 else (None,) * 3, strict=True))
+            for name, size, *spread in sockets
         ],
         "lengths": [
             {

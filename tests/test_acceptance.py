@@ -172,6 +172,36 @@ def test_limits_that_cannot_be_are_refused(texts, said):
     assert_refused(lambda: decision.read_limits(texts, acceptance.FIGURES), "--mpe", said)
 
 
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: aj.decide("a", 1, 0), "numbers of mm"),
+        (lambda: aj.decide(np.array([1.0, 2.0]), 1, 0), "numbers of mm"),
+        (lambda: aj.decide(math.nan, 1, 0), "not a number"),
+        (lambda: accept(Measured({"A": [[1, 2]]})), "'A'"),
+        (lambda: accept(Measured({"A": np.full((2, 3), 1e200)})), "beyond"),
+        (lambda: accept(Measured({"A": np.eye(3)}, (aj.ReferenceLength("A", "B", 1.0),))), "unknown socket 'B'"),
+        (lambda: accept(Measured({"A": np.eye(3)}), {"Deltam": "x"}), "limit of Deltam"),
+        (lambda: accept(Measured({"A": np.eye(3)}), {"Delta": 1.0}), "did you mean 'Deltam'"),
+        (lambda: accept(Measured({"A": np.eye(3)}), {"Deltam": aj.Limit(1, -1000)}), "divisor"),
+        (lambda: accept(Measured({"A": np.eye(3)}), u_test=-1), "standard uncertainty of the test"),
+        (lambda: accept(Measured({}, spheres=(aj.ProbedSphere("S", "probing", (PLACE + AXES,), math.nan),))), "sphere 'S'"),
+        (lambda: accept(Measured({}, spheres=(aj.ProbedSphere("S", "probe", (PLACE + AXES,), 25.0),))), "must be one of"),
+        (
+            lambda: accept(Measured({}, spheres=(aj.ProbedSphere("S", "probing", (AXES, AXES[:3]), 25.0),))),
+            "sphere 'S', group 2",
+        ),
+    ],
+)
+def test_what_cannot_be_tested_is_refused(call, said):
+    assert_refused(call, said)
+
+
+def test_a_plain_number_is_a_limit():
+    (test,) = accept(Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])}), {"Deltam": 0.04})
+    assert test.decision == "fails"
+
+
 def test_every_part_has_its_own_limit_and_the_worst_decides():
     sockets = {name: np.array([[x, 0.0, 0.0]]) for name, x in (("A", 0), ("B", 100.03), ("C", 1000.03))}
     lengths = (aj.ReferenceLength("A", "B", 100.0, 0.002), aj.ReferenceLength("A", "C", 1000.0, 0.002))
@@ -184,6 +214,53 @@ def test_every_part_has_its_own_limit_and_the_worst_decides():
     assert [part.decision for part in parts] == ["fails", "conforms"]
     assert found.decision == found.figures[0].decision == "fails"
     assert found.figures[0].worst.where == "A - B"
+
+
+def lengths_of(*entries):
+    """Points on a line, and lengths from the first: (error, u, calibrated value) each."""
+    sockets = {"O": np.zeros((1, 3))} | {
+        f"P{i}": np.array([[value + error, 0, 0]]) for i, (error, _, value) in enumerate(entries)
+    }
+    lengths = tuple(aj.ReferenceLength("O", f"P{i}", value, u) for i, (_, u, value) in enumerate(entries))
+    return Measured(sockets, lengths)
+
+
+@pytest.mark.parametrize(
+    ("entries", "limit", "where", "decision"),
+    [
+        # Without a limit the largest, whatever its uncertainty.
+        ([(0.030, 0.002, 100.0), (-0.029, 0.02, 200.0)], None, "O - P0", None),
+        ([(0.029, 0.002, 100.0), (-0.030, 0.02, 200.0)], None, "O - P1", None),
+        # What fails comes before what is undecided, even where that is nearer to failing by its U.
+        ([(0.050, 0.0005, 100.0), (0.040, 0.01, 200.0)], aj.Limit(0.04), "O - P0", "fails"),
+        # With limits that grow, the part farthest beyond its own.
+        ([(0.050, 0.0, 100.0), (0.055, 0.0, 1000.0)], aj.Limit(0.01, 40_000), "O - P0", "fails"),
+        ([(0.010, 0.0, 100.0), (0.030, 0.0, 1000.0)], aj.Limit(0.05), "O - P1", "conforms"),
+    ],
+)
+def test_the_worst_part_speaks_for_a_figure(entries, limit, where, decision):
+    (test,) = [
+        test for test in accept(lengths_of(*entries), {"E_Uni": limit} if limit else None) if test.title == "length error"
+    ]
+    assert (test.figures[0].worst.where, test.figures[0].decision) == (where, decision)
+    assert test.figures[0].value == pytest.approx(next(error for i, (error, *_) in enumerate(entries) if where == f"O - P{i}"))
+
+
+def test_names_of_sockets_change_no_limit():
+    """Limits follow the length itself, whatever the sockets are called."""
+    limit = {"E_Uni": aj.Limit(0.01, 10_000)}
+    for names in (("A", "B"), ("A, reading 1", "B"), ("A - B", "C"), ("A", "B - C, reading 2")):
+        sockets = dict(zip(names, (np.zeros((2, 3)), np.tile([500.04, 0, 0], (2, 1))), strict=True))
+        measured = Measured(sockets, (aj.ReferenceLength(*names, 500.0), aj.ReferenceLength(*names, 500.01)))
+        (test,) = [test for test in accept(measured, limit) if test.title == "length error"]
+        assert [part.limit for part in test.figures[0].parts] == pytest.approx([0.06, 0.06, 0.060001, 0.060001])
+
+
+@pytest.mark.parametrize("name", ["Length_Range", "Volumetric_2RMS", "Deltam"])
+def test_a_limit_that_grows_needs_a_length(name):
+    measured = lengths_of((0.01, 0.0, 100.0), (0.02, 0.0, 200.0))
+    measured = measured._replace(sockets={**measured.sockets, "S": PLACE + np.eye(3)})
+    assert_refused(lambda: accept(measured, {name: aj.Limit(1.0, 1000)}), name, "grows with a length")
 
 
 def test_uncertainties_of_figures_by_hand():
@@ -310,6 +387,44 @@ def test_reach_of_arms():
     assert aj.reach_of(bent).radius == pytest.approx(math.hypot(300, 250))
 
 
+def complete_volumetric(near: int, far: int) -> Measured:
+    entries = [(0.0, 0.0, 600.0 + 0.001 * i) for i in range(near)] + [(0.0, 0.0, 1300.0 + 0.001 * i) for i in range(far)]
+    return lengths_of(*entries)._replace(reach=acceptance.Reach(np.zeros(3), 1000.0))
+
+
+@pytest.mark.parametrize(("near", "far", "missing"), [(10, 10, 0), (15, 5, 0), (19, 1, 1), (9, 10, 1), (20, 0, 2)])
+def test_a_volumetric_test_needs_both_bars_often_enough(near, far, missing):
+    (test,) = [test for test in accept(complete_volumetric(near, far)) if test.title == "volumetric"]
+    assert len(test.missing) == missing, test.missing
+
+
+def test_lengths_between_the_same_sockets_are_one_position():
+    measured = complete_volumetric(10, 10)
+    twice = measured._replace(lengths=measured.lengths[:19] + measured.lengths[:1])
+    (test,) = [test for test in accept(twice) if test.title == "volumetric"]
+    assert "(19 are there)" in test.missing[0]
+
+
+def test_every_length_of_a_length_test_needs_its_three_readings(recorded):
+    if len(recorded.spheres) == 1:
+        pytest.skip("of ISO 10360-12 only")
+    whole = measured_by(recorded.nominal.arm, recorded)
+    complete = lambda measured: next(test for test in accept(measured) if test.title == "length error").missing == ()  # noqa: E731
+    assert complete(whole)
+    short = dict(whole.sockets) | {"bar1/01/a": whole.sockets["bar1/01/a"][:1]}
+    more = {name: np.repeat(points, 2, axis=0) for name, points in short.items() if name.startswith("bar2")}
+    assert not complete(whole._replace(sockets=short | more))  # more readings elsewhere do not make up for it
+
+
+@pytest.mark.parametrize("test", ["effective-diameter", "probing", "articulation"])
+def test_figures_that_could_not_fail_are_left_out(test):
+    """A sphere goes through four points exactly, and the sphere round one centre has no size."""
+    points = PLACE + 12.5 * AXES[[0, 1, 2, 4]]
+    found = accept(Measured({}, spheres=(aj.ProbedSphere("S", test, (points,), 25.0),)))
+    names = {figure.name for result in found for figure in result.figures}
+    assert names == {"effective-diameter": {"D_Eff"}, "probing": {"P_Size"}, "articulation": set()}[test]
+
+
 def test_a_limit_without_data_is_refused():
     sockets = {"A": PLACE + np.eye(3)}
     assert_refused(lambda: accept(Measured(sockets), {"P_Size": decision.Limit(0.1)}), "P_Size", "nothing to measure it on")
@@ -392,6 +507,7 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
         (('file = "sphere/touch.txt"', ""), "either file or files"),
         (('unit = "um"', 'unit = "um"\ncolumns = [1, 2, 4]'), "column 4"),
         (("reach = 1000", "reech = 1000"), "did you mean 'reach'"),
+        (("shoulder = [0, 0, 0]", ""), "reach and shoulder together"),
     ],
 )
 def test_wrong_manifests_of_points(tmp_path, change, said):
@@ -431,6 +547,77 @@ def test_an_evaluation_is_stored_whole(recorded, tmp_path):
     assert not names & used
 
 
+@pytest.fixture(scope="module")
+def calibrated(cheng):
+    """A calibration from sockets A and B of a recording with C besides."""
+    sockets = {"A": (400, 200, 300), "B": (700, 500, 500), "C": (-300, 600, 400)}
+    lengths = [("A", "B", 0.002), ("A", "C", 0.002)]
+    capture = aj.simulate(cheng.arm, sockets, poses={"A": 40, "B": 12, "C": 12}, lengths=lengths, encoder_arcsec=2.0, seed=1)
+    seen = capture.select(without="C")
+    space = aj.Parameters.free_of(cheng.arm)
+    result = aj.calibrate(cheng.arm, seen, aj.Bounds.around(cheng.arm, space, length=10.0, angle=0.0175))
+    return aj.record_of(result, aj.Recording(seen, cheng)), aj.Recording(capture, cheng)
+
+
+def test_only_what_was_not_seen_is_tested_with_the_uncertainty_that_is_stated(calibrated):
+    record, recording = calibrated
+    found = aj.evaluation_of(record, recording, u_test=0.01).acceptance()["calibrated"]
+    parts = {figure.name: figure.parts for test in found for figure in test.figures}
+    assert {part.where for part in parts["Deltam"]} == {"C"}
+    assert {part.where.partition(",")[0] for part in parts["E_Uni"]} == {"A - C"}
+    assert parts["Deltam"][0].expanded == pytest.approx(0.02)
+    assert parts["E_Uni"][0].expanded == pytest.approx(2 * math.hypot(0.002, 0.01))
+
+
+def test_sockets_that_share_poses_with_the_calibration_are_not_new(calibrated):
+    record, recording = calibrated
+    # C is new, B is known but for two poses that the calibration has not seen.
+    q = recording.capture.sockets
+    more = {"A": q["A"], "B": np.concatenate([q["B"], q["C"][:2] + 0.001]), "C": q["C"]}
+    evaluation = aj.evaluation_of(record, recording._replace(capture=aj.Capture(more, recording.capture.lengths)))
+    assert evaluation.used == {"A", "B"}
+    assert "B (12 of 14 poses)" in " ".join(evaluation.warnings)
+
+
+def test_what_makes_an_evaluation_doubtful_is_said_first(calibrated):
+    record, recording = calibrated
+    seen = aj.evaluation_of(record, record.recording, limits={"Deltam": aj.Limit(1.0)})
+    words = " ".join(seen.warnings)
+    assert "flatters" in words or "flatter it" in words
+    assert "Nothing was stated of the uncertainty of Deltam" in words
+    assert all(test.missing for test in seen.acceptance()["calibrated"])
+    failed = aj.evaluation_of(record._replace(converged=False, reason="It did not."), recording)
+    assert "The calibration failed" in failed.warnings[0]
+    simulated = aj.evaluation_of(record, recording._replace(true=recording.nominal))
+    assert "simulated" in simulated.warnings[0]
+
+
+def test_an_evaluation_of_points_is_stored_whole(tmp_path):
+    from aacmm_jax.points_evaluation import PointsRecord, load_points, save_points
+
+    spheres = (aj.ProbedSphere("S", "probing", (PLACE + 15.5 * AXES,), 31.0, 0.001, 0.0, 0.0002),)
+    measured = lengths_of((0.01, 0.001, 100.0))._replace(
+        spheres=spheres, reach=acceptance.Reach(np.ones(3), 900.0), measured="2026-01-31"
+    )
+    record = PointsRecord(measured, {"E_Uni": aj.Limit(0.02, 49)}, 0.001)
+    save_points(tmp_path / "points.h5", record)
+    again = load_points(tmp_path / "points.h5")
+    assert again.acceptance() == record.acceptance()
+    assert (again.limits, again.u_test, again.measured.measured) == (record.limits, record.u_test, "2026-01-31")
+    written = aj.write_report(tmp_path / "points.h5", tmp_path / "points.html")
+    assert written["verdict"].startswith("Every limit is kept")
+
+
+def test_bars_at_hand_are_planned_for(cheng):
+    procedure = acceptance_procedure(cheng.arm, "asme", bars=[1000.0, 500.5])
+    assert sorted({value for *_, value in procedure.lengths}) == [500.5, 1000.0]
+    assert len(procedure.left_out) == 2  # neither is within the ranges of the standard, for a reach of 1359 mm
+    for start, end, value in procedure.lengths:
+        ends = [next(item for item in procedure.sockets if item.name == name).points[0] for name in (start, end)]
+        assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(value, abs=1e-5)
+    assert_refused(lambda: acceptance_procedure(cheng.arm, "iso", bars=[500.0]), "takes 5")
+
+
 def test_an_arm_that_cannot_take_a_zone_goes_without_it():
     procedure = acceptance_procedure(aj.load_arm("iiwa14"), "asme")
     assert "0 to 20 %" in procedure.left_out[0]
@@ -452,3 +639,6 @@ def test_planned_poses_can_be_taken(cheng, standard):
         for item in procedure.touches:
             distances = np.linalg.norm(item.points - sphere.centre, axis=1)
             np.testing.assert_allclose(distances, (sphere.diameter + sphere.stylus) / 2, atol=1e-9)
+            # From outside: the probe points against the normal of the surface.
+            towards = np.asarray(cheng.arm.pose(item.q))[:, :3, :3] @ np.asarray(cheng.arm.probe)
+            assert np.all(np.sum(towards * (item.points - sphere.centre), axis=1) < 0)

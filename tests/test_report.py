@@ -146,6 +146,115 @@ def test_a_calibration_report_says_what_the_calibration_found(written):
     assert all(pose["points"][0] == [0, 0, 0] for pose in scene["poses"])
 
 
+def tables_of(report):
+    found = {}
+    for section in report.sections:
+        for block in section.blocks:
+            table = block.table if isinstance(block, parts.Chart) else block if isinstance(block, parts.Table) else None
+            if table is not None:
+                found[table.caption] = table
+    return found
+
+
+def test_numbers_of_a_report_stand_under_the_right_heading(written):
+    from aacmm_jax.report.calibration import calibration_report
+
+    record = written.record
+    tables = tables_of(calibration_report(record)[0])
+    evaluations, factor = record.evaluations(), aj.uncertainty_of(record).factor(0.95)
+    stages = {"as found": "nominal", "after stage 1": "stage1", "as left": "calibrated"}
+    figures = tables["Figures as found and as left [mm]"]
+    for heading, stage in stages.items():
+        cell = figures.rows[0][figures.columns.index(heading)]
+        assert cell.value == pytest.approx(float(evaluations[stage].repeatability.de))
+    parameters = tables["Parameters"]
+    u = np.sqrt(np.diag(record.covariance))
+    for row in parameters.rows:
+        i = record.names.index(row[0].text)
+        scale = 180 / math.pi if row[1].text == "deg" else 1.0
+        assert row[parameters.columns.index("as left")].value == pytest.approx(scale * record.vectors()["calibrated"][i])
+        if row[parameters.columns.index("U (95 %)")].value is not None:
+            assert row[parameters.columns.index("U (95 %)")].value == pytest.approx(scale * factor * u[i])
+    volume = aj.over_volume(aj.uncertainty_of(record))
+    rows = tables["Expanded uncertainty over the working volume [mm]"].rows
+    assert rows[1][3].value == pytest.approx(factor * volume.u_length.max())
+    places = tables["All places"]
+    np.testing.assert_allclose([row[4].value for row in places.rows], factor * volume.u_length)
+    assert (factor, u.max()) != (1.0, 0.0)
+
+
+def test_lengths_of_a_report_by_arm_and_with_expanded_uncertainty(written):
+    """The recording has two lengths, so that none is zero by construction."""
+    from aacmm_jax.report.calibration import calibration_report
+
+    recording = written.evaluation.recording
+    space = aj.Parameters(recording.nominal.arm, written.record.names)
+    bounds = aj.Bounds.around(recording.nominal.arm, space, length=10.0, angle=0.0175)
+    record = aj.record_of(aj.calibrate(recording.nominal.arm, recording.capture, bounds), recording)
+    table = tables_of(calibration_report(record)[0])["Reference lengths [mm]"]
+    factor, evaluations = aj.uncertainty_of(record).factor(0.95), record.evaluations()
+    for i, row in enumerate(table.rows):
+        cells = dict(zip(table.columns, row, strict=True))
+        for heading, stage in (("as found", "nominal"), ("after stage 1", "stage1"), ("as left", "calibrated")):
+            assert cells[heading].value == pytest.approx(float(evaluations[stage].error[i]))
+        assert cells["U of error"].value == pytest.approx(factor * float(evaluations["calibrated"].u[i]))
+
+
+def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
+    """A table of thousands of rows is cut, not written out cell by cell for minutes."""
+    from aacmm_jax.report.residuals import residual_chart
+
+    arm = written.record.calibrated.arm
+    q = np.tile(np.asarray(written.record.recording.capture.q), (120, 1)) + 1e-5 * np.random.default_rng(0).normal(
+        size=(120 * 52, 6)
+    )
+    capture = aj.Capture({"A": q[:6000], "B": q[6000:6001]})
+    chart = residual_chart("r", "R", capture, {"as left": aj.evaluate(arm, capture)}, mark=True)
+    assert chart.table is not None
+    assert len(chart.table.rows) == 1000
+    assert len(chart.figure["data"][0]["x"]) <= 2001
+    distances = np.asarray(aj.evaluate(arm, capture).distances)
+    assert chart.table.rows[0][2].value == pytest.approx(distances.max())
+
+
+def test_poses_alone_in_their_socket_show_no_scatter(written):
+    from aacmm_jax.report.residuals import residual_chart, socket_table
+
+    arm, q = written.record.calibrated.arm, written.record.recording.capture.q
+    capture = aj.Capture({"A": q[:10], "B": q[10:11]})
+    evaluation = aj.evaluate(arm, capture)
+    assert [cell.text for cell in socket_table(capture, evaluation).rows[1]][2:5] == ["–"] * 3
+    assert len(residual_chart("r", "R", capture, {"as left": evaluation}).figure["data"][0]["x"]) == 10
+    assert (
+        "no scatter"
+        in residual_chart("r", "R", aj.Capture({"B": q[:1]}), {"as left": aj.evaluate(arm, aj.Capture({"B": q[:1]}))}).words
+    )
+
+
+CONFORMITY = """
+[conformity]
+verdict = "{}"
+specification = "a specification"
+decision_rule = "a rule"
+"""
+
+
+def test_a_statement_that_the_file_contradicts_is_refused(written, tmp_path):
+    from aacmm_jax.points_evaluation import PointsRecord, save_points
+
+    (tmp_path / "pass.toml").write_text(CONFORMITY.format("pass"))
+    stated = aj.read_about(tmp_path / "pass.toml")
+    for kind in ("calibration", "evaluation"):
+        assert_refused(lambda kind=kind: write_report(written.folder / f"{kind}.h5", tmp_path / "r.html", stated), "simulated")
+    measured = aj.Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])})
+    save_points(tmp_path / "fails.h5", PointsRecord(measured, {"Deltam": aj.Limit(0.04)}, 0.001))
+    assert_refused(lambda: write_report(tmp_path / "fails.h5", tmp_path / "r.html", stated), "a limit is not kept")
+    save_points(tmp_path / "passes.h5", PointsRecord(measured, {"Deltam": aj.Limit(0.06)}, 0.001))
+    write_report(tmp_path / "passes.h5", tmp_path / "r.html", stated)
+    assert "pass: a specification; a rule" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert_refused(lambda: aj.dcc(written.record, stated, created="2026-01-31T00:00:00"), "simulated")
+
+
 def test_corners_of_an_arm_by_hand():
     from aacmm_jax.poses import corners
 

@@ -46,7 +46,7 @@ def compare(
         raise InputError(f"{files[0]} alone cannot be compared; name at least two calibrations.")
     _check_outputs(files, figure, csv)
     records = [load_calibration(file) for file in files]
-    created = [_created(file) for file in files]
+    created = [record.recording.measured or _created(file) for record, file in zip(records, files, strict=True)]
     labels = [str(file) for file in files]
     found = _busy("Comparing", lambda: _compared(records, created, labels, level, length_mm))
     summary: dict[str, Any] = compared_summary(found, labels, records[0].recording.nominal.name)
@@ -70,7 +70,15 @@ def _compared(records: list, created: list[str], labels: list[str], level: float
     from ..drift import Trend, compare, moment, trend
 
     if len(records) > 2:
-        return trend(records, created, level=level, length=length, labels=labels)
+        found = trend(records, created, level=level, length=length, labels=labels)
+        if list(found.order) != sorted(found.order):
+            caution = (
+                f"Ordered by their dates, not as they were named: {', '.join(labels[i] for i in found.order)}. The date is when poses were "
+                "measured, where the manifest states it, and else when the file was made."
+            )
+            first = found.drifts[0]
+            found = found._replace(drifts=(first._replace(cautions=(caution, *first.cautions)), *found.drifts[1:]))
+        return found
     drift = compare(*records, level=level, length=length, labels=labels)
     dates = tuple(moment(date) for date in created)
     if dates[1] < dates[0]:
@@ -96,3 +104,5 @@ def _check_outputs(files: list[Path], figure: Path | None, csv: Path | None) -> 
     for output in (figure, csv):
         if output is not None and output.exists() and any(file.exists() and output.samefile(file) for file in files):
             raise InputError(f"{output} is one of the calibrations; choose another output.")
+    if figure is not None and csv is not None and figure.resolve() == csv.resolve():
+        raise InputError(f"{figure} is given for the figure and for the table; choose another for one of them.")

@@ -52,7 +52,7 @@ def _parameters(console: Console, summary: dict[str, Any]) -> None:
             "um" if length else "arcsec",
             f"{fine * row['change']:+.{small}f}",
             "-" if expanded is None else f"{fine * expanded:.{small}f}",
-            row["without"] or ("[bold]* moved[/bold]" if row["moved"] else ""),
+            row["without"] or ("[bold]* beyond U[/bold]" if row["moved"] else ""),
         )
     console.print(table)
 
@@ -69,7 +69,7 @@ def _lengths(console: Console, summary: dict[str, Any]) -> None:
 def _trend(console: Console, rows: list[dict[str, Any]]) -> None:
     table = _table(
         "\nEach calibration against the first (whose own error all of them share)",
-        "", "calibration", "made", "moved", "p together", "RMS [mm]", "by chance [mm]", "largest [mm]", "mean [um/m]",
+        "", "calibration", "date", "beyond U", "p together", "RMS [mm]", "by chance [mm]", "largest [mm]", "mean [um/m]",
     )  # fmt: skip
     table.columns[1].justify = "left"
     for number, row in enumerate(rows, start=1):

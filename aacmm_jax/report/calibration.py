@@ -106,7 +106,8 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     held = ", ".join(record.held) or "nothing"
     hold = f" {record.hold} was held in stage 1 as well, since poses alone cannot tell the scale." if record.hold else ""
     words = f"{kind} Identified were {len(record.names)} parameters of {capture.joints} joints. Held at their nominal values: {held}.{hold}"
-    return Section("data", "What was calibrated, and from which data", [words, sockets, lengths])
+    traceable = "What the arm measures is traceable to the metre through these reference lengths alone, as far as their calibration certificates are."
+    return Section("data", "What was calibrated, and from which data", [words, sockets, lengths, traceable])
 
 
 def _found_and_left(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation]) -> Section:

@@ -1,13 +1,18 @@
 """The report of an evaluation: acceptance tests, and the arm on a capture as found and as left."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ..acceptance import FIGURES, AcceptanceTest, Figure
+from ..capture import ReferenceLength
+from ..decision import worst
 from ..evaluate import Evaluation, evaluate
 from ..evaluation_files import EvaluationRecord
-from ..evaluation_summary import evaluation_summary
+from ..evaluation_summary import evaluation_summary, points_summary
+from ..points_evaluation import PointsRecord
+from ..recording import ProbedSphere
 from . import charts
 from .parts import Arms, Cell, Chart, Report, Section, Table, number, shown, text
 from .residuals import figures_table, length_rows, residual_chart, socket_table
@@ -28,13 +33,20 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
     report = Report(
         title="Evaluation of " + (record.recording.nominal.name or "an arm"),
         subtitle=f"{sum(capture.sizes)} poses in {len(capture.names)} sockets, {len(capture.lengths)} reference lengths, "
-        f"{len(record.recording.spheres)} spheres",
+        f"{len(record.recording.spheres)} touched spheres",
         verdict=verdict,
         verdict_mark=mark,
         warnings=summary["warnings"] + [f"Over the limit: {sentence}" for sentence in summary["failed"]],
         facts=_facts(summary),
         sections=[
-            Section("acceptance", "Acceptance tests", _acceptance(record, tests, summary)),
+            Section(
+                "acceptance",
+                "Acceptance tests",
+                [
+                    *_acceptance(tests["calibrated"], summary["acceptance"], record.u_test),
+                    *_artefacts(capture.lengths, record.recording.spheres),
+                ],
+            ),
             Section("found-left", "As found and as left", _found_and_left(record, summary, evaluations)),
             *_lengths(record, tests["calibrated"], evaluations["calibrated"], evaluations["nominal"]),
             Section(
@@ -53,13 +65,19 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
     return report, summary
 
 
-def _verdict(summary: dict[str, Any]) -> tuple[str, str]:
+def overall(summary: dict[str, Any]) -> str | None:
+    """What all limits come to together: "fails", "undecided", "conforms"; None where there is none."""
     decisions = [figure["decision"] for test in summary["acceptance"] for figure in test["figures"] if figure["decision"]]
-    if "fails" in decisions or summary["failed"]:
+    return "fails" if summary["failed"] else worst(decisions) or ("conforms" if summary["kept"] else None)
+
+
+def _verdict(summary: dict[str, Any]) -> tuple[str, str]:
+    decision = overall(summary)
+    if decision == "fails":
         return "A limit is not kept", "bad"
-    if "undecided" in decisions:
+    if decision == "undecided":
         return "Undecided: the measurement is not certain enough for a limit", "unsure"
-    if decisions or summary["kept"]:
+    if decision == "conforms":
         incomplete = any(test["missing"] for test in summary["acceptance"] if test["decision"])
         words = "Every limit is kept" + ("; a procedure was not complete" if incomplete else "")
         return words, "unsure" if incomplete or summary["warnings"] else "good"
@@ -80,59 +98,116 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
     return facts
 
 
-def _decision(figure: Figure | dict[str, Any]) -> Cell:
-    decision = figure["decision"] if isinstance(figure, dict) else figure.decision
-    signs = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
-    return text(signs[decision], _MARKS[decision])
+_EDITIONS = {
+    "JJF 1408": "JJF 1408, as Cheng et al. 2018 use it",
+    "ASME B89.4.22": "ASME B89.4.22-2004",
+    "ISO 10360-12": "ISO 10360-12:2016",
+}
 
 
-def _acceptance(record: EvaluationRecord, tests: dict[str, list[AcceptanceTest]], summary: dict[str, Any]) -> list:
+def _acceptance(tests: list[AcceptanceTest], rows: list[dict[str, Any]], u_test: float) -> list:
+    """Every test as a table, what its full procedure would need besides, and the parts that its figures rest on."""
+    if not rows:
+        return ["There is nothing here that an acceptance test looks at: no socket of several poses, no length, no sphere."]
+    stated = (
+        f"{shown(1000 * u_test, 1)} µm of standard uncertainty were stated for seat, fixture and temperature"
+        if u_test
+        else "nothing was stated for seat, fixture and temperature"
+    )
     blocks: list = [
-        "Every figure is of single readings. U is what the tester brings (artefacts"
-        + (
-            f", and {shown(1000 * record.u_test, 1)} µm of standard uncertainty stated for seat, fixture and temperature"
-            if record.u_test
-            else ""
-        )
-        + "), with coverage factor 2. A figure conforms where |value| ≤ MPE − U, fails where |value| ≥ MPE + U, and is undecided between (ISO 14253-1)."
+        f"Every figure is of single readings. U is what the tester brings, with coverage factor 2: the artefacts' uncertainty; {stated}. The arm's own "
+        "scatter is what is tested (ISO 14253-5). A figure conforms where |value| ≤ MPE − U, fails where |value| ≥ MPE + U, and is undecided between "
+        "(ISO 14253-1, with U as guard band as in its editions up to 2013). What standards allow of repeating a reading is not applied, and how positions and "
+        "directions are spread is not checked. Procedures and formulas follow secondary sources of the editions named.",
     ]
-    if not summary["acceptance"]:
-        return ["The capture holds nothing that an acceptance test looks at."]
-    for test in summary["acceptance"]:
-        rows = [
-            [
-                text(figure["name"]),
-                text(FIGURES[figure["name"]]),
-                number(figure["as_found_mm"], mark="bad" if figure["as_found_decision"] == "fails" else ""),
-                number(figure["value_mm"]),
-                number(figure["expanded_mm"]),
-                number(figure["limit_mm"]),
-                _decision(figure),
-                text(figure["where"]),
-            ]
-            for figure in test["figures"]
-        ]
-        columns = ("figure", "what it is", "as found", "as left", "U", "MPE", "decision", "worst at")
-        blocks.append(Table(f"{test['standard']}: {test['title']} [mm]", columns, rows))
+    before = any(figure["as_found_mm"] is not None for test in rows for figure in test["figures"])
+    limited = any(figure["limit_mm"] is not None for test in rows for figure in test["figures"])
+    for test in rows:
+        columns = ["figure", "what it is"]
+        columns += (["as found"] + (["decision as found"] if limited else [])) if before else []
+        columns += (
+            ["as left" if before else "value", "U"]
+            + (["MPE", "decision as left" if before else "decision"] if limited else [])
+            + ["worst at"]
+        )
+        lines = []
+        for figure in test["figures"]:
+            line = [text(figure["name"]), text(FIGURES[figure["name"]])]
+            if before:
+                line += [number(figure["as_found_mm"])] + ([_sign(figure["as_found_decision"])] if limited else [])
+            line += [number(figure["value_mm"]), number(figure["expanded_mm"])]
+            line += (
+                [number(figure["limit_mm"]), _sign(figure["decision"], figure["failing"], len(figure["parts"]))]
+                if limited
+                else []
+            )
+            lines.append([*line, text(figure["where"])])
+        blocks.append(Table(f"{_EDITIONS[test['standard']]}: {test['title']} [mm]", tuple(columns), lines))
         if test["missing"]:
             blocks.append(f"This was not the full procedure; it also needs {'; '.join(test['missing'])}.")
     parts = [
         [
-            text(test.standard),
-            text(figure.name),
-            text(part.where),
-            number(part.value),
-            number(part.expanded),
-            number(part.limit),
+            *(text(word) for word in (test.standard, figure.name, part.where)),
+            *(number(value) for value in (part.value, part.expanded, part.limit)),
             _part(part.decision),
         ]
-        for test in tests["calibrated"]
+        for test in tests
         for figure in test.figures
         for part in figure.parts
+        if not limited or part.limit is not None
     ]
-    chart = _margins(tests["calibrated"])
-    behind = Table("Every part of every figure [mm]", ("standard", "figure", "at", "as left", "U", "MPE", "decision"), parts)
-    return [*blocks, chart._replace(table=behind)]
+    title = "Every part of every figure with a limit [mm]" if limited else "Every part of every figure [mm]"
+    behind = Table(title, ("standard", "figure", "at", "as left" if before else "value", "U", "MPE", "decision"), parts)
+    return [*blocks, _margins(tests)._replace(table=behind, printed=limited)]
+
+
+def _sign(decision: Any, failing: int = 0, of: int = 1) -> Cell:
+    signs = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
+    return text(signs[decision] + (f" ({failing} of {of})" if failing and of > 1 else ""), _MARKS[decision])
+
+
+def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSphere]) -> list:
+    """Bars and spheres that figures were measured on."""
+    bars: dict[tuple[float, float], int] = {}
+    for length in lengths:
+        key = (float(length.value), float(length.u))
+        bars[key] = bars.get(key, 0) + 1
+    rows = [
+        [text("length"), number(value), number(u), text(f"in {count} place{'' if count == 1 else 's'}")]
+        for (value, u), count in sorted(bars.items())
+    ]
+    rows += [
+        [
+            text(f"sphere '{sphere.name}' for {sphere.test.replace('-', ' ')}"),
+            number(sphere.diameter),
+            number(sphere.u),
+            text(
+                f"touched {'+'.join(str(len(group)) for group in sphere.groups)} times by a ball of {sphere.stylus:g} mm; form error {shown(sphere.form)} mm"
+            ),
+        ]
+        for sphere in spheres
+    ]
+    return [Table("Artefacts", ("artefact", "calibrated value [mm]", "u [mm]", "used"), rows)] if rows else []
+
+
+def points_report(record: PointsRecord) -> tuple[Report, dict[str, Any]]:
+    """The report of an evaluation of points, and the summary that it was made from."""
+    summary, tests = points_summary(record), record.acceptance()
+    verdict, mark = _verdict(summary)
+    chart = next((figure for test in tests for figure in test.figures if figure.name == "E_Uni"), None)
+    sections = [
+        Section(
+            "acceptance",
+            "Acceptance tests",
+            [
+                *_acceptance(tests, summary["acceptance"], record.u_test),
+                *_artefacts(record.measured.lengths, record.measured.spheres),
+            ],
+        ),
+        *([] if chart is None else [Section("lengths", "Lengths", [_length_chart(chart)])]),
+    ]
+    subtitle = f"{summary['points']} points as they were recorded: {summary['sockets']} sockets, {summary['lengths']} lengths, {summary['spheres']} spheres"
+    return Report("Acceptance test of points", subtitle, verdict, mark, summary["warnings"], [], sections), summary
 
 
 def _part(decision: Any) -> Cell:
@@ -142,10 +217,11 @@ def _part(decision: Any) -> Cell:
 def _margins(tests: list[AcceptanceTest]) -> Chart:
     """Every figure's worst value with U; where limits were given as a share of them."""
     figures = [figure for test in tests for figure in test.figures]
-    limited = [figure for figure in figures if figure.worst.limit]
+    limited = [figure for figure in figures if figure.worst.limit is not None]
     if limited:
-        shares = [abs(figure.value) / (figure.worst.limit or 1.0) for figure in limited]
-        bars = [figure.worst.expanded / (figure.worst.limit or 1.0) for figure in limited]
+        least = 1e-6  # mm: a limit of zero is drawn as this
+        shares = [abs(figure.value) / max(figure.worst.limit or 0.0, least) for figure in limited]
+        bars = [figure.worst.expanded / max(figure.worst.limit or 0.0, least) for figure in limited]
         words = "The value of each figure as a share of its limit, with U: it conforms where the whole bar lies below 1."
         y, shapes, shown_figures = "|value| / MPE", charts.horizontal([1.0], "solid"), limited
     else:
@@ -199,11 +275,12 @@ def _lengths(record: EvaluationRecord, tests: list[AcceptanceTest], left: Evalua
     ]
     columns = ("between", "value", "as found", "as left", "U of error")
     table = Table(
-        "Lengths between the centroids of their sockets [mm]",
+        "Lengths between the mean points of their sockets [mm]",
         columns,
         length_rows(rows, 2.0, {"as found": np.asarray(found.error)}),
     )
-    return [Section("lengths", "Lengths", [*blocks, table])]
+    note = "Means of all poses, for comparison; no acceptance test uses them. Their U (factor 2) also holds the scatter of the poses at both ends."
+    return [Section("lengths", "Lengths", [*blocks, table, note])]
 
 
 def _known(u: Any) -> float | None:

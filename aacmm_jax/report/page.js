@@ -22,8 +22,8 @@
     place.dataset.drawn = "yes";
   }
 
-  // Lists of files are folded on the screen, and open on paper.
-  const folded = () => [...document.querySelectorAll(".origin details:not([open])")];
+  // Lists of files, and the parts that decisions rest on, are folded on the screen and open on paper.
+  const folded = () => [...document.querySelectorAll(".origin details:not([open]), details[data-print]:not([open])")];
   let opened = [];
   window.addEventListener("beforeprint", () => { opened = folded(); for (const one of opened) one.open = true; });
   window.addEventListener("afterprint", () => { for (const one of opened) one.open = false; });

@@ -3,11 +3,14 @@
 import base64
 import hashlib
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from .. import storage
+from ..about import check_conformity
 from ..errors import InputError
+from ..evaluation_files import SIMULATED
 from .about import about_section
 from .parts import Arms, Chart, Report, Table
 
@@ -41,31 +44,64 @@ def write_report(source: str | os.PathLike, target: str | os.PathLike, about: An
 def report_of(source: Path, about: Any = None) -> tuple[str, Report]:
     """The page of a file, and the report that it shows."""
     stored = storage.read_tables(source, KINDS, without=("trials",))
-    kind = stored.attributes["kind"]
-    if kind == "calibration":
-        from ..calibration_files import load_calibration
-        from .calibration import calibration_report
-
-        report, _ = calibration_report(load_calibration(source))
-    elif kind == "evaluation":
-        from ..evaluation_files import load_evaluation
-        from .evaluation import evaluation_report
-
-        report, _ = evaluation_report(load_evaluation(source))
-    else:
-        from ..study.results import Results
-        from .study import study_report
-
-        report, _ = study_report(Results.of(source))
+    report, simulated, decision = _MAKERS[stored.attributes["kind"]](source, stored.attributes)
+    if simulated:
+        report = report._replace(
+            warnings=list(dict.fromkeys([SIMULATED, *report.warnings])), verdict_mark=_unsure(report.verdict_mark)
+        )
     if about is not None:
-        report = report._replace(sections=[about_section(about), *report.sections])
+        tested = stored.attributes["kind"] == "evaluation"
+        check_conformity(about, simulated=simulated, decision=decision, tested=tested)
+        report = report._replace(sections=[about_section(about, tested), *report.sections])
     return page_of(report, made_by(source, stored.attributes)), report
+
+
+def _unsure(mark: str) -> str:
+    return "bad" if mark == "bad" else "unsure"
+
+
+def _of_calibration(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+    from ..calibration_files import load_calibration
+    from .calibration import calibration_report
+
+    record = load_calibration(source)
+    return calibration_report(record)[0], record.recording.true is not None, None
+
+
+def _of_evaluation(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+    from .evaluation import evaluation_report, overall, points_report
+
+    if attributes.get("of") == "points":
+        from ..points_evaluation import load_points
+
+        report, summary = points_report(load_points(source))
+        return report, False, overall(summary)
+    from ..evaluation_files import load_evaluation
+
+    record = load_evaluation(source)
+    report, summary = evaluation_report(record)
+    return report, record.recording.true is not None, overall(summary)
+
+
+def _of_study(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+    from ..study.results import Results
+    from .study import study_report
+
+    return study_report(Results.of(source))[0], False, None
+
+
+_MAKERS: dict[str, Callable[[Path, dict[str, Any]], tuple[Report, bool, str | None]]] = {
+    "calibration": _of_calibration,
+    "evaluation": _of_evaluation,
+    "study": _of_study,
+}
 
 
 def made_by(source: Path, attributes: dict[str, Any]) -> list[tuple[str, list[str]]]:
     """How the file came about, and how to make it again."""
     return [
         ("File", [storage.fingerprint(source)]),
+        ("Measured on", [str(attributes.get("measured") or "not stated")]),
         ("Made on", [str(attributes["created"])]),
         ("Command", [str(attributes["command"])]),
         ("aacmm_jax", [str(attributes["package_version"])]),
@@ -95,6 +131,7 @@ def page_of(report: Report, origin: list[tuple[str, list[str]]]) -> str:
         scenes={block.id: block.data for block in blocks if isinstance(block, Arms)},
         style=(_FOLDER / "page.css").read_text(encoding="utf-8"),
         programs=programs,
+        mark=hashlib.sha256(repr(origin).encode()).hexdigest()[:12],
         hashes=[_hash(program) for program in programs],
     )
 

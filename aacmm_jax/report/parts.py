@@ -38,6 +38,7 @@ class Chart(NamedTuple):
     figure: dict[str, Any]
     table: Table | None = None
     height: int = 380
+    printed: bool = False  # whether the numbers behind it belong on paper too
 
 
 class Arms(NamedTuple):

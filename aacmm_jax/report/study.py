@@ -37,7 +37,11 @@ def study_report(results: Results) -> tuple[Report, dict[str, Any]]:
         title=f"Study {summary['name']}".strip() + f" of {summary['arm'] or 'an arm'}",
         subtitle=f"{summary['cells']} cell{'' if summary['cells'] == 1 else 's'} of {summary['trials']:,} simulated calibrations",
         verdict=f"{'Finished' if summary['finished'] else 'Not finished'}: {ran:,} trials run, {100 * share:.4g} % converged",
-        verdict_mark="good" if summary["finished"] and share > 0.999 and not warnings else "unsure",
+        verdict_mark="bad"
+        if ran and not converged
+        else "good"
+        if summary["finished"] and share > 0.999 and not warnings
+        else "unsure",
         warnings=warnings,
         facts=[
             (
@@ -65,7 +69,7 @@ def _warnings(summary: dict[str, Any]) -> list[str]:
     for cell in summary["results"]:
         if cell["trials_run"] and (cell["converged"]["value"] or 0.0) < 0.99:
             found.append(
-                f"Cell {cell['cell']}: only {100 * cell['converged']['value']:.3g} % of {cell['trials_run']} trials converged; its figures are of those."
+                f"Cell {cell['cell']}: only {100 * cell['converged']['value']:.3g} % of {cell['trials_run']} trials converged; its figures are of those, if any."
             )
         if (cell["truth_inside"]["value"] or 0.0) < 1.0 and cell["trials_run"]:
             found.append(
@@ -171,7 +175,7 @@ def _cell_axis(summary: dict[str, Any], places: list[int]) -> tuple[dict[str, An
     if not varied or len(places) > 16:
         return ({"dtick": 1} if len(places) <= 24 else {}), "cell"
     cells = {cell["cell"]: cell["factors"] for cell in summary["results"]}
-    ticks = [f"{place}<br>" + "<br>".join(charts.plain(_level(cells[place][name]))[:14] for name in varied) for place in places]
+    ticks = [f"{place}<br>" + "<br>".join(charts.plain(_level(cells[place][name])[:14]) for name in varied) for place in places]
     title = "cell, and under it " + ", ".join(charts.plain(name.split(".")[-1].replace("_", " ")) for name in varied)
     return {"tickvals": places, "ticktext": ticks, "tickangle": 0}, title
 
