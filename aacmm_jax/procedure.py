@@ -319,7 +319,7 @@ def record_procedure(
     for *_, value in procedure.lengths:  # one bar, one error
         drawn.setdefault(value, value + u_length * random.normal())
     lengths = [ReferenceLength(start, end, drawn[value], u_length) for start, end, value in procedure.lengths]
-    spheres = []
+    spheres, sizes = [], {}
     for sphere in procedure.spheres:
         of = {
             "effective-diameter": "effective diameter",
@@ -327,6 +327,6 @@ def record_procedure(
             "articulation": "articulated location",
         }
         groups = tuple(read(item, 0.0) for item in procedure.touches if item.test == of[sphere.test])
-        size = sphere.diameter + u_diameter * random.normal()
+        size = sizes.setdefault(sphere.name, sphere.diameter + u_diameter * random.normal())
         spheres.append(ProbedSphere(sphere.name, sphere.test, groups, size, u_diameter, sphere.stylus))
     return Recording(Capture(sockets, lengths), nominal, true, seed, tuple(spheres))

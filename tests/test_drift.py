@@ -211,6 +211,21 @@ def test_on_a_bound_or_held_there_is_no_uncertainty_of_change(old, new):
         assert rows["d_6"]["change"] == pytest.approx(float(pair[1].calibrated.arm.d[5] - pair[0].calibrated.arm.d[5]))
 
 
+def test_lengths_that_were_held_follow_the_scale(paper_arm, specification):
+    """After two stages a held length is divided by k too, so that its share of u(k) is in every length."""
+    space = aj.Parameters.free_of(paper_arm, held=("alpha_6", "a_6", "d_1", "theta_1", "probe_x", "probe_y", "a_2", "d_5"))
+    capture = aj.simulate(paper_arm, SOCKETS, poses={"A": 50, "B": 10}, lengths=[("A", "B", 0.05)], encoder_arcsec=2.0, seed=3)
+    record = aj.record_of(
+        aj.calibrate(paper_arm, capture, aj.Bounds.around(paper_arm, space)), Recording(capture, specification)
+    )
+    assert np.any(record.stretch)
+    found = compare(record, record, points=30).lengths
+    alone = aj.uncertainty_of(record).length(found.q, found.q_end)
+    np.testing.assert_allclose(found.u, math.sqrt(2) * np.asarray(alone), rtol=1e-9)
+    # One length of 583 mm with u = 0.05 mm dominates: every length is uncertain by nearly its share of that.
+    assert found.u_size == pytest.approx(math.sqrt(2) * record.u_k, rel=0.05)
+
+
 def test_lengths_are_those_of_the_two_arms(old, new):
     found = compare(old, new, points=50, length=250.0).lengths
     by = [

@@ -25,8 +25,19 @@ def test_python_runs(capsys, tmp_path, monkeypatch):
 
 
 def test_study_is_read(tmp_path):
-    (tmp_path / "study.toml").write_text(blocks("toml")[2])
+    (tmp_path / "study.toml").write_text(blocks("toml")[3])
     assert len(aj.read_study(tmp_path / "study.toml").cells) == 6
+
+
+def test_what_a_certificate_states_is_read(tmp_path):
+    (tmp_path / "laboratory.toml").write_text(blocks("toml")[2].replace("# conformity", "conformity"))
+    about = aj.read_about(tmp_path / "laboratory.toml")
+    # Every key that there is stands in the example.
+    stated = about.model_dump(exclude_unset=True)
+    for part, model in ((name, field.annotation) for name, field in type(about).model_fields.items()):
+        entry = stated[part][0] if isinstance(stated[part], list) else stated[part]
+        if part not in ("customer", "person", "reference", "conformity"):
+            assert set(entry) == set(model.model_fields), part
 
 
 def test_arm_file_is_read(tmp_path):
