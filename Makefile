@@ -16,10 +16,10 @@ demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
 
 test: .venv/.test
-	$(BIN)/python -m pytest -n auto --dist loadscope
+	$(BIN)/python -m pytest -n auto --dist loadscope --no-loadscope-reorder
 
 test-slow: .venv/.test
-	$(BIN)/python -m pytest -n auto --dist loadscope -m slow
+	$(BIN)/python -m pytest -n auto --dist loadscope --no-loadscope-reorder -m slow
 
 check: .venv/.dev
 	$(BIN)/ruff check .

@@ -73,3 +73,32 @@ def noisy_capture(paper_arm) -> "aj.Capture":
     return aj.simulate(
         paper_arm, sockets, poses={"A": 70, "B": 5}, lengths=[("A", "B", 0.002)], encoder_arcsec=2.0, seating=0.005, seed=5
     )
+
+
+# Modules that take longest, the longest first: started last, one of them would keep a single worker busy at the end.
+_LONGEST = [
+    "cli",
+    "study_trials",
+    "uncertainty",
+    "calibrate",
+    "report",
+    "study_store",
+    "solver",
+    "sampling",
+    "planning",
+    "drift",
+    "real_captures",
+    "readme",
+    "acceptance",
+    "observability",
+    "chain",
+    "study_results",
+    "batch",
+    "paper",
+]
+
+
+def pytest_collection_modifyitems(items):
+    """Modules in order of their length (with ``--no-loadscope-reorder``); within them nothing changes places."""
+    rank = {f"test_{name}": number for number, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))

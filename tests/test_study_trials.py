@@ -40,8 +40,8 @@ def hayati() -> "aj.Arm":
     [
         ("cheng2018-simulation", OFF),
         ("cheng2018-simulation", {"length_mm": 10.0, "angle_deg": 1.0}),
-        ("panda", OFF),
-        (hayati(), OFF),
+        pytest.param("panda", OFF, marks=pytest.mark.slow),
+        pytest.param(hayati(), OFF, marks=pytest.mark.slow),
     ],
     ids=["paper", "far off", "panda", "beta"],
 )
@@ -89,7 +89,9 @@ def test_deviations_have_their_distributions():
     assert np.abs(correlation - np.eye(15)).max() < 0.08
 
 
-@pytest.mark.parametrize("part", ["encoder_arcsec", "seating_mm", "resolution_arcsec", "eccentricity_arcsec"])
+@pytest.mark.parametrize(
+    "part", ["encoder_arcsec", "seating_mm", "resolution_arcsec", pytest.param("eccentricity_arcsec", marks=pytest.mark.slow)]
+)
 def test_noise_is_what_was_asked(part):
     """The same keys with and without one part of the noise differ by that part."""
     level = {"encoder_arcsec": 2.0, "seating_mm": 0.005, "resolution_arcsec": 20.0, "eccentricity_arcsec": 5.0}[part]
@@ -156,7 +158,7 @@ STUDIES = {
 }
 
 
-@pytest.fixture(scope="module", params=STUDIES)
+@pytest.fixture(scope="module", params=["two-stage", "joint", pytest.param("stage1", marks=pytest.mark.slow)])
 def whole(request):
     reference = {} if request.param == "stage1" else {"reference": REFERENCE}
     study = made(deviation=OFF, noise=NOISE, bounds={"length_mm": [3, 10]}, identification=STUDIES[request.param], **reference)

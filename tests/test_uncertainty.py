@@ -80,7 +80,10 @@ def test_weighted_solve_is_the_dense_generalised_least_squares(paper_arm, space,
     np.testing.assert_allclose(result.covariance / np.outer(u, u), covariance / np.outer(u, u), atol=0.02)
 
 
-@pytest.mark.parametrize(("method", "noise"), [("two-stage", None), ("joint", UNEVEN)], ids=["even", "weighted"])
+@pytest.mark.parametrize(
+    ("method", "noise"),
+    [pytest.param("two-stage", None, id="even", marks=pytest.mark.slow), pytest.param("joint", UNEVEN, id="weighted")],
+)
 def test_gains_are_derivatives_of_the_whole_calibration(paper_arm, space, bounds, method, noise):
     """What the propagation says of readings and lengths is what central differences of whole calibrations say."""
     pairs, poses = [("A", "B", 0.002), ("B", "C", 0.004)], {"A": 30, "B": 5, "C": 8}
@@ -122,7 +125,7 @@ def test_gains_are_derivatives_of_the_whole_calibration(paper_arm, space, bounds
     assert np.abs((mine - slopes) / np.abs(slopes).max(axis=0)).max() < 0.02
 
 
-@pytest.mark.parametrize("method", ["two-stage", "joint"])
+@pytest.mark.parametrize("method", [pytest.param("two-stage", marks=pytest.mark.slow), "joint"])
 def test_many_weighted_calibrations_equal_single_ones(paper_arm, bounds, capture, method):
     shifts = 1e-6 * np.random.default_rng(0).normal(size=(3, *capture.q.shape))
     readings = np.asarray(capture.q) + shifts
@@ -137,7 +140,18 @@ def test_many_weighted_calibrations_equal_single_ones(paper_arm, bounds, capture
         assert many.k[i] == pytest.approx(float(one.scale.value), abs=1e-13)
 
 
-def test_coverage(paper_arm, space, bounds):
+# Least share of the worst parameter; a share of 95 % of 400 scatters by 1.1 %: 3.8 of it for the worst of 21.
+@pytest.mark.parametrize(
+    ("noise", "form", "least", "most"),
+    [
+        (NOISE, "given", 0.91, 1.0),
+        (None, "estimated", 0.91, 1.0),
+        pytest.param(None, "common", 0.0, 0.91, marks=pytest.mark.slow),
+        pytest.param(None, "robust", 0.92, 1.0, marks=pytest.mark.slow),
+    ],
+    ids=["given", "estimated", "common", "robust"],
+)
+def test_coverage(paper_arm, space, bounds, noise, form, least, most):
     """400 simulated calibrations: 95 % intervals of noise given, or estimated from the residuals, hold the truth; a common variance does
     not (86 % for some), which is why it is not the default. The 10,000 trials of benchmarks/uncertainty.py are the sharp version."""
     pairs, poses = [("A", "B", 0.0)], {"A": 70, "B": 10}
@@ -159,13 +173,10 @@ def test_coverage(paper_arm, space, bounds):
         error, u = jax.jit(lambda rows: jax.lax.map(one, rows, batch_size=20))((jnp.asarray(readings), jnp.asarray(values)))
         return np.mean(np.abs(error) <= 1.97 * np.asarray(u), axis=0)
 
-    # A share of 95 % of 400 scatters by 1.1 %: 3.8 of it for the worst of 21.
-    for noise, form in ((NOISE, "given"), (None, "estimated")):
-        share = shares(noise, form)
-        assert share.min() > 0.91, (form, dict(zip(space.names, share, strict=True)))
+    share = shares(noise, form)
+    assert least < share.min() <= most, dict(zip(space.names, share, strict=True))
+    if form in ("given", "estimated"):
         assert 0.94 < share.mean() < 0.965
-    assert shares(None, "common").min() < 0.91
-    assert shares(None, "robust").min() > 0.92
 
 
 def test_tips_and_lengths(paper_arm, space, result):
