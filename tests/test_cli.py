@@ -135,6 +135,7 @@ def test_plan(aacmm, tmp_path):
     assert "Not looked at: obstacles" in " ".join(printed.split())
 
 
+@pytest.mark.slow
 def test_uncertainties_are_printed(aacmm):
     """Known noise, what the data determine, uncertainty over the volume; cross-validated where a length stood in two places."""
     aacmm(

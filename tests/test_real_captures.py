@@ -41,7 +41,8 @@ def manifest(shared, tmp_path):
     return write
 
 
-@pytest.mark.parametrize("name", CASES)
+# The one that is cross-validated takes half a minute.
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name == "panda_6" else ()) for name in CASES])
 def test_unseen_placements(aacmm, manifest, name):
     _, places, options, nominal, asked = CASES[name]
     manifest(name)
@@ -61,6 +62,7 @@ def test_unseen_placements(aacmm, manifest, name):
     assert after["length_error_mean_absolute_mm"] <= asked[1]
 
 
+@pytest.mark.slow
 def test_free_lengths_shrink_the_arm_and_the_result_says_so(aacmm, manifest):
     """Without a held length stage 1 shrinks this arm to 0.947 (the data's reference), with d_5 on its bound."""
     name = "panda_2_clean"

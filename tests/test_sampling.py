@@ -61,6 +61,7 @@ def test_monte_carlo_agrees_with_the_linear_result_and_is_stable(arm, sampled):
     assert np.all((sampled.low < sampled.estimate) & (sampled.estimate < sampled.high))
 
 
+@pytest.mark.slow
 def test_lengths_that_were_held_are_divided_too(arm, capture, bounds):
     """The scale fix divides every length, held ones (here most) too: what k is uncertain by is theirs as well."""
     result = aj.calibrate(arm, capture, bounds, noise=NOISE)
@@ -91,6 +92,7 @@ def test_monte_carlo_says_where_the_linear_result_fails(arm, capture, bounds):
     assert "d_5" in " ".join(sampled.sentences())
 
 
+@pytest.mark.slow
 def test_bootstrap_sees_the_noise(arm, bounds, capture):
     """Poses drawn with replacement scatter the result about as the noise does."""
     result = aj.calibrate(arm, capture, bounds, method="joint")
