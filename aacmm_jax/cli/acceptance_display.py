@@ -73,7 +73,7 @@ def _acceptance(console: Console, summary: dict[str, Any]) -> None:
     for test in tests:
         for figure in test["figures"]:
             cells = [_number(figure["as_found_mm"])] if before else []
-            cells += [_number(figure["value_mm"]), _number(figure["expanded_mm"])]
+            cells += [_number(figure["value_mm"]), _number(figure["expanded_mm"] or None)]
             if limited:
                 decision = figure["decision"]
                 count = (

@@ -135,7 +135,7 @@ def _acceptance(tests: list[AcceptanceTest], rows: list[dict[str, Any]], u_test:
             line = [text(figure["name"]), text(FIGURES[figure["name"]])]
             if before:
                 line += [number(figure["as_found_mm"])] + ([_sign(figure["as_found_decision"])] if limited else [])
-            line += [number(figure["value_mm"]), number(figure["expanded_mm"])]
+            line += [number(figure["value_mm"]), _expanded(figure["expanded_mm"])]
             line += (
                 [number(figure["limit_mm"]), _sign(figure["decision"], figure["failing"], len(figure["parts"]))]
                 if limited
@@ -148,7 +148,7 @@ def _acceptance(tests: list[AcceptanceTest], rows: list[dict[str, Any]], u_test:
     parts = [
         [
             *(text(word) for word in (test.standard, figure.name, part.where)),
-            *(number(value) for value in (part.value, part.expanded, part.limit)),
+            *(number(part.value), _expanded(part.expanded), number(part.limit)),
             _part(part.decision),
         ]
         for test in tests
@@ -159,6 +159,11 @@ def _acceptance(tests: list[AcceptanceTest], rows: list[dict[str, Any]], u_test:
     title = "Every part of every figure with a limit [mm]" if limited else "Every part of every figure [mm]"
     behind = Table(title, ("standard", "figure", "at", "as left" if before else "value", "U", "MPE", "decision"), parts)
     return [*blocks, _margins(tests)._replace(table=behind, printed=limited)]
+
+
+def _expanded(value: float) -> Cell:
+    """U, or that nothing was stated that it could be made of."""
+    return number(value) if value > 0 else text("not stated")
 
 
 def _sign(decision: Any, failing: int = 0, of: int = 1) -> Cell:
