@@ -71,7 +71,7 @@ def accept(measured: Measured, limits: Mapping[str, Limit | float] | None = None
     """
     measured = _checked(measured)
     u_test = _number(u_test, "the standard uncertainty of the test")
-    given = {name: _limit(name, limit) for name, limit in (limits or {}).items()}
+    given = checked_limits(limits or {})
     tests = [test for run in _TESTS if (test := run(measured, u_test)) is not None]
     if measured.seen:
         unseen = "sockets and lengths that the arm was not identified from"
@@ -111,15 +111,19 @@ def _number(value: float, what: str) -> float:
     return number
 
 
-def _limit(name: str, limit: Limit | float) -> Limit:
-    if name not in FIGURES:
-        raise InputError(f"there is no figure '{name}'{nearest(name, list(FIGURES))}")
-    fixed, divisor = limit if isinstance(limit, Limit) else (limit, math.inf)
-    if not divisor >= _LEAST_DIVISOR:
-        raise InputError(
-            f"the limit of {name} grows by the length over {divisor:g}; give a divisor of {_LEAST_DIVISOR:g} or more."
-        )
-    return Limit(_number(fixed, f"the limit of {name}"), divisor)
+def checked_limits(limits: Mapping[str, Limit | float]) -> dict[str, Limit]:
+    """Limits by the name of a figure, numbers made into `Limit`; `InputError` for what is no figure or no limit."""
+    found = {}
+    for name, limit in limits.items():
+        if name not in FIGURES:
+            raise InputError(f"there is no figure '{name}'{nearest(name, list(FIGURES))}")
+        fixed, divisor = limit if isinstance(limit, Limit) else (limit, math.inf)
+        if not divisor >= _LEAST_DIVISOR:
+            raise InputError(
+                f"the limit of {name} grows by the length over {divisor:g}; give a divisor of {_LEAST_DIVISOR:g} or more."
+            )
+        found[name] = Limit(_number(fixed, f"the limit of {name}"), divisor)
+    return found
 
 
 def _decided(figure: Figure, limits: Mapping[str, Limit]) -> Figure:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from . import storage
-from .acceptance import FIGURES, AcceptanceTest, Measured, accept, measured_by, unstated
+from .acceptance import FIGURES, AcceptanceTest, Measured, accept, checked_limits, measured_by, unstated
 from .arm import Arm
 from .calibration_files import CalibrationRecord
 from .capture_files import arm_table, recording_attributes, recording_of, recording_tables, specification_of
@@ -64,7 +64,7 @@ def evaluation_of(
     record: CalibrationRecord,
     recording: Recording,
     *,
-    limits: Mapping[str, Limit] | None = None,
+    limits: Mapping[str, Limit | float] | None = None,
     u_test: float = 0.0,
     maxima: Mapping[str, float] | None = None,
 ) -> EvaluationRecord:
@@ -93,7 +93,7 @@ def evaluation_of(
         record.calibrated,
         frozenset(used),
         tuple(warnings),
-        dict(limits or {}),
+        checked_limits(limits or {}),
         u_test,
         dict(maxima or {}),
     )
@@ -139,12 +139,13 @@ def save_evaluation(path: str | os.PathLike, record: EvaluationRecord) -> None:
     storage.write_tables(path, "evaluation", tables, attributes)
 
 
-def limit_table(limits: Mapping[str, Limit]) -> Table:
+def limit_table(limits: Mapping[str, Limit | float]) -> Table:
     """Limits by the name of a figure."""
+    checked = checked_limits(limits)
     columns = {
-        "figure": (list(limits), "", "figure of an acceptance test"),
-        "fixed": ([limit.fixed for limit in limits.values()], "mm", "MPE at length 0"),
-        "divisor": ([limit.divisor for limit in limits.values()], "1", "MPE grows by the length over this"),
+        "figure": (list(checked), "", "figure of an acceptance test"),
+        "fixed": ([limit.fixed for limit in checked.values()], "mm", "MPE at length 0"),
+        "divisor": ([limit.divisor for limit in checked.values()], "1", "MPE grows by the length over this"),
     }
     return Table({name: Variable(("figure",), *column) for name, column in columns.items()})
 

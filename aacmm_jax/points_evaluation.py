@@ -20,7 +20,7 @@ class PointsRecord(NamedTuple):
     """What an evaluation of points is of; its figures follow from that."""
 
     measured: Measured
-    limits: Mapping[str, Limit] = MappingProxyType({})
+    limits: Mapping[str, Limit | float] = MappingProxyType({})
     u_test: float = 0.0  # standard uncertainty that seat, fixture and temperature add, mm
 
     def acceptance(self) -> list[AcceptanceTest]:

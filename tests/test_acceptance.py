@@ -574,7 +574,10 @@ def test_sockets_that_share_poses_with_the_calibration_are_not_new(calibrated):
     # C is new, B is known but for two poses that the calibration has not seen.
     q = recording.capture.sockets
     more = {"A": q["A"], "B": np.concatenate([q["B"], q["C"][:2] + 0.001]), "C": q["C"]}
-    evaluation = aj.evaluation_of(record, recording._replace(capture=aj.Capture(more, recording.capture.lengths)))
+    evaluation = aj.evaluation_of(
+        record, recording._replace(capture=aj.Capture(more, recording.capture.lengths)), limits={"Deltam": 1.0}
+    )
+    assert evaluation.limits == {"Deltam": aj.Limit(1.0)}
     assert evaluation.used == {"A", "B"}
     assert "B (12 of 14 poses)" in " ".join(evaluation.warnings)
 
