@@ -160,7 +160,8 @@ def test_numbers_of_a_report_stand_under_the_right_heading(written):
     from aacmm_jax.report.calibration import calibration_report
 
     record = written.record
-    tables = tables_of(calibration_report(record)[0])
+    report = calibration_report(record)[0]
+    tables = tables_of(report)
     evaluations, factor = record.evaluations(), aj.uncertainty_of(record).factor(0.95)
     stages = {"as found": "nominal", "after stage 1": "stage1", "as left": "calibrated"}
     figures = tables["Figures as found and as left [mm]"]
@@ -180,7 +181,15 @@ def test_numbers_of_a_report_stand_under_the_right_heading(written):
     assert rows[1][3].value == pytest.approx(factor * volume.u_length.max())
     places = tables["All places"]
     np.testing.assert_allclose([row[4].value for row in places.rows], factor * volume.u_length)
-    assert (factor, u.max()) != (1.0, 0.0)
+    charts_by_id = {
+        block.id: block for section in report.sections for block in section.blocks if isinstance(block, parts.Chart)
+    }
+    np.testing.assert_allclose(charts_by_id["volume"].figure["data"][0]["marker"]["color"], factor * volume.u_length, rtol=1e-3)
+    change = charts_by_id["change-mm"].figure["data"][0]
+    i = record.names.index(change["x"][0])
+    vectors = record.vectors()
+    assert change["y"][0] == pytest.approx(vectors["calibrated"][i] - vectors["nominal"][i], rel=1e-5)
+    assert change["error_y"]["array"][0] == pytest.approx(factor * u[i], rel=1e-5)
 
 
 def test_lengths_of_a_report_by_arm_and_with_expanded_uncertainty(written):
