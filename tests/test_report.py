@@ -45,6 +45,7 @@ def written(tmp_path_factory):
     record = aj.record_of(aj.calibrate(nominal.arm, seen.capture, bounds), seen)
     aj.save_calibration(folder / "calibration.h5", record)
     evaluation = aj.evaluation_of(record, recording, limits={"Deltam": aj.Limit(5.0), "E_Uni": aj.Limit(1e-4)}, u_test=0.001)
+    evaluation = evaluation._replace(warnings=(*evaluation.warnings, f"Beware of {HOSTILE}"))
     aj.save_evaluation(folder / "evaluation.h5", evaluation)
     aj.run_study(aj.make_study(**{**STUDY, "arm": nominal.arm}), folder / "study.h5")
     pages = {kind: folder / f"{kind}.html" for kind in ("calibration", "evaluation", "study")}
@@ -89,6 +90,8 @@ def test_text_of_people_never_becomes_markup(page):
     assert "img" not in tags
     assert tags.count("script") == 4  # two of data, Plotly, the page's own
     assert not [attributes for _, attributes in page.elements if any(name.startswith("on") for name in attributes)]
+    if page.kind == "evaluation":
+        assert f"Beware of {HOSTILE}" in page.text
     if page.kind != "study":  # a study knows its arm by the name that its maker gave in Python: none
         assert HOSTILE in page.text
     for name in ("charts", "scenes"):
