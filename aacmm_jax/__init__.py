@@ -78,7 +78,7 @@ _LATER = {
     "Limit": "decision",
     "fit_sphere": "spheres",
     "enclosing_sphere": "spheres",
-    "reach_of": "volume",
+    "reach_of": "reach",
     "read_points": "points_files",
     "acceptance_procedure": "procedure",
     "record_procedure": "procedure",
@@ -128,6 +128,7 @@ if _typing.TYPE_CHECKING:
     from .points_files import read_points as read_points
     from .procedure import acceptance_procedure as acceptance_procedure
     from .procedure import record_procedure as record_procedure
+    from .reach import reach_of as reach_of
     from .report import write_report as write_report
     from .sampling import Sampled as Sampled
     from .sampling import bootstrap as bootstrap
@@ -142,7 +143,6 @@ if _typing.TYPE_CHECKING:
     from .study.study import Study as Study
     from .study.study import make_study as make_study
     from .validation import cross_validate as cross_validate
-    from .volume import reach_of as reach_of
 else:
 
     def __getattr__(name: str):

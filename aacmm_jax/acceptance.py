@@ -28,10 +28,10 @@ from .arm import Arm
 from .capture import ReferenceLength
 from .decision import Limit, decide
 from .errors import InputError, nearest
+from .reach import Reach as Reach
+from .reach import reach_of
 from .recording import ProbedSphere, Recording, checked_sphere
 from .spheres import points_of
-from .volume import Reach as Reach
-from .volume import reach_of
 
 FACTOR = 2.0  # coverage factor of the expanded uncertainties
 ZONES = ((0.0, 0.2), (0.2, 0.8), (0.8, 1.0))  # of the reach

@@ -10,13 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .arrays import Numbers
+from .arrays import Numbers, as_floats
 from .capture import ReferenceLength
 from .decision import Decision, worst
 from .errors import InputError
+from .reach import Reach
 from .recording import ProbedSphere
 from .spheres import enclosing_sphere, fit_sphere, points_of
-from .volume import Reach
 
 FIGURES = {
     "Deltam": "largest half range of a coordinate in a socket",
@@ -132,7 +132,9 @@ def spat(points: Numbers) -> tuple[float, float]:
 
 def two_rms(deviations: Numbers) -> float:
     """Twice the root mean square of deviations from the calibrated values, mm (ASME B89.4.22; Cheng et al. 2018, section 4.4)."""
-    given = np.asarray(deviations, dtype=float)
+    given = np.asarray(as_floats(deviations, "deviations"))
+    if not given.size:
+        raise InputError("there are no deviations, so they have no root mean square; measure some.")
     return 2 * math.sqrt(float(np.mean(given**2)))
 
 

@@ -51,6 +51,11 @@ class CalibrationRecord(NamedTuple):
     sampled: Mapping[str, np.ndarray] | None = None
     sampled_says: str | None = None
 
+    @property
+    def fixed_by_one_length(self) -> bool:
+        """Whether a single length fixed the scale exactly, so that its own error as left is zero by construction: no measurement."""
+        return self.method == "two-stage" and len(self.recording.capture.lengths) == 1
+
     def vectors(self) -> dict[str, np.ndarray]:
         """Free parameters of the nominal arm, after stage 1, and calibrated; and of the true arm of a simulation."""
         space = Parameters(self.recording.nominal.arm, self.names)

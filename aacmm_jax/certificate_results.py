@@ -67,7 +67,7 @@ def _measurement(measurement: Element, record: CalibrationRecord, about: About, 
     results = put(measurement, "results")
     factor = uncertainty_of(record).factor(LEVEL)
     _repeatability(results, stage)
-    fixed = stage.name == "As left" and record.method == "two-stage" and len(lengths) == 1
+    fixed = stage.name == "As left" and record.fixed_by_one_length
     _lengths(results, lengths, stage, factor, fixed)
     _parameters(results, record, stage, factor)
     if stage.name == "As left":

@@ -41,10 +41,19 @@ class _Angles(_Strict):
         return self
 
 
-class _Socket(_Strict):
-    name: str | None = None
+class _Files(_Strict):
+    """What is recorded in one file, or in several."""
+
     file: str | None = None
     files: Annotated[list[str], Field(min_length=1)] | None = None
+
+    @property
+    def paths(self) -> list[str]:
+        return [self.file] if self.file is not None else list(self.files or ())
+
+
+class _Socket(_Files):
+    name: str | None = None
 
     @model_validator(mode="after")
     def _one(self) -> "_Socket":
@@ -54,10 +63,6 @@ class _Socket(_Strict):
             raise ValueError("a socket of several files needs a name.")
         return self
 
-    @property
-    def paths(self) -> list[str]:
-        return [self.file] if self.file is not None else list(self.files or ())
-
 
 class _Length(_Strict):
     start: str = Field(alias="from")
@@ -66,11 +71,9 @@ class _Length(_Strict):
     u: NonNegativeFloat = 0.0
 
 
-class _Sphere(_Strict):
+class _Sphere(_Files):
     name: str
     test: SphereTest
-    file: str | None = None
-    files: Annotated[list[str], Field(min_length=1)] | None = None
     diameter: PositiveFloat
     u: NonNegativeFloat = 0.0
     stylus: NonNegativeFloat = 0.0
@@ -81,10 +84,6 @@ class _Sphere(_Strict):
         if (self.file is None) == (self.files is None):
             raise ValueError("a sphere needs either file or files (one for each repeat, or orientation).")
         return self
-
-    @property
-    def paths(self) -> list[str]:
-        return [self.file] if self.file is not None else list(self.files or ())
 
 
 class _Points(_Strict):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +50,30 @@ class Place(NamedTuple):
     u: tuple[float, ...]
 
 
-def poses_at(scene: Scene, points: Float[np.ndarray, "s 3"], each: int) -> tuple[np.ndarray, np.ndarray]:
+class Room(Protocol):
+    """Where poses may be: of a `Scene`, or of whoever else looks for poses."""
+
+    @property
+    def arm(self) -> Arm:
+        """The arm."""
+        ...
+
+    @property
+    def limits(self) -> Float[np.ndarray, "n 2"]:
+        """Lowest and highest reading of each joint, rad."""
+        ...
+
+    @property
+    def above(self) -> float:
+        """Height below which no joint and no tip comes, mm."""
+        ...
+
+    def draw(self, count: int) -> Float[np.ndarray, "c n"]:
+        """Poses at random within the limits."""
+        ...
+
+
+def poses_at(scene: Room, points: Float[np.ndarray, "s 3"], each: int) -> tuple[np.ndarray, np.ndarray]:
     """Poses from ``each`` random starts for each socket that arrived within the limits, and the socket of each."""
     owner = np.repeat(np.arange(len(points)), each)
     q, arrived = moved_onto(scene.arm, scene.draw(len(owner)), points[owner], scene.limits)

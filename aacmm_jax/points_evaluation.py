@@ -11,9 +11,9 @@ from . import storage
 from .acceptance import AcceptanceTest, Measured, accept
 from .capture_files import lengths_of, reference_table, sphere_table, spheres_of
 from .decision import Limit
-from .evaluation_files import bare_warning, limit_table, limits_in
+from .evaluation_files import limit_table, limits_in
+from .reach import Reach
 from .storage import Table, Variable
-from .volume import Reach
 
 
 class PointsRecord(NamedTuple):
@@ -26,10 +26,6 @@ class PointsRecord(NamedTuple):
     def acceptance(self) -> list[AcceptanceTest]:
         """Every test that the points allow."""
         return accept(self.measured, self.limits, self.u_test)
-
-    def warnings(self) -> list[str]:
-        """What should be read before the figures."""
-        return bare_warning(self.acceptance())
 
 
 def save_points(path: str | os.PathLike, record: PointsRecord) -> None:

@@ -9,8 +9,8 @@ from . import storage
 from .acceptance import Measured
 from .errors import InputError, nearest
 from .manifest import PointsManifest, recorded
+from .reach import Reach
 from .toml import read_toml
-from .volume import Reach
 
 _UNITS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "inch": 25.4}
 

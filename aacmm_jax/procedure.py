@@ -13,17 +13,25 @@ from .capture import Capture, ReferenceLength
 from .errors import InputError
 from .independence import moved_onto
 from .noise import ARCSEC
-from .placing import lowest
+from .placing import lowest, poses_at
+from .reach import Reach, reach_of
 from .recording import ArmSpecification, ProbedSphere, Recording, SphereTest
 from .simulate import limits_of
 from .uncertainty import check_lengths
-from .volume import Reach, reach_of
 
 Standard = Literal["asme", "iso"]
 _TRIED, _STARTS, _LOOKED_AT = 16, 48, 6000
 _LONGEST_SHARE = 0.68  # of the range, a little over the 66 % that ISO 10360-12 asks for
 # Rings of touched points on the upper half of a sphere: elevation in degrees, how many.
 _RINGS = {25: ((90, 1), (67.5, 4), (45, 8), (22.5, 4), (0, 8)), 9: ((90, 1), (45, 4), (0, 4)), 5: ((90, 1), (10, 4))}
+
+
+# What an item with touches is for, as it is called and as a manifest calls it.
+TOUCHED: dict[str, SphereTest] = {
+    "effective diameter": "effective-diameter",
+    "probing size and form": "probing",
+    "articulated location": "articulation",
+}
 
 
 class Item(NamedTuple):
@@ -79,7 +87,8 @@ def acceptance_procedure(
     ("iso": probing, articulated location, length error), as `acceptance` describes them.
 
     Joints stay ``margin`` (rad) from their limits, and no joint and no tip comes below ``above`` (mm, base frame). ``diameter`` of the sphere and
-    ``stylus`` of the probe's ball are in mm. ``bars``: the lengths at hand, mm: two for "asme", five for "iso" (default: fitting ones). Raises `InputError` where the arm cannot take such a test.
+    ``stylus`` of the probe's ball are in mm. ``bars``: the lengths at hand, mm: two for "asme", five for "iso" (default: fitting ones).
+    Raises `InputError` where the arm cannot take such a test; a zone that it cannot reach is left out, and said.
     """
     if standard not in ("asme", "iso"):
         raise InputError(f"acceptance is '{standard}'; it must be asme or iso.")
@@ -143,14 +152,8 @@ class _Room(NamedTuple):
     random: np.random.Generator
 
     def draw(self, count: int) -> Float[np.ndarray, "c n"]:
+        """Poses at random within the limits."""
         return self.random.uniform(self.limits[:, 0], self.limits[:, 1], (count, self.arm.joints))
-
-    def poses(self, points: Float[np.ndarray, "s 3"], each: int) -> tuple[np.ndarray, Int[np.ndarray, " c"]]:
-        """Poses that reach points, from random starts, and the point of each."""
-        owner = np.repeat(np.arange(len(points)), each)
-        q, arrived = moved_onto(self.arm, self.draw(len(owner)), points[owner], self.limits)
-        good = arrived & (lowest(self.arm, q) >= self.above)
-        return q[good], owner[good]
 
     def place(self, zone: tuple[float, float]) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "c n"]]:
         """A point in a zone of the reach that is reached in many poses, and these."""
@@ -162,7 +165,7 @@ class _Room(NamedTuple):
         inside = inside[np.argsort(off)[: 4 * _TRIED]]
         points = inside[self.random.permutation(len(inside))[:_TRIED]]
         if len(points):
-            q, owner = self.poses(points, _STARTS)
+            q, owner = poses_at(self, points, _STARTS)
             counts = np.bincount(owner, minlength=len(points))
             if counts.max() >= SPAT_POSES:
                 best = int(counts.argmax())
@@ -240,7 +243,7 @@ def _bars(room: _Room, name: str, length: float, positions: int, repeats: int, t
         for label, q, tip in zip(labels, (start, end), tips, strict=True):
             poses = q[row : row + 1]
             if repeats > 1:
-                others, _ = room.poses(tip[row : row + 1], _STARTS)
+                others, _ = poses_at(room, tip[row : row + 1], _STARTS)
                 poses = np.concatenate([poses, others])
                 poses = poses[_spread(poses, repeats)] if len(poses) >= repeats else np.resize(poses, (repeats, poses.shape[1]))
             items.append(Item(test, label, 1, np.tile(tip[row], (len(poses), 1)), poses))
@@ -262,7 +265,7 @@ def _touched(room: _Room, sphere: Artefact, test: str, count: int, number: int, 
     """Poses that touch a sphere from outside; for an orientation all with the probe in about one direction of its own."""
     normals = _pattern(count)
     points = sphere.centre + (sphere.diameter + sphere.stylus) / 2 * normals
-    q, owner = room.poses(points, 3 * _STARTS)
+    q, owner = poses_at(room, points, 3 * _STARTS)
     towards = np.asarray(room.arm.pose(q))[:, :3, :3] @ np.asarray(room.arm.probe)
     size = np.linalg.norm(towards, axis=1, keepdims=True)
     towards = np.divide(towards, size, out=np.zeros_like(towards), where=size > 0)
@@ -321,12 +324,7 @@ def record_procedure(
     lengths = [ReferenceLength(start, end, drawn[value], u_length) for start, end, value in procedure.lengths]
     spheres, sizes = [], {}
     for sphere in procedure.spheres:
-        of = {
-            "effective-diameter": "effective diameter",
-            "probing": "probing size and form",
-            "articulation": "articulated location",
-        }
-        groups = tuple(read(item, 0.0) for item in procedure.touches if item.test == of[sphere.test])
+        groups = tuple(read(item, 0.0) for item in procedure.touches if TOUCHED[item.test] == sphere.test)
         size = sizes.setdefault(sphere.name, sphere.diameter + u_diameter * random.normal())
         spheres.append(ProbedSphere(sphere.name, sphere.test, groups, size, u_diameter, sphere.stylus))
     return Recording(Capture(sockets, lengths), nominal, true, seed, tuple(spheres))

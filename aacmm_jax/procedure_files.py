@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .procedure import Item, Procedure
+from .procedure import TOUCHED, Item, Procedure
 
 TITLES = {"asme": "ASME B89.4.22", "iso": "ISO 10360-12"}
 _DIRECTION = ("probe_direction_x", "probe_direction_y", "probe_direction_z")  # the last frame's z axis
@@ -30,7 +30,7 @@ def procedure_csv(procedure: Procedure) -> str:
 
 def file_of(procedure: Procedure, item: Item) -> str:
     """The file that a manifest of `procedure_manifest` expects an item's readings in."""
-    if item.test not in _TESTS:
+    if item.test not in TOUCHED:
         return f"{item.name}.csv"
     several = sum(other.test == item.test for other in procedure.touches) > 1
     return f"{item.name}/{item.test.replace(' ', '-')}" + (f"-{item.group}" if several else "") + ".csv"
@@ -63,7 +63,7 @@ def procedure_manifest(procedure: Procedure, arm: str) -> str:
                 "u = 0.002   # mm: its standard uncertainty",
             ]
     for sphere in procedure.spheres:
-        of = [item for item in procedure.touches if item.name == sphere.name and _TESTS[item.test] == sphere.test]
+        of = [item for item in procedure.touches if item.name == sphere.name and TOUCHED[item.test] == sphere.test]
         files = ", ".join(_quoted(file_of(procedure, item)) for item in of)
         lines += ["", "[[sphere]]", f"name = {_quoted(sphere.name)}", f"test = {_quoted(sphere.test)}", f"files = [{files}]"]
         lines += [
@@ -75,13 +75,6 @@ def procedure_manifest(procedure: Procedure, arm: str) -> str:
             "form = 0.0   # mm: its calibrated form error",
         ]
     return "\n".join(lines) + "\n"
-
-
-_TESTS = {
-    "effective diameter": "effective-diameter",
-    "probing size and form": "probing",
-    "articulated location": "articulation",
-}
 
 
 def _quoted(text: str) -> str:

@@ -149,6 +149,7 @@ def calibration_summary(
         "sockets_used": list(record.recording.capture.names),
         "scale_k": record.k,
         "scale_u": record.u_k,
+        "fixed_by_one_length": record.fixed_by_one_length,
         "held": list(record.held),
         "hold": record.hold,
         "active_stage1": active_names_of(record, record.active_stage1),

@@ -13,7 +13,7 @@ FLOORS = tuple(
     arrays storage toml
     chain arm parameters capture recording arm_files manifest capture_files noise simulate independence
     metrics steps weights residuals solver
-    covariance scale propagation observability checks results evaluate calibrate lanes batch calibration_files uncertainty sampling validation exchange placing refining planning plan_files volume poses spheres decision acceptance_figures acceptance procedure procedure_files points_files evaluation_files points_evaluation about differences drift
+    covariance scale propagation observability checks results evaluate calibrate lanes batch calibration_files uncertainty sampling validation exchange placing refining planning plan_files reach poses spheres decision acceptance_figures acceptance procedure procedure_files points_files evaluation_files points_evaluation about differences drift
     cautions summary evaluation_summary figures demo study certificate certificate_results dcc_xml drift_summary drift_figure plot
     cli report
     """.strip().splitlines()

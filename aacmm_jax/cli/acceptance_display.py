@@ -5,7 +5,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from .display import _console, _lengths, _number, _stages, _table, _warnings, _written
+from .display import _console, _lengths, _number, _stages, _table, _verdicts, _warnings, _written
 
 _STYLES = {"conforms": "green", "fails": "red", "undecided": "yellow", None: "default"}
 
@@ -27,10 +27,7 @@ def evaluation(summary: dict[str, Any]) -> None:
         console.print(table)
         if part["lengths"]:
             _lengths(console, part["lengths"])
-    for sentence in summary["kept"]:
-        console.print(f"[green]Passed:[/green] {sentence}")
-    for sentence in summary["failed"]:
-        console.print(f"[red]Failed:[/red] {sentence}")
+    _verdicts(console, summary)
     _acceptance(console, summary)
     _written(console, summary)
 

@@ -6,7 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from .display import _ARCSEC, _console, _number, _table, _warnings, _written
+from .display import _ARCSEC, _console, _number, _table, _verdicts, _warnings, _written
 
 _COLUMNS = 9  # calibrations beside each other
 
@@ -26,10 +26,7 @@ def comparison(summary: dict[str, Any]) -> None:
     if len(summary["trend"]) > 2:
         _trend(console, summary["trend"])
         _changes(console, summary["trend"])
-    for sentence in summary["kept"]:
-        console.print(f"[green]Passed:[/green] {escape(sentence)}")
-    for sentence in summary["failed"]:
-        console.print(f"[red]Failed:[/red] {escape(sentence)}")
+    _verdicts(console, summary)
     _written(console, summary)
 
 

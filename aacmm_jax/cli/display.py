@@ -102,19 +102,14 @@ def calibration(summary: dict[str, Any]) -> None:
     _warnings(console, summary)
     _validated(console, summary["cross_validation"])
     stages = ("nominal", "stage1", "calibrated")
-    _stages(console, "\nOn the poses it was identified from [mm]", summary, stages, fitted=fixed_scale(summary))
+    _stages(console, "\nOn the poses it was identified from [mm]", summary, stages, fitted=summary["fixed_by_one_length"])
     if "truth" in summary:
         _truth(console, summary["truth"])
     _parameters(console, summary["parameters"])
     if summary["lengths"]:
-        _lengths(console, summary["lengths"], fitted=fixed_scale(summary))
+        _lengths(console, summary["lengths"], fitted=summary["fixed_by_one_length"])
     _uncertainty(console, summary)
     _written(console, summary)
-
-
-def fixed_scale(summary: dict[str, Any]) -> bool:
-    """Whether a single length fixed the scale exactly, so that its own error is zero by construction."""
-    return summary["method"] == "two-stage" and len(summary["lengths"]) == 1
 
 
 def _validated(console: Console, found: dict[str, Any] | None) -> None:
@@ -246,6 +241,14 @@ def _lengths(console: Console, rows: list[dict[str, Any]], *, fitted: bool = Fal
             _number(row["error_u_mm"]),
         )
     console.print(table)
+
+
+def _verdicts(console: Console, summary: dict[str, Any]) -> None:
+    """Limits kept, and limits exceeded."""
+    for sentence in summary["kept"]:
+        console.print(f"[green]Passed:[/green] {escape(sentence)}")
+    for sentence in summary["failed"]:
+        console.print(f"[red]Failed:[/red] {escape(sentence)}")
 
 
 def _written(console: Console, summary: dict[str, Any]) -> None:

@@ -12,9 +12,9 @@ from ..summary import calibration_summary
 from ..uncertainty import over_volume, uncertainty_of
 from . import charts
 from .knowledge import bounds_section, correlations_section, observability_section, sampled_section, volume_section
-from .parts import ARCSEC, Arms, Chart, Report, Section, Table, decimals_of, number, shown, text
+from .parts import ARCSEC, Chart, Report, Section, Table, decimals_of, number, shown, text
 from .residuals import figures_table, length_rows, residual_chart, socket_table
-from .scene import scene_of
+from .scene import arms_of
 
 
 def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any]]:
@@ -30,7 +30,9 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
         _scale(record, summary, evaluations, factor),
         _parameters(record, summary, factor),
         _residuals(record, evaluations["calibrated"]),
-        Section("arm", "The arm in its poses", [_arms(record, evaluations["calibrated"])]),
+        Section(
+            "arm", "The arm in its poses", [arms_of(record.calibrated.arm, record.recording.capture, evaluations["calibrated"])]
+        ),
         volume_section(volume, summary, factor),
         correlations_section(record, uncertainty),
         observability_section(seen),
@@ -115,7 +117,7 @@ def _found_and_left(record: CalibrationRecord, summary: dict[str, Any], evaluati
     blocks: list = ["As found is the nominal arm, as left the calibrated one, both on the poses that were identified from."]
     if summary["cross_validation"] is not None:
         blocks.append(_validated(summary["cross_validation"]))
-    blocks.append(figures_table("Figures as found and as left [mm]", summary, stages, fixed_scale=_fixed(record)))
+    blocks.append(figures_table("Figures as found and as left [mm]", summary, stages, fixed_scale=record.fixed_by_one_length))
     pair = {"as found": evaluations["nominal"], "as left": evaluations["calibrated"]}
     blocks.append(
         residual_chart("found-left", "Distance of every pose from its socket's centroid", record.recording.capture, pair)
@@ -146,11 +148,6 @@ def _validated(found: dict[str, Any]) -> Table:
     )
 
 
-def _fixed(record: CalibrationRecord) -> bool:
-    """Whether a single length fixed the scale exactly, so that its own error is zero by construction."""
-    return record.method == "two-stage" and len(record.recording.capture.lengths) == 1
-
-
 def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation], factor: float) -> Section:
     k, u = record.k, record.u_k
     words = (
@@ -163,7 +160,7 @@ def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict
             f"Poses and reference lengths were fitted together. By the arm that poses alone give, they measure k = {k:.8f} times their calibrated "
             f"value, with u(k) = {u:.1e}."
         )
-    single = _fixed(record)
+    single = record.fixed_by_one_length
     errors = {stage: np.asarray(evaluations[stage].error) for stage in ("nominal", "stage1", "calibrated")}
     if not single:
         words += " A length's U holds what its certificate says and the scatter of the poses at its ends."
@@ -261,10 +258,3 @@ def _residuals(record: CalibrationRecord, evaluation: Evaluation) -> Section:
         "the median: look at how the tip was seated there."
     )
     return Section("residuals", "Residuals by socket and pose", [words, socket_table(capture, evaluation), chart])
-
-
-def _arms(record: CalibrationRecord, evaluation: Evaluation) -> Arms:
-    capture = record.recording.capture
-    data = scene_of(record.calibrated.arm, capture, np.asarray(evaluation.distances))
-    words = "Drag, or use the arrow keys, to turn it; plus and minus change its size. The slider goes through the poses."
-    return Arms("scene", "The calibrated arm, its sockets and its poses", words, data)

@@ -14,9 +14,9 @@ from ..evaluation_summary import evaluation_summary, points_summary
 from ..points_evaluation import PointsRecord
 from ..recording import ProbedSphere
 from . import charts
-from .parts import Arms, Cell, Chart, Report, Section, Table, number, shown, text
+from .parts import Cell, Chart, Report, Section, Table, number, shown, text
 from .residuals import figures_table, length_rows, residual_chart, socket_table
-from .scene import scene_of
+from .scene import arms_of
 
 _MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}
 _STAGES = {"nominal": "as found", "calibrated": "as left"}
@@ -25,8 +25,8 @@ _GROUPS = (("held_out", "Sockets never identified from"), ("identified_from", "S
 
 def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]:
     """The report, without what names its file; and the summary that it was made from."""
-    summary = evaluation_summary(record)
     tests = record.acceptance()
+    summary = evaluation_summary(record, tests)
     evaluations = {stage: evaluate(arm.arm, record.recording.capture) for stage, arm in record.arms().items()}
     verdict, mark = _verdict(summary)
     capture = record.recording.capture
@@ -59,7 +59,7 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
                     ),
                 ],
             ),
-            Section("arm", "The arm in its poses", [_arms(record, evaluations["calibrated"])]),
+            Section("arm", "The arm in its poses", [arms_of(record.calibrated.arm, capture, evaluations["calibrated"])]),
         ],
     )
     return report, summary
@@ -197,7 +197,8 @@ def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSpher
 
 def points_report(record: PointsRecord) -> tuple[Report, dict[str, Any]]:
     """The report of an evaluation of points, and the summary that it was made from."""
-    summary, tests = points_summary(record), record.acceptance()
+    tests = record.acceptance()
+    summary = points_summary(record, tests)
     verdict, mark = _verdict(summary)
     chart = next((figure for test in tests for figure in test.figures if figure.name == "E_Uni"), None)
     sections = [
@@ -308,12 +309,6 @@ def _length_chart(figure: Figure) -> Chart:
         ]
     layout = charts.layout("length [mm]", "measured − value [mm]", shapes=charts.horizontal([0.0], "dot"))
     words = "Errors of the reference lengths, each reading by itself, by the calibrated arm" + (
-        ", within their limits." if limits else "."
+        ", and their limits." if limits else "."
     )
-    return Chart("length-errors", "Errors of lengths", words.replace("within", "and"), {"data": traces, "layout": layout})
-
-
-def _arms(record: EvaluationRecord, evaluation: Evaluation) -> Arms:
-    data = scene_of(record.calibrated.arm, record.recording.capture, np.asarray(evaluation.distances))
-    words = "Drag, or use the arrow keys, to turn it; plus and minus change its size. The slider goes through the poses."
-    return Arms("scene", "The calibrated arm, its sockets and its poses", words, data)
+    return Chart("length-errors", "Errors of lengths", words, {"data": traces, "layout": layout})

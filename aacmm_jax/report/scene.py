@@ -6,10 +6,19 @@ import numpy as np
 
 from ..arm import Arm
 from ..capture import Capture
+from ..evaluate import Evaluation
 from ..poses import corners
-from ..volume import reach_of
+from ..reach import reach_of
+from .parts import Arms
 
 _MOST = 150  # poses that a page holds
+
+
+def arms_of(arm: Arm, capture: Capture, evaluation: Evaluation) -> Arms:
+    """The calibrated arm in the poses of a capture, to be turned."""
+    words = "Drag, or use the arrow keys, to turn it; plus and minus change its size. The slider goes through the poses."
+    data = scene_of(arm, capture, np.asarray(evaluation.distances))
+    return Arms("scene", "The calibrated arm, its sockets and its poses", words, data)
 
 
 def scene_of(arm: Arm, capture: Capture, distances: np.ndarray) -> dict[str, Any]:
