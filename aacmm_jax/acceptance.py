@@ -1,4 +1,4 @@
-"""Acceptance tests of arms: JJF 1408 as Cheng et al. 2018 use it, ASME B89.4.22, ISO 10360-12.
+"""Acceptance tests of arms: JJF 1408-2013 as Cheng et al. 2018 use it, ASME B89.4.22-2004, ISO 10360-12:2016.
 
 The texts of the standards were not at hand: formulas and procedures follow secondary sources, which each function names, and the edition
 that these describe. Every figure is of single readings, never of means: a test is about what one measurement does. Uncertainties are what
@@ -187,7 +187,7 @@ def _summed(readings: list[_Reading], u_test: float, names: tuple[str, str, str]
 
 
 def jjf_1408(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None:
-    """JJF 1408 as Cheng et al. 2018 use it (section 4): Deltam in every socket, and the deviations of lengths.
+    """JJF 1408-2013 as Cheng et al. 2018 use it (section 4; their reference 17): Deltam in every socket, and the deviations of lengths.
 
     The paper's verification takes a length 30 times in different places; its Table 3 takes Deltam of 70 poses.
     """
@@ -206,7 +206,7 @@ def jjf_1408(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None:
 
 
 def asme_diameter(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None:
-    """ASME B89.4.22-2004, effective diameter: a sphere of 10 to 50 mm, 9 points, 3 repeats; largest \\|D - Dcal\\|. Background knowledge."""
+    """ASME B89.4.22-2004, effective diameter: a sphere of 10 to 50 mm, 9 points, 3 repeats; largest |D - Dcal|. Background knowledge."""
     spheres = [sphere for sphere in measured.spheres if sphere.test == "effective-diameter"]
     parts, missing = [], []
     for sphere in spheres:
@@ -245,7 +245,7 @@ def asme_single_point(measured: Measured, u_test: float = 0.0) -> AcceptanceTest
 
 
 def asme_volumetric(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None:
-    """ASME B89.4.22-2004, volumetric: two bars, of 50 to 75 % and of 120 to 150 % of the reach, 20 positions in all; largest \\|L - Lcal\\|,
+    """ASME B89.4.22-2004, volumetric: two bars, of 50 to 75 % and of 120 to 150 % of the reach, 20 positions in all; largest |L - Lcal|,
     range, and twice the RMS. Background knowledge."""
     readings = _readings(measured)
     missing = []

@@ -231,10 +231,14 @@ def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
 
 def test_poses_alone_in_their_socket_show_no_scatter(written):
     from aacmm_jax.report.residuals import residual_chart, socket_table
+    from aacmm_jax.report.scene import arms_of
 
     arm, q = written.record.calibrated.arm, written.record.recording.capture.q
     capture = aj.Capture({"A": q[:10], "B": q[10:11]})
     evaluation = aj.evaluate(arm, capture)
+    distances = [pose["distance"] for pose in arms_of(arm, capture, evaluation).data["poses"]]
+    assert distances[10] is None
+    assert None not in distances[:10]
     assert [cell.text for cell in socket_table(capture, evaluation).rows[1]][2:5] == ["–"] * 3
     assert len(residual_chart("r", "R", capture, {"as left": evaluation}).figure["data"][0]["x"]) == 10
     assert (

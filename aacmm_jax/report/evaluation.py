@@ -99,7 +99,7 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 _EDITIONS = {
-    "JJF 1408": "JJF 1408",
+    "JJF 1408": "JJF 1408-2013",
     "ASME B89.4.22": "ASME B89.4.22-2004",
     "ISO 10360-12": "ISO 10360-12:2016",
 }

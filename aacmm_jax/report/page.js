@@ -148,7 +148,8 @@
     const choose = () => {
       view.pose = Number(slider.value) - 1;
       const pose = poses[view.pose];
-      told.textContent = `${pose.label}: ${pose.distance.toPrecision(3)} mm from its socket's centroid`;
+      const away = pose.distance === null ? "alone in its socket" : `${pose.distance.toPrecision(3)} mm from its socket's centroid`;
+      told.textContent = `${pose.label}: ${away}`;
       render();
     };
     slider.addEventListener("input", choose);

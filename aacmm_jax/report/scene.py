@@ -10,6 +10,7 @@ from ..evaluate import Evaluation
 from ..poses import corners
 from ..reach import reach_of
 from .parts import Arms
+from .residuals import shared_distances
 
 _MOST = 150  # poses that a page holds
 
@@ -17,7 +18,7 @@ _MOST = 150  # poses that a page holds
 def arms_of(arm: Arm, capture: Capture, evaluation: Evaluation) -> Arms:
     """The calibrated arm in the poses of a capture, to be turned."""
     words = "Drag, or use the arrow keys, to turn it; plus and minus change its size. The slider goes through the poses."
-    data = scene_of(arm, capture, np.asarray(evaluation.distances))
+    data = scene_of(arm, capture, shared_distances(capture, evaluation))
     return Arms("scene", "The calibrated arm, its sockets and its poses", words, data)
 
 
@@ -37,7 +38,7 @@ def scene_of(arm: Arm, capture: Capture, distances: np.ndarray) -> dict[str, Any
             {
                 "label": f"{capture.names[owner[i]]}, pose {i - first[owner[i]] + 1}",
                 "points": np.round(line, 1).tolist(),
-                "distance": float(f"{distances[i]:.4g}"),
+                "distance": float(f"{distances[i]:.4g}") if np.isfinite(distances[i]) else None,  # None: alone in its socket
             }
             for i, line in zip(chosen, lines, strict=True)
         ],
