@@ -17,11 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import aacmm_jax as aj
-from aacmm_jax.independence import moved_onto
-from aacmm_jax.noise import ARCSEC
-from aacmm_jax.sampling import batch_of
+from aacmm_jax.calibration.sampling import batch_of
+from aacmm_jax.data.noise import ARCSEC
+from aacmm_jax.kinematics.independence import moved_onto
 from aacmm_jax.study.drawing import draw
-from aacmm_jax.uncertainty import check_lengths
+from aacmm_jax.uncertainty.volume import check_lengths
 
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
 SIZES, NAMES = (70, 5, 5), ("S", "A", "B")
@@ -278,7 +278,7 @@ def _measured(space, vectors, start, end):
 
 def real(folder: Path) -> dict:
     """Recorded captures: what the placements identified from predict of the placement left out, and what is found there."""
-    from aacmm_jax.validation import cross_validate
+    from aacmm_jax.calibration.cross_validation import cross_validate
 
     found = {}
     for name, arm, bound in (("panda_2_clean", "panda", None), ("panda_6", "panda", 10.0), ("kuka_14", "iiwa14", None)):

@@ -15,8 +15,8 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 with install_import_hook("aacmm_jax", "tests.run_time_types.checked"):
     import aacmm_jax as aj
-    import aacmm_jax.certificate  # these two are imported late by the package itself
-    import aacmm_jax.manifest
+    import aacmm_jax.certificate.document  # these two are imported late by the package itself
+    import aacmm_jax.files.manifest
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 

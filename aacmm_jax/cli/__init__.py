@@ -20,7 +20,7 @@ def main() -> None:
     # interpreter ends, would take a sixth of a short command.
     gc.set_threshold(200_000, 20, 20)
     try:
-        from ..errors import InputError
+        from ..core.errors import InputError
         from .compare_commands import app
     except ImportError as error:
         if debug:

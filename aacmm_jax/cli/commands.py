@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, NoReturn
 
 import typer
 
-from ..errors import IdentifiabilityWarning, InputError
+from ..core.errors import IdentifiabilityWarning, InputError
 
 _U_ARTEFACT = 0.001  # mm
 
@@ -64,8 +64,8 @@ def demo(
     as_json: Json = False,
 ) -> None:
     """Simulate the paper's arm with realistic noise, calibrate it, and compare with the truth."""
-    from ..demo import run
     from . import display
+    from .demo import run
 
     summary = _busy("Simulating and calibrating", lambda: run(folder, seed))
     _show(summary, as_json, display.demo)
@@ -101,13 +101,13 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Make a capture with a simulated arm."""
-    from ..arm_files import load_specification
-    from ..capture_files import save_capture
-    from ..parameters import Parameters
-    from ..recording import Recording
-    from ..simulate import deviated
-    from ..simulate import simulate as run
-    from ..summary import capture_summary
+    from ..data.recording import Recording
+    from ..data.simulation import deviated
+    from ..data.simulation import simulate as run
+    from ..files.arms import load_specification
+    from ..files.captures import save_capture
+    from ..kinematics.parameters import Parameters
+    from ..summaries.calibration import capture_summary
     from . import display
 
     nominal = load_specification(arm)
@@ -122,7 +122,7 @@ def simulate(
         noise = {"encoder_arcsec": encoder_arcsec, "seating": seating_mm, "u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
 
         def taken() -> Recording:
-            from ..procedure import acceptance_procedure, record_procedure
+            from ..acceptance.procedure import acceptance_procedure, record_procedure
 
             return record_procedure(acceptance_procedure(nominal.arm, acceptance), nominal, true, **noise, seed=seed)
 
@@ -164,9 +164,9 @@ def import_(
     as_json: Json = False,
 ) -> None:
     """Read recorded joint angles into a capture."""
-    from ..capture_files import save_capture
-    from ..manifest import read_manifest
-    from ..summary import capture_summary
+    from ..files.captures import save_capture
+    from ..files.manifest import read_manifest
+    from ..summaries.calibration import capture_summary
     from . import display
 
     recording = read_manifest(manifest)
@@ -222,12 +222,12 @@ def calibrate(
     as_json: Json = False,
 ) -> None:
     """Identify the arm from repeatability, and fix its scale with the reference lengths."""
-    from ..calibrate import calibrate as run
-    from ..calibration_files import record_of, save_calibration
-    from ..capture_files import load_capture
-    from ..cautions import plausible
-    from ..storage import fingerprint
-    from ..summary import calibration_summary
+    from ..calibration.stages import calibrate as run
+    from ..files.calibrations import record_of, save_calibration
+    from ..files.captures import load_capture
+    from ..files.storage import fingerprint
+    from ..summaries.calibration import calibration_summary
+    from ..summaries.warnings import plausible
     from . import display, options
 
     if output.exists() and output.samefile(capture):
@@ -254,18 +254,18 @@ def calibrate(
         if cross_validate or (
             cross_validate is None and recording.true is None and _several(capture_used, len(bounds.space.names))
         ):
-            from ..validation import cross_validate as validated
+            from ..calibration.cross_validation import cross_validate as validated
 
             found = _busy("Cross-validating", lambda: validated(bounds.space.base, capture_used, bounds, **solving))
             record = record._replace(validation=found)
     if monte_carlo:
-        from ..sampling import monte_carlo as sample
+        from ..calibration.sampling import monte_carlo as sample
 
         sampled = _busy("Drawing trials", lambda: sample(result, capture_used))
         record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
     save_calibration(output, record)
     if figure is not None:
-        from ..figures import calibration_figure
+        from ..plot.calibration import calibration_figure
 
         calibration_figure(record, figure)
     _show(calibration_summary(record) | {"written": str(output)}, as_json, display.calibration)
@@ -286,11 +286,11 @@ def show(
     as_json: Json = False,
 ) -> None:
     """Print what a file holds."""
-    from .. import storage
-    from ..arm_files import load_specification
-    from ..calibration_files import load_calibration
-    from ..capture_files import load_capture
-    from ..summary import arm_summary, calibration_summary, capture_summary
+    from ..files import storage
+    from ..files.arms import load_specification
+    from ..files.calibrations import load_calibration
+    from ..files.captures import load_capture
+    from ..summaries.calibration import arm_summary, calibration_summary, capture_summary
     from . import display
 
     if file.suffix in ("", ".toml") and not (file.is_file() and file.suffix == ""):
@@ -318,7 +318,7 @@ def _several(capture: Any, parameters: int) -> bool:
     """Whether the reference length stood in several placements, so that each can be left out."""
     if len(capture.lengths) < 2:
         return False
-    from ..validation import can_cross_validate
+    from ..calibration.cross_validation import can_cross_validate
 
     return can_cross_validate(capture, parameters)
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ..errors import InputError
+from ..core.errors import InputError
 from .commands import Json, _busy, _show
 from .result_commands import app
 
@@ -37,9 +37,9 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Say what moved between calibrations, beyond its uncertainty, and what that does to lengths."""
-    from .. import storage
-    from ..calibration_files import load_calibration
-    from ..drift_summary import change_exceeded, compared_summary, drift_csv
+    from ..files import storage
+    from ..files.calibrations import load_calibration
+    from ..summaries.drift import change_exceeded, compared_summary, drift_csv
     from . import compare_display
 
     if len(files) < 2:
@@ -53,7 +53,7 @@ def compare(
     summary["kept"], summary["failed"] = change_exceeded(found.drifts[-1].lengths, max_length_change_mm)
     written = []
     if figure is not None:
-        from ..drift_figure import save_trend
+        from ..plot.drift import save_trend
 
         save_trend(found, figure)
         written.append(str(figure))
@@ -67,7 +67,7 @@ def compare(
 
 def _compared(records: list, created: list[str], labels: list[str], level: float, length: float | None) -> Any:
     """The trend over all files; of two, in the order in which they are named, whatever their dates."""
-    from ..drift import Trend, compare, moment, trend
+    from ..drift.comparison import Trend, compare, moment, trend
 
     if len(records) > 2:
         found = trend(records, created, level=level, length=length, labels=labels)
@@ -89,7 +89,7 @@ def _compared(records: list, created: list[str], labels: list[str], level: float
 
 def _created(file: Path) -> str:
     """When a calibration's file was made."""
-    from .. import storage
+    from ..files import storage
 
     attributes = storage.read_tables(file, ("calibration",)).attributes
     storage.need(file, attributes, "created", of="attribute")
@@ -97,7 +97,7 @@ def _created(file: Path) -> str:
 
 
 def _check_outputs(files: list[Path], figure: Path | None, csv: Path | None) -> None:
-    from ..drift_figure import check_format
+    from ..plot.drift import check_format
 
     if figure is not None:
         check_format(figure)

@@ -3,10 +3,10 @@
 import math
 from collections.abc import Sequence
 
-from ..errors import InputError
-from ..noise import Noise
-from ..parameters import Bounds, Parameters, is_length
-from ..recording import ArmSpecification
+from ..core.errors import InputError
+from ..data.noise import Noise
+from ..data.recording import ArmSpecification
+from ..kinematics.parameters import Bounds, Parameters, is_length
 
 
 def bounds(

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from ..errors import InputError
+from ..core.errors import InputError
 from .commands import Json, _busy, _length_option, _show, _socket_option
 from .study_commands import app
 
@@ -70,11 +70,11 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """Choose poses, sockets and the place of the reference length before the arm is touched; or the poses of an acceptance test."""
-    from ..arm_files import load_specification
-    from ..noise import Noise
-    from ..parameters import Parameters
-    from ..plan_files import plan_summary, save_plan
-    from ..planning import plan as run
+    from ..data.noise import Noise
+    from ..files.arms import load_specification
+    from ..files.plans import plan_summary, save_plan
+    from ..kinematics.parameters import Parameters
+    from ..planning.design import plan as run
     from . import acceptance_display, plan_display
 
     specification = load_specification(arm)
@@ -137,9 +137,9 @@ def _procedure(
     specification: Any, arm: str, standard: Any, output: Path, manifest: Path | None, room: dict[str, Any]
 ) -> dict[str, Any]:
     """Plan an acceptance test and write it."""
-    from ..procedure import acceptance_procedure
-    from ..procedure_files import procedure_csv, procedure_manifest, procedure_summary
-    from ..storage import write_text
+    from ..acceptance.procedure import acceptance_procedure
+    from ..files.procedures import procedure_csv, procedure_manifest, procedure_summary
+    from ..files.storage import write_text
 
     if manifest is not None:
         _check_output(manifest, arm)

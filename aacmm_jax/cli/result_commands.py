@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from ..errors import InputError
+from ..core.errors import InputError
 from .commands import CalibrationFile, Json, Only, Without, _busy, _show
 from .plan_commands import app
 
@@ -48,8 +48,8 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Try a calibration on a capture, with sockets it has never seen, and run every acceptance test that the capture holds."""
-    from ..acceptance import FIGURES
-    from ..decision import read_limits
+    from ..acceptance.decision import read_limits
+    from ..acceptance.suite import FIGURES
     from . import acceptance_display
 
     limits = read_limits(mpe or [], FIGURES)
@@ -80,7 +80,7 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Write a report that can be handed on: warnings, results, uncertainty, charts and tables in one HTML file, which prints well."""
-    from ..about import read_about
+    from ..files.administrative_data import read_about
     from ..report import write_report
     from . import acceptance_display
 
@@ -93,9 +93,9 @@ def report(
 
 def show_evaluation(file: Path, of_points: bool, as_json: bool) -> None:
     """What an evaluation's file holds, printed."""
-    from ..evaluation_files import load_evaluation
-    from ..evaluation_summary import evaluation_summary, points_summary
-    from ..points_evaluation import load_points
+    from ..files.evaluations import load_evaluation
+    from ..files.points_evaluations import load_points
+    from ..summaries.evaluation import evaluation_summary, points_summary
     from . import acceptance_display
 
     if of_points:
@@ -107,11 +107,11 @@ def show_evaluation(file: Path, of_points: bool, as_json: bool) -> None:
 def _evaluated(
     calibration: Path, capture: Path, output: Path | None, choice: tuple, limits: Any, u_test: float, maxima: dict[str, float]
 ) -> dict[str, Any]:
-    from ..calibration_files import load_calibration
-    from ..capture_files import load_capture
-    from ..evaluation_files import evaluation_of, save_evaluation
-    from ..evaluation_summary import evaluation_summary
-    from ..storage import fingerprint
+    from ..files.calibrations import load_calibration
+    from ..files.captures import load_capture
+    from ..files.evaluations import evaluation_of, save_evaluation
+    from ..files.storage import fingerprint
+    from ..summaries.evaluation import evaluation_summary
 
     if output is not None:
         for given in (calibration, capture):
@@ -131,9 +131,9 @@ def _evaluated(
 
 
 def _evaluated_points(manifest: Path, output: Path | None, limits: Any, u_test: float) -> dict[str, Any]:
-    from ..evaluation_summary import points_summary
-    from ..points_evaluation import PointsRecord, save_points
-    from ..points_files import read_points
+    from ..files.points import read_points
+    from ..files.points_evaluations import PointsRecord, save_points
+    from ..summaries.evaluation import points_summary
 
     if manifest.suffix != ".toml":
         raise InputError(f"{manifest} alone cannot be evaluated; name a capture too, or a manifest (TOML) of points.")
@@ -171,10 +171,10 @@ def export(
     for given in (calibration, about):
         if output is not None and given is not None and output.exists() and given.exists() and output.samefile(given):
             raise InputError(f"{output} is what the export is made from; choose another output.")
-    from .. import storage
-    from ..arm_files import specification_toml
-    from ..calibration_files import load_calibration
-    from ..summary import calibration_summary, parameters_csv
+    from ..files import storage
+    from ..files.arms import specification_toml
+    from ..files.calibrations import load_calibration
+    from ..summaries.calibration import calibration_summary, parameters_csv
 
     record = load_calibration(calibration)
     arms = {"calibrated": record.calibrated, "nominal": record.recording.nominal, "true": record.recording.true}
@@ -201,10 +201,10 @@ def export(
 
 
 def _certificate(calibration: Path, record: Any, about: Path | None) -> str:
-    from .. import storage
-    from ..about import About as Stated
-    from ..about import read_about
-    from ..certificate import dcc
+    from ..certificate.document import dcc
+    from ..files import storage
+    from ..files.administrative_data import About as Stated
+    from ..files.administrative_data import read_about
 
     made = storage.read_tables(calibration, ("calibration",)).attributes
     sources = [storage.fingerprint(calibration), *record.recording.sources]

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ..errors import InputError
+from ..core.errors import InputError
 from . import Stopped
 from .commands import Json, _busy, _show, app
 
@@ -43,7 +43,7 @@ def study(
     as_json: Json = False,
 ) -> None:
     """Run thousands of simulated calibrations; run again, it goes on where it was."""
-    from ..study.run import Progress, run_study
+    from ..study.runner import Progress, run_study
     from ..study.store import read
 
     if resume and not output.exists():
@@ -82,9 +82,9 @@ def study(
 
 
 def _asked(specification: str, trials: int | None, seed: int | None) -> Any:
+    from ..files.toml import validated
+    from ..study.definition import Study
     from ..study.shipped import read_study
-    from ..study.study import Study
-    from ..toml import validated
 
     asked = read_study(specification)
     changes = {name: value for name, value in (("trials", trials), ("seed", seed)) if value is not None}
@@ -140,7 +140,7 @@ def _ended(outcome: Any, output: Path) -> None:
 
 def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool) -> None:
     """Print a study's results, and draw its figures."""
-    from ..study.figures import write_figures
+    from ..plot.study import write_figures
     from ..study.results import Results
     from ..study.statistics import study_summary
     from . import study_display

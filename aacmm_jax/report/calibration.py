@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration_files import CalibrationRecord
-from ..cautions import observed
-from ..evaluate import Evaluation
-from ..summary import calibration_summary
-from ..uncertainty import over_volume, uncertainty_of
+from ..calibration.evaluation import Evaluation
+from ..files.calibrations import CalibrationRecord
+from ..summaries.calibration import calibration_summary
+from ..summaries.warnings import observed
+from ..uncertainty.volume import over_volume, uncertainty_of
 from . import charts
 from .knowledge import bounds_section, correlations_section, observability_section, sampled_section, volume_section
 from .parts import ARCSEC, Chart, Report, Section, Table, decimals_of, number, shown, text

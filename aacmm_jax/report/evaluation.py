@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance import FIGURES, AcceptanceTest, Figure
-from ..capture import ReferenceLength
-from ..decision import worst
-from ..evaluate import Evaluation, evaluate
-from ..evaluation_files import EvaluationRecord
-from ..evaluation_summary import evaluation_summary, points_summary
-from ..points_evaluation import PointsRecord
-from ..recording import ProbedSphere
+from ..acceptance.decision import worst
+from ..acceptance.suite import FIGURES, AcceptanceTest, Figure
+from ..calibration.evaluation import Evaluation, evaluate
+from ..data.capture import ReferenceLength
+from ..data.recording import ProbedSphere
+from ..files.evaluations import EvaluationRecord
+from ..files.points_evaluations import PointsRecord
+from ..summaries.evaluation import evaluation_summary, points_summary
 from . import charts
 from .parts import Cell, Chart, Report, Section, Table, number, shown, text
 from .residuals import figures_table, length_rows, residual_chart, socket_table

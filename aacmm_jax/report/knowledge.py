@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration_files import CalibrationRecord
-from ..observability import Observability
-from ..parameters import is_length
-from ..uncertainty import Uncertainty, Volume
+from ..files.calibrations import CalibrationRecord
+from ..kinematics.parameters import is_length
+from ..uncertainty.identifiability import Observability
+from ..uncertainty.volume import Uncertainty, Volume
 from . import charts
 from .parts import Chart, Section, Table, number, shown, text
 

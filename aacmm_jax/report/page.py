@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from .. import storage
-from ..about import check_conformity
-from ..errors import InputError
-from ..evaluation_files import SIMULATED
+from ..core.errors import InputError
+from ..files import storage
+from ..files.administrative_data import check_conformity
+from ..files.evaluations import SIMULATED
 from .about import about_section
 from .parts import Arms, Chart, Report, Table
 
@@ -61,7 +61,7 @@ def _unsure(mark: str) -> str:
 
 
 def _of_calibration(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
-    from ..calibration_files import load_calibration
+    from ..files.calibrations import load_calibration
     from .calibration import calibration_report
 
     record = load_calibration(source)
@@ -72,11 +72,11 @@ def _of_evaluation(source: Path, attributes: dict[str, Any]) -> tuple[Report, bo
     from .evaluation import evaluation_report, overall, points_report
 
     if attributes.get("of") == "points":
-        from ..points_evaluation import load_points
+        from ..files.points_evaluations import load_points
 
         report, summary = points_report(load_points(source))
         return report, False, overall(summary)
-    from ..evaluation_files import load_evaluation
+    from ..files.evaluations import load_evaluation
 
     record = load_evaluation(source)
     report, summary = evaluation_report(record)

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ..capture import Capture
-from ..evaluate import Evaluation
+from ..calibration.evaluation import Evaluation
+from ..data.capture import Capture
 from . import charts
 from .parts import Cell, Chart, Table, number, shown, text
 

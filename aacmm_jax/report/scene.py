@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from ..arm import Arm
-from ..capture import Capture
-from ..evaluate import Evaluation
-from ..poses import corners
-from ..reach import reach_of
+from ..calibration.evaluation import Evaluation
+from ..data.capture import Capture
+from ..kinematics.arm import Arm
+from ..kinematics.skeleton import corners
+from ..kinematics.workspace import reach_of
 from .parts import Arms
 from .residuals import shared_distances
 

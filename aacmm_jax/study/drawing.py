@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..chain import Geometry, columns_of, walk
-from ..parameters import placed
-from ..simulate import least_moves
+from ..data.simulation import least_moves
+from ..kinematics.chain import Geometry, columns_of, walk
+from ..kinematics.parameters import placed
+from .definition import BATCHES, Numbers, Setting, Study
 from .pools import Pool, pool_of
-from .study import BATCHES, Numbers, Setting, Study
 
 _WIDTH = 16  # trials at a time: of one width, so that every trial's arithmetic is the same whatever the chunk
 _TOLERANCE = 1e-9  # mm: how far from its point a tip may end

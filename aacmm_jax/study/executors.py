@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-from ..errors import InputError
+from ..core.errors import InputError
 
 _ATTEMPTS = 3  # of a block whose worker died, beyond the first
 

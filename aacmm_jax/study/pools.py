@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import chain
-from ..arm import Arm
-from ..errors import InputError
-from ..simulate import approach, least_moves
+from ..core.errors import InputError
+from ..data.simulation import approach, least_moves
+from ..kinematics import chain
+from ..kinematics.arm import Arm
+from .definition import BATCHES, Setting, Stand, Study, pose_choice
 from .specification import Region
-from .study import BATCHES, Setting, Stand, Study, pose_choice
 
 _ROUNDS, _STEPS, _AT_ONCE = 100, 20, 2048
 _TOLERANCE = 1e-9  # mm

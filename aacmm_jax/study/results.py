@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .. import storage
-from ..errors import InputError
+from ..core.errors import InputError
+from ..files import storage
 from . import store
+from .definition import BATCHES, Study
 from .store import VARIABLES
-from .study import BATCHES, Study
 
 if TYPE_CHECKING:
     import xarray

@@ -4,13 +4,13 @@ import os
 from importlib import resources
 from pathlib import Path
 
-from ..errors import InputError, nearest
-from .study import Study, study_of_file
+from ..core.errors import InputError, nearest
+from .definition import Study, study_of_file
 
 
 def shipped_studies() -> tuple[str, ...]:
     """Names of the studies that come with the package."""
-    folder = resources.files("aacmm_jax") / "studies"
+    folder = resources.files("aacmm_jax.study") / "shipped_studies"
     return tuple(sorted(item.name.removesuffix(".toml") for item in folder.iterdir() if item.name.endswith(".toml")))
 
 
@@ -20,7 +20,7 @@ def read_study(source: str | os.PathLike) -> Study:
     Raises `InputError` that names the file, the place in it and the mend.
     """
     if isinstance(source, str) and source in shipped_studies():
-        with resources.as_file(resources.files("aacmm_jax") / "studies" / f"{source}.toml") as path:
+        with resources.as_file(resources.files("aacmm_jax.study") / "shipped_studies" / f"{source}.toml") as path:
             return study_of_file(path)
     try:
         there = Path(source).exists()

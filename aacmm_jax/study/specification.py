@@ -21,7 +21,7 @@ from pydantic import (
     model_validator,
 )
 
-from ..toml import validated
+from ..files.toml import validated
 
 # More cells than this are a slip of the pen: a grid of four factors with ten levels each.
 MOST_CELLS = 10_000

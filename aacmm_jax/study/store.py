@@ -18,14 +18,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .. import storage
-from ..capture_files import arm_table, recording_of, recording_tables, specification_of
-from ..errors import InputError
-from ..parameters import is_length
-from ..recording import Recording
-from ..storage import Table, Variable
+from ..core.errors import InputError
+from ..data.recording import Recording
+from ..files import storage
+from ..files.captures import arm_table, recording_of, recording_tables, specification_of
+from ..files.storage import Table, Variable
+from ..kinematics.parameters import is_length
+from .definition import Setting, Study
 from .specification import Specification, unit
-from .study import Setting, Study
 from .trials import Block
 
 _MEND = "free some space there, then run the same command again: what is finished is kept"
@@ -258,7 +258,7 @@ def _write(
     }
 
     def extend(file: Any) -> None:
-        from ..steps import Reason, numbers_of
+        from ..solver.levenberg_marquardt import Reason, numbers_of
 
         group = file["trials"]
         for name, kind in VARIABLES.items():

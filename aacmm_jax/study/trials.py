@@ -7,11 +7,11 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ..batch import calibrate_many, identify_many
-from ..capture import Capture, ReferenceLength
-from ..steps import numbers_of
+from ..calibration.batch import calibrate_many, identify_many
+from ..data.capture import Capture, ReferenceLength
+from ..solver.levenberg_marquardt import numbers_of
+from .definition import Setting, Study
 from .drawing import Drawn, draw, ends_of
-from .study import Setting, Study
 
 
 class Block(NamedTuple):

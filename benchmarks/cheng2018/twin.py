@@ -16,7 +16,7 @@ from paper import NAMES, POSES, PUBLISHED, arm_of, box, figures_of, is_length, t
 from scipy.optimize import minimize
 
 import aacmm_jax as aj
-from aacmm_jax.simulate import ARCSEC, reach
+from aacmm_jax.data.simulation import ARCSEC, reach
 
 # mm: three sockets well within the arm's reach of 1.4 m, since the paper does not print where its own stood.
 SOCKETS = {"Data1": (400.0, 200.0, 300.0), "Data2": (-350.0, 500.0, 150.0), "Data3": (600.0, -450.0, 550.0)}

@@ -1,0 +1,336 @@
+"""Thousands of calibrations at once (`identify_many`, `calibrate_many`): the engine under every Monte Carlo study.
+
+The batch is cut into chunks, which are spread over devices and cores; `lanes` solves a chunk.
+"""
+
+import math
+import os
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..core.arrays import Numbers, as_array
+from ..core.errors import InputError
+from ..data.capture import Capture
+from ..data.noise import Noise
+from ..kinematics.arm import Arm, replace
+from ..kinematics.parameters import Parameters, is_length
+from ..solver.levenberg_marquardt import Reason, reasons
+from .batch_kernel import Problems, Shape, solve_chunk
+from .checks import check_enough, check_fit, held_length
+from .results import converged
+
+# Lanes per loop. On a CPU the columns of all lanes should fit the second-level cache (measured from 20 to 7,000 poses: five
+# times slower where they do not); a GPU wants thousands.
+_LANES_CPU, _POSES_IN_CACHE = 16, 2000
+_LANES_ELSEWHERE = 4096
+_ROUNDS = 64  # problems a lane of one chunk takes at most, one after the other
+
+
+class ManyIdentifications(eqx.Module):
+    """Results of stage 1, problem by problem, as NumPy arrays; ``parameters`` in the order of ``space.names``, mm and rad."""
+
+    parameters: Float[np.ndarray, "b p"]
+    de: Float[np.ndarray, " b"]  # mm
+    deltam: Float[np.ndarray, " b"]  # mm
+    k: Float[np.ndarray, " b"] | None  # measured / nominal, where the capture holds reference lengths
+    steps: Int[np.ndarray, " b"]  # evaluations
+    result: Reason  # why each ended
+    active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, 0 inside or held
+    space: Parameters
+    hold: str | None = eqx.field(static=True)
+
+    @property
+    def converged(self) -> Bool[np.ndarray, " b"]:
+        """Which problems ended at a minimum."""
+        return np.asarray(converged(self.result))
+
+
+class ManyCalibrations(eqx.Module):
+    """Results of both stages, or of the joint solve, problem by problem, as NumPy arrays; mm and rad."""
+
+    parameters: Float[np.ndarray, "b p"]
+    k: Float[np.ndarray, " b"]  # of stage 1, by which its lengths were divided
+    de: Float[np.ndarray, " b"]  # mm
+    deltam: Float[np.ndarray, " b"]  # mm
+    steps: Int[np.ndarray, " b"]  # evaluations of all solves
+    result: Reason  # why the last solve ended
+    active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, in the last solve
+    stage1: ManyIdentifications
+    method: str = eqx.field(static=True)
+
+    @property
+    def space(self) -> Parameters:
+        """The free parameters."""
+        return self.stage1.space
+
+    @property
+    def converged(self) -> Bool[np.ndarray, " b"]:
+        """Which problems ended at a minimum in every solve."""
+        return self.stage1.converged & np.asarray(converged(self.result))
+
+
+def identify_many(
+    arm: Arm,
+    capture: Capture,
+    lower: Numbers,
+    upper: Numbers,
+    start: Numbers | None = None,
+    *,
+    space: Parameters | None = None,
+    hold: str | None = "longest",
+    noise: Noise | None = None,
+    max_steps: int = 300,
+    chunk: int | None = None,
+    lanes: int | None = None,
+    devices: Sequence[Any] | None = None,
+    workers: int | None = None,
+) -> ManyIdentifications:
+    """Stage 1 for a batch: what `identify` does, problem by problem, fast.
+
+    ``lower``, ``upper`` and ``start`` are ``(batch, p)`` or ``(p,)``, in the order of ``space.names`` (default: the paper's
+    parameters of ``arm``); ``start`` defaults to the arm. ``arm`` may be a batch (every parameter ``(batch, n)``), and so
+    may the capture (see `stack_captures`).
+
+    With ``noise`` poses are weighed by it, as in `identify`. Work is spread over all devices and, on a CPU, all cores (or ``workers`` threads); memory is bounded by the ``chunk``
+    (problems per call of the compiled program). Failure is data (``result``); a start outside its box is clipped to it. Raises `InputError` for
+    shapes that do not fit, a lower bound above its upper one, and too few poses.
+    """
+    effort = _Effort(max_steps, chunk, lanes, devices, workers)
+    return _Work.of(arm, capture, lower, upper, start, space, hold, noise, effort).identified()
+
+
+def calibrate_many(
+    arm: Arm,
+    capture: Capture,
+    lower: Numbers,
+    upper: Numbers,
+    start: Numbers | None = None,
+    *,
+    method: Literal["two-stage", "joint"] = "two-stage",
+    space: Parameters | None = None,
+    hold: str | None = "longest",
+    noise: Noise | None = None,
+    max_steps: int = 300,
+    chunk: int | None = None,
+    lanes: int | None = None,
+    devices: Sequence[Any] | None = None,
+    workers: int | None = None,
+) -> ManyCalibrations:
+    """Both stages for a batch: what `calibrate` does, problem by problem, fast; arguments as for `identify_many`.
+
+    Raises `InputError` as `identify_many` does, and where the capture holds no reference length.
+    """
+    if method not in ("two-stage", "joint"):
+        raise InputError(f"method is '{method}'; it must be 'two-stage' or 'joint'.")
+    if not capture.lengths:
+        raise InputError("the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many.")
+    effort = _Effort(max_steps, chunk, lanes, devices, workers)
+    work = _Work.of(arm, capture, lower, upper, start, space, hold, noise, effort)
+    stage1 = work.identified()
+    k = stage1.k
+    assert k is not None
+    # Every length but d_1, as in `divide_lengths`.
+    divided = np.array([is_length(name) and name != "d_1" for name in stage1.space.names])
+    scaled = np.where(divided, stage1.parameters / k[:, None], stage1.parameters)
+    if method == "two-stage":
+        # Divided by k, the whole arm shrinks about the base, so do distances between its tips.
+        return ManyCalibrations(
+            scaled, k, stage1.de / k, stage1.deltam / k, stage1.steps, stage1.result, stage1.active, stage1, method
+        )
+    fitted = sum(work.shape.kept)
+    work = _Work.of(arm, capture, lower, upper, scaled, stage1.space, None, noise, effort, fitted)
+    joint = work.identified()
+    steps = stage1.steps + joint.steps
+    return ManyCalibrations(joint.parameters, k, joint.de, joint.deltam, steps, joint.result, joint.active, stage1, method)
+
+
+def stack_captures(captures: Iterable[Capture]) -> Capture:
+    """A batch of captures of the same shape (sockets, poses, lengths) for `identify_many`."""
+    captures = list(captures)
+    if len({(c.names, c.sizes, tuple((r.start, r.end) for r in c.lengths), c.joints) for c in captures}) != 1:
+        raise InputError("captures of a batch must have the same sockets, numbers of poses, joints and lengths.")
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *captures)
+
+
+class _Effort(NamedTuple):
+    """How much is computed at a time, and where."""
+
+    max_steps: int
+    chunk: int | None
+    lanes: int | None
+    devices: Sequence[Any] | None
+    workers: int | None
+
+
+class _Work(NamedTuple):
+    """The whole batch on the host, and how a chunk of it is run on a device."""
+
+    problems: Problems
+    shape: Shape
+    pieces: list[range]
+    room: int  # problems that the compiled program has room for
+    devices: list[Any]
+    workers: int
+    space: Parameters
+    hold: str | None
+    noise: Noise | None
+
+    @classmethod
+    def of(
+        cls,
+        arm: Arm,
+        capture: Capture,
+        lower: Numbers,
+        upper: Numbers,
+        start: Numbers | None,
+        space: Parameters | None,
+        hold: str | None,
+        noise: Noise | None,
+        effort: _Effort,
+        fitted: int | None = None,
+    ) -> "_Work":
+        """Everything checked and laid out. ``fitted``: the joint solve, after a stage 1 of so many parameters."""
+        if space is None:
+            space = Parameters.free_of(arm)
+        problems, batched, size = _problems(arm, capture, lower, upper, start, space)
+        hold = held_length(space, arm, hold)
+        check_fit(capture, space)
+        if noise is not None:
+            noise.check(arm.joints)
+        check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
+        for what, number in (("chunk", effort.chunk), ("lanes", effort.lanes), ("workers", effort.workers)):
+            if number is not None and number < 1:
+                raise InputError(f"{what} is {number}; give at least 1, or leave it out.")
+        devices = jax.local_devices() if effort.devices is None else list(effort.devices)
+        lanes = effort.lanes or _lanes(devices, sum(capture.sizes))
+        workers = effort.workers or _workers(devices)
+        pieces = _pieces(size, lanes, workers, effort.chunk)
+        shape = Shape(
+            sizes=capture.sizes,
+            ends=tuple((int(a), int(b)) for a, b in capture.ends()),
+            entries=space.entries(),
+            kept=tuple(name != hold for name in space.names),
+            scale=tuple(np.asarray(space.scale).tolist()),
+            batched=batched,
+            lanes=lanes,
+            max_steps=effort.max_steps,
+            joint=fitted is not None,
+            fitted=fitted or 0,
+        )
+        room = _room(max(len(piece) for piece in pieces), lanes)
+        return cls(problems, shape, pieces, room, devices, workers, space, hold, noise)
+
+    def run(self, piece: range, device: Any) -> tuple[np.ndarray, ...]:
+        """Solve one chunk. What room is left is filled with its first problem, which is never begun."""
+        rows = np.full(self.room, piece.start)
+        rows[: len(piece)] = piece
+        part = jax.tree.map(lambda leaf, many: leaf[rows] if many else leaf, self.problems, self.shape.batched)
+        with jax.default_device(device):
+            given = jax.device_put((part, np.asarray(len(piece)), self.noise), device)
+            solved = solve_chunk(*given, self.shape, self.room)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(piece)], solved)
+
+    def identified(self) -> ManyIdentifications:
+        """All chunks solved."""
+        found = _spread(self.run, self.pieces, self.devices, self.workers)
+        parameters, de, deltam, k, steps, reason, active = (np.concatenate(column) for column in zip(*found, strict=True))
+        scale = k if self.shape.ends else None
+        return ManyIdentifications(
+            parameters, de, deltam, scale, steps, reasons(jnp.asarray(reason)), active, self.space, self.hold
+        )
+
+
+def _lanes(devices: Sequence[Any], poses: int) -> int:
+    if devices[0].platform != "cpu":
+        return _LANES_ELSEWHERE
+    return min(_LANES_CPU, 2 ** max(round(math.log2(_POSES_IN_CACHE / poses)), 0))
+
+
+def _workers(devices: Sequence[Any]) -> int:
+    """Chunks in work at a time: one a device; on a CPU, one a core."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return len(devices) if devices[0].platform != "cpu" else max(len(devices), cores)
+
+
+def _pieces(size: int, lanes: int, workers: int, chunk: int | None) -> list[range]:
+    """The batch in chunks: of the given size; or as few as fill the workers evenly, since at the end of each some lanes idle."""
+    if chunk is None:
+        rounds = -(-size // (lanes * _ROUNDS))
+        calls = min(-(-rounds // workers) * workers, -(-size // lanes))
+        chunk = -(-size // calls)
+    return [range(first, min(first + chunk, size)) for first in range(0, size, chunk)]
+
+
+def _room(count: int, lanes: int) -> int:
+    """Whole rounds of the lanes, their number a power of two: each size is compiled once, so there should be few."""
+    return lanes * 2 ** math.ceil(math.log2(-(-count // lanes)))
+
+
+def _spread(run: Callable, pieces: Sequence[range], devices: Sequence[Any], workers: int) -> list:
+    """Chunks over devices and cores, in their order. XLA leaves the interpreter's lock while it computes, so threads are enough.
+
+    The calling thread is one of the workers, since a new one takes a millisecond to start. A worker keeps its device.
+    """
+    following, failed, found = iter(range(len(pieces))), threading.Event(), {}
+
+    def work(worker: int) -> None:
+        try:
+            for i in following:
+                if failed.is_set():
+                    return
+                found[i] = run(pieces[i], devices[worker % len(devices)])
+        except BaseException:
+            failed.set()
+            raise
+
+    with ThreadPoolExecutor(workers) as pool:
+        others = [pool.submit(work, worker) for worker in range(1, min(workers, len(pieces)))]
+        work(0)
+        for other in others:
+            other.result()
+    return [found[i] for i in range(len(pieces))]
+
+
+def _problems(
+    arm: Arm, capture: Capture, lower: Numbers, upper: Numbers, start: Numbers | None, space: Parameters
+) -> tuple[Problems, Problems, int]:
+    """The batch on the host, which leaves are batched, and its size. Raises `InputError` where shapes do not fit."""
+    p = len(space.names)
+    given = {"start": space.vector(arm) if start is None else start, "lower": lower, "upper": upper}
+    boxes = {what: np.asarray(as_array(value, what)) for what, value in given.items()}
+    for what, value in boxes.items():
+        if value.ndim not in (1, 2) or value.shape[-1] != p:
+            raise InputError(f"{what} has shape {value.shape}; give ({p},) or (batch, {p}), since {p} parameters are free.")
+    if arm.beta is None and space.base.beta is not None:
+        arm = replace(arm, beta=jnp.zeros_like(arm.alpha))
+    lengths = [[np.asarray(getattr(r, key)) for r in capture.lengths] for key in ("value", "u")]
+    nominal, u = (np.stack(values, axis=-1) if values else np.zeros(0) for values in lengths)
+    geometry = jax.tree.map(np.asarray, arm.geometry)
+    problems = Problems(boxes["start"], boxes["lower"], boxes["upper"], geometry, np.asarray(capture.q), nominal, u)
+    ranks = Problems(1, 1, 1, jax.tree.map(lambda _: 1, geometry), 2, 1, 1)
+    batched = jax.tree.map(lambda leaf, rank: leaf.ndim > rank, problems, ranks)
+    sizes = {leaf.shape[0] for leaf, many in zip(jax.tree.leaves(problems), jax.tree.leaves(batched), strict=True) if many}
+    if not sizes:
+        raise InputError(
+            "nothing is a batch: give start, lower or upper as (batch, p), a batch of arms or of captures; or use identify."
+        )
+    if sizes == {0}:
+        raise InputError("the batch is empty; give at least one problem.")
+    if len(sizes) > 1:
+        numbers = " and ".join(map(str, sorted(sizes)))
+        raise InputError(f"batches of {numbers} problems do not fit together; give each the same number.")
+    crossed = np.argwhere(~(np.atleast_2d(boxes["lower"]) <= np.atleast_2d(boxes["upper"])))
+    if len(crossed):
+        row, i = crossed[0]
+        raise InputError(
+            f"lower bound of {space.names[i]} is above its upper bound in problem {row + 1}; exchange or widen them."
+        )
+    return problems, batched, sizes.pop()

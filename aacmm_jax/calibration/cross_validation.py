@@ -1,0 +1,115 @@
+"""Cross-validation: the arm identified without some of the sockets, and tried on them. The figure that a user should trust."""
+
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..core.errors import InputError
+from ..data.capture import Capture
+from ..data.noise import Noise, tip_covariances
+from ..kinematics.arm import Arm
+from ..kinematics.chain import turns_of
+from ..kinematics.parameters import Bounds
+from ..model.residuals import averaging_matrix
+from ..uncertainty.volume import Uncertainty, uncertainty_of
+from .evaluation import evaluate
+from .results import CrossValidation, LeftOut
+from .stages import calibrate
+
+
+def groups_of(capture: Capture) -> tuple[tuple[str, ...], ...]:
+    """Sockets that reference lengths join: they stand or fall together."""
+    group = list(range(len(capture.names)))
+    for start, end in capture.ends():
+        old, new = group[end], group[start]
+        group = [new if number == old else number for number in group]
+    return tuple(
+        tuple(name for name, number in zip(capture.names, group, strict=True) if number == wanted)
+        for wanted in dict.fromkeys(group)
+    )
+
+
+def can_cross_validate(capture: Capture, parameters: int) -> bool:
+    """Whether each group can be left out, and what remains holds a reference length and enough poses for so many parameters."""
+    groups = groups_of(capture)
+    with_lengths = {group for group in groups if any(length.start in group for length in capture.lengths)}
+    if len(with_lengths) < 2:
+        return False
+    poses = {group: sum(capture.sizes[capture.names.index(name)] - 1 for name in group) for group in groups}
+    return 3 * (sum(poses.values()) - max(poses.values())) >= parameters
+
+
+def cross_validate(
+    arm: Arm,
+    capture: Capture,
+    bounds: Bounds,
+    *,
+    method: Literal["two-stage", "joint"] = "two-stage",
+    hold: str | None = "longest",
+    noise: Noise | None = None,
+) -> CrossValidation:
+    """Calibrate once without each group of sockets that reference lengths join, and try the result on that group.
+
+    Where errors exceed what the uncertainty predicts, the model misses something (joints that give, eccentric encoders) that
+    poses alike to those identified from do not show. Raises `InputError` where fewer than two groups hold a reference length.
+    """
+    if not can_cross_validate(capture, len(bounds.space.names)):
+        raise InputError(
+            "cross-validation leaves sockets out with their reference lengths, so it needs two groups of sockets that each hold a "
+            "length, and without the largest of them poses enough for the parameters; place the reference length somewhere else too, "
+            "or do without (--no-cross-validate)."
+        )
+    found = []
+    for group in groups_of(capture):
+        rest = _part(capture, tuple(name for name in capture.names if name not in group))
+        result = calibrate(arm, rest, bounds, method=method, hold=hold, noise=noise)
+        left = _part(capture, group)
+        found.append(_tried(uncertainty_of(result), left, group, bool(result.converged)))
+    return CrossValidation(tuple(found))
+
+
+def _part(capture: Capture, names: tuple[str, ...]) -> Capture:
+    """Sockets by their exact names, which `Capture.select` would take for patterns."""
+    lengths = [length for length in capture.lengths if length.start in names and length.end in names]
+    return Capture({name: q for name, q in capture.sockets.items() if name in names}, lengths)
+
+
+def _tried(uncertainty: Uncertainty, left: Capture, group: tuple[str, ...], converged: bool) -> LeftOut:
+    evaluation = evaluate(uncertainty.arm, left)
+    predicted, length_u = predicted_errors(uncertainty, left)
+    return LeftOut(
+        sockets=group,
+        poses=sum(size for size in left.sizes if size > 1),
+        rms=float(evaluation.repeatability.rms),
+        rms_predicted=float(predicted),
+        length_error=np.asarray(evaluation.error),
+        length_u=np.asarray(length_u),
+        converged=converged,
+    )
+
+
+def predicted_errors(uncertainty: Uncertainty, capture: Capture) -> tuple[Float[Array, ""], Float[Array, " l"]]:
+    """What an arm's uncertainty and the readings' noise predict on a capture it was not identified from, mm: the RMS distance
+    from the sockets' centroids, and the standard uncertainty of the error of every reference length."""
+    arm, owner = uncertainty.arm, capture.owner
+    sizes = np.asarray(capture.sizes, dtype=float)
+    slopes = np.asarray(uncertainty.slopes(capture.q))
+    averaging = averaging_matrix(capture.sizes)
+    means = np.einsum("sN,Ncp->scp", averaging, slopes)
+    centred = slopes - means[owner]
+    reading = np.asarray(tip_covariances(arm.geometry, turns_of(capture.q), uncertainty.noise))
+    squares = np.trace(np.asarray(uncertainty.spread_of(jnp.asarray(centred))), axis1=1, axis2=2)
+    squares = squares + np.einsum("ccN->N", reading) * (1 - 1 / sizes[owner])
+    scattered = sizes[owner] > 1
+    centroids = averaging @ np.asarray(arm.position(capture.q))
+    ends = capture.ends()
+    between = centroids[ends[:, 1]] - centroids[ends[:, 0]]
+    direction = between / np.linalg.norm(between, axis=1, keepdims=True)
+    along = np.einsum("lc,lcp->lp", direction, means[ends[:, 1]] - means[ends[:, 0]])
+    of_means = np.einsum("sN,cdN->scd", averaging**2, reading)
+    scatter = np.einsum("lc,lcd,ld->l", direction, of_means[ends[:, 0]] + of_means[ends[:, 1]], direction)
+    own = np.array([float(length.u) for length in capture.lengths])
+    variance = np.asarray(uncertainty.spread_of(jnp.asarray(along[:, None, :])))[:, 0, 0] + scatter + own**2
+    return jnp.sqrt(jnp.asarray(squares[scattered].mean() if scattered.any() else np.nan)), jnp.asarray(np.sqrt(variance))

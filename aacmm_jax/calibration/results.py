@@ -1,0 +1,230 @@
+"""What an identification, a calibration and a cross-validation return."""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..core.arrays import Numbers, is_concrete
+from ..data.noise import Noise
+from ..kinematics.arm import Arm
+from ..kinematics.parameters import Bounds, Parameters
+from ..model.metrics import Repeatability
+from ..model.scale import Scale
+from ..solver.levenberg_marquardt import Reason, numbers_of
+from ..uncertainty.covariance import Covariance, Form
+
+_GOOD = [int(reason._value) for reason in (Reason.gradient, Reason.step, Reason.rounding)]  # pyright: ignore
+
+
+class Identification(eqx.Module):
+    """Result of stage 1. A PyTree: under ``eqx.filter_vmap`` every array gains the batch axis.
+
+    ``parameters``, ``active`` and ``covariance`` are in the order of ``space.names``; mm and rad.
+    """
+
+    arm: Arm
+    parameters: Float[Array, " p"]
+    de: Float[Array, ""]  # mean distance from the centroid, mm
+    deltam: Float[Array, ""]  # largest half range, mm
+    active: Int[Array, " p"]  # -1 on the lower bound, +1 on the upper, 0 inside
+    steps: Int[Array, ""]  # evaluations
+    result: Reason  # why it ended
+    optimality: Float[Array, ""]  # projected gradient as a cosine; 0 at a minimum
+    scale: Scale | None  # k of this arm, where the capture holds reference lengths
+    spread: Covariance  # with the scale as it was held; rows of active and held parameters are 0
+    before: Repeatability  # the start
+    after: Repeatability
+    # Root mean square of the residuals in units of what the given noise predicts (1 where it is right); None without.
+    misfit: Float[Array, ""] | None
+    bounds: Bounds
+    hold: str | None = eqx.field(static=True)
+    form: Form = eqx.field(static=True)  # what the covariance takes errors of tips for
+    freedom: float = eqx.field(static=True)  # degrees of freedom behind the covariance; infinite where the noise was given
+
+    @property
+    def covariance(self) -> Float[Array, "*lanes p p"]:
+        """Covariance of the parameters; that of what is determined, where not all is."""
+        return self.spread.matrix
+
+    @property
+    def determined(self) -> Bool[Array, "*lanes p"]:
+        """Which parameters are determined one by one, and not only in combination with others."""
+        return self.spread.determined
+
+    @property
+    def noise(self) -> Noise:
+        """Noise of readings and seat: as given, or as estimated from the residuals."""
+        return self.spread.noise
+
+    @property
+    def space(self) -> Parameters:
+        """The free parameters."""
+        return self.bounds.space
+
+    @property
+    def converged(self) -> Bool[Array | np.ndarray, "*lanes"]:
+        """Whether the solve ended at a minimum."""
+        return converged(self.result)
+
+    def active_names(self) -> dict[str, str]:
+        """Parameters on a bound: name -> 'lower' or 'upper'."""
+        return active_names(self.space, self.active)
+
+
+class Calibration(eqx.Module):
+    """Result of both stages, or of the joint solve. ``covariance`` is in the order of ``space.names``; mm and rad."""
+
+    arm: Arm
+    parameters: Float[Array, " p"]
+    scale: Scale  # k of stage 1, by which its lengths were divided
+    de: Float[Array, ""]
+    deltam: Float[Array, ""]
+    active: Int[Array, " p"]
+    steps: Int[Array, ""]
+    result: Reason
+    spread: Covariance
+    before: Repeatability
+    after: Repeatability
+    length_before: Float[Array, " l"]  # measured reference lengths, mm: at the start
+    length_after: Float[Array, " l"]  # by the calibrated arm
+    stage1: Identification
+    method: str = eqx.field(static=True)
+
+    @property
+    def covariance(self) -> Float[Array, "*lanes p p"]:
+        """Covariance of the parameters; that of what is determined, where not all is."""
+        return self.spread.matrix
+
+    @property
+    def determined(self) -> Bool[Array, "*lanes p"]:
+        """Which parameters are determined one by one, and not only in combination with others."""
+        return self.spread.determined
+
+    @property
+    def noise(self) -> Noise:
+        """Noise of readings and seat: as given, or as estimated from the residuals."""
+        return self.spread.noise
+
+    @property
+    def form(self) -> Form:
+        """What the covariance takes errors of tips for."""
+        return self.stage1.form
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom behind the covariance; infinite where the noise was given."""
+        return self.stage1.freedom
+
+    @property
+    def space(self) -> Parameters:
+        """The free parameters."""
+        return self.stage1.space
+
+    @property
+    def bounds(self) -> Bounds:
+        """The box of the identification."""
+        return self.stage1.bounds
+
+    @property
+    def converged(self) -> Bool[Array | np.ndarray, "*lanes"]:
+        """Whether every solve ended at a minimum."""
+        both = self.stage1.converged & converged(self.result)
+        return np.asarray(both) if is_concrete(both) else both
+
+    def active_names(self) -> dict[str, str]:
+        """Parameters on a bound: name -> 'lower' or 'upper'."""
+        return active_names(self.space, self.active)
+
+
+def converged(result: Reason) -> Bool[Array | np.ndarray, "*lanes"]:
+    """Whether a reason means that a minimum was reached."""
+    number = numbers_of(result)
+    good = np.array(_GOOD, dtype=number.dtype)
+    return np.asarray(np.isin(np.asarray(number), good)) if is_concrete(number) else jnp.isin(number, good)
+
+
+def active_names(space: Parameters, active: Numbers) -> dict[str, str]:
+    """Parameters on a bound: name -> 'lower' or 'upper'."""
+    return {name: "lower" if side < 0 else "upper" for name, side in zip(space.names, np.asarray(active), strict=True) if side}
+
+
+class LeftOut(NamedTuple):
+    """One group of sockets that an arm was not identified from; mm. Infinite predictions: the others leave something open."""
+
+    sockets: tuple[str, ...]
+    poses: int  # in sockets with more than one
+    rms: float  # distance from the socket's centroid, found
+    rms_predicted: float  # root of the mean square that the uncertainty predicts
+    length_error: Float[np.ndarray, " l"]
+    length_u: Float[np.ndarray, " l"]  # standard uncertainty of that error, predicted
+    converged: bool
+
+
+class CrossValidation(NamedTuple):
+    """Every group of sockets left out once. Figures are of what the remaining groups determine."""
+
+    groups: tuple[LeftOut, ...]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square distance from the socket's centroid over the poses of all groups, mm."""
+        return self._pooled([group.rms for group in self.groups])
+
+    @property
+    def rms_predicted(self) -> float:
+        """What the uncertainties of the calibrations without them predicted, mm."""
+        return self._pooled([group.rms_predicted for group in self.groups])
+
+    def _pooled(self, values: list[float]) -> float:
+        counted = [
+            (group.poses, value)
+            for group, value in zip(self.groups, values, strict=True)
+            if group.poses and np.isfinite(group.rms_predicted)
+        ]
+        total = sum(poses for poses, _ in counted)
+        return float(np.sqrt(sum(poses * value**2 for poses, value in counted) / total)) if total else float("nan")
+
+    def _lengths(self) -> tuple[np.ndarray, np.ndarray]:
+        errors, u = (np.concatenate([getattr(group, what) for group in self.groups]) for what in ("length_error", "length_u"))
+        return errors[np.isfinite(u)], u[np.isfinite(u)]
+
+    @property
+    def length_rms(self) -> float:
+        """Root mean square error of the reference lengths, mm."""
+        errors, _ = self._lengths()
+        return float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan")
+
+    @property
+    def length_u(self) -> float:
+        """Root mean square of the predicted standard uncertainties of these errors, mm."""
+        _, u = self._lengths()
+        return float(np.sqrt(np.mean(u**2))) if len(u) else float("nan")
+
+    @property
+    def open(self) -> int:
+        """How many groups the others cannot predict, because without them something is not determined."""
+        return sum(not np.all(np.isfinite(group.length_u)) or group.rms_predicted == np.inf for group in self.groups)
+
+    def ratios(self) -> list[tuple[float, int]]:
+        """Found over predicted, of poses and of lengths, and from how many numbers each; those that are known."""
+        pairs = [
+            (self.rms, self.rms_predicted, 3 * sum(group.poses for group in self.groups)),
+            (self.length_rms, self.length_u, len(self._lengths()[0])),
+        ]
+        return [(found / predicted, count) for found, predicted, count in pairs if predicted > 0 and np.isfinite(found)]
+
+    @property
+    def excess(self) -> float:
+        """By how much errors exceed what was predicted, the worse of both figures: about 1 where the uncertainty is honest."""
+        return max((ratio for ratio, _ in self.ratios()), default=float("nan"))
+
+    @property
+    def surprising(self) -> bool:
+        """Whether errors exceed their prediction by half, and by more than chance would allow in one case of a hundred."""
+        from scipy import stats
+
+        return any(ratio > max(1.5, math.sqrt(stats.chi2.ppf(0.99, count) / count)) for ratio, count in self.ratios())

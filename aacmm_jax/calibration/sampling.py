@@ -1,0 +1,290 @@
+"""Uncertainty without linearisation: Monte Carlo after JCGM 101, and the bootstrap over poses; both through the batch engine."""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..core.errors import InputError
+from ..data.capture import Capture
+from ..data.noise import Noise
+from ..kinematics.arm import Arm
+from ..kinematics.independence import settled
+from ..kinematics.parameters import Parameters
+from ..model.scale import divide_lengths
+from ..uncertainty.volume import check_lengths, default_length, uncertainty_of
+from .batch import calibrate_many
+from .results import Calibration
+
+_LENGTHS = 24  # lengths over the volume that are followed besides the parameters and k
+_REFINED = 5  # the standard's own tolerance is divided by this where a linear result is validated (JCGM 101, 8.2)
+
+
+class Sampled(NamedTuple):
+    """A calibration's outputs over many trials, as NumPy arrays: mm and rad, k, and mm for the lengths.
+
+    ``quantities`` are the parameters' names, ``k`` and ``length 1`` ... . Failed solves are left out of ``values``.
+    """
+
+    quantities: tuple[str, ...]
+    estimate: Float[np.ndarray, " q"]  # of the calibration itself
+    u: Float[np.ndarray, " q"]
+    low: Float[np.ndarray, " q"]  # equal shares beyond both ends
+    high: Float[np.ndarray, " q"]
+    linear_u: Float[np.ndarray, " q"]  # what the law of propagation says
+    factor: float  # of the linear interval
+    tolerance: Float[np.ndarray, " q"]  # delta of JCGM 101, 7.9.2
+    stable: bool  # the adaptive procedure ended before ``most`` trials
+    trials: int
+    failed: int
+    level: float
+    values: Float[np.ndarray, "t q"]
+
+    @property
+    def agrees(self) -> Bool[np.ndarray, " q"]:
+        """Where the linear interval's ends differ from the sampled ones by no more than the tolerance (JCGM 101, 8.2)."""
+        off = np.stack([
+            self.estimate - self.factor * self.linear_u - self.low, self.estimate + self.factor * self.linear_u - self.high
+        ])  # fmt: skip
+        return np.all(np.abs(off) <= self.tolerance, axis=0)
+
+    def table(self) -> dict[str, np.ndarray]:
+        """The distribution in a few columns, as calibration files keep it."""
+        columns = {name: getattr(self, name) for name in ("estimate", "u", "low", "high", "linear_u", "agrees")}
+        return {"quantity": np.array(self.quantities), **columns}
+
+    def sentences(self) -> list[str]:
+        """Whether the linear result may be used, and where not."""
+        found = [] if self.stable else [f"After {self.trials} trials the intervals are not yet stable; allow more."]
+        if self.failed:
+            found.append(f"{self.failed} of {self.trials} trials did not converge and are left out.")
+        apart = [name for name, good in zip(self.quantities, self.agrees, strict=True) if not good]
+        percent = f"{100 * self.level:g} %"
+        if apart:
+            found.append(
+                f"The linear {percent} intervals differ from the Monte Carlo ones by more than the tolerance of JCGM 101 for "
+                f"{len(apart)} of {len(self.quantities)} quantities: {', '.join(apart[:8])}{' ...' if len(apart) > 8 else ''}; "
+                "use the Monte Carlo ones."
+            )
+        else:
+            found.append(
+                f"The linear {percent} intervals agree with those of {self.trials} Monte Carlo trials within the tolerance of JCGM 101, for "
+                "every parameter, k, and lengths over the volume."
+            )
+        return found
+
+
+def monte_carlo(
+    result: Calibration,
+    capture: Capture,
+    *,
+    level: float = 0.95,
+    digits: int = 1,
+    most: int = 1_000_000,
+    lengths: tuple[np.ndarray, np.ndarray] | None = None,
+    noise: Noise | None = None,
+    seed: int = 0,
+) -> Sampled:
+    """Propagation of distributions (JCGM 101:2008): the whole calibration is repeated on readings drawn anew.
+
+    Readings are drawn about poses that the calibrated arm holds exactly in their sockets, with the calibration's noise (given
+    or estimated; or ``noise``), certified lengths with their u. Blocks of max(100 / (1 - level), 10,000) trials are added until
+    mean, u and both ends of the interval of every quantity are stable to a fifth of the tolerance for ``digits`` significant
+    digits of u, or ``most`` trials are done. ``lengths`` are poses at both ends, ``(v, n)`` each (default: 24 over the volume).
+
+    Bounds act in every trial as they did in the calibration, so where one is active the distribution ends there.
+    """
+    if digits not in (1, 2):
+        raise InputError(f"digits is {digits}; give 1 or 2 significant digits of the uncertainty.")
+    if not 0 < level <= 0.9999:
+        raise InputError(f"level is {level:g}; give a share between 0 and 0.9999, for example 0.95.")
+    if not isinstance(result, Calibration):
+        raise InputError("monte_carlo repeats a whole calibration; give the result of aj.calibrate.")
+    if noise is not None:
+        noise.check(result.arm.joints)
+    noise = result.noise if noise is None else noise
+    block = max(math.ceil(100 / (1 - level)), 10_000)
+    if most < block:
+        raise InputError(f"most is {most}, but one block of trials has {block}; allow that many at least.")
+    task = _Task.of(result, capture, lengths)
+    exact, moves = _exact(result.arm, capture)
+    true_lengths = np.asarray(_lengths_by(result.arm, capture))
+    drawn, failed, blocks = [], 0, []
+    stable = False
+    while sum(map(len, drawn)) + failed < most and not stable:
+        random = np.random.default_rng([seed, len(drawn)])
+        pieces = []
+        for count in _slices(block, exact.size):
+            # Noise estimated with few degrees of freedom is itself uncertain: its scale is drawn too, which gives Student's t
+            # (JCGM 101, 6.4.9).
+            known = math.isinf(result.freedom)
+            level_of = 1.0 if known else np.sqrt(result.freedom / random.chisquare(result.freedom, size=(count, 1, 1)))
+            seats = float(noise.seating) * level_of * random.normal(size=(count, *exact.shape[:1], 3))
+            readings = exact + np.einsum("Nic,tNc->tNi", moves, seats)
+            readings += np.asarray(noise.encoder) * level_of * random.normal(size=readings.shape)
+            values = true_lengths + task.u * random.normal(size=(count, len(task.u)))
+            solved, lost = task.solved(readings, values)
+            pieces.append(solved)
+            failed += lost
+        found = np.concatenate(pieces)
+        drawn.append(found)
+        if len(found) < 10:
+            raise InputError("hardly any Monte Carlo trial converges; widen the bounds, or look at the calibration first.")
+        low, high = np.quantile(found, [(1 - level) / 2, (1 + level) / 2], axis=0)
+        blocks.append(np.stack([found.mean(axis=0), found.std(axis=0, ddof=1), low, high]))
+        u = np.concatenate(drawn).std(axis=0, ddof=1)
+        stable = len(blocks) > 1 and bool(np.all(_unsettled(blocks) <= numerical_tolerance(u, digits) / _REFINED))
+    return task.sampled(result, np.concatenate(drawn), stable, failed, level, digits)
+
+
+def bootstrap(result: Calibration, capture: Capture, *, trials: int = 2000, level: float = 0.95, seed: int = 0) -> Sampled:
+    """The calibration repeated on poses drawn with replacement from each socket, and lengths drawn with their u.
+
+    It assumes nothing of the errors but that poses are independent. (A socket of m poses then scatters by (m - 1) / m too little.)
+    """
+    if trials < 100:
+        raise InputError(f"{trials} trials show no distribution; ask for at least 100.")
+    random = np.random.default_rng(seed)
+    starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
+    task = _Task.of(result, capture, None)
+    rows = np.concatenate(
+        [start + random.integers(size, size=(trials, size)) for start, size in zip(starts, capture.sizes, strict=True)], axis=1
+    )
+    nominal = np.array([float(length.value) for length in capture.lengths])
+    found, failed = task.solved(np.asarray(capture.q)[rows], nominal + task.u * random.normal(size=(trials, len(nominal))))
+    if len(found) < 10:
+        raise InputError("hardly any bootstrap trial converges: too few poses a socket for this; record more.")
+    return task.sampled(result, found, True, failed, level, 1)
+
+
+def numerical_tolerance(u: Float[np.ndarray, " q"], digits: int) -> Float[np.ndarray, " q"]:
+    """delta = 10^l / 2, where u = c 10^l with an integer c of so many digits (JCGM 101, 7.9.2)."""
+    safe = np.where(u > 0, u, 1.0)
+    exponent = np.floor(np.log10(safe)) - (digits - 1)
+    # 9.96 rounds to 10, which has one digit more.
+    exponent += np.round(safe / 10**exponent) >= 10**digits
+    return np.where(u > 0, 0.5 * 10**exponent, 0.0)
+
+
+def _unsettled(blocks: list[np.ndarray]) -> Float[np.ndarray, " q"]:
+    """Twice the standard deviation of the averages over blocks, of the worst of mean, u and both ends."""
+    count = len(blocks)
+    return 2 * np.std(blocks, axis=0, ddof=1).max(axis=0) / math.sqrt(count)
+
+
+def _slices(block: int, numbers: int) -> list[int]:
+    """A block of trials in pieces whose readings take 200 MB at most."""
+    most = max(int(2.5e7 / numbers), 1)
+    return [min(most, block - first) for first in range(0, block, most)]
+
+
+def _exact(arm: Arm, capture: Capture) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n 3"]]:
+    """Poses that hold their socket exactly, and the least change of the joints for each mm that the tip shall move."""
+    q = settled(arm, capture)
+    by_joints = np.asarray(arm.jacobian(q, [f"q_{i}" for i in range(1, arm.joints + 1)]))
+    return q, np.linalg.pinv(by_joints, rcond=1e-8)
+
+
+def _lengths_by(arm: Arm, capture: Capture) -> np.ndarray:
+    tips = np.asarray(arm.position(settled(arm, capture)))
+    first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
+    ends = capture.ends()
+    return np.linalg.norm(tips[first[ends[:, 0]]] - tips[first[ends[:, 1]]], axis=1)
+
+
+class _Task(NamedTuple):
+    """What is the same in all trials."""
+
+    result: Calibration
+    capture: Capture
+    start: Float[np.ndarray, "v n"]
+    end: Float[np.ndarray, "v n"]
+    u: Float[np.ndarray, " l"]
+
+    @classmethod
+    def of(cls, result: Calibration, capture: Capture, lengths: tuple[np.ndarray, np.ndarray] | None) -> "_Task":
+        if lengths is not None and (
+            len(lengths) != 2 or np.ndim(lengths[0]) != 2 or np.shape(lengths[0]) != np.shape(lengths[1])
+        ):
+            raise InputError("lengths must be two arrays of poses, (v, n) each: where each length starts, and where it ends.")
+        start, end = lengths or check_lengths(result.arm, _LENGTHS, length=default_length(result.arm))
+        u = np.array([float(length.u) for length in capture.lengths])
+        return cls(result, capture, np.asarray(start), np.asarray(end), u)
+
+    def solved(self, q: Float[np.ndarray, "t N n"], values: Float[np.ndarray, "t l"]) -> tuple[np.ndarray, int]:
+        """Outputs of the trials that converged ``(t, q)``, and how many did not."""
+        result = self.result
+        given = None if result.stage1.misfit is None else result.noise  # weighed as the calibration was
+        many = calibrate_many(
+            result.stage1.arm,
+            batch_of(self.capture, q, values),
+            result.bounds.lower,
+            result.bounds.upper,
+            result.stage1.parameters,
+            method=result.method,  # pyright: ignore[reportArgumentType]
+            space=Parameters(result.stage1.arm, result.space.names),
+            hold=result.stage1.hold,
+            noise=given,
+        )
+        good = many.converged
+        lengths = self._measured(many.stage1.parameters if self.divided else many.parameters, many.k)
+        found = np.hstack([many.parameters, many.k[:, None], lengths])
+        return found[good], int(np.sum(~good))
+
+    @property
+    def divided(self) -> bool:
+        """Whether the scale fix divided every length, held ones too."""
+        return self.result.method == "two-stage"
+
+    def _measured(self, parameters: Float[np.ndarray, "t p"], k: Float[np.ndarray, " t"]) -> Float[np.ndarray, "t v"]:
+        """The followed lengths by each trial's arm: of the joint solve, or of stage 1 and divided by k."""
+        base = Parameters(self.result.stage1.arm if self.divided else self.result.arm, self.result.space.names)
+        ends = (jnp.asarray(self.start), jnp.asarray(self.end))
+        return np.asarray(_lengths_of(base, jnp.asarray(parameters), jnp.asarray(k), ends, self.divided))
+
+    def sampled(self, result: Calibration, values: np.ndarray, stable: bool, failed: int, level: float, digits: int) -> Sampled:
+        """The trials' distribution beside the linear result."""
+        linear = uncertainty_of(result)
+        u_length = np.asarray(linear.length(self.start, self.end))
+        u = values.std(axis=0, ddof=1)
+        low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
+        start, end = (np.asarray(result.arm.position(q)) for q in (self.start, self.end))
+        lengths = np.linalg.norm(start - end, axis=1)
+        estimate = np.concatenate([result.parameters, [result.scale.value], lengths])
+        return Sampled(
+            quantities=(*result.space.names, "k", *(f"length {i + 1}" for i in range(len(self.start)))),
+            estimate=estimate,
+            u=u,
+            low=low,
+            high=high,
+            linear_u=np.concatenate([linear.u, [float(result.scale.u)], u_length]),
+            factor=linear.factor(level),
+            tolerance=numerical_tolerance(u, digits),
+            stable=stable,
+            trials=len(values) + failed,
+            failed=failed,
+            level=level,
+            values=values,
+        )
+
+
+@eqx.filter_jit
+def _lengths_of(space: Parameters, parameters: Array, k: Array, ends: tuple[Array, Array], divided: bool) -> Array:
+    def one(row: tuple[Array, Array]) -> Array:
+        arm = space.arm(row[0])
+        arm = divide_lengths(arm, row[1]) if divided else arm
+        return jnp.linalg.norm(arm.position(ends[0]) - arm.position(ends[1]), axis=-1)
+
+    return jax.lax.map(one, (parameters, k), batch_size=256)
+
+
+def batch_of(capture: Capture, q: Float[np.ndarray, "t N n"], values: Float[np.ndarray, "t l"]) -> Capture:
+    """A batch of captures like this one with other readings and certified lengths; nothing is checked."""
+    names = range(len(capture.lengths))
+    leaves = lambda c: [c.q, *(c.lengths[i].value for i in names), *(c.lengths[i].u for i in names)]  # noqa: E731
+    spread = [jnp.asarray(np.broadcast_to(np.asarray(length.u), len(q))) for length in capture.lengths]
+    return eqx.tree_at(leaves, capture, [jnp.asarray(q), *(jnp.asarray(values[:, i]) for i in names), *spread])

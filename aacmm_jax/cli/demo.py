@@ -1,0 +1,114 @@
+"""The demonstration: the paper's arm with realistic noise, both stages, compared with the truth."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..calibration.evaluation import evaluate
+from ..calibration.stages import calibrate
+from ..core.errors import InputError
+from ..data.capture import Capture
+from ..data.recording import Recording
+from ..data.simulation import deviated, simulate
+from ..files.arms import load_specification, save_arm
+from ..files.calibrations import CalibrationRecord, record_of, save_calibration
+from ..files.captures import save_capture
+from ..files.storage import fingerprint
+from ..summaries.calibration import calibration_summary
+
+_DEVIATION_MM, _DEVIATION_DEG = 1.0, 0.1
+_ENCODER_ARCSEC, _SEATING_MM, _LENGTH_U_MM = 2.0, 0.005, 0.002
+_CHECKS, _CHECK_MM = 30, 300.0
+_START, _END = (400.0, 200.0, 300.0), (700.0, 500.0, 500.0)
+
+
+def run(folder: Path, seed: int) -> dict[str, Any]:
+    """Simulate, calibrate, compare, and leave capture, calibration, arms and a figure in ``folder``."""
+    nominal = load_specification("cheng2018-simulation")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder} cannot be used as a folder: {(error.strerror or str(error)).lower()}; name another."
+        ) from error
+    bounds = nominal.bounds()
+    true = nominal._replace(
+        arm=deviated(bounds.space, length=_DEVIATION_MM, angle=math.radians(_DEVIATION_DEG), seed=seed),
+        name=f"{nominal.name}, true",
+    )
+    capture = simulate(
+        true.arm,
+        {"A": _START, "B": _END},
+        poses={"A": 70, "B": 10},
+        lengths=[("A", "B", _LENGTH_U_MM)],
+        encoder_arcsec=_ENCODER_ARCSEC,
+        seating=_SEATING_MM,
+        seed=seed,
+    )
+    recording = Recording(capture, nominal, true, seed)
+    save_capture(folder / "capture.h5", recording)
+    recording = recording._replace(sources=(fingerprint(folder / "capture.h5"),))
+    record = record_of(calibrate(nominal.arm, capture, bounds), recording)
+    save_calibration(folder / "calibration.h5", record)
+    save_arm(nominal.arm, folder / "nominal.toml", name=nominal.name)
+    save_arm(true.arm, folder / "true.toml", name=true.name)
+    save_arm(record.calibrated.arm, folder / "calibrated.toml", name=record.calibrated.name)
+    summary = _summary(record, _checks(record, seed))
+    from ..plot.calibration import calibration_figure
+
+    calibration_figure(record, folder / "calibration.png")
+    files = ["capture.h5", "calibration.h5", "nominal.toml", "true.toml", "calibrated.toml", "calibration.png"]
+    return summary | {"folder": str(folder), "files": files}
+
+
+def _checks(record: CalibrationRecord, seed: int) -> dict[str, float]:
+    """RMS error of lengths that were not used, all over the volume, measured with the same noise by each arm."""
+    random = np.random.default_rng(seed)
+    assert record.recording.true is not None
+    sockets = {}
+    for i in range(_CHECKS):
+        middle = np.array([500.0, 300.0, 400.0]) + random.uniform(-250, 250, 3)
+        direction = random.normal(size=3)
+        half = 0.5 * _CHECK_MM * direction / np.linalg.norm(direction)
+        sockets[f"{i}-"], sockets[f"{i}+"] = tuple(middle - half), tuple(middle + half)
+    pairs = [(f"{i}-", f"{i}+") for i in range(_CHECKS)]
+    capture: Capture = simulate(
+        record.recording.true.arm,
+        sockets,
+        poses=1,
+        lengths=pairs,
+        encoder_arcsec=_ENCODER_ARCSEC,
+        seating=_SEATING_MM,
+        seed=seed + 1,
+    )
+    arms = {"nominal": record.recording.nominal, "stage1": record.stage1, "calibrated": record.calibrated}
+    return {
+        stage: float(np.sqrt(np.mean(np.asarray(evaluate(specification.arm, capture).error) ** 2)))
+        for stage, specification in arms.items()
+    }
+
+
+def _summary(record: CalibrationRecord, checks: dict[str, float]) -> dict[str, Any]:
+    whole = calibration_summary(record)
+    length = record.recording.capture.lengths[0]
+    return {
+        "kind": "demo",
+        "poses": record.recording.capture.sizes[0],
+        "more_poses": record.recording.capture.sizes[1],
+        "deviation_mm": _DEVIATION_MM,
+        "deviation_deg": _DEVIATION_DEG,
+        "encoder_arcsec": _ENCODER_ARCSEC,
+        "seating_um": 1e3 * _SEATING_MM,
+        "length_mm": float(length.value),
+        "length_u_um": 1e3 * _LENGTH_U_MM,
+        "checks": _CHECKS,
+        "check_length_mm": _CHECK_MM,
+        "scale_k": record.k,
+        "scale_u": record.u_k,
+        **{
+            stage: whole[stage] | whole["truth"][stage] | {"check_rms_mm": checks[stage]}
+            for stage in ("nominal", "stage1", "calibrated")
+        },
+    }

@@ -1,0 +1,1 @@
+"""What is recorded: captures, their noise, and simulated recordings."""

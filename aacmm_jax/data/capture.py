@@ -1,0 +1,171 @@
+"""What was recorded: joint angles taken while the tip rested in fixed sockets, and known lengths between sockets."""
+
+import fnmatch
+from collections.abc import Iterable, Mapping, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..core.arrays import Numbers, as_array, is_concrete, joined
+from ..core.errors import InputError, nearest
+
+# Encoders of arms with unlimited joints count a few turns at most; readings beyond this are degrees taken for radians.
+_MOST_RADIANS = 8 * np.pi
+
+
+class ReferenceLength(eqx.Module):
+    """A physical artefact: the distance between two sockets.
+
+    ``value`` is its calibrated length and ``u`` the standard uncertainty (k = 1) of that length, both in mm.
+    """
+
+    start: str = eqx.field(static=True)
+    end: str = eqx.field(static=True)
+    value: Float[Array, ""]
+    u: Float[Array, ""]
+
+    def __init__(self, start: str, end: str, value: Numbers, u: Numbers = 0.0):
+        self.start, self.end = start, end
+        where = f"reference length '{start}' to '{end}'"
+        self.value, self.u = as_array(value, where), as_array(u, f"u of {where}")
+        if start == end:
+            raise InputError(f"{where} joins a socket to itself; name two different sockets.")
+        if self.value.ndim or self.u.ndim:
+            raise InputError(f"{where} needs one value and one u, in mm.")
+        # NumPy does the looking: inside jit even a constant becomes a tracer once JAX computes with it.
+        if is_concrete(self.value) and not 0 < float(self.value) < np.inf:
+            raise InputError(f"{where} is {float(self.value):g} mm; a length must be positive and finite.")
+        if is_concrete(self.u) and not 0 <= float(self.u) < np.inf:
+            raise InputError(
+                f"{where} has u = {float(self.u):g} mm; a standard uncertainty must be zero or positive, and finite."
+            )
+
+
+class Capture(eqx.Module):
+    """Poses grouped by the socket that held the tip, and reference lengths between sockets.
+
+    ``Capture(sockets={"A": q, ...}, lengths=[ReferenceLength("A", "B", value=201.513, u=0.002)])`` with q ``(m, n)`` in
+    rad. A socket's position is unknown and is eliminated by the centroid of its poses; one pose an end is enough for a
+    length. All poses are kept in one ``(N, n)`` array, socket after socket, because that is what is fast.
+
+    Raises `InputError` for angles that are not finite or look like degrees, for sockets of different joint counts, and
+    for lengths that join unknown or identical sockets.
+    """
+
+    q: Float[Array, "N n"]
+    lengths: tuple[ReferenceLength, ...]
+    names: tuple[str, ...] = eqx.field(static=True)
+    sizes: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(self, sockets: Mapping[str, Numbers], lengths: Iterable[ReferenceLength] = ()):
+        if not sockets:
+            raise InputError("a capture needs at least one socket with poses.")
+        blocks = {name: _checked_angles(name, angles) for name, angles in sockets.items()}
+        first, width = next((name, block.shape[1]) for name, block in blocks.items())
+        for name, block in blocks.items():
+            if block.shape[1] != width:
+                raise InputError(
+                    f"socket '{name}' has {block.shape[1]} columns, but socket '{first}' has {width}; give one column a joint."
+                )
+        _check_different(blocks)
+        self.q = joined(list(blocks.values()))
+        self.names = tuple(blocks)
+        self.sizes = tuple(block.shape[0] for block in blocks.values())
+        self.lengths = tuple(lengths)
+        for length in self.lengths:
+            for end in (length.start, length.end):
+                if end not in self.names:
+                    raise InputError(
+                        f"reference length '{length.start}' to '{length.end}' names the unknown socket '{end}'"
+                        f"{nearest(end, self.names)}"
+                    )
+
+    @property
+    def joints(self) -> int:
+        """Number of joints, n."""
+        return self.q.shape[-1]
+
+    @property
+    def sockets(self) -> dict[str, Float[Array | np.ndarray, "m n"]]:
+        """Joint angles by socket, rad."""
+        q = np.asarray(self.q) if is_concrete(self.q) else self.q
+        ends = np.cumsum(self.sizes)
+        return {name: q[end - size : end] for name, size, end in zip(self.names, self.sizes, ends, strict=True)}
+
+    @property
+    def owner(self) -> Int[np.ndarray, " N"]:
+        """Index of the socket that each pose belongs to, ``(N,)``."""
+        return np.repeat(np.arange(len(self.sizes)), self.sizes)
+
+    def ends(self) -> Int[np.ndarray, "l 2"]:
+        """Socket indices of every length's two ends."""
+        pairs = [(self.names.index(length.start), self.names.index(length.end)) for length in self.lengths]
+        return np.array(pairs, dtype=int).reshape(-1, 2)
+
+    def select(self, only: Iterable[str] | str | None = None, without: Iterable[str] | str = ()) -> "Capture":
+        """The sockets whose names match ``only`` and not ``without`` (shell patterns), with the lengths among them."""
+        only = [only] if isinstance(only, str) else only
+        without = [without] if isinstance(without, str) else list(without)
+        kept = list(self.names) if only is None else _matching(self.names, only)
+        dropped = _matching(self.names, without)
+        kept = [name for name in kept if name not in dropped]
+        if not kept:
+            raise InputError("no socket is left after the selection; widen it.")
+        sockets = self.sockets
+        lengths = [length for length in self.lengths if length.start in kept and length.end in kept]
+        return Capture({name: sockets[name] for name in kept}, lengths)
+
+
+def _matching(names: Sequence[str], patterns: Iterable[str]) -> list[str]:
+    chosen: set[str] = set()
+    for pattern in patterns:
+        found = {name for name in names if name == pattern or fnmatch.fnmatchcase(name, pattern)}
+        if not found:
+            raise InputError(f"no socket matches '{pattern}'{nearest(pattern, names)}")
+        chosen |= found
+    return [name for name in names if name in chosen]
+
+
+def _checked_angles(name: str, angles: Numbers) -> Array | np.ndarray:
+    if not is_concrete(angles):
+        array = jnp.asarray(angles, dtype=jnp.float64)
+    else:
+        try:
+            array = np.asarray(angles, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"socket '{name}' holds something that is not a number, or rows of unequal length.") from error
+    if array.ndim != 2 or 0 in array.shape:
+        raise InputError(
+            f"socket '{name}' has shape {array.shape}; give one row a pose and one column a joint, at least one of each."
+        )
+    if is_concrete(array):
+        _check_values(name, np.asarray(array))
+    return array
+
+
+def _check_different(blocks: Mapping[str, Array | np.ndarray]) -> None:
+    """Two sockets with the very same poses are one file given twice."""
+    seen: dict[bytes, str] = {}
+    for name, block in blocks.items():
+        if is_concrete(block) and block.shape[0] > 1:
+            twin = seen.setdefault(np.asarray(block).tobytes(), name)
+            if twin != name:
+                raise InputError(f"sockets '{twin}' and '{name}' hold the very same poses; is one file given twice?")
+
+
+def _check_values(name: str, array: np.ndarray) -> None:
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        row, column = bad[0] + 1
+        raise InputError(
+            f"socket '{name}' pose {row} joint {column} is {array[row - 1, column - 1]}; every angle must be finite."
+        )
+    largest = float(np.abs(array).max())
+    if largest > _MOST_RADIANS:
+        row, column = np.argwhere(np.abs(array) == largest)[0] + 1
+        raise InputError(
+            f"socket '{name}' pose {row} joint {column} is {largest:g} rad, more than four turns: these look like degrees; "
+            "convert with numpy.deg2rad, or state the unit in the manifest."
+        )

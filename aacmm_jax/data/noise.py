@@ -1,0 +1,75 @@
+"""What a reading errs by: encoders in every joint, and the tip in its seat."""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..core.arrays import Numbers, as_floats, is_concrete
+from ..core.errors import InputError
+from ..kinematics.chain import Geometry, Turns, columns_of, walk
+
+_MOST = {"encoder_arcsec": 36_000.0, "seating": 100.0}  # ten degrees; mm
+ARCSEC = math.pi / (180 * 3600)  # rad
+
+
+class Noise(eqx.Module):
+    """Standard deviations of independent errors: of every joint's reading (rad), and of a coordinate of the seated tip (mm).
+
+    ``Noise(encoder_arcsec=2.0, seating=0.005)``; one number for all encoders, or one each. Raises `InputError` for negative or
+    infinite ones.
+    """
+
+    encoder: Float[Array, "..."]
+    seating: Float[Array, ""]
+
+    def __init__(self, *, encoder_arcsec: Numbers = 0.0, seating: Numbers = 0.0):
+        self.encoder = as_floats(encoder_arcsec, "encoder_arcsec") * ARCSEC
+        self.seating = as_floats(seating, "seating")
+        for what, values in (("encoder_arcsec", self.encoder), ("seating", self.seating)):
+            if values.ndim > (what == "encoder_arcsec"):
+                raise InputError(f"{what} has shape {values.shape}; give one number{', or one a joint' * ('enc' in what)}.")
+            if values.size == 0:
+                raise InputError(f"{what} is empty; give one number, or one a joint.")
+            if is_concrete(values) and np.any(np.asarray(values) < 0):
+                raise InputError(f"{what} must be a standard deviation: zero or positive.")
+
+    @property
+    def encoder_arcsec(self) -> Float[Array, "..."]:
+        """Standard deviation of readings, arcsec."""
+        return self.encoder / ARCSEC
+
+    def check(self, joints: int) -> None:
+        """Raise `InputError` where nothing can be weighed by it: no noise at all, absurdly much, or another number of encoders than joints."""
+        if is_concrete(self.encoder, self.seating) and not (
+            np.any(np.asarray(self.encoder)) or np.any(np.asarray(self.seating))
+        ):
+            raise InputError(
+                "noise is zero everywhere, so nothing can be weighed by it; give a standard deviation, or no noise."
+            )
+        # Not in the constructor: residuals of a calibration that failed may be as large, and its file must still be read.
+        for what, values in (("encoder_arcsec", self.encoder_arcsec), ("seating", self.seating)):
+            if is_concrete(values) and np.any(np.asarray(values) > _MOST[what]):
+                raise InputError(f"{what} is over {_MOST[what]:g}, which no arm's is; is it in another unit?")
+        if self.encoder.ndim and self.encoder.shape != (joints,):
+            raise InputError(
+                f"encoder_arcsec has {self.encoder.shape[0]} values, but the arm has {joints} joints; give one number, or one a joint."
+            )
+
+
+def tip_covariances(geometry: Geometry, turns: Turns, noise: Noise) -> Float[Array, "... 3 3 N"]:
+    """Covariance of every pose's tip, mm^2: J_q S J_q^T of the encoders, and the seat's in every direction."""
+    # 1 nm besides, so that a pose in which the encoders cannot move the tip in some direction has no infinite weight.
+    seat = (noise.seating**2 + 1e-12) * jnp.eye(3)[..., None]
+    encoders = encoder_part(geometry, turns, noise.encoder)
+    return encoders + seat.reshape((1,) * (encoders.ndim - 3) + seat.shape)
+
+
+def encoder_part(geometry: Geometry, turns: Turns, encoder: Float[Array, "..."]) -> Float[Array, "... 3 3 N"]:
+    """J_q S J_q^T, pose by pose, mm^2, for encoders of standard deviation ``encoder`` (one, or one a joint; rad)."""
+    columns = columns_of(walk(geometry, turns))["theta"]
+    each = jnp.broadcast_to(encoder, (columns.shape[0],))
+    columns = columns * each.reshape(-1, *(1,) * (columns.ndim - 1))
+    return jnp.sum(columns[..., :, None, :] * columns[..., None, :, :], axis=0)

@@ -1,0 +1,1 @@
+"""Calibrations of one arm compared over time."""

@@ -1,0 +1,168 @@
+"""What a calibration certificate says besides numbers: laboratory, customer, item, persons and dates, written by people in TOML."""
+
+import datetime
+import itertools
+import os
+import re
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+
+from ..core.errors import InputError
+from .toml import read_toml
+
+NOT_STATED = "not stated"
+NO_COUNTRY = "ZZ"  # ISO 3166-1 leaves it to users: the certificate must have a country code, and none was given
+
+# All but the characters of XML 1.0, production 2.
+_UNHOLDABLE = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def held_by_xml(text: str, what: str) -> str:
+    """The same text, or `InputError` where it has a character that XML 1.0 cannot hold. ``what`` names it in the sentence."""
+    found = _UNHOLDABLE.search(text)
+    if found:
+        raise InputError(f"{what} holds the character U+{ord(found.group()):04X}, which no XML file can hold; take it out.")
+    return text
+
+
+def _text(text: str) -> str:
+    """Text without blanks around it, as the schema wants it."""
+    text = held_by_xml(text, "the text").strip(" \t\n\r")
+    if not text:
+        raise ValueError("the text is empty; give some, or leave the key out.")
+    return text
+
+
+Text = Annotated[str, AfterValidator(_text)]
+
+
+def _country(code: str) -> str:
+    if not re.fullmatch("[A-Z]{2}", code):
+        raise ValueError(f"{code!r} is no country code of ISO 3166-1; give two capital letters, for example DE.")
+    return code
+
+
+Country = Annotated[str, AfterValidator(_country)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Contact(_Strict):
+    """A laboratory's or a customer's name and address. ``country`` is a code of ISO 3166-1: two capital letters."""
+
+    name: Text = NOT_STATED
+    street: Text | None = None
+    postal_code: Text | None = None
+    city: Text | None = None
+    country: Country | None = None
+    email: Text | None = None
+    phone: Text | None = None
+
+
+class Laboratory(Contact):
+    """The calibration laboratory; ``code`` is what its accreditation body calls it."""
+
+    code: Text | None = None
+
+
+class Item(_Strict):
+    """The arm that was calibrated; without a name, it is called as in its arm file."""
+
+    name: Text | None = None
+    manufacturer: Text | None = None
+    model: Text | None = None
+    serial_number: Text | None = None
+    customer_number: Text | None = None  # what the customer calls it by
+
+
+class Person(_Strict):
+    """A person responsible for the certificate."""
+
+    name: Text
+    role: Text | None = None
+    main_signer: bool = False
+
+
+class Reference(_Strict):
+    """A reference artefact that the lengths are between: gauge block, ball bar, plate."""
+
+    name: Text
+    manufacturer: Text | None = None
+    model: Text | None = None
+    serial_number: Text | None = None
+    certificate_number: Text | None = None  # of its own calibration
+
+
+class Certificate(_Strict):
+    """Number, dates and conditions. Without dates, the day on which the calibration was computed counts as begin and end."""
+
+    number: Text | None = None
+    country: Country | None = None  # where it is issued; by default the laboratory's
+    received: datetime.date | None = None  # when the arm came in
+    begin: datetime.date | None = None
+    end: datetime.date | None = None
+    issued: datetime.date | None = None
+    place: Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"] = "other"
+    remarks: Text | None = None
+    temperature_celsius: FiniteFloat | None = None
+    temperature_u_celsius: Annotated[FiniteFloat, Field(ge=0)] | None = None  # standard uncertainty
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "Certificate":
+        dates = [(name, getattr(self, name)) for name in ("received", "begin", "end", "issued")]
+        given = [(name, date) for name, date in dates if date is not None]
+        for (earlier, first), (later, second) in itertools.pairwise(given):
+            if first > second:
+                raise ValueError(f"{earlier} is {first}, after {later} on {second}; mend one of them.")
+        if self.temperature_u_celsius is not None and self.temperature_celsius is None:
+            raise ValueError("temperature_u_celsius is given without temperature_celsius; give both.")
+        return self
+
+
+class Conformity(_Strict):
+    """A statement of conformity: the verdict, the specification it is about, and the rule by which it was decided."""
+
+    verdict: Literal["pass", "fail", "conditionalPass", "conditionalFail", "noPass", "noFail"]
+    specification: Text
+    decision_rule: Text
+
+
+class About(_Strict):
+    """What a certificate needs besides numbers. Everything is optional, and says that it is not stated where it is missing."""
+
+    laboratory: Laboratory = Laboratory()
+    customer: Contact = Contact()
+    item: Item = Item()
+    person: list[Person] = []
+    certificate: Certificate = Certificate()
+    reference: list[Reference] = []
+    conformity: Conformity | None = None
+
+    @property
+    def country(self) -> str:
+        """Country code of the certificate."""
+        return self.certificate.country or self.laboratory.country or NO_COUNTRY
+
+
+def read_about(path: str | os.PathLike) -> About:
+    """Read the TOML file about a certificate: ``[laboratory]``, ``[customer]``, ``[item]``, ``[[person]]``, ``[certificate]``,
+    ``[[reference]]``, ``[conformity]``. Raises `InputError` that names the file, the place in it and the mend."""
+    return read_toml(path, About)
+
+
+def check_conformity(about: About, *, simulated: bool, decision: str | None = None, tested: bool = False) -> None:
+    """Refuse a statement of conformity that the data contradict: of a simulated arm, or other than what an evaluation decided."""
+    if about.conformity is None:
+        return
+    verdict = about.conformity.verdict
+    if simulated:
+        raise InputError("conformity is stated of a simulated arm, which conforms to nothing; leave [conformity] out.")
+    passes = {"pass": ("conforms",), "fail": ("fails",)}.get(verdict)
+    if tested and passes is not None and decision not in passes:
+        came = {"conforms": "every limit is kept", "fails": "a limit is not kept", "undecided": "a limit is undecided"}
+        raise InputError(
+            f"conformity.verdict is '{verdict}', but of this evaluation {came.get(decision or '', 'no limit was given')}; mend the statement."
+        )

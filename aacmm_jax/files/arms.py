@@ -1,0 +1,170 @@
+"""Arms in files: TOML for people, one row a joint, and the arms that ship with the package."""
+
+import math
+import os
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
+
+from ..core.errors import InputError, nearest
+from ..data.recording import ArmSpecification, single
+from ..kinematics.arm import Arm
+from . import storage
+from .toml import read_toml
+
+_LENGTH_UNITS = {"mm": 1.0, "m": 1000.0}
+_ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180}
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class _Joint(_Strict):
+    alpha: FiniteFloat
+    a: FiniteFloat
+    d: FiniteFloat
+    theta: FiniteFloat = 0.0
+    beta: FiniteFloat | None = None
+    limits: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
+
+
+class _Identification(_Strict):
+    held: list[str] | None = None
+    length: PositiveFloat = 10.0
+    angle: PositiveFloat | None = None
+    override: dict[str, PositiveFloat] = {}
+
+
+class _ArmModel(_Strict):
+    name: str = ""
+    source: str = ""
+    convention: Literal["standard", "craig"] = "standard"
+    length_unit: Literal["mm", "m"]
+    angle_unit: Literal["rad", "deg"]
+    probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] = [0.0, 0.0, 0.0]
+    joint: Annotated[list[_Joint], Field(min_length=1)]
+    identification: _Identification = _Identification()
+
+    @model_validator(mode="after")
+    def _all_or_none(self) -> "_ArmModel":
+        if len({joint.limits is None for joint in self.joint}) > 1:
+            raise ValueError("limits are given for some joints only; give them for all or for none.")
+        first = self.joint[0]
+        if self.convention == "craig" and (first.alpha or first.a):
+            raise ValueError(
+                "joint 1 has a twist or a length before its axis (alpha_0, a_0), which standard form cannot hold; "
+                "choose the base frame on the first axis, so that both are 0."
+            )
+        if self.convention == "craig" and any(joint.beta for joint in self.joint):
+            raise ValueError("beta is Hayati's angle of the standard form; leave it out of a craig table.")
+        return self
+
+
+def shipped_arms() -> tuple[str, ...]:
+    """Names of the arms that come with the package."""
+    folder = resources.files("aacmm_jax.files") / "shipped_arms"
+    return tuple(sorted(item.name.removesuffix(".toml") for item in folder.iterdir() if item.name.endswith(".toml")))
+
+
+def load_arm(source: str | os.PathLike) -> Arm:
+    """An arm by shipped name (``"cheng2018-simulation"``) or from a TOML file. Raises `InputError` where neither is found."""
+    return load_specification(source).arm
+
+
+def load_specification(source: str | os.PathLike) -> ArmSpecification:
+    """An arm with its name and its proposed identification, by shipped name or from a TOML file."""
+    if isinstance(source, str) and source in shipped_arms():
+        with resources.as_file(resources.files("aacmm_jax.files") / "shipped_arms" / f"{source}.toml") as path:
+            return _specification(path)
+    path = Path(source)
+    if not path.exists() and path.suffix != ".toml":
+        raise InputError(
+            f"'{source}' is neither a file nor an arm that ships with the package{nearest(str(source), shipped_arms())}"
+        )
+    return _specification(path)
+
+
+def _specification(path: Path) -> ArmSpecification:
+    model = read_toml(path, _ArmModel)
+    length, angle = _LENGTH_UNITS[model.length_unit], _ANGLE_UNITS[model.angle_unit]
+    rows = model.joint
+    links = [(row.alpha, row.a) for row in rows]
+    if model.convention == "craig":
+        # Rx(alpha_{i-1}) Tx(a_{i-1}) Rz Tz: the link after joint i stands in row i + 1; after the last there is none.
+        links = [*links[1:], (0.0, 0.0)]
+    beta = None if all(row.beta is None for row in rows) else [angle * (0.0 if row.beta is None else row.beta) for row in rows]
+    try:
+        arm = Arm(
+            alpha=[angle * twist for twist, _ in links],
+            a=[length * a for _, a in links],
+            d=[length * row.d for row in rows],
+            theta=[angle * row.theta for row in rows],
+            beta=beta,
+            probe=[length * x for x in model.probe],
+            limits=None if rows[0].limits is None else [[angle * x for x in row.limits or ()] for row in rows],
+        )
+        wanted = model.identification
+        specification = ArmSpecification(
+            arm=arm,
+            name=model.name or path.stem,
+            held=None if wanted.held is None else tuple(wanted.held),
+            length=wanted.length * length,
+            angle=0.0175 if wanted.angle is None else wanted.angle * angle,
+            override={
+                name: width * (length if name.split("_")[0] in ("a", "d", "probe") else angle)
+                for name, width in wanted.override.items()
+            },
+        )
+        specification.bounds()
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return specification
+
+
+def save_arm(arm: Arm, path: str | os.PathLike, *, name: str = "", source: str = "") -> None:
+    """Write an arm as TOML: standard convention, mm and rad, digits enough to read back the same numbers."""
+    storage.write_text(path, arm_toml(arm, name=name, source=source))
+
+
+def arm_toml(arm: Arm, *, name: str = "", source: str = "") -> str:
+    """The text of an arm file: standard convention, mm and rad."""
+    return specification_toml(ArmSpecification(arm, name), source=source)
+
+
+def specification_toml(specification: ArmSpecification, *, source: str = "") -> str:
+    """The text of an arm file with its proposed identification: standard convention, mm and rad."""
+    import tomlkit
+
+    document = tomlkit.document()
+    arm = single(specification.arm)
+    for key, value in (("name", specification.name), ("source", source)):
+        if value:
+            document[key] = storage.storable(value)
+    document["convention"] = "standard"
+    document["length_unit"] = "mm"
+    document["angle_unit"] = "rad"
+    document["probe"] = [float(x) for x in np.asarray(arm.probe)]
+    rows = tomlkit.array().multiline(True)
+    for i in range(arm.joints):
+        row = tomlkit.inline_table()
+        for kind in ("alpha", "a", "d", "theta", "beta"):
+            values = getattr(arm, kind)
+            if values is not None:
+                row[kind] = float(values[i])
+        if arm.limits is not None:
+            row["limits"] = list(arm.limits[i])
+        rows.append(row)
+    document["joint"] = rows
+    wanted = tomlkit.table()
+    if specification.held is not None:
+        wanted["held"] = list(specification.held)
+    wanted["length"] = float(specification.length)
+    wanted["angle"] = float(specification.angle)
+    if specification.override:
+        wanted["override"] = {name: float(width) for name, width in specification.override.items()}
+    document["identification"] = wanted
+    return tomlkit.dumps(document)

@@ -1,0 +1,199 @@
+"""Captures in HDF5: the poses, the reference lengths, the nominal arm and, for a simulation, the true one."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import InputError
+from ..data.capture import Capture, ReferenceLength
+from ..data.recording import ArmSpecification, ProbedSphere, Recording, checked_sphere, single
+from ..kinematics.arm import Arm
+from . import storage
+from .storage import Table, Variable
+
+_KINDS = {"alpha": "link twist", "a": "link length", "d": "link offset", "theta": "joint zero offset", "beta": "Hayati's angle"}
+
+
+def save_capture(path: str | os.PathLike, recording: Recording) -> None:
+    """Write a capture with its arms to HDF5, whole or not at all."""
+    storage.write_tables(path, "capture", recording_tables(recording), recording_attributes(recording))
+
+
+def load_capture(path: str | os.PathLike) -> Recording:
+    """Read a capture with its arms. Raises `InputError` where the file is missing, damaged, foreign or newer."""
+    stored = storage.read_tables(path, ("capture", "calibration"))
+    with storage.undamaged(path):
+        return recording_of(path, stored)
+
+
+def recording_attributes(recording: Recording) -> dict[str, Any]:
+    """Root attributes of a file that holds a recording."""
+    return {"seed": recording.seed, "sources": list(recording.sources) or None, "measured": recording.measured or None}
+
+
+def recording_tables(recording: Recording) -> dict[str, Table]:
+    """The tables of a recording: ``capture``, ``reference``, ``nominal_arm`` and perhaps ``true_arm``."""
+    capture = recording.capture
+    owner = [capture.names[i] for i in capture.owner]
+    tables = {
+        "capture": Table(
+            {
+                "pose": Variable(("pose",), np.arange(1, len(owner) + 1), "1", "pose number"),
+                "joint": Variable(("joint",), np.arange(1, capture.joints + 1), "1", "joint number"),
+                "angle": Variable(("pose", "joint"), np.asarray(capture.q), "rad", "joint angle as read"),
+                "socket": Variable(("pose",), owner, "", "socket that held the tip"),
+            }
+        ),
+        "reference": reference_table(capture.lengths),
+        "nominal_arm": arm_table(recording.nominal),
+    }
+    if recording.true is not None:
+        tables["true_arm"] = arm_table(recording.true)
+    if recording.spheres:
+        tables["sphere"] = sphere_table(recording.spheres)
+    return tables
+
+
+def reference_table(lengths: Sequence[ReferenceLength]) -> Table:
+    """Reference lengths, one row each."""
+    columns = {
+        "length": (np.arange(1, len(lengths) + 1), "1", "reference length number"),
+        "start": ([length.start for length in lengths], "", "socket at one end"),
+        "end": ([length.end for length in lengths], "", "socket at the other end"),
+        "value": ([float(length.value) for length in lengths], "mm", "calibrated length"),
+        "u": ([float(length.u) for length in lengths], "mm", "standard uncertainty"),
+    }
+    return Table({name: Variable(("length",), *column) for name, column in columns.items()})
+
+
+def lengths_of(path: str | os.PathLike, stored: storage.Stored) -> list[ReferenceLength]:
+    """The reference lengths that a file holds."""
+    table = stored.tables["reference"]
+    storage.need(path, table, "start", "end", "value", "u", of="entry")
+    rows = zip(table["start"], table["end"], table["value"], table["u"], strict=True)
+    return [ReferenceLength(str(start), str(end), float(value), float(u)) for start, end, value, u in rows]
+
+
+def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False) -> Table:
+    """Touched spheres, by poses or points, one row a touch; what belongs to a sphere stands in every row of it."""
+    rows = [(sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group]
+    each = {
+        "sphere": ([sphere.name for sphere, *_ in rows], "", "reference sphere"),
+        "test": ([sphere.test for sphere, *_ in rows], "", "acceptance test that the sphere was touched for"),
+        "group": ([number for _, number, _ in rows], "1", "repeat, or orientation of the wrist"),
+        "diameter": ([sphere.diameter for sphere, *_ in rows], "mm", "calibrated diameter"),
+        "u": ([sphere.u for sphere, *_ in rows], "mm", "standard uncertainty of the diameter"),
+        "stylus": ([sphere.stylus for sphere, *_ in rows], "mm", "diameter of the probe's ball"),
+        "form": ([sphere.form for sphere, *_ in rows], "mm", "calibrated form error"),
+    }
+    variables = {name: Variable(("touch",), *column) for name, column in each.items()}
+    variables["touch"] = Variable(("touch",), np.arange(1, len(rows) + 1), "1", "touch number")
+    values = np.array([touched for *_, touched in rows])
+    if points:
+        variables["axis"] = Variable(("axis",), ["x", "y", "z"], "", "axis")
+        variables["position"] = Variable(("touch", "axis"), values, "mm", "centre of the probe")
+    else:
+        variables["joint"] = Variable(("joint",), np.arange(1, values.shape[1] + 1), "1", "joint number")
+        variables["angle"] = Variable(("touch", "joint"), values, "rad", "joint angle as read")
+    return Table(variables)
+
+
+def spheres_of(path: str | os.PathLike, stored: storage.Stored, entry: str = "angle") -> tuple[ProbedSphere, ...]:
+    """The touched spheres that a file holds, by their ``angle`` or ``position``."""
+    table = stored.tables.get("sphere")
+    if table is None:
+        return ()
+    storage.need(path, table, "sphere", "test", "group", "diameter", "u", "stylus", "form", entry, of="entry")
+    keys = list(zip(table["sphere"].tolist(), table["test"].tolist(), strict=True))
+    found = []
+    for name, test in dict.fromkeys(keys):
+        rows = np.array([key == (name, test) for key in keys])
+        first = int(rows.argmax())
+        groups = tuple(table[entry][rows & (table["group"] == number)] for number in np.unique(table["group"][rows]))
+        numbers = (float(table[what][first]) for what in ("diameter", "u", "stylus", "form"))
+        found.append(ProbedSphere(str(name), test, groups, *numbers))
+    return tuple(found)
+
+
+def recording_of(path: str | os.PathLike, stored: storage.Stored) -> Recording:
+    """The recording that a file's tables hold."""
+    storage.need(path, stored.tables, "capture", "reference", "nominal_arm")
+    poses = stored.tables["capture"]
+    storage.need(path, poses, "angle", "socket", of="entry")
+    owner = np.asarray(poses["socket"]).astype(str)
+    names = list(dict.fromkeys(owner.tolist()))
+    try:
+        capture = Capture({name: poses["angle"][owner == name] for name in names}, lengths_of(path, stored))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    true = specification_of(path, stored, "true_arm") if "true_arm" in stored.tables else None
+    try:
+        spheres = tuple(checked_sphere(sphere, capture.joints) for sphere in spheres_of(path, stored))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    sources = tuple(stored.attributes.get("sources") or ())
+    attributes = stored.attributes
+    nominal = specification_of(path, stored, "nominal_arm")
+    return Recording(capture, nominal, true, attributes.get("seed"), spheres, sources, attributes.get("measured", ""))
+
+
+def arm_table(specification: ArmSpecification) -> Table:
+    """An arm as a table over ``joint``, with its proposed identification in attributes."""
+    arm = single(specification.arm)
+    variables = {
+        "joint": Variable(("joint",), np.arange(1, arm.joints + 1), "1", "joint number"),
+        "axis": Variable(("axis",), ["x", "y", "z"], "", "axis of the last frame"),
+        "probe": Variable(("axis",), np.asarray(arm.probe), "mm", "tip in the last frame"),
+    }
+    for kind, long_name in _KINDS.items():
+        values = getattr(arm, kind)
+        if values is not None:
+            unit = "mm" if kind in ("a", "d") else "rad"
+            variables[kind] = Variable(("joint",), np.asarray(values), unit, long_name)
+    if arm.limits is not None:
+        for side, name in enumerate(("lowest", "highest")):
+            values = [limit[side] for limit in arm.limits]
+            variables[name] = Variable(("joint",), values, "rad", f"{name} reading of the joint")
+    attributes: dict[str, Any] = {
+        "name": specification.name,
+        "half_width_length_mm": specification.length,
+        "half_width_angle_rad": specification.angle,
+        "override_names": list(specification.override) or None,
+        "override_half_widths": [float(width) for width in specification.override.values()] or None,
+        "held": None if specification.held is None else ",".join(specification.held),
+    }
+    return Table(variables, attributes)
+
+
+def specification_of(path: str | os.PathLike, stored: storage.Stored, table: str) -> ArmSpecification:
+    """The arm that a table holds."""
+    arrays: Mapping[str, np.ndarray] = stored.tables[table]
+    attributes = stored.table_attributes[table]
+    storage.need(path, arrays, "alpha", "a", "d", "theta", "probe", of="entry")
+    limits = None
+    if "lowest" in arrays:
+        limits = list(zip(arrays["lowest"].tolist(), arrays["highest"].tolist(), strict=True))
+    held = attributes.get("held")
+    try:
+        arm = Arm(
+            alpha=arrays["alpha"],
+            a=arrays["a"],
+            d=arrays["d"],
+            theta=arrays["theta"],
+            beta=arrays.get("beta"),
+            probe=arrays["probe"],
+            limits=limits,
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    override = zip(attributes.get("override_names") or [], attributes.get("override_half_widths") or [], strict=True)
+    return ArmSpecification(
+        arm=arm,
+        name=attributes.get("name", ""),
+        held=None if held is None else tuple(name for name in held.split(",") if name),
+        length=attributes.get("half_width_length_mm", 10.0),
+        angle=attributes.get("half_width_angle_rad", 0.0175),
+        override=dict(override),
+    )

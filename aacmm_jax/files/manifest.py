@@ -1,0 +1,266 @@
+"""The capture manifest: a short TOML file that says which text files hold which socket, in which unit, and the lengths."""
+
+import datetime
+import glob
+import math
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+
+from ..core.errors import InputError
+from ..data.capture import Capture, ReferenceLength
+from ..data.recording import ProbedSphere, Recording, SphereTest, checked_sphere
+from . import storage
+from .arms import load_specification
+from .toml import read_toml
+
+_UNITS = {"rad": 1.0, "deg": math.pi / 180, "arcsec": math.pi / (180 * 3600)}
+_FIELD = re.compile(r"\{(\w+)\}")
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", populate_by_name=True)
+
+
+class _Angles(_Strict):
+    unit: Literal["rad", "deg", "arcsec", "counts"]
+    counts_per_turn: PositiveFloat | list[PositiveFloat] | None = None
+    sign: Literal[1, -1] | list[Literal[1, -1]] = 1
+    offset: FiniteFloat | list[FiniteFloat] = 0.0
+    columns: list[PositiveInt] | None = None
+
+    @model_validator(mode="after")
+    def _counts(self) -> "_Angles":
+        if (self.unit == "counts") != (self.counts_per_turn is not None):
+            raise ValueError("give counts_per_turn with unit = 'counts', and only with it.")
+        return self
+
+
+class _Files(_Strict):
+    """What is recorded in one file, or in several."""
+
+    file: str | None = None
+    files: Annotated[list[str], Field(min_length=1)] | None = None
+
+    @property
+    def paths(self) -> list[str]:
+        return [self.file] if self.file is not None else list(self.files or ())
+
+
+class _Socket(_Files):
+    name: str | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> "_Socket":
+        if (self.file is None) == (self.files is None):
+            raise ValueError("a socket needs either file or files.")
+        if self.files is not None and self.name is None:
+            raise ValueError("a socket of several files needs a name.")
+        return self
+
+
+class _Length(_Strict):
+    start: str = Field(alias="from")
+    end: str = Field(alias="to")
+    value: float
+    u: NonNegativeFloat = 0.0
+
+
+class _Sphere(_Files):
+    name: str
+    test: SphereTest
+    diameter: PositiveFloat
+    u: NonNegativeFloat = 0.0
+    stylus: NonNegativeFloat = 0.0
+    form: NonNegativeFloat = 0.0
+
+    @model_validator(mode="after")
+    def _one(self) -> "_Sphere":
+        if (self.file is None) == (self.files is None):
+            raise ValueError("a sphere needs either file or files (one for each repeat, or orientation).")
+        return self
+
+
+class _Points(_Strict):
+    unit: Literal["mm", "m", "um", "inch"]
+    columns: Annotated[list[PositiveInt], Field(min_length=3, max_length=3)] | None = None
+    reach: PositiveFloat | None = None  # mm
+    shoulder: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None  # mm
+
+    @model_validator(mode="after")
+    def _both(self) -> "_Points":
+        if (self.reach is None) != (self.shoulder is None):
+            raise ValueError(
+                "give reach and shoulder together: the zones of a test are counted from the shoulder, in the points' frame."
+            )
+        return self
+
+
+class _Recorded(_Strict):
+    """What manifests of poses and of points have in common."""
+
+    date: datetime.date | None = None  # when it was recorded
+    socket: list[_Socket] = []
+    length: list[_Length] = []
+    sphere: list[_Sphere] = []
+
+
+class _Manifest(_Recorded):
+    arm: str
+    angles: _Angles
+    socket: Annotated[list[_Socket], Field(min_length=1)]  # pyright: ignore[reportGeneralTypeIssues]
+
+
+class PointsManifest(_Recorded):
+    """A manifest of points instead of poses."""
+
+    points: _Points
+
+
+def read_manifest(path: str | os.PathLike) -> Recording:
+    """Read a manifest and every file it names; paths are relative to the manifest.
+
+    A field in braces stands for part of a path and makes one socket for each value found: with
+    ``file = "run_1/{place}/hole_{hole}.csv"`` and ``name = "{place}/{hole}"``, the length ``from = "{place}/0"``,
+    ``to = "{place}/1"`` holds at every place. Angles: reading -> sign * (reading - offset), in the stated unit.
+
+    Raises `InputError` that names the file, the place in it and the mend.
+    """
+    path = Path(path)
+    model = read_toml(path, _Manifest)
+    try:
+        nominal = load_specification(_arm_source(path, model.arm))
+        joints = nominal.arm.joints
+        if model.angles.columns is not None and len(model.angles.columns) != joints:
+            raise InputError(
+                f"angles.columns picks {len(model.angles.columns)} columns, but the arm has {joints} joints; pick one a joint."
+            )
+        files = [path]
+
+        def angles(file: Path) -> np.ndarray:
+            files.append(file)
+            table = storage.read_numbers(file, model.angles.columns)
+            if table.shape[1] != joints:
+                raise InputError(
+                    f"{file} has {table.shape[1]} columns, but the arm has {joints} joints; give one column a joint, "
+                    "or pick them with columns = [...] in [angles]."
+                )
+            return _radians(table, model.angles)
+
+        sockets, lengths, spheres = recorded(path.parent, model, angles)
+        sources = tuple(storage.fingerprint(file, path.parent) for file in files)
+        return Recording(Capture(sockets, lengths), nominal, spheres=spheres, sources=sources, measured=str(model.date or ""))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def recorded(
+    folder: Path, model: _Recorded, read: Callable[[Path], np.ndarray]
+) -> tuple[dict[str, np.ndarray], list[ReferenceLength], tuple[ProbedSphere, ...]]:
+    """The sockets, lengths and spheres that a manifest names, each file read by ``read``."""
+    sockets: dict[str, np.ndarray] = {}
+    fields: list[dict[str, str]] = []
+    for entry in model.socket:
+        for name, files, values in _expand(folder, entry):
+            if name in sockets:
+                raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
+            sockets[name] = np.concatenate([read(file) for file in files])
+            fields.append(values)
+    spheres = []
+    for entry in model.sphere:
+        if any((entry.name, entry.test) == (other.name, other.test) for other in spheres):
+            raise InputError(f"sphere '{entry.name}' is defined twice for one test; give its files in one [[sphere]].")
+        groups = tuple(read(folder / file) for file in entry.paths)
+        sphere = ProbedSphere(entry.name, entry.test, groups, entry.diameter, entry.u, entry.stylus, entry.form)
+        spheres.append(checked_sphere(sphere))
+    return sockets, _lengths(model.length, fields, sockets), tuple(spheres)
+
+
+def _arm_source(manifest: Path, arm: str) -> str | Path:
+    beside = manifest.parent / arm
+    return beside if arm.endswith(".toml") or beside.is_file() else arm
+
+
+def _radians(readings: np.ndarray, angles: _Angles) -> np.ndarray:
+    joints = readings.shape[1]
+
+    def a_joint(value: float | list, what: str) -> np.ndarray:
+        array = np.asarray(value, dtype=float)
+        if array.ndim and array.shape != (joints,):
+            raise InputError(f"angles.{what} has {array.size} values, but there are {joints} joints; give one, or one a joint.")
+        return array
+
+    unit = 2 * math.pi / a_joint(angles.counts_per_turn, "counts_per_turn") if angles.counts_per_turn else _UNITS[angles.unit]
+    return a_joint(angles.sign, "sign") * (readings - a_joint(angles.offset, "offset")) * unit
+
+
+def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dict[str, str]]]:
+    """Sockets of one entry: name, files and the values of its fields in braces."""
+    first = entry.paths[0]
+    fields = set(_FIELD.findall(first))
+    for what, text in (("name", entry.name or ""), *(("file", file) for file in entry.paths[1:])):
+        if set(_FIELD.findall(text)) != fields:
+            raise InputError(
+                f"socket {what} '{text}' has {_braces(_FIELD.findall(text))}, but file '{first}' has {_braces(fields)}; "
+                "use the same fields in the name and in every file."
+            )
+    if not fields:
+        yield entry.name or Path(first).stem, [folder / file for file in entry.paths], {}
+        return
+    assert entry.name is not None  # its fields are those of the file
+    before = "" if Path(first).is_absolute() else f"{folder.as_posix()}/"
+    literals = _FIELD.sub("\0", first).split("\0")
+    # Separators only: to resolve "./" or "//" would keep the pattern from matching.
+    found = sorted(item.replace(os.sep, "/") for item in glob.glob(glob.escape(before) + "*".join(map(glob.escape, literals))))
+    pattern = re.compile(re.escape(before) + _matcher(first))
+    matches = [match for item in found if (match := pattern.fullmatch(item))]
+    if not matches:
+        raise InputError(f"no file matches '{first}' in {folder}; check the path.")
+    for match in matches:
+        values = match.groupdict()
+        yield _fill(entry.name, values), [folder / _fill(file, values) for file in entry.paths], values
+
+
+def _braces(fields: Iterable[str]) -> str:
+    return ", ".join(f"{{{name}}}" for name in sorted(set(fields))) or "no field"
+
+
+def _matcher(pattern: str) -> str:
+    """Regular expression of a path with fields; a field that returns must match the same text."""
+    parts, last, seen = "", 0, set()
+    for field in _FIELD.finditer(pattern):
+        parts += re.escape(pattern[last : field.start()])
+        name = field.group(1)
+        parts += f"(?P={name})" if name in seen else f"(?P<{name}>[^/]+)"
+        seen.add(name)
+        last = field.end()
+    return parts + re.escape(pattern[last:])
+
+
+def _fill(text: str, values: Mapping[str, str]) -> str:
+    return _FIELD.sub(lambda field: values[field.group(1)], text)
+
+
+def _lengths(entries: list[_Length], fields: list[dict[str, str]], sockets: Mapping[str, np.ndarray]) -> list[ReferenceLength]:
+    """Reference lengths; one with fields in braces stands for every combination of them that the sockets' files showed."""
+    lengths = []
+    for entry in entries:
+        names = set(_FIELD.findall(entry.start + entry.end))
+        if not names:
+            lengths.append(ReferenceLength(entry.start, entry.end, entry.value, entry.u))
+            continue
+        choices = {tuple((name, values[name]) for name in sorted(names)) for values in fields if names <= values.keys()}
+        if not choices:
+            raise InputError(
+                f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; name the fields alike."
+            )
+        pairs = [(_fill(entry.start, dict(choice)), _fill(entry.end, dict(choice))) for choice in sorted(choices)]
+        # A field may also stand in the names of sockets that have nothing to do with this length.
+        there = [pair for pair in pairs if pair[0] in sockets or pair[1] in sockets]
+        lengths += [ReferenceLength(*pair, entry.value, entry.u) for pair in there or pairs]
+    return lengths

@@ -1,0 +1,51 @@
+"""Points instead of poses, for acceptance tests of arms that report coordinates: read by the same kind of manifest."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from ..acceptance.suite import Measured
+from ..core.errors import InputError, nearest
+from ..kinematics.workspace import Reach
+from . import storage
+from .manifest import PointsManifest, recorded
+from .toml import read_toml
+
+_UNITS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "inch": 25.4}
+
+
+def read_points(path: str | os.PathLike) -> Measured:
+    """Read a manifest of points: ``[points]`` with ``unit`` (mm, m, um, inch), perhaps ``columns``, and the arm's ``reach`` and ``shoulder`` (x, y, z) in mm
+    (for the zones of ASME B89.4.22); ``[[socket]]``, ``[[length]]`` and ``[[sphere]]`` as in a manifest of poses, with files of x, y, z.
+
+    Raises `InputError` that names the file, the place in it and the mend.
+    """
+    path = Path(path)
+    model = read_toml(path, PointsManifest)
+    try:
+        files = [path]
+
+        def points(file: Path) -> np.ndarray:
+            files.append(file)
+            table = storage.read_numbers(file, model.points.columns)
+            if table.shape[1] != 3:
+                raise InputError(
+                    f"{file} has {table.shape[1]} columns; give x, y and z, or pick three with columns = [...] in [points]."
+                )
+            return table * _UNITS[model.points.unit]
+
+        sockets, lengths, spheres = recorded(path.parent, model, points)
+        for length in lengths:
+            for end in (length.start, length.end):
+                if end not in sockets:
+                    raise InputError(
+                        f"length '{length.start}' to '{length.end}' names the unknown socket '{end}'{nearest(end, sockets)}"
+                    )
+        if not sockets and not spheres:
+            raise InputError("there is neither a [[socket]] nor a [[sphere]], so nothing can be tested; add one.")
+        reach = None if model.points.reach is None else Reach(np.array(model.points.shoulder), model.points.reach)
+        sources = tuple(storage.fingerprint(file, path.parent) for file in files)
+        return Measured(sockets, tuple(lengths), spheres, reach, sources=sources, measured=str(model.date or ""))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error

@@ -1,0 +1,370 @@
+"""Files, without any idea of arms: whole-or-nothing writes, HDF5 tables after netCDF-4's conventions, CSV."""
+
+import contextlib
+import csv
+import datetime
+import math
+import os
+import secrets
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..core.errors import InputError
+
+FORMAT = "aacmm_jax"
+FORMAT_VERSION = 1
+ELSEWHERE = "choose another output path"
+
+
+class Variable(NamedTuple):
+    """One column or block of a table: the names of its dimensions, its values, its unit and what it is."""
+
+    dimensions: tuple[str, ...]
+    values: np.ndarray | Sequence
+    units: str
+    long_name: str
+
+
+class Table(NamedTuple):
+    """One HDF5 group: variables by name (a variable named like its only dimension is its coordinate), and attributes."""
+
+    variables: dict[str, Variable]
+    attributes: Mapping[str, Any] = MappingProxyType({})
+
+
+@contextlib.contextmanager
+def whole_file(path: str | os.PathLike, mend: str = ELSEWHERE) -> Iterator[Path]:
+    """Write a file whole or not at all: yields a temporary path beside the target, renamed onto it at the end.
+
+    Whatever goes wrong (Ctrl-C included), the temporary file is removed and an existing target stays as it was.
+    Raises `InputError` where the path cannot be written.
+    """
+    target = Path(path)
+    # Named before it is made: an interrupt between the two must not leave a file that nobody removes.
+    temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
+    try:
+        if target.exists() and not target.is_file():
+            raise OSError(None, "it is a folder" if target.is_dir() else "it is not an ordinary file")
+        open(temporary, "xb").close()
+        yield temporary
+        with open(temporary, "rb+") as written:
+            os.fsync(written.fileno())
+        os.replace(temporary, target)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise InputError(f"{target} cannot be written: {reason}; {mend}.") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def write_text(path: str | os.PathLike, text: str) -> None:
+    """Write a text file whole or not at all."""
+    with whole_file(path) as temporary:
+        temporary.write_bytes(text.encode())
+
+
+def write_tables(
+    path: str | os.PathLike,
+    kind: str,
+    tables: Mapping[str, Table],
+    attributes: Mapping[str, Any],
+    extend: Callable[[Any], None] | None = None,
+    mend: str = ELSEWHERE,
+    streamed: bool = False,
+) -> None:
+    """Write an HDF5 file of tables that netCDF-4 readers (xarray) understand. ``kind`` says what the file is.
+
+    ``extend`` is given the open file at the end, to add to it. ``streamed``: more than memory holds.
+    """
+    import h5py
+
+    def fill(file: Any) -> None:
+        _write_attributes(file, provenance(kind) | dict(attributes))
+        for name, table in tables.items():
+            _write_group(file.create_group(name, track_order=True), table)
+        if extend is not None:
+            extend(file)
+
+    with whole_file(path, mend) as temporary:
+        if streamed:
+            with _Unbroken(temporary) as stream:
+                with h5py.File(stream, "w", track_order=True) as file:
+                    fill(file)
+                stream.check()
+            return
+        # HDF5 builds the file in memory and Python writes it: on a full disk the HDF5 library crashes the process.
+        with h5py.File(temporary.name, "w", driver="core", backing_store=False, track_order=True) as file:
+            fill(file)
+            file.flush()
+            image = file.id.get_file_image()
+        temporary.write_bytes(image)
+
+
+class _Unbroken:
+    """A file that HDF5 writes through. Where a write fails (a full disk), the HDF5 library would crash the process: so the failure
+    is kept, HDF5 is left to believe in success, and `check` raises it. Interrupts must be kept away meanwhile."""
+
+    def __init__(self, path: Path):
+        self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 - closed on exit
+        self._failure: OSError | None = None
+        self.seek, self.tell, self.read, self.readinto = (
+            getattr(self._file, name) for name in ("seek", "tell", "read", "readinto")
+        )
+
+    def __enter__(self) -> "_Unbroken":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def check(self) -> None:
+        """Raise what went wrong, if anything did."""
+        if self._failure is not None:
+            raise self._failure
+
+    def _kept(self, work: Callable, given: Any) -> Any:
+        if self._failure is None:
+            try:
+                return work(given)
+            except OSError as failure:
+                self._failure = failure
+        return None
+
+    def write(self, content: Any) -> int:
+        """As a raw file's, but all is taken."""
+        left = memoryview(content).cast("B")
+        while len(left) and (taken := self._kept(self._file.write, left)):
+            left = left[taken:]
+        return len(content)
+
+    def truncate(self, size: int | None = None) -> int:
+        """As a raw file's."""
+        self._kept(self._file.truncate, size)
+        return size or 0
+
+    def flush(self) -> None:
+        """Nothing waits."""
+
+
+def storable(text: str) -> str:
+    """The same text, or `InputError` where neither HDF5 nor TOML can hold it (NUL, or a file name that is not UTF-8)."""
+    if "\0" in text or text.encode(errors="ignore").decode() != text:
+        raise InputError(f"the name {text!r} holds a character that no file can hold; rename it.")
+    return text
+
+
+def fingerprint(path: str | os.PathLike, beside: str | os.PathLike | None = None) -> str:
+    """A file's name and SHA-256, by which it can be told from every other; with its folders below ``beside``, where it lies there."""
+    import hashlib
+
+    path = Path(path)
+    check_readable(path)
+    below = beside is not None and path.is_relative_to(beside)
+    name = path.relative_to(beside).as_posix() if below and beside is not None else path.name
+    return storable_name(f"{name} (SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()})")
+
+
+def storable_name(text: str) -> str:
+    """A name from the file system or the command line in a form that HDF5 can hold: bytes that are not UTF-8 are written out."""
+    return text.encode(errors="backslashreplace").decode()
+
+
+def _versions() -> str:
+    import platform
+    from importlib import metadata
+
+    others = (f"{name} {metadata.version(name)}" for name in ("jax", "equinox", "optimistix", "numpy"))
+    return ", ".join([f"Python {platform.python_version()}", *others])
+
+
+def provenance(kind: str) -> dict[str, Any]:
+    """Root attributes of every file: what it is, and what made it."""
+    from importlib import metadata
+
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]) if sys.argv and sys.argv[0] else "python"
+    return {
+        "format": FORMAT,
+        "kind": kind,
+        "format_version": FORMAT_VERSION,
+        "package_version": metadata.version("aacmm_jax"),
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "versions": _versions(),
+        "command": storable_name(command),  # arguments that are not UTF-8 arrive as surrogates
+    }
+
+
+def _write_attributes(item: Any, attributes: Mapping[str, Any]) -> None:
+    for key, value in attributes.items():
+        if value is not None:
+            item.attrs[key] = storable(value) if isinstance(value, str) else value
+
+
+def _write_group(group: Any, table: Table) -> None:
+    import h5py
+
+    _write_attributes(group, table.attributes)
+    for name, variable in table.variables.items():
+        values = np.asarray(variable.values)
+        text = not variable.units
+        data = np.array([storable(str(value)) for value in values], dtype=object) if text else values
+        options = {"compression": "gzip", "shuffle": True} if values.ndim and values.size > 1000 and not text else {}
+        dataset = group.create_dataset(name, data=data, dtype=h5py.string_dtype() if text else None, **options)
+        dataset.attrs["long_name"] = variable.long_name
+        if not text:
+            dataset.attrs["units"] = variable.units
+        if variable.dimensions == (name,):
+            dataset.make_scale(name)
+    for name, variable in table.variables.items():
+        for axis, dimension in enumerate(variable.dimensions):
+            if dimension != name:
+                group[name].dims[axis].attach_scale(group[dimension])
+
+
+class Stored(NamedTuple):
+    """What `read_tables` found: root attributes, and per group its arrays and attributes."""
+
+    attributes: dict[str, Any]
+    tables: dict[str, dict[str, np.ndarray]]
+    table_attributes: dict[str, dict[str, Any]]
+
+
+def read_tables(path: str | os.PathLike, kinds: Sequence[str], without: Sequence[str] = ()) -> Stored:
+    """Read a file of tables whole, but for those named. Raises `InputError` where it is missing, damaged, foreign, newer or of another kind."""
+    import h5py
+
+    path = Path(path)
+    check_readable(path)
+    if not h5py.is_hdf5(path):
+        raise InputError(f"{path} is not an HDF5 file, or it is damaged; name a file written by aacmm.")
+    with undamaged(path), h5py.File(path, "r") as file:
+        attributes = {key: _plain(value) for key, value in file.attrs.items()}
+        _check_kind(path, attributes, kinds)
+        groups = {name: group for name, group in file.items() if isinstance(group, h5py.Group) and name not in without}
+        tables = {name: {key: _values(item) for key, item in group.items()} for name, group in groups.items()}
+        table_attributes = {name: {key: _plain(value) for key, value in group.attrs.items()} for name, group in groups.items()}
+    return Stored(attributes, tables, table_attributes)
+
+
+@contextlib.contextmanager
+def undamaged(path: str | os.PathLike) -> Iterator[None]:
+    """While the content of a file is taken apart: whatever fails there fails because the file is not as it was written."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # a single wrong byte surfaces as almost any exception of HDF5, h5py and NumPy
+        raise InputError(f"{path} is damaged, cut short or was edited; make it again.") from error
+
+
+def check_readable(path: Path) -> None:
+    """Raise `InputError` where a file is missing, a folder, or may not be read."""
+    try:
+        open(path, "rb").close()
+    except FileNotFoundError as error:
+        raise InputError(f"{path} does not exist; check the path.") from error
+    except IsADirectoryError as error:
+        raise InputError(f"{path} is a folder; name a file.") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{str(path)!r} cannot be read: {reason.lower()}; name another file.") from error
+
+
+def _check_kind(path: Path, attributes: Mapping[str, Any], kinds: Sequence[str]) -> None:
+    wanted = " or ".join(kinds)
+    if attributes.get("format") != FORMAT:
+        raise InputError(f"{path} is HDF5, but was not written by aacmm; name a {wanted} file.")
+    for name in ("created", "command", "package_version", "kind"):
+        if not isinstance(attributes.get(name), str):
+            raise InputError(f"{path} lacks the attribute '{name}'; it is damaged or was edited, make it again.")
+    version = attributes["format_version"]
+    if version > FORMAT_VERSION:
+        raise InputError(
+            f"{path} has format version {version}, newer than this package reads ({FORMAT_VERSION}); update aacmm_jax."
+        )
+    if attributes["kind"] not in kinds:
+        article = "an" if attributes["kind"][:1] in "aeiou" else "a"
+        raise InputError(f"{path} holds {article} {attributes['kind']}; name a {wanted} file.")
+
+
+def need(path: str | os.PathLike, names: Mapping[str, Any], *needed: str, of: str = "table") -> None:
+    """Raise `InputError` where a file lacks a table, or a table an entry."""
+    for name in needed:
+        if name not in names:
+            raise InputError(f"{path} lacks the {of} '{name}'; it is damaged or was edited, make it again.")
+
+
+def _values(dataset: Any) -> np.ndarray:
+    return dataset.asstr()[()] if dataset.dtype.kind == "O" else dataset[()]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return value.decode()
+    if isinstance(value, np.ndarray):
+        return [_plain(item) for item in value.tolist()]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def read_numbers(path: str | os.PathLike, columns: Sequence[int] | None = None) -> np.ndarray:
+    """Read a text table of numbers, ``(rows, columns)``: comma, semicolon, tab or blank between them, header lines allowed.
+
+    ``columns`` picks columns, counted from 1. Raises `InputError` that names the file, the line and the column.
+    """
+    path = Path(path)
+    check_readable(path)
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} cannot be read as text; give a text file of numbers, in UTF-8.") from error
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, start=1):
+        cells = _cells(line)
+        if not cells or cells[0].startswith("#"):
+            continue
+        try:
+            rows.append([float(cell) for cell in cells])
+        except ValueError as error:
+            if not rows and not any(_is_number(cell) for cell in cells):
+                continue  # a header
+            column = next(i for i, cell in enumerate(cells, start=1) if not _is_number(cell))
+            raise InputError(
+                f"{path} line {number} column {column}: '{cells[column - 1]}' is not a number; mend it."
+            ) from error
+        if len(rows[-1]) != len(rows[0]):
+            raise InputError(
+                f"{path} line {number} has {len(rows[-1])} columns, the lines before it {len(rows[0])}; give all the same."
+            )
+        for column, value in enumerate(rows[-1], start=1):
+            if not math.isfinite(value):
+                raise InputError(f"{path} line {number} column {column}: '{cells[column - 1]}' is not finite; mend it.")
+    if not rows:
+        raise InputError(f"{path} holds no numbers; give one line a pose, with decimal points.")
+    table = np.array(rows)
+    if columns is None:
+        return table
+    for column in columns:
+        if not 1 <= column <= table.shape[1]:
+            raise InputError(f"{path} has {table.shape[1]} columns, so there is no column {column}; pick others.")
+    return table[:, [column - 1 for column in columns]]
+
+
+def _cells(line: str) -> list[str]:
+    for delimiter in (";", ",", "\t"):
+        if delimiter in line:
+            return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]
+    return line.split()
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,1 @@
+"""The arm: its Denavit-Hartenberg chain, parameters, inverse kinematics and workspace."""

@@ -1,0 +1,151 @@
+"""The arm: a serial chain of revolute joints in standard Denavit-Hartenberg form, with a probe on its last frame."""
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..core.arrays import Numbers, as_array, as_floats
+from ..core.errors import InputError, nearest
+from . import chain
+
+LENGTHS = ("a", "d", "probe")
+ANGLES = ("alpha", "theta", "beta")
+_PROBE_AXES = ("x", "y", "z")
+
+
+class Arm(eqx.Module):
+    """A serial arm. One joint: T = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)]; the tip is ``probe`` in the last frame.
+
+    Shapes: every parameter is ``(..., n)`` for n joints and ``probe`` is ``(..., 3)``; leading shapes are a batch of
+    arms and broadcast against those of q. Units: mm and rad.
+
+    Source: Denavit and Hartenberg 1955; Cheng et al. 2018, eq. 1; ``beta`` is Hayati and Mirmirani's (1985) extra
+    angle for near-parallel axes, absent (None) unless used.
+
+    Raises `InputError` where shapes do not fit together or a value is not finite.
+    """
+
+    alpha: Float[Array, "... n"]  # link twist, rad
+    a: Float[Array, "... n"]  # link length, mm
+    d: Float[Array, "... n"]  # link offset, mm
+    theta: Float[Array, "... n"]  # joint zero offset, rad
+    beta: Float[Array, "... n"] | None  # Hayati's angle, rad
+    probe: Float[Array, "... 3"]  # tip in the last frame, mm
+    # Lowest and highest reading of each joint, rad. Static: limits are not calibrated, only respected by `simulate`.
+    limits: tuple[tuple[float, float], ...] | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        *,
+        alpha: Numbers,
+        a: Numbers,
+        d: Numbers,
+        theta: Numbers | None = None,
+        beta: Numbers | None = None,
+        probe: Numbers = (0.0, 0.0, 0.0),
+        limits: Sequence[Sequence[float]] | None = None,
+    ):
+        self.alpha = as_floats(alpha, "alpha")
+        self.a = as_floats(a, "a")
+        self.d = as_floats(d, "d")
+        self.theta = jnp.zeros_like(self.alpha) if theta is None else as_floats(theta, "theta")
+        self.beta = None if beta is None else as_floats(beta, "beta")
+        self.probe = as_floats(probe, "probe")
+        if self.alpha.ndim == 0 or self.alpha.shape[-1] == 0:
+            raise InputError("alpha needs one value a joint, and an arm at least one joint.")
+        joints = self.alpha.shape[-1]
+        for kind in ("a", "d", "theta", "beta"):
+            array = getattr(self, kind)
+            if array is not None and array.shape[-1:] != (joints,):
+                raise InputError(f"{kind} has shape {array.shape}, but alpha has {joints} joints; give one value a joint.")
+        if self.probe.shape[-1:] != (3,):
+            raise InputError(f"probe has shape {self.probe.shape}; give its three coordinates (x, y, z) in mm.")
+        arrays = [array for array in (self.alpha, self.a, self.d, self.theta, self.beta) if array is not None]
+        batches = [array.shape[:-1] for array in (*arrays, self.probe)]
+        try:
+            np.broadcast_shapes(*batches)
+        except ValueError as error:
+            raise InputError(
+                f"the parameters have the batch shapes {', '.join(map(str, batches))}; make them alike."
+            ) from error
+        self.limits = None if limits is None else checked_limits(limits, joints)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints, n."""
+        return self.alpha.shape[-1]
+
+    @property
+    def geometry(self) -> chain.Geometry:
+        """The parameters without the limits, as the kinematic kernels take them."""
+        return chain.Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe)
+
+    def position(self, q: Numbers) -> Float[Array, "... 3"]:
+        """Tip in the base frame, mm, at joint angles q in rad: ``(..., n) -> (..., 3)``."""
+        return chain.tip_position(self.geometry, self._checked(q))
+
+    def pose(self, q: Numbers) -> Float[Array, "... 4 4"]:
+        """Homogeneous pose of the last frame moved to the tip, mm: ``(..., n) -> (..., 4, 4)``."""
+        return chain.tip_pose(self.geometry, self._checked(q))
+
+    def jacobian(self, q: Numbers, names: Sequence[str] | None = None) -> Float[Array, "... 3 p"]:
+        """Exact derivative of the tip by named parameters, ``(..., n) -> (..., 3, p)``; mm per mm or mm per rad.
+
+        ``names`` are parameter names (``alpha_1`` ... ``probe_z``) or joint readings ``q_1`` ... ``q_n``; by default all
+        parameters, in the order of `parameter_names`. Analytic, equal to ``jax.jacfwd`` to rounding.
+        """
+        names = parameter_names(self) if names is None else names
+        return chain.tip_jacobian(self.geometry, self._checked(q), tuple(locate(self, n, extra=("q",)) for n in names))
+
+    def _checked(self, q: Numbers) -> Float[Array, "... n"]:
+        array = as_array(q, "q")
+        if array.shape[-1:] != (self.joints,):
+            raise InputError(f"q has shape {array.shape}, but the arm has {self.joints} joints; the last axis is the joint.")
+        return array
+
+
+def checked_limits(limits: Sequence[Sequence[float]], joints: int) -> tuple[tuple[float, float], ...]:
+    """Lowest and highest reading of each joint, rad, or `InputError` that names the joint."""
+    rows = [tuple(float(reading) for reading in row) for row in limits]
+    if len(rows) != joints or any(len(row) != 2 for row in rows):
+        raise InputError(f"limits must be {joints} rows of (lowest, highest) in rad, one a joint.")
+    for i, (low, high) in enumerate(rows, start=1):
+        if not -math.inf < low < high < math.inf:
+            raise InputError(
+                f"limits of joint {i} are {low:g} to {high:g} rad; they must be finite, and the lower below the upper."
+            )
+    return tuple((low, high) for low, high in rows)
+
+
+def is_single(arm: Arm) -> bool:
+    """Whether this is one arm and not a batch."""
+    return all(array is None or array.ndim == 1 for array in arm.geometry)
+
+
+def parameter_names(arm: Arm) -> tuple[str, ...]:
+    """All parameter names of an arm: alpha, a, d, theta, (beta,) by joint from 1, then probe_x, probe_y, probe_z."""
+    kinds = ("alpha", "a", "d", "theta") + (() if arm.beta is None else ("beta",))
+    by_joint = [f"{kind}_{i}" for kind in kinds for i in range(1, arm.joints + 1)]
+    return (*by_joint, *(f"probe_{axis}" for axis in _PROBE_AXES))
+
+
+def locate(arm: Arm, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
+    """Kind and 0-based index of a parameter name: ``d_3 -> ("d", 2)``. Raises `InputError` naming the nearest spelling."""
+    kinds = ("alpha", "a", "d", "theta", "beta", *extra)
+    kind, _, index = name.rpartition("_") if isinstance(name, str) else ("", "", "")
+    if kind == "probe" and index in _PROBE_AXES:
+        return "probe", _PROBE_AXES.index(index)
+    if kind in kinds and index.isdecimal() and str(int(index)) == index and 1 <= int(index) <= arm.joints:
+        return kind, int(index) - 1
+    known = [f"{k}_{i}" for k in kinds for i in range(1, arm.joints + 1)] + [f"probe_{axis}" for axis in _PROBE_AXES]
+    raise InputError(f"unknown parameter '{name}' of a {arm.joints}-joint arm{nearest(str(name), known)}")
+
+
+def replace(arm: Arm, **changes: Array | None) -> Arm:
+    """The same arm with some parameters replaced, by kind (``a=...``); nothing is checked, so it works on tracers."""
+    kinds = tuple(changes)
+    return eqx.tree_at(lambda x: [getattr(x, kind) for kind in kinds], arm, list(changes.values()), is_leaf=lambda x: x is None)

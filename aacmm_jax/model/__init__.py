@@ -1,0 +1,1 @@
+"""Measurement and arm make residuals: weights, scale and repeatability."""

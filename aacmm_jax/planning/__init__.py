@@ -1,0 +1,1 @@
+"""Which poses to take, in which sockets, before the arm is touched."""

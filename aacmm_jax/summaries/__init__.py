@@ -1,0 +1,1 @@
+"""Sentences and tables that command line, report and JSON share."""

@@ -1,0 +1,217 @@
+"""What files hold, as plain dictionaries with the unit in every key: printed by the command line, and its ``--json``."""
+
+from typing import Any
+
+import numpy as np
+
+from ..calibration.evaluation import Evaluation
+from ..calibration.results import CrossValidation, active_names
+from ..data.capture import Capture
+from ..data.recording import ArmSpecification, Recording
+from ..files.calibrations import CalibrationRecord
+from ..kinematics.parameters import Parameters, is_length
+from ..uncertainty.identifiability import Observability
+from ..uncertainty.volume import Volume, over_volume, uncertainty_of
+from .warnings import observed, of_calibration, of_capture
+
+_CORRELATED = 0.95
+
+
+def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
+    """An arm, joint by joint, and what is not identified of it by default."""
+    arm = specification.arm
+    joints = [
+        {
+            "joint": i + 1,
+            "alpha_rad": float(arm.alpha[i]),
+            "a_mm": float(arm.a[i]),
+            "d_mm": float(arm.d[i]),
+            "theta_rad": float(arm.theta[i]),
+            "beta_rad": None if arm.beta is None else float(arm.beta[i]),
+            "limits_rad": None if arm.limits is None else list(arm.limits[i]),
+        }
+        for i in range(arm.joints)
+    ]
+    return {
+        "kind": "arm",
+        "name": specification.name,
+        "joints": joints,
+        "probe_mm": np.asarray(arm.probe).tolist(),
+        "held": list(Parameters.free_of(arm, held=specification.held).held),
+    }
+
+
+def parameters_csv(record: CalibrationRecord) -> str:
+    """The free parameters as CSV: name, unit, nominal, calibrated, standard uncertainty."""
+    vectors, u = record.vectors(), np.sqrt(np.diag(record.covariance))
+    lines = ["parameter,unit,nominal,calibrated,u"]
+    for i, name in enumerate(record.names):
+        values = (vectors["nominal"][i], vectors["calibrated"][i], u[i])
+        lines.append(",".join([name, "mm" if is_length(name) else "rad", *(repr(float(value)) for value in values)]))
+    return "\n".join(lines) + "\n"
+
+
+def capture_summary(recording: Recording) -> dict[str, Any]:
+    """A capture: sockets with their poses, lengths, the nominal arm."""
+    capture = recording.capture
+    return {
+        "kind": "capture",
+        "arm": recording.nominal.name,
+        "joints": capture.joints,
+        "poses": sum(capture.sizes),
+        "sockets": [{"socket": name, "poses": size} for name, size in zip(capture.names, capture.sizes, strict=True)],
+        "lengths": [
+            {"from": length.start, "to": length.end, "value_mm": float(length.value), "u_mm": float(length.u)}
+            for length in capture.lengths
+        ],
+        "ranges": [
+            {"joint": i + 1, "lowest_rad": float(low), "highest_rad": float(high)}
+            for i, (low, high) in enumerate(zip(np.min(capture.q, axis=0), np.max(capture.q, axis=0), strict=True))
+        ],
+        "simulated": recording.true is not None,
+        "warnings": of_capture(recording),
+    }
+
+
+def figures(evaluation: Evaluation) -> dict[str, Any]:
+    """Repeatability over all sockets, and the errors of the lengths; mm."""
+    spread, error = evaluation.repeatability, np.asarray(evaluation.error)
+    numbers = {"de_mm": spread.de, "deltam_mm": spread.deltam, "rms_mm": spread.rms}
+    # With one pose in every socket there is no repeatability to speak of.
+    found: dict[str, Any] = {key: float(value) for key, value in numbers.items() if np.isfinite(value)}
+    return found | (length_figures(error) if len(error) else {})
+
+
+def length_figures(error: np.ndarray) -> dict[str, float]:
+    """Mean absolute and largest error of lengths, mm."""
+    return {
+        "length_error_mean_absolute_mm": float(np.mean(np.abs(error))),
+        "length_error_largest_mm": float(np.max(np.abs(error))),
+    }
+
+
+def tables(capture: Capture, evaluation: Evaluation) -> dict[str, Any]:
+    """Figures socket by socket and length by length."""
+    spread = evaluation.repeatability
+    figures = (np.asarray(column) for column in (spread.socket_de, spread.socket_deltam, spread.socket_rms))
+    sockets = zip(capture.names, capture.sizes, *figures, strict=True)
+    columns = (np.asarray(column) for column in (evaluation.measured, evaluation.error, evaluation.u))
+    lengths = zip(capture.lengths, *columns, strict=True)
+    return {
+        "sockets": [
+            {"socket": name, "poses": size}
+            # One pose shows no scatter.
+            | dict(zip(("de_mm", "deltam_mm", "rms_mm"), map(float, spread) if size > 1 else (None,) * 3, strict=True))
+            for name, size, *spread in sockets
+        ],
+        "lengths": [
+            {
+                "from": length.start,
+                "to": length.end,
+                "value_mm": float(length.value),
+                "measured_mm": float(measured),
+                "error_mm": float(error),
+                "error_u_mm": float(u) if np.isfinite(u) else None,
+            }
+            for length, measured, error, u in lengths
+        ],
+    }
+
+
+def calibration_summary(
+    record: CalibrationRecord, seen: Observability | None = None, volume: Volume | None = None
+) -> dict[str, Any]:
+    """A calibration: what was done, before and after, the scale, the parameters, and what to be wary of.
+
+    ``seen`` (`cautions.observed`) and ``volume`` (`over_volume`) are worked out where they are not given.
+    """
+    seen = observed(record) if seen is None else seen
+    evaluations, vectors = record.evaluations(), record.vectors()
+    u = np.sqrt(np.diag(record.covariance))
+    parameters = [
+        {
+            "parameter": name,
+            "unit": "mm" if is_length(name) else "rad",
+            "u": float(u[i]) if record.determined[i] and u[i] > 0 else None,
+            **{stage: float(vector[i]) for stage, vector in vectors.items()},
+            "bound": {-1: "lower", 1: "upper"}.get(int(record.active[i])),
+        }
+        for i, name in enumerate(record.names)
+    ]
+    summary: dict[str, Any] = {
+        "kind": "calibration",
+        "arm": record.recording.nominal.name,
+        "method": record.method,
+        "converged": record.converged,
+        "reason": record.reason,
+        "steps": record.steps,
+        "poses": sum(record.recording.capture.sizes),
+        "sockets_used": list(record.recording.capture.names),
+        "scale_k": record.k,
+        "scale_u": record.u_k,
+        "fixed_by_one_length": record.fixed_by_one_length,
+        "held": list(record.held),
+        "hold": record.hold,
+        "active_stage1": active_names_of(record, record.active_stage1),
+        "active": active_names_of(record, record.active),
+        **{stage: figures(evaluation) for stage, evaluation in evaluations.items()},
+        **tables(record.recording.capture, evaluations["calibrated"]),
+        "parameters": parameters,
+        "uncertainty": uncertainty_summary(record, seen, volume),
+        "cross_validation": None if record.validation is None else _validation_summary(record.validation),
+        "monte_carlo": record.sampled_says,
+        "warnings": of_calibration(record, seen),
+    }
+    if "true" in vectors:
+        summary["truth"] = {stage: truth_errors(record, vectors, stage) for stage in ("nominal", "stage1", "calibrated")}
+    return summary
+
+
+def uncertainty_summary(record: CalibrationRecord, seen: Observability, volume: Volume | None = None) -> dict[str, Any]:
+    """What the uncertainty comes from and what it means for lengths all over the volume; standard uncertainties (k = 1)."""
+    uncertainty = uncertainty_of(record)
+    noise = record.noise
+    encoder = np.asarray(noise.encoder_arcsec)
+    found = {
+        "form": record.form,
+        "encoder_arcsec": encoder.tolist(),
+        "seating_mm": float(noise.seating),
+        "misfit": record.misfit,
+        "coverage_factor_95": uncertainty.factor(0.95),
+        "volume": (over_volume(uncertainty) if volume is None else volume).summary,
+        "correlated": [{"one": one, "other": other, "r": r} for one, other, r in uncertainty.correlated(_CORRELATED)],
+        "rank": seen.rank,
+        "parameters": len(seen.names),
+        "condition": seen.condition,
+        "indices": seen.indices,
+    }
+    # JSON has no infinity; what is not determined has no number.
+    found["volume"] = {key: value if np.isfinite(value) else None for key, value in found["volume"].items()}
+    found["condition"] = found["condition"] if np.isfinite(found["condition"]) else None
+    return found
+
+
+def _validation_summary(validation: CrossValidation) -> dict[str, Any]:
+    return {
+        "groups": len(validation.groups),
+        "rms_mm": validation.rms,
+        "rms_predicted_mm": validation.rms_predicted,
+        "length_error_rms_mm": validation.length_rms,
+        "length_u_mm": validation.length_u,
+        "excess": validation.excess,
+    }
+
+
+def active_names_of(record: CalibrationRecord, active: np.ndarray) -> dict[str, str]:
+    """Parameters on a bound: name -> side."""
+    return active_names(Parameters(record.recording.nominal.arm, record.names), active)
+
+
+def truth_errors(record: CalibrationRecord, vectors: dict[str, np.ndarray], stage: str) -> dict[str, float]:
+    """Largest parameter errors against the true arm of a simulation."""
+    difference = np.abs(vectors[stage] - vectors["true"])
+    length = np.array([is_length(name) for name in record.names])
+    return {
+        "length_error_largest_mm": float(difference[length].max(initial=0.0)),
+        "angle_error_largest_rad": float(difference[~length].max(initial=0.0)),
+    }

@@ -1,0 +1,124 @@
+"""What a comparison of calibrations found, as plain dictionaries with the unit in every key, and as CSV."""
+
+import csv
+import io
+from typing import Any
+
+import numpy as np
+
+from ..drift.comparison import Drift, Trend
+from ..drift.statistics import LengthChange
+from ..kinematics.parameters import is_length
+
+
+def drift_summary(drift: Drift) -> dict[str, Any]:
+    """Two calibrations compared; None where something is not known or has no end."""
+    joint = drift.joint
+    return {
+        "kind": "comparison",
+        "level": drift.level,
+        "warnings": list(drift.cautions),
+        "findings": drift.findings(),
+        "parameters": _rows(drift),
+        "compared": drift.without.count(""),
+        "moved": int(drift.moved.sum()),
+        "moved_by_chance": drift.by_chance,
+        "joint": {
+            "statistic": _finite(joint.statistic),
+            "rank": joint.rank,
+            "freedom": _finite(joint.freedom),
+            "p": _finite(joint.p),
+            "parameters": list(joint.names),
+            "causes": [
+                {"parameter": name, "unit": "mm" if is_length(name) else "rad", "change": amount}
+                for name, amount in joint.causes
+            ],
+        },
+        "lengths": lengths_summary(drift.lengths),
+    }
+
+
+def compared_summary(trend: Trend, labels: list[str], arm: str) -> dict[str, Any]:
+    """The first calibration against the last in full, and all of them; ``labels`` in the order in which they were given."""
+    summary = {"kind": "comparison", "arm": arm, "old": labels[trend.order[0]], "new": labels[trend.order[-1]]}
+    summary |= {"old_created": trend.dates[0].isoformat(), "new_created": trend.dates[-1].isoformat()}
+    summary |= drift_summary(trend.drifts[-1])
+    return summary | {"warnings": trend.cautions, "trend": trend_summary(trend, labels)}
+
+
+def change_exceeded(lengths: LengthChange, limit: float | None) -> tuple[list[str], list[str]]:
+    """Sentences on a limit of the largest change of a length, mm: kept, and exceeded."""
+    if limit is None:
+        return [], []
+    kept = abs(lengths.largest) <= limit
+    verdict = (
+        f"the largest change of a length of {lengths.length:g} mm is {abs(lengths.largest):.4f} mm, {'within' if kept else 'over'} the "
+        f"limit of {limit:g} mm."
+    )
+    return ([verdict], []) if kept else ([], [verdict])
+
+
+def lengths_summary(lengths: LengthChange) -> dict[str, Any]:
+    """What a change does to lengths over the volume."""
+    return {
+        "length_mm": lengths.length,
+        "places": len(lengths.change),
+        "rms_mm": lengths.rms,
+        "rms_by_chance_mm": _finite(lengths.rms_by_chance),
+        "percentile_95_mm": lengths.percentile_95,
+        "largest_mm": lengths.largest,
+        "mean_mm": float(np.mean(lengths.change)),
+        "mean_um_per_m": 1e6 * lengths.size,
+        "mean_expanded_um_per_m": _finite(1e6 * lengths.expanded_size),
+        "moved_share": float(np.mean(lengths.moved)),
+    }
+
+
+def trend_summary(trend: Trend, labels: list[str]) -> list[dict[str, Any]]:
+    """Every calibration of a trend in the order of their dates; ``labels`` in the order in which they were given."""
+    rows: list[dict[str, Any]] = [{"calibration": labels[trend.order[0]], "created": trend.dates[0].isoformat()}]
+    for date, place, drift in zip(trend.dates[1:], trend.order[1:], trend.drifts, strict=True):
+        rows.append({
+            "calibration": labels[place],
+            "created": date.isoformat(),
+            "moved": int(drift.moved.sum()),
+            "moved_by_chance": drift.by_chance,
+            "p": _finite(drift.joint.p),
+            "lengths": lengths_summary(drift.lengths),
+            "parameters": _rows(drift),
+        })  # fmt: skip
+    return rows
+
+
+def drift_csv(trend: Trend, labels: list[str]) -> str:
+    """Every parameter of every calibration but the first, compared with the first: mm and rad, empty where not known."""
+    text = io.StringIO()
+    columns = ("parameter", "unit", "old", "new", "change", "u", "expanded", "moved", "without")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["old_calibration", "new_calibration", "new_created", *columns])
+    for date, place, drift in zip(trend.dates[1:], trend.order[1:], trend.drifts, strict=True):
+        for row in _rows(drift):
+            cells = ["" if row[name] is None else row[name] for name in columns]
+            writer.writerow([labels[trend.order[0]], labels[place], date.isoformat(), *cells])
+    return text.getvalue()
+
+
+def _rows(drift: Drift) -> list[dict[str, Any]]:
+    return [
+        {
+            "parameter": name,
+            "unit": "mm" if is_length(name) else "rad",
+            "old": float(drift.old[i]),
+            "new": float(drift.new[i]),
+            "change": float(drift.change[i]),
+            "u": _finite(drift.u[i]),
+            "expanded": _finite(drift.expanded[i]),
+            "moved": bool(drift.moved[i]) if not drift.without[i] else None,
+            "without": drift.without[i] or None,
+        }
+        for i, name in enumerate(drift.names)
+    ]
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

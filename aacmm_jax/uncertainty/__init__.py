@@ -1,0 +1,1 @@
+"""What data determine, and how well: covariance, propagation, identifiability."""

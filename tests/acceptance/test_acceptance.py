@@ -1,0 +1,648 @@
+"""Acceptance tests: figures by hand, by an arm whose error is known, and the decisions at, just inside and just outside a limit."""
+
+import csv
+import itertools
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import aacmm_jax as aj
+from aacmm_jax.acceptance import decision
+from aacmm_jax.acceptance import suite as acceptance
+from aacmm_jax.acceptance.procedure import acceptance_procedure, record_procedure
+from aacmm_jax.acceptance.spheres import enclosing_sphere, fit_sphere
+from aacmm_jax.acceptance.suite import Measured, accept, measured_by
+from aacmm_jax.files.procedures import procedure_csv, procedure_manifest
+
+from tests.refusals import assert_refused
+
+AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float)
+PLACE = np.array([400.0, 200.0, 300.0])
+
+
+@pytest.fixture(scope="module")
+def cheng():
+    return aj.load_specification("cheng2018-simulation")
+
+
+@pytest.fixture(scope="module", params=["asme", "iso"])
+def recorded(request, cheng):
+    """A noise-free acceptance test of the nominal arm."""
+    return record_procedure(acceptance_procedure(cheng.arm, request.param), cheng, cheng)
+
+
+# --- By hand -------------------------------------------------------------------------------------------------------------
+
+
+def test_single_point_figures_by_hand():
+    # x spans 0.04, y 0.06, z nothing.
+    assert acceptance.half_range([[0, 0, 5], [0.04, 0, 5], [0.01, -0.06, 5]]) == pytest.approx(0.03)
+    # The corners of a square of side 0.02 lie 0.01 sqrt(2) from its middle: s^2 = 4 x 2e-4 / 3.
+    corners = PLACE + 0.01 * np.array([[1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
+    assert acceptance.spat(corners) == pytest.approx((0.01 * math.sqrt(2), 2 * math.sqrt(8e-4 / 3)))
+    assert acceptance.two_rms([0.03, -0.04]) == pytest.approx(2 * math.sqrt(12.5e-4))
+
+
+def test_sphere_figures_by_hand():
+    # Opposite points drawn out or pushed in by pairs leave centre and mean radius as they are: 15.5 + (0.02 - 0.01 + 0.02) / 3.
+    radii = 15.5 + np.repeat([0.02, -0.01, 0.02], 2)
+    points = PLACE + radii[:, None] * AXES
+    fitted = fit_sphere(points)
+    np.testing.assert_allclose(fitted.centre, PLACE, atol=1e-9)
+    assert fitted.radius == pytest.approx(15.51, abs=1e-9)
+    # A sphere of 25 mm and a probe of 6 mm make 31; the least-squares diameter is 31.02.
+    assert acceptance.size_error(points, 25.0, stylus=6.0) == pytest.approx(0.02, abs=1e-9)
+    assert acceptance.form_error(points) == pytest.approx(0.03, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("points", "diameter"),
+    [
+        ([[1, 2, 3]], 0.0),
+        ([[0, 0, 0], [0, 0, 2]], 2.0),
+        ([[0, 0, 0], [3, 0, 0], [0, 4, 0]], 5.0),  # a right angle: the hypotenuse
+        ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], 2 * math.sqrt(2 / 3)),  # equilateral, side sqrt(2): 2 s / sqrt(3)
+        (
+            [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1], [0.5, 0.2, 0]],
+            2 * math.sqrt(3),
+        ),  # regular tetrahedron, one inside
+        ([[0, 0, 0], [0, 0, 0], [0, 0, 1e-6]], 1e-6),
+    ],
+)
+def test_smallest_sphere_by_hand(points, diameter):
+    assert 2 * enclosing_sphere(PLACE + np.array(points, dtype=float))[1] == pytest.approx(diameter, rel=1e-6, abs=1e-12)
+
+
+@given(st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=2, max_size=8))
+def test_smallest_sphere_holds_all_and_none_smaller_does(points):
+    points = np.array(points, dtype=float)
+    _, radius = enclosing_sphere(points)
+    # The smallest sphere of a set is that of two, three or four of its points: the largest over all such choices.
+    largest = 0.0
+    for size in (2, 3, 4):
+        for chosen in itertools.combinations(points, size):
+            subset = np.array(chosen)
+            centre = (
+                subset[0]
+                + np.linalg.lstsq(2 * (subset[1:] - subset[0]), np.sum((subset[1:] - subset[0]) ** 2, axis=1), rcond=None)[0]
+            )
+            around = np.linalg.norm(subset - centre, axis=1)
+            weights = np.linalg.lstsq(np.vstack([subset.T, np.ones(size)]), np.append(centre, 1), rcond=None)[0]
+            if np.ptp(around) < 1e-9 and np.all(weights > -1e-9):  # its own smallest sphere
+                largest = max(largest, float(around[0]))
+    assert radius == pytest.approx(largest, abs=1e-6)
+
+
+def test_articulated_location_by_hand():
+    # Five centres: a right triangle of hypotenuse 0.05 and two points inside its circle.
+    centres = PLACE + 0.01 * np.array([[0, 0, 0], [3, 0, 0], [0, 4, 0], [1, 1, 0], [2, 1, 0]])
+    groups = [centre + 15.5 * AXES for centre in centres]
+    assert acceptance.articulated_location(groups) == pytest.approx(0.05, abs=1e-8)
+
+
+@pytest.mark.parametrize("points", [np.zeros((4, 3)), np.eye(3), np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0.0]])])
+def test_points_that_fix_no_sphere_are_refused(points):
+    assert_refused(lambda: fit_sphere(points), "sphere", "touch it")
+
+
+# --- Decisions -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("error", "limit", "expanded", "expected"),
+    [
+        (0.040, 0.05, 0.01, "conforms"),  # exactly limit - U
+        (0.0399999, 0.05, 0.01, "conforms"),
+        (0.0400001, 0.05, 0.01, "undecided"),
+        (0.050, 0.05, 0.01, "undecided"),
+        (0.0599999, 0.05, 0.01, "undecided"),
+        (0.060, 0.05, 0.01, "fails"),  # exactly limit + U
+        (0.0600001, 0.05, 0.01, "fails"),
+        (-0.040, 0.05, 0.01, "conforms"),
+        (-0.060, 0.05, 0.01, "fails"),
+        (0.05, 0.05, 0.0, "conforms"),
+        (0.0500001, 0.05, 0.0, "fails"),
+        (0.0, 0.01, 0.02, "undecided"),  # nothing can conform where U is larger than the limit
+        (0.019, 0.03, 0.011, "conforms"),  # 0.03 - 0.011 is a little below 0.019 in binary
+        (0.0, 0.0, 0.0, "conforms"),
+    ],
+)
+def test_decisions(error, limit, expanded, expected):
+    assert decision.decide(error, limit, expanded) == expected
+
+
+@given(st.floats(-1, 1), st.floats(0, 1), st.floats(0, 1), st.floats(0, 0.5))
+def test_a_larger_uncertainty_never_decides_otherwise(error, limit, expanded, more):
+    before, after = decision.decide(error, limit, expanded), decision.decide(error, limit, expanded + more)
+    assert after in (before, "undecided")
+
+
+@pytest.mark.parametrize(
+    ("text", "at_zero", "at_metre"),
+    [
+        ("E_Uni=0.02", 0.02, 0.02),
+        ("e_uni=0.02+L/40000", 0.02, 0.045),
+        ("E_Uni = 0.02 + l / 4e4", 0.02, 0.045),
+        ("E_Uni=0+L/5", 0, 200),
+    ],
+)
+def test_limits_are_read(text, at_zero, at_metre):
+    limit = decision.read_limits([text], acceptance.FIGURES)["E_Uni"]
+    assert (limit.at(), limit.at(1000.0)) == pytest.approx((at_zero, at_metre))
+
+
+@pytest.mark.parametrize(
+    ("texts", "said"),
+    [
+        (["E_Uni"], "NAME=A+L/K"),
+        (["E_Uny=1"], "did you mean 'E_Uni'"),
+        (["E_Uni=a"], "numbers"),
+        (["E_Uni=-1"], "zero or positive"),
+        (["E_Uni=1+L/0"], "K at least"),
+        (["E_Uni=1+L/1e-320"], "K at least"),
+        (["E_Uni=1e308"], "finite"),
+        (["E_Uni=nan"], "zero or positive"),
+        (["E_Uni=1", "e_uni=2"], "two limits"),
+    ],
+)
+def test_limits_that_cannot_be_are_refused(texts, said):
+    assert_refused(lambda: decision.read_limits(texts, acceptance.FIGURES), "--mpe", said)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: aj.decide("a", 1, 0), "numbers of mm"),
+        (lambda: aj.decide(np.array([1.0, 2.0]), 1, 0), "numbers of mm"),
+        (lambda: aj.decide(math.nan, 1, 0), "not a number"),
+        (lambda: accept(Measured({"A": [[1, 2]]})), "'A'"),
+        (lambda: accept(Measured({"A": np.full((2, 3), 1e200)})), "beyond"),
+        (lambda: accept(Measured({"A": np.eye(3)}, (aj.ReferenceLength("A", "B", 1.0),))), "unknown socket 'B'"),
+        (lambda: accept(Measured({"A": np.eye(3)}), {"Deltam": "x"}), "limit of Deltam"),
+        (lambda: accept(Measured({"A": np.eye(3)}), {"Delta": 1.0}), "did you mean 'Deltam'"),
+        (lambda: accept(Measured({"A": np.eye(3)}), {"Deltam": aj.Limit(1, -1000)}), "divisor"),
+        (lambda: accept(Measured({"A": np.eye(3)}), u_test=-1), "standard uncertainty of the test"),
+        (lambda: accept(Measured({}, spheres=(aj.ProbedSphere("S", "probing", (PLACE + AXES,), math.nan),))), "sphere 'S'"),
+        (lambda: accept(Measured({}, spheres=(aj.ProbedSphere("S", "probe", (PLACE + AXES,), 25.0),))), "must be one of"),
+        (
+            lambda: accept(Measured({}, spheres=(aj.ProbedSphere("S", "probing", (AXES, AXES[:3]), 25.0),))),
+            "sphere 'S', group 2",
+        ),
+    ],
+)
+def test_what_cannot_be_tested_is_refused(call, said):
+    assert_refused(call, said)
+
+
+def test_a_plain_number_is_a_limit():
+    (test,) = accept(Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])}), {"Deltam": 0.04})
+    assert test.decision == "fails"
+
+
+def test_every_part_has_its_own_limit_and_the_worst_decides():
+    sockets = {name: np.array([[x, 0.0, 0.0]]) for name, x in (("A", 0), ("B", 100.03), ("C", 1000.03))}
+    lengths = (aj.ReferenceLength("A", "B", 100.0, 0.002), aj.ReferenceLength("A", "C", 1000.0, 0.002))
+    limit = {"E_Uni": decision.Limit(0.02, 40_000)}
+    (found,) = [test for test in accept(Measured(sockets, lengths), limit, 0.0) if test.title == "length error"]
+    parts = found.figures[0].parts
+    # Both are off by 0.03, U is 0.004; the limits are 0.0225 and 0.045.
+    assert [part.limit for part in parts] == pytest.approx([0.0225, 0.045])
+    assert [part.expanded for part in parts] == pytest.approx([0.004, 0.004])
+    assert [part.decision for part in parts] == ["fails", "conforms"]
+    assert found.decision == found.figures[0].decision == "fails"
+    assert found.figures[0].worst.where == "A - B"
+
+
+def lengths_of(*entries):
+    """Points on a line, and lengths from the first: (error, u, calibrated value) each."""
+    sockets = {"O": np.zeros((1, 3))} | {
+        f"P{i}": np.array([[value + error, 0, 0]]) for i, (error, _, value) in enumerate(entries)
+    }
+    lengths = tuple(aj.ReferenceLength("O", f"P{i}", value, u) for i, (_, u, value) in enumerate(entries))
+    return Measured(sockets, lengths)
+
+
+@pytest.mark.parametrize(
+    ("entries", "limit", "where", "decision"),
+    [
+        # Without a limit the largest, whatever its uncertainty.
+        ([(0.030, 0.002, 100.0), (-0.029, 0.02, 200.0)], None, "O - P0", None),
+        ([(0.029, 0.002, 100.0), (-0.030, 0.02, 200.0)], None, "O - P1", None),
+        # What fails comes before what is undecided, even where that is nearer to failing by its U.
+        ([(0.050, 0.0005, 100.0), (0.040, 0.01, 200.0)], aj.Limit(0.04), "O - P0", "fails"),
+        # With limits that grow, the part farthest beyond its own.
+        ([(0.050, 0.0, 100.0), (0.055, 0.0, 1000.0)], aj.Limit(0.01, 40_000), "O - P0", "fails"),
+        ([(0.010, 0.0, 100.0), (0.030, 0.0, 1000.0)], aj.Limit(0.05), "O - P1", "conforms"),
+    ],
+)
+def test_the_worst_part_speaks_for_a_figure(entries, limit, where, decision):
+    (test,) = [
+        test for test in accept(lengths_of(*entries), {"E_Uni": limit} if limit else None) if test.title == "length error"
+    ]
+    assert (test.figures[0].worst.where, test.figures[0].decision) == (where, decision)
+    assert test.figures[0].value == pytest.approx(next(error for i, (error, *_) in enumerate(entries) if where == f"O - P{i}"))
+
+
+def test_names_of_sockets_change_no_limit():
+    """Limits follow the length itself, whatever the sockets are called."""
+    limit = {"E_Uni": aj.Limit(0.01, 10_000)}
+    for names in (("A", "B"), ("A, reading 1", "B"), ("A - B", "C"), ("A", "B - C, reading 2")):
+        sockets = dict(zip(names, (np.zeros((2, 3)), np.tile([500.04, 0, 0], (2, 1))), strict=True))
+        measured = Measured(sockets, (aj.ReferenceLength(*names, 500.0), aj.ReferenceLength(*names, 500.01)))
+        (test,) = [test for test in accept(measured, limit) if test.title == "length error"]
+        assert [part.limit for part in test.figures[0].parts] == pytest.approx([0.06, 0.06, 0.060001, 0.060001])
+
+
+@pytest.mark.parametrize("name", ["Length_Range", "Volumetric_2RMS", "Deltam"])
+def test_a_limit_that_grows_needs_a_length(name):
+    measured = lengths_of((0.01, 0.0, 100.0), (0.02, 0.0, 200.0))
+    measured = measured._replace(sockets={**measured.sockets, "S": PLACE + np.eye(3)})
+    assert_refused(lambda: accept(measured, {name: aj.Limit(1.0, 1000)}), name, "grows with a length")
+
+
+def test_uncertainties_of_figures_by_hand():
+    sockets = {name: np.array([[x, 0.0, 0.0]]) for name, x in (("A", 0), ("B", 100.03), ("C", 199.99))}
+    lengths = (aj.ReferenceLength("A", "B", 100.0, 0.003), aj.ReferenceLength("A", "C", 200.0, 0.004))
+    test = accept(Measured(sockets, lengths), u_test=0.012)[0]
+    values = {figure.name: (figure.value, figure.worst.expanded) for figure in test.figures}
+    assert values["Length"] == pytest.approx((0.03, 2 * math.hypot(0.003, 0.012)))
+    assert values["Length_Range"] == pytest.approx((0.04, 2 * math.sqrt(0.003**2 + 0.004**2 + 2 * 0.012**2)))
+    rms_u = math.sqrt((0.003**2 + 0.004**2) / 2)
+    assert values["Length_2RMS"] == pytest.approx((2 * math.sqrt(5e-4), 2 * 2 * math.hypot(rms_u, 0.012)))
+
+
+# --- An arm of known error --------------------------------------------------------------------------------------------------
+
+
+def test_a_perfect_arm_has_no_error_and_the_full_procedure(recorded):
+    tests = accept(measured_by(recorded.nominal.arm, recorded))
+    assert all(abs(part.value) < 1e-6 for test in tests for figure in test.figures for part in figure.parts)
+    own = "ISO 10360-12" if len(recorded.spheres) == 2 else "ASME B89.4.22"
+    for test in tests:
+        if test.standard == own:
+            assert test.missing == (), test.title
+    assert len([test for test in tests if test.standard == own]) == 3
+
+
+def test_an_arm_that_is_too_large_measures_everything_too_large(recorded):
+    grown = 1.0001
+    arm = recorded.nominal.arm
+    large = aj.Arm(alpha=arm.alpha, a=grown * arm.a, d=grown * arm.d, theta=arm.theta, probe=grown * arm.probe)
+    lengths = [float(length.value) for length in recorded.capture.lengths]
+    for test in accept(measured_by(large, recorded)):
+        for figure in test.figures:
+            for part in figure.parts:
+                expected = {
+                    "E_Uni": 1e-4 * (part.length or 0.0),
+                    "Volumetric": 1e-4 * (part.length or 0.0),
+                    "Length": 1e-4 * (part.length or 0.0),
+                    "D_Eff": 1e-4 * 31.0,  # of the sphere and of the probe's ball
+                    "P_Size": 1e-4 * 31.0,
+                    "Length_Range": 1e-4 * (max(lengths) - min(lengths)),
+                    "Volumetric_Range": 1e-4 * (max(lengths) - min(lengths)),
+                    "Length_2RMS": 2e-4 * math.sqrt(np.mean(np.square(lengths))),
+                    "Volumetric_2RMS": 2e-4 * math.sqrt(np.mean(np.square(lengths))),
+                }.get(figure.name, 0.0)
+                assert part.value == pytest.approx(expected, abs=2e-6), (figure.name, part.where)
+
+
+def test_a_probe_that_is_off_scatters_tips_on_a_sphere(cheng):
+    recorded = record_procedure(acceptance_procedure(cheng.arm, "asme"), cheng, cheng)
+    off = 0.1
+    space = aj.Parameters(cheng.arm, ("probe_z",))
+    arm = space.arm(space.vector() + off)
+    tests = accept(measured_by(arm, recorded))
+    for name, q in recorded.capture.sockets.items():
+        if not name.startswith("spat"):
+            continue
+        # Every tip is off along the last frame's z axis, by the same amount.
+        tips = off * np.asarray(cheng.arm.pose(q))[:, :3, 2]
+        spans = tips.max(axis=0) - tips.min(axis=0)
+        away = np.linalg.norm(tips - tips.mean(axis=0), axis=1)
+        found = {
+            figure.name: part.value
+            for test in tests
+            for figure in test.figures
+            for part in figure.parts
+            if part.where.startswith(name)
+        }
+        assert found["Deltam"] == pytest.approx(spans.max() / 2, abs=1e-8)
+        assert found["SPAT"] == pytest.approx(away.max(), abs=1e-8)
+        assert found["SPAT_2s"] == pytest.approx(2 * np.sqrt(np.sum(away**2) / 9), abs=1e-8)
+
+
+# --- What a capture holds -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sockets", "lengths", "reach", "missing"),
+    [
+        ({"A": 10}, [], None, {"single-point articulation": ["reach of the arm"]}),
+        (
+            {"A": 10, "B": 1, "C": 1},
+            [("B", "C", 100.0)],
+            1000.0,
+            {
+                "single-point articulation": ["at 0 to 20 %", "at 80 to 100 %"],
+                "volumetric": ["20 positions", "two bars, no fewer", "500 to 750 mm", "1200 to 1500 mm"],
+                "length error": ["105 in all (1 readings of 1 length", "1320 mm"],
+            },
+        ),
+    ],
+)
+def test_what_a_full_procedure_needs_besides(sockets, lengths, reach, missing):
+    points = {name: PLACE + 100.0 * number + np.zeros((size, 3)) for number, (name, size) in enumerate(sockets.items())}
+    ball = None if reach is None else acceptance.Reach(np.zeros(3), reach)
+    references = tuple(aj.ReferenceLength(*length) for length in lengths)
+    found = {test.title: test.missing for test in accept(Measured(points, references, reach=ball))}
+    for title, wanted in missing.items():
+        assert len(found[title]) == len(wanted), found[title]
+        for sentence, part in zip(found[title], wanted, strict=True):
+            assert part in sentence
+
+
+def test_zones_are_told_by_the_distance_from_the_shoulder():
+    shoulder = np.array([0.0, 0.0, 376.5])
+    points = {
+        f"{share}": np.tile(shoulder + np.array([share * 1000.0, 0, 0]), (10, 1)) for share in (0.1, 0.2, 0.21, 0.8, 0.81, 1.1)
+    }
+    (test,) = [
+        test
+        for test in accept(Measured(points, reach=acceptance.Reach(shoulder, 1000.0)))
+        if test.title.startswith("single-point a")
+    ]
+    found = [part.where.split("(")[1].split(" %")[0] for part in test.figures[0].parts]
+    assert found == ["0 to 20", "0 to 20", "20 to 80", "20 to 80", "80 to 100", "80 to 100"]
+
+
+def test_reach_of_arms():
+    # Two links in a plane and a probe along the second: 300 + 200 + 50 when stretched; with the elbow's limits less.
+    limits = [(-3, 3), (math.pi / 2, 3)]
+    arm = aj.Arm(alpha=[0, 0], a=[300, 200], d=[100, 0], theta=[0, 0], probe=[50, 0, 0])
+    assert aj.reach_of(arm).radius == pytest.approx(550)
+    bent = aj.Arm(alpha=[0, 0], a=[300, 200], d=[100, 0], theta=[0, 0], probe=[50, 0, 0], limits=limits)
+    assert aj.reach_of(bent).radius == pytest.approx(math.hypot(300, 250))
+
+
+def complete_volumetric(near: int, far: int) -> Measured:
+    entries = [(0.0, 0.0, 600.0 + 0.001 * i) for i in range(near)] + [(0.0, 0.0, 1300.0 + 0.001 * i) for i in range(far)]
+    return lengths_of(*entries)._replace(reach=acceptance.Reach(np.zeros(3), 1000.0))
+
+
+@pytest.mark.parametrize(("near", "far", "missing"), [(10, 10, 0), (15, 5, 0), (19, 1, 1), (9, 10, 1), (20, 0, 2)])
+def test_a_volumetric_test_needs_both_bars_often_enough(near, far, missing):
+    (test,) = [test for test in accept(complete_volumetric(near, far)) if test.title == "volumetric"]
+    assert len(test.missing) == missing, test.missing
+
+
+def test_lengths_between_the_same_sockets_are_one_position():
+    measured = complete_volumetric(10, 10)
+    twice = measured._replace(lengths=measured.lengths[:19] + measured.lengths[:1])
+    (test,) = [test for test in accept(twice) if test.title == "volumetric"]
+    assert "(19 are there)" in test.missing[0]
+
+
+def test_every_length_of_a_length_test_needs_its_three_readings(recorded):
+    if len(recorded.spheres) == 1:
+        pytest.skip("of ISO 10360-12 only")
+    whole = measured_by(recorded.nominal.arm, recorded)
+    complete = lambda measured: next(test for test in accept(measured) if test.title == "length error").missing == ()  # noqa: E731
+    assert complete(whole)
+    short = dict(whole.sockets) | {"bar1/01/a": whole.sockets["bar1/01/a"][:1]}
+    more = {name: np.repeat(points, 2, axis=0) for name, points in short.items() if name.startswith("bar2")}
+    assert not complete(whole._replace(sockets=short | more))  # more readings elsewhere do not make up for it
+
+
+@pytest.mark.parametrize("test", ["effective-diameter", "probing", "articulation"])
+def test_figures_that_could_not_fail_are_left_out(test):
+    """A sphere goes through four points exactly, and the sphere round one centre has no size."""
+    points = PLACE + 12.5 * AXES[[0, 1, 2, 4]]
+    found = accept(Measured({}, spheres=(aj.ProbedSphere("S", test, (points,), 25.0),)))
+    names = {figure.name for result in found for figure in result.figures}
+    assert names == {"effective-diameter": {"D_Eff"}, "probing": {"P_Size"}, "articulation": set()}[test]
+
+
+def test_a_limit_without_data_is_refused():
+    sockets = {"A": PLACE + np.eye(3)}
+    assert_refused(lambda: accept(Measured(sockets), {"P_Size": decision.Limit(0.1)}), "P_Size", "nothing to measure it on")
+
+
+# --- Files ----------------------------------------------------------------------------------------------------------------------
+
+
+def test_readings_taken_by_the_plan_come_back_through_its_manifest(recorded, cheng, tmp_path):
+    """What a laboratory does: plan, record a file for each socket and group of touches, import."""
+    standard = "iso" if len(recorded.spheres) == 2 else "asme"
+    procedure = acceptance_procedure(cheng.arm, standard)
+    (tmp_path / "acceptance.toml").write_text(procedure_manifest(procedure, "cheng2018-simulation"))
+    files: dict[str, list[str]] = {}
+    for row in csv.DictReader(procedure_csv(procedure).splitlines()):
+        files.setdefault(row["file"], []).append(" ".join(row[f"q_{i}_deg"] for i in range(1, 7)))
+    for name, rows in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("\n".join(rows))
+    imported = aj.read_manifest(tmp_path / "acceptance.toml")
+    assert sorted(imported.capture.names) == sorted(recorded.capture.names)
+    assert len(imported.capture.lengths) == len(recorded.capture.lengths)
+    assert len(imported.sources) == 1 + len(files)
+    for test in accept(measured_by(cheng.arm, imported)):
+        for figure in test.figures:
+            # The plan prints angles to 0.001 deg: 0.02 mm at the end of the arm, several joints together.
+            assert abs(figure.value) < (0.2 if "2RMS" not in figure.name else 0.3), figure.name
+    # And through HDF5.
+    aj.save_capture(tmp_path / "capture.h5", imported)
+    again = aj.load_capture(tmp_path / "capture.h5")
+    assert [sphere.name for sphere in again.spheres] == [sphere.name for sphere in imported.spheres]
+    for one, other in zip(again.spheres, imported.spheres, strict=True):
+        assert (one.test, one.diameter, one.u, one.stylus) == (other.test, other.diameter, other.u, other.stylus)
+        for rows, others in zip(one.groups, other.groups, strict=True):
+            np.testing.assert_array_equal(rows, others)
+    assert again.sources == imported.sources
+
+
+POINTS = """
+[points]
+unit = "um"
+reach = 1000
+shoulder = [0, 0, 0]
+[[socket]]
+name = "{end}"
+file = "{end}.txt"
+[[length]]
+from = "a"
+to = "b"
+value = 100
+u = 0.001
+[[sphere]]
+name = "S"
+test = "probing"
+file = "sphere/touch.txt"
+diameter = 30.98
+"""
+
+
+def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
+    (tmp_path / "points.toml").write_text(POINTS)
+    (tmp_path / "a.txt").write_text("0 0 0\n")
+    (tmp_path / "b.txt").write_text("100030 0 0\n")
+    (tmp_path / "sphere").mkdir()
+    np.savetxt(tmp_path / "sphere" / "touch.txt", 1000 * (PLACE + 15.5 * AXES))
+    found = json.loads(aacmm("evaluate", "points.toml", "--mpe", "E_Uni=0.05", "--json").stdout)
+    values = {figure["name"]: figure["value_mm"] for test in found["acceptance"] for figure in test["figures"]}
+    assert (values["E_Uni"], values["P_Size"], values["P_Form"]) == pytest.approx((0.03, 0.02, 0), abs=1e-9)
+    printed = aacmm("evaluate", "points.toml", "--mpe", "E_Uni=0.03", expect=1).stdout
+    assert "undecided" in printed
+    assert "25 points a group on sphere 'S'" in " ".join(printed.split())
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (('to = "b"', 'to = "c"'), "unknown socket 'c'"),
+        (('test = "probing"', 'test = "probe"'), "'sphere 1.test'"),
+        (("diameter = 30.98", "diameter = 0"), "diameter"),
+        (('file = "sphere/touch.txt"', ""), "either file or files"),
+        (('unit = "um"', 'unit = "um"\ncolumns = [1, 2, 4]'), "column 4"),
+        (("reach = 1000", "reech = 1000"), "did you mean 'reach'"),
+        (("shoulder = [0, 0, 0]", ""), "reach and shoulder together"),
+    ],
+)
+def test_wrong_manifests_of_points(tmp_path, change, said):
+    for name in ("a.txt", "b.txt", "touch.txt"):
+        np.savetxt(tmp_path / name, 1000 * (PLACE + 15.5 * AXES + (name == "b.txt")))
+    text = POINTS.replace("sphere/touch", "touch")
+    (tmp_path / "points.toml").write_text(text.replace(*(part.replace("sphere/touch", "touch") for part in change)))
+    assert_refused(lambda: aj.read_points(tmp_path / "points.toml"), "points.toml", said)
+
+
+def test_an_evaluation_is_stored_whole(recorded, tmp_path):
+    from aacmm_jax.files.evaluations import EvaluationRecord
+
+    used = frozenset(recorded.capture.names[:1])
+    record = EvaluationRecord(
+        recorded,
+        recorded.nominal,
+        used,
+        ("x",),
+        {"E_Uni": decision.Limit(0.1, 4e4), "Deltam": decision.Limit(0.1)},
+        0.001,
+        {"rms_mm": 0.2},
+    )
+    aj.save_evaluation(tmp_path / "e.h5", record)
+    again = aj.load_evaluation(tmp_path / "e.h5")
+    assert (again.used, again.warnings, again.limits, again.u_test, again.maxima) == record[2:]
+    # To rounding of the last bit of poses read back, the same tests come out.
+    assert again.acceptance()["calibrated"] == record.acceptance()["calibrated"]
+    # What the arm was identified from counts in no repeatability.
+    names = {
+        part.where
+        for test in again.acceptance()["calibrated"]
+        for figure in test.figures
+        if figure.name == "Deltam"
+        for part in figure.parts
+    }
+    assert not names & used
+
+
+@pytest.fixture(scope="module")
+def calibrated(cheng):
+    """A calibration from sockets A and B of a recording with C besides."""
+    sockets = {"A": (400, 200, 300), "B": (700, 500, 500), "C": (-300, 600, 400)}
+    lengths = [("A", "B", 0.002), ("A", "C", 0.002)]
+    capture = aj.simulate(cheng.arm, sockets, poses={"A": 40, "B": 12, "C": 12}, lengths=lengths, encoder_arcsec=2.0, seed=1)
+    seen = capture.select(without="C")
+    space = aj.Parameters.free_of(cheng.arm)
+    result = aj.calibrate(cheng.arm, seen, aj.Bounds.around(cheng.arm, space, length=10.0, angle=0.0175))
+    return aj.record_of(result, aj.Recording(seen, cheng)), aj.Recording(capture, cheng)
+
+
+def test_only_what_was_not_seen_is_tested_with_the_uncertainty_that_is_stated(calibrated):
+    record, recording = calibrated
+    found = aj.evaluation_of(record, recording, u_test=0.01).acceptance()["calibrated"]
+    parts = {figure.name: figure.parts for test in found for figure in test.figures}
+    assert {part.where for part in parts["Deltam"]} == {"C"}
+    assert {part.where.partition(",")[0] for part in parts["E_Uni"]} == {"A - C"}
+    assert parts["Deltam"][0].expanded == pytest.approx(0.02)
+    assert parts["E_Uni"][0].expanded == pytest.approx(2 * math.hypot(0.002, 0.01))
+
+
+def test_sockets_that_share_poses_with_the_calibration_are_not_new(calibrated):
+    record, recording = calibrated
+    # C is new, B is known but for two poses that the calibration has not seen.
+    q = recording.capture.sockets
+    more = {"A": q["A"], "B": np.concatenate([q["B"], q["C"][:2] + 0.001]), "C": q["C"]}
+    evaluation = aj.evaluation_of(
+        record, recording._replace(capture=aj.Capture(more, recording.capture.lengths)), limits={"Deltam": 1.0}
+    )
+    assert evaluation.limits == {"Deltam": aj.Limit(1.0)}
+    assert evaluation.used == {"A", "B"}
+    assert "B (12 of 14 poses)" in " ".join(evaluation.warnings)
+
+
+def test_what_makes_an_evaluation_doubtful_is_said_first(calibrated):
+    record, recording = calibrated
+    seen = aj.evaluation_of(record, record.recording, limits={"Deltam": aj.Limit(1.0)})
+    words = " ".join(seen.warnings)
+    assert "flatters" in words or "flatter it" in words
+    assert "Nothing was stated of the uncertainty of Deltam" in words
+    assert all(test.missing for test in seen.acceptance()["calibrated"])
+    failed = aj.evaluation_of(record._replace(converged=False, reason="It did not."), recording)
+    assert "The calibration failed" in failed.warnings[0]
+    simulated = aj.evaluation_of(record, recording._replace(true=recording.nominal))
+    assert "simulated" in simulated.warnings[0]
+
+
+def test_an_evaluation_of_points_is_stored_whole(tmp_path):
+    from aacmm_jax.files.points_evaluations import PointsRecord, load_points, save_points
+
+    spheres = (aj.ProbedSphere("S", "probing", (PLACE + 15.5 * AXES,), 31.0, 0.001, 0.0, 0.0002),)
+    measured = lengths_of((0.01, 0.001, 100.0))._replace(
+        spheres=spheres, reach=acceptance.Reach(np.ones(3), 900.0), measured="2026-01-31"
+    )
+    record = PointsRecord(measured, {"E_Uni": aj.Limit(0.02, 49)}, 0.001)
+    save_points(tmp_path / "points.h5", record)
+    again = load_points(tmp_path / "points.h5")
+    assert again.acceptance() == record.acceptance()
+    assert (again.limits, again.u_test, again.measured.measured) == (record.limits, record.u_test, "2026-01-31")
+    written = aj.write_report(tmp_path / "points.h5", tmp_path / "points.html")
+    assert written["verdict"].startswith("Every limit is kept")
+
+
+def test_bars_at_hand_are_planned_for(cheng):
+    procedure = acceptance_procedure(cheng.arm, "asme", bars=[1000.0, 500.5])
+    assert sorted({value for *_, value in procedure.lengths}) == [500.5, 1000.0]
+    assert len(procedure.left_out) == 2  # neither is within the ranges of the standard, for a reach of 1359 mm
+    for start, end, value in procedure.lengths:
+        ends = [next(item for item in procedure.sockets if item.name == name).points[0] for name in (start, end)]
+        assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(value, abs=1e-5)
+    assert_refused(lambda: acceptance_procedure(cheng.arm, "iso", bars=[500.0]), "takes 5")
+
+
+def test_an_arm_that_cannot_take_a_zone_goes_without_it():
+    procedure = acceptance_procedure(aj.load_arm("iiwa14"), "asme")
+    assert "0 to 20 %" in procedure.left_out[0]
+    assert {item.name for item in procedure.sockets if item.name.startswith("spat")} == {"spat/middle", "spat/far"}
+    assert_refused(lambda: acceptance_procedure(aj.load_arm("iiwa14"), "asme", margin=3.0), "margin")
+    assert_refused(lambda: acceptance_procedure(aj.load_arm("iiwa14"), "vdi"), "asme or iso")
+
+
+@pytest.mark.parametrize("standard", ["asme", "iso"])
+def test_planned_poses_can_be_taken(cheng, standard):
+    above, margin = 50.0, math.radians(10)
+    procedure = acceptance_procedure(cheng.arm, standard, above=above, margin=margin)
+    limits = np.array(cheng.arm.limits or [(-math.pi, math.pi)] * 6)
+    for item in (*procedure.sockets, *procedure.touches):
+        np.testing.assert_allclose(cheng.arm.position(item.q), item.points, atol=1e-5)
+        assert np.all((item.q >= limits[:, 0] + margin - 1e-9) & (item.q <= limits[:, 1] - margin + 1e-9))
+        assert item.points[:, 2].min() >= above
+    for sphere in procedure.spheres:
+        for item in procedure.touches:
+            distances = np.linalg.norm(item.points - sphere.centre, axis=1)
+            np.testing.assert_allclose(distances, (sphere.diameter + sphere.stylus) / 2, atol=1e-9)
+            # From outside: the probe points against the normal of the surface.
+            towards = np.asarray(cheng.arm.pose(item.q))[:, :3, :3] @ np.asarray(cheng.arm.probe)
+            assert np.all(np.sum(towards * (item.points - sphere.centre), axis=1) < 0)

@@ -1,0 +1,528 @@
+"""The Digital Calibration Certificate: valid after the published schema, numbers that read back exactly, texts that stay texts."""
+
+import datetime
+import math
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+import aacmm_jax as aj
+from aacmm_jax.certificate import xml as dcc_xml
+from aacmm_jax.certificate.document import dcc, values_of_dcc
+from aacmm_jax.files.administrative_data import About, Certificate, Conformity, Item, Laboratory, Person, Reference, read_about
+from aacmm_jax.summaries.warnings import of_calibration
+
+from tests.refusals import assert_refused
+
+CREATED = "2026-03-05T10:11:12+00:00"
+DCC, SI = "{https://ptb.de/dcc}", "{https://ptb.de/si}"
+MM, RAD = r"\milli\metre", r"\radian"
+COVERAGE = ("Factor", "Probability")
+PARAMETERS = "Denavit-Hartenberg parameters"
+
+# All that can be stated, as people write it.
+FULL = """
+[laboratory]
+name = "Längenlabor <b>&amp; Söhne</b>"
+code = "D-K-00000-01-00"
+street = "Maßstraße 1"
+postal_code = "01234"
+city = "Ort"
+country = "DE"
+email = "a@b.example"
+phone = "+49 1"
+
+[customer]
+name = "]]> & Co."
+country = "FR"
+
+[item]
+name = "arm \\"7\\""
+manufacturer = "maker"
+model = "X'1"
+serial_number = "0007"
+customer_number = "c <7>"
+
+[[person]]
+name = "Ada"
+role = "head"
+main_signer = true
+
+[[person]]
+name = "Βύρων"
+
+[certificate]
+number = "2026-1"
+country = "CH"
+received = 2026-02-01
+begin = 2026-02-02
+end = 2026-02-03
+issued = 2026-02-04
+place = "laboratory"
+remarks = "first line\\nsecond line"
+temperature_celsius = 20.25
+temperature_u_celsius = 0.1
+
+[[reference]]
+name = "ball bar"
+manufacturer = "maker of bars"
+model = "B"
+serial_number = "5"
+certificate_number = "K 17"
+
+[conformity]
+verdict = "conditionalPass"
+specification = "house rule 1"
+decision_rule = "passes where |E| + U is below 0.05 mm"
+"""
+
+HOSTILE = ("<script>alert('1')</script>", 'a]]><b>"&amp;&lt;', "tab\tline\nfeed\rreturn é Ж 測 𝄞", " blank ")
+
+
+@pytest.fixture(scope="module")
+def record(paper_arm) -> aj.CalibrationRecord:
+    """A calibration of an arm that is off, so as found and as left differ. One of its two lengths is exact."""
+    nominal = aj.ArmSpecification(paper_arm, "small & fine")
+    bounds = nominal.bounds()
+    true = bounds.space.arm(np.asarray(bounds.space.vector()) + np.where(bounds.space.lengths, 0.4, 0.001))
+    sockets = {"A": (400.0, 200.0, 300.0), "B": (600.0, 200.0, 300.0), "C": (500.0, 400.0, 300.0)}
+    lengths = [("A", "B", 0.01), ("B", "C", 0.0)]
+    poses = {"A": 40, "B": 3, "C": 1}
+    capture = aj.simulate(true, sockets, poses=poses, lengths=lengths, encoder_arcsec=2.0, seating=0.005, seed=1)
+    return aj.record_of(aj.calibrate(paper_arm, capture, bounds), aj.Recording(capture, nominal))
+
+
+def renamed(record: aj.CalibrationRecord, *names: str) -> aj.CalibrationRecord:
+    """The same calibration, with other names of sockets A, B and C."""
+    other = dict(zip("ABC", names, strict=True))
+    capture = record.recording.capture
+    lengths = [aj.ReferenceLength(other[x.start], other[x.end], x.value, x.u) for x in capture.lengths]
+    capture = aj.Capture({other[name]: q for name, q in capture.sockets.items()}, lengths)
+    return record._replace(recording=record.recording._replace(capture=capture))
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory) -> About:
+    path = tmp_path_factory.mktemp("about") / "about.toml"
+    path.write_text(FULL, encoding="utf-8")
+    return read_about(path)
+
+
+@pytest.fixture(scope="module")
+def certificates(record, full) -> dict[str, str]:
+    """Certificates of every kind that the published rules are held against."""
+    uncertain = record.determined.copy()
+    uncertain[0] = False
+    active = record.active.copy()
+    active[1:3] = (-1, 1)
+    return {
+        "nothing stated": dcc(record, About(), created=CREATED),
+        "all stated": dcc(record, full, created=CREATED, sources=("a.h5", "<b>.toml"), command="aacmm calibrate a.h5"),
+        "hostile names": dcc(renamed(record, *HOSTILE[:3]), full, created=CREATED),
+        "on bounds": dcc(record._replace(determined=uncertain, active=active), About(), created=CREATED),
+        "joint": dcc(record._replace(method="joint", freedom=math.inf, form="given"), About(), created=CREATED),
+    }
+
+
+KINDS = ("nothing stated", "all stated", "hostile names", "on bounds", "joint")
+
+
+def contents(text: str, path: str) -> list[str]:
+    """Texts of ``dcc:content`` below every element of a path."""
+    found = ElementTree.fromstring(text).iterfind(path.replace("dcc:", DCC))
+    return [content.text or "" for element in found for content in element.iter(f"{DCC}content")]
+
+
+# The rules that PTB publishes
+
+
+@pytest.fixture(scope="module")
+def schema():
+    toolkit = pytest.importorskip(
+        "dcc_json_toolkit", reason="install dcc-json-toolkit to validate against the published schema"
+    )
+    from xmlschema import XMLSchemaException
+
+    try:
+        return toolkit.DccSchema("3.3.0")
+    except (OSError, ElementTree.ParseError, XMLSchemaException) as error:
+        folder = toolkit.cache.CACHE_DIR_PATH / "3.3.0"
+        pytest.skip(f"no schema in {folder}, and none from ptb.de ({type(error).__name__}); run once with a network")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_published_schema_holds(schema, certificates, kind):
+    assert schema.validate_dcc(certificates[kind]) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("<dcc:value>0007</dcc:value>", "<dcc:value> </dcc:value>"),
+        ("<dcc:performanceLocation>laboratory", "<dcc:performanceLocation>moon"),
+        ("dcc:receiptDate", "dcc:receivedDate"),
+        ("<si:coverageProbability>0.95", "<si:coverageProbability>95"),
+        ('schemaVersion="3.3.0"', 'schemaVersion="3.2.1"'),
+    ],
+)
+def test_the_published_schema_notices_what_is_wrong(schema, certificates, old, new):
+    good = certificates["all stated"]
+    assert old in good
+    assert schema.validate_dcc(good.replace(old, new)) != []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_published_schematron_rules_hold(certificates, kind):
+    validation = pytest.importorskip("dcclib.validation", reason="install dcclib to check PTB's Schematron rules")
+    rules = Path(validation.__file__).parent / "schema" / "dcc.sch"
+    found = validation.SchematronValidator.from_file(str(rules)).validate_str(certificates[kind])
+    wrong = [report.text for report in [*found.failed_assertions, *found.successful_reports] if report.role != "information"]
+    # Where no country is stated, ZZ is: one that ISO 3166-1 leaves free, so that nobody takes it for a country.
+    stated = kind in ("all stated", "hostile names")
+    assert len(wrong) == (0 if stated else 1), wrong
+    assert stated or "'ZZ' is not a valid country code" in wrong[0]
+
+
+# What holds without either
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_elements_stand_in_the_order_of_the_schema(certificates, kind):
+    root = ElementTree.fromstring(certificates[kind].encode())
+    children = lambda element: [child.tag.removeprefix(DCC) for child in element]  # noqa: E731
+    assert root.tag == f"{DCC}digitalCalibrationCertificate"
+    assert root.get("schemaVersion") == "3.3.0"
+    assert children(root) == ["administrativeData", "measurementResults"]
+    administrative = "dccSoftware coreData items calibrationLaboratory respPersons customer statements"
+    assert children(root[0]) == administrative.split()
+    parts = "name description usedMethods usedSoftware measuringEquipments influenceConditions results"
+    assert [children(result) for result in root[1]] == [parts.split()] * 2
+    core = root[0].find(f"{DCC}coreData")
+    dates = "beginPerformanceDate endPerformanceDate performanceLocation"
+    given = f"receiptDate {dates} issueDate" if kind in ("all stated", "hostile names") else dates
+    languages = "usedLangCodeISO639_1 mandatoryLangCodeISO639_1"
+    assert core is not None
+    assert children(core) == f"countryCodeISO3166_1 {languages} uniqueIdentifier {given}".split()
+    found, left = (contents(certificates[kind], f"*/dcc:measurementResult[{n}]/dcc:results/*/dcc:name") for n in (1, 2))
+    assert found == ["Repeatability", "Reference lengths", PARAMETERS]
+    assert left == [*found, "Scale"]
+
+
+def test_numbers_read_back_exactly(record):
+    text = dcc(record, About(), created=CREATED)
+    values = values_of_dcc(text)
+    factor = stats.t.ppf(0.975, record.freedom)
+    coverage = {name: {x.text for x in ElementTree.fromstring(text).iter(f"{SI}coverage{name}")} for name in COVERAGE}
+    assert coverage["Probability"] == {"0.95"}
+    np.testing.assert_allclose([float(x or "") for x in coverage["Factor"]], [factor], rtol=1e-12)
+    arms = {"As found": record.recording.nominal.arm, "As left": record.calibrated.arm}
+    held = set(record.held)
+    for stage, arm in arms.items():
+        for kind, unit in (("alpha", RAD), ("a", MM), ("d", MM), ("theta", RAD)):
+            for i in range(6):
+                name = f"{kind}_{i + 1}"
+                value = values[stage, PARAMETERS, name]
+                assert value[:2] == (float(getattr(arm, kind)[i]), unit)
+                assert (value.expanded is not None) == (stage == "As left" and name not in held), name
+        for axis, number in zip("xyz", np.asarray(arm.probe), strict=True):
+            assert values[stage, PARAMETERS, f"probe_{axis}"][:2] == (float(number), MM)
+        figures = aj.evaluate(arm, record.recording.capture)
+        for name, number in (("DE", "de"), ("Deltam", "deltam"), ("RMS", "rms")):
+            assert values[stage, "Repeatability", name] == (float(getattr(figures.repeatability, number)), MM, None)
+        for i, (length, name) in enumerate(zip(record.recording.capture.lengths, ("1: A - B", "2: B - C"), strict=True)):
+            row = {key[3]: value for key, value in values.items() if key[:3] == (stage, "Reference lengths", name)}
+            assert row["calibrated value"][:2] == (float(length.value), MM)
+            assert row["measured value"] == (float(figures.measured[i]), MM, None)
+            assert row["error"][:2] == (float(figures.measured[i] - length.value), MM)
+            np.testing.assert_allclose(row["error"].expanded, factor * figures.u[i], rtol=1e-12)
+    for i, name in enumerate(record.names):
+        expected = factor * math.sqrt(record.covariance[i, i])
+        np.testing.assert_allclose(values["As left", PARAMETERS, name].expanded, expected, rtol=1e-12)
+    exact, measured = (values["As left", "Reference lengths", name, "calibrated value"] for name in ("2: B - C", "1: A - B"))
+    assert exact.expanded is None
+    np.testing.assert_allclose(measured.expanded, factor * 0.01, rtol=1e-12)
+    k = values["As left", "Scale", "k"]
+    assert k[:2] == (record.k, r"\one")
+    np.testing.assert_allclose(k.expanded, factor * record.u_k, rtol=1e-12)
+    # Three figures, three numbers for each of two lengths, and 27 parameters, twice; and the scale.
+    assert len(values) == 2 * (3 + 6 + 27) + 1
+
+
+@pytest.mark.parametrize("value", [5e-324, -0.0, 1e-5, 0.1, 1 / 3, -123456789.125, 1.7976931348623157e308])
+def test_any_number_reads_back(record, value):
+    text = dcc(record, About(), created=CREATED)
+    k = f"<si:value>{record.k!r}</si:value>"
+    assert text.count(k) == 1
+    parent = ElementTree.Element("x")
+    dcc_xml.real(parent, value, MM)
+    again = ElementTree.fromstring(dcc_xml.written(parent).replace("si:", ""))[0]
+    read = values_of_dcc(text.replace(k, f"<si:value>{again.findtext('value')}</si:value>"))["As left", "Scale", "k"].value
+    assert (read, math.copysign(1, read)) == (value, math.copysign(1, value))
+
+
+def test_parameters_without_an_uncertainty_of_their_own_say_why(record, certificates):
+    text = certificates["on bounds"]
+    values = values_of_dcc(text)
+    found, left = (
+        {
+            quantity.findtext(f"{DCC}name/{DCC}content"): quantity.findtext(f"{DCC}description/{DCC}content")
+            for quantity in results.iter(f"{DCC}quantity")
+        }
+        for results in ElementTree.fromstring(text).iterfind(f"*/{DCC}measurementResult/{DCC}results")
+    )
+    words = {
+        record.names[0]: "Determined only together with other",
+        record.names[1]: "On its lower bound",
+        record.names[2]: "On its upper bound",
+        "theta_1": "held at its nominal value",
+        "d_1": "held at its nominal value",
+    }
+    for name, word in words.items():
+        assert word in left[name]
+        assert values["As left", PARAMETERS, name].expanded is None
+        assert found[name] is None
+    assert all("divided" not in text for text in left.values() if text)  # d_1 only says where the base is, the others are 0
+    others = set(record.names) - set(words)
+    assert others
+    assert all(left[name] is None and values["As left", PARAMETERS, name].expanded for name in others)
+
+
+def test_a_held_length_that_the_scale_fix_divided_says_so(record):
+    i = record.names.index("probe_z")
+    parts = ("lower", "upper", "active_stage1", "active", "determined", "stretch")
+    fewer = {name: np.delete(getattr(record, name), i) for name in parts}
+    square = {name: np.delete(np.delete(getattr(record, name), i, 0), i, 1) for name in ("covariance", "open")}
+    names = tuple(name for name in record.names if name != "probe_z")
+    text = dcc(record._replace(names=names, held=(*record.held, "probe_z"), **fewer, **square), About(), created=CREATED)
+    assert "Not identified: held at its nominal value, and divided by k as all lengths are" in text
+    assert values_of_dcc(text)["As left", PARAMETERS, "probe_z"].expanded is None
+
+
+def test_what_is_stated_stands_there(certificates, full):
+    text = certificates["all stated"]
+    root = ElementTree.fromstring(text.encode())
+    path = lambda *tags: "/".join(f"{DCC}{tag}" for tag in ("administrativeData", *tags))  # noqa: E731
+    expected = {
+        ("coreData", "countryCodeISO3166_1"): "CH",
+        ("coreData", "uniqueIdentifier"): "2026-1",
+        ("coreData", "receiptDate"): "2026-02-01",
+        ("coreData", "beginPerformanceDate"): "2026-02-02",
+        ("coreData", "endPerformanceDate"): "2026-02-03",
+        ("coreData", "issueDate"): "2026-02-04",
+        ("coreData", "performanceLocation"): "laboratory",
+        ("items", "item", "name", "content"): 'arm "7"',
+        ("items", "item", "manufacturer", "name", "content"): "maker",
+        ("items", "item", "model"): "X'1",
+        ("items", "item", "identifications", "identification", "value"): "0007",
+        ("items", "item", "identifications", "identification[2]", "value"): "c <7>",
+        ("calibrationLaboratory", "calibrationLaboratoryCode"): "D-K-00000-01-00",
+        ("calibrationLaboratory", "contact", "name", "content"): "Längenlabor <b>&amp; Söhne</b>",
+        ("calibrationLaboratory", "contact", "eMail"): "a@b.example",
+        ("calibrationLaboratory", "contact", "location", "street"): "Maßstraße 1",
+        ("calibrationLaboratory", "contact", "location", "postCode"): "01234",
+        ("customer", "name", "content"): "]]> & Co.",
+        ("customer", "location", "countryCode"): "FR",
+        ("respPersons", "respPerson", "role"): "head",
+        ("respPersons", "respPerson", "mainSigner"): "true",
+        ("respPersons", "respPerson[2]", "person", "name", "content"): "Βύρων",
+        ("statements", "statement", "conformity"): "conditionalPass",
+    }
+    assert {place: root.findtext(path(*place)) for place in expected} == expected
+    assert "first line\nsecond line" in contents(text, "*/dcc:statements")
+    assert "a.h5, <b>.toml" in contents(text, "*/dcc:statements")
+    equipment = "*/dcc:measurementResult[1]/dcc:measuringEquipments/dcc:measuringEquipment"
+    assert contents(text, f"{equipment}/dcc:name") == ["ball bar", "Reference lengths"]
+    assert values_of_dcc(text)["As left", "Scale", "k"].expanded
+    temperature = root.find(f"*/{DCC}measurementResult/{DCC}influenceConditions//{SI}real")
+    assert temperature is not None
+    assert [item.text for item in temperature.iter() if item.text and item.text.strip()] == ["20.25", r"\degreecelsius", "0.1"]
+
+
+def test_nothing_is_made_up(record):
+    text = dcc(record, About(), created=CREATED)
+    root = ElementTree.fromstring(text)
+    core = [(child.tag.removeprefix(DCC), child.text) for child in root[0][1]]
+    assert ("countryCodeISO3166_1", "ZZ") in core
+    assert [text for name, text in core if name.endswith("Date")] == ["2026-03-05"] * 2
+    for part in ("calibrationLaboratory", "customer", "respPersons"):
+        assert set(contents(text, f"*/dcc:{part}")) == {"not stated"}
+    # The schema wants an address, and the Schematron rules a condition: where there is none, they say so.
+    for place in ("dcc:calibrationLaboratory/dcc:contact", "dcc:customer"):
+        assert contents(text, f"*/{place}/dcc:location/dcc:further") == ["not stated"]
+    assert contents(text, "*/dcc:measurementResult/dcc:influenceConditions/*/dcc:data") == ["not stated"] * 2
+    assert contents(text, "*/dcc:items/dcc:item/dcc:name")[0] == "small & fine"
+    status = [element.text for element in root.iter(f"{DCC}status")]
+    assert status == ["beforeAdjustment", "afterAdjustment"]
+    names = contents(text, "*/dcc:statements/dcc:statement/dcc:name")
+    assert not {"Conformity", "Simulation", "Files", "Remarks"} & set(names)
+    assert names[:2] == ["Scale", "Uncertainty"]
+
+
+def test_cautions_and_simulations_are_told(record):
+    recording = record.recording
+    simulated = record._replace(recording=recording._replace(true=recording.nominal), misfit=3.0)
+    cautions = of_calibration(simulated)
+    assert any("3 times what the given noise predicts" in sentence for sentence in cautions)
+    said = contents(dcc(simulated, About(), created=CREATED), "*/dcc:statements")
+    assert set(cautions) <= set(said)
+    assert "The readings are simulated, so this is no certificate of a real arm." in said
+
+
+@pytest.mark.parametrize(
+    ("stated", "begin", "end"),
+    [
+        ({}, "2026-03-05", "2026-03-05"),
+        ({"begin": "2026-03-01"}, "2026-03-01", "2026-03-05"),
+        ({"begin": "2026-04-01"}, "2026-04-01", "2026-04-01"),
+        ({"end": "2026-03-04"}, "2026-03-04", "2026-03-04"),
+        ({"begin": "2026-03-01", "end": "2026-03-02"}, "2026-03-01", "2026-03-02"),
+    ],
+)
+def test_the_day_of_the_calibration_stands_in_for_missing_dates(record, stated, begin, end):
+    dates = {name: datetime.date.fromisoformat(text) for name, text in stated.items()}
+    text = dcc(record, About(certificate=Certificate(**dates)), created=CREATED)
+    assert f"<dcc:beginPerformanceDate>{begin}<" in text
+    assert f"<dcc:endPerformanceDate>{end}<" in text
+
+
+def test_the_same_calibration_has_the_same_certificate(record):
+    one, again = (dcc(record, About(), created=CREATED) for _ in range(2))
+    assert one == again
+    other = dcc(record, About(item=Item(name="other")), created=CREATED)
+    identifier = lambda text: ElementTree.fromstring(text).findtext(f"*/{DCC}coreData/{DCC}uniqueIdentifier")  # noqa: E731
+    assert identifier(one) != identifier(other)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_names_stay_text(record, name):
+    record = renamed(record, name, "B", "C")
+    record = record._replace(recording=record.recording._replace(nominal=record.recording.nominal._replace(name=name)))
+    text = dcc(record, About(), created=CREATED, command=name)
+    assert ("As left", "Reference lengths", f"1: {name} - B", "error") in values_of_dcc(text)
+    assert contents(text, "*/dcc:items/dcc:item/dcc:name")[0] == name
+    assert name in contents(text, "*/dcc:measurementResult/dcc:usedSoftware")
+    assert all(element.tag.startswith((DCC, SI)) for element in ElementTree.fromstring(text).iter())
+
+
+def is_held_by_xml(text: str) -> bool:
+    """XML 1.0, section 2.2, by exclusion: no C0 controls but tab, line feed and return, no surrogates, not U+FFFE or U+FFFF."""
+    return not any((ord(c) < 32 and c not in "\t\n\r") or 0xD800 <= ord(c) <= 0xDFFF or c in "\ufffe\uffff" for c in text)
+
+
+@given(st.text(st.characters()) | st.text(st.sampled_from("\x00\x1f\x7f\x85\u2028\ufffe\uffff\ud800\t\n\r <>&]\"'a")))
+def test_any_text_survives_or_is_refused(text):
+    def there_and_back() -> str | None:
+        from aacmm_jax.files.administrative_data import held_by_xml
+
+        parent = ElementTree.Element("x")
+        dcc_xml.theirs(parent, "name", held_by_xml(text, "a name"))
+        return ElementTree.fromstring(dcc_xml.written(parent).replace("dcc:", "").encode()).findtext("name/content")
+
+    if is_held_by_xml(text):
+        assert there_and_back() == text
+    else:
+        assert_refused(there_and_back, "a name", "U+")
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("changes", "keywords", "parts"),
+    [
+        ({"converged": False, "reason": "Not converged: too few steps; allow more."}, {}, ["too few steps", "calibrate again"]),
+        ({"k": 25.4}, {}, ["25.4", "mend the lengths"]),
+        ({"k": math.nan}, {}, ["nan", "mend the lengths"]),
+        ({}, {"created": "yesterday"}, ["yesterday", "ISO 8601"]),
+        ({}, {"sources": ["a\x07.h5"]}, ["file", "U+0007", "take it out"]),
+        ({}, {"command": "aacmm \x00"}, ["command", "U+0000"]),
+    ],
+)
+def test_what_cannot_be_certified_is_refused(record, changes, keywords, parts):
+    assert_refused(lambda: dcc(record._replace(**changes), About(), **{"created": CREATED} | keywords), *parts)
+
+
+def test_names_that_xml_cannot_hold_are_refused(record):
+    assert_refused(lambda: dcc(renamed(record, "A\x1b", "B", "C"), About(), created=CREATED), r"socket 'A\x1b'", "U+001B")
+    nominal = record.recording.nominal._replace(name="\ud800")
+    broken = record._replace(recording=record.recording._replace(nominal=nominal))
+    assert_refused(lambda: dcc(broken, About(), created=CREATED), "arm", "U+D800")
+
+
+@pytest.mark.parametrize(
+    ("stated", "part"),
+    [({"received": "2026-03-06"}, "certificate.received"), ({"issued": "2026-03-04"}, "certificate.issued")],
+)
+def test_dates_that_contradict_the_calibration_are_refused(record, stated, part):
+    dates = {name: datetime.date.fromisoformat(text) for name, text in stated.items()}
+    assert_refused(lambda: dcc(record, About(certificate=Certificate(**dates)), created=CREATED), part, "2026-03-05")
+
+
+@pytest.mark.parametrize(
+    ("content", "parts"),
+    [
+        ('[item]\nname = "a\\u0007b"', ["item.name", "U+0007"]),
+        ('[[person]]\nname = "Ada"\n[[person]]\nname = "\\u0000"', ["person 2.name", "U+0000"]),
+        ('[item]\nname = " "', ["item.name", "empty"]),
+        ('[itm]\nname = "a"', ["itm", "did you mean 'item'"]),
+        ('[laboratory]\nnmae = "a"', ["laboratory.nmae", "did you mean 'name'"]),
+        ('[laboratory]\ncountry = "Germany"', ["laboratory.country", "'Germany'", "two capital letters"]),
+        ('[laboratory]\ncountry = "DE\\n"', ["laboratory.country"]),
+        ('[[person]]\nrole = "head"', ["person 1.name", "missing"]),
+        ('[person]\nname = "Ada"', ["[[person]]"]),
+        ('[certificate]\nplace = "moon"', ["certificate.place", "laboratory", "'moon'"]),
+        ('[certificate]\nbegin = "soon"', ["certificate.begin", "'soon'"]),
+        ("[certificate]\nbegin = 2026-02-02\nend = 2026-02-01", ["begin is 2026-02-02", "after end"]),
+        ("[certificate]\nreceived = 2026-02-02\nissued = 2026-02-01", ["received is 2026-02-02", "after issued"]),
+        ("[certificate]\ntemperature_u_celsius = 0.1", ["temperature_celsius", "give both"]),
+        ("[certificate]\ntemperature_celsius = 20.0\ntemperature_u_celsius = inf", ["temperature_u_celsius", "finite"]),
+        ("[certificate]\ntemperature_celsius = 20.0\ntemperature_u_celsius = -1.0", ["temperature_u_celsius"]),
+        ('[conformity]\nverdict = "pass"', ["conformity", "missing"]),
+        ("[item", ["not valid TOML"]),
+    ],
+)
+def test_what_is_said_about_a_certificate_is_checked(tmp_path, content, parts):
+    path = tmp_path / "about.toml"
+    path.write_text(content)
+    assert_refused(lambda: read_about(path), path, *parts)
+
+
+def test_everything_about_a_certificate_is_optional(tmp_path, full):
+    path = tmp_path / "about.toml"
+    path.write_text("")
+    assert read_about(path) == About()
+    assert About().country == "ZZ"
+    assert About(laboratory=Laboratory(country="DE")).country == "DE"
+    assert full.country == "CH"
+    assert full.person[0] == Person(name="Ada", role="head", main_signer=True)
+    assert full.reference[0].certificate_number == "K 17"
+    assert isinstance(full.conformity, Conformity)
+    assert Reference(name=" bar\n").name == "bar"
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("", ["not valid XML"]),
+        ("<a", ["not valid XML"]),
+        ("<a>\x00</a>", ["not valid XML"]),
+        ("\ud800", ["not valid XML"]),
+        ("<a/>", ["'a'", "give a DCC"]),
+        ('<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/hostname">]><a>&x;</a>', ["document type", "leave it out"]),
+        ('<!DOCTYPE a SYSTEM "http://localhost/a.dtd"><a/>', ["document type"]),
+    ],
+)
+def test_what_is_no_certificate_is_refused(text, parts):
+    assert_refused(lambda: values_of_dcc(text), *parts)
+
+
+def test_a_certificate_whose_number_was_edited_is_refused(record):
+    text = dcc(record, About(), created=CREATED)
+    k = f"<si:value>{record.k!r}</si:value>"
+    for edited in (k.replace(".", ","), ""):
+        assert_refused(lambda edited=edited: values_of_dcc(text.replace(k, edited)), "'As left / Scale / k'", "no number")

@@ -1,0 +1,504 @@
+"""Calibrations compared: figures worked out by hand, true changes found again, chance alone, and the command."""
+
+import csv
+import datetime
+import io
+import json
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+from typer.testing import CliRunner
+
+import aacmm_jax as aj
+from aacmm_jax.cli.compare_commands import app
+from aacmm_jax.data.noise import ARCSEC
+from aacmm_jax.data.recording import ArmSpecification, Recording
+from aacmm_jax.drift.comparison import compare, trend
+from aacmm_jax.drift.statistics import coverage_factor, effective_freedom
+from aacmm_jax.model.scale import divide_lengths
+from aacmm_jax.plot import drift as drift_figure
+from aacmm_jax.summaries.drift import drift_csv, drift_summary
+
+from tests.refusals import assert_refused
+
+SOCKETS = {"A": (400, 200, 300), "B": (700, 500, 500)}
+PAIRS, OTHERS = 60, 12
+MOVED = {"theta_4": 20 * ARCSEC, "a_2": 0.05}
+
+
+@pytest.fixture(scope="module")
+def specification() -> ArmSpecification:
+    return aj.load_specification("cheng2018-simulation")
+
+
+@pytest.fixture(scope="module")
+def space(paper_arm) -> aj.Parameters:
+    return aj.Parameters.free_of(paper_arm)
+
+
+def moved_arm(space, changes):
+    vector = space.vector()
+    for name, change in changes.items():
+        vector = vector.at[space.index(name)].add(change)
+    return space.arm(vector)
+
+
+@pytest.fixture(scope="module")
+def calibrated(paper_arm, specification, space):
+    """Calibrations, noise estimated, of the paper's arm (120) and of one with two parameters moved (12), each of its own capture."""
+    bounds = aj.Bounds.around(paper_arm, space)
+    captures = [
+        aj.simulate(
+            arm, SOCKETS, poses={"A": 50, "B": 10}, lengths=[("A", "B", 0.002)], encoder_arcsec=2.0, seating=0.005, seed=seed
+        )
+        for arm, seeds in ((paper_arm, range(2 * PAIRS)), (moved_arm(space, MOVED), range(2 * PAIRS, 2 * PAIRS + OTHERS)))
+        for seed in seeds
+    ]
+
+    def one(row):
+        q, value = row
+        lengths = [aj.ReferenceLength("A", "B", value, 0.002)]
+        return aj.calibrate(paper_arm, aj.Capture({"A": q[:50], "B": q[50:]}, lengths), bounds)
+
+    rows = (jnp.stack([capture.q for capture in captures]), jnp.stack([capture.lengths[0].value for capture in captures]))
+    found = jax.jit(lambda rows: jax.lax.map(one, rows, batch_size=20))(rows)
+    found = jax.tree.map(np.asarray, found)
+    records = [
+        aj.record_of(jax.tree.map(lambda leaf, i=i: jnp.asarray(leaf[i]), found), Recording(capture, specification))
+        for i, capture in enumerate(captures)
+    ]
+    assert all(record.converged for record in records)
+    return records
+
+
+@pytest.fixture(scope="module")
+def old(calibrated):
+    return calibrated[0]
+
+
+@pytest.fixture(scope="module")
+def new(calibrated):
+    return calibrated[1]
+
+
+def shifted(record, changes, **fields):
+    """The record with parameters of its arm changed, and whatever else."""
+    space = aj.Parameters(record.calibrated.arm, record.names)
+    return record._replace(calibrated=record.calibrated._replace(arm=moved_arm(space, changes)), **fields)
+
+
+def certain(record, u, freedom=math.inf):
+    """The record with independent parameters of standard uncertainty ``u`` mm or mrad each, and no stretch."""
+    steps = np.array([1e-3 if name.startswith(("alpha", "theta")) else 1.0 for name in record.names])
+    return record._replace(covariance=np.diag((u * steps) ** 2), stretch=np.zeros_like(record.stretch), freedom=freedom)
+
+
+# Two-sided Student's t and normal quantiles, from printed tables (JCGM 100, table G.2, 95.00 %).
+TABLE = {3: 3.18, 10: 2.23, 20: 2.09, 100: 1.984, math.inf: 1.960}
+
+
+def test_coverage_factors_are_those_of_the_guide():
+    np.testing.assert_allclose(coverage_factor(0.95, np.array(list(TABLE))), list(TABLE.values()), atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("u_old", "freedom_old", "u_new", "freedom_new", "expected"),
+    [
+        (1.0, 10.0, 1.0, 10.0, 20.0),
+        (1.0, 10.0, 1.0, math.inf, 40.0),
+        (3e-7, 5.0, 4e-7, 8.0, 625 / (81 / 5 + 256 / 8)),  # Welch and Satterthwaite by hand
+        (0.0, 5.0, 2.0, 8.0, 8.0),
+        (1.0, math.inf, 1.0, math.inf, math.inf),
+        (0.0, 5.0, 0.0, 5.0, math.inf),
+    ],
+)
+def test_effective_freedom(u_old, freedom_old, u_new, freedom_new, expected):
+    found = effective_freedom(np.array([u_old]), freedom_old, np.array([u_new]), freedom_new)
+    np.testing.assert_allclose(found, [expected], rtol=1e-12)
+
+
+@given(st.floats(0.01, 100), st.floats(1, 500), st.floats(1, 500))
+def test_effective_freedom_is_between_the_smaller_and_the_sum(ratio, one, two):
+    found = effective_freedom(np.array([1.0]), one, np.array([ratio]), two)[0]
+    assert min(one, two) * (1 - 1e-9) <= found <= (one + two) * (1 + 1e-9)
+
+
+def test_parameters_against_numbers_worked_out_by_hand(old, new):
+    """Uncertainties of 3 and 4 steps make one of 5; 9.7 and 9.9 steps are either side of U = 9.80."""
+    start = certain(old, 0.003)
+    end = certain(shifted(old, {"theta_4": 9.9e-6, "a_2": 0.0097}, recording=new.recording), 0.004)
+    found = compare(start, end)
+    np.testing.assert_allclose(found.u[[found.names.index("a_2"), found.names.index("theta_4")]], [5e-3, 5e-6])
+    np.testing.assert_allclose(found.expanded / found.u, stats.norm.ppf(0.975))
+    assert [name for name, moved in zip(found.names, found.moved, strict=True) if moved] == ["theta_4"]
+    assert found.joint.statistic == pytest.approx((9.9**2 + 9.7**2) / 25, rel=1e-6)
+    assert (found.joint.rank, found.joint.freedom) == (21, math.inf)
+    assert found.joint.p == pytest.approx(stats.chi2.sf((9.9**2 + 9.7**2) / 25, 21), rel=1e-6)
+    assert found.by_chance == pytest.approx(1.05)
+    assert "1 of 21 parameters moved beyond its uncertainty (95 %; 1 would by chance): theta_4 by +2.04 arcsec" in " ".join(
+        found.sentences()
+    )
+
+
+@pytest.mark.parametrize(
+    ("u", "freedom", "expected"),
+    [((0.003, 0.003), (40.0, 40.0), 80.0), ((0.003, 0.004), (40.0, 90.0), 625 / (81 / 40 + 256 / 90))],
+)
+def test_estimated_noise_takes_f(old, new, u, freedom, expected):
+    """Two alike with 40 degrees of freedom each have 80 together, as two pooled variances; else Welch and Satterthwaite."""
+    end = shifted(old, {"d_3": 0.02}, recording=new.recording)
+    found = compare(certain(old, u[0], freedom[0]), certain(end, u[1], freedom[1]))
+    assert found.joint.freedom == pytest.approx(expected)
+    assert found.joint.p == pytest.approx(stats.f.sf(0.02**2 / (u[0] ** 2 + u[1] ** 2) / 21, 21, expected), rel=1e-6)
+    np.testing.assert_allclose(found.expanded / found.u, stats.t.ppf(0.975, expected))
+
+
+def test_robust_covariances_take_hotelling(old, new):
+    """T^2 with 80 degrees of freedom of 21 parameters is 80 * 21 / 60 times F with 21 and 60."""
+    end = shifted(old, {"d_3": 0.02}, recording=new.recording, form="robust")
+    found = compare(certain(old, 0.003, 40.0)._replace(form="robust"), certain(end, 0.003, 40.0))
+    assert found.joint.p == pytest.approx(stats.f.sf(0.02**2 / 18e-6 * 60 / (80 * 21), 21, 60), rel=1e-6)
+
+
+def test_only_what_both_determine_is_tested(old, new):
+    """alpha_5 and d_6 trade off: changed together along the open direction they say nothing, across it they do."""
+    pair, root = [old.names.index("alpha_5"), old.names.index("d_6")], math.sqrt(0.5)
+    direction = np.zeros(21)
+    direction[pair] = root
+    projector = np.outer(direction, direction)
+    determined = np.ones(21, dtype=bool)
+    determined[pair] = False
+    steps = np.where([name.startswith(("alpha", "theta")) for name in old.names], 1e-3, 1.0)
+    inside = (np.eye(21) - projector) * 0.003**2 * np.outer(steps, steps)
+    start = certain(old, 0.003)._replace(covariance=inside, open=projector, determined=determined)
+    for side, statistic in ((1, 0.0), (-1, (0.01 * root * 2) ** 2 / (2 * 0.003**2))):
+        end = shifted(start, {"alpha_5": 0.01e-3, "d_6": 0.01 * side}, recording=new.recording)
+        found = compare(start, end)
+        assert found.joint.rank == 20
+        assert found.joint.statistic == pytest.approx(statistic, rel=1e-6, abs=1e-9)
+        assert [found.without[i] for i in pair] == ["left open by the data in both"] * 2
+        assert np.isnan(found.u[pair]).all()
+        assert not found.moved[pair].any()
+
+
+def test_on_a_bound_or_held_there_is_no_uncertainty_of_change(old, new):
+    active = np.zeros(21, dtype=int)
+    active[old.names.index("a_3")] = 1
+    without = old.names.index("d_6")
+    kept = [i for i in range(21) if i != without]
+    short = new._replace(
+        names=tuple(old.names[i] for i in kept), covariance=new.covariance[np.ix_(kept, kept)], open=new.open[np.ix_(kept, kept)],
+        determined=new.determined[kept], active=new.active[kept], stretch=new.stretch[[*kept, 21]],
+    )  # fmt: skip
+    for pair, side in (((old._replace(active=active), short), "new"), ((short, old._replace(active=active)), "old")):
+        found = compare(*pair)
+        assert dict(zip(found.names, found.without, strict=True))["d_6"] == f"held in the {side} one"
+        other = "old" if side == "new" else "new"
+        assert dict(zip(found.names, found.without, strict=True))["a_3"] == f"on a bound in the {other} one"
+        assert found.joint.rank == 19
+        assert len(found.joint.names) == 19
+        assert found.by_chance == pytest.approx(19 * 0.05)
+        assert f"Free in the {other} calibration only: d_6." in " ".join(found.cautions)
+        rows = {row["parameter"]: row for row in drift_summary(found)["parameters"]}
+        assert rows["d_6"]["u"] is rows["d_6"]["moved"] is None
+        assert rows["d_6"]["change"] == pytest.approx(float(pair[1].calibrated.arm.d[5] - pair[0].calibrated.arm.d[5]))
+
+
+def test_lengths_that_were_held_follow_the_scale(paper_arm, specification):
+    """After two stages a held length is divided by k too, so that its share of u(k) is in every length."""
+    space = aj.Parameters.free_of(paper_arm, held=("alpha_6", "a_6", "d_1", "theta_1", "probe_x", "probe_y", "a_2", "d_5"))
+    capture = aj.simulate(paper_arm, SOCKETS, poses={"A": 50, "B": 10}, lengths=[("A", "B", 0.05)], encoder_arcsec=2.0, seed=3)
+    record = aj.record_of(
+        aj.calibrate(paper_arm, capture, aj.Bounds.around(paper_arm, space)), Recording(capture, specification)
+    )
+    assert np.any(record.stretch)
+    found = compare(record, record, points=30).lengths
+    alone = aj.uncertainty_of(record).length(found.q, found.q_end)
+    np.testing.assert_allclose(found.u, math.sqrt(2) * np.asarray(alone), rtol=1e-9)
+    # One length of 583 mm with u = 0.05 mm dominates: every length is uncertain by nearly its share of that.
+    assert found.u_size == pytest.approx(math.sqrt(2) * record.u_k, rel=0.05)
+
+
+def test_lengths_are_those_of_the_two_arms(old, new):
+    found = compare(old, new, points=50, length=250.0).lengths
+    by = [
+        np.linalg.norm(
+            np.asarray(record.calibrated.arm.position(found.q_end) - record.calibrated.arm.position(found.q)), axis=1
+        )
+        for record in (old, new)
+    ]
+    np.testing.assert_allclose(by[0], 250, atol=1e-6)
+    np.testing.assert_allclose(found.change, by[1] - by[0], atol=1e-9)
+    length = eqx.filter_jit(lambda uncertainty: uncertainty.length(found.q, found.q_end))
+    each = [np.asarray(length(aj.uncertainty_of(record))) for record in (old, new)]
+    np.testing.assert_allclose(found.u, np.hypot(*each), rtol=1e-9)
+
+    space = aj.Parameters(old.calibrated.arm, old.names)  # of both arms: what is held is alike
+
+    @jax.jit
+    @jax.grad
+    def slope(vector):
+        arm = space.arm(vector)
+        return jnp.mean(jnp.linalg.norm(arm.position(found.q_end) - arm.position(found.q), axis=-1))
+
+    means = [slope(space.vector(record.calibrated.arm)) for record in (old, new)]
+    variance = sum(float(g @ record.covariance @ g) for g, record in zip(means, (old, new), strict=True))
+    assert found.u_size == pytest.approx(math.sqrt(variance) / 250, rel=1e-6)
+    assert found.largest == found.change[np.argmax(np.abs(found.change))]
+    assert found.rms == pytest.approx(float(np.sqrt(np.mean((by[1] - by[0]) ** 2))))
+
+
+def test_an_arm_that_grew_measures_everything_longer(old, new):
+    grown = old.calibrated._replace(arm=divide_lengths(old.calibrated.arm, jnp.asarray(1 / 1.0002)))
+    found = compare(old, new._replace(calibrated=grown))
+    np.testing.assert_allclose(found.lengths.change, 0.06, rtol=1e-6)
+    assert found.lengths.size == pytest.approx(2e-4, rel=1e-6)
+    assert found.lengths.moved.all()
+    assert "the same lengths measure 200.0 um/m longer than before" in found.sentences()[-1]
+    # The artefact's 2 um in 469 mm, twice, is all that two angle-perfect arms could differ by; poses add to it.
+    assert found.lengths.u_size > math.sqrt(2) * 0.002 / math.dist(*SOCKETS.values())
+
+
+def test_the_scale_left_open_is_no_drift(old, new):
+    scale = np.asarray(aj.Parameters(old.calibrated.arm, old.names).vector()) * np.array(
+        [0.0 if name.startswith(("alpha", "theta")) else 1.0 for name in old.names]
+    )
+    scale /= np.linalg.norm(scale)
+    found = compare(old, new._replace(open=np.outer(scale, scale)))
+    assert not found.lengths.moved.any()
+    assert np.isinf(found.lengths.u_size)
+    assert drift_summary(found)["lengths"]["mean_expanded_um_per_m"] is None
+    assert "leave them open" in " ".join(found.findings())
+
+
+def test_chance_alone_flags_one_parameter_in_twenty(calibrated):
+    """60 pairs of captures of one arm: 5 % of parameters and lengths, and the joint test's p uniform. 300 pairs say it sharper."""
+    found = [compare(calibrated[2 * i], calibrated[2 * i + 1], points=40) for i in range(PAIRS)]
+    # Parameters of one calibration are correlated: 1260 changes count for about 300, which scatter by 1.3 %.
+    assert 0.02 < np.mean([drift.moved for drift in found]) < 0.09
+    assert 0.02 < np.mean([drift.lengths.moved for drift in found]) < 0.10
+    assert stats.kstest([drift.joint.p for drift in found], "uniform").pvalue > 0.005
+    ratio = np.mean([drift.lengths.rms**2 for drift in found]) / np.mean([drift.lengths.rms_by_chance**2 for drift in found])
+    assert 0.7 < ratio < 1.3
+
+
+def test_true_changes_are_found(calibrated, paper_arm, space):
+    """theta_4 moved by 20 arcsec and a_2 by 0.05 mm, 12 times: both are flagged and named alone, and lengths change as the true ones."""
+    other = moved_arm(space, MOVED)
+    found = [compare(calibrated[i], calibrated[2 * PAIRS + i], points=40) for i in range(OTHERS)]
+    for name in MOVED:
+        assert np.mean([drift.moved[space.index(name)] for drift in found]) > 0.9
+    rest = [i for i, name in enumerate(space.names) if name not in MOVED]
+    assert np.mean([drift.moved[rest] for drift in found]) < 0.12
+    assert max(drift.joint.p for drift in found) < 1e-6
+    for name, size in MOVED.items():
+        found_sizes = [dict(drift.joint.causes).get(name, math.nan) for drift in found]
+        np.testing.assert_allclose(np.nanmedian(found_sizes), size, rtol=0.1)
+    off = []
+    for drift in found:
+        ends = [(arm.position(drift.lengths.q), arm.position(drift.lengths.q_end)) for arm in (paper_arm, other)]
+        before, after = (np.linalg.norm(np.asarray(end - start), axis=1) for start, end in ends)
+        off.append((drift.lengths.change - (after - before)) / drift.lengths.u)
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1, abs=0.3)
+
+
+def capture_of(record, q):
+    lengths = [aj.ReferenceLength("A", "B", length.value, length.u) for length in record.recording.capture.lengths]
+    return aj.Capture({"A": q[:50], "B": q[50:]}, lengths)
+
+
+def half_shared(old, new):
+    q = np.concatenate([np.asarray(old.recording.capture.q)[:30], np.asarray(new.recording.capture.q)[30:]])
+    return new._replace(recording=new.recording._replace(capture=capture_of(new, q)))
+
+
+def other_nominal(old, new):
+    nominal = new.recording.nominal
+    arm = nominal.arm
+    changed = aj.Arm(alpha=arm.alpha, a=arm.a, d=arm.d.at[2].add(0.5), theta=arm.theta, probe=arm.probe)
+    return new._replace(recording=new.recording._replace(nominal=nominal._replace(arm=changed, name="another arm")))
+
+
+CAUTIONS = {
+    "failed": (
+        lambda o, n: n._replace(converged=False, reason="Not converged."),
+        "Failed: the new calibration. Not converged.",
+    ),
+    "implausible": (lambda o, n: n._replace(k=25.4), "Implausible: the new calibration, with k = 25.4."),
+    "itself": (lambda o, n: o, "Not independent: the old calibration and the new calibration are one and the same calibration"),
+    "same capture": (
+        lambda o, n: n._replace(recording=o.recording),
+        "Not independent: the old calibration and the new calibration are of the same capture",
+    ),
+    "shared poses": (half_shared, "share 30 of 60 poses, so the uncertainties of the changes are wrong"),
+    "nominal": (
+        other_nominal,
+        "The nominal arms differ in d_3 ('Cheng 2018, simulated arm' of the old calibration, 'another arm'",
+    ),
+    "method": (lambda o, n: n._replace(method="joint"), "the old calibration is two-stage, the new calibration joint"),
+}
+
+
+@pytest.mark.parametrize("case", CAUTIONS)
+def test_what_makes_a_comparison_doubtful_is_said_first(old, new, case):
+    change, text = CAUTIONS[case]
+    found = compare(old, change(old, new), points=5)
+    assert text in found.sentences()[0]
+    assert len(found.cautions) == 1
+
+
+def test_two_good_calibrations_of_one_arm_have_no_cautions(old, new):
+    assert compare(old, new, points=5).cautions == ()
+
+
+@pytest.mark.parametrize(
+    ("ask", "parts"),
+    [
+        (lambda old, new, panda: compare(old, new, level=95), ("level is 95",)),
+        (lambda old, new, panda: compare(old, new, length=1e5), ("does not fit into the volume",)),
+        (lambda old, new, panda: compare(old, panda), ("'Cheng 2018, simulated arm' with 6 joints", "with 7, which are different arms")),
+        (lambda old, new, panda: compare(old, new.calibrated), ("ArmSpecification cannot be compared",)),  # pyright: ignore
+        (lambda old, new, panda: trend([old], ["2026-01-01"]), ("at least two calibrations",)),
+        (lambda old, new, panda: trend([old, new], ["2026-01-01"]), ("2 calibrations and 1 dates",)),
+        (lambda old, new, panda: trend([old, new], ["2026-01-01", "yesterday"]), ("'yesterday' is no date",)),
+    ],
+    ids=["level", "length", "joints", "type", "one", "dates", "date"],
+)  # fmt: skip
+def test_refused(old, new, ask, parts):
+    panda = aj.load_specification("panda")
+    other = old._replace(recording=old.recording._replace(nominal=panda), calibrated=panda)
+    assert_refused(lambda: ask(old, new, other), *parts)
+
+
+def test_a_trend_is_in_the_order_of_its_dates(calibrated):
+    """Given last first; noon in Paris is before noon in London."""
+    given = [calibrated[2 * PAIRS], calibrated[1], calibrated[0]]
+    table = trend(given, ["2026-03-01", "2026-01-01T12:00:00+00:00", "2026-01-01T12:00:00+01:00"], points=40)
+    assert table.order == (2, 1, 0)
+    assert table.dates[2] == datetime.datetime(2026, 3, 1, tzinfo=datetime.UTC)
+    alone = compare(calibrated[0], calibrated[2 * PAIRS], points=40)
+    np.testing.assert_array_equal(table.change[2], alone.change)
+    np.testing.assert_array_equal(table.expanded[2], alone.expanded)
+    assert table.change[0].tolist() == [0.0] * 21
+    assert not table.moved[0].any()
+    assert table.drifts[1].lengths.rms == alone.lengths.rms
+    assert table.cautions == []
+    rows = list(csv.DictReader(io.StringIO(drift_csv(table, ["last.h5", "mid,dle.h5", "first.h5"]))))
+    assert len(rows) == 2 * 21
+    assert {(row["old_calibration"], row["new_calibration"]) for row in rows} == {
+        ("first.h5", "mid,dle.h5"), ("first.h5", "last.h5")
+    }  # fmt: skip
+    assert [float(row["change"]) for row in rows[21:]] == alone.change.tolist()
+
+
+def test_figures_draw_the_numbers(calibrated, tmp_path):
+    given, dates = [calibrated[i] for i in (0, 1, 2 * PAIRS)], ["2026-01-01", "2026-02-01", "2026-07-01"]
+    table = trend(given, dates, points=40)
+    upper, lower = drift_figure.trend(table)
+    named = {text.get_text().split()[0] for text in upper.texts}
+    assert named == {name for name, moved in zip(table.names, table.moved[-1], strict=True) if moved}
+    i = table.names.index("a_2")
+    ends = [line.get_ydata()[-1] for line in upper.lines if len(line.get_ydata()) == 3]
+    assert any(end == pytest.approx(table.change[-1, i] / table.expanded[-1, i]) for end in ends)
+    found = {line.get_label(): line for line in lower.lines}["RMS"]
+    np.testing.assert_allclose(found.get_ydata(), [1e3 * drift.lengths.rms for drift in table.drifts])
+    # January is 31 of 181 days: places are in proportion to time.
+    np.testing.assert_allclose(found.get_xdata(), [2 * 31 / 181, 2])
+    two = drift_figure.trend(trend(given[::2], dates[::2], points=40))
+    assert [label.get_text() for label in two[0].get_xticklabels()] == list(table.names)
+    for suffix, start in (("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")):
+        drift_figure.save_trend(table, tmp_path / f"trend.{suffix}")
+        assert (tmp_path / f"trend.{suffix}").read_bytes().startswith(start)
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """The command in this process, in an empty folder: exit code and standard output, or the refusal that it raised."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "110")
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))  # so that the command leaves JAX's own setting alone
+
+    def command(*arguments):
+        return CliRunner().invoke(app, ["compare", *map(str, arguments)])
+
+    return command
+
+
+def saved(record, path, created, monkeypatch):
+    from aacmm_jax.files import storage
+
+    genuine = storage.provenance
+    with monkeypatch.context() as patch:
+        patch.setattr(storage, "provenance", lambda kind: genuine(kind) | {"created": created})
+        aj.save_calibration(path, record)
+
+
+@pytest.fixture
+def files(calibrated, tmp_path, monkeypatch):
+    for name, record, month in (("a", calibrated[0], 1), ("b", calibrated[1], 2), ("c", calibrated[2 * PAIRS], 3)):
+        saved(record, tmp_path / f"{name}.h5", f"2026-0{month}-01T00:00:00+00:00", monkeypatch)
+    return tmp_path
+
+
+def test_command(run, files, calibrated):
+    printed = run("a.h5", "c.h5")
+    assert printed.exit_code == 0
+    words = " ".join(printed.stdout.split())
+    assert words.startswith(
+        "Cheng 2018, simulated arm: c.h5 (2026-03-01) against a.h5 (2026-01-01) Together, the changes of 21"
+    )
+    assert "Warning" not in words
+    assert "* beyond U" in words
+    summary = json.loads(run("a.h5", "c.h5", "--json").stdout, parse_constant=lambda text: pytest.fail(f"{text} is no JSON"))
+    expected = compare(calibrated[0], calibrated[2 * PAIRS])
+    assert [row["change"] for row in summary["parameters"]] == expected.change.tolist()
+    assert summary["lengths"]["largest_mm"] == expected.lengths.largest
+    assert summary["moved"] == expected.moved.sum()
+    largest = abs(expected.lengths.largest)
+    failed = run("a.h5", "c.h5", "--max-length-change-mm", 0.9 * largest)
+    assert failed.exit_code == 1
+    assert "Failed: the largest change of a length of 300 mm" in " ".join(failed.stdout.split())
+    assert run("a.h5", "c.h5", "--max-length-change-mm", 1.1 * largest).exit_code == 0
+    again = run("c.h5", "a.h5")
+    assert "Warning: a.h5 was made before c.h5" in " ".join(again.stdout.split())
+
+
+def test_command_on_three_calibrations(run, files):
+    done = run("c.h5", "a.h5", "b.h5", "--figure", "trend.svg", "--csv", "table.csv", "--json")
+    assert done.exit_code == 0
+    summary = json.loads(done.stdout)
+    assert [row["calibration"] for row in summary["trend"]] == ["a.h5", "b.h5", "c.h5"]
+    assert (summary["old"], summary["new"]) == ("a.h5", "c.h5")
+    assert len((files / "table.csv").read_text().splitlines()) == 1 + 2 * 21
+    assert (files / "trend.svg").stat().st_size > 10_000
+    printed = " ".join(run("c.h5", "a.h5", "b.h5").stdout.split())
+    assert "Each calibration against the first" in printed
+    assert "Change from the first calibration (*: beyond its uncertainty)" in printed
+
+
+def test_command_refuses(run, files):
+    """What is refused is raised, and becomes one sentence and exit code 2 in `main`; nothing is written."""
+    before = sorted(files.iterdir())
+    for arguments, text in (
+        (("a.h5",), "a.h5 alone cannot be compared"),
+        (("a.h5", "none.h5"), "none.h5 does not exist"),
+        (("a.h5", "b.h5", "--figure", "trend.gif"), "end its name in .png, .svg or .pdf"),
+        (("a.h5", "b.h5", "--csv", "b.h5"), "b.h5 is one of the calibrations"),
+        (("a.h5", "b.h5", "--level", 0), "level is 0"),
+    ):
+        error = run(*arguments).exception
+        assert isinstance(error, aj.InputError)
+        assert text in str(error)
+    assert sorted(files.iterdir()) == before
+
+
+def test_command_in_a_process_of_its_own(aacmm, files):
+    refused = aacmm("compare", "a.h5", "b.h5", "--length-mm", 100000, expect=2)
+    assert refused.stderr.startswith("Error: a length of 100000 mm does not fit")

@@ -1,0 +1,231 @@
+"""Capture manifests: every unit gives the same angles, many files and patterns of files, and bad manifests."""
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+
+from tests.refusals import assert_refused
+
+TURN = 2 * np.pi
+HEAD = 'arm = "cheng2018-simulation"\n'
+ANGLES = '[angles]\nunit = "rad"\n'
+SOCKET = '[[socket]]\nfile = "a.csv"\n'
+SMALL = HEAD + ANGLES + SOCKET
+
+
+@pytest.fixture
+def motion(tmp_path) -> np.ndarray:
+    """Four poses of six joints in rad, also in a.csv."""
+    q = np.random.default_rng(0).uniform(-3, 3, (4, 6))
+    record(tmp_path / "a.csv", q)
+    return q
+
+
+def record(path, readings: np.ndarray, delimiter: str = ",", header: str = "") -> None:
+    """Write readings with digits enough to read back the same numbers."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [delimiter.join(repr(float(reading)) for reading in row) for row in readings]
+    path.write_text(header + "\n".join(lines) + "\n")
+
+
+def read(tmp_path, text: str) -> aj.Capture:
+    path = tmp_path / "capture.toml"
+    path.write_text(text)
+    return aj.read_manifest(path).capture
+
+
+JOINTS = np.arange(1.0, 7.0)
+SIGNS = np.array([1, -1, 1, 1, -1, -1])
+
+
+@pytest.mark.parametrize(
+    ("angles", "reading"),
+    [
+        ('unit = "rad"', lambda q: q),
+        ('unit = "deg"', np.rad2deg),
+        ('unit = "arcsec"', lambda q: np.rad2deg(q) * 3600),
+        ('unit = "counts"\ncounts_per_turn = 4096', lambda q: q / TURN * 4096),
+        (f'unit = "counts"\ncounts_per_turn = {(1000 * JOINTS).tolist()}', lambda q: q / TURN * 1000 * JOINTS),
+        ('unit = "deg"\nsign = -1\noffset = 90', lambda q: 90 - np.rad2deg(q)),
+        (f'unit = "rad"\nsign = {SIGNS.tolist()}', lambda q: q * SIGNS),
+        (f'unit = "deg"\noffset = {JOINTS.tolist()}', lambda q: np.rad2deg(q) + JOINTS),
+        (
+            f'unit = "counts"\ncounts_per_turn = 4096\nsign = {SIGNS.tolist()}\noffset = {JOINTS.tolist()}',
+            lambda q: q / TURN * 4096 * SIGNS + JOINTS,
+        ),
+        (
+            'unit = "rad"\ncolumns = [7, 2, 3, 4, 5, 6]\noffset = [0.5, 0, 0, 0, 0, 0]',
+            lambda q: np.column_stack([np.full(4, 99.0), q[:, 1:], q[:, 0] + 0.5]),
+        ),
+    ],
+    ids=[
+        *("rad", "deg", "arcsec", "counts", "counts a joint", "sign and offset", "sign a joint", "offset a joint"),
+        *("counts with sign and offset", "columns"),
+    ],
+)
+def test_every_unit_gives_the_same_angles(tmp_path, motion, angles, reading):
+    """Angle = sign * (reading - offset), both in the stated unit."""
+    record(tmp_path / "a.csv", reading(motion))
+    capture = read(tmp_path, f"{HEAD}[angles]\n{angles}\n{SOCKET}")
+    np.testing.assert_allclose(capture.q, motion, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("delimiter", "header"),
+    [
+        (",", ""),
+        (", ", "q1, q2, q3, q4, q5, q6\n"),
+        (";", "joint 1;joint 2;joint 3;joint 4;joint 5;joint 6\nrad;rad;rad;rad;rad;rad\n"),
+        ("\t", "# recorded on Monday\n\n"),
+        ("   ", "\ufeff"),
+    ],
+    ids=["comma", "header", "semicolon and two headers", "tab and comment", "blank and byte order mark"],
+)
+def test_text_tables(tmp_path, motion, delimiter, header):
+    record(tmp_path / "a.csv", motion, delimiter, header)
+    np.testing.assert_array_equal(read(tmp_path, SMALL).q, motion)
+
+
+def test_several_files_make_one_socket(tmp_path, motion):
+    record(tmp_path / "b.csv", -motion)
+    capture = read(tmp_path, f'{HEAD}{ANGLES}[[socket]]\nname = "plate"\nfiles = ["a.csv", "b.csv"]\n')
+    assert (capture.names, capture.sizes) == (("plate",), (8,))
+    np.testing.assert_array_equal(capture.q, np.concatenate([motion, -motion]))
+
+
+@pytest.mark.parametrize("prefix", ["", "./", "{folder}/"], ids=["relative", "dotted", "absolute"])
+@pytest.mark.parametrize("inside", [True, False], ids=["inside the folder", "from elsewhere"])
+def test_braces_make_a_socket_a_file(tmp_path, monkeypatch, motion, prefix, inside):
+    """As for the MUKCa captures: one socket a file, one length a placement; other files and folders are left alone."""
+    for number, (place, hole) in enumerate([("left", 0), ("left", 1), ("mid-high", 0), ("mid-high", 1)]):
+        record(tmp_path / "run_1" / place / f"hole_{hole}.csv", motion + number)
+    record(tmp_path / "run_1" / "left" / "notes.csv", motion)
+    prefix = prefix.format(folder=tmp_path.as_posix())
+    text = f"""{HEAD}{ANGLES}
+        [[socket]]
+        name = "{{place}}/{{hole}}"
+        file = "{prefix}run_1/{{place}}/hole_{{hole}}.csv"
+        [[length]]
+        from = "{{place}}/0"
+        to = "{{place}}/1"
+        value = 50.0
+        u = 0.01
+    """
+    (tmp_path / "capture.toml").write_text(text)
+    monkeypatch.chdir(tmp_path if inside else tmp_path.parent)
+    recording = aj.read_manifest("capture.toml" if inside else f"{tmp_path.name}/capture.toml")
+    capture = recording.capture
+    assert capture.names == ("left/0", "left/1", "mid-high/0", "mid-high/1")
+    np.testing.assert_array_equal(capture.sockets["mid-high/0"], motion + 2)
+    assert [(length.start, length.end) for length in capture.lengths] == [("left/0", "left/1"), ("mid-high/0", "mid-high/1")]
+    assert {(float(length.value), float(length.u)) for length in capture.lengths} == {(50.0, 0.01)}
+    assert recording.nominal.name == "Cheng 2018, simulated arm"
+
+
+def test_a_field_that_returns_is_the_same_text(tmp_path, motion):
+    record(tmp_path / "left" / "left.csv", motion)
+    record(tmp_path / "left" / "right.csv", motion)
+    text = f'{HEAD}{ANGLES}[[socket]]\nname = "{{side}}"\nfile = "{{side}}/{{side}}.csv"\n'
+    assert read(tmp_path, text).names == ("left",)
+
+
+def test_an_arm_beside_the_manifest(tmp_path, motion):
+    aj.save_arm(aj.load_arm("cheng2018-simulation"), tmp_path / "arm.toml", name="ours")
+    # With the mark that some editors put before UTF-8.
+    (tmp_path / "capture.toml").write_text(SMALL.replace("cheng2018-simulation", "arm.toml"), encoding="utf-8-sig")
+    assert aj.read_manifest(tmp_path / "capture.toml").nominal.name == "ours"
+
+
+LENGTH = '[[length]]\nfrom = "a"\nto = "b"\nvalue = 200.0\n'
+PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        (SMALL.replace("a.csv", "z.csv"), ["z.csv does not exist", "check the path"]),
+        (SMALL.replace("a.csv", "folder"), ["folder is a folder", "name a file"]),
+        (SMALL.replace("rad", "grad"), ["'angles.unit' must be 'rad', 'deg', 'arcsec' or 'counts', not 'grad'"]),
+        (HEAD + SOCKET, ["'angles' is missing; add it"]),
+        (HEAD + ANGLES, ["'socket' is missing; add it"]),
+        (SMALL.replace("file", "flie"), ["unknown key 'socket 1.flie'", "did you mean 'file'?"]),
+        (SMALL.replace("unit", "unti"), ["unknown key 'angles.unti'", "did you mean 'unit'?"]),
+        (SMALL + LENGTH.replace("from", "form"), ["unknown key 'length 1.form'", "did you mean 'from'?"]),
+        (SMALL.replace("[[socket]]", "[socket]"), ["'socket' must be a valid list, not a table", "write [[socket]]"]),
+        (SMALL + 'name = "{place}"', ["name '{place}'", "file 'a.csv' has no field", "use the same fields"]),
+        (SMALL + 'files = ["a.csv"]', ["socket 1", "either file or files"]),
+        (HEAD + ANGLES + '[[socket]]\nfiles = ["a.csv"]', ["socket 1", "needs a name"]),
+        (HEAD + ANGLES + '[[socket]]\nname = "a"\nfiles = []', ["'socket 1.files' has no entries", "give at least 1"]),
+        (SMALL + SOCKET, ["socket 'a' is defined twice", "in one [[socket]]"]),
+        (SMALL + LENGTH, ["'a' to 'b'", "unknown socket 'b'", "known are a."]),
+        (SMALL + LENGTH.replace("200.0", "-200.0"), ["'a' to 'b' is -200 mm", "positive"]),
+        (SMALL + LENGTH.replace("200.0", '"long"'), ["'length 1.value' must be a valid number, not 'long'"]),
+        (SMALL + LENGTH + "u = -1", ["'length 1.u' must be greater than or equal to 0, not -1"]),
+        (SMALL + LENGTH.replace('"b"', '"{x}"'), ["from 'a' to '{x}'", "field that no [[socket]] has"]),
+        (SMALL.replace("rad", "counts"), ["angles", "give counts_per_turn with unit = 'counts'"]),
+        (SMALL.replace(SOCKET, "counts_per_turn = 9\n" + SOCKET), ["angles", "only with it"]),
+        (SMALL.replace('"rad"', '"counts"\ncounts_per_turn = [9, 9]'), ["angles.counts_per_turn has 2 values", "6 joints"]),
+        (SMALL.replace('"rad"', '"counts"\ncounts_per_turn = "many"'), ["'angles.counts_per_turn' must be", "not 'many'"]),
+        (SMALL.replace('"rad"', '"rad"\nsign = 2'), ["'angles.sign' must be 1 or -1, not 2"]),
+        (SMALL.replace('"rad"', '"rad"\nsign = [1, 1, 0, 1, 1, 1]'), ["'angles.sign 3' must be 1 or -1, not 0"]),
+        (SMALL.replace('"rad"', '"rad"\noffset = [1, 2]'), ["angles.offset has 2 values", "give one, or one a joint"]),
+        (SMALL.replace('"rad"', '"rad"\ncolumns = [1, 2, 3]'), ["angles.columns picks 3", "6 joints", "pick one a joint"]),
+        (SMALL.replace('"rad"', '"rad"\ncolumns = [1, 2, 3, 4, 5, 9]'), ["a.csv has 6 columns", "no column 9", "pick others"]),
+        (SMALL.replace('"rad"', '"rad"\ncolumns = [0, 2, 3, 4, 5, 6]'), ["'angles.columns 1' must be greater than 0"]),
+        (HEAD + ANGLES + PATTERN.replace(".csv", ".txt"), ["no file matches '{place}.txt'", "check the path"]),
+        (HEAD + ANGLES + PATTERN.replace('name = "{place}"\n', ""), ["has {place}", "use the same fields in the name"]),
+        (
+            HEAD + ANGLES + PATTERN.replace('file = "{place}.csv"', 'files = ["{place}.csv", "{palce}_2.csv"]'),
+            ["file '{palce}_2.csv' has {palce}", "'{place}.csv' has {place}", "use the same fields"],
+        ),
+        (
+            SMALL.replace("simulation", "simulaton"),
+            ["'cheng2018-simulaton' is neither", "did you mean 'cheng2018-simulation'?"],
+        ),
+        (SMALL.replace("cheng2018-simulation", "ours.toml"), ["ours.toml does not exist"]),
+        ("arm = ", ["not valid TOML", "end of document"]),
+    ],
+    ids=[
+        *("missing file", "folder", "unit", "no angles", "no socket", "misspelt in socket", "misspelt in angles"),
+        *("misspelt in length", "socket as a table", "field in the name only", "file and files", "files without name"),
+        *("no files", "socket twice", "length to unknown", "length negative", "length text", "u negative", "length field"),
+        *("counts without per turn", "per turn without counts", "per turn of two", "per turn text", "sign", "sign of one"),
+        *("offset of two", "columns of three", "column beyond", "column 0", "pattern without match", "pattern without name"),
+        *("pattern of two", "arm", "arm file", "not TOML"),
+    ],
+)
+def test_bad_manifest(tmp_path, motion, text, parts):
+    (tmp_path / "folder").mkdir()
+    assert_refused(lambda: read(tmp_path, text), tmp_path / "capture.toml", *parts)
+
+
+@pytest.mark.parametrize(
+    ("content", "parts"),
+    [
+        (b"1,2,3,4,5\n", ["has 5 columns", "the arm has 6 joints", "one column a joint", "columns = [...]"]),
+        (b"1,2,3,4,5,6\n1,2,3,4,5\n", ["line 2 has 5 columns", "before it 6", "give all the same"]),
+        (b"q\n1,2,3,4,5,6\n\n1,2,x,4,5,6\n", ["line 4 column 3", "'x' is not a number", "mend it"]),
+        (b"1,2,3,4,5,\n", ["line 1 column 6", "'' is not a number"]),
+        (b"1,2,3,4,5,6\n1,2,3,4,nan,6\n", ["line 2 column 5", "'nan' is not finite", "mend it"]),
+        (b"q1,q2,q3,q4,q5,q6\n", ["holds no numbers", "one line a pose"]),
+        (b"", ["holds no numbers", "one line a pose"]),
+        (b"0,5;1,5;2,5;0,5;1,5;2,5\n", ["holds no numbers", "with decimal points"]),
+        (bytes(range(256)), ["cannot be read as text", "UTF-8"]),
+    ],
+    ids=["columns", "ragged", "text", "last cell empty", "nan", "header only", "empty", "decimal commas", "binary"],
+)
+def test_bad_table(tmp_path, content, parts):
+    """The message names the manifest, the file and the place in it."""
+    (tmp_path / "a.csv").write_bytes(content)
+    assert_refused(lambda: read(tmp_path, SMALL), tmp_path / "capture.toml", tmp_path / "a.csv", *parts)
+
+
+def test_degrees_taken_for_radians(tmp_path, motion):
+    record(tmp_path / "a.csv", np.rad2deg(motion))
+    assert_refused(lambda: read(tmp_path, SMALL), tmp_path / "capture.toml", "socket 'a' pose", "degrees", "state the unit")
+
+
+def test_what_is_not_a_manifest(tmp_path):
+    assert_refused(lambda: aj.read_manifest(tmp_path / "none.toml"), "none.toml does not exist", "check the path")
+    assert_refused(lambda: aj.read_manifest(tmp_path), tmp_path, "is a folder", "name a file")

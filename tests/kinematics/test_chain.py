@@ -1,0 +1,132 @@
+"""The chain against an independent product of 4x4 matrices, JAX's differentiation, and a maker's URDF."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.kinematics import chain
+
+
+def random_arm(joints: int, seed: int, *, beta: bool = False, batch: tuple[int, ...] = ()) -> aj.Arm:
+    random = np.random.default_rng(seed)
+    shape = (*batch, joints)
+    return aj.Arm(
+        alpha=random.uniform(-np.pi, np.pi, shape),
+        a=random.uniform(-500, 500, shape),
+        d=random.uniform(-500, 500, shape),
+        theta=random.uniform(-0.1, 0.1, shape),
+        beta=random.uniform(-0.1, 0.1, shape) if beta else None,
+        probe=random.uniform(-100, 100, (*batch, 3)),
+    )
+
+
+def by_matrices(arm: aj.Arm, q: np.ndarray) -> np.ndarray:
+    """Pose of the tip by the textbook: a product of elementary 4x4 matrices, one pose."""
+
+    def turn(axis: int, angle: float) -> np.ndarray:
+        i, j = [(1, 2), (2, 0), (0, 1)][axis]
+        matrix = np.eye(4)
+        matrix[i, i] = matrix[j, j] = np.cos(angle)
+        matrix[i, j], matrix[j, i] = -np.sin(angle), np.sin(angle)
+        return matrix
+
+    def slide(x: float, y: float, z: float) -> np.ndarray:
+        matrix = np.eye(4)
+        matrix[:3, 3] = x, y, z
+        return matrix
+
+    pose = np.eye(4)
+    for i in range(arm.joints):
+        pose = pose @ turn(2, q[i] + arm.theta[i]) @ slide(0, 0, arm.d[i]) @ slide(arm.a[i], 0, 0) @ turn(0, arm.alpha[i])
+        if arm.beta is not None:
+            pose = pose @ turn(1, arm.beta[i])
+    return pose @ slide(*np.asarray(arm.probe))
+
+
+@pytest.mark.parametrize("beta", [False, True])
+@pytest.mark.parametrize("joints", [1, 2, 6, 9])
+def test_pose_is_the_textbook_product(joints, beta):
+    arm = random_arm(joints, joints, beta=beta)
+    q = np.random.default_rng(0).uniform(-3, 3, (5, joints))
+    expected = np.stack([by_matrices(arm, row) for row in q])
+    np.testing.assert_allclose(arm.pose(q), expected, atol=1e-11)
+    np.testing.assert_allclose(arm.position(q), expected[:, :3, 3], atol=1e-11)
+
+
+@pytest.mark.parametrize("joints", range(2, 10))
+def test_jacobian_is_jax_own_differentiation(joints):
+    """Analytic columns, JAX's forward and reverse modes through the custom rule, and through the plain chain: all equal."""
+    arm = random_arm(joints, joints, beta=True)
+    q = jnp.asarray(np.random.default_rng(joints).uniform(-3, 3, (4, joints)))
+    names = (*aj.parameter_names(arm), *(f"q_{i}" for i in range(1, joints + 1)))
+
+    def flattened(derivative):
+        geometry, by_q = derivative
+        by_kind = [getattr(geometry, kind) for kind in ("alpha", "a", "d", "theta", "beta", "probe")]
+        return jnp.concatenate([*by_kind, by_q], axis=-1)
+
+    def one(q):
+        plain = lambda geometry, q: chain.walk(geometry, chain.turns_of(q)).tip[:, 0]  # noqa: E731 - no custom rule on the way
+        modes = [jax.jacfwd(chain.tip_position, (0, 1)), jax.jacrev(chain.tip_position, (0, 1)), jax.jacfwd(plain, (0, 1))]
+        return [arm.jacobian(q, names), *(flattened(mode(arm.geometry, q)) for mode in modes)]
+
+    analytic, *others = jax.jit(jax.vmap(one))(q)
+    assert analytic.shape == (4, 3, len(names))
+    # Relative to the arm's size: a column is a difference of positions, so single entries may cancel.
+    size = float(jnp.max(jnp.abs(analytic)))
+    for other in others:
+        np.testing.assert_allclose(analytic, other, rtol=0, atol=1e-12 * size)
+
+
+def test_second_derivatives_pass_through_the_rule():
+    arm = random_arm(3, 1)
+    q = jnp.array([0.3, -0.7, 1.1])
+    plain = jax.hessian(lambda q: jnp.sum(chain.walk(arm.geometry, chain.turns_of(q)).tip ** 2))(q)
+    for mode in (jax.hessian, lambda f: jax.jacrev(jax.jacrev(f))):
+        np.testing.assert_allclose(mode(lambda q: jnp.sum(arm.position(q) ** 2))(q), plain, rtol=1e-10, atol=1e-9)
+
+
+@pytest.mark.parametrize(("arm_batch", "pose_batch"), [((), (2, 3)), ((3,), ()), ((2, 1), (2, 3)), ((2, 3), (3,))])
+def test_batches_broadcast(arm_batch, pose_batch):
+    arm = random_arm(3, 7, batch=arm_batch)
+    q = np.random.default_rng(1).uniform(-3, 3, (*pose_batch, 3))
+    shape = np.broadcast_shapes(arm_batch, pose_batch)
+    position = arm.position(q)
+    assert position.shape == (*shape, 3)
+    assert arm.pose(q).shape == (*shape, 4, 4)
+    assert arm.jacobian(q, ("alpha_1", "probe_y")).shape == (*shape, 3, 2)
+    full = {
+        kind: np.broadcast_to(np.asarray(getattr(arm, kind)), (*shape, 3)) for kind in ("alpha", "a", "d", "theta", "probe")
+    }
+    angles = np.broadcast_to(q, (*shape, 3))
+    for index in np.ndindex(*shape):
+        single = aj.Arm(**{kind: value[index] for kind, value in full.items()})
+        np.testing.assert_allclose(position[index], by_matrices(single, angles[index])[:3, 3], atol=1e-11)
+
+
+def test_unknown_parameter_suggests_the_nearest():
+    with pytest.raises(aj.InputError, match=r"unknown parameter 'alhpa_2' of a 3-joint arm; did you mean 'alpha_2'\?"):
+        random_arm(3, 0).jacobian(np.zeros(3), ["alhpa_2"])
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("name", "urdf", "flange"), [("panda", "panda.urdf", "panda_link8")])
+def test_panda_equals_its_urdf(shared, name, urdf, flange):
+    """Standard D-H against the maker's URDF, read by an independent library."""
+    yourdfpy = pytest.importorskip("yourdfpy")
+    model = yourdfpy.URDF.load(str(shared / "data" / "mukca" / "urdf" / urdf), load_meshes=False, build_scene_graph=True)
+    arm = aj.load_arm(name)
+    flange_arm = aj.Arm(alpha=arm.alpha, a=arm.a, d=arm.d, theta=arm.theta)
+    low, high = np.array(arm.limits).T
+    q = np.random.default_rng(0).uniform(low, high, (1000, arm.joints))
+    joints = [joint for joint in model.actuated_joint_names if "finger" not in joint]
+    expected = np.empty((1000, 4, 4))
+    for i, row in enumerate(q):
+        model.update_cfg(dict(zip(joints, row, strict=True)))
+        expected[i] = model.get_transform(flange, model.base_link)
+    expected[:, :3, 3] *= 1000
+    poses = np.asarray(flange_arm.pose(q))
+    np.testing.assert_allclose(poses[:, :3, 3], expected[:, :3, 3], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(poses[:, :3, :3], expected[:, :3, :3], rtol=0, atol=1e-12)

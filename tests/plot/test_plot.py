@@ -1,0 +1,94 @@
+"""Figures alone: each returns the axes that it drew into, and what it drew are the numbers."""
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import aacmm_jax as aj
+
+from tests.refusals import assert_refused
+
+
+@pytest.fixture(scope="module")
+def record():
+    nominal = aj.load_specification("cheng2018-simulation")
+    space = aj.Parameters.free_of(nominal.arm)
+    true = aj.deviated(space, length=1.0, angle=0.002, seed=2)
+    capture = aj.simulate(
+        true, {"A": (400, 200, 300), "B": (700, 500, 500)}, poses={"A": 40, "B": 12}, lengths=[("A", "B", 0.002)], encoder_arcsec=2, seed=2
+    )  # fmt: skip
+    result = aj.calibrate(nominal.arm, capture, aj.Bounds.around(nominal.arm, space, length=10.0, angle=0.0175))
+    return aj.record_of(result, aj.Recording(capture, nominal, nominal._replace(arm=true), 2))
+
+
+@pytest.fixture(scope="module")
+def made(record, tmp_path_factory):
+    uncertainty = aj.uncertainty_of(record)
+    study = aj.make_study(arm="cheng2018-simulation", trials=4, capture={"positions_mm": [[400, 200, 300]], "poses": [20, 30]}, noise={"encoder_arcsec": 2}, identification={"method": "stage1"})  # fmt: skip
+    path = tmp_path_factory.mktemp("plot") / "study.h5"
+    aj.run_study(study, path)
+    arm, capture = record.calibrated.arm, record.recording.capture
+    sockets = {name: np.asarray(arm.position(q)) for name, q in capture.sockets.items()}
+    from aacmm_jax.study.results import Results
+
+    return {
+        "distances": (record,),
+        "length_parameter_errors": (record,),
+        "parameter_changes": (record,),
+        "length_errors": (record,),
+        "volume": (aj.over_volume(uncertainty, points=30),),
+        "correlation": (uncertainty,),
+        "singular_values": (aj.observe(arm, capture, aj.Parameters(arm, record.names)),),
+        "acceptance": (aj.accept(aj.Measured(sockets), {"Deltam": aj.Limit(0.05)}),),
+        "study": (Results.of(path), "de_stage1"),
+    }
+
+
+FIGURES = ["distances", "length_parameter_errors", "parameter_changes", "length_errors", "volume", "correlation", "singular_values", "acceptance", "study"]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_figure_draws_into_the_axes_it_is_given_or_into_new_ones(made, name, tmp_path):
+    axes = Figure().subplots()
+    assert getattr(aj.plot, name)(*made[name], axes=axes) is axes
+    alone = getattr(aj.plot, name)(*made[name])
+    alone.figure.savefig(tmp_path / "figure.pdf")
+    drawn = [*alone.lines, *alone.collections, *alone.images, *alone.containers]
+    assert drawn
+    assert alone.get_ylabel() or name == "correlation"
+
+
+def test_figures_hold_the_numbers(record, made):
+    lines = aj.plot.distances(record).lines
+    left = np.asarray(record.evaluations()["calibrated"].distances)
+    np.testing.assert_allclose(np.sort(lines[1].get_ydata()), np.sort(left))
+    changes = aj.plot.parameter_changes(record, "angle").containers[0].lines[0].get_ydata()
+    vectors = record.vectors()
+    angles = [i for i, name in enumerate(record.names) if name.startswith(("alpha", "theta"))]
+    expected = np.degrees((vectors["calibrated"] - vectors["nominal"])[angles]) * 3600
+    np.testing.assert_allclose(changes, expected)
+    values = aj.plot.singular_values(*made["singular_values"]).lines[0].get_ydata()
+    np.testing.assert_allclose(values, made["singular_values"][0].singular)
+
+
+def test_an_arm_is_drawn_in_space(record):
+    arm, q = record.calibrated.arm, record.recording.capture.q[:3]
+    axes = aj.plot.arm(arm, q)
+    x, y, z = axes.lines[-1].get_data_3d()  # the tips, drawn last
+    np.testing.assert_allclose(np.column_stack([x, y, z]), arm.position(q))
+    assert_refused(lambda: aj.plot.arm(arm, q, Figure().subplots()), "projection='3d'")
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda record: aj.plot.parameter_changes(record, "lengths"), "length or angle"),
+        (lambda record: aj.plot.acceptance(aj.accept(aj.Measured({"A": np.eye(3)}))), "no figure has a limit"),
+        (
+            lambda record: aj.plot.length_parameter_errors(record._replace(recording=record.recording._replace(true=None))),
+            "simulation",
+        ),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(record, call, said):
+    assert_refused(lambda: call(record), said)

@@ -1,0 +1,477 @@
+"""Reports: what they hold, that nobody's text becomes markup, and that a real browser shows, turns, sorts and prints them."""
+
+import json
+import math
+import re
+import shutil
+from html.parser import HTMLParser
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.report import charts, parts, write_report
+from aacmm_jax.report.residuals import outliers
+
+from tests.refusals import assert_refused
+
+HOSTILE = '<script>document.title="taken"</script><img src=x onerror=alert(1)> & "B" <b>bold</b>'
+STUDY = {
+    "arm": "cheng2018-simulation",
+    "trials": 4,
+    "capture": {"positions_mm": [[400, 200, 300]], "poses": [20, 30]},
+    "noise": {"encoder_arcsec": 2},
+    "identification": {"method": "stage1"},
+}
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """The files and reports of a simulated arm with hostile names: calibration, evaluation, study."""
+    folder = tmp_path_factory.mktemp("reports")
+    nominal = aj.load_specification("cheng2018-simulation")._replace(name=f"Arm {HOSTILE}")
+    space = aj.Parameters.free_of(nominal.arm)
+    true = aj.deviated(space, length=1.0, angle=0.002, seed=1)
+    names = [HOSTILE, "B", "C"]
+    points = dict(zip(names, [(400, 200, 300), (700, 500, 500), (-300, 600, 400)], strict=True))
+    lengths = [(HOSTILE, "B", 0.002), (HOSTILE, "C", 0.002)]
+    capture = aj.simulate(
+        true, points, poses={HOSTILE: 40, "B": 12, "C": 12}, lengths=lengths, encoder_arcsec=2.0, seating=0.005, seed=1
+    )
+    recording = aj.Recording(capture, nominal, nominal._replace(arm=true), 1, sources=(f"{HOSTILE} (SHA-256 0)",))
+    seen = recording._replace(capture=capture.select(without="C"))
+    bounds = aj.Bounds.around(nominal.arm, space, length=10.0, angle=0.0175, override={"d_5": 0.2})
+    record = aj.record_of(aj.calibrate(nominal.arm, seen.capture, bounds), seen)
+    aj.save_calibration(folder / "calibration.h5", record)
+    evaluation = aj.evaluation_of(record, recording, limits={"Deltam": aj.Limit(5.0), "E_Uni": aj.Limit(1e-4)}, u_test=0.001)
+    evaluation = evaluation._replace(warnings=(*evaluation.warnings, f"Beware of {HOSTILE}"))
+    aj.save_evaluation(folder / "evaluation.h5", evaluation)
+    aj.run_study(aj.make_study(**{**STUDY, "arm": nominal.arm}), folder / "study.h5")
+    pages = {kind: folder / f"{kind}.html" for kind in ("calibration", "evaluation", "study")}
+    for kind, page in pages.items():
+        write_report(folder / f"{kind}.h5", page)
+    return SimpleNamespace(folder=folder, pages=pages, record=record, evaluation=evaluation)
+
+
+class Page(HTMLParser):
+    """Elements, visible text, and the data of the charts."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.elements, self.text, self.held, self._in = [], "", {}, []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag in ("script", "style"):
+            self._in.append(dict(attrs).get("id", tag))
+
+    def handle_endtag(self, tag):
+        if tag in ("script", "style"):
+            self._in.pop()
+
+    def handle_data(self, data):
+        if self._in:
+            self.held[self._in[-1]] = self.held.get(self._in[-1], "") + data
+        else:
+            self.text += data
+
+
+@pytest.fixture(scope="module", params=["calibration", "evaluation", "study"])
+def page(request, written):
+    found = Page(written.pages[request.param].read_text(encoding="utf-8"))
+    found.kind = request.param
+    return found
+
+
+def test_text_of_people_never_becomes_markup(page):
+    tags = [tag for tag, _ in page.elements]
+    assert "img" not in tags
+    assert tags.count("script") == 4  # two of data, Plotly, the page's own
+    assert not [attributes for _, attributes in page.elements if any(name.startswith("on") for name in attributes)]
+    if page.kind == "evaluation":
+        assert f"Beware of {HOSTILE}" in page.text
+    if page.kind != "study":  # a study knows its arm by the name that its maker gave in Python: none
+        assert HOSTILE in page.text
+    for name in ("charts", "scenes"):
+        assert "<" not in page.held[name]
+        json.loads(page.held[name])
+    # Plotly takes tags in labels for formatting, so that names come to it escaped.
+    labels = re.findall(r'"(?:text|ticktext)": \[("[^]]*")\]', json.dumps(json.loads(page.held["charts"])))
+    assert not re.search("<(b|script|img)", "".join(labels).replace("<br>", ""))
+
+
+def test_a_page_needs_nothing_else_and_is_small(page, written):
+    links = [value for _, attributes in page.elements for name, value in attributes.items() if name in ("src", "href")]
+    assert all(link.startswith("#") or link == "data:," for link in links)
+    assert written.pages[page.kind].stat().st_size < 6_000_000
+    policy = next(attributes["content"] for tag, attributes in page.elements if attributes.get("http-equiv"))
+    assert "default-src 'none'" in policy
+    assert "script-src 'sha256-" in policy
+    assert "unsafe-inline" not in policy.split("style-src")[0]
+
+
+def test_every_chart_is_one_that_plotly_takes(page):
+    graph_objects = pytest.importorskip("plotly.graph_objects")
+    figures = json.loads(page.held["charts"])
+    places = {attributes["data-chart"] for _, attributes in page.elements if "data-chart" in attributes}
+    assert set(figures) == places
+    for figure in figures.values():
+        graph_objects.Figure(figure)  # raises for an attribute or value that Plotly does not know
+    assert len(figures) >= (4 if page.kind != "calibration" else 8)
+
+
+def test_every_chart_has_words_and_numbers(page):
+    for _, attributes in page.elements:
+        if "data-chart" in attributes:
+            assert len(attributes["aria-label"]) > 30
+    assert sum(tag == "details" for tag, _ in page.elements) >= 3
+
+
+def test_a_calibration_report_says_what_the_calibration_found(written):
+    found = Page(written.pages["calibration"].read_text(encoding="utf-8"))
+    record = written.record
+    assert f"{record.k:.8f}" in found.text
+    for name, value, u in zip(record.names, record.vectors()["calibrated"], np.sqrt(np.diag(record.covariance)), strict=True):
+        if name.startswith("a_") and u > 0:
+            decimals = parts.decimals_of(1.99 * u)
+            assert f"{value:.{decimals}f}".replace("-", "−") in found.text, name
+    assert "on the upper bound" in found.text or "on the lower bound" in found.text
+    assert "Read this first" in found.text
+    # Warnings come before results.
+    assert found.text.index("Read this first") < found.text.index("What was calibrated")
+    for needed in ("aacmm_jax", "jax 0.", "SHA-256", "Command", "Seed"):
+        assert needed in found.text
+    scene = json.loads(found.held["scenes"])["scene"]
+    q = np.asarray(record.recording.capture.q)
+    np.testing.assert_allclose([pose["points"][-1] for pose in scene["poses"]], record.calibrated.arm.position(q), atol=0.06)
+    assert all(pose["points"][0] == [0, 0, 0] for pose in scene["poses"])
+
+
+def tables_of(report):
+    found = {}
+    for section in report.sections:
+        for block in section.blocks:
+            table = block.table if isinstance(block, parts.Chart) else block if isinstance(block, parts.Table) else None
+            if table is not None:
+                found[table.caption] = table
+    return found
+
+
+def test_numbers_of_a_report_stand_under_the_right_heading(written):
+    from aacmm_jax.report.calibration import calibration_report
+
+    record = written.record
+    report = calibration_report(record)[0]
+    tables = tables_of(report)
+    evaluations, factor = record.evaluations(), aj.uncertainty_of(record).factor(0.95)
+    stages = {"as found": "nominal", "after stage 1": "stage1", "as left": "calibrated"}
+    figures = tables["Figures as found and as left [mm]"]
+    for heading, stage in stages.items():
+        cell = figures.rows[0][figures.columns.index(heading)]
+        assert cell.value == pytest.approx(float(evaluations[stage].repeatability.de))
+    parameters = tables["Parameters"]
+    u = np.sqrt(np.diag(record.covariance))
+    for row in parameters.rows:
+        i = record.names.index(row[0].text)
+        scale = 180 / math.pi if row[1].text == "deg" else 1.0
+        assert row[parameters.columns.index("as left")].value == pytest.approx(scale * record.vectors()["calibrated"][i])
+        if row[parameters.columns.index("U (95 %)")].value is not None:
+            assert row[parameters.columns.index("U (95 %)")].value == pytest.approx(scale * factor * u[i])
+    volume = aj.over_volume(aj.uncertainty_of(record))
+    rows = tables["Expanded uncertainty over the working volume [mm]"].rows
+    assert rows[1][3].value == pytest.approx(factor * volume.u_length.max())
+    places = tables["All places"]
+    np.testing.assert_allclose([row[4].value for row in places.rows], factor * volume.u_length)
+    charts_by_id = {
+        block.id: block for section in report.sections for block in section.blocks if isinstance(block, parts.Chart)
+    }
+    np.testing.assert_allclose(charts_by_id["volume"].figure["data"][0]["marker"]["color"], factor * volume.u_length, rtol=1e-3)
+    change = charts_by_id["change-mm"].figure["data"][0]
+    i = record.names.index(change["x"][0])
+    vectors = record.vectors()
+    assert change["y"][0] == pytest.approx(vectors["calibrated"][i] - vectors["nominal"][i], rel=1e-5)
+    assert change["error_y"]["array"][0] == pytest.approx(factor * u[i], rel=1e-5)
+
+
+def test_lengths_of_a_report_by_arm_and_with_expanded_uncertainty(written):
+    """The recording has two lengths, so that none is zero by construction."""
+    from aacmm_jax.report.calibration import calibration_report
+
+    recording = written.evaluation.recording
+    space = aj.Parameters(recording.nominal.arm, written.record.names)
+    bounds = aj.Bounds.around(recording.nominal.arm, space, length=10.0, angle=0.0175)
+    record = aj.record_of(aj.calibrate(recording.nominal.arm, recording.capture, bounds), recording)
+    table = tables_of(calibration_report(record)[0])["Reference lengths [mm]"]
+    factor, evaluations = aj.uncertainty_of(record).factor(0.95), record.evaluations()
+    for i, row in enumerate(table.rows):
+        cells = dict(zip(table.columns, row, strict=True))
+        for heading, stage in (("as found", "nominal"), ("after stage 1", "stage1"), ("as left", "calibrated")):
+            assert cells[heading].value == pytest.approx(float(evaluations[stage].error[i]))
+        assert cells["U of error"].value == pytest.approx(factor * float(evaluations["calibrated"].u[i]))
+
+
+def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
+    """A table of thousands of rows is cut, not written out cell by cell for minutes."""
+    from aacmm_jax.report.residuals import residual_chart
+
+    arm = written.record.calibrated.arm
+    q = np.tile(np.asarray(written.record.recording.capture.q), (120, 1)) + 1e-5 * np.random.default_rng(0).normal(
+        size=(120 * 52, 6)
+    )
+    capture = aj.Capture({"A": q[:6000], "B": q[6000:6001]})
+    chart = residual_chart("r", "R", capture, {"as left": aj.evaluate(arm, capture)}, mark=True)
+    assert chart.table is not None
+    assert len(chart.table.rows) == 1000
+    assert len(chart.figure["data"][0]["x"]) <= 2001
+    distances = np.asarray(aj.evaluate(arm, capture).distances)
+    assert chart.table.rows[0][2].value == pytest.approx(distances.max())
+
+
+def test_poses_alone_in_their_socket_show_no_scatter(written):
+    from aacmm_jax.report.residuals import residual_chart, socket_table
+    from aacmm_jax.report.scene import arms_of
+
+    arm, q = written.record.calibrated.arm, written.record.recording.capture.q
+    capture = aj.Capture({"A": q[:10], "B": q[10:11]})
+    evaluation = aj.evaluate(arm, capture)
+    distances = [pose["distance"] for pose in arms_of(arm, capture, evaluation).data["poses"]]
+    assert distances[10] is None
+    assert None not in distances[:10]
+    assert [cell.text for cell in socket_table(capture, evaluation).rows[1]][2:5] == ["–"] * 3
+    assert len(residual_chart("r", "R", capture, {"as left": evaluation}).figure["data"][0]["x"]) == 10
+    assert (
+        "no scatter"
+        in residual_chart("r", "R", aj.Capture({"B": q[:1]}), {"as left": aj.evaluate(arm, aj.Capture({"B": q[:1]}))}).words
+    )
+
+
+CONFORMITY = """
+[conformity]
+verdict = "{}"
+specification = "a specification"
+decision_rule = "a rule"
+"""
+
+
+def test_a_statement_that_the_file_contradicts_is_refused(written, tmp_path):
+    from aacmm_jax.files.points_evaluations import PointsRecord, save_points
+
+    (tmp_path / "pass.toml").write_text(CONFORMITY.format("pass"))
+    stated = aj.read_about(tmp_path / "pass.toml")
+    for kind in ("calibration", "evaluation"):
+        assert_refused(lambda kind=kind: write_report(written.folder / f"{kind}.h5", tmp_path / "r.html", stated), "simulated")
+    measured = aj.Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])})
+    save_points(tmp_path / "fails.h5", PointsRecord(measured, {"Deltam": aj.Limit(0.04)}, 0.001))
+    assert_refused(lambda: write_report(tmp_path / "fails.h5", tmp_path / "r.html", stated), "a limit is not kept")
+    save_points(tmp_path / "passes.h5", PointsRecord(measured, {"Deltam": aj.Limit(0.06)}, 0.001))
+    write_report(tmp_path / "passes.h5", tmp_path / "r.html", stated)
+    assert "pass: a specification; a rule" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert_refused(lambda: aj.dcc(written.record, stated, created="2026-01-31T00:00:00"), "simulated")
+
+
+def test_corners_of_an_arm_by_hand():
+    from aacmm_jax.kinematics.skeleton import corners
+
+    # One joint turned by 90 degrees: up 100, then out 200 along y, then the probe 50 along the last z, tilted by alpha = -90 deg.
+    arm = aj.Arm(alpha=[-math.pi / 2], a=[200], d=[100], theta=[0], probe=[0, 0, 50])
+    np.testing.assert_allclose(
+        corners(arm, np.array([[math.pi / 2]]))[0], [[0, 0, 0], [0, 0, 100], [0, 200, 100], [-50, 200, 100]], atol=1e-9
+    )
+
+
+def test_an_evaluation_report_decides(written):
+    text = Page(written.pages["evaluation"].read_text(encoding="utf-8")).text
+    assert "✗ fails" in text  # E_Uni of 0.1 um
+    assert "✓ conforms" in text  # Deltam of 5 mm
+    assert "A limit is not kept" in text
+    assert "it also needs" in text
+
+
+def test_outliers_by_hand():
+    assert (
+        outliers(np.array([0.01, 0.012, 0.009, 0.041, 0.0439, 0.011, 0.0461])).tolist() == []
+    )  # median 0.012: four times is 0.048
+    assert outliers(np.array([0.01, 0.012, 0.009, 0.049, 0.011])).tolist() == [3]
+    assert outliers(np.full(5, 1e-12)).tolist() == []
+
+
+@pytest.mark.parametrize(
+    ("value", "decimals", "signed", "expected"),
+    [
+        (1.23456, 2, False, "1.23"),
+        (-1.5, 1, True, "−1.5"),
+        (1.5, 1, True, "+1.5"),
+        (1e-7, 4, False, "1.0e−07"),
+        (0.0, 3, False, "0.000"),
+    ],
+)
+def test_numbers_are_shown(value, decimals, signed, expected):
+    assert parts.shown(value, decimals, signed=signed) == expected
+
+
+def test_missing_numbers_are_told_from_infinite_ones():
+    assert [parts.number(value).text for value in (None, math.nan, math.inf)] == ["–", "–", "not determined"]
+
+
+def test_a_logarithmic_axis_marks_what_is_there():
+    axis = charts.logarithmic([0.012, 0.3])
+    assert [mark for mark in axis["tickvals"] if 0.012 <= mark <= 0.3] == pytest.approx([0.02, 0.05, 0.1, 0.2])
+    assert charts.logarithmic([])["tickvals"]
+
+
+def test_what_cannot_be_reported_is_refused(written, tmp_path):
+    aj.save_capture(tmp_path / "capture.h5", written.record.recording)
+    assert_refused(lambda: write_report(tmp_path / "capture.h5", tmp_path / "r.html"), "capture.h5", "holds a capture")
+    assert_refused(lambda: write_report(tmp_path / "none.h5", tmp_path / "r.html"), "does not exist")
+    calibration = written.folder / "calibration.h5"
+    assert_refused(lambda: write_report(calibration, calibration), "choose another output")
+    assert_refused(lambda: write_report(calibration, tmp_path / "no" / "r.html"), "cannot be written")
+
+
+ABOUT = """
+[laboratory]
+name = "Metrology <b>Lab</b>"
+city = "Chengdu"
+[item]
+serial_number = "7125-001"
+[[person]]
+name = "A. Smith"
+role = "calibration engineer"
+"""
+
+
+def test_the_command_states_the_laboratory_and_prints_for_machines(written, aacmm, tmp_path):
+    (tmp_path / "about.toml").write_text(ABOUT)
+    done = aacmm("report", written.folder / "calibration.h5", "-o", "report.html", "--about", "about.toml", "--json")
+    summary = json.loads(done.stdout)
+    assert summary["bytes"] == (tmp_path / "report.html").stat().st_size
+    text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
+    for needed in ("Metrology <b>Lab</b>", "Chengdu", "7125-001", "calibration engineer"):
+        assert needed in text
+    dcc = aacmm("export", written.folder / "calibration.h5", "--format", "dcc", "--about", "about.toml").stdout
+    values = aj.values_of_dcc(dcc)
+    assert any(value.value == float(written.record.calibrated.arm.a[1]) for value in values.values())
+    assert "--format dcc" in aacmm("export", written.folder / "calibration.h5", "--about", "about.toml", expect=2).stderr
+
+
+# --- A real browser -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def browser():
+    api = pytest.importorskip("playwright.sync_api")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
+    quiet = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
+    with api.sync_playwright() as playwright:
+        running = playwright.chromium.launch(executable_path=chromium, args=quiet)
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def shown(browser, written):
+    """Open a report at a width, ready; what the console said and what was asked of the network is kept on the page."""
+    contexts = []
+
+    def open_(kind: str, width: int):
+        context = browser.new_context(viewport={"width": width, "height": 900}, offline=True)
+        contexts.append(context)
+        opened = context.new_page()
+        opened.said, opened.asked = [], []
+        opened.on("console", lambda message: opened.said.append(message.text))
+        opened.on("pageerror", lambda error: opened.said.append(str(error)))
+        opened.on("dialog", lambda dialog: opened.said.append(dialog.message))
+        opened.on("request", lambda request: opened.asked.append(request.url))
+        opened.goto(written.pages[kind].as_uri())
+        opened.wait_for_selector("body[data-ready=yes]", timeout=60_000)
+        return opened
+
+    yield open_
+    for context in contexts:
+        context.close()
+
+
+@pytest.mark.parametrize("width", [400, 1600])
+@pytest.mark.parametrize("kind", ["calibration", "evaluation", "study"])
+def test_a_browser_draws_everything_and_asks_for_nothing(shown, written, kind, width):
+    opened = shown(kind, width)
+    assert opened.said == []
+    assert [url for url in opened.asked if not url.startswith(("data:", "blob:"))] == [written.pages[kind].as_uri()]
+    # Every chart has drawn marks of some size, and the page is no wider than the screen.
+    drawn = opened.evaluate(
+        """() => [...document.querySelectorAll("[data-chart]")].map((place) => ({
+            marks: place.querySelectorAll(".main-svg .point, .main-svg .hm image, .main-svg .heatmaplayer image").length,
+            width: place.getBoundingClientRect().width, paper: place.querySelector("img.paper").naturalWidth }))"""
+    )
+    assert drawn
+    for chart in drawn:
+        assert chart["marks"] > 0
+        assert chart["width"] > 0.7 * min(width, 1200) * 0.9
+        assert chart["paper"] == 700
+    assert opened.evaluate("document.documentElement.scrollWidth") <= width
+    if kind == "evaluation":
+        assert opened.title().startswith("Evaluation of Arm <script>")
+
+
+@pytest.mark.parametrize("kind", ["calibration", "evaluation"])
+def test_the_arm_turns_under_mouse_keys_and_buttons(shown, kind):
+    opened = shown(kind, 1600)
+    scene = opened.locator("[data-scene]")
+    scene.scroll_into_view_if_needed()
+    read = lambda: (float(scene.get_attribute("data-turn")), float(scene.get_attribute("data-tilt")))  # noqa: E731
+    picture = lambda: opened.evaluate("document.querySelector('[data-scene] svg').innerHTML")  # noqa: E731
+    before, drawn = read(), picture()
+    box = scene.bounding_box()
+    opened.mouse.move(box["x"] + 200, box["y"] + 200)
+    opened.mouse.down()
+    opened.mouse.move(box["x"] + 300, box["y"] + 250, steps=5)
+    opened.mouse.up()
+    after = read()
+    assert after[0] - before[0] == pytest.approx(0.8, abs=0.01)  # 100 pixels
+    assert after[1] - before[1] == pytest.approx(0.4, abs=0.01)
+    assert picture() != drawn
+    scene.focus()
+    opened.keyboard.press("ArrowLeft")
+    assert read()[0] == pytest.approx(after[0] - 0.15, abs=1e-3)
+    opened.get_by_role("button", name="tilt down").click()
+    assert read()[1] == pytest.approx(after[1] - 0.1, abs=1e-3)
+    slider = opened.locator(".controls input")
+    slider.fill("3")
+    assert "pose 3" in opened.locator(".controls output").inner_text()
+
+
+def test_tables_sort_by_click_and_by_keyboard(shown):
+    opened = shown("calibration", 1600)
+    table = opened.locator("table", has=opened.locator("caption", has_text=re.compile("^Parameters$")))
+    column = lambda: [  # noqa: E731
+        float(cell.get_attribute("data-value")) for cell in table.locator("tbody tr td:nth-child(4)").all()
+    ]
+    heading = table.locator("th button", has_text="as left")
+    heading.click()
+    assert column() == sorted(column())
+    assert table.locator("th[aria-sort=ascending]").count() == 1
+    heading.focus()
+    opened.keyboard.press("Enter")
+    assert column() == sorted(column(), reverse=True)
+    table.locator("th button", has_text=re.compile("^parameter$")).click()
+    names = [cell.inner_text() for cell in table.locator("tbody tr td:nth-child(1)").all()]
+    assert names == sorted(names)
+
+
+@pytest.mark.parametrize("kind", ["calibration", "evaluation", "study"])
+def test_it_prints_to_pdf(shown, tmp_path, kind):
+    opened = shown(kind, 1600)
+    content = opened.pdf(path=tmp_path / "report.pdf", format="A4", print_background=True)
+    pages = len(re.findall(rb"/Type\s*/Page\b", content))
+    assert 2 <= pages <= 25
+    # On paper each chart is its picture of fixed width, and nothing else of it.
+    opened.emulate_media(media="print")
+    seen = opened.evaluate(
+        """() => [...document.querySelectorAll("[data-chart]")].map((place) =>
+            [...place.children].filter((child) => getComputedStyle(child).display !== "none").map((child) => child.className))"""
+    )
+    assert seen == [["paper"]] * len(seen)

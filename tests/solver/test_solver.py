@@ -1,0 +1,195 @@
+"""The bounded solver: against SciPy on random boxes, on NIST's certified problems, and its derivatives."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+import scipy.optimize
+
+import aacmm_jax as aj
+
+from tests import bounded_problems, nist
+
+PROBLEMS = 200
+
+
+@jax.jit
+def solve(problem):
+    solution = aj.least_squares(
+        bounded_problems.residual,
+        problem["start"],
+        problem,
+        lower=problem["lower"],
+        upper=problem["upper"],
+        throw=False,
+    )
+    stats = solution.stats
+    cost = 0.5 * jnp.sum(bounded_problems.residual(solution.value, problem) ** 2)
+    return solution.value, cost, stats["optimality"], aj.converged(stats["reason"])
+
+
+@pytest.mark.parametrize("third", range(3))
+def test_never_worse_than_scipy_in_random_boxes(third):
+    """Cost against SciPy's TRF at its tightest tolerances; the drawn boxes must hold both active and inactive bounds."""
+    active = 0
+    for seed in range(third, PROBLEMS, 3):
+        problem = bounded_problems.draw(seed)
+        value, cost, _, converged = solve({key: jnp.asarray(item) for key, item in problem.items()})
+        reference = scipy.optimize.least_squares(
+            bounded_problems.residual,
+            problem["start"],
+            jac=bounded_problems.jacobian,
+            bounds=(problem["lower"], problem["upper"]),
+            args=(problem,),
+            x_scale="jac",
+            xtol=1e-15,
+            ftol=1e-15,
+            gtol=1e-15,
+            max_nfev=5000,
+        )
+        assert converged, seed
+        # Where the model can fit exactly both costs are rounding errors, so they are compared with the start's as well.
+        start = 0.5 * np.sum(bounded_problems.residual(problem["start"], problem) ** 2)
+        assert cost <= reference.cost * (1 + 1e-9) + 1e-24 * start, seed
+        assert np.all(value >= problem["lower"]), seed
+        assert np.all(value <= problem["upper"]), seed
+        active += int(np.sum((value == problem["lower"]) | (value == problem["upper"])))
+    assert active > 20
+
+
+def test_residual_is_never_evaluated_outside_the_box():
+    """Every point that the residual sees is recorded by the running program itself."""
+    seen: list[np.ndarray] = []
+
+    def recorded(y, problem):
+        jax.debug.callback(lambda point: seen.append(np.array(point)), y)
+        return bounded_problems.residual(y, problem)
+
+    @jax.jit
+    def run(problem):
+        return aj.least_squares(
+            recorded, problem["start"], problem, lower=problem["lower"], upper=problem["upper"], throw=False
+        ).value
+
+    evaluated = 0
+    for seed in range(0, 60, 3):
+        seen.clear()
+        problem = bounded_problems.draw(seed)
+        # A start outside is clipped before anything is evaluated.
+        problem["start"] = problem["upper"] + 1.0
+        run({key: jnp.asarray(item) for key, item in problem.items()}).block_until_ready()
+        jax.effects_barrier()
+        points = np.stack(seen)
+        evaluated += len(points)
+        assert np.all(points >= problem["lower"])
+        assert np.all(points <= problem["upper"])
+    assert evaluated > 60
+
+
+@pytest.mark.parametrize("name", nist.MODELS)
+def test_nist_certified_digits(shared, name):
+    """At least 6 certified digits of every parameter, from both starts (NIST StRD)."""
+    data = nist.load(name)
+
+    @jax.jit
+    def fit(start):
+        solution = aj.least_squares(data.residual, start, throw=False)
+        return solution.value, solution.stats["cost"], aj.converged(solution.stats["reason"])
+
+    for start in data.starts:
+        value, cost, converged = fit(jnp.asarray(start))
+        assert converged
+        assert nist.certified_digits(np.asarray(value), data.certified) >= 6
+        assert 2 * cost <= data.certified_sum_of_squares * (1 + 1e-9)
+
+
+def rosenbrock(y, args):
+    steepness = 10.0 if args is None else args
+    return {"valley": steepness * (y["b"] - y["a"] ** 2), "slope": 1 - y["a"]}
+
+
+def test_pytrees_and_partial_bounds():
+    start = {"a": jnp.array([-1.2]), "b": jnp.array([1.0])}
+    free = aj.least_squares(rosenbrock, start)
+    np.testing.assert_allclose([free.value["a"][0], free.value["b"][0]], [1, 1], rtol=1e-10)
+    boxed = aj.least_squares(rosenbrock, start, upper={"a": 0.5, "b": jnp.inf})
+    np.testing.assert_allclose([boxed.value["a"][0], boxed.value["b"][0]], [0.5, 0.25], rtol=1e-10)
+    assert boxed.stats["reason"] == aj.Reason.gradient
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_derivative_follows_an_active_bound(mode):
+    """With a on its bound u, the minimum is (u, u^2): d/du = (1, 2u) exactly, and nothing depends on the steepness."""
+
+    def optimum(upper, steepness):
+        start = {"a": jnp.array(-1.2), "b": jnp.array(1.0)}
+        value = aj.least_squares(rosenbrock, start, steepness, upper={"a": upper, "b": jnp.inf}).value
+        return jnp.stack([value["a"], value["b"]])
+
+    by_bound, by_steepness = mode(optimum, (0, 1))(jnp.array(0.5), jnp.array(10.0))
+    np.testing.assert_allclose(by_bound, [1, 1], atol=1e-10)
+    np.testing.assert_allclose(by_steepness, [0, 0], atol=1e-10)
+    # A bound that does not bind has no influence.
+    np.testing.assert_allclose(mode(optimum)(jnp.array(5.0), jnp.array(10.0)), [0, 0], atol=1e-10)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e8, pytest.param(1e-8, marks=pytest.mark.slow)])
+def test_derivative_does_not_depend_on_units(unit):
+    """The same problem with one unknown in another unit: y_1 = u on its bound, y_0 = unit / (1 + u) at the minimum."""
+
+    def optimum(upper):
+        residual = lambda y, _: jnp.stack([y[0] / unit * (1 + y[1]) - 1, 0.1 * (y[1] - 3)])  # noqa: E731
+        return aj.least_squares(residual, jnp.array([0.5 * unit, 0.1]), upper=jnp.stack([jnp.inf, upper])).value
+
+    value, slope = optimum(jnp.array(1.0)), jax.jacrev(optimum)(jnp.array(1.0))
+    np.testing.assert_allclose(value / jnp.array([unit, 1.0]), [0.5, 1.0], rtol=1e-8)
+    np.testing.assert_allclose(slope / jnp.array([unit, 1.0]), [-0.25, 1.0], rtol=1e-6)
+
+
+def test_a_false_derivative_is_not_called_converged():
+    @jax.custom_jvp
+    def wrong(y):
+        return y - 1
+
+    wrong.defjvp(lambda primals, tangents: (wrong(*primals), -tangents[0]))
+    solution = aj.least_squares(lambda y, _: wrong(y), jnp.array([3.0, 4.0]), throw=False)
+    assert solution.stats["reason"] == aj.Reason.stalled
+
+
+def test_crossed_bounds_are_refused():
+    with pytest.raises(aj.InputError, match="lower bound 2 of unknown 1 is above its upper bound 1"):
+        aj.least_squares(lambda y, _: y, jnp.array([1.0]), lower=2.0, upper=1.0)
+
+
+def test_solves_under_vmap_equal_single_solves():
+    problems = [bounded_problems.draw(seed) for seed in range(0, 24, 3)]
+    stacked = {key: jnp.stack([jnp.asarray(problem[key]) for problem in problems]) for key in problems[0]}
+    together = jax.jit(jax.vmap(solve))(stacked)[0]
+    for value, problem in zip(together, problems, strict=True):
+        single = solve({key: jnp.asarray(item) for key, item in problem.items()})[0]
+        np.testing.assert_allclose(value / problem["unit"], single / problem["unit"], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("residual", "start", "reason", "result"),
+    [
+        (lambda y, _: jnp.log(y), -1.0, aj.Reason.nonfinite, optx.RESULTS.nonfinite),
+        (lambda y, _: jnp.stack([10 * (y[1] - y[0] ** 2), 1 - y[0]]), [-1.2, 1.0], aj.Reason.max_steps, None),
+    ],
+)
+def test_failure_is_data_and_an_exception_only_on_request(residual, start, reason, result):
+    steps = 3 if result is None else 100
+    solution = aj.least_squares(residual, jnp.asarray(start), max_steps=steps, throw=False)
+    assert solution.stats["reason"] == reason
+    assert solution.result == (optx.RESULTS.nonlinear_max_steps_reached if result is None else result)
+    with pytest.raises(eqx.EquinoxRuntimeError):
+        aj.least_squares(residual, jnp.asarray(start), max_steps=steps)
+
+
+def test_the_solution_is_a_point_that_was_evaluated():
+    """A last step into where the residual does not exist is not taken unseen, however small it is."""
+    solution = aj.least_squares(lambda y, _: jnp.sqrt(y - 1.0), jnp.array([1.05]), throw=False)
+    assert np.all(np.isfinite(np.sqrt(np.asarray(solution.value) - 1.0)))
+    assert float(solution.stats["cost"]) == pytest.approx(0.5 * float(solution.value[0] - 1.0), rel=1e-12)

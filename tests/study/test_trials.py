@@ -1,0 +1,213 @@
+"""Trials of a study: what is drawn is what was asked, depends on its key alone, and is identified as one by one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.data.noise import ARCSEC
+from aacmm_jax.study import drawing, pools
+from aacmm_jax.study.trials import Block, run_block
+
+DEVICE = jax.devices()[0]
+REFERENCE = {"length_mm": 500, "positions": 2, "poses": 3, "u_mm": 0.01, "region": {"distance_mm": [300, 1000]}}
+NOISE = {"encoder_arcsec": 2.0, "seating_mm": 0.005}
+OFF = {"length_mm": 1.0, "angle_deg": 0.1}
+
+
+def made(**tables) -> "aj.Study":
+    capture = {"positions_mm": [[400, 200, 300]], "poses": 30, "pool": 4096}
+    return aj.make_study(**{"arm": "cheng2018-simulation", "trials": 64, "seed": 3, "capture": capture} | tables)
+
+
+def drawn(study: "aj.Study", count: int = 64, cell: int = 0) -> drawing.Drawn:
+    return drawing.draw(study, study.settings[cell], np.full(count, cell), np.arange(count), DEVICE)
+
+
+def tips(study: "aj.Study", trials: drawing.Drawn) -> np.ndarray:
+    arms = jax.vmap(study.space.arm)(jnp.asarray(trials.true))
+    return np.asarray(jax.vmap(lambda arm, q: arm.position(q))(arms, jnp.asarray(trials.q)))
+
+
+def hayati() -> "aj.Arm":
+    panda = aj.load_arm("panda")
+    return aj.Arm(alpha=panda.alpha, a=panda.a, d=panda.d, theta=panda.theta, probe=panda.probe, beta=0.01 * np.ones(7))
+
+
+@pytest.mark.parametrize(
+    ("arm", "deviation"),
+    [
+        ("cheng2018-simulation", OFF),
+        ("cheng2018-simulation", {"length_mm": 10.0, "angle_deg": 1.0}),
+        pytest.param("panda", OFF, marks=pytest.mark.slow),
+        pytest.param(hayati(), OFF, marks=pytest.mark.slow),
+    ],
+    ids=["paper", "far off", "panda", "beta"],
+)
+def test_without_noise_every_true_tip_stands_on_its_point(arm, deviation):
+    capture = {"positions_mm": [[400, 200, 300], [300, -300, 400]], "poses": 20, "pool": 4096}
+    study = made(arm=arm, deviation=deviation, reference=REFERENCE | {"u_mm": 0.0, "length_mm": 200}, capture=capture)
+    trials = drawn(study)
+    found = tips(study, trials)
+    assert np.abs(found[:, :20] - [400, 200, 300]).max() < 1e-8
+    assert np.abs(found[:, 20:40] - [300, -300, 400]).max() < 1e-8
+    ends = found[:, 40:].reshape(64, 2, 2, 3, 3)
+    assert np.abs(np.ptp(ends, axis=3)).max() < 1e-8  # the poses of one end agree
+    length = np.linalg.norm(ends[:, :, 0, 0] - ends[:, :, 1, 0], axis=-1)
+    np.testing.assert_allclose(length, 200, atol=1e-8)
+    np.testing.assert_allclose(trials.value, 200, atol=1e-8)
+    assert np.ptp(trials.true, axis=0).min() > 0.5 * 2 * study.numbers.width[0].min()
+
+
+def test_no_pose_twice_and_all_within_the_limits(paper_arm):
+    limits = [[-170, 170], [-100, 100], [-150, 150], [-120, 120], [-170, 170], [-90, 90]]
+    study = made(capture={"positions_mm": [[400, 200, 300]], "poses": 70, "pool": 4096, "joint_limits_deg": limits})
+    q = drawn(study).q
+    for trial in q:
+        assert len(np.unique(trial.round(9), axis=0)) == 70
+    low, high = np.radians(limits).T
+    assert (q >= low).all()
+    assert (q <= high).all()
+    # Trials of different batches share no pose.
+    first, second = ({tuple(pose) for t in range(batch, 64, 32) for pose in q[t].round(9)} for batch in (0, 1))
+    assert not first & second
+
+
+def test_deviations_have_their_distributions():
+    study = made(deviation={"length_mm": 1.0, "d_mm": {"normal": 0.3}, "angle_deg": 0.1, "theta_deg": 0.0})
+    trials = drawn(study, 4000)
+    off = (trials.true - np.asarray(study.space.vector())) / np.where(study.space.lengths, 1.0, np.pi / 180)
+    kinds = {kind: off[:, [n.startswith(kind + "_") for n in study.space.names]] for kind in ("a", "d", "alpha", "theta")}
+    assert 0.99 < np.abs(kinds["a"]).max() <= 1
+    assert kinds["a"].std() == pytest.approx(1 / 3**0.5, rel=0.02)
+    assert kinds["d"].std() == pytest.approx(0.3, rel=0.02)
+    assert np.abs(kinds["d"]).max() > 0.9
+    assert kinds["alpha"].std() == pytest.approx(0.1 / 3**0.5, rel=0.02)
+    np.testing.assert_array_equal(kinds["theta"], 0)
+    correlation = np.corrcoef(off[:, :15].T)
+    assert np.abs(correlation - np.eye(15)).max() < 0.08
+
+
+@pytest.mark.parametrize(
+    "part", ["encoder_arcsec", "seating_mm", "resolution_arcsec", pytest.param("eccentricity_arcsec", marks=pytest.mark.slow)]
+)
+def test_noise_is_what_was_asked(part):
+    """The same keys with and without one part of the noise differ by that part."""
+    level = {"encoder_arcsec": 2.0, "seating_mm": 0.005, "resolution_arcsec": 20.0, "eccentricity_arcsec": 5.0}[part]
+    without, with_it = (made(deviation=OFF, noise={part: value}) for value in (0.0, level))
+    exact, noisy = drawn(without), drawn(with_it)
+    np.testing.assert_array_equal(exact.true, noisy.true)
+    change = noisy.q - exact.q
+    if part == "encoder_arcsec":
+        assert change.std() == pytest.approx(2 * ARCSEC, rel=0.03)
+    elif part == "seating_mm":
+        moved = tips(with_it, noisy) - tips(without, exact)
+        assert moved.std() == pytest.approx(0.005, rel=0.03)
+    elif part == "resolution_arcsec":
+        step = 20 * ARCSEC
+        np.testing.assert_allclose(noisy.q / step, np.round(noisy.q / step), atol=1e-6)
+        assert np.abs(change).max() <= step / 2 * 1.001
+    else:
+        # A first harmonic, its two parts the same in all readings of one joint in one trial.
+        parts = []
+        for trial, moved in zip(exact.q[:16], change[:16], strict=True):
+            for joint in range(6):
+                harmonics = np.stack([np.sin(trial[:, joint]), np.cos(trial[:, joint])], axis=1)
+                found, left, *_ = np.linalg.lstsq(harmonics, moved[:, joint])
+                assert left[0] < 1e-24
+                parts.append(found)
+        assert np.std(parts) == pytest.approx(5 * ARCSEC, rel=0.2)
+
+
+def test_reference_lengths_err_by_their_u():
+    study = made(reference=REFERENCE)
+    trials = drawn(study, 2000)
+    assert (trials.value - 500).std() == pytest.approx(0.01, rel=0.05)
+    np.testing.assert_array_equal(trials.u, 0.01)
+
+
+@pytest.mark.slow
+def test_starts_at_random_fill_the_box():
+    study = made(identification={"start": "random", "hold": "none"}, bounds={"length_mm": 2.0, "length_shift_mm": 1.0})
+    trials = drawn(study, 2000)
+    share = (trials.start - trials.lower) / (trials.upper - trials.lower)
+    assert share.min() >= 0
+    assert share.max() <= 1
+    assert share.mean() == pytest.approx(0.5, abs=0.01)
+    d_3 = study.space.index("d_3")
+    assert (trials.lower[0, d_3], trials.upper[0, d_3]) == (749.0, 753.0)
+    held = drawn(made(identification={"start": "random"}))
+    assert np.ptp(held.start, axis=0)[d_3] == 0
+    assert np.delete(np.ptp(held.start, axis=0), d_3).min() > 0
+
+
+def test_a_recording_lends_its_poses(noisy_capture):
+    study = made(arm=aj.load_arm("cheng2018-simulation"), capture=noisy_capture, deviation=OFF)
+    trials = drawn(study, 20)
+    assert np.abs(trials.q - np.asarray(noisy_capture.q)).max() < 0.03
+    centres = tips(study, trials)[:, :70].mean(axis=1)
+    assert np.ptp(centres, axis=0).max() < 1e-8
+    np.testing.assert_array_equal(trials.u, 0.002)
+
+
+STUDIES = {
+    "two-stage": {"method": "two-stage"},
+    "joint": {"method": "joint"},
+    "stage1": {"method": "stage1", "hold": "none"},
+}
+
+
+@pytest.fixture(scope="module", params=["two-stage", "joint", pytest.param("stage1", marks=pytest.mark.slow)])
+def whole(request):
+    reference = {} if request.param == "stage1" else {"reference": REFERENCE}
+    study = made(deviation=OFF, noise=NOISE, bounds={"length_mm": [3, 10]}, identification=STUDIES[request.param], **reference)
+    return study, run_block(study, Block(0, 2, 0, 40))
+
+
+def test_equals_one_by_one(whole):
+    study, results = whole
+    method = study.settings[0].method
+    trials = drawn(study, 3, cell=1)
+    names, sizes = [], study.settings[1].sizes
+    names = [f"s{i}" for i in range(len(sizes))]
+    for i in range(3):
+        sockets = dict(zip(names, np.split(trials.q[i], np.cumsum(sizes)[:-1]), strict=True))
+        pairs = drawing.ends_of(study, study.settings[1])
+        lengths = [
+            aj.ReferenceLength(names[a], names[b], value, u)
+            for (a, b), value, u in zip(pairs, trials.value[i], trials.u[i], strict=True)
+        ]
+        bounds = aj.Bounds(study.space, trials.lower[i], trials.upper[i])
+        capture = aj.Capture(sockets, lengths)
+        hold = study.settings[1].hold
+        if method == "stage1":
+            alone = aj.identify(study.nominal.arm, capture, bounds, hold=hold)
+            figures = {"de_stage1": alone.de, "deltam_stage1": alone.deltam, "estimate": alone.parameters}
+        else:
+            alone = aj.calibrate(study.nominal.arm, capture, bounds, method=method, hold=hold)
+            figures = {"de": alone.de, "deltam": alone.deltam, "k": alone.scale.value, "estimate": alone.parameters}
+        for name, value in figures.items():
+            np.testing.assert_allclose(results[name][1, i], value, rtol=1e-8, atol=1e-7)
+        np.testing.assert_array_equal(results["active"][1, i], alone.active)
+        np.testing.assert_array_equal(results["true"][1, i], trials.true[i])
+        error = np.abs(np.asarray(alone.parameters) - trials.true[i])[study.space.lengths].max()
+        there = "length_error_stage1" if method == "stage1" else "length_error"
+        assert results[there][1, i] == pytest.approx(error, abs=1e-7)
+
+
+def test_a_trial_depends_on_its_key_alone(whole):
+    """Whatever block a trial stands in, to the bit."""
+    study, results = whole
+    for block in (Block(1, 2, 0, 40), Block(0, 1, 13, 29), Block(1, 2, 39, 40)):
+        part = run_block(study, block, workers=1)
+        for name, values in part.items():
+            cells, trials = slice(block.first_cell, block.last_cell), slice(block.first_trial, block.last_trial)
+            np.testing.assert_array_equal(values, results[name][cells, trials])
+
+
+def test_pools_are_the_same_in_every_study_of_a_seed():
+    one, two = (made(noise=noise) for noise in ({}, NOISE))
+    np.testing.assert_array_equal(pools.pool_of(one, one.settings[0]).table, pools.pool_of(two, two.settings[0]).table)
+    other = made(seed=4)
+    assert not np.array_equal(pools.pool_of(one, one.settings[0]).table, pools.pool_of(other, other.settings[0]).table)
