@@ -65,7 +65,7 @@ def ceres(binary: Path, threads: int = 2) -> Contender:
     def run(task: Task, starts: np.ndarray) -> Found:
         arm, n = task.arm, task.arm.joints
         offsets = {"alpha": 0, "a": n, "d": 2 * n, "theta": 3 * n, "probe": 4 * n}
-        slots = [offsets[kind] + i for kind, i in task.space.entries()]
+        slots = [offsets[kind] + i for kind, i in task.space.indices()]
         base = [np.asarray(getattr(arm, kind)) for kind in offsets]
         held = -1 if task.hold is None else task.space.index(task.hold)
         parts = ([n, len(task.q), len(starts), threads, held], *base, slots, task.q, task.lower, task.upper, starts)
@@ -108,7 +108,7 @@ def scipy_trf(analytic: bool) -> Contender:
 
 def numpy_functions(task: Task) -> tuple[Callable, Callable]:
     """Residual and Jacobian in NumPy, all poses at once."""
-    entries, arm, q = task.space.entries(), task.arm, task.q
+    entries, arm, q = task.space.indices(), task.arm, task.q
     n, poses = arm.joints, len(q)
     base = {kind: np.asarray(getattr(arm, kind)) for kind in ("alpha", "a", "d", "theta", "probe")}
 
@@ -192,7 +192,7 @@ def pybotics(python: Path) -> Contender:
     """pybotics' chain and forward kinematics under SciPy's solver, in its own environment."""
 
     def run(task: Task, starts: np.ndarray) -> Found:
-        kinds, indices = zip(*task.space.entries(), strict=True)
+        kinds, indices = zip(*task.space.indices(), strict=True)
         boxes = {"lower": task.lower, "upper": task.upper, "scale": np.asarray(task.space.scale), "starts": starts}
         solved = run_peer(python, HERE / "peers/pybotics/solve.py", task, kinds=kinds, indices=indices, **boxes)
         return float(solved["seconds"]), solved["found"]

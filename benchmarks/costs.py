@@ -27,7 +27,7 @@ def seconds_of(call: Callable[[], Any]) -> float:
 
 
 def in_turns(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
-    """Seconds of every call, in turns, so that all meet the same mood of the machine; a first call of each is not counted."""
+    """Seconds of every call, in sines_cosines, so that all meet the same mood of the machine; a first call of each is not counted."""
     for call in calls.values():
         jax.block_until_ready(call())
     times: dict[str, list[float]] = {name: [] for name in calls}
@@ -168,7 +168,7 @@ def calls() -> list[Row]:
 
 
 def commands(rounds: int) -> list[Row]:
-    """Whole processes, in turns: a cold and a warm `aacmm calibrate` on 70 poses, and the import of its two heaviest parts."""
+    """Whole processes, in sines_cosines: a cold and a warm `aacmm calibrate` on 70 poses, and the import of its two heaviest parts."""
     program = str(Path(sys.executable).with_name("aacmm"))
     with tempfile.TemporaryDirectory() as folder:
         sockets = ["--socket", "A=400,200,300", "--socket", "B=600,200,300", "--poses", "70", "--poses", "B=1"]

@@ -29,8 +29,8 @@ def sized(trials: int):
     """The study with so many trials in each cell."""
     import aacmm_jax as aj
 
-    study = aj.read_study("bound-sensitivity")
-    return aj.Study(study.specification.model_copy(update={"trials": trials}), study.nominal)
+    study = aj.study.read_study("bound-sensitivity")
+    return aj.study.Study(study.specification.model_copy(update={"trials": trials}), study.nominal)
 
 
 def fresh(name: str, *arguments: object, cores: str | None = None) -> dict:
@@ -47,11 +47,11 @@ def once(trials: int, repeats: int, bare: int) -> dict:
 
     found = {"total": CELLS * trials, "seconds": [], "bare_seconds": []}
     with tempfile.TemporaryDirectory() as folder:
-        aj.run_study(sized(1000), Path(folder) / "first.h5")
+        aj.study.run_study(sized(1000), Path(folder) / "first.h5")
         forget_pools()
         for number in range(repeats):
             began = time.perf_counter()
-            aj.run_study(sized(trials), Path(folder) / f"{number}.h5")
+            aj.study.run_study(sized(trials), Path(folder) / f"{number}.h5")
             found["seconds"].append(time.perf_counter() - began)
             found["bytes"] = (Path(folder) / f"{number}.h5").stat().st_size
             forget_pools()
@@ -128,10 +128,10 @@ def run_into(path: str, trials: str, chunk: str, devices: str, dask: str) -> dic
     import aacmm_jax as aj
 
     if dask != "0":
-        with aj.dask_executor("local", int(dask)) as (executor, workers):
-            outcome = aj.run_study(sized(int(trials)), path, executor=executor, workers=workers, chunk=int(chunk))
+        with aj.study.dask_executor("local", int(dask)) as (executor, workers):
+            outcome = aj.study.run_study(sized(int(trials)), path, executor=executor, workers=workers, chunk=int(chunk))
     else:
-        outcome = aj.run_study(sized(int(trials)), path, chunk=int(chunk))
+        outcome = aj.study.run_study(sized(int(trials)), path, chunk=int(chunk))
     return {"finished": outcome.finished}
 
 
@@ -247,11 +247,11 @@ def on_dask(address: str, count: str, folder: str) -> dict:
     with Client(address) as client:
         client.wait_for_workers(int(count))
     seconds = []
-    with aj.dask_executor(address) as (executor, workers):
+    with aj.study.dask_executor(address) as (executor, workers):
         for number in range(4):
             path = Path(folder) / f"{count}-{number}.h5"
             began = time.perf_counter()
-            aj.run_study(sized(1000 if number == 0 else 2000), path, executor=executor, workers=workers)
+            aj.study.run_study(sized(1000 if number == 0 else 2000), path, executor=executor, workers=workers)
             if number:  # the first compiles
                 seconds.append(time.perf_counter() - began)
     return {"seconds": seconds}

@@ -1,4 +1,4 @@
-"""Identifications a second, every contender on the same problems, tolerance and machine, in one run and in turns.
+"""Identifications a second, every contender on the same problems, tolerance and machine, in one run and in sines_cosines.
 
 The problem is the paper's: 70 noise-free poses, 21 parameters, random starts in simulation 1's box, DE <= 1e-9 mm asked of every
 problem. Then what kinematics, sizes of problems, memory, calls and whole commands cost. Prints tables (medians, and the spread over the

@@ -18,19 +18,19 @@ import numpy as np
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.sampling import batch_of
-from aacmm_jax.data.noise import ARCSEC
-from aacmm_jax.kinematics.independence import moved_onto
+from aacmm_jax.core.units import ARCSEC
+from aacmm_jax.kinematics.inverse_kinematics import project_to_targets
 from aacmm_jax.study.drawing import draw
-from aacmm_jax.uncertainty.volume import check_lengths
+from aacmm_jax.uncertainty.volume import sample_lengths
 
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
 SIZES, NAMES = (70, 5, 5), ("S", "A", "B")
 ENDS = [[[400, 200, 300], [700, 500, 500]]]
 
 
-def study_of(trials: int, length_bound: float) -> aj.Study:
+def study_of(trials: int, length_bound: float) -> aj.study.Study:
     """The paper's arm off by up to 1 mm and 0.1 deg; 70 poses in a socket, five at each end of one length with u = 2 um."""
-    return aj.make_study(
+    return aj.study.make_study(
         arm="cheng2018-simulation",
         trials=trials,
         seed=3,
@@ -43,7 +43,7 @@ def study_of(trials: int, length_bound: float) -> aj.Study:
     )
 
 
-def drawn_of(study: aj.Study, trials: int):
+def drawn_of(study: aj.study.Study, trials: int):
     """Readings, true parameters and certified values of every trial."""
     return draw(study, study.settings[0], np.zeros(trials, int), np.arange(trials), jax.local_devices()[0])
 
@@ -57,7 +57,7 @@ def capture_of(q, value) -> aj.Capture:
 
 def lengths_over_volume(arm: aj.Arm) -> tuple[np.ndarray, np.ndarray]:
     """Sixty lengths of 300 mm and twenty of any length, all over the volume."""
-    pairs = [check_lengths(arm, 60, length=300.0, seed=5), check_lengths(arm, 20, length=None, seed=6)]
+    pairs = [sample_lengths(arm, 60, length=300.0, seed=5), sample_lengths(arm, 20, length=None, seed=6)]
     return tuple(np.concatenate(column) for column in zip(*pairs, strict=True))
 
 
@@ -70,7 +70,7 @@ def calibrated(study, drawn, lengths, method, noise, form, hold="d_3"):
 
     def one(row):
         q, value, true = row
-        result = aj.calibrate(arm, capture_of(q, value), bounds, method=method, noise=noise, form=form, hold=hold)
+        result = aj.calibrate(arm, capture_of(q, value), bounds, method=method, noise=noise, noise_model=form, hold=hold)
         uncertainty = aj.uncertainty_of(result)
         factor.append(uncertainty.factor(0.95))
 
@@ -154,7 +154,7 @@ def sampled(trials: int = 10_000, draws: int = 199, length_bound: float = 10.0) 
         for i in range(done, min(done + at_once, trials)):
             body = space.arm(many.parameters[i])
             centroids = averaging @ np.asarray(body.position(drawn.q[i]))
-            exact, _ = moved_onto(body, drawn.q[i], centroids[owner])
+            exact, _ = project_to_targets(body, drawn.q[i], centroids[owner])
             moves = np.linalg.pinv(np.asarray(body.jacobian(exact, [f"q_{j}" for j in range(1, 7)])))
             seats = 0.005 * random.normal(size=(draws, len(owner), 3))
             q = exact + np.einsum("Nic,tNc->tNi", moves, seats) + 2 * ARCSEC * random.normal(size=(draws, *exact.shape))
@@ -211,13 +211,13 @@ def planned(sets: int = 100) -> dict:
     """Planned poses against 70 random ones: the largest uncertainty of 400 lengths of 300 mm, by formula and by simulation."""
     arm = aj.load_arm("cheng2018-simulation")
     space = aj.Parameters.free_of(arm)
-    start, end = check_lengths(arm, 400, length=300.0, seed=99)
+    start, end = sample_lengths(arm, 400, length=300.0, seed=99)
     found = {"plans": []}
     # Random poses know no table, so plans are compared without one; and shown with one.
     for above in (0.0, -math.inf):
         for seed in range(3):
             begun = time.perf_counter()
-            plan = aj.plan(arm, sockets=4, poses=25, seed=seed, above=above)
+            plan = aj.planning.plan(arm, sockets=4, poses=25, seed=seed, above=above)
             seconds = time.perf_counter() - begun
             row = {"seed": seed, "table": above == 0.0, "seconds": round(seconds, 1)}
             row |= judged(arm, space, plan.capture(), start, end, 1000)
@@ -289,7 +289,7 @@ def real(folder: Path) -> dict:
             for hole in (0, 1)
         }
         capture = aj.Capture(sockets, [aj.ReferenceLength(f"{p}/0", f"{p}/1", 50.0, 0.01) for p in places])
-        nominal = aj.load_specification(arm)
+        nominal = aj.files.load_specification(arm)
         nominal = nominal if bound is None else nominal._replace(length=bound)
         for method in ("two-stage", "joint"):
             checked = cross_validate(nominal.arm, capture, nominal.bounds(), method=method, hold="d_3")

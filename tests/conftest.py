@@ -13,10 +13,8 @@ from . import run_time_types as run_time_types  # named in the hook below, as an
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-with install_import_hook("aacmm_jax", "tests.run_time_types.checked"):
-    import aacmm_jax as aj
-    import aacmm_jax.certificate.document  # these two are imported late by the package itself
-    import aacmm_jax.files.manifest
+install_import_hook("aacmm_jax", "tests.run_time_types.checked")
+import aacmm_jax as aj  # noqa: E402 - the hook checks what is imported after it
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
@@ -76,29 +74,16 @@ def noisy_capture(paper_arm) -> "aj.Capture":
 
 
 # Modules that take longest, the longest first: started last, one of them would keep a single worker busy at the end.
-_LONGEST = [
-    "cli",
-    "study_trials",
-    "uncertainty",
-    "calibrate",
-    "report",
-    "study_store",
-    "solver",
-    "sampling",
-    "planning",
-    "drift",
-    "real_captures",
-    "readme",
-    "acceptance",
-    "observability",
-    "chain",
-    "study_results",
-    "batch",
-    "paper",
-]
+_LONGEST = """
+cli/test_cli study/test_trials uncertainty/test_uncertainty calibration/test_stages report/test_report study/test_store
+solver/test_solver calibration/test_sampling planning/test_planning drift/test_drift test_real_captures test_readme
+acceptance/test_acceptance uncertainty/test_identifiability kinematics/test_chain study/test_results calibration/test_batch
+test_paper
+""".split()
 
 
 def pytest_collection_modifyitems(items):
     """Modules in order of their length (with ``--no-loadscope-reorder``); within them nothing changes places."""
-    rank = {f"test_{name}": number for number, name in enumerate(_LONGEST)}
-    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+    here = Path(__file__).parent
+    rank = {name: number for number, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.relative_to(here).with_suffix("").as_posix(), len(rank)))

@@ -130,7 +130,10 @@ def test_arm(paper_arm, changes, parts):
         (lambda x: aj.Parameters.free_of(x.arm, free=["beto_2"]), ["'beto_2'", "did you mean 'beta_2'?"]),
         (lambda x: aj.Parameters.free_of(x.arm, held=["d_1"], free=["d_1"]), ["'d_1'", "as held and as free", "once"]),
         (lambda x: aj.Parameters.free_of(x.arm, held=["d_1", "d_1"]), ["'d_1'", "twice in held", "once"]),
-        (lambda x: aj.Parameters.free_of(x.arm, held=aj.parameter_names(x.arm)), ["every parameter is held", "hold fewer"]),
+        (
+            lambda x: aj.Parameters.free_of(x.arm, held=aj.kinematics.parameter_names(x.arm)),
+            ["every parameter is held", "hold fewer"],
+        ),
         (lambda x: aj.Bounds.around(x.arm, x.space, override={"prob_z": 60}), ["'prob_z'", "did you mean 'probe_z'?"]),
         (lambda x: aj.Bounds.around(x.arm, x.space, override={"d_1": 60}), ["'d_1' is held, not free", "such as 'alpha_1'"]),
         (lambda x: aj.Bounds.around(x.arm, x.space, length=-1.0), ["half-width of a_1 is -1", "zero or a positive"]),
@@ -215,7 +218,7 @@ def test_too_few_poses(given, monkeypatch, sizes, held, hold):
     """A socket of m poses gives 3 (m - 1) equations; the number of poses named as enough is enough, and one less is not."""
     if held == "lengths":
         # Angles alone: nothing slides with the scale, so every free one is determined.
-        held = [name for name in aj.parameter_names(given.arm) if not name.startswith(("alpha", "theta"))]
+        held = [name for name in aj.kinematics.parameter_names(given.arm) if not name.startswith(("alpha", "theta"))]
     space = aj.Parameters.free_of(given.arm, held=held)
     bounds = aj.Bounds.around(given.arm, space)
 
@@ -270,7 +273,7 @@ def test_simulation(paper_arm, arguments, parts):
 
 
 def test_deviation_and_batch(given):
-    assert_refused(lambda: aj.deviated(given.space, length=-1.0, angle=0.0), "free length is -1", "zero or positive")
+    assert_refused(lambda: aj.perturbed_arm(given.space, length=-1.0, angle=0.0), "free length is -1", "zero or positive")
     batch = changed_arm(given.arm, a=np.zeros((2, 6)))
     assert_refused(lambda: aj.simulate(batch, {"A": (400, 200, 300)}), "one arm, not a batch")
 

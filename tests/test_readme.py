@@ -26,12 +26,12 @@ def test_python_runs(capsys, tmp_path, monkeypatch):
 
 def test_study_is_read(tmp_path):
     (tmp_path / "study.toml").write_text(blocks("toml")[3])
-    assert len(aj.read_study(tmp_path / "study.toml").cells) == 6
+    assert len(aj.study.read_study(tmp_path / "study.toml").cells) == 6
 
 
 def test_what_a_certificate_states_is_read(tmp_path):
     (tmp_path / "laboratory.toml").write_text(blocks("toml")[2].replace("# conformity", "conformity"))
-    about = aj.read_about(tmp_path / "laboratory.toml")
+    about = aj.files.read_administrative_data(tmp_path / "laboratory.toml")
     # Every key that there is stands in the example.
     stated = about.model_dump(exclude_unset=True)
     for part, model in ((name, field.annotation) for name, field in type(about).model_fields.items()):
@@ -48,11 +48,11 @@ def test_arm_file_is_read(tmp_path):
 def test_manifest_is_read(shared, tmp_path):
     shutil.copytree(shared / "data" / "mukca" / "panda_2_clean", tmp_path / "panda_2_clean")
     (tmp_path / "capture.toml").write_text(blocks("toml")[0])
-    capture = aj.read_manifest(tmp_path / "capture.toml").capture
+    capture = aj.files.read_manifest(tmp_path / "capture.toml").capture
     assert len(capture.names) == 16
     assert len(capture.lengths) == 8
 
 
 @pytest.mark.parametrize("name", re.findall(r"`(cheng2018-\w+|panda|iiwa14)`", README))
 def test_named_arms_ship(name):
-    assert name in aj.shipped_arms()
+    assert name in aj.files.shipped_arms()

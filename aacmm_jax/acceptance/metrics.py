@@ -13,12 +13,12 @@ from jaxtyping import Float
 from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError
 from ..data.capture import ReferenceLength
-from ..data.recording import ProbedSphere
+from ..data.sphere import ProbedSphere
 from ..kinematics.workspace import Reach
 from .decision import Decision, worst
 from .spheres import enclosing_sphere, fit_sphere, points_of
 
-FIGURES = {
+METRICS = {
     "Deltam": "largest half range of a coordinate in a socket",
     "Length": "largest deviation of a length",
     "Length_Range": "largest less smallest deviation of lengths",
@@ -48,8 +48,8 @@ class Part(NamedTuple):
     decision: Decision | None = None  # None without a limit
 
 
-class Figure(NamedTuple):
-    """One figure of a test; its name is a key of `FIGURES`."""
+class Metric(NamedTuple):
+    """One figure of a test; its name is a key of `METRICS`."""
 
     name: str
     parts: tuple[Part, ...]
@@ -86,7 +86,7 @@ class AcceptanceTest(NamedTuple):
 
     standard: str
     title: str
-    figures: tuple[Figure, ...]
+    figures: tuple[Metric, ...]
     missing: tuple[str, ...]
 
     @property

@@ -8,15 +8,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.errors import InputError
+from ..core.units import ARCSEC
 from ..data.capture import Capture, ReferenceLength
-from ..data.noise import ARCSEC
-from ..data.recording import ArmSpecification, ProbedSphere, Recording, SphereTest
-from ..data.simulation import limits_of
-from ..kinematics.arm import Arm, is_single
-from ..kinematics.independence import moved_onto
-from ..kinematics.workspace import Reach, reach_of
-from ..planning.placement import lowest, poses_at
-from ..uncertainty.volume import check_lengths
+from ..data.recording import Recording
+from ..data.sphere import ProbedSphere, SphereTest
+from ..kinematics.arm import Arm, is_single, joint_limits
+from ..kinematics.inverse_kinematics import project_to_targets
+from ..kinematics.specification import ArmSpecification
+from ..kinematics.workspace import Reach, arm_reach, configurations_at, lowest_point
+from ..uncertainty.volume import sample_lengths
 from .suite import BARS, POSITIONS, REPEATS, SPAT_POSES, UNI_LENGTHS, UNI_LONGEST, UNI_POSITIONS, ZONES, percent
 
 Standard = Literal["asme", "iso"]
@@ -72,7 +72,7 @@ class Procedure(NamedTuple):
         return sum(len(item.q) for item in (*self.sockets, *self.touches))
 
 
-def acceptance_procedure(
+def plan_procedure(
     arm: Arm,
     standard: Standard,
     *,
@@ -96,12 +96,12 @@ def acceptance_procedure(
         raise InputError("acceptance_procedure takes one arm, not a batch; take one of it first.")
     if not (diameter > 0 and stylus >= 0 and math.isfinite(diameter + stylus)):
         raise InputError(f"a sphere of {diameter:g} mm and a stylus of {stylus:g} mm cannot be; give a positive diameter.")
-    allowed = np.asarray(limits_of(arm, None))
+    allowed = np.asarray(joint_limits(arm, None))
     if not (math.isfinite(margin) and 0 <= margin < np.min(allowed[:, 1] - allowed[:, 0]) / 2):
         raise InputError(
             f"a margin of {math.degrees(margin):g} deg leaves a joint no room within its limits; give a smaller one."
         )
-    reach = reach_of(arm)
+    reach = arm_reach(arm)
     if reach.radius < 10 * diameter:
         raise InputError(
             f"an arm that reaches {reach.radius:.0f} mm is too small for a sphere of {diameter:g} mm; give a smaller one."
@@ -165,7 +165,7 @@ class _Room(NamedTuple):
         inside = inside[np.argsort(off)[: 4 * _TRIED]]
         points = inside[self.random.permutation(len(inside))[:_TRIED]]
         if len(points):
-            q, owner = poses_at(self, points, _STARTS)
+            q, owner = configurations_at(self, points, _STARTS)
             counts = np.bincount(owner, minlength=len(points))
             if counts.max() >= SPAT_POSES:
                 best = int(counts.argmax())
@@ -224,8 +224,8 @@ def _iso(room: _Room, diameter: float, stylus: float, bars: list[float]) -> tupl
 
 def _bars(room: _Room, name: str, length: float, positions: int, repeats: int, test: str) -> tuple[list, list]:
     """Both ends of a bar in positions that differ much in place and direction, each end in as many poses as there are repeats."""
-    start, end = check_lengths(room.arm, 300, length=length, limits=room.limits, seed=int(room.random.integers(2**31)))
-    good = np.minimum(lowest(room.arm, start), lowest(room.arm, end)) >= room.above
+    start, end = sample_lengths(room.arm, 300, length=length, limits=room.limits, seed=int(room.random.integers(2**31)))
+    good = np.minimum(lowest_point(room.arm, start), lowest_point(room.arm, end)) >= room.above
     start, end = start[good], end[good]
     if len(start) < positions:
         raise InputError(
@@ -243,7 +243,7 @@ def _bars(room: _Room, name: str, length: float, positions: int, repeats: int, t
         for label, q, tip in zip(labels, (start, end), tips, strict=True):
             poses = q[row : row + 1]
             if repeats > 1:
-                others, _ = poses_at(room, tip[row : row + 1], _STARTS)
+                others, _ = configurations_at(room, tip[row : row + 1], _STARTS)
                 poses = np.concatenate([poses, others])
                 poses = poses[_spread(poses, repeats)] if len(poses) >= repeats else np.resize(poses, (repeats, poses.shape[1]))
             items.append(Item(test, label, 1, np.tile(tip[row], (len(poses), 1)), poses))
@@ -265,7 +265,7 @@ def _touched(room: _Room, sphere: Artefact, test: str, count: int, number: int, 
     """Poses that touch a sphere from outside; for an orientation all with the probe in about one direction of its own."""
     normals = _pattern(count)
     points = sphere.centre + (sphere.diameter + sphere.stylus) / 2 * normals
-    q, owner = poses_at(room, points, 3 * _STARTS)
+    q, owner = configurations_at(room, points, 3 * _STARTS)
     towards = np.asarray(room.arm.pose(q))[:, :3, :3] @ np.asarray(room.arm.probe)
     size = np.linalg.norm(towards, axis=1, keepdims=True)
     towards = np.divide(towards, size, out=np.zeros_like(towards), where=size > 0)
@@ -288,7 +288,7 @@ def _touched(room: _Room, sphere: Artefact, test: str, count: int, number: int, 
     return Item(test, sphere.name, number, points, q[rows])
 
 
-def record_procedure(
+def simulate_procedure(
     procedure: Procedure,
     nominal: ArmSpecification,
     true: ArmSpecification,
@@ -310,7 +310,7 @@ def record_procedure(
 
     def read(item: Item, seat: float) -> np.ndarray:
         targets = item.points + seat * random.normal(size=item.points.shape)
-        q, arrived = moved_onto(true.arm, item.q, targets)
+        q, arrived = project_to_targets(true.arm, item.q, targets)
         if not np.all(arrived):
             raise InputError(
                 f"{item.test} '{item.name}': the true arm does not reach it; let it differ less from the nominal one."
@@ -328,3 +328,6 @@ def record_procedure(
         size = sizes.setdefault(sphere.name, sphere.diameter + u_diameter * random.normal())
         spheres.append(ProbedSphere(sphere.name, sphere.test, groups, size, u_diameter, sphere.stylus))
     return Recording(Capture(sockets, lengths), nominal, true, seed, tuple(spheres))
+
+
+TITLES = {"asme": "ASME B89.4.22", "iso": "ISO 10360-12"}

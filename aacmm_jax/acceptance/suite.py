@@ -15,15 +15,16 @@ from jaxtyping import Float
 
 from ..core.errors import InputError, nearest
 from ..data.capture import ReferenceLength
-from ..data.recording import ProbedSphere, Recording, checked_sphere
+from ..data.recording import Recording
+from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import Reach as Reach
-from ..kinematics.workspace import reach_of
+from ..kinematics.workspace import arm_reach
 from .decision import Limit, decide
-from .metrics import FIGURES as FIGURES
+from .metrics import METRICS as FIGURES
 from .metrics import AcceptanceTest as AcceptanceTest
-from .metrics import Figure as Figure
 from .metrics import Measured as Measured
+from .metrics import Metric as Figure
 from .metrics import Part as Part
 from .metrics import articulated_location as articulated_location
 from .metrics import form_error as form_error
@@ -53,7 +54,7 @@ def measured_by(arm: Arm, recording: Recording) -> Measured:
         sphere._replace(groups=tuple(np.asarray(arm.position(group)) for group in sphere.groups))
         for sphere in recording.spheres
     )
-    return Measured(sockets, recording.capture.lengths, spheres, reach_of(arm))
+    return Measured(sockets, recording.capture.lengths, spheres, arm_reach(arm))
 
 
 def unstated(tests: Sequence[AcceptanceTest]) -> list[str]:
@@ -62,7 +63,7 @@ def unstated(tests: Sequence[AcceptanceTest]) -> list[str]:
     return [figure.name for figure in figures if figure.decision is not None and figure.worst.expanded == 0]
 
 
-def accept(measured: Measured, limits: Mapping[str, Limit | float] | None = None, u_test: float = 0.0) -> list[AcceptanceTest]:
+def run(measured: Measured, limits: Mapping[str, Limit | float] | None = None, u_test: float = 0.0) -> list[AcceptanceTest]:
     """Every test that the measured points allow.
 
     ``limits``: MPE by the name of a figure (a key of `FIGURES`), a `Limit` or a number of mm. ``u_test``: standard uncertainty, mm, that the
@@ -220,7 +221,7 @@ def asme_diameter(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | N
 
 def asme_single_point(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None:
     """ASME B89.4.22-2004, single-point articulation (SPAT): a socket in each of three zones of the reach (0 to 20, 20 to 80, 80 to 100 %),
-    10 articulations in each; a socket of fewer is not looked at. Background knowledge; distances are from the shoulder (see `reach_of`)."""
+    10 articulations in each; a socket of fewer is not looked at. Background knowledge; distances are from the shoulder (see `arm_reach`)."""
     largest, spread, seen = [], [], set()
     for name, points in measured.tested.items():
         if len(points) < SPAT_POSES:

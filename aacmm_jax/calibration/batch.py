@@ -6,7 +6,7 @@ The batch is cut into chunks, which are spread over devices and cores; `lanes` s
 import math
 import os
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal, NamedTuple
 
@@ -20,12 +20,14 @@ from ..core.arrays import Numbers, as_array
 from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.noise import Noise
-from ..kinematics.arm import Arm, replace
-from ..kinematics.parameters import Parameters, is_length
+from ..kinematics.arm import Arm, is_length, replace
+from ..kinematics.parameters import Parameters
+from ..model.measurement import check_joints
 from ..solver.levenberg_marquardt import Reason, reasons
 from .batch_kernel import Problems, Shape, solve_chunk
-from .checks import check_enough, check_fit, held_length
+from .checks import check_enough
 from .results import converged
+from .scale_anchor import scale_anchor
 
 # Lanes per loop. On a CPU the columns of all lanes should fit the second-level cache (measured from 20 to 7,000 poses: five
 # times slower where they do not); a GPU wants thousands.
@@ -152,14 +154,6 @@ def calibrate_many(
     return ManyCalibrations(joint.parameters, k, joint.de, joint.deltam, steps, joint.result, joint.active, stage1, method)
 
 
-def stack_captures(captures: Iterable[Capture]) -> Capture:
-    """A batch of captures of the same shape (sockets, poses, lengths) for `identify_many`."""
-    captures = list(captures)
-    if len({(c.names, c.sizes, tuple((r.start, r.end) for r in c.lengths), c.joints) for c in captures}) != 1:
-        raise InputError("captures of a batch must have the same sockets, numbers of poses, joints and lengths.")
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *captures)
-
-
 class _Effort(NamedTuple):
     """How much is computed at a time, and where."""
 
@@ -201,8 +195,8 @@ class _Work(NamedTuple):
         if space is None:
             space = Parameters.free_of(arm)
         problems, batched, size = _problems(arm, capture, lower, upper, start, space)
-        hold = held_length(space, arm, hold)
-        check_fit(capture, space)
+        hold = scale_anchor(space, arm, hold)
+        check_joints(capture, space)
         if noise is not None:
             noise.check(arm.joints)
         check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
@@ -216,7 +210,7 @@ class _Work(NamedTuple):
         shape = Shape(
             sizes=capture.sizes,
             ends=tuple((int(a), int(b)) for a, b in capture.ends()),
-            entries=space.entries(),
+            entries=space.indices(),
             kept=tuple(name != hold for name in space.names),
             scale=tuple(np.asarray(space.scale).tolist()),
             batched=batched,

@@ -15,14 +15,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..data.noise import Noise, tip_covariances
-from ..kinematics.chain import Geometry, Turns, turns_of, walk
-from ..kinematics.parameters import placed
+from ..kinematics.arm import with_values
+from ..kinematics.chain import Geometry, SinesCosines, forward_pass, sines_cosines
+from ..model.measurement import LEAST_SIGMA, Measurement, length_covariance
 from ..model.metrics import repeatability
-from ..model.residuals import Measurement, Weighing, model_of
+from ..model.residuals import JointWeights, model_of
 from ..model.scale import scale_of
 from ..model.weights import Weights
 from ..solver.levenberg_marquardt import Box, Reason, advance, begin, choose, either, numbers_of, reasons
-from ..uncertainty.covariance import LEAST_SIGMA, length_covariance
 from .stages import SOLVER
 
 
@@ -64,12 +64,12 @@ class _Ended(NamedTuple):
 @partial(jax.jit, static_argnames=("shape", "room"))
 def solve_chunk(problems: Problems, count: Int[Array, ""], noise: Noise | None, shape: Shape, room: int) -> tuple[Array, ...]:
     """Solve the first ``count`` of ``room`` problems: parameters, DE, Deltam, k, steps, reasons, active bounds."""
-    batch = _Batch(problems, turns_of(problems.q), None, None)
+    batch = _Batch(problems, sines_cosines(problems.q), None, None)
     start = jnp.broadcast_to(problems.start, (room, len(shape.kept)))
     if noise is not None:
         batch = batch._replace(weights=_by_groups(partial(_weights, noise), batch, start, shape))
     if shape.joint:
-        batch = batch._replace(weighing=_by_groups(_weighing, batch, start, shape))
+        batch = batch._replace(joint_weights=_by_groups(_joint_weights, batch, start, shape))
     ended = _work_off(batch, shape, count, room)
     de, deltam, k, active = _by_groups(_figures, batch, ended.parameters, shape)
     return ended.parameters, de, deltam, k, ended.steps, numbers_of(ended.reason), active
@@ -79,15 +79,17 @@ class _Batch(NamedTuple):
     """A chunk, or a group of lanes taken from it."""
 
     problems: Problems
-    turns: Turns
+    sines_cosines: SinesCosines
     weights: Weights | None  # of poses, where the noise is given
-    weighing: tuple[Array, Array] | None  # of a joint solve: sigma and whitening
+    joint_weights: tuple[Array, Array] | None  # of a joint solve: sigma and whitening
 
     def taken(self, shape: Shape, index: Int[Array, " w"]) -> "_Batch":
         """The problems of an index, one a lane."""
-        turns = (self.turns[0][:, index], self.turns[1][:, index]) if shape.batched.q else self.turns
-        rest = jax.tree.map(lambda leaf: leaf[index], (self.weights, self.weighing))
-        return _Batch(_taken(self.problems, shape, index), turns, *rest)
+        sines_cosines = (
+            (self.sines_cosines[0][:, index], self.sines_cosines[1][:, index]) if shape.batched.q else self.sines_cosines
+        )
+        rest = jax.tree.map(lambda leaf: leaf[index], (self.weights, self.joint_weights))
+        return _Batch(_taken(self.problems, shape, index), sines_cosines, *rest)
 
 
 def _taken(problems: Problems, shape: Shape, index: Int[Array, " w"]) -> Problems:
@@ -126,8 +128,8 @@ def _work_off(batch: _Batch, shape: Shape, count: Int[Array, ""], room: int) -> 
         part = batch.taken(shape, index)
         problems = part.problems
         geometry = _with_parameters(problems.geometry, problems.start.at[:, kept].set(trial), shape.entries)
-        weighing = None if part.weighing is None else Weighing(shape.ends, problems.nominal, *part.weighing)
-        return model_of(geometry, part.turns, shape.sizes, entries, weighing, part.weights)
+        joint_weights = None if part.joint_weights is None else JointWeights(shape.ends, problems.nominal, *part.joint_weights)
+        return model_of(geometry, part.sines_cosines, shape.sizes, entries, joint_weights, part.weights)
 
     def more(carry) -> Bool[Array, ""]:
         _, index, _, _ = carry
@@ -162,18 +164,18 @@ def _work_off(batch: _Batch, shape: Shape, count: Int[Array, ""], room: int) -> 
 
 def _with_parameters(rows: Geometry, vector: Float[Array, "w p"], entries: tuple[tuple[str, int], ...]) -> Geometry:
     """Geometry of every lane ``(w, 1, n)`` with its free parameters from ``vector``; the axis of ones is for the poses."""
-    return jax.tree.map(lambda leaf: leaf[:, None, :], rows._replace(**placed(rows, vector, entries)))
+    return jax.tree.map(lambda leaf: leaf[:, None, :], rows._replace(**with_values(rows, vector, entries)))
 
 
 def _tips(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> Float[Array, "w N 3"]:
     geometry = _with_parameters(part.problems.geometry, parameters, shape.entries)
-    return jnp.swapaxes(walk(geometry, part.turns).tip, -1, -2)
+    return jnp.swapaxes(forward_pass(geometry, part.sines_cosines).tip, -1, -2)
 
 
 def _measurement(nominal: Float[Array, " l"], u: Float[Array, " l"], weights: Weights | None, shape: Shape) -> Measurement:
     """The lengths of one problem; its poses are known by their tips already."""
     empty = jnp.zeros((sum(shape.sizes), 1))
-    return Measurement(empty, turns_of(empty), nominal, u, shape.sizes, shape.ends, weights)
+    return Measurement(empty, sines_cosines(empty), nominal, u, shape.sizes, shape.ends, weights)
 
 
 def _figures(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> tuple[Array, ...]:
@@ -194,18 +196,18 @@ def _figures(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> tup
 def _weights(noise: Noise, part: _Batch, start: Float[Array, "w p"], shape: Shape) -> Weights:
     """Weights of poses by the noise, in the arm at the start of one group of lanes."""
     geometry = _with_parameters(part.problems.geometry, start, shape.entries)
-    return Weights.of(tip_covariances(geometry, part.turns, noise), shape.sizes)
+    return Weights.of(tip_covariances(geometry, part.sines_cosines, noise), shape.sizes)
 
 
-def _weighing(part: _Batch, start: Float[Array, "w p"], shape: Shape) -> tuple[Array, Array]:
+def _joint_weights(part: _Batch, start: Float[Array, "w p"], shape: Shape) -> tuple[Array, Array]:
     """What weighs poses and lengths in a joint solve, from the scatter at its start: sigma and whitening of every lane."""
 
-    def weighing(t: Array, value: Array, uncertainty: Array, weights: Weights | None) -> tuple[Array, Array]:
+    def joint_weights(t: Array, value: Array, uncertainty: Array, weights: Weights | None) -> tuple[Array, Array]:
         figures = repeatability(t, shape.sizes, fitted=shape.fitted)
         sigma = jnp.maximum(figures.sigma, LEAST_SIGMA)
         measurement = _measurement(value, uncertainty, weights, shape)
-        spread = length_covariance(measurement.centroids(t), measurement, sigma)
+        covariance = length_covariance(measurement.centroids(t), measurement, sigma)
         counted = sigma if weights is None else jnp.ones_like(sigma)
-        return counted, jnp.linalg.inv(jnp.linalg.cholesky(spread))
+        return counted, jnp.linalg.inv(jnp.linalg.cholesky(covariance))
 
-    return jax.vmap(weighing)(_tips(part, start, shape), part.problems.nominal, part.problems.u, part.weights)
+    return jax.vmap(joint_weights)(_tips(part, start, shape), part.problems.nominal, part.problems.u, part.weights)

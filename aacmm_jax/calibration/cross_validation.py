@@ -10,11 +10,12 @@ from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm
-from ..kinematics.chain import turns_of
+from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Bounds
-from ..model.residuals import averaging_matrix
-from ..uncertainty.volume import Uncertainty, uncertainty_of
+from ..model.measurement import averaging_matrix
+from ..uncertainty.arm_uncertainty import Uncertainty
 from .evaluation import evaluate
+from .record import uncertainty_of
 from .results import CrossValidation, LeftOut
 from .stages import calibrate
 
@@ -99,8 +100,8 @@ def predicted_errors(uncertainty: Uncertainty, capture: Capture) -> tuple[Float[
     averaging = averaging_matrix(capture.sizes)
     means = np.einsum("sN,Ncp->scp", averaging, slopes)
     centred = slopes - means[owner]
-    reading = np.asarray(tip_covariances(arm.geometry, turns_of(capture.q), uncertainty.noise))
-    squares = np.trace(np.asarray(uncertainty.spread_of(jnp.asarray(centred))), axis1=1, axis2=2)
+    reading = np.asarray(tip_covariances(arm.geometry, sines_cosines(capture.q), uncertainty.noise))
+    squares = np.trace(np.asarray(uncertainty.covariance_of_functions(jnp.asarray(centred))), axis1=1, axis2=2)
     squares = squares + np.einsum("ccN->N", reading) * (1 - 1 / sizes[owner])
     scattered = sizes[owner] > 1
     centroids = averaging @ np.asarray(arm.position(capture.q))
@@ -111,5 +112,5 @@ def predicted_errors(uncertainty: Uncertainty, capture: Capture) -> tuple[Float[
     of_means = np.einsum("sN,cdN->scd", averaging**2, reading)
     scatter = np.einsum("lc,lcd,ld->l", direction, of_means[ends[:, 0]] + of_means[ends[:, 1]], direction)
     own = np.array([float(length.u) for length in capture.lengths])
-    variance = np.asarray(uncertainty.spread_of(jnp.asarray(along[:, None, :])))[:, 0, 0] + scatter + own**2
+    variance = np.asarray(uncertainty.covariance_of_functions(jnp.asarray(along[:, None, :])))[:, 0, 0] + scatter + own**2
     return jnp.sqrt(jnp.asarray(squares[scattered].mean() if scattered.any() else np.nan)), jnp.asarray(np.sqrt(variance))

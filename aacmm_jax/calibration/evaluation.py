@@ -7,9 +7,8 @@ from jaxtyping import Array, Float
 from ..core.errors import InputError
 from ..data.capture import Capture
 from ..kinematics.arm import Arm
+from ..model.measurement import Measurement, length_covariance
 from ..model.metrics import Repeatability, repeatability
-from ..model.residuals import Measurement
-from ..uncertainty.covariance import length_covariance
 
 
 class Evaluation(eqx.Module):

@@ -15,7 +15,7 @@ from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import Repeatability
 from ..model.scale import Scale
 from ..solver.levenberg_marquardt import Reason, numbers_of
-from ..uncertainty.covariance import Covariance, Form
+from ..uncertainty.covariance import NoiseModel, ParameterCovariance
 
 _GOOD = [int(reason._value) for reason in (Reason.gradient, Reason.step, Reason.rounding)]  # pyright: ignore
 
@@ -35,30 +35,32 @@ class Identification(eqx.Module):
     result: Reason  # why it ended
     optimality: Float[Array, ""]  # projected gradient as a cosine; 0 at a minimum
     scale: Scale | None  # k of this arm, where the capture holds reference lengths
-    spread: Covariance  # with the scale as it was held; rows of active and held parameters are 0
+    parameter_covariance: ParameterCovariance  # with the scale as it was held; rows of active and held parameters are 0
     before: Repeatability  # the start
     after: Repeatability
     # Root mean square of the residuals in units of what the given noise predicts (1 where it is right); None without.
-    misfit: Float[Array, ""] | None
+    reduced_chi: Float[Array, ""] | None
     bounds: Bounds
     hold: str | None = eqx.field(static=True)
-    form: Form = eqx.field(static=True)  # what the covariance takes errors of tips for
-    freedom: float = eqx.field(static=True)  # degrees of freedom behind the covariance; infinite where the noise was given
+    noise_model: NoiseModel = eqx.field(static=True)  # what the covariance takes errors of tips for
+    degrees_of_freedom: float = eqx.field(
+        static=True
+    )  # degrees of freedom behind the covariance; infinite where the noise was given
 
     @property
     def covariance(self) -> Float[Array, "*lanes p p"]:
         """Covariance of the parameters; that of what is determined, where not all is."""
-        return self.spread.matrix
+        return self.parameter_covariance.matrix
 
     @property
     def determined(self) -> Bool[Array, "*lanes p"]:
         """Which parameters are determined one by one, and not only in combination with others."""
-        return self.spread.determined
+        return self.parameter_covariance.determined
 
     @property
     def noise(self) -> Noise:
         """Noise of readings and seat: as given, or as estimated from the residuals."""
-        return self.spread.noise
+        return self.parameter_covariance.noise
 
     @property
     def space(self) -> Parameters:
@@ -86,7 +88,7 @@ class Calibration(eqx.Module):
     active: Int[Array, " p"]
     steps: Int[Array, ""]
     result: Reason
-    spread: Covariance
+    parameter_covariance: ParameterCovariance
     before: Repeatability
     after: Repeatability
     length_before: Float[Array, " l"]  # measured reference lengths, mm: at the start
@@ -97,27 +99,27 @@ class Calibration(eqx.Module):
     @property
     def covariance(self) -> Float[Array, "*lanes p p"]:
         """Covariance of the parameters; that of what is determined, where not all is."""
-        return self.spread.matrix
+        return self.parameter_covariance.matrix
 
     @property
     def determined(self) -> Bool[Array, "*lanes p"]:
         """Which parameters are determined one by one, and not only in combination with others."""
-        return self.spread.determined
+        return self.parameter_covariance.determined
 
     @property
     def noise(self) -> Noise:
         """Noise of readings and seat: as given, or as estimated from the residuals."""
-        return self.spread.noise
+        return self.parameter_covariance.noise
 
     @property
-    def form(self) -> Form:
+    def noise_model(self) -> NoiseModel:
         """What the covariance takes errors of tips for."""
-        return self.stage1.form
+        return self.stage1.noise_model
 
     @property
-    def freedom(self) -> float:
+    def degrees_of_freedom(self) -> float:
         """Degrees of freedom behind the covariance; infinite where the noise was given."""
-        return self.stage1.freedom
+        return self.stage1.degrees_of_freedom
 
     @property
     def space(self) -> Parameters:

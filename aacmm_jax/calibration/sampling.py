@@ -13,11 +13,12 @@ from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
-from ..kinematics.independence import settled
+from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..model.scale import divide_lengths
-from ..uncertainty.volume import check_lengths, default_length, uncertainty_of
+from ..uncertainty.volume import default_length, sample_lengths
 from .batch import calibrate_many
+from .record import uncertainty_of
 from .results import Calibration
 
 _LENGTHS = 24  # lengths over the volume that are followed besides the parameters and k
@@ -121,8 +122,12 @@ def monte_carlo(
         for count in _slices(block, exact.size):
             # Noise estimated with few degrees of freedom is itself uncertain: its scale is drawn too, which gives Student's t
             # (JCGM 101, 6.4.9).
-            known = math.isinf(result.freedom)
-            level_of = 1.0 if known else np.sqrt(result.freedom / random.chisquare(result.freedom, size=(count, 1, 1)))
+            known = math.isinf(result.degrees_of_freedom)
+            level_of = (
+                1.0
+                if known
+                else np.sqrt(result.degrees_of_freedom / random.chisquare(result.degrees_of_freedom, size=(count, 1, 1)))
+            )
             seats = float(noise.seating) * level_of * random.normal(size=(count, *exact.shape[:1], 3))
             readings = exact + np.einsum("Nic,tNc->tNi", moves, seats)
             readings += np.asarray(noise.encoder) * level_of * random.normal(size=readings.shape)
@@ -184,13 +189,13 @@ def _slices(block: int, numbers: int) -> list[int]:
 
 def _exact(arm: Arm, capture: Capture) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n 3"]]:
     """Poses that hold their socket exactly, and the least change of the joints for each mm that the tip shall move."""
-    q = settled(arm, capture)
+    q = project_to_centroids(arm, capture)
     by_joints = np.asarray(arm.jacobian(q, [f"q_{i}" for i in range(1, arm.joints + 1)]))
     return q, np.linalg.pinv(by_joints, rcond=1e-8)
 
 
 def _lengths_by(arm: Arm, capture: Capture) -> np.ndarray:
-    tips = np.asarray(arm.position(settled(arm, capture)))
+    tips = np.asarray(arm.position(project_to_centroids(arm, capture)))
     first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
     ends = capture.ends()
     return np.linalg.norm(tips[first[ends[:, 0]]] - tips[first[ends[:, 1]]], axis=1)
@@ -211,14 +216,14 @@ class _Task(NamedTuple):
             len(lengths) != 2 or np.ndim(lengths[0]) != 2 or np.shape(lengths[0]) != np.shape(lengths[1])
         ):
             raise InputError("lengths must be two arrays of poses, (v, n) each: where each length starts, and where it ends.")
-        start, end = lengths or check_lengths(result.arm, _LENGTHS, length=default_length(result.arm))
+        start, end = lengths or sample_lengths(result.arm, _LENGTHS, length=default_length(result.arm))
         u = np.array([float(length.u) for length in capture.lengths])
         return cls(result, capture, np.asarray(start), np.asarray(end), u)
 
     def solved(self, q: Float[np.ndarray, "t N n"], values: Float[np.ndarray, "t l"]) -> tuple[np.ndarray, int]:
         """Outputs of the trials that converged ``(t, q)``, and how many did not."""
         result = self.result
-        given = None if result.stage1.misfit is None else result.noise  # weighed as the calibration was
+        given = None if result.stage1.reduced_chi is None else result.noise  # weighed as the calibration was
         many = calibrate_many(
             result.stage1.arm,
             batch_of(self.capture, q, values),
@@ -286,5 +291,5 @@ def batch_of(capture: Capture, q: Float[np.ndarray, "t N n"], values: Float[np.n
     """A batch of captures like this one with other readings and certified lengths; nothing is checked."""
     names = range(len(capture.lengths))
     leaves = lambda c: [c.q, *(c.lengths[i].value for i in names), *(c.lengths[i].u for i in names)]  # noqa: E731
-    spread = [jnp.asarray(np.broadcast_to(np.asarray(length.u), len(q))) for length in capture.lengths]
-    return eqx.tree_at(leaves, capture, [jnp.asarray(q), *(jnp.asarray(values[:, i]) for i in names), *spread])
+    covariance = [jnp.asarray(np.broadcast_to(np.asarray(length.u), len(q))) for length in capture.lengths]
+    return eqx.tree_at(leaves, capture, [jnp.asarray(q), *(jnp.asarray(values[:, i]) for i in names), *covariance])

@@ -15,16 +15,18 @@ from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm, is_single
 from ..kinematics.parameters import Bounds, Parameters
+from ..model.measurement import Measurement, check_joints
 from ..model.metrics import repeatability
-from ..model.residuals import Measurement, joint_model, joint_residual, repeatability_model, repeatability_residual
+from ..model.residuals import joint_model, joint_residual, repeatability_model, repeatability_residual
 from ..model.scale import divide_lengths
 from ..solver.bounded import BoundedLevenbergMarquardt, least_squares
 from ..solver.levenberg_marquardt import Reason
 from ..uncertainty import propagation
-from ..uncertainty.covariance import Covariance, Form, freedom_of
-from ..uncertainty.identifiability import observe
-from .checks import based_on, check_enough, check_fit, check_form, check_start, held_length
+from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
+from ..uncertainty.identifiability import observability
+from .checks import based_on, check_enough, check_noise_model, check_start
 from .results import Calibration, Identification
+from .scale_anchor import scale_anchor
 
 # The boxes of this problem are small against its curvature, so the first steps can be nearly Gauss-Newton's.
 SOLVER = BoundedLevenbergMarquardt(rtol=1e-13, initial_damping=1e-6)
@@ -39,7 +41,7 @@ def identify(
     hold: str | None = "longest",
     start: Numbers | None = None,
     noise: Noise | None = None,
-    form: Form | None = None,
+    noise_model: NoiseModel | None = None,
     max_steps: int = _MAX_STEPS,
 ) -> Identification:
     """Stage 1: the parameters that make the poses of every socket agree, within bounds.
@@ -57,7 +59,7 @@ def identify(
     leave open, such as the scale of noise-free data with nothing held). Failure to converge is
     data (``result``). Raises `InputError` for too few poses, a start outside the box, or names that do not fit.
     """
-    return _identify(_checked(arm, capture, bounds, start, noise, hold, form, max_steps))
+    return _identify(_checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps))
 
 
 def _checked(
@@ -67,18 +69,18 @@ def _checked(
     start: Numbers | None,
     noise: Noise | None,
     hold: str | None,
-    form: Form | None,
+    noise_model: NoiseModel | None,
     max_steps: int,
 ) -> "_Task":
     space = bounds.space
     vector = space.vector(arm) if start is None else as_array(start, "the start")
-    check_fit(capture, space)
+    check_joints(capture, space)
     check_start(bounds, vector, "the start" if start is not None else "the arm")
     # Repeatability does not see the scale: where lengths are free, it determines one parameter less.
     check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
-    form = check_form(form, noise, arm.joints)
-    hold = held_length(space, arm, hold)
-    return _Task(based_on(space, arm), Measurement.of(capture), bounds, vector, noise, hold, form, max_steps)
+    noise_model = check_noise_model(noise_model, noise, arm.joints)
+    hold = scale_anchor(space, arm, hold)
+    return _Task(based_on(space, arm), Measurement.of(capture), bounds, vector, noise, hold, noise_model, max_steps)
 
 
 def calibrate(
@@ -90,7 +92,7 @@ def calibrate(
     hold: str | None = "longest",
     start: Numbers | None = None,
     noise: Noise | None = None,
-    form: Form | None = None,
+    noise_model: NoiseModel | None = None,
     strict: bool = False,
     max_steps: int = _MAX_STEPS,
 ) -> Calibration:
@@ -109,7 +111,7 @@ def calibrate(
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, from Python, identify for stage 1 alone)."
         )
-    task = _checked(arm, capture, bounds, start, noise, hold, form, max_steps)
+    task = _checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps)
     _check_identifiable(arm, capture, bounds, strict)
     return _calibrate(task, method)
 
@@ -119,7 +121,7 @@ def _check_identifiable(arm: Arm, capture: Capture, bounds: Bounds, strict: bool
     # Inside jit or vmap even what is constant becomes a tracer once JAX computes with it.
     if not is_single(arm) or not is_concrete(jnp.negative(0.0), *jax.tree.leaves((arm, capture, bounds))):
         return
-    sentences = observe(arm, capture, bounds.space).sentences()
+    sentences = observability(arm, capture, bounds.space).sentences()
     if sentences and strict:
         raise InputError(" ".join(sentences))
     for sentence in sentences:
@@ -135,7 +137,7 @@ class _Task(NamedTuple):
     start: Float[Array, " p"]
     noise: Noise | None
     hold: str | None
-    form: Form
+    noise_model: NoiseModel
     max_steps: int
 
 
@@ -146,7 +148,7 @@ def _identify(task: _Task) -> Identification:
 
 def _stage1(task: _Task) -> tuple[Identification, propagation.Propagated]:
     space, bounds, start, hold = task.space, task.bounds, task.start, task.hold
-    measurement = task.measurement.weighed(space.arm(start).geometry, task.noise)
+    measurement = task.measurement.weighted(space.arm(start).geometry, task.noise)
     kept = np.array([name != hold for name in space.names])
     index = jnp.asarray(np.flatnonzero(kept))
     reduced = Parameters(base=space.arm(start), names=tuple(name for name in space.names if name != hold))
@@ -168,7 +170,7 @@ def _stage1(task: _Task) -> tuple[Identification, propagation.Propagated]:
     after = repeatability(tips, measurement.sizes, fitted=int(kept.sum()))
     active = jnp.where(jnp.asarray(kept), bounds.active(parameters), 0)
     fixed = (active != 0) | ~jnp.asarray(kept)
-    propagated = propagation.of_solve(identified, space, measurement, fixed, after.sigma, task.form, task.noise)
+    propagated = propagation.propagate_solve(identified, space, measurement, fixed, after.sigma, task.noise_model, task.noise)
     identification = Identification(
         arm=identified,
         parameters=parameters,
@@ -178,24 +180,24 @@ def _stage1(task: _Task) -> tuple[Identification, propagation.Propagated]:
         steps=solution.stats["num_steps"],
         result=solution.stats["reason"],
         optimality=solution.stats["optimality"],
-        scale=propagation.scale(tips, measurement, propagated, after.sigma) if measurement.ends else None,
-        spread=propagated.spread,
+        scale=propagation.propagated_scale(tips, measurement, propagated, after.sigma) if measurement.ends else None,
+        parameter_covariance=propagated.parameter_covariance,
         before=repeatability(space.arm(start).position(measurement.q), measurement.sizes),
         after=after,
-        misfit=_misfit(measurement, tips, int(kept.sum())),
+        reduced_chi=_reduced_chi(measurement, tips, int(kept.sum())),
         bounds=bounds,
         hold=hold,
-        form=task.form,
-        freedom=freedom_of(task.form, measurement.sizes, int(kept.sum())),
+        noise_model=task.noise_model,
+        degrees_of_freedom=residual_degrees_of_freedom(task.noise_model, measurement.sizes, int(kept.sum())),
     )
     return identification, propagated
 
 
-def _misfit(measurement: Measurement, tips: Float[Array, "N 3"], fitted: int) -> Float[Array, ""] | None:
+def _reduced_chi(measurement: Measurement, tips: Float[Array, "N 3"], fitted: int) -> Float[Array, ""] | None:
     if measurement.weights is None:
         return None
-    freedom = max(3 * sum(size - 1 for size in measurement.sizes) - fitted, 1)
-    return jnp.sqrt(jnp.sum(measurement.whitened(measurement.centred(tips)) ** 2) / freedom)
+    degrees_of_freedom = max(3 * sum(size - 1 for size in measurement.sizes) - fitted, 1)
+    return jnp.sqrt(jnp.sum(measurement.whitened(measurement.centred(tips)) ** 2) / degrees_of_freedom)
 
 
 @eqx.filter_jit
@@ -204,14 +206,16 @@ def _calibrate(task: _Task, method: str) -> Calibration:
     assert stage1.scale is not None
     space, k = task.space, stage1.scale.value
     arm = space.arm(task.start)
-    measurement = task.measurement.weighed(arm.geometry, task.noise)
+    measurement = task.measurement.weighted(arm.geometry, task.noise)
     if method == "joint":
-        calibrated, parameters, active, steps, result, spread = _joint(arm, stage1, task)
+        calibrated, parameters, active, steps, result, parameter_covariance = _joint(arm, stage1, task)
     else:
         calibrated = divide_lengths(stage1.arm, k)
         parameters, active, steps, result = space.vector(calibrated), stage1.active, stage1.steps, stage1.result
         sigma = stage1.after.sigma
-        spread = propagation.of_division(propagated, stage1.arm, space, measurement, sigma, parameters).spread
+        parameter_covariance = propagation.propagate_division(
+            propagated, stage1.arm, space, measurement, sigma, parameters
+        ).parameter_covariance
     tips = calibrated.position(measurement.q)
     after = repeatability(tips, measurement.sizes, fitted=len(space.names))
     return Calibration(
@@ -223,7 +227,7 @@ def _calibrate(task: _Task, method: str) -> Calibration:
         active=active,
         steps=steps,
         result=result,
-        spread=spread,
+        parameter_covariance=parameter_covariance,
         before=stage1.before,
         after=after,
         length_before=measurement.distances(arm.position(measurement.q)),
@@ -233,18 +237,18 @@ def _calibrate(task: _Task, method: str) -> Calibration:
     )
 
 
-def _joint(arm: Arm, stage1: Identification, task: _Task) -> tuple[Arm, Array, Array, Array, Reason, Covariance]:
+def _joint(arm: Arm, stage1: Identification, task: _Task) -> tuple[Arm, Array, Array, Array, Reason, ParameterCovariance]:
     """One weighted least squares of poses and lengths, from the two-stage result; held parameters stay as given."""
     assert stage1.scale is not None
     space, k = Parameters(arm, stage1.space.names), stage1.scale.value
     # The joint solve waits for stage 1's covariance: see `covariance.inverted`.
-    scaled, _ = jax.lax.optimization_barrier((divide_lengths(stage1.arm, k), stage1.spread.matrix))
-    measurement = task.measurement.weighed(scaled.geometry, task.noise)
-    weighing = propagation.weighing(scaled, measurement, stage1.after.sigma / k)
+    scaled, _ = jax.lax.optimization_barrier((divide_lengths(stage1.arm, k), stage1.parameter_covariance.matrix))
+    measurement = task.measurement.weighted(scaled.geometry, task.noise)
+    joint_weights = propagation.joint_weights(scaled, measurement, stage1.after.sigma / k)
     solution = least_squares(
         joint_residual,
         space.vector(scaled),
-        (space, measurement, weighing.sigma, weighing.whitening),
+        (space, measurement, joint_weights.sigma, joint_weights.whitening),
         lower=stage1.bounds.lower,
         upper=stage1.bounds.upper,
         scale=space.scale,
@@ -256,5 +260,7 @@ def _joint(arm: Arm, stage1: Identification, task: _Task) -> tuple[Arm, Array, A
     stats, active = solution.stats, stage1.bounds.active(solution.value)
     found = space.arm(solution.value)
     sigma = stage1.after.sigma / k
-    spread = propagation.of_solve(found, space, measurement, active != 0, sigma, task.form, task.noise, weighing).spread
-    return found, solution.value, active, stage1.steps + stats["num_steps"], stats["reason"], spread
+    parameter_covariance = propagation.propagate_solve(
+        found, space, measurement, active != 0, sigma, task.noise_model, task.noise, joint_weights
+    ).parameter_covariance
+    return found, solution.value, active, stage1.steps + stats["num_steps"], stats["reason"], parameter_covariance

@@ -7,9 +7,9 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
+from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
-from ..files.administrative_data import NOT_STATED, About, check_conformity, held_by_xml
-from ..files.calibrations import CalibrationRecord
+from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity, held_by_xml
 from ..summaries.warnings import of_calibration, plausible
 from .results import add_results, uncertainty_says
 from .xml import DCC, SI, XSI, contact, identifications, ours, put, software, theirs, written
@@ -26,7 +26,9 @@ class Certified(NamedTuple):
     expanded: float | None
 
 
-def dcc(record: CalibrationRecord, about: About, *, created: str, sources: Sequence[str] = (), command: str = "") -> str:
+def dcc(
+    record: CalibrationRecord, about: AdministrativeData, *, created: str, sources: Sequence[str] = (), command: str = ""
+) -> str:
     """The certificate of a calibration: the text of an XML file in UTF-8.
 
     ``created``: when the calibration was computed (ISO 8601, as calibration files say); ``sources``: names of the files that it
@@ -76,7 +78,7 @@ def _day(created: str) -> datetime.date:
 
 
 def _administrative(
-    data: Element, record: CalibrationRecord, about: About, day: datetime.date, sources: Sequence[str]
+    data: Element, record: CalibrationRecord, about: AdministrativeData, day: datetime.date, sources: Sequence[str]
 ) -> Element:
     """Fill in the administrative data; returns the element for the unique identifier, still empty."""
     software(data, "dccSoftware")
@@ -99,7 +101,7 @@ def _administrative(
     return identifier
 
 
-def _core(core: Element, about: About, day: datetime.date) -> Element:
+def _core(core: Element, about: AdministrativeData, day: datetime.date) -> Element:
     given = about.certificate
     begin = given.begin or given.end or day
     end = given.end or max(day, begin)
@@ -123,7 +125,7 @@ def _core(core: Element, about: About, day: datetime.date) -> Element:
     return identifier
 
 
-def _persons(persons: Element, about: About) -> None:
+def _persons(persons: Element, about: AdministrativeData) -> None:
     for person in about.person:
         element = put(persons, "respPerson")
         theirs(put(element, "person"), "name", person.name)
@@ -134,7 +136,7 @@ def _persons(persons: Element, about: About) -> None:
         ours(put(put(persons, "respPerson"), "person"), "name", NOT_STATED)
 
 
-def _statements(statements: Element, record: CalibrationRecord, about: About, sources: Sequence[str]) -> None:
+def _statements(statements: Element, record: CalibrationRecord, about: AdministrativeData, sources: Sequence[str]) -> None:
     if record.recording.true is not None:
         _state(statements, "Simulation", "The readings are simulated, so this is no certificate of a real arm.")
     _state(
@@ -168,7 +170,7 @@ def _state(statements: Element, name: str, text: str, *, norm: str | None = None
     return statement
 
 
-def values_of_dcc(text: str) -> dict[tuple[str, ...], Certified]:
+def parse_dcc(text: str) -> dict[tuple[str, ...], Certified]:
     """The single values (``si:real``) among the results of a DCC, by the names of measurement result, result, list and quantity.
 
     Such as ``("As left", "Denavit-Hartenberg parameters", "a_2")``. Where several stand under one path, the last is returned.

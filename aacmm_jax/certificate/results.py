@@ -8,12 +8,11 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
+from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..data.capture import ReferenceLength
-from ..files.administrative_data import NOT_STATED, About, Reference
-from ..files.calibrations import CalibrationRecord
-from ..kinematics.arm import Arm, parameter_names
-from ..kinematics.parameters import Parameters, is_length
-from ..uncertainty.volume import uncertainty_of
+from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
+from ..kinematics.arm import Arm, is_length, parameter_names
+from ..kinematics.parameters import Parameters
 from .xml import CELSIUS, LEVEL, MILLIMETRE, ONE, RADIAN, identifications, ours, put, real, software, theirs
 
 _METHODS = {"two-stage": "from repeatability first, and then the scale from the lengths", "joint": "from both jointly"}
@@ -32,7 +31,7 @@ class _Stage(NamedTuple):
     evaluation: Evaluation
 
 
-def add_results(results: Element, record: CalibrationRecord, about: About, command: str) -> None:
+def add_results(results: Element, record: CalibrationRecord, about: AdministrativeData, command: str) -> None:
     """Add both measurement results of a calibration."""
     evaluations = record.evaluations()
     found = "The readings, evaluated with the nominal parameters, those before the calibration."
@@ -46,8 +45,8 @@ def add_results(results: Element, record: CalibrationRecord, about: About, comma
 
 def uncertainty_says(record: CalibrationRecord) -> str:
     """How the uncertainties were evaluated, and what they do not hold."""
-    noise = "as it was given" if record.form == "given" else "as estimated from the residuals"
-    freedom = "infinitely many" if math.isinf(record.freedom) else f"{record.freedom:.4g}"
+    noise = "as it was given" if record.noise_model == "given" else "as estimated from the residuals"
+    freedom = "infinitely many" if math.isinf(record.degrees_of_freedom) else f"{record.degrees_of_freedom:.4g}"
     return (
         f"Expanded uncertainties are standard uncertainties times {uncertainty_of(record).factor(LEVEL):.4g}, the coverage factor of "
         f"Student's t for {freedom} degrees of freedom and a coverage probability of {LEVEL:.0%}. They follow, by the law of propagation "
@@ -56,7 +55,9 @@ def uncertainty_says(record: CalibrationRecord) -> str:
     )
 
 
-def _measurement(measurement: Element, record: CalibrationRecord, about: About, stage: _Stage, command: str) -> None:
+def _measurement(
+    measurement: Element, record: CalibrationRecord, about: AdministrativeData, stage: _Stage, command: str
+) -> None:
     ours(measurement, "name", stage.name)
     ours(measurement, "description", stage.says)
     lengths = record.recording.capture.lengths
@@ -112,7 +113,7 @@ def _equipment(equipments: Element, lengths: Sequence[ReferenceLength], referenc
         real(quantity, float(length.value), MILLIMETRE, float(length.u))
 
 
-def _conditions(conditions: Element, about: About, stage: _Stage) -> None:
+def _conditions(conditions: Element, about: AdministrativeData, stage: _Stage) -> None:
     condition, given = put(conditions, "influenceCondition"), about.certificate
     ours(condition, "name", "Ambient temperature")
     put(condition, "status", stage.status)

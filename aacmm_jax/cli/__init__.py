@@ -2,13 +2,20 @@
 
 import gc
 import sys
+from importlib import import_module
 from typing import NoReturn
 
 _INTERRUPTED = 130
-
-
-class Stopped(Exception):
-    """Work was interrupted and what is done is kept; the message says how to go on."""
+# Modules of commands, in the order in which ``--help`` lists them.
+_FAMILIES = (
+    "capture_commands",
+    "calibration_commands",
+    "result_commands",
+    "study_commands",
+    "plan_commands",
+    "compare_commands",
+    "show_command",
+)
 
 
 def main() -> None:
@@ -21,7 +28,10 @@ def main() -> None:
     gc.set_threshold(200_000, 20, 20)
     try:
         from ..core.errors import InputError
-        from .compare_commands import app
+        from .app import Stopped, app
+
+        for family in _FAMILIES:
+            import_module(f".{family}", __name__)
     except ImportError as error:
         if debug:
             raise

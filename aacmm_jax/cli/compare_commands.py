@@ -6,8 +6,9 @@ from typing import Annotated, Any
 import typer
 
 from ..core.errors import InputError
-from .commands import Json, _busy, _show
-from .result_commands import app
+from ..files.hdf5 import need, read_tables
+from ..files.whole_file import write_text
+from .app import Json, app, show_summary, with_spinner
 
 
 @app.command(epilog="Examples: aacmm compare march.h5 september.h5; "
@@ -37,7 +38,6 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Say what moved between calibrations, beyond its uncertainty, and what that does to lengths."""
-    from ..files import storage
     from ..files.calibrations import load_calibration
     from ..summaries.drift import change_exceeded, compared_summary, drift_csv
     from . import compare_display
@@ -48,7 +48,7 @@ def compare(
     records = [load_calibration(file) for file in files]
     created = [record.recording.measured or _created(file) for record, file in zip(records, files, strict=True)]
     labels = [str(file) for file in files]
-    found = _busy("Comparing", lambda: _compared(records, created, labels, level, length_mm))
+    found = with_spinner("Comparing", lambda: _compared(records, created, labels, level, length_mm))
     summary: dict[str, Any] = compared_summary(found, labels, records[0].recording.nominal.name)
     summary["kept"], summary["failed"] = change_exceeded(found.drifts[-1].lengths, max_length_change_mm)
     written = []
@@ -58,9 +58,9 @@ def compare(
         save_trend(found, figure)
         written.append(str(figure))
     if csv is not None:
-        storage.write_text(csv, drift_csv(found, labels))
+        write_text(csv, drift_csv(found, labels))
         written.append(str(csv))
-    _show(summary | ({"written": ", ".join(written)} if written else {}), as_json, compare_display.comparison)
+    show_summary(summary | ({"written": ", ".join(written)} if written else {}), as_json, compare_display.comparison)
     if summary["failed"]:
         raise typer.Exit(1)
 
@@ -89,10 +89,9 @@ def _compared(records: list, created: list[str], labels: list[str], level: float
 
 def _created(file: Path) -> str:
     """When a calibration's file was made."""
-    from ..files import storage
 
-    attributes = storage.read_tables(file, ("calibration",)).attributes
-    storage.need(file, attributes, "created", of="attribute")
+    attributes = read_tables(file, ("calibration",)).attributes
+    need(file, attributes, "created", of="attribute")
     return attributes["created"]
 
 

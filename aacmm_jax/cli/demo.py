@@ -7,15 +7,17 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import evaluate
+from ..calibration.record import CalibrationRecord, record_of
 from ..calibration.stages import calibrate
 from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.recording import Recording
-from ..data.simulation import deviated, simulate
+from ..data.simulation import simulate
 from ..files.arms import load_specification, save_arm
-from ..files.calibrations import CalibrationRecord, record_of, save_calibration
+from ..files.calibrations import save_calibration
 from ..files.captures import save_capture
-from ..files.storage import fingerprint
+from ..files.whole_file import fingerprint
+from ..kinematics.parameters import perturbed_arm
 from ..summaries.calibration import calibration_summary
 
 _DEVIATION_MM, _DEVIATION_DEG = 1.0, 0.1
@@ -35,7 +37,7 @@ def run(folder: Path, seed: int) -> dict[str, Any]:
         ) from error
     bounds = nominal.bounds()
     true = nominal._replace(
-        arm=deviated(bounds.space, length=_DEVIATION_MM, angle=math.radians(_DEVIATION_DEG), seed=seed),
+        arm=perturbed_arm(bounds.space, length=_DEVIATION_MM, angle=math.radians(_DEVIATION_DEG), seed=seed),
         name=f"{nominal.name}, true",
     )
     capture = simulate(
@@ -56,7 +58,7 @@ def run(folder: Path, seed: int) -> dict[str, Any]:
     save_arm(true.arm, folder / "true.toml", name=true.name)
     save_arm(record.calibrated.arm, folder / "calibrated.toml", name=record.calibrated.name)
     summary = _summary(record, _checks(record, seed))
-    from ..plot.calibration import calibration_figure
+    from ..plot.axes import calibration_figure
 
     calibration_figure(record, folder / "calibration.png")
     files = ["capture.h5", "calibration.h5", "nominal.toml", "true.toml", "calibrated.toml", "calibration.png"]

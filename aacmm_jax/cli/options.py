@@ -5,8 +5,9 @@ from collections.abc import Sequence
 
 from ..core.errors import InputError
 from ..data.noise import Noise
-from ..data.recording import ArmSpecification
-from ..kinematics.parameters import Bounds, Parameters, is_length
+from ..kinematics.arm import is_length
+from ..kinematics.parameters import Bounds, Parameters
+from ..kinematics.specification import ArmSpecification
 
 
 def bounds(

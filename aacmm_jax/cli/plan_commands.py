@@ -8,8 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ..core.errors import InputError
-from .commands import Json, _busy, _length_option, _show, _socket_option
-from .study_commands import app
+from .app import Json, app, length_option, show_summary, socket_option, with_spinner
 
 
 @app.command(epilog="Examples: aacmm plan my-arm.toml --sockets 4 --poses 30 -o plan.csv; "
@@ -72,9 +71,10 @@ def plan(
     """Choose poses, sockets and the place of the reference length before the arm is touched; or the poses of an acceptance test."""
     from ..data.noise import Noise
     from ..files.arms import load_specification
-    from ..files.plans import plan_summary, save_plan
+    from ..files.plans import save_plan
     from ..kinematics.parameters import Parameters
     from ..planning.design import plan as run
+    from ..summaries.planning import plan_summary
     from . import acceptance_display, plan_display
 
     specification = load_specification(arm)
@@ -98,7 +98,7 @@ def plan(
             "seed": seed,
             "bars": bar_mm or None,
         }
-        _show(_procedure(specification, arm, acceptance, output, manifest, room), as_json, acceptance_display.procedure)
+        show_summary(_procedure(specification, arm, acceptance, output, manifest, room), as_json, acceptance_display.procedure)
         return
     if manifest is not None:
         raise InputError("--manifest goes with --acceptance; a plan for a calibration is in its CSV whole.")
@@ -106,7 +106,7 @@ def plan(
     if len(dict(axes)) < len(axes):
         raise InputError("an axis is named twice in --region; give each one range.")
     _check_output(output, arm)
-    points = dict(_socket_option(text) for text in socket or ())
+    points = dict(socket_option(text) for text in socket or ())
     if len(points) < len(socket or ()):
         raise InputError("a socket is named twice in --socket; give each its own name.")
     with plan_display.progress() as tell:
@@ -116,7 +116,7 @@ def plan(
             poses=poses,
             length=_range("--length-mm", length_mm),
             u=u_mm,
-            lengths=[_length_option(text) for text in length or ()],
+            lengths=[length_option(text) for text in length or ()],
             region=dict(axes) if axes else None,
             space=Parameters.free_of(specification.arm, held=specification.held),
             noise=Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm),
@@ -130,22 +130,23 @@ def plan(
         )
     save_plan(output, found)
     summary: dict[str, Any] = plan_summary(found, specification.name) | {"written": str(output)}
-    _show(summary, as_json, plan_display.plan)
+    show_summary(summary, as_json, plan_display.plan)
 
 
 def _procedure(
     specification: Any, arm: str, standard: Any, output: Path, manifest: Path | None, room: dict[str, Any]
 ) -> dict[str, Any]:
     """Plan an acceptance test and write it."""
-    from ..acceptance.procedure import acceptance_procedure
-    from ..files.procedures import procedure_csv, procedure_manifest, procedure_summary
-    from ..files.storage import write_text
+    from ..acceptance.procedure import plan_procedure
+    from ..files.procedures import procedure_csv, procedure_manifest
+    from ..files.whole_file import write_text
+    from ..summaries.procedure import procedure_summary
 
     if manifest is not None:
         _check_output(manifest, arm)
         if manifest.resolve() == output.resolve():
             raise InputError(f"{output} is given for the plan and for the manifest; choose another for one of them.")
-    found = _busy("Planning", lambda: acceptance_procedure(specification.arm, standard, **room))
+    found = with_spinner("Planning", lambda: plan_procedure(specification.arm, standard, **room))
     write_text(output, procedure_csv(found))
     written = str(output)
     if manifest is not None:

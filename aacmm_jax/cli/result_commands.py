@@ -7,8 +7,9 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ..core.errors import InputError
-from .commands import CalibrationFile, Json, Only, Without, _busy, _show
-from .plan_commands import app
+from ..files.hdf5 import read_tables
+from ..files.whole_file import fingerprint, write_text
+from .app import CalibrationFile, Json, Only, Without, app, show_summary, with_spinner
 
 About = Annotated[
     Path | None,
@@ -61,10 +62,10 @@ def evaluate(
                 "with a manifest of points there are only --mpe, --test-u-mm, --output and --json; name a calibration and a capture for more."
             )
         summary = _evaluated_points(calibration, output, limits, test_u_mm)
-        _show(summary, as_json, acceptance_display.points)
+        show_summary(summary, as_json, acceptance_display.points)
     else:
         summary = _evaluated(calibration, capture, output, (only, without), limits, test_u_mm, maxima)
-        _show(summary, as_json, acceptance_display.evaluation)
+        show_summary(summary, as_json, acceptance_display.evaluation)
     undecided = [test for test in summary["acceptance"] if test["decision"] in ("fails", "undecided")]
     if summary["failed"] or undecided:
         raise typer.Exit(1)
@@ -80,12 +81,14 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Write a report that can be handed on: warnings, results, uncertainty, charts and tables in one HTML file, which prints well."""
-    from ..files.administrative_data import read_about
+    from ..files.administrative_data import read_administrative_data
     from ..report import write_report
     from . import acceptance_display
 
-    _show(
-        _busy("Writing the report", lambda: write_report(file, output, None if about is None else read_about(about))),
+    show_summary(
+        with_spinner(
+            "Writing the report", lambda: write_report(file, output, None if about is None else read_administrative_data(about))
+        ),
         as_json,
         acceptance_display.report,
     )
@@ -99,18 +102,19 @@ def show_evaluation(file: Path, of_points: bool, as_json: bool) -> None:
     from . import acceptance_display
 
     if of_points:
-        _show(points_summary(load_points(file)), as_json, acceptance_display.points)
+        show_summary(points_summary(load_points(file)), as_json, acceptance_display.points)
     else:
-        _show(evaluation_summary(load_evaluation(file)), as_json, acceptance_display.evaluation)
+        show_summary(evaluation_summary(load_evaluation(file)), as_json, acceptance_display.evaluation)
 
 
 def _evaluated(
     calibration: Path, capture: Path, output: Path | None, choice: tuple, limits: Any, u_test: float, maxima: dict[str, float]
 ) -> dict[str, Any]:
+    from ..acceptance.record import evaluation_of
     from ..files.calibrations import load_calibration
     from ..files.captures import load_capture
-    from ..files.evaluations import evaluation_of, save_evaluation
-    from ..files.storage import fingerprint
+    from ..files.evaluations import save_evaluation
+    from ..files.whole_file import fingerprint
     from ..summaries.evaluation import evaluation_summary
 
     if output is not None:
@@ -123,7 +127,7 @@ def _evaluated(
         sources=(fingerprint(calibration), fingerprint(capture), *recording.sources),
     )
     found = evaluation_of(record, recording, limits=limits, u_test=u_test, maxima=maxima)
-    summary = _busy("Evaluating", lambda: evaluation_summary(found))
+    summary = with_spinner("Evaluating", lambda: evaluation_summary(found))
     if output is not None:
         save_evaluation(output, found)
         summary["written"] = str(output)
@@ -131,8 +135,9 @@ def _evaluated(
 
 
 def _evaluated_points(manifest: Path, output: Path | None, limits: Any, u_test: float) -> dict[str, Any]:
+    from ..acceptance.record import PointsRecord
     from ..files.points import read_points
-    from ..files.points_evaluations import PointsRecord, save_points
+    from ..files.points_evaluations import save_points
     from ..summaries.evaluation import points_summary
 
     if manifest.suffix != ".toml":
@@ -171,7 +176,6 @@ def export(
     for given in (calibration, about):
         if output is not None and given is not None and output.exists() and given.exists() and output.samefile(given):
             raise InputError(f"{output} is what the export is made from; choose another output.")
-    from ..files import storage
     from ..files.arms import specification_toml
     from ..files.calibrations import load_calibration
     from ..summaries.calibration import calibration_summary, parameters_csv
@@ -197,20 +201,19 @@ def export(
     if output is None:
         typer.echo(text, nl=False)
     else:
-        storage.write_text(output, text)
+        write_text(output, text)
 
 
 def _certificate(calibration: Path, record: Any, about: Path | None) -> str:
     from ..certificate.document import dcc
-    from ..files import storage
-    from ..files.administrative_data import About as Stated
-    from ..files.administrative_data import read_about
+    from ..files.administrative_data import AdministrativeData as Stated
+    from ..files.administrative_data import read_administrative_data
 
-    made = storage.read_tables(calibration, ("calibration",)).attributes
-    sources = [storage.fingerprint(calibration), *record.recording.sources]
+    made = read_tables(calibration, ("calibration",)).attributes
+    sources = [fingerprint(calibration), *record.recording.sources]
     return dcc(
         record,
-        Stated() if about is None else read_about(about),
+        Stated() if about is None else read_administrative_data(about),
         created=made["created"],
         sources=sources,
         command=made["command"],

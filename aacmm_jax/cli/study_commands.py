@@ -8,8 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from ..core.errors import InputError
-from . import Stopped
-from .commands import Json, _busy, _show, app
+from .app import Json, Stopped, app, show_summary, with_spinner
 
 
 @app.command(
@@ -74,7 +73,7 @@ def study(
         "trials_this_run": outcome.ran,
         "finished": outcome.finished,
     }
-    _show(summary, as_json, lambda _: _ended(outcome, output))
+    show_summary(summary, as_json, lambda _: _ended(outcome, output))
     if not outcome.finished:
         raise Stopped(
             f"Stopped; {outcome.done:,} of {outcome.total:,} trials are kept. Go on with: aacmm study --resume -o {shlex.quote(str(output))}"
@@ -148,8 +147,8 @@ def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool
     results = Results.of(file)
     if cell is not None and cell > len(results.study.cells):
         raise InputError(f"{file} has {len(results.study.cells)} cells, so there is no cell {cell}; name another.")
-    summary = _busy("Reading", lambda: study_summary(results, cell))
+    summary = with_spinner("Reading", lambda: study_summary(results, cell))
     if figures is not None:
-        paths = _busy("Drawing", lambda: write_figures(results, figures))
+        paths = with_spinner("Drawing", lambda: write_figures(results, figures))
         summary["figures_written"] = [str(path) for path in paths]
-    _show(summary, as_json, study_display.study if cell is None else study_display.one_cell)
+    show_summary(summary, as_json, study_display.study if cell is None else study_display.one_cell)

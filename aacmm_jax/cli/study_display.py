@@ -103,7 +103,7 @@ def study(summary: dict[str, Any]) -> None:
     if len(cells) > 1:
         _spreads(console, shown, ("length_error", "angle_error") if fixed else ("length_error_stage1", "angle_error_stage1"))
     if len(cells) > len(shown):
-        console.print(f"\n{len(cells) - len(shown)} more cells: see them with --json, or aacmm_jax.open_study.")
+        console.print(f"\n{len(cells) - len(shown)} more cells: see them with --json, or aacmm_jax.study.open_study.")
     console.print(
         "\nDigits in parentheses: Monte Carlo standard error of the last digits. Length and angle error: the largest of all parameters'."
     )

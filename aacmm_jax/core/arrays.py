@@ -1,6 +1,6 @@
 """Numbers at the door: what people pass for arrays, made into float64 arrays or refused."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -52,3 +52,16 @@ def as_floats(value: Numbers, what: str) -> Array:
     if is_concrete(array) and not np.all(np.isfinite(np.asarray(array))):
         raise InputError(f"{what} holds a value that is not finite; give finite numbers.")
     return array
+
+
+def in_chunks(work: Callable[[np.ndarray], np.ndarray], rows: np.ndarray) -> np.ndarray:
+    """``work`` on whole blocks of rows; the last is filled up with its first row."""
+    pieces = []
+    for first in range(0, len(rows), _CHUNK):
+        block = rows[first : first + _CHUNK]
+        filled = np.concatenate([block, np.repeat(block[:1], _CHUNK - len(block), axis=0)])
+        pieces.append(work(filled)[: len(block)])
+    return np.concatenate(pieces)
+
+
+_CHUNK = 256  # poses at a time: one compiled program for captures of every size

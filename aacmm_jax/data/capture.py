@@ -4,6 +4,7 @@ import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -166,6 +167,14 @@ def _check_values(name: str, array: np.ndarray) -> None:
     if largest > _MOST_RADIANS:
         row, column = np.argwhere(np.abs(array) == largest)[0] + 1
         raise InputError(
-            f"socket '{name}' pose {row} joint {column} is {largest:g} rad, more than four turns: these look like degrees; "
+            f"socket '{name}' pose {row} joint {column} is {largest:g} rad, more than four sines_cosines: these look like degrees; "
             "convert with numpy.deg2rad, or state the unit in the manifest."
         )
+
+
+def stack_captures(captures: Iterable[Capture]) -> Capture:
+    """A batch of captures of the same shape (sockets, poses, lengths) for `identify_many`."""
+    captures = list(captures)
+    if len({(c.names, c.sizes, tuple((r.start, r.end) for r in c.lengths), c.joints) for c in captures}) != 1:
+        raise InputError("captures of a batch must have the same sockets, numbers of poses, joints and lengths.")
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *captures)

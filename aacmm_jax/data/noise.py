@@ -1,7 +1,5 @@
 """What a reading errs by: encoders in every joint, and the tip in its seat."""
 
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -9,10 +7,10 @@ from jaxtyping import Array, Float
 
 from ..core.arrays import Numbers, as_floats, is_concrete
 from ..core.errors import InputError
-from ..kinematics.chain import Geometry, Turns, columns_of, walk
+from ..core.units import ARCSEC
+from ..kinematics.chain import Geometry, SinesCosines, forward_pass, jacobian_columns
 
 _MOST = {"encoder_arcsec": 36_000.0, "seating": 100.0}  # ten degrees; mm
-ARCSEC = math.pi / (180 * 3600)  # rad
 
 
 class Noise(eqx.Module):
@@ -59,17 +57,19 @@ class Noise(eqx.Module):
             )
 
 
-def tip_covariances(geometry: Geometry, turns: Turns, noise: Noise) -> Float[Array, "... 3 3 N"]:
+def tip_covariances(geometry: Geometry, sines_cosines: SinesCosines, noise: Noise) -> Float[Array, "... 3 3 N"]:
     """Covariance of every pose's tip, mm^2: J_q S J_q^T of the encoders, and the seat's in every direction."""
     # 1 nm besides, so that a pose in which the encoders cannot move the tip in some direction has no infinite weight.
     seat = (noise.seating**2 + 1e-12) * jnp.eye(3)[..., None]
-    encoders = encoder_part(geometry, turns, noise.encoder)
+    encoders = encoder_covariances(geometry, sines_cosines, noise.encoder)
     return encoders + seat.reshape((1,) * (encoders.ndim - 3) + seat.shape)
 
 
-def encoder_part(geometry: Geometry, turns: Turns, encoder: Float[Array, "..."]) -> Float[Array, "... 3 3 N"]:
+def encoder_covariances(
+    geometry: Geometry, sines_cosines: SinesCosines, encoder: Float[Array, "..."]
+) -> Float[Array, "... 3 3 N"]:
     """J_q S J_q^T, pose by pose, mm^2, for encoders of standard deviation ``encoder`` (one, or one a joint; rad)."""
-    columns = columns_of(walk(geometry, turns))["theta"]
+    columns = jacobian_columns(forward_pass(geometry, sines_cosines))["theta"]
     each = jnp.broadcast_to(encoder, (columns.shape[0],))
     columns = columns * each.reshape(-1, *(1,) * (columns.ndim - 1))
     return jnp.sum(columns[..., :, None, :] * columns[..., None, :, :], axis=0)

@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..calibration.checks import plausible
+from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
-from ..data.noise import ARCSEC
-from ..files.calibrations import CalibrationRecord
-from ..kinematics.arm import Arm, parameter_names
-from ..kinematics.parameters import Parameters, is_length
-from ..uncertainty.volume import check_lengths, default_length
+from ..core.units import ARCSEC
+from ..kinematics.arm import Arm, is_length, parameter_names
+from ..kinematics.parameters import Parameters
+from ..uncertainty.volume import default_length, sample_lengths
 from .statistics import Joint, LengthChange, coverage_factor, effective_freedom, length_change, tested
 
 _NAMED = 6  # how many parameters a sentence names
@@ -28,7 +28,7 @@ class Drift(NamedTuple):
     old: Float[np.ndarray, " p"]
     new: Float[np.ndarray, " p"]
     u: Float[np.ndarray, " p"]  # standard uncertainty of the change; NaN where there is none
-    freedom: Float[np.ndarray, " p"]  # its effective degrees of freedom
+    degrees_of_freedom: Float[np.ndarray, " p"]  # its effective degrees of freedom
     expanded: Float[np.ndarray, " p"]
     without: tuple[str, ...]  # why a change has no uncertainty; empty where it has one
     level: float
@@ -163,21 +163,21 @@ def _compared(
     before, after = (_values(record.calibrated.arm, names) for record in (old, new))
     without = _without(old, new, names)
     known = np.array([not reason for reason in without])
-    u_old, u_new = (np.where(known, _spread(record, names), 0.0) for record in (old, new))
-    freedom = effective_freedom(u_old, old.freedom, u_new, new.freedom)
+    u_old, u_new = (np.where(known, _standard_uncertainties(record, names), 0.0) for record in (old, new))
+    degrees_of_freedom = effective_freedom(u_old, old.degrees_of_freedom, u_new, new.degrees_of_freedom)
     u = np.where(known, np.hypot(u_old, u_new), np.nan)
     return Drift(
         names=names,
         old=before,
         new=after,
         u=u,
-        freedom=freedom,
-        expanded=coverage_factor(level, freedom) * u,
+        degrees_of_freedom=degrees_of_freedom,
+        expanded=coverage_factor(level, degrees_of_freedom) * u,
         without=without,
         level=level,
         joint=tested(old, new, names, without, after - before, level),
         lengths=length_change(old, new, level, readings),
-        cautions=tuple(_cautions(old, new, labels)),
+        cautions=tuple(_warnings(old, new, labels)),
     )
 
 
@@ -193,7 +193,7 @@ def _union(records: Sequence[CalibrationRecord]) -> tuple[str, ...]:
 def _readings(record: CalibrationRecord, points: int, length: float | None, seed: int) -> tuple[float, np.ndarray, np.ndarray]:
     arm = record.calibrated.arm
     length = default_length(arm) if length is None else length
-    return (length, *check_lengths(arm, points, length=length, seed=seed))
+    return (length, *sample_lengths(arm, points, length=length, seed=seed))
 
 
 def _without(old: CalibrationRecord, new: CalibrationRecord, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -217,7 +217,7 @@ def _reason(record: CalibrationRecord, name: str) -> str:
     return "" if known else "left open by the data"
 
 
-def _spread(record: CalibrationRecord, names: tuple[str, ...]) -> np.ndarray:
+def _standard_uncertainties(record: CalibrationRecord, names: tuple[str, ...]) -> np.ndarray:
     """Standard uncertainties in the order of ``names``; 0 for what is held."""
     known = dict(zip(record.names, np.sqrt(np.diag(record.covariance)), strict=True))
     return np.array([known.get(name, 0.0) for name in names])
@@ -230,7 +230,7 @@ def _check(records: Sequence[CalibrationRecord], level: float, labels: Sequence[
     for record in records:
         if not isinstance(record, CalibrationRecord):
             raise InputError(
-                f"a {type(record).__name__} cannot be compared; give records, from aj.load_calibration or aj.record_of."
+                f"a {type(record).__name__} cannot be compared; give records, from aj.files.load_calibration or aj.calibration.record_of."
             )
     arms = [record.recording.nominal for record in records]
     for arm, label in zip(arms, labels, strict=True):
@@ -250,7 +250,7 @@ def moment(date: datetime.datetime | str) -> datetime.datetime:
     return found if found.tzinfo else found.replace(tzinfo=datetime.UTC)
 
 
-def _cautions(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str]) -> list[str]:
+def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str]) -> list[str]:
     """What makes a comparison doubtful, the gravest first."""
     found = []
     for record, label in zip((old, new), labels, strict=True):
@@ -306,8 +306,8 @@ def _of_all(drift: Drift) -> str:
     if math.isnan(joint.p):
         return "Together the changes cannot be tested: too few parameters or poses determine them in both calibrations."
     law = f"chi-square {joint.statistic:.1f} with {joint.rank} degrees of freedom"
-    if math.isfinite(joint.freedom):
-        law = f"F {joint.statistic / joint.rank:.2f} with {joint.rank} and {joint.freedom:.0f} degrees of freedom"
+    if math.isfinite(joint.degrees_of_freedom):
+        law = f"F {joint.statistic / joint.rank:.2f} with {joint.rank} and {joint.degrees_of_freedom:.0f} degrees of freedom"
     chance = "p < 0.0001" if joint.p < 1e-4 else f"p = {joint.p:.2g}"
     start = f"Together, the changes of {len(joint.names)} parameters are"
     if joint.p >= 1 - drift.level:

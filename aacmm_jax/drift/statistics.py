@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..data.noise import Noise
-from ..files.calibrations import CalibrationRecord
-from ..kinematics.parameters import is_length
-from ..uncertainty.volume import Uncertainty, uncertainty_of
+from ..kinematics.arm import is_length
+from ..uncertainty.arm_uncertainty import Uncertainty
 
 _FOLLOWS = 1e-5  # more than this of a direction that is open, and a combination is not determined: see `uncertainty`
 _FEW = 4  # parameters that explain a change in a few words
@@ -25,7 +25,7 @@ class Joint(NamedTuple):
 
     statistic: float  # about ``rank`` where nothing moved
     rank: int
-    freedom: float  # of the variance behind it: infinite for chi-square, else statistic / rank follows Fisher's F
+    degrees_of_freedom: float  # of the variance behind it: infinite for chi-square, else statistic / rank follows Fisher's F
     p: float  # probability of as much without any drift; NaN where there is nothing to test
     names: tuple[str, ...]  # parameters that take part
     # Where chance does not explain the statistic: the fewest parameters whose change alone would, found one by one, and by how much
@@ -84,12 +84,12 @@ def effective_freedom(
     return np.where(below > 0, (one + two) ** 2 / np.where(below > 0, below, 1.0), np.inf)
 
 
-def coverage_factor(level: float, freedom: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+def coverage_factor(level: float, degrees_of_freedom: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
     """Student's t for a coverage of ``level``; the normal distribution's where the degrees of freedom are infinite."""
     from scipy import stats
 
-    tail, endless = 0.5 + level / 2, np.isinf(freedom)
-    return np.where(endless, stats.norm.ppf(tail), stats.t.ppf(tail, np.where(endless, 1.0, freedom)))
+    tail, endless = 0.5 + level / 2, np.isinf(degrees_of_freedom)
+    return np.where(endless, stats.norm.ppf(tail), stats.t.ppf(tail, np.where(endless, 1.0, degrees_of_freedom)))
 
 
 def tested(
@@ -116,30 +116,30 @@ def tested(
     left, size, _ = np.linalg.svd(lost)
     kept = left[:, int(np.sum(size > _FOLLOWS)) :]
     moved = kept.T @ (change[chosen] / steps)
-    spread = [
+    covariances = [
         kept.T @ (record.covariance[np.ix_(rows, rows)] / np.outer(steps, steps)) @ kept
         for record, rows in zip((old, new), index, strict=True)
     ]
     # Eigenvalues are cut off where combinations are comparable: each in units of its own uncertainty.
-    alone = np.sqrt(np.diag(spread[0] + spread[1]))
+    alone = np.sqrt(np.diag(covariances[0] + covariances[1]))
     alone = np.where(alone > 0, alone, 1.0)
-    values, vectors = np.linalg.eigh((spread[0] + spread[1]) / np.outer(alone, alone))
+    values, vectors = np.linalg.eigh((covariances[0] + covariances[1]) / np.outer(alone, alone))
     seen = values > _SINGULAR * values[-1] if len(values) else np.zeros(0, dtype=bool)
     root = vectors[:, seen] / np.sqrt(values[seen]) / alone[:, None]
     rank = int(seen.sum())
     statistic = float(np.sum((root.T @ moved) ** 2))
-    shares = [float(np.sum((root.T @ matrix @ root) ** 2)) for matrix in spread]
-    below = shares[0] / old.freedom + shares[1] / new.freedom
-    freedom = rank / below if below > 0 else math.inf
-    robust = "robust" in (old.form, new.form)
+    weights = [float(np.sum((root.T @ matrix @ root) ** 2)) for matrix in covariances]
+    below = weights[0] / old.degrees_of_freedom + weights[1] / new.degrees_of_freedom
+    degrees_of_freedom = rank / below if below > 0 else math.inf
+    robust = "robust" in (old.noise_model, new.noise_model)
 
     def chance(remaining: float, fitted: int) -> float:
-        return _probability(remaining, rank - fitted, freedom, robust)
+        return _probability(remaining, rank - fitted, degrees_of_freedom, robust)
 
     columns = root.T @ kept.T  # of a change of each parameter by one step, in units of the noise
     few = _few(root.T @ moved, columns, lambda remaining, fitted: chance(remaining, fitted) >= 1 - level)
     causes = tuple((part[i], float(amount * steps[i])) for i, amount in few)
-    return Joint(statistic, rank, freedom, chance(statistic, 0), part, causes)
+    return Joint(statistic, rank, degrees_of_freedom, chance(statistic, 0), part, causes)
 
 
 def _few(
@@ -164,7 +164,7 @@ def _few(
     return list(zip(chosen, factors.tolist(), strict=True))
 
 
-def _probability(statistic: float, rank: int, freedom: float, robust: bool) -> float:
+def _probability(statistic: float, rank: int, degrees_of_freedom: float, robust: bool) -> float:
     """Probability of a statistic as large by chance.
 
     Where one variance (or two) is estimated, statistic / rank follows F. The robust form estimates the whole covariance from as
@@ -175,12 +175,12 @@ def _probability(statistic: float, rank: int, freedom: float, robust: bool) -> f
 
     if rank == 0:
         return math.nan
-    if math.isinf(freedom):
+    if math.isinf(degrees_of_freedom):
         return float(stats.chi2.sf(statistic, rank))
-    spare = freedom - rank + 1 if robust else freedom
+    spare = degrees_of_freedom - rank + 1 if robust else degrees_of_freedom
     if spare < 1:
         return math.nan
-    return float(stats.f.sf(statistic / rank * spare / freedom, rank, spare))
+    return float(stats.f.sf(statistic / rank * spare / degrees_of_freedom, rank, spare))
 
 
 def length_change(
@@ -190,9 +190,9 @@ def length_change(
     length, start, end = readings
     both = [_measured(_plain(record), jnp.asarray(start), jnp.asarray(end)) for record in (old, new)]
     (before, u_old, mean_old), (after, u_new, mean_new) = ([np.asarray(part) for part in found] for found in both)
-    freedom = effective_freedom(u_old, old.freedom, u_new, new.freedom)
+    degrees_of_freedom = effective_freedom(u_old, old.degrees_of_freedom, u_new, new.degrees_of_freedom)
     u = np.hypot(u_old, u_new)
-    mean_freedom = effective_freedom(mean_old[None], old.freedom, mean_new[None], new.freedom)
+    mean_freedom = effective_freedom(mean_old[None], old.degrees_of_freedom, mean_new[None], new.degrees_of_freedom)
     u_size = float(np.hypot(mean_old, mean_new) / np.mean(before))
     return LengthChange(
         length=length,
@@ -200,7 +200,7 @@ def length_change(
         q_end=end,
         change=after - before,
         u=u,
-        expanded=coverage_factor(level, freedom) * u,
+        expanded=coverage_factor(level, degrees_of_freedom) * u,
         size=float(np.mean(after - before) / np.mean(before)),
         u_size=u_size,
         expanded_size=float(coverage_factor(level, mean_freedom)[0]) * u_size,
@@ -209,7 +209,7 @@ def length_change(
 
 def _plain(record: CalibrationRecord) -> Uncertainty:
     """A calibration's uncertainty less what lengths do not follow, so that one compiled program serves all calibrations."""
-    return dataclasses.replace(uncertainty_of(record), freedom=math.inf, noise=Noise(), u_k=None)
+    return dataclasses.replace(uncertainty_of(record), degrees_of_freedom=math.inf, noise=Noise(), u_k=None)
 
 
 @eqx.filter_jit
@@ -221,5 +221,5 @@ def _measured(
     measured = jnp.linalg.norm(between, axis=-1)
     slopes = uncertainty.slopes(end) - uncertainty.slopes(start)
     along = jnp.einsum("vc,vcw->vw", between / measured[:, None], slopes)
-    each = uncertainty.spread_of(along[:, None, :])[:, 0, 0]
-    return measured, jnp.sqrt(each), jnp.sqrt(uncertainty.spread_of(jnp.mean(along, axis=0)[None, :])[0, 0])
+    each = uncertainty.covariance_of_functions(along[:, None, :])[:, 0, 0]
+    return measured, jnp.sqrt(each), jnp.sqrt(uncertainty.covariance_of_functions(jnp.mean(along, axis=0)[None, :])[0, 0])

@@ -130,7 +130,7 @@ class Conformity(_Strict):
     decision_rule: Text
 
 
-class About(_Strict):
+class AdministrativeData(_Strict):
     """What a certificate needs besides numbers. Everything is optional, and says that it is not stated where it is missing."""
 
     laboratory: Laboratory = Laboratory()
@@ -147,13 +147,13 @@ class About(_Strict):
         return self.certificate.country or self.laboratory.country or NO_COUNTRY
 
 
-def read_about(path: str | os.PathLike) -> About:
+def read_administrative_data(path: str | os.PathLike) -> AdministrativeData:
     """Read the TOML file about a certificate: ``[laboratory]``, ``[customer]``, ``[item]``, ``[[person]]``, ``[certificate]``,
     ``[[reference]]``, ``[conformity]``. Raises `InputError` that names the file, the place in it and the mend."""
-    return read_toml(path, About)
+    return read_toml(path, AdministrativeData)
 
 
-def check_conformity(about: About, *, simulated: bool, decision: str | None = None, tested: bool = False) -> None:
+def check_conformity(about: AdministrativeData, *, simulated: bool, decision: str | None = None, tested: bool = False) -> None:
     """Refuse a statement of conformity that the data contradict: of a simulated arm, or other than what an evaluation decided."""
     if about.conformity is None:
         return

@@ -10,10 +10,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
 
 from ..core.errors import InputError, nearest
-from ..data.recording import ArmSpecification, single
 from ..kinematics.arm import Arm
-from . import storage
+from ..kinematics.specification import ArmSpecification, single
 from .toml import read_toml
+from .whole_file import storable, write_text
 
 _LENGTH_UNITS = {"mm": 1.0, "m": 1000.0}
 _ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180}
@@ -127,7 +127,7 @@ def _specification(path: Path) -> ArmSpecification:
 
 def save_arm(arm: Arm, path: str | os.PathLike, *, name: str = "", source: str = "") -> None:
     """Write an arm as TOML: standard convention, mm and rad, digits enough to read back the same numbers."""
-    storage.write_text(path, arm_toml(arm, name=name, source=source))
+    write_text(path, arm_toml(arm, name=name, source=source))
 
 
 def arm_toml(arm: Arm, *, name: str = "", source: str = "") -> str:
@@ -143,7 +143,7 @@ def specification_toml(specification: ArmSpecification, *, source: str = "") -> 
     arm = single(specification.arm)
     for key, value in (("name", specification.name), ("source", source)):
         if value:
-            document[key] = storage.storable(value)
+            document[key] = storable(value)
     document["convention"] = "standard"
     document["length_unit"] = "mm"
     document["angle_unit"] = "rad"

@@ -1,105 +1,17 @@
 """A finished calibration as plain tables: made from a `Calibration`, written to and read from HDF5."""
 
 import os
-from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.evaluation import Evaluation, evaluate
-from ..calibration.results import Calibration, CrossValidation, LeftOut
+from ..calibration.record import CalibrationRecord
+from ..calibration.results import CrossValidation, LeftOut
 from ..data.noise import Noise
-from ..data.recording import ArmSpecification, Recording
-from ..kinematics.parameters import Parameters, is_length
-from ..solver.levenberg_marquardt import Reason
-from . import storage
+from ..kinematics.arm import is_length
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
-from .storage import Table, Variable
+from .hdf5 import Stored, Table, Variable, need, read_tables, undamaged, write_tables
 
 STAGES = ("nominal", "stage1", "calibrated")
-
-
-class CalibrationRecord(NamedTuple):
-    """Everything a calibration file holds. Arrays are NumPy's, in mm and rad, in the order of ``names``."""
-
-    recording: Recording  # what it was identified from, and the nominal arm
-    stage1: ArmSpecification
-    calibrated: ArmSpecification
-    names: tuple[str, ...]  # free parameters
-    held: tuple[str, ...]
-    hold: str | None  # held in stage 1 only
-    lower: np.ndarray
-    upper: np.ndarray
-    active_stage1: np.ndarray  # -1, 0, +1
-    active: np.ndarray
-    covariance: np.ndarray
-    determined: np.ndarray  # False where only a combination with others is determined
-    open: np.ndarray  # projector onto the directions that are not determined, in steps of 1 mm and 1 mrad
-    stretch: np.ndarray  # of lengths that were held but divided by k: see covariance.Covariance
-    noise: Noise  # given, or estimated from the residuals
-    form: str  # what the covariance takes errors of tips for: covariance.FORMS
-    freedom: float  # degrees of freedom behind the covariance
-    misfit: float | None  # residuals in units of the given noise
-    k: float
-    u_k: float
-    method: str
-    steps: int
-    converged: bool
-    reason: str
-    validation: CrossValidation | None = None
-    # Monte Carlo after JCGM 101: quantity, estimate, u, low, high, linear_u, agrees; and what to say of it.
-    sampled: Mapping[str, np.ndarray] | None = None
-    sampled_says: str | None = None
-
-    @property
-    def fixed_by_one_length(self) -> bool:
-        """Whether a single length fixed the scale exactly, so that its own error as left is zero by construction: no measurement."""
-        return self.method == "two-stage" and len(self.recording.capture.lengths) == 1
-
-    def vectors(self) -> dict[str, np.ndarray]:
-        """Free parameters of the nominal arm, after stage 1, and calibrated; and of the true arm of a simulation."""
-        space = Parameters(self.recording.nominal.arm, self.names)
-        arms = {"nominal": self.recording.nominal.arm, "stage1": self.stage1.arm, "calibrated": self.calibrated.arm}
-        if self.recording.true is not None:
-            arms["true"] = self.recording.true.arm
-        return {stage: np.asarray(space.vector(arm)) for stage, arm in arms.items()}
-
-    def evaluations(self) -> dict[str, Evaluation]:
-        """The three arms on the capture that was identified from."""
-        arms = {"nominal": self.recording.nominal.arm, "stage1": self.stage1.arm, "calibrated": self.calibrated.arm}
-        return {stage: evaluate(arm, self.recording.capture) for stage, arm in arms.items()}
-
-
-def record_of(calibration: Calibration, recording: Recording) -> CalibrationRecord:
-    """The record of a calibration, given the recording that it was identified from."""
-    nominal, stage1 = recording.nominal, calibration.stage1
-    result = calibration.result if bool(stage1.converged) else stage1.result
-    return CalibrationRecord(
-        recording=recording,
-        stage1=nominal._replace(arm=stage1.arm, name=f"{nominal.name}, after stage 1"),
-        calibrated=nominal._replace(arm=calibration.arm, name=f"{nominal.name}, calibrated"),
-        names=calibration.space.names,
-        held=calibration.space.held,
-        hold=stage1.hold,
-        lower=np.asarray(calibration.bounds.lower),
-        upper=np.asarray(calibration.bounds.upper),
-        active_stage1=np.asarray(stage1.active),
-        active=np.asarray(calibration.active),
-        covariance=np.asarray(calibration.covariance),
-        determined=np.asarray(calibration.determined),
-        open=np.asarray(calibration.spread.open),
-        stretch=np.asarray(calibration.spread.stretch),
-        noise=calibration.noise,
-        form=calibration.form,
-        freedom=calibration.freedom,
-        misfit=None if stage1.misfit is None else float(stage1.misfit),
-        k=float(calibration.scale.value),
-        u_k=float(calibration.scale.u),
-        method=calibration.method,
-        steps=int(calibration.steps),
-        converged=bool(calibration.converged),
-        reason=Reason[result],
-    )
 
 
 def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None:
@@ -127,28 +39,28 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
         "scale_u": record.u_k,
         "encoder_arcsec": np.asarray(record.noise.encoder_arcsec),
         "seating_mm": float(record.noise.seating),
-        "form": record.form,
-        "freedom": record.freedom,
-        "stretch_variance": float(record.stretch[-1]),
-        "misfit": record.misfit,
+        "form": record.noise_model,
+        "freedom": record.degrees_of_freedom,
+        "stretch_variance": float(record.common_scale_error[-1]),
+        "misfit": record.reduced_chi,
         "steps": record.steps,
         "converged": record.converged,
         "reason": record.reason,
     }
-    storage.write_tables(path, "calibration", tables, attributes)
+    write_tables(path, "calibration", tables, attributes)
 
 
 def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
     """Read a calibration. Raises `InputError` where the file is missing, damaged, foreign, newer or no calibration."""
-    stored = storage.read_tables(path, ("calibration",))
-    storage.need(path, stored.tables, "stage1_arm", "calibrated_arm", "parameters")
-    with storage.undamaged(path):
+    stored = read_tables(path, ("calibration",))
+    need(path, stored.tables, "stage1_arm", "calibrated_arm", "parameters")
+    with undamaged(path):
         return _record(path, stored)
 
 
-def _record(path: str | os.PathLike, stored: storage.Stored) -> CalibrationRecord:
+def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
     table, attributes = stored.tables["parameters"], stored.attributes
-    storage.need(path, table, "parameter", "lower", "upper", "active_stage1", "active", "covariance", "determined", of="entry")
+    need(path, table, "parameter", "lower", "upper", "active_stage1", "active", "covariance", "determined", of="entry")
     return CalibrationRecord(
         recording=recording_of(path, stored),
         stage1=specification_of(path, stored, "stage1_arm"),
@@ -164,14 +76,16 @@ def _record(path: str | os.PathLike, stored: storage.Stored) -> CalibrationRecor
         determined=table["determined"].astype(bool),
         # Files of version 0.1 and before have none of the following.
         open=table.get("open", np.zeros_like(table["covariance"])),
-        stretch=np.append(table.get("stretch", np.zeros(len(table["covariance"]))), attributes.get("stretch_variance", 0.0)),
+        common_scale_error=np.append(
+            table.get("stretch", np.zeros(len(table["covariance"]))), attributes.get("stretch_variance", 0.0)
+        ),
         noise=Noise(
             encoder_arcsec=np.squeeze(np.atleast_1d(attributes.get("encoder_arcsec", 0.0))),
             seating=attributes.get("seating_mm", 0.0),
         ),
-        form=attributes.get("form", "common"),
-        freedom=float(attributes.get("freedom", np.inf)),
-        misfit=attributes.get("misfit"),
+        noise_model=attributes.get("form", "common"),
+        degrees_of_freedom=float(attributes.get("freedom", np.inf)),
+        reduced_chi=attributes.get("misfit"),
         k=attributes["scale_k"],
         u_k=attributes["scale_u"],
         method=attributes["method"],
@@ -200,7 +114,9 @@ def _parameter_table(record: CalibrationRecord) -> Table:
         ),
         "active": Variable(("parameter",), record.active, "1", "-1 on the lower bound, +1 on the upper"),
         "determined": Variable(("parameter",), record.determined.astype(np.int8), "1", "0: only a combination is determined"),
-        "stretch": Variable(("parameter",), record.stretch[:-1], both, "covariance with the relative error of held lengths"),
+        "stretch": Variable(
+            ("parameter",), record.common_scale_error[:-1], both, "covariance with the relative error of held lengths"
+        ),
         "open": Variable(
             ("parameter", "parameter_2"), record.open, "1", "projector onto what is not determined, in mm and mrad"
         ),
@@ -236,7 +152,7 @@ def _validation_table(record: CalibrationRecord) -> Table:
     return Table(variables)
 
 
-def _validation_of(stored: storage.Stored) -> CrossValidation | None:
+def _validation_of(stored: Stored) -> CrossValidation | None:
     table = stored.tables.get("cross_validation")
     if table is None:
         return None

@@ -8,23 +8,24 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..data.capture import Capture, ReferenceLength
-from ..data.recording import ArmSpecification, ProbedSphere, Recording, checked_sphere, single
+from ..data.recording import Recording
+from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm
-from . import storage
-from .storage import Table, Variable
+from ..kinematics.specification import ArmSpecification, single
+from .hdf5 import Stored, Table, Variable, need, read_tables, undamaged, write_tables
 
 _KINDS = {"alpha": "link twist", "a": "link length", "d": "link offset", "theta": "joint zero offset", "beta": "Hayati's angle"}
 
 
 def save_capture(path: str | os.PathLike, recording: Recording) -> None:
     """Write a capture with its arms to HDF5, whole or not at all."""
-    storage.write_tables(path, "capture", recording_tables(recording), recording_attributes(recording))
+    write_tables(path, "capture", recording_tables(recording), recording_attributes(recording))
 
 
 def load_capture(path: str | os.PathLike) -> Recording:
     """Read a capture with its arms. Raises `InputError` where the file is missing, damaged, foreign or newer."""
-    stored = storage.read_tables(path, ("capture", "calibration"))
-    with storage.undamaged(path):
+    stored = read_tables(path, ("capture", "calibration"))
+    with undamaged(path):
         return recording_of(path, stored)
 
 
@@ -68,10 +69,10 @@ def reference_table(lengths: Sequence[ReferenceLength]) -> Table:
     return Table({name: Variable(("length",), *column) for name, column in columns.items()})
 
 
-def lengths_of(path: str | os.PathLike, stored: storage.Stored) -> list[ReferenceLength]:
+def lengths_of(path: str | os.PathLike, stored: Stored) -> list[ReferenceLength]:
     """The reference lengths that a file holds."""
     table = stored.tables["reference"]
-    storage.need(path, table, "start", "end", "value", "u", of="entry")
+    need(path, table, "start", "end", "value", "u", of="entry")
     rows = zip(table["start"], table["end"], table["value"], table["u"], strict=True)
     return [ReferenceLength(str(start), str(end), float(value), float(u)) for start, end, value, u in rows]
 
@@ -100,12 +101,12 @@ def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False) -> Ta
     return Table(variables)
 
 
-def spheres_of(path: str | os.PathLike, stored: storage.Stored, entry: str = "angle") -> tuple[ProbedSphere, ...]:
+def spheres_of(path: str | os.PathLike, stored: Stored, entry: str = "angle") -> tuple[ProbedSphere, ...]:
     """The touched spheres that a file holds, by their ``angle`` or ``position``."""
     table = stored.tables.get("sphere")
     if table is None:
         return ()
-    storage.need(path, table, "sphere", "test", "group", "diameter", "u", "stylus", "form", entry, of="entry")
+    need(path, table, "sphere", "test", "group", "diameter", "u", "stylus", "form", entry, of="entry")
     keys = list(zip(table["sphere"].tolist(), table["test"].tolist(), strict=True))
     found = []
     for name, test in dict.fromkeys(keys):
@@ -117,11 +118,11 @@ def spheres_of(path: str | os.PathLike, stored: storage.Stored, entry: str = "an
     return tuple(found)
 
 
-def recording_of(path: str | os.PathLike, stored: storage.Stored) -> Recording:
+def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     """The recording that a file's tables hold."""
-    storage.need(path, stored.tables, "capture", "reference", "nominal_arm")
+    need(path, stored.tables, "capture", "reference", "nominal_arm")
     poses = stored.tables["capture"]
-    storage.need(path, poses, "angle", "socket", of="entry")
+    need(path, poses, "angle", "socket", of="entry")
     owner = np.asarray(poses["socket"]).astype(str)
     names = list(dict.fromkeys(owner.tolist()))
     try:
@@ -167,11 +168,11 @@ def arm_table(specification: ArmSpecification) -> Table:
     return Table(variables, attributes)
 
 
-def specification_of(path: str | os.PathLike, stored: storage.Stored, table: str) -> ArmSpecification:
+def specification_of(path: str | os.PathLike, stored: Stored, table: str) -> ArmSpecification:
     """The arm that a table holds."""
     arrays: Mapping[str, np.ndarray] = stored.tables[table]
     attributes = stored.table_attributes[table]
-    storage.need(path, arrays, "alpha", "a", "d", "theta", "probe", of="entry")
+    need(path, arrays, "alpha", "a", "d", "theta", "probe", of="entry")
     limits = None
     if "lowest" in arrays:
         limits = list(zip(arrays["lowest"].tolist(), arrays["highest"].tolist(), strict=True))

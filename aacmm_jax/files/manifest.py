@@ -14,10 +14,12 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeFloat
 
 from ..core.errors import InputError
 from ..data.capture import Capture, ReferenceLength
-from ..data.recording import ProbedSphere, Recording, SphereTest, checked_sphere
-from . import storage
+from ..data.recording import Recording
+from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
 from .arms import load_specification
+from .text_table import read_numbers
 from .toml import read_toml
+from .whole_file import fingerprint
 
 _UNITS = {"rad": 1.0, "deg": math.pi / 180, "arcsec": math.pi / (180 * 3600)}
 _FIELD = re.compile(r"\{(\w+)\}")
@@ -144,7 +146,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
 
         def angles(file: Path) -> np.ndarray:
             files.append(file)
-            table = storage.read_numbers(file, model.angles.columns)
+            table = read_numbers(file, model.angles.columns)
             if table.shape[1] != joints:
                 raise InputError(
                     f"{file} has {table.shape[1]} columns, but the arm has {joints} joints; give one column a joint, "
@@ -153,7 +155,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
             return _radians(table, model.angles)
 
         sockets, lengths, spheres = recorded(path.parent, model, angles)
-        sources = tuple(storage.fingerprint(file, path.parent) for file in files)
+        sources = tuple(fingerprint(file, path.parent) for file in files)
         return Recording(Capture(sockets, lengths), nominal, spheres=spheres, sources=sources, measured=str(model.date or ""))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

@@ -1,12 +1,11 @@
 """A plan as CSV, for people and spreadsheets, and as a plain dictionary."""
 
 import os
-from typing import Any
 
 import numpy as np
 
-from ..planning.design import MORE, Plan, Prediction
-from . import storage
+from ..planning.design import Plan
+from .whole_file import write_text
 
 _DIRECTION = ("probe_direction_x", "probe_direction_y", "probe_direction_z")  # the last frame's z axis
 
@@ -14,7 +13,7 @@ _DIRECTION = ("probe_direction_x", "probe_direction_y", "probe_direction_z")  # 
 def save_plan(path: str | os.PathLike, plan: Plan) -> None:
     """Write a plan as CSV: a row a pose, with its socket, where that stands (mm), the joints' readings (deg), and the direction in which
     the probe points."""
-    storage.write_text(path, plan_csv(plan))
+    write_text(path, plan_csv(plan))
 
 
 def plan_csv(plan: Plan) -> str:
@@ -34,34 +33,3 @@ def plan_csv(plan: Plan) -> str:
             )
         )
     return "\n".join(lines) + "\n"
-
-
-def plan_summary(plan: Plan, arm: str) -> dict[str, Any]:
-    """Where sockets stand, how many poses each gets, and the predictions; the unit in every key."""
-    counts = np.bincount(plan.owner, minlength=len(plan.sockets))
-    return {
-        "kind": "plan",
-        "arm": arm,
-        "criterion": plan.criterion,
-        "poses": len(plan.q),
-        "sockets": [
-            {"socket": name, "position_mm": list(point), "poses": int(count)}
-            for (name, point), count in zip(plan.sockets.items(), counts, strict=True)
-        ],
-        "lengths": [
-            {"from": length.start, "to": length.end, "value_mm": float(length.value), "u_mm": float(length.u)}
-            for length in plan.lengths
-        ],
-        "check_length_mm": plan.check_length,
-        "encoder_arcsec": np.asarray(plan.noise.encoder_arcsec).tolist(),
-        "seating_mm": float(plan.noise.seating),
-        "predicted": _prediction(plan.predicted),
-        "loose": _prediction(plan.loose),
-        "random": _prediction(plan.random),
-        "more": _prediction(plan.more),
-        "more_poses": MORE,
-    }
-
-
-def _prediction(prediction: Prediction) -> dict[str, float]:
-    return {"median_mm": prediction.median, "largest_mm": prediction.largest}

@@ -8,9 +8,10 @@ import numpy as np
 from ..acceptance.suite import Measured
 from ..core.errors import InputError, nearest
 from ..kinematics.workspace import Reach
-from . import storage
 from .manifest import PointsManifest, recorded
+from .text_table import read_numbers
 from .toml import read_toml
+from .whole_file import fingerprint
 
 _UNITS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "inch": 25.4}
 
@@ -28,7 +29,7 @@ def read_points(path: str | os.PathLike) -> Measured:
 
         def points(file: Path) -> np.ndarray:
             files.append(file)
-            table = storage.read_numbers(file, model.points.columns)
+            table = read_numbers(file, model.points.columns)
             if table.shape[1] != 3:
                 raise InputError(
                     f"{file} has {table.shape[1]} columns; give x, y and z, or pick three with columns = [...] in [points]."
@@ -45,7 +46,7 @@ def read_points(path: str | os.PathLike) -> Measured:
         if not sockets and not spheres:
             raise InputError("there is neither a [[socket]] nor a [[sphere]], so nothing can be tested; add one.")
         reach = None if model.points.reach is None else Reach(np.array(model.points.shoulder), model.points.reach)
-        sources = tuple(storage.fingerprint(file, path.parent) for file in files)
+        sources = tuple(fingerprint(file, path.parent) for file in files)
         return Measured(sockets, tuple(lengths), spheres, reach, sources=sources, measured=str(model.date or ""))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

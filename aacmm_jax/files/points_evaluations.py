@@ -1,31 +1,15 @@
 """An evaluation of points, without an arm's poses: acceptance tests of what an arm's own program reported; in HDF5."""
 
 import os
-from collections.abc import Mapping
-from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 
-from ..acceptance.decision import Limit
-from ..acceptance.suite import AcceptanceTest, Measured, accept
+from ..acceptance.record import PointsRecord
+from ..acceptance.suite import Measured
 from ..kinematics.workspace import Reach
-from . import storage
 from .captures import lengths_of, reference_table, sphere_table, spheres_of
 from .evaluations import limit_table, limits_in
-from .storage import Table, Variable
-
-
-class PointsRecord(NamedTuple):
-    """What an evaluation of points is of; its figures follow from that."""
-
-    measured: Measured
-    limits: Mapping[str, Limit | float] = MappingProxyType({})
-    u_test: float = 0.0  # standard uncertainty that seat, fixture and temperature add, mm
-
-    def acceptance(self) -> list[AcceptanceTest]:
-        """Every test that the points allow."""
-        return accept(self.measured, self.limits, self.u_test)
+from .hdf5 import Table, Variable, need, read_tables, undamaged, write_tables
 
 
 def save_points(path: str | os.PathLike, record: PointsRecord) -> None:
@@ -56,14 +40,14 @@ def save_points(path: str | os.PathLike, record: PointsRecord) -> None:
         "reach_mm": None if reach is None else reach.radius,
         "shoulder_mm": None if reach is None else reach.shoulder,
     }
-    storage.write_tables(path, "evaluation", tables, attributes)
+    write_tables(path, "evaluation", tables, attributes)
 
 
 def load_points(path: str | os.PathLike) -> PointsRecord:
     """Read an evaluation of points. Raises `InputError` where the file is missing, damaged, foreign, newer or none."""
-    stored = storage.read_tables(path, ("evaluation",))
-    storage.need(path, stored.tables, "points", "reference", "limits")
-    with storage.undamaged(path):
+    stored = read_tables(path, ("evaluation",))
+    need(path, stored.tables, "points", "reference", "limits")
+    with undamaged(path):
         table, attributes = stored.tables["points"], stored.attributes
         owner = np.asarray(table["socket"]).astype(str)
         sockets = {name: table["position"][owner == name] for name in dict.fromkeys(owner.tolist())}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..core.errors import InputError, nearest
-from .storage import check_readable
+from .whole_file import check_readable
 
 Model = TypeVar("Model")
 

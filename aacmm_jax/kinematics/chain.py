@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from ..core.arrays import is_concrete
 
-Turns = tuple[Float[Array, "n ... 1 N"], Float[Array, "n ... 1 N"]]
+SinesCosines = tuple[Float[Array, "n ... 1 N"], Float[Array, "n ... 1 N"]]
 
 
 class Geometry(NamedTuple):
@@ -34,7 +34,7 @@ class Geometry(NamedTuple):
     probe: Float[Array, "... 3"]
 
 
-class Walked(NamedTuple):
+class ForwardPass(NamedTuple):
     """The last frame, the tip, and what the joints leave for the derivatives: unit axes and points on them; base frame, mm."""
 
     frame: tuple[Float[Array, "... 3 N"], Float[Array, "... 3 N"], Float[Array, "... 3 N"]]  # x, y, z
@@ -55,8 +55,8 @@ def _rows(values: Any, rank: int) -> Any:
     return moved.reshape(*moved.shape[:1], *batch[:-1], 1, *batch[-1:])
 
 
-def turns_of(q: Float[Array, "... n"]) -> Turns:
-    """Cosines and sines of joint angles, as `walk` takes them: computed once for many arms, they save half of its time."""
+def sines_cosines(q: Float[Array, "... n"]) -> SinesCosines:
+    """Cosines and sines of joint angles, as `forward_pass` takes them: computed once for many arms, they save half of its time."""
     if is_concrete(q):  # at the edges, where NumPy saves compiling four kernels
         rows = _rows(np.asarray(q), max(q.ndim - 1, 1))
         return jax.device_put((np.cos(rows), np.sin(rows)))
@@ -65,13 +65,13 @@ def turns_of(q: Float[Array, "... n"]) -> Turns:
 
 
 @jax.jit
-def walk(geometry: Geometry, turns: Turns) -> Walked:
+def forward_pass(geometry: Geometry, sines_cosines: SinesCosines) -> ForwardPass:
     """Walk the chain from base to flange: T_i = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)].
 
     Batches of the parameters (their leading axes) and of the turns (poses last) broadcast.
     """
-    rank = max(turns[0].ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
-    cos_q, sin_q = (jnp.reshape(t, t.shape[:1] + (1,) * (rank + 2 - t.ndim) + t.shape[1:]) for t in turns)
+    rank = max(sines_cosines[0].ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
+    cos_q, sin_q = (jnp.reshape(t, t.shape[:1] + (1,) * (rank + 2 - t.ndim) + t.shape[1:]) for t in sines_cosines)
     parameters = jax.tree.map(lambda leaf: _rows(leaf, rank), geometry)
     cos_theta, sin_theta = jnp.cos(parameters.theta), jnp.sin(parameters.theta)
     inputs = (
@@ -96,14 +96,14 @@ def walk(geometry: Geometry, turns: Turns) -> Walked:
             new_x, new_z = cos_tilt * new_x - sin_tilt * new_z, sin_tilt * new_x + cos_tilt * new_z
         return ((new_x, new_y, new_z), new_origin), axes
 
-    batch = jnp.broadcast_shapes(*(leaf.shape[1:] for leaf in jax.tree.leaves((turns, parameters))))
+    batch = jnp.broadcast_shapes(*(leaf.shape[1:] for leaf in jax.tree.leaves((sines_cosines, parameters))))
     shape = (*batch[:-2], 3, batch[-1])
     axes_of_base = [jnp.broadcast_to(axis.reshape((1,) * len(batch[:-2]) + (3, 1)), shape) for axis in jnp.eye(3)]
     start = ((axes_of_base[0], axes_of_base[1], axes_of_base[2]), jnp.zeros(shape))
     (frame, origin), axes = jax.lax.scan(joint, start, inputs)
     probe = parameters.probe
     tip = origin + probe[0] * frame[0] + probe[1] * frame[1] + probe[2] * frame[2]
-    return Walked(frame, tip, *axes)
+    return ForwardPass(frame, tip, *axes)
 
 
 def _cross(u: Float[Array, "... 3 N"], v: Float[Array, "... 3 N"]) -> Float[Array, "... 3 N"]:
@@ -111,30 +111,30 @@ def _cross(u: Float[Array, "... 3 N"], v: Float[Array, "... 3 N"]) -> Float[Arra
     return jnp.stack([u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0], axis=-2)
 
 
-def columns_of(walked: Walked) -> dict[str, Float[Array, "k ... 3 N"]]:
+def jacobian_columns(forward: ForwardPass) -> dict[str, Float[Array, "k ... 3 N"]]:
     """Derivative of the tip by every parameter: kind -> one vector a joint (or a probe axis).
 
     ``theta`` also serves for q: the two enter only as their sum.
     """
-    tip = walked.tip[None]
+    tip = forward.tip[None]
     columns = {
-        "alpha": _cross(walked.x, tip - walked.origin),
-        "a": walked.x,
-        "d": walked.z_before,
-        "theta": _cross(walked.z_before, tip - walked.origin_before),
-        "probe": jnp.stack(walked.frame),
+        "alpha": _cross(forward.x, tip - forward.origin),
+        "a": forward.x,
+        "d": forward.z_before,
+        "theta": _cross(forward.z_before, tip - forward.origin_before),
+        "probe": jnp.stack(forward.frame),
     }
-    if walked.y is not None:
-        columns["beta"] = _cross(walked.y, tip - walked.origin)
+    if forward.y is not None:
+        columns["beta"] = _cross(forward.y, tip - forward.origin)
     return columns
 
 
 @partial(jax.jit, static_argnames=("entries",))
-def stacked_columns(walked: Walked, entries: tuple[tuple[str, int], ...]) -> Float[Array, "... p 3 N"]:
+def stacked_jacobian_columns(forward: ForwardPass, entries: tuple[tuple[str, int], ...]) -> Float[Array, "... p 3 N"]:
     """The Jacobian columns of named entries (kind and 0-based index; ``q`` counts as ``theta``), in their order."""
-    columns = columns_of(walked)
+    columns = jacobian_columns(forward)
     chosen = [columns["theta" if kind == "q" else kind][i] for kind, i in entries]
-    return jnp.stack(chosen, axis=-3) if chosen else jnp.zeros((*walked.tip.shape[:-2], 0, *walked.tip.shape[-2:]))
+    return jnp.stack(chosen, axis=-3) if chosen else jnp.zeros((*forward.tip.shape[:-2], 0, *forward.tip.shape[-2:]))
 
 
 def _unrolled(rows: Float[Array, "... 3 N"], geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 3"]:
@@ -145,22 +145,22 @@ def _unrolled(rows: Float[Array, "... 3 N"], geometry: Geometry, q: Float[Array,
 
 @jax.custom_jvp
 def _tip_position(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 3"]:
-    return _unrolled(walk(geometry, turns_of(q)).tip, geometry, q)
+    return _unrolled(forward_pass(geometry, sines_cosines(q)).tip, geometry, q)
 
 
 def _tip_position_jvp(primals, tangents):
     geometry, q = primals
     geometry_dot, q_dot = tangents
-    walked = walk(geometry, turns_of(q))
-    columns = columns_of(walked)
-    rank = walked.tip.ndim - 1
+    forward = forward_pass(geometry, sines_cosines(q))
+    columns = jacobian_columns(forward)
+    rank = forward.tip.ndim - 1
     pairs = [(kind, getattr(geometry_dot, kind)) for kind in columns] + [("theta", q_dot)]
-    moved = jnp.zeros_like(walked.tip)
+    moved = jnp.zeros_like(forward.tip)
     for kind, tangent in pairs:
         # Unperturbed arguments arrive as symbolic zeros: a derivative by parameters then never touches q.
         if not isinstance(tangent, jax.custom_derivatives.SymbolicZero):
             moved = moved + jnp.sum(columns[kind] * _rows(tangent, rank), axis=0)
-    return _unrolled(walked.tip, geometry, q), _unrolled(moved, geometry, q)
+    return _unrolled(forward.tip, geometry, q), _unrolled(moved, geometry, q)
 
 
 _tip_position.defjvp(_tip_position_jvp, symbolic_zeros=True)
@@ -178,8 +178,8 @@ def tip_position(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "
 @jax.jit
 def tip_pose(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 4 4"]:
     """Homogeneous pose of the last frame with the tip as its origin (mm), in the base frame."""
-    walked = walk(geometry, turns_of(q))
-    columns = [_unrolled(rows, geometry, q) for rows in (*walked.frame, walked.tip)]
+    forward = forward_pass(geometry, sines_cosines(q))
+    columns = [_unrolled(rows, geometry, q) for rows in (*forward.frame, forward.tip)]
     top = jnp.stack(columns, axis=-1)
     bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]).reshape((1,) * (top.ndim - 1) + (4,)), (*top.shape[:-2], 1, 4))
     return jnp.concatenate([top, bottom], axis=-2)
@@ -188,7 +188,7 @@ def tip_pose(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 
 @partial(jax.jit, static_argnames=("entries",))
 def tip_jacobian(geometry: Geometry, q: Float[Array, "... n"], entries: tuple[tuple[str, int], ...]) -> Float[Array, "... 3 p"]:
     """Derivative of the tip by the named entries, each a kind (``alpha`` ... ``probe``, or ``q``) and a 0-based index."""
-    stacked = stacked_columns(walk(geometry, turns_of(q)), entries)
+    stacked = stacked_jacobian_columns(forward_pass(geometry, sines_cosines(q)), entries)
     columns = jnp.moveaxis(stacked, -1, -3)
     batched = max(leaf.ndim for leaf in jax.tree.leaves((geometry, q))) > 1
     return jnp.moveaxis(columns if batched else columns[0], -2, -1)

@@ -1,71 +1,31 @@
 """Which parameters a capture can tell apart at all: the tips' derivatives, made consistent, and a choice of independent ones."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from ..core.arrays import in_chunks
 from ..core.errors import InputError
-from ..data.capture import Capture
-from ..data.simulation import approach
-from .arm import LENGTHS, Arm, locate, replace
-from .parameters import Parameters
+from .arm import LENGTHS, Arm, jacobian_at, locate, neighbouring_arm, replace
+from .inverse_kinematics import SocketPoses, project_to_centroids
 
-_BLOCK = 256  # poses at a time: one compiled program for captures of every size
-_SETTLED = 1e-6  # mm
 _OFF_AXIS = 5.0  # mm
 _INDEPENDENT = 1e-6  # of a column's size must stand apart from the columns chosen before it
 NEARLY_PARALLEL = 0.02  # |sin alpha|, about 1 degree
 
 
-def settled(arm: Arm, capture: Capture, stands: Arm | None = None) -> Float[np.ndarray, "N n"]:
-    """The poses of a capture moved, as little as possible, until each tip rests in its socket's centroid by this arm; or by the
-    arm that ``stands`` in its place.
-
-    A nominal arm that is mm off scatters the tips, and scattered tips make directions look determined that are not: turning
-    the whole arm about its base moves them.
-    """
-    q = np.asarray(capture.q)
-    owner = capture.owner
-    by = arm if stands is None else stands
-    tips = in_blocks(lambda rows: np.asarray(by.position(rows)), q)
-    sizes = np.asarray(capture.sizes)
-    sums = np.stack([np.bincount(owner, weights=tips[:, axis]) for axis in range(3)], axis=1)
-    targets = (sums / sizes[:, None])[owner]
-    moved, reached = moved_onto(arm, q, targets)
-    return np.where(reached[:, None], moved, q)
-
-
-def moved_onto(
-    arm: Arm, q: Float[np.ndarray, "N n"], targets: Float[np.ndarray, "N 3"], limits: Float[np.ndarray, "n 2"] | None = None
-) -> tuple[Float[np.ndarray, "N n"], Bool[np.ndarray, " N"]]:
-    """Poses moved by least steps until the tip is at its target, within limits (default: none), and which of them arrived."""
-    allowed = jnp.asarray(np.tile([-np.inf, np.inf], (arm.joints, 1)) if limits is None else limits)
-
-    def moved(rows: np.ndarray) -> np.ndarray:
-        found, distance = approach(arm.geometry, jnp.asarray(rows[:, :-3]), jnp.asarray(rows[:, -3:]), allowed)
-        return np.hstack([np.asarray(found), np.asarray(distance)[:, None]])
-
-    found = in_blocks(moved, np.hstack([q, targets]))
-    return found[:, :-1], found[:, -1] <= _SETTLED
-
-
-def columns_at(arm: Arm, q: Float[np.ndarray, "N n"], names: Sequence[str]) -> Float[np.ndarray, "N 3 p"]:
-    """Derivatives of the tips by named parameters at poses."""
-    return in_blocks(lambda rows: np.asarray(arm.jacobian(rows, names)), q)
-
-
 def equations(
-    arm: Arm, capture: Capture, names: Sequence[str], q: Float[np.ndarray, "N n"]
+    arm: Arm, capture: SocketPoses, names: Sequence[str], q: Float[np.ndarray, "N n"]
 ) -> tuple[Float[np.ndarray, "N 3 p"], Float[np.ndarray, "l p"]]:
     """Derivatives of what a capture determines: tips less their socket's mean, and reference lengths; poses at ``q``."""
-    columns = columns_at(arm, q, names)
+    columns = jacobian_at(arm, q, names)
     owner, sizes = capture.owner, np.asarray(capture.sizes, dtype=float)
     starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
     means = np.add.reduceat(columns, starts, axis=0) / sizes[:, None, None]
-    tips = in_blocks(lambda rows: np.asarray(arm.position(rows)), q)
+    tips = in_chunks(lambda rows: np.asarray(arm.position(rows)), q)
     centroids = np.add.reduceat(tips, starts, axis=0) / sizes[:, None]
     ends = capture.ends()
     between = centroids[ends[:, 1]] - centroids[ends[:, 0]]
@@ -74,18 +34,12 @@ def equations(
     return columns - means[owner], lengths
 
 
-def jittered(arm: Arm, space: Parameters) -> Arm:
-    """The arm beside itself by about 1 mm and 1 mrad: out of a special position that only the nominal arm has."""
-    step = np.random.default_rng(0).normal(size=len(space.names)) * np.asarray(space.scale)
-    return space.arm(np.asarray(space.vector(arm)) + step)
-
-
 def nearly_parallel(arm: Arm) -> list[int]:
     """Joints, from 1, whose axis is nearly parallel to the next: there plain D-H is singular (Hayati and Mirmirani 1985)."""
     return [i + 1 for i in range(arm.joints - 1) if abs(np.sin(float(arm.alpha[i]))) < NEARLY_PARALLEL]
 
 
-def independent_names(arm: Arm, capture: Capture) -> tuple[Arm, tuple[str, ...]]:
+def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, ...]]:
     """A largest set of parameters that a capture determines, in the package's order, and the arm (with beta where needed).
 
     Taken one after the other, and held where those taken before can imitate them: nonzero lengths first, then angles, lengths
@@ -103,16 +57,16 @@ def independent_names(arm: Arm, capture: Capture) -> tuple[Arm, tuple[str, ...]]
     taken: tuple[str, ...] = ()
     for _ in range(5):
         # Out of a special position, but with what is held at its nominal value, which may make others redundant in its turn.
-        beside = jittered(arm, Parameters(arm, taken or tuple(order)))
+        beside = neighbouring_arm(arm, taken or tuple(order))
         before, taken = taken, _independent(beside, arm, capture, order)
         if taken == before or not taken:
             break
     return arm, taken
 
 
-def _independent(arm: Arm, stands: Arm, capture: Capture, order: list[str]) -> tuple[str, ...]:
+def _independent(arm: Arm, stands: Arm, capture: SocketPoses, order: list[str]) -> tuple[str, ...]:
     """Those whose columns stand apart from the columns of those before them; poses hold sockets where another arm puts them."""
-    poses, lengths = equations(arm, capture, order, settled(arm, capture, stands))
+    poses, lengths = equations(arm, capture, order, project_to_centroids(arm, capture, stands))
     rows = np.concatenate([poses.reshape(-1, len(order)), lengths])
     basis = np.zeros((rows.shape[0], 0))
     taken = []
@@ -147,13 +101,3 @@ def _order(arm: Arm, parallel: list[int]) -> list[str]:
     nonzero += [name for name, value in tip.items() if value != 0]
     order = [*nonzero, *angles, *(f"beta_{i}" for i in parallel), *zero, *wrist, *last]
     return [name for i, name in enumerate(order) if name not in last or i == len(order) - 1]
-
-
-def in_blocks(work: Callable[[np.ndarray], np.ndarray], rows: np.ndarray) -> np.ndarray:
-    """``work`` on whole blocks of rows; the last is filled up with its first row."""
-    pieces = []
-    for first in range(0, len(rows), _BLOCK):
-        block = rows[first : first + _BLOCK]
-        filled = np.concatenate([block, np.repeat(block[:1], _BLOCK - len(block), axis=0)])
-        pieces.append(work(filled)[: len(block)])
-    return np.concatenate(pieces)

@@ -1,7 +1,7 @@
 """Which numbers of an arm are free, and within what bounds."""
 
+import math
 from collections.abc import Iterable, Mapping
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -12,17 +12,9 @@ from jaxtyping import Array, Float
 
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError
-from ..data.capture import Capture
-from .arm import LENGTHS, Arm, locate, parameter_names, replace
-from .chain import Geometry
-
-# Steps of about 1 mm and 1 mrad are comparable at the tip of an arm of about 1 m.
-_LENGTH_SCALE, _ANGLE_SCALE = 1.0, 1e-3
-
-
-def is_length(name: str) -> bool:
-    """Whether a parameter name is a length (a, d, probe) and not an angle."""
-    return name.rpartition("_")[0] in LENGTHS
+from .arm import Arm, is_length, locate, natural_steps, parameter_names, replace, with_values
+from .independence import independent_names
+from .inverse_kinematics import SocketPoses
 
 
 class Parameters(eqx.Module):
@@ -62,14 +54,12 @@ class Parameters(eqx.Module):
         return cls(base=arm, names=tuple(wanted))
 
     @classmethod
-    def independent(cls, arm: Arm, capture: Capture) -> "Parameters":
+    def independent(cls, arm: Arm, capture: SocketPoses) -> "Parameters":
         """A largest set of free parameters that a capture can determine; what is redundant is held at its nominal value.
 
         For the paper's arm with a reference length these are its 21; without, the longest link is held too. Where neighbouring
         axes are nearly parallel, d of the first is held and Hayati's beta freed in its place.
         """
-        from .independence import independent_names  # that room builds on simulate, which builds on this one
-
         base, names = independent_names(arm, capture)
         if not names:
             raise InputError("the capture determines no parameter at all; record more poses in its sockets.")
@@ -88,9 +78,9 @@ class Parameters(eqx.Module):
     @property
     def scale(self) -> Float[Array, " p"]:
         """Natural step of each free parameter ``(p,)``: 1 mm for a length, 1 mrad for an angle."""
-        return jnp.where(jnp.asarray(self.lengths), _LENGTH_SCALE, _ANGLE_SCALE)
+        return jnp.asarray(natural_steps(self.names))
 
-    def entries(self) -> tuple[tuple[str, int], ...]:
+    def indices(self) -> tuple[tuple[str, int], ...]:
         """Kind and 0-based index of each free parameter."""
         return tuple(locate(self.base, name) for name in self.names)
 
@@ -108,7 +98,7 @@ class Parameters(eqx.Module):
         tools: Any = np if known else jnp  # see `joined`
         values = {kind: tools.asarray(getattr(arm, kind)) for kind in ("alpha", "a", "d", "theta", "probe")}
         values["beta"] = tools.zeros_like(values["alpha"]) if arm.beta is None else tools.asarray(arm.beta)
-        return joined(tools.broadcast_arrays(*(values[kind][..., i] for kind, i in self.entries())), axis=-1, new=True)
+        return joined(tools.broadcast_arrays(*(values[kind][..., i] for kind, i in self.indices())), axis=-1, new=True)
 
     def arm(self, vector: Numbers) -> Arm:
         """The base arm with its free parameters taken from ``(p,)``. Use ``vmap`` for a batch of vectors."""
@@ -117,27 +107,8 @@ class Parameters(eqx.Module):
             raise InputError(
                 f"vector has shape {vector.shape}, but {len(self.names)} parameters are free; give one value each."
             )
-        changes = placed(self.base.geometry, vector, self.entries())
+        changes = with_values(self.base.geometry, vector, self.indices())
         return replace(self.base, **changes)
-
-
-@partial(jax.jit, static_argnames=("entries",))
-def placed(
-    geometry: Geometry, vector: Float[Array, "... p"], entries: tuple[tuple[str, int], ...]
-) -> dict[str, Float[Array, "... n"]]:
-    """The kinds of parameters that ``vector`` holds some of, kind -> array, with its values put in their places."""
-    found = {}
-    for kind in dict.fromkeys(kind for kind, _ in entries):
-        held = getattr(geometry, kind)
-        sources = np.arange(held.shape[-1])
-        for position, (other, i) in enumerate(entries):
-            if other == kind:
-                sources[i] = held.shape[-1] + position
-        batch = np.broadcast_shapes(held.shape[:-1], vector.shape[:-1])
-        both = [jnp.broadcast_to(values, (*batch, values.shape[-1])) for values in (held, vector)]
-        # One gather from known positions: a third as many operations to trace and compile as a scatter.
-        found[kind] = jnp.concatenate(both, axis=-1).at[..., sources].get(mode="promise_in_bounds")
-    return found
 
 
 def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
@@ -205,3 +176,16 @@ class Bounds(eqx.Module):
         """Which parameters of ``(..., p)`` sit on a bound: -1 on the lower, +1 on the upper, 0 inside."""
         on_lower, on_upper = vector <= self.lower, vector >= self.upper
         return jnp.where(on_lower, -1, jnp.where(on_upper, 1, 0))
+
+
+def perturbed_arm(space: Parameters, *, length: float, angle: float, seed: int = 0) -> Arm:
+    """An arm that differs from the space's base: free lengths by up to ``length`` mm, free angles by up to ``angle`` rad.
+
+    Uniform and independent; what the maker's tolerances might have left.
+    """
+    for what, value in (("length", length), ("angle", angle)):
+        if not (math.isfinite(value) and value >= 0):
+            raise InputError(f"the deviation of a free {what} is {value:g}; it must be zero or positive.")
+    width = jnp.where(jnp.asarray(space.lengths), length, angle)
+    shift = jax.random.uniform(jax.random.key(seed), width.shape, minval=-1.0, maxval=1.0)
+    return space.arm(space.vector() + width * shift)

@@ -1,12 +1,16 @@
-"""How far an arm reaches."""
+"""Where an arm can be: its reach, its lowest point, poses at given points, and poses as lines in space."""
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from ..data.simulation import limits_of
-from .arm import Arm
+from ..core.arrays import in_chunks
+from .arm import Arm, joint_limits
+from .chain import Geometry, forward_pass, sines_cosines
+from .inverse_kinematics import project_to_targets
 
 _STARTS, _SWEEPS = 256, 30
 
@@ -18,14 +22,14 @@ class Reach(NamedTuple):
     radius: float
 
 
-def reach_of(arm: Arm) -> Reach:
+def arm_reach(arm: Arm) -> Reach:
     """How far the tip can be from the shoulder within the joint limits.
 
     Along one joint the squared distance is a constant and a sinusoid, so three of its values tell where it is largest. From many
     starts, joint after joint is set there until nothing changes: exact but for the choice of starts, and quick.
     """
     shoulder = np.array([0.0, 0.0, float(arm.d[0])])
-    limits = np.asarray(limits_of(arm, None))
+    limits = np.asarray(joint_limits(arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_STARTS, arm.joints))
 
     def squared(poses: np.ndarray) -> np.ndarray:
@@ -54,3 +58,67 @@ def reach_of(arm: Arm) -> Reach:
             break
         best = now
     return Reach(shoulder, float(np.sqrt(squared(q).max())))
+
+
+def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"]:
+    """Corners of the arm in each pose, mm: the base, for each joint the end of its offset and of its link, and the tip (``c`` = 2 n + 2)."""
+
+    def lines(rows: np.ndarray) -> np.ndarray:
+        forward = forward_pass(arm.geometry, sines_cosines(jnp.asarray(rows)))
+        before, after, axis = (
+            np.asarray(part).reshape(arm.joints, 3, -1) for part in (forward.origin_before, forward.origin, forward.z_before)
+        )
+        offset = before + np.asarray(arm.d)[:, None, None] * axis
+        both = np.stack([offset, after], axis=1).reshape(2 * arm.joints, 3, -1)
+        tip = np.asarray(forward.tip).reshape(1, 3, -1)
+        return np.concatenate([np.zeros_like(tip), both, tip]).transpose(2, 0, 1)
+
+    return in_chunks(lines, np.asarray(q))
+
+
+def lowest_point(arm: Arm, q: Float[np.ndarray, "c n"]) -> Float[np.ndarray, " c"]:
+    """Height of each pose's lowest joint or tip in the base frame, mm; the base itself left out."""
+    return in_chunks(lambda rows: np.asarray(_lowest(arm.geometry, jnp.asarray(rows))), q)
+
+
+@jax.jit
+def _lowest(geometry: Geometry, q: Array) -> Float[Array, " c"]:
+    forward = forward_pass(geometry, sines_cosines(q))
+    return jnp.minimum(jnp.min(forward.origin[:, 2], axis=0), forward.tip[2])
+
+
+def total_link_length(arm: Arm) -> float:
+    """What the links and the probe measure together, without the base's height, mm."""
+    return float(np.abs(arm.a).sum() + np.abs(np.asarray(arm.d)[1:]).sum() + np.linalg.norm(np.asarray(arm.probe)))
+
+
+@runtime_checkable
+class SearchRegion(Protocol):
+    """Where poses may be: of a `Scene`, or of whoever else looks for poses."""
+
+    @property
+    def arm(self) -> Arm:
+        """The arm."""
+        ...
+
+    @property
+    def limits(self) -> Float[np.ndarray, "n 2"]:
+        """Lowest and highest reading of each joint, rad."""
+        ...
+
+    @property
+    def above(self) -> float:
+        """Height below which no joint and no tip comes, mm."""
+        ...
+
+    def draw(self, count: int) -> Float[np.ndarray, "c n"]:
+        """Poses at random within the limits."""
+        ...
+
+
+def configurations_at(scene: SearchRegion, points: Float[np.ndarray, "s 3"], each: int) -> tuple[np.ndarray, np.ndarray]:
+    """Poses from ``each`` random starts for each socket that arrived within the limits, and the socket of each."""
+    owner = np.repeat(np.arange(len(points)), each)
+    q, arrived = project_to_targets(scene.arm, scene.draw(len(owner)), points[owner], scene.limits)
+    good = arrived & (lowest_point(scene.arm, q) >= scene.above)
+    return q[good], owner[good]

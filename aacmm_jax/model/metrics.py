@@ -42,17 +42,17 @@ def repeatability(tips: Float[Array, "N 3"], sizes: Sequence[int], *, fitted: in
     distances = _root(squared)
     half_range = jnp.max(highest(tips) + highest(-tips), axis=-1) / 2
     # With one pose in every socket nothing is known of the scatter: 0 / 0, which is NaN and not a perfect 0.
-    spread = int(counts[counts > 1].sum())
-    freedom = max(3 * int((counts - 1).sum()) - fitted, min(spread, 1))
+    scattering = int(counts[counts > 1].sum())
+    degrees_of_freedom = max(3 * int((counts - 1).sum()) - fitted, min(scattering, 1))
     return Repeatability(
-        de=_over(jnp.sum(distances), spread),
+        de=_over(jnp.sum(distances), scattering),
         deltam=jnp.max(half_range),
-        rms=_root(_over(jnp.sum(squared), spread)),
+        rms=_root(_over(jnp.sum(squared), scattering)),
         socket_de=total(distances) / jnp.asarray(counts, dtype=tips.dtype),
         socket_deltam=half_range,
         socket_rms=_root(total(squared) / jnp.asarray(counts, dtype=tips.dtype)),
         centroids=centroids,
-        sigma=_root(_over(jnp.sum(squared), freedom)),
+        sigma=_root(_over(jnp.sum(squared), degrees_of_freedom)),
     )
 
 

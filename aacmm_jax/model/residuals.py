@@ -2,104 +2,18 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core.arrays import joined
-from ..data.capture import Capture
-from ..data.noise import Noise, tip_covariances
-from ..kinematics.chain import Geometry, Turns, stacked_columns, turns_of, walk
+from ..kinematics.chain import Geometry, SinesCosines, forward_pass, stacked_jacobian_columns
 from ..kinematics.parameters import Parameters
 from ..solver.levenberg_marquardt import Model
-from .weights import Weights, membership
+from .measurement import Measurement, averaging_matrix, differences_matrix
+from .weights import Weights
 
 
-class Measurement(eqx.Module):
-    """A capture in the form that residuals take: all poses, which socket each belongs to, and the lengths.
-
-    ``sizes`` and ``ends`` are static: they fix the shape of the problem, as the number of poses does. ``turns`` are the
-    cosines and sines of q, which every evaluation needs and none changes. With ``weights``, centroids are weighted means.
-    """
-
-    q: Float[Array, "N n"]
-    turns: Turns
-    nominal: Float[Array, " l"]  # calibrated values of the reference lengths, mm
-    u: Float[Array, " l"]  # their standard uncertainties, mm
-    sizes: tuple[int, ...] = eqx.field(static=True)
-    ends: tuple[tuple[int, int], ...] = eqx.field(static=True)
-    weights: Weights | None = None  # None: every pose weighs the same
-
-    @classmethod
-    def of(cls, capture: Capture) -> "Measurement":
-        """The measurement of a capture."""
-        return cls(
-            q=capture.q,
-            turns=turns_of(capture.q),
-            nominal=joined([length.value for length in capture.lengths], new=True)
-            if capture.lengths
-            else jnp.array(np.zeros(0)),
-            u=joined([length.u for length in capture.lengths], new=True) if capture.lengths else jnp.array(np.zeros(0)),
-            sizes=capture.sizes,
-            ends=tuple((int(start), int(end)) for start, end in capture.ends()),
-        )
-
-    def weighed(self, geometry: Geometry, noise: Noise | None) -> "Measurement":
-        """The same with poses weighed by the inverse covariance that ``noise`` gives their tips in an arm about this one."""
-        if noise is None:
-            return self
-        weights = Weights.of(tip_covariances(geometry, self.turns, noise), self.sizes)
-        return eqx.tree_at(lambda m: m.weights, self, weights, is_leaf=lambda leaf: leaf is None)
-
-    @property
-    def averaging(self) -> Float[np.ndarray, "s N"]:
-        """Matrix that takes tips to socket centroids."""
-        return averaging_matrix(self.sizes)
-
-    # Sums over sockets are products with this matrix: sockets are few, and a scatter would not vectorise.
-    def centroids(self, tips: Float[Array, "N 3"]) -> Float[Array, "s 3"]:
-        """Mean of each socket's tips."""
-        if self.weights is not None:
-            return self.weights.centroids(tips.T, self.sizes).T
-        return jnp.asarray(self.averaging) @ tips
-
-    def centred(self, tips: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
-        """Tips less the mean of their socket: eliminates the sockets' unknown positions."""
-        return tips - jnp.asarray(membership(self.sizes).T) @ self.centroids(tips)
-
-    def whitened(self, centred: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
-        """Centred tips as a least squares counts them: in standard deviations where there are weights, else in mm."""
-        return centred if self.weights is None else self.weights.whiten(centred.T).T
-
-    def centroid_covariances(self, sigma: Float[Array, ""]) -> Float[Array, "s 3 3"]:
-        """Covariance of each socket's mean, mm^2: what the weights say, or ``sigma``^2 of a tip coordinate over the poses."""
-        if self.weights is not None:
-            return jnp.einsum("abs,cbs->sac", self.weights.spread, self.weights.spread)
-        return sigma**2 * jnp.asarray(np.eye(3)[None] / np.asarray(self.sizes, dtype=float)[:, None, None])
-
-    def distances(self, tips: Float[Array, "N 3"]) -> Float[Array, " l"]:
-        """Measured reference lengths: distances between the centroids of their end sockets, mm."""
-        return jnp.linalg.norm(self.differences @ self.centroids(tips), axis=-1)
-
-    @property
-    def differences(self) -> Float[Array, "l s"]:
-        """Matrix that takes socket centroids to the vectors between the ends of the lengths."""
-        return jnp.asarray(differences_matrix(self.ends, len(self.sizes)))
-
-
-def differences_matrix(ends: tuple[tuple[int, int], ...], sockets: int) -> Float[np.ndarray, "l s"]:
-    """Matrix that takes socket centroids to the vectors between the ends of the lengths."""
-    pairs, unit = np.asarray(ends, dtype=int).reshape(-1, 2), np.eye(sockets)
-    return unit[pairs[:, 1]] - unit[pairs[:, 0]]
-
-
-def averaging_matrix(sizes: tuple[int, ...]) -> Float[np.ndarray, "s N"]:
-    """Matrix whose product with poses in socket order gives each socket's mean."""
-    return membership(sizes) / np.asarray(sizes, dtype=float)[:, None]
-
-
-class Weighing(NamedTuple):
+class JointWeights(NamedTuple):
     """What a joint solve needs besides the poses: the lengths, and how both are weighed. Leading axes may be lanes."""
 
     ends: tuple[tuple[int, int], ...]
@@ -135,7 +49,7 @@ def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Meas
     """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic columns."""
     space, measurement = args
     geometry = space.arm(vector).geometry
-    return model_of(geometry, measurement.turns, measurement.sizes, space.entries(), weights=measurement.weights)
+    return model_of(geometry, measurement.sines_cosines, measurement.sizes, space.indices(), weights=measurement.weights)
 
 
 def joint_model(
@@ -144,26 +58,26 @@ def joint_model(
 ) -> Model:
     """Cost, gradient and Gram matrix of `joint_residual`."""
     space, measurement, sigma, whitening = args
-    weighing = Weighing(measurement.ends, measurement.nominal, sigma, whitening)
+    joint_weights = JointWeights(measurement.ends, measurement.nominal, sigma, whitening)
     geometry = space.arm(vector).geometry
-    return model_of(geometry, measurement.turns, measurement.sizes, space.entries(), weighing, measurement.weights)
+    return model_of(geometry, measurement.sines_cosines, measurement.sizes, space.indices(), joint_weights, measurement.weights)
 
 
 def measured_lengths(
     vector: Float[Array, " p"], space: Parameters, measurement: Measurement
 ) -> tuple[Float[Array, " l"], Float[Array, "l p"]]:
     """Measured reference lengths, mm, and their analytic Jacobian by the free parameters."""
-    walked = walk(space.arm(vector).geometry, measurement.turns)
-    columns = stacked_columns(walked, space.entries())
-    return _distances(walked.tip, columns, measurement.sizes, measurement.ends, measurement.weights)
+    forward = forward_pass(space.arm(vector).geometry, measurement.sines_cosines)
+    columns = stacked_jacobian_columns(forward, space.indices())
+    return _distances(forward.tip, columns, measurement.sizes, measurement.ends, measurement.weights)
 
 
 def model_of(
     geometry: Geometry,
-    turns: Turns,
+    sines_cosines: SinesCosines,
     sizes: tuple[int, ...],
     entries: tuple[tuple[str, int], ...],
-    weighing: Weighing | None = None,
+    joint_weights: JointWeights | None = None,
     weights: Weights | None = None,
 ) -> Model:
     """Cost, gradient and Gram matrix of the repeatability residual, for any batch of arms and poses that broadcast; with
@@ -172,12 +86,12 @@ def model_of(
     The mean over a socket is taken off the Gram matrix as a correction of rank 3 a socket, J^T J - m mu^T mu, which spares
     a centred copy of the columns; the gradient needs none, because centred residuals sum to zero.
     """
-    walked = walk(geometry, turns)
-    columns = stacked_columns(walked, entries)
+    forward = forward_pass(geometry, sines_cosines)
+    columns = stacked_jacobian_columns(forward, entries)
     # Centred twice: the rounding that one pass leaves in the mean (1e-13 mm) would otherwise be multiplied by the columns'
     # means, and near a perfect fit outweigh the gradient.
     averaging = averaging_matrix(sizes)
-    residual = _centred_rows(walked.tip, averaging)
+    residual = _centred_rows(forward.tip, averaging)
     if weights is None:
         residual, counted = _centred_rows(residual, averaging), columns
         shifts = columns @ jnp.asarray((averaging * np.sqrt(np.asarray(sizes, dtype=float))[:, None]).T)
@@ -192,12 +106,12 @@ def model_of(
         (flat @ residual[..., None])[..., 0],
         flat @ jnp.swapaxes(flat, -1, -2) - weighted @ jnp.swapaxes(weighted, -1, -2),
     )
-    if weighing is None:
+    if joint_weights is None:
         return poses
-    distance, rows = _distances(walked.tip, columns, sizes, weighing.ends, weights)
-    off = (weighing.whitening @ (distance - weighing.nominal)[..., None])[..., 0]
-    rows = weighing.whitening @ rows
-    weight = 1 / weighing.sigma**2
+    distance, rows = _distances(forward.tip, columns, sizes, joint_weights.ends, weights)
+    off = (joint_weights.whitening @ (distance - joint_weights.nominal)[..., None])[..., 0]
+    rows = joint_weights.whitening @ rows
+    weight = 1 / joint_weights.sigma**2
     return Model(
         weight * poses.cost + 0.5 * jnp.sum(off**2, axis=-1),
         weight[..., None] * poses.gradient + (off[..., None, :] @ rows)[..., 0, :],

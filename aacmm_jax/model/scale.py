@@ -9,9 +9,8 @@ from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
 from ..data.capture import Capture
 from ..kinematics.arm import Arm, replace
-from ..uncertainty.covariance import length_covariance
+from .measurement import Measurement, length_covariance
 from .metrics import repeatability
-from .residuals import Measurement
 
 
 class Scale(eqx.Module):
@@ -69,10 +68,10 @@ def _fixed(arm: Arm, measurement: Measurement, sigma: float | Array | None) -> S
 
 def scale_of(tips: Float[Array, "N 3"], measurement: Measurement, sigma: Float[Array, ""]) -> Scale:
     """k from tips, given the standard deviation of a tip coordinate (NaN where unknown)."""
-    return scale_and_shares(tips, measurement, sigma)[0]
+    return scale_and_weights(tips, measurement, sigma)[0]
 
 
-def scale_and_shares(
+def scale_and_weights(
     tips: Float[Array, "N 3"], measurement: Measurement, sigma: Float[Array, ""]
 ) -> tuple[Scale, Float[Array, " l"]]:
     """k from tips, and its derivative by each measured length, 1/mm."""
@@ -82,11 +81,11 @@ def scale_and_shares(
     centroids = measurement.centroids(tips)
     plain = jnp.diagonal(length_covariance(centroids, measurement, known, ratio))
     weight = measurement.nominal**2 / plain
-    share = weight / jnp.sum(weight)
-    value = jnp.sum(share * ratio)
-    relative = share / measurement.nominal
+    weight_of = weight / jnp.sum(weight)
+    value = jnp.sum(weight_of * ratio)
+    relative = weight_of / measurement.nominal
     predicted = relative @ length_covariance(centroids, measurement, sigma, value) @ relative
-    observed = jnp.sum(share * (ratio - value) ** 2) / max(ratio.shape[0] - 1, 1)
+    observed = jnp.sum(weight_of * (ratio - value) ** 2) / max(ratio.shape[0] - 1, 1)
     return Scale(value, jnp.sqrt(jnp.maximum(predicted, observed)), measured, measurement.nominal), relative
 
 

@@ -12,12 +12,12 @@ class Weights(NamedTuple):
 
     With W_j the inverse covariance of tip j: ``root`` R_j has R_j^T R_j = W_j, so it whitens the tip's error. A socket shifted
     by c moves its whitened tips by R_j c; ``basis`` B_j = R_j T spans the same shifts orthonormally (the sum of B_j^T B_j over
-    a socket is I), where ``spread`` T of the socket has T T^T = (sum of W_j)^-1, the covariance of its weighted centroid.
+    a socket is I), where ``centroid_factor`` T of the socket has T T^T = (sum of W_j)^-1, the covariance of its weighted centroid.
     """
 
     root: Float[Array, "*lanes 3 3 N"]  # 1/mm
     basis: Float[Array, "*lanes 3 3 N"]
-    spread: Float[Array, "*lanes 3 3 s"]  # mm
+    centroid_factor: Float[Array, "*lanes 3 3 s"]  # mm
 
     @classmethod
     def of(cls, covariances: Float[Array, "*lanes 3 3 N"], sizes: tuple[int, ...]) -> "Weights":
@@ -25,8 +25,8 @@ class Weights(NamedTuple):
         root = inverse_root(covariances)
         members = jnp.asarray(membership(sizes))
         total = _product(_transposed(root), root) @ members.T  # sum of W over each socket
-        spread = _transposed(inverse_root(total))
-        return cls(root, _product(root, spread @ members), spread)
+        centroid_factor = _transposed(inverse_root(total))
+        return cls(root, _product(root, centroid_factor @ members), centroid_factor)
 
     def whiten(self, rows: Float[Array, "... 3 N"]) -> Float[Array, "... 3 N"]:
         """R_j times every pose's vector; more axes than the weights' (parameters) come after the lanes."""
@@ -42,7 +42,7 @@ class Weights(NamedTuple):
 
     def centroids(self, rows: Float[Array, "... 3 N"], sizes: tuple[int, ...]) -> Float[Array, "... 3 s"]:
         """Weighted mean of each socket's rows."""
-        return _applied(self.spread, self.sums(self.whiten(rows), sizes))
+        return _applied(self.centroid_factor, self.sums(self.whiten(rows), sizes))
 
 
 def membership(sizes: tuple[int, ...]) -> Float[np.ndarray, "s N"]:

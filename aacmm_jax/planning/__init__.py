@@ -1,1 +1,5 @@
 """Which poses to take, in which sockets, before the arm is touched."""
+
+import lazy_loader as _lazy_loader
+
+__getattr__, __dir__, __all__ = _lazy_loader.attach_stub(__name__, __file__)

@@ -11,14 +11,15 @@ from ..core.arrays import Numbers
 from ..core.errors import InputError, nearest
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
-from ..data.simulation import limits_of, socket_point
-from ..kinematics.arm import Arm, is_single
-from ..kinematics.independence import columns_at, moved_onto
+from ..data.simulation import socket_point
+from ..kinematics.arm import Arm, is_single, jacobian_at, joint_limits
+from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.parameters import Parameters
-from ..uncertainty.identifiability import observe
-from ..uncertainty.volume import check_lengths, default_length, links_of
+from ..kinematics.workspace import configurations_at, lowest_point, total_link_length
+from ..uncertainty.identifiability import observability
+from ..uncertainty.volume import default_length, sample_lengths
 from .fedorov_exchange import Candidates, Goal, covariance_of, exchange
-from .placement import Place, Scene, beside, candidates_of, lowest, places, poses_at, worth
+from .placement import Place, Scene, beside, candidates_of, places, worth
 from .pose_refinement import refined
 
 Criterion = Literal["length", "A", "D", "E"]
@@ -125,9 +126,9 @@ def plan(
         noise=noise,
         criterion=criterion,
         check_length=check_length,
-        **_predictions(scene, place, given, q, owner, check_length, np.asarray(limits_of(arm, limits)), seed),
+        **_predictions(scene, place, given, q, owner, check_length, np.asarray(joint_limits(arm, limits)), seed),
     )
-    unseen = observe(arm, found.capture(), space)
+    unseen = observability(arm, found.capture(), space)
     if unseen.rank < len(space.names):
         raise InputError(f"no {poses} poses in these sockets determine the parameters. {' '.join(unseen.sentences())}")
     return found
@@ -146,14 +147,14 @@ def _scene(
     margin, above = room
     if not is_single(arm):
         raise InputError("plan takes one arm, not a batch; take one of it first.")
-    if arm.joints < 3 or links_of(arm) == 0:
+    if arm.joints < 3 or total_link_length(arm) == 0:
         raise InputError("this arm reaches no volume (three joints and some link are the least), so there is nothing to plan.")
     if seed < 0:
         raise InputError(f"seed is {seed}; give zero or a positive number.")
     if criterion not in CRITERIA:
         raise InputError(f"criterion is '{criterion}'; it must be one of {', '.join(CRITERIA)}.")
     noise.check(arm.joints)
-    allowed = np.asarray(limits_of(arm, limits))
+    allowed = np.asarray(joint_limits(arm, limits))
     if not (math.isfinite(margin) and 0 <= margin < np.min(allowed[:, 1] - allowed[:, 0]) / 2):
         raise InputError(
             f"a margin of {math.degrees(margin):g} deg leaves a joint no room within its limits; give a smaller one."
@@ -169,10 +170,10 @@ def _functions(
     arm: Arm, space: Parameters, count: int, length: float, limits: np.ndarray, seed: int
 ) -> Float[np.ndarray, "v p"]:
     """Derivatives of lengths over the volume by the free parameters, in natural steps."""
-    start, end = check_lengths(arm, count, length=length, limits=limits, seed=seed)
+    start, end = sample_lengths(arm, count, length=length, limits=limits, seed=seed)
     between = np.asarray(arm.position(end)) - np.asarray(arm.position(start))
     direction = between / np.linalg.norm(between, axis=1, keepdims=True)
-    slopes = columns_at(arm, end, space.names) - columns_at(arm, start, space.names)
+    slopes = jacobian_at(arm, end, space.names) - jacobian_at(arm, start, space.names)
     return np.einsum("vc,vcp->vp", direction, slopes) * np.asarray(space.scale)
 
 
@@ -221,7 +222,7 @@ def _choices(
                 f"the region's {axis} is {least:g} to {most:g} mm, which is no range; give the lower number first."
             )
     low, high = (length, length) if isinstance(length, int | float) else length
-    if not 0 < low <= high < 2 * links_of(scene.arm):
+    if not 0 < low <= high < 2 * total_link_length(scene.arm):
         raise InputError(
             f"a reference length of {low:g} to {high:g} mm does not fit this arm; give one shorter than its reach."
         )
@@ -270,7 +271,7 @@ def _chosen_place(
 
 def _chosen_worth(scene: Scene, place: Place, poses: int) -> float:
     """The criterion for poses chosen, not too carefully, in a place."""
-    q, owner = poses_at(scene, place.points, _AT_FIRST // len(place.points))
+    q, owner = configurations_at(scene, place.points, _AT_FIRST // len(place.points))
     if np.bincount(owner, minlength=len(place.points)).min(initial=_AT_FIRST) < _LEAST:
         return np.inf
     given = candidates_of(scene, place, q, owner)
@@ -280,7 +281,7 @@ def _chosen_worth(scene: Scene, place: Place, poses: int) -> float:
 
 
 def _candidates(scene: Scene, place: Place, count: int) -> _Given:
-    q, owner = poses_at(scene, place.points, max(count // len(place.points), 50))
+    q, owner = configurations_at(scene, place.points, max(count // len(place.points), 50))
     for i, point in enumerate(place.points):
         if np.sum(owner == i) < 20:
             where = ", ".join(f"{x:.0f}" for x in point)
@@ -335,8 +336,10 @@ def _predictions(
     ]
     loose = []
     for _ in range(_LOOSE_SETS):
-        near, arrived = moved_onto(scene.arm, q + _LOOSE * scene.random.normal(size=q.shape), place.points[owner], scene.limits)
-        near = np.where((arrived & (lowest(scene.arm, near) >= scene.above))[:, None], near, q)
+        near, arrived = project_to_targets(
+            scene.arm, q + _LOOSE * scene.random.normal(size=q.shape), place.points[owner], scene.limits
+        )
+        near = np.where((arrived & (lowest_point(scene.arm, near) >= scene.above))[:, None], near, q)
         loose.append(of(candidates_of(scene, place, near, owner).rows))
     base = pool.base + np.einsum("cki,ckj->ij", planned.rows, planned.rows)
     added = exchange(pool._replace(base=base), MORE, scene.goal, least=0, sweeps=1)

@@ -55,7 +55,7 @@ class Goal(NamedTuple):
         tools: Any = jnp if isinstance(covariance, jax.Array) else np
         return tools.einsum("vp,pq,vq->v", self.functions, covariance, self.functions)
 
-    def weighed(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+    def weighted(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
         """The derivative by the covariance, but for a factor."""
         if self.kind == "trace":
             return np.linalg.matrix_power(covariance / np.trace(covariance), int(self.power))
@@ -134,8 +134,8 @@ def _best(candidates: Candidates, information: np.ndarray, goal: Goal, allowed: 
         own = np.eye(3) + (part.reshape(-1, len(sockets)) @ sockets).reshape(part.shape) @ part.transpose(0, 2, 1)
         gain = np.linalg.slogdet(inner)[1] - np.linalg.slogdet(own)[1]
     else:
-        weighed = inverse[:, :p] @ goal.weighed(inverse[:p, :p]) @ inverse[:p]
-        outer = (flat @ weighed).reshape(candidates.rows.shape) @ candidates.rows.transpose(0, 2, 1)
+        weighted = inverse[:, :p] @ goal.weighted(inverse[:p, :p]) @ inverse[:p]
+        outer = (flat @ weighted).reshape(candidates.rows.shape) @ candidates.rows.transpose(0, 2, 1)
         gain = np.trace(np.linalg.solve(inner, outer), axis1=1, axis2=2)
     if not (allowed.any() and np.all(np.isfinite(gain))):
         raise InputError("there are fewer candidate poses than poses to choose, or they add nothing; ask for more candidates.")

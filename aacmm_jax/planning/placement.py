@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial.transform import Rotation
 
+from ..core.arrays import in_chunks
 from ..core.errors import InputError
 from ..data.noise import Noise, tip_covariances
-from ..kinematics.arm import Arm
-from ..kinematics.chain import Geometry, turns_of, walk
-from ..kinematics.independence import columns_at, in_blocks, moved_onto
+from ..kinematics.arm import Arm, jacobian_at
+from ..kinematics.chain import Geometry, sines_cosines
 from ..kinematics.parameters import Parameters
+from ..kinematics.workspace import configurations_at, total_link_length
 from ..model.weights import inverse_root
-from ..uncertainty.volume import links_of
 from .fedorov_exchange import Candidates, Goal, covariance_of
 
 _TRIES = 24  # poses tried in each socket of a place
@@ -50,53 +50,11 @@ class Place(NamedTuple):
     u: tuple[float, ...]
 
 
-class Room(Protocol):
-    """Where poses may be: of a `Scene`, or of whoever else looks for poses."""
-
-    @property
-    def arm(self) -> Arm:
-        """The arm."""
-        ...
-
-    @property
-    def limits(self) -> Float[np.ndarray, "n 2"]:
-        """Lowest and highest reading of each joint, rad."""
-        ...
-
-    @property
-    def above(self) -> float:
-        """Height below which no joint and no tip comes, mm."""
-        ...
-
-    def draw(self, count: int) -> Float[np.ndarray, "c n"]:
-        """Poses at random within the limits."""
-        ...
-
-
-def poses_at(scene: Room, points: Float[np.ndarray, "s 3"], each: int) -> tuple[np.ndarray, np.ndarray]:
-    """Poses from ``each`` random starts for each socket that arrived within the limits, and the socket of each."""
-    owner = np.repeat(np.arange(len(points)), each)
-    q, arrived = moved_onto(scene.arm, scene.draw(len(owner)), points[owner], scene.limits)
-    good = arrived & (lowest(scene.arm, q) >= scene.above)
-    return q[good], owner[good]
-
-
-def lowest(arm: Arm, q: Float[np.ndarray, "c n"]) -> Float[np.ndarray, " c"]:
-    """Height of each pose's lowest joint or tip in the base frame, mm; the base itself left out."""
-    return in_blocks(lambda rows: np.asarray(_lowest(arm.geometry, jnp.asarray(rows))), q)
-
-
-@jax.jit
-def _lowest(geometry: Geometry, q: Array) -> Float[Array, " c"]:
-    walked = walk(geometry, turns_of(q))
-    return jnp.minimum(jnp.min(walked.origin[:, 2], axis=0), walked.tip[2])
-
-
 def candidates_of(scene: Scene, place: Place, q: Float[np.ndarray, "c n"], owner: Int[np.ndarray, " c"]) -> Candidates:
     """What each pose would add to what is known, and what the lengths add by themselves."""
     p, sockets = len(scene.space.names), len(place.points)
-    slopes = columns_at(scene.arm, q, scene.space.names) * np.asarray(scene.space.scale)
-    roots = in_blocks(lambda rows: np.asarray(_roots(scene.arm.geometry, jnp.asarray(rows), scene.noise)), q)
+    slopes = jacobian_at(scene.arm, q, scene.space.names) * np.asarray(scene.space.scale)
+    roots = in_chunks(lambda rows: np.asarray(_roots(scene.arm.geometry, jnp.asarray(rows), scene.noise)), q)
     rows = np.zeros((len(q), 3, p + 3 * sockets))
     rows[:, :, :p] = roots @ slopes
     for axis in range(3):
@@ -113,12 +71,12 @@ def candidates_of(scene: Scene, place: Place, q: Float[np.ndarray, "c n"], owner
 
 @jax.jit
 def _roots(geometry: Geometry, q: Array, noise: Noise) -> Float[Array, "c 3 3"]:
-    return jnp.moveaxis(inverse_root(tip_covariances(geometry, turns_of(q), noise)), -1, 0)
+    return jnp.moveaxis(inverse_root(tip_covariances(geometry, sines_cosines(q), noise)), -1, 0)
 
 
 def worth(scene: Scene, place: Place, poses: int) -> float:
     """The criterion for so many poses taken at random in a place; infinite where a socket cannot be reached well."""
-    q, owner = poses_at(scene, place.points, _TRIES)
+    q, owner = configurations_at(scene, place.points, _TRIES)
     if np.bincount(owner, minlength=len(place.points)).min(initial=_TRIES) < _REACHED * _TRIES:
         return np.inf
     candidates = candidates_of(scene, place, q, owner)
@@ -164,7 +122,7 @@ def beside(scene: Scene, place: Place, region: Mapping[str, tuple[float, float]]
     stands += [[i] for i in range(len(points)) if not any(i in pair for pair in stands)]
     moved = stands[scene.random.integers(len(stands))]
     middle = points[moved].mean(axis=0)
-    shift = scene.random.normal(size=3) * _SHIFT * links_of(scene.arm)
+    shift = scene.random.normal(size=3) * _SHIFT * total_link_length(scene.arm)
     turn = Rotation.from_rotvec(scene.random.normal(size=3) * _TURN)
     points[moved] = middle + shift + turn.apply(points[moved] - middle)
     return place._replace(points=points) if _inside(points, region).all() else None

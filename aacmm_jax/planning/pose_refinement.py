@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..data.simulation import least_moves
 from ..kinematics.arm import Arm
-from ..kinematics.chain import columns_of, turns_of, walk
-from ..kinematics.independence import moved_onto
+from ..kinematics.chain import forward_pass, jacobian_columns, sines_cosines
+from ..kinematics.inverse_kinematics import damped_inverse, project_to_targets
 from ..kinematics.parameters import Parameters
-from ..model.residuals import Measurement
+from ..kinematics.workspace import lowest_point
+from ..model.measurement import Measurement
 from ..uncertainty.identifiability import whitened_equations
-from .placement import Place, Scene, lowest
+from .placement import Place, Scene
 
 _STEPS = 80
 _ONTO = 4  # Newton's steps that bring a moved pose back into its socket, inside the derivative
@@ -45,7 +45,7 @@ def refined(
     lengths = [np.linalg.norm(place.points[b] - place.points[a]) for a, b in place.ends]
     measurement = Measurement(
         q=jnp.asarray(q),
-        turns=turns_of(jnp.asarray(q)),
+        sines_cosines=sines_cosines(jnp.asarray(q)),
         nominal=jnp.asarray(np.array(lengths)),
         u=jnp.asarray(np.array(place.u)),
         sizes=sizes,
@@ -58,8 +58,8 @@ def refined(
     @eqx.filter_value_and_grad
     def criterion(moved: Array, design: _Design) -> Array:
         at = _onto(design.arm, moved, design.targets)
-        fresh = eqx.tree_at(lambda m: (m.q, m.turns), design.measurement, (at, turns_of(at)))
-        rows = whitened_equations(design.arm, design.space, fresh.weighed(design.arm.geometry, scene.noise))
+        fresh = eqx.tree_at(lambda m: (m.q, m.sines_cosines), design.measurement, (at, sines_cosines(at)))
+        rows = whitened_equations(design.arm, design.space, fresh.weighted(design.arm.geometry, scene.noise))
         information = rows.T @ rows + 1e-4 * jnp.eye(rows.shape[1])
         return scene.goal._replace(functions=design.functions).value(jnp.linalg.inv(information))
 
@@ -79,8 +79,8 @@ def refined(
     solution = optimize.minimize(
         both, q.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, callback=told, options={"maxiter": _STEPS}
     )
-    better, arrived = moved_onto(scene.arm, solution.x.reshape(q.shape), targets, scene.limits)
-    better = np.where((arrived & (lowest(scene.arm, better) >= scene.above))[:, None], better, q)
+    better, arrived = project_to_targets(scene.arm, solution.x.reshape(q.shape), targets, scene.limits)
+    better = np.where((arrived & (lowest_point(scene.arm, better) >= scene.above))[:, None], better, q)
     return better if both(better.ravel())[0] <= both(q.ravel())[0] else q
 
 
@@ -88,9 +88,9 @@ def _onto(arm: Arm, q: Float[Array, "N n"], targets: Float[Array, "N 3"]) -> Flo
     """Poses brought onto their targets by least steps, differentiably."""
 
     def step(rows: Array, _: None) -> tuple[Array, None]:
-        walked = walk(arm.geometry, turns_of(rows))
-        gap = targets.T - walked.tip
-        moves = least_moves(columns_of(walked)["theta"], jnp.full(rows.shape[0], 1e-6))
+        forward = forward_pass(arm.geometry, sines_cosines(rows))
+        gap = targets.T - forward.tip
+        moves = damped_inverse(jacobian_columns(forward)["theta"], jnp.full(rows.shape[0], 1e-6))
         return rows + jnp.sum(moves * gap[None], axis=1).T, None
 
     return jax.lax.scan(step, q, None, length=_ONTO)[0]

@@ -5,19 +5,21 @@ None touches matplotlib's global state; save one with ``axes.figure.savefig("nam
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..acceptance.suite import AcceptanceTest
+from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.arrays import Numbers
 from ..core.errors import InputError
-from ..files.calibrations import CalibrationRecord
-from ..kinematics.arm import Arm
-from ..kinematics.parameters import is_length
-from ..model.residuals import Measurement
+from ..files.whole_file import whole_file
+from ..kinematics.arm import Arm, is_length
+from ..model.measurement import Measurement
+from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
-from ..uncertainty.volume import Uncertainty, Volume, uncertainty_of
+from ..uncertainty.volume import VolumetricUncertainty
 from .drift import plot_changes as plot_changes
 from .drift import trend as trend
 
@@ -120,7 +122,7 @@ def length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
 
 def arm(arm: Arm, q: Numbers, axes: Any = None) -> Any:
     """The arm in poses ``(m, n)`` (rad) as lines in space, mm; the first is drawn dark. ``axes`` must be three-dimensional."""
-    from ..kinematics.skeleton import corners
+    from ..kinematics.workspace import skeleton
 
     if axes is None:
         from matplotlib.figure import Figure
@@ -129,7 +131,7 @@ def arm(arm: Arm, q: Numbers, axes: Any = None) -> Any:
     elif getattr(axes, "name", "") != "3d":
         raise InputError("an arm is drawn in space; give axes made with projection='3d'.")
     poses = np.atleast_2d(np.asarray(arm._checked(q)))
-    for number, line in reversed(list(enumerate(corners(arm, poses)))):
+    for number, line in reversed(list(enumerate(skeleton(arm, poses)))):
         style = (
             {"color": _DARK, "linewidth": 3, "marker": "o", "markersize": 4}
             if number == 0
@@ -143,7 +145,7 @@ def arm(arm: Arm, q: Numbers, axes: Any = None) -> Any:
     return axes
 
 
-def volume(volume: Volume, factor: float = 2.0, axes: Any = None) -> Any:
+def volume(volume: VolumetricUncertainty, factor: float = 2.0, axes: Any = None) -> Any:
     """Expanded uncertainty of lengths over the volume: larger and darker marks, at the height and distance from the first axis where each starts."""
     axes = _axes(axes)
     expanded = factor * volume.u_length
@@ -247,3 +249,17 @@ def _axes(axes: Any) -> Any:
 def _titled(axes: Any, x: str, y: str) -> None:
     axes.set(xlabel=x, ylabel=y)
     axes.grid(True, which="major", alpha=0.3)
+
+
+def calibration_figure(record: CalibrationRecord, path: Path) -> None:
+    """Distances from the centroid pose by pose and, where the truth is known, errors of the length parameters; as PNG."""
+    from matplotlib.figure import Figure
+
+    panels = 2 if record.recording.true is not None else 1
+    figure = Figure(figsize=(5.5 * panels, 3.9), layout="constrained")
+    axes = figure.subplots(1, panels, squeeze=False)
+    distances(record, axes[0, 0])
+    if panels == 2:
+        length_parameter_errors(record, axes[0, 1])
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=150)

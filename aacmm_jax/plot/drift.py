@@ -7,7 +7,7 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..drift.comparison import Drift, Trend, in_words
-from ..files import storage
+from ..files.whole_file import whole_file
 
 FORMATS = ("png", "svg", "pdf")
 _DARK, _LIGHT, _ACCENT = "#1b3a6b", "0.72", "#d95f02"
@@ -30,7 +30,7 @@ def save_trend(table: Trend, path: Path) -> None:
     """Draw `trend` into a file, PNG, SVG or PDF by its name, whole or not at all."""
     suffix = check_format(path)
     panels = trend(table)
-    with storage.whole_file(path) as temporary:
+    with whole_file(path) as temporary:
         panels[0].figure.savefig(temporary, format=suffix, dpi=150)
 
 

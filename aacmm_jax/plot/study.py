@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..files import storage
+from ..files.whole_file import whole_file
 from ..study.results import Results
 from ..study.specification import unit
 from ..study.statistics import FIGURES, correlation
@@ -50,7 +50,7 @@ def write_figures(results: Results, folder: Path) -> list[Path]:
     written = []
     for name, draw in made.items():
         figure = draw()
-        with storage.whole_file(folder / f"{name}.png") as temporary:
+        with whole_file(folder / f"{name}.png") as temporary:
             figure.savefig(temporary, format="png", dpi=150)
         pyplot.close(figure)
         written.append(folder / f"{name}.png")

@@ -1,3 +1,5 @@
 """Reports that a laboratory would hand on: one HTML file for a calibration, an evaluation or a study."""
 
-from .page import write_report as write_report
+import lazy_loader as _lazy_loader
+
+__getattr__, __dir__, __all__ = _lazy_loader.attach_stub(__name__, __file__)

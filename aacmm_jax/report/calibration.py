@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..files.calibrations import CalibrationRecord
+from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..summaries.calibration import calibration_summary
 from ..summaries.warnings import observed
-from ..uncertainty.volume import over_volume, uncertainty_of
+from ..uncertainty.volume import volumetric_uncertainty
 from . import charts
 from .knowledge import bounds_section, correlations_section, observability_section, sampled_section, volume_section
 from .parts import ARCSEC, Chart, Report, Section, Table, decimals_of, number, shown, text
@@ -20,7 +20,7 @@ from .scene import arms_of
 def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any]]:
     """The report, without what names its file; and the summary that it was made from."""
     uncertainty, seen = uncertainty_of(record), observed(record)
-    volume = over_volume(uncertainty)
+    volume = volumetric_uncertainty(uncertainty)
     summary = calibration_summary(record, seen, volume)
     evaluations = record.evaluations()
     factor = uncertainty.factor(0.95)

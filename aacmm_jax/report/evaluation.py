@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 
 from ..acceptance.decision import worst
+from ..acceptance.record import EvaluationRecord, PointsRecord
 from ..acceptance.suite import FIGURES, AcceptanceTest, Figure
 from ..calibration.evaluation import Evaluation, evaluate
 from ..data.capture import ReferenceLength
-from ..data.recording import ProbedSphere
-from ..files.evaluations import EvaluationRecord
-from ..files.points_evaluations import PointsRecord
+from ..data.sphere import ProbedSphere
 from ..summaries.evaluation import evaluation_summary, points_summary
 from . import charts
 from .parts import Cell, Chart, Report, Section, Table, number, shown, text

@@ -5,15 +5,16 @@ from typing import Any
 
 import numpy as np
 
-from ..files.calibrations import CalibrationRecord
-from ..kinematics.parameters import is_length
+from ..calibration.record import CalibrationRecord
+from ..kinematics.arm import is_length
+from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
-from ..uncertainty.volume import Uncertainty, Volume
+from ..uncertainty.volume import VolumetricUncertainty
 from . import charts
 from .parts import Chart, Section, Table, number, shown, text
 
 
-def volume_section(volume: Volume, summary: dict[str, Any], factor: float) -> Section:
+def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], factor: float) -> Section:
     """Expanded uncertainty of tips and lengths over the working volume."""
     found = summary["uncertainty"]["volume"]
     length = f"{volume.length:g} mm length"

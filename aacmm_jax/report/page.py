@@ -7,11 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ..acceptance.record import SIMULATED
 from ..core.errors import InputError
-from ..files import storage
 from ..files.administrative_data import check_conformity
-from ..files.evaluations import SIMULATED
-from .about import about_section
+from ..files.hdf5 import read_tables
+from ..files.whole_file import fingerprint, write_text
+from .administrative_data import administrative_section
 from .parts import Arms, Chart, Report, Table
 
 _FOLDER = Path(__file__).parent
@@ -29,7 +30,7 @@ def write_report(source: str | os.PathLike, target: str | os.PathLike, about: An
     if target.exists() and source.exists() and target.samefile(source):
         raise InputError(f"{target} is the file that the report is of; choose another output.")
     page, report = report_of(source, about)
-    storage.write_text(target, page)
+    write_text(target, page)
     return {
         "kind": "report",
         "of": str(source),
@@ -43,7 +44,7 @@ def write_report(source: str | os.PathLike, target: str | os.PathLike, about: An
 
 def report_of(source: Path, about: Any = None) -> tuple[str, Report]:
     """The page of a file, and the report that it shows."""
-    stored = storage.read_tables(source, KINDS, without=("trials",))
+    stored = read_tables(source, KINDS, without=("trials",))
     report, simulated, decision = _MAKERS[stored.attributes["kind"]](source, stored.attributes)
     if simulated:
         report = report._replace(
@@ -52,7 +53,7 @@ def report_of(source: Path, about: Any = None) -> tuple[str, Report]:
     if about is not None:
         tested = stored.attributes["kind"] == "evaluation"
         check_conformity(about, simulated=simulated, decision=decision, tested=tested)
-        report = report._replace(sections=[about_section(about, tested), *report.sections])
+        report = report._replace(sections=[administrative_section(about, tested), *report.sections])
     return page_of(report, made_by(source, stored.attributes)), report
 
 
@@ -100,7 +101,7 @@ _MAKERS: dict[str, Callable[[Path, dict[str, Any]], tuple[Report, bool, str | No
 def made_by(source: Path, attributes: dict[str, Any]) -> list[tuple[str, list[str]]]:
     """How the file came about, and how to make it again."""
     return [
-        ("File", [storage.fingerprint(source)]),
+        ("File", [fingerprint(source)]),
         ("Measured on", [str(attributes.get("measured") or "not stated")]),
         ("Made on", [str(attributes["created"])]),
         ("Command", [str(attributes["command"])]),

@@ -7,8 +7,7 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..data.capture import Capture
 from ..kinematics.arm import Arm
-from ..kinematics.skeleton import corners
-from ..kinematics.workspace import reach_of
+from ..kinematics.workspace import arm_reach, skeleton
 from .parts import Arms
 from .residuals import shared_distances
 
@@ -27,7 +26,7 @@ def scene_of(arm: Arm, capture: Capture, distances: np.ndarray) -> dict[str, Any
     owner = capture.owner
     chosen = _chosen(np.asarray(capture.sizes))
     q = np.asarray(capture.q)[chosen]
-    lines = corners(arm, q)
+    lines = skeleton(arm, q)
     first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
     tips = np.asarray(arm.position(capture.q))
     return {
@@ -42,7 +41,7 @@ def scene_of(arm: Arm, capture: Capture, distances: np.ndarray) -> dict[str, Any
             }
             for i, line in zip(chosen, lines, strict=True)
         ],
-        "reach": round(reach_of(arm).radius, 1),
+        "reach": round(arm_reach(arm).radius, 1),
         "all": len(capture.q),
     }
 

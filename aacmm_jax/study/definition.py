@@ -12,17 +12,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..calibration.checks import check_enough, held_length
+from ..calibration.checks import check_enough
+from ..calibration.scale_anchor import scale_anchor
 from ..core.errors import InputError, nearest
+from ..core.units import ARCSEC
 from ..data.capture import Capture
-from ..data.noise import ARCSEC
-from ..data.recording import ArmSpecification, Recording, single
-from ..files import storage
+from ..data.recording import Recording
 from ..files.arms import load_specification, specification_toml
 from ..files.captures import load_capture
 from ..files.toml import read_toml
-from ..kinematics.arm import Arm, checked_limits
-from ..kinematics.parameters import Parameters, is_length
+from ..files.whole_file import storable
+from ..kinematics.arm import Arm, checked_limits, is_length
+from ..kinematics.parameters import Parameters
+from ..kinematics.specification import ArmSpecification, single
 from .specification import Point, Region, Specification, checked, label
 
 _KINDS = {"a": "a_mm", "d": "d_mm", "probe": "probe_mm", "alpha": "alpha_deg", "theta": "theta_deg", "beta": "beta_deg"}
@@ -229,7 +231,7 @@ class Study:
 
     def _hold(self, hold: str) -> str | None:
         with _at("identification.hold"):
-            return held_length(self.space, self.nominal.arm, None if hold == "none" else hold)
+            return scale_anchor(self.space, self.nominal.arm, None if hold == "none" else hold)
 
     def _numbers(self, cell: Mapping[str, Any]) -> tuple:
         space, nominal, table = self.space, self.nominal, self.specification.bounds
@@ -390,5 +392,19 @@ def make_study(
         raise InputError(f"capture is a {type(capture).__name__}; give a table (positions_mm, sockets or file), or a Capture.")
     elif capture.get("file") is not None:
         recording = load_capture(capture["file"])
-    specification = checked(name=storage.storable(name), arm=nominal.name, trials=trials, seed=seed, capture=capture, **tables)
+    specification = checked(name=storable(name), arm=nominal.name, trials=trials, seed=seed, capture=capture, **tables)
     return Study(specification, nominal, recording)
+
+
+class Block(NamedTuple):
+    """Trials of some cells: all of one setting."""
+
+    first_cell: int
+    last_cell: int  # not included
+    first_trial: int
+    last_trial: int  # not included
+
+    @property
+    def size(self) -> int:
+        """How many trials it holds."""
+        return (self.last_cell - self.first_cell) * (self.last_trial - self.first_trial)

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..data.simulation import least_moves
-from ..kinematics.chain import Geometry, columns_of, walk
-from ..kinematics.parameters import placed
+from ..kinematics.arm import with_values
+from ..kinematics.chain import Geometry, forward_pass, jacobian_columns
+from ..kinematics.inverse_kinematics import damped_inverse
 from .definition import BATCHES, Numbers, Setting, Study
 from .pools import Pool, pool_of
 
@@ -88,7 +88,7 @@ def _shape(study: Study, setting: Setting, pool: Pool) -> _Shape:
     starts = np.cumsum([0, *setting.sizes])
     ends = [(int(starts[a]), int(starts[b])) for a, b in ends_of(study, setting)]
     held = None if setting.hold is None else study.space.index(setting.hold)
-    return _Shape(stands, tuple(ends), study.space.entries(), setting.recorded, held, setting.random_start, study.eccentric)
+    return _Shape(stands, tuple(ends), study.space.indices(), setting.recorded, held, setting.random_start, study.eccentric)
 
 
 def ends_of(study: Study, setting: Setting) -> list[tuple[int, int]]:
@@ -128,7 +128,7 @@ def _block(shape: _Shape, given: _Given, keys: Array, trials: Int[Array, " w"], 
     point = jnp.swapaxes(columns[6 * n :], 0, 1)  # (w, 3, N)
     target = point + numbers.seating[:, None, None] * _noise(parts[:, 2], (3, poses))
     geometry = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_WIDTH, *leaf.shape)), given.geometry)
-    geometry = geometry._replace(**placed(geometry, true, shape.entries))
+    geometry = geometry._replace(**with_values(geometry, true, shape.entries))
     q = q + _moved(geometry, cosine, sine, moves, target)
     q = q - jnp.swapaxes(geometry.theta - given.geometry.theta[None], 0, 1)[:, :, None]
     reading = _read(shape, q, parts[:, 3:5], numbers)
@@ -228,10 +228,10 @@ def _moved_slowly(geometry: Geometry, cosine: Array, sine: Array, target: Array)
 
     def step(_: Array, state: tuple) -> tuple:
         change, cosine, sine, _ = state
-        walked = walk(turned, (cosine[:, :, None], sine[:, :, None]))
-        gap = target - walked.tip
-        moves = jax.vmap(least_moves, in_axes=(1, 0), out_axes=1)(
-            columns_of(walked)["theta"], 1e-2 * jnp.sum(gap**2, axis=1) + 1e-12
+        forward = forward_pass(turned, (cosine[:, :, None], sine[:, :, None]))
+        gap = target - forward.tip
+        moves = jax.vmap(damped_inverse, in_axes=(1, 0), out_axes=1)(
+            jacobian_columns(forward)["theta"], 1e-2 * jnp.sum(gap**2, axis=1) + 1e-12
         )
         move = jnp.clip(jnp.sum(moves * gap[None], axis=2), -0.2, 0.2)
         return change + move, *_turned(cosine, sine, move), jnp.max(jnp.abs(gap), axis=(1, 2))
@@ -253,7 +253,7 @@ def _turned(cosine: Array, sine: Array, move: Array) -> tuple[Array, Array]:
 
 
 def _tip(links: Geometry, twist: tuple[Array, Array], cosine: Array, sine: Array) -> tuple[Array, ...]:
-    """The tip alone, walked from the probe back to the base: one vector instead of a frame. ``cosine`` of q + theta."""
+    """The tip alone, forward from the probe back to the base: one vector instead of a frame. ``cosine`` of q + theta."""
     (cos_twist, sin_twist), (x, y, z) = twist, links.probe
     for i in reversed(range(cosine.shape[0])):
         if links.beta is not None:

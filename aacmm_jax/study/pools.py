@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.errors import InputError
-from ..data.simulation import approach, least_moves
 from ..kinematics import chain
 from ..kinematics.arm import Arm
+from ..kinematics.inverse_kinematics import damped_inverse, solve_to_targets
 from .definition import BATCHES, Setting, Stand, Study, pose_choice
 from .specification import Region
 
@@ -165,9 +165,9 @@ def _tried(arm: Arm, start: np.ndarray, points: np.ndarray, limits: Array) -> tu
 
 @jax.jit
 def _try(geometry: chain.Geometry, start: Array, points: Array, limits: Array) -> tuple[Array, Array]:
-    q, distance = approach(geometry, start, points, limits, _STEPS)
-    columns = chain.columns_of(chain.walk(geometry, chain.turns_of(q)))["theta"]
-    moves = least_moves(columns, jnp.zeros(q.shape[0]))
+    q, distance = solve_to_targets(geometry, start, points, limits, _STEPS)
+    columns = chain.jacobian_columns(chain.forward_pass(geometry, chain.sines_cosines(q)))["theta"]
+    moves = damped_inverse(columns, jnp.zeros(q.shape[0]))
     stiffness = jnp.sqrt(jnp.sum(columns**2, axis=(0, 1)) * jnp.sum(moves**2, axis=(0, 1)))
     return q, (distance <= _TOLERANCE) & (stiffness <= _STRAIGHT)
 
@@ -184,8 +184,8 @@ def _rows(arm: Arm, q: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 @jax.jit
 def _moves(geometry: chain.Geometry, q: Array) -> Array:
-    columns = chain.columns_of(chain.walk(geometry, chain.turns_of(q)))["theta"]
-    return jnp.moveaxis(least_moves(columns, jnp.zeros(q.shape[0])), -1, 0).reshape(q.shape[0], -1)
+    columns = chain.jacobian_columns(chain.forward_pass(geometry, chain.sines_cosines(q)))["theta"]
+    return jnp.moveaxis(damped_inverse(columns, jnp.zeros(q.shape[0])), -1, 0).reshape(q.shape[0], -1)
 
 
 def _placed(arm: Arm, stand: Stand, limits: Array, key: Array, count: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import InputError
-from ..files import storage
+from ..files.hdf5 import undamaged
 from . import store
 from .definition import BATCHES, Study
 from .store import VARIABLES
@@ -34,7 +34,7 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
     study = opened.study
     if opened.kept.parts is not None:
         _allow_files(len(store.finished_blocks(opened.path, store.Layout.of(study, opened.kept.chunk))), opened.path)
-    with storage.undamaged(path):
+    with undamaged(path):
         data = xarray.open_dataset(opened.path, group="trials", engine="h5netcdf")
         columns = store.factor_columns(study)
         labels = {
@@ -106,7 +106,7 @@ class Results(NamedTuple):
 
     def _columns(self, names: list[str], cell: int) -> dict[str, np.ndarray]:
         found = {name: np.full(self.study.trials, store.fill_of(name), VARIABLES[name].dtype) for name in names}
-        with storage.undamaged(self.path):
+        with undamaged(self.path):
             for part, rows in store.rows_of(self.path, self.kept, names, cell):
                 for name in names:
                     found[name][part] = rows[name]
@@ -114,7 +114,7 @@ class Results(NamedTuple):
 
     def errors(self, cell: int) -> Iterator[tuple[Float[np.ndarray, "t p"], np.ndarray, np.ndarray]]:
         """Errors of the parameters of converged trials (estimate less truth), their active bounds and their groups, piece by piece."""
-        with storage.undamaged(self.path):
+        with undamaged(self.path):
             for part, rows in store.rows_of(self.path, self.kept, ["converged", "estimate", "true", "active"], cell):
                 good = rows["converged"] == 1
                 yield (

@@ -16,10 +16,10 @@ from filelock import FileLock, Timeout
 
 from ..core.errors import InputError
 from . import store
-from .definition import Study
+from .definition import Block, Study
 from .pools import check_reach
 from .store import Layout
-from .trials import Block, run_block
+from .trials import run_block
 
 _CHUNK_CPU, _CHUNK_ELSEWHERE = 1000, 65_536
 _AHEAD = 2  # blocks in work or waiting, for each worker

@@ -91,7 +91,7 @@ class Distribution(_Table):
         return self
 
 
-class Deviation(_Table):
+class DeviationTable(_Table):
     """How the true arm differs from the nominal one, independently for every free parameter.
 
     ``length_mm`` and ``angle_deg`` hold for all lengths and angles; a kind named apart takes precedence.
@@ -148,7 +148,7 @@ class CaptureTable(_Table):
         return self
 
 
-class Noise(_Table):
+class NoiseTable(_Table):
     """Standard deviations: of a reading, of a coordinate of the seat, and of both first harmonics of every encoder; and the step of a reading."""
 
     encoder_arcsec: Levels[Amount] = [0.0]
@@ -167,7 +167,7 @@ class BoundsTable(_Table):
     override: dict[str, Amount] | None = None  # half-widths by name, mm or deg
 
 
-class Reference(_Table):
+class ReferenceTable(_Table):
     """The reference length: how long, at how many positions, with how many poses at each end, and its standard uncertainty.
 
     It lies at random in the ``region`` (default: that of the capture), or where ``ends_mm`` says, whose distance it then has.
@@ -181,7 +181,7 @@ class Reference(_Table):
     region: Levels[Region] | None = None
 
     @model_validator(mode="after")
-    def _one(self) -> "Reference":
+    def _one(self) -> "ReferenceTable":
         if (self.length_mm is None) == (self.ends_mm is None):
             raise ValueError("give either length_mm, for lengths at random in the region, or ends_mm.")
         if self.ends_mm is not None and "positions" in self.model_fields_set:
@@ -192,7 +192,7 @@ class Reference(_Table):
         return self
 
 
-class Identification(_Table):
+class IdentificationTable(_Table):
     """How the arm is identified. ``start``: at the nominal arm, or at random in the box (but for the held length)."""
 
     method: Levels[Literal["stage1", "two-stage", "joint"]] | None = None
@@ -209,12 +209,12 @@ class Specification(_Table):
     arm: str = ""
     trials: Annotated[int, Field(ge=1, le=10**8)]  # in each cell
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    deviation: Deviation = Deviation()
+    deviation: DeviationTable = DeviationTable()
     capture: CaptureTable
-    noise: Noise = Noise()
+    noise: NoiseTable = NoiseTable()
     bounds: BoundsTable = BoundsTable()
-    reference: Reference | None = None
-    identification: Identification = Identification()
+    reference: ReferenceTable | None = None
+    identification: IdentificationTable = IdentificationTable()
 
     @model_validator(mode="after")
     def _sensible(self) -> "Specification":

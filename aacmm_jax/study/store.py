@@ -20,13 +20,12 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..data.recording import Recording
-from ..files import storage
 from ..files.captures import arm_table, recording_of, recording_tables, specification_of
-from ..files.storage import Table, Variable
-from ..kinematics.parameters import is_length
-from .definition import Setting, Study
+from ..files.hdf5 import Table, Variable, need, read_tables, undamaged, write_tables
+from ..files.whole_file import ELSEWHERE, whole_file
+from ..kinematics.arm import is_length
+from .definition import Block, Setting, Study
 from .specification import Specification, unit
-from .trials import Block
 
 _MEND = "free some space there, then run the same command again: what is finished is kept"
 MOST_BLOCKS = 1_000_000
@@ -145,7 +144,7 @@ def write_part(path: Path, block: Block, packed: Packed, layout: Layout) -> None
     """Keep a finished block: its file appears whole, or not at all."""
     import h5py
 
-    with storage.whole_file(part_of(path, block, layout), _MEND) as temporary:
+    with whole_file(part_of(path, block, layout), _MEND) as temporary:
         with h5py.File(temporary.name, "w", driver="core", backing_store=False) as file:
             for name, content in packed.items():
                 size = (block.last_cell - block.first_cell, block.last_trial - block.first_trial)
@@ -179,7 +178,7 @@ def create(path: Path, study: Study, layout: Layout, chunk: int) -> None:
         ) from error
 
     try:
-        _write(path, study, chunk, partial(_add_virtual, path, layout), finished=False, mend=storage.ELSEWHERE)
+        _write(path, study, chunk, partial(_add_virtual, path, layout), finished=False, mend=ELSEWHERE)
     except BaseException:
         with contextlib.suppress(OSError):
             folder.rmdir()  # only where it is empty
@@ -220,7 +219,7 @@ def finish(path: Path, study: Study, layout: Layout, chunk: int, keep_parts: boo
                     mask, content = source.id.read_direct_chunk((0,) * source.ndim)
                     target.id.write_direct_chunk((block.first_cell, block.first_trial, 0)[: source.ndim], content, mask)
 
-    with storage.undamaged(parts_of(path)):
+    with undamaged(parts_of(path)):
         _write(path, study, chunk, add_results, fill, finished=True)
     clean(path)
 
@@ -271,7 +270,7 @@ def _write(
         members = [(name, getattr(Reason, name)) for name in Reason._name_to_item if name]  # pyright: ignore
         group["reason"].attrs["reasons"] = ", ".join(f"{int(numbers_of(item))}: {name}" for name, item in members)
 
-    storage.write_tables(path, "study", _tables(study), attributes, extend, mend, streamed=fill is not None)
+    write_tables(path, "study", _tables(study), attributes, extend, mend, streamed=fill is not None)
 
 
 def _tables(study: Study) -> dict[str, Table]:
@@ -333,9 +332,9 @@ class Kept(NamedTuple):
 
 def read(path: Path) -> Kept:
     """The study that a file holds, without its results. Raises `InputError` where it is missing, damaged or no study."""
-    stored = storage.read_tables(path, ("study",), without=("trials",))
-    with storage.undamaged(path):
-        storage.need(path, stored.tables, "specification", "nominal_arm", "parameters", "cells")
+    stored = read_tables(path, ("study",), without=("trials",))
+    with undamaged(path):
+        need(path, stored.tables, "specification", "nominal_arm", "parameters", "cells")
         specification = Specification.model_validate_json(str(stored.tables["specification"]["text"][0]))
         nominal = specification_of(path, stored, "nominal_arm")
         recording: Recording | None = recording_of(path, stored) if "capture" in stored.tables else None

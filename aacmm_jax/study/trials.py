@@ -1,7 +1,7 @@
 """A block of trials, from keys to results: drawn, identified by one call, compared with the truth."""
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,22 +10,8 @@ import numpy as np
 from ..calibration.batch import calibrate_many, identify_many
 from ..data.capture import Capture, ReferenceLength
 from ..solver.levenberg_marquardt import numbers_of
-from .definition import Setting, Study
+from .definition import Block, Setting, Study
 from .drawing import Drawn, draw, ends_of
-
-
-class Block(NamedTuple):
-    """Trials of some cells: all of one setting."""
-
-    first_cell: int
-    last_cell: int  # not included
-    first_trial: int
-    last_trial: int  # not included
-
-    @property
-    def size(self) -> int:
-        """How many trials it holds."""
-        return (self.last_cell - self.first_cell) * (self.last_trial - self.first_trial)
 
 
 def run_block(study: Study, block: Block, *, device: Any = None, workers: int | None = None) -> dict[str, np.ndarray]:

@@ -5,13 +5,15 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
+from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import CrossValidation, active_names
 from ..data.capture import Capture
-from ..data.recording import ArmSpecification, Recording
-from ..files.calibrations import CalibrationRecord
-from ..kinematics.parameters import Parameters, is_length
+from ..data.recording import Recording
+from ..kinematics.arm import is_length
+from ..kinematics.parameters import Parameters
+from ..kinematics.specification import ArmSpecification
 from ..uncertainty.identifiability import Observability
-from ..uncertainty.volume import Volume, over_volume, uncertainty_of
+from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .warnings import observed, of_calibration, of_capture
 
 _CORRELATED = 0.95
@@ -119,11 +121,11 @@ def tables(capture: Capture, evaluation: Evaluation) -> dict[str, Any]:
 
 
 def calibration_summary(
-    record: CalibrationRecord, seen: Observability | None = None, volume: Volume | None = None
+    record: CalibrationRecord, seen: Observability | None = None, volume: VolumetricUncertainty | None = None
 ) -> dict[str, Any]:
     """A calibration: what was done, before and after, the scale, the parameters, and what to be wary of.
 
-    ``seen`` (`cautions.observed`) and ``volume`` (`over_volume`) are worked out where they are not given.
+    ``seen`` (`cautions.observed`) and ``volume`` (`volumetric_uncertainty`) are worked out where they are not given.
     """
     seen = observed(record) if seen is None else seen
     evaluations, vectors = record.evaluations(), record.vectors()
@@ -167,18 +169,20 @@ def calibration_summary(
     return summary
 
 
-def uncertainty_summary(record: CalibrationRecord, seen: Observability, volume: Volume | None = None) -> dict[str, Any]:
+def uncertainty_summary(
+    record: CalibrationRecord, seen: Observability, volume: VolumetricUncertainty | None = None
+) -> dict[str, Any]:
     """What the uncertainty comes from and what it means for lengths all over the volume; standard uncertainties (k = 1)."""
     uncertainty = uncertainty_of(record)
     noise = record.noise
     encoder = np.asarray(noise.encoder_arcsec)
     found = {
-        "form": record.form,
+        "form": record.noise_model,
         "encoder_arcsec": encoder.tolist(),
         "seating_mm": float(noise.seating),
-        "misfit": record.misfit,
+        "misfit": record.reduced_chi,
         "coverage_factor_95": uncertainty.factor(0.95),
-        "volume": (over_volume(uncertainty) if volume is None else volume).summary,
+        "volume": (volumetric_uncertainty(uncertainty) if volume is None else volume).summary,
         "correlated": [{"one": one, "other": other, "r": r} for one, other, r in uncertainty.correlated(_CORRELATED)],
         "rank": seen.rank,
         "parameters": len(seen.names),

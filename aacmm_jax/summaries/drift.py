@@ -8,7 +8,7 @@ import numpy as np
 
 from ..drift.comparison import Drift, Trend
 from ..drift.statistics import LengthChange
-from ..kinematics.parameters import is_length
+from ..kinematics.arm import is_length
 
 
 def drift_summary(drift: Drift) -> dict[str, Any]:
@@ -26,7 +26,7 @@ def drift_summary(drift: Drift) -> dict[str, Any]:
         "joint": {
             "statistic": _finite(joint.statistic),
             "rank": joint.rank,
-            "freedom": _finite(joint.freedom),
+            "freedom": _finite(joint.degrees_of_freedom),
             "p": _finite(joint.p),
             "parameters": list(joint.names),
             "causes": [

@@ -4,11 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from ..acceptance.record import EvaluationRecord, PointsRecord, unstated_uncertainty_warning
 from ..acceptance.suite import FIGURES, AcceptanceTest, Figure, Part
 from ..calibration.evaluation import Evaluation, evaluate
 from ..data.capture import Capture
-from ..files.evaluations import EvaluationRecord, bare_warning
-from ..files.points_evaluations import PointsRecord
 from .calibration import figures, length_figures, tables
 
 _LIMITED = {"rms_mm": "RMS distance", "deltam_mm": "Deltam", "length_error_largest_mm": "largest length error"}
@@ -60,7 +59,7 @@ def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = No
         "sockets": len(sockets),
         "lengths": len(record.measured.lengths),
         "spheres": len(record.measured.spheres),
-        "warnings": bare_warning(tests),
+        "warnings": unstated_uncertainty_warning(tests),
         "kept": [],
         "failed": [],
         "acceptance": acceptance_summary(tests),

@@ -4,12 +4,13 @@ import math
 
 import numpy as np
 
-from ..calibration.checks import plausible, value_of
+from ..calibration.checks import plausible
+from ..calibration.record import CalibrationRecord
 from ..calibration.results import active_names
 from ..data.recording import Recording
-from ..files.calibrations import CalibrationRecord
-from ..kinematics.parameters import Parameters, is_length
-from ..uncertainty.identifiability import Observability, observe
+from ..kinematics.arm import is_length, value_of
+from ..kinematics.parameters import Parameters
+from ..uncertainty.identifiability import Observability, observability
 
 _SUSPICIOUS_SCALE = 0.005  # a held link is not off by more than this; its nominal value or a reference length is wrong
 _LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 where the D-H model misses something
@@ -47,7 +48,7 @@ def of_calibration(record: CalibrationRecord, seen: Observability | None = None)
 def observed(record: CalibrationRecord) -> Observability:
     """What the data of a calibration determine, about the calibrated arm."""
     arm = record.calibrated.arm
-    return observe(arm, record.recording.capture, Parameters(arm, record.names))
+    return observability(arm, record.recording.capture, Parameters(arm, record.names))
 
 
 def _validation(record: CalibrationRecord) -> list[str]:
@@ -61,11 +62,11 @@ def _validation(record: CalibrationRecord) -> list[str]:
             f"{validation.length_u:.3g}): errors of neighbouring poses are alike, so the D-H model misses something (joints that "
             "give way, eccentric encoders). Trust the cross-validated figures; every u below is too small."
         )
-    if record.misfit is not None and not 1 / _HONEST < record.misfit < _HONEST:
-        word = "small" if record.misfit > 1 else "large"
-        factor = max(record.misfit, 1 / record.misfit)
+    if record.reduced_chi is not None and not 1 / _HONEST < record.reduced_chi < _HONEST:
+        word = "small" if record.reduced_chi > 1 else "large"
+        factor = max(record.reduced_chi, 1 / record.reduced_chi)
         found.append(
-            f"Residuals are {record.misfit:.2g} times what the given noise predicts, and every uncertainty below rests on that noise: it is "
+            f"Residuals are {record.reduced_chi:.2g} times what the given noise predicts, and every uncertainty below rests on that noise: it is "
             f"about {factor:.2g} times too {word}. Check the noise, or leave it out to have it estimated."
         )
     return found

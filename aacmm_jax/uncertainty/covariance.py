@@ -1,7 +1,7 @@
 """How uncertain an identification is: the law of propagation (JCGM 100) from every reading and length to every parameter.
 
-An identification is linearised at its result. `Gains` says how its parameters follow the error of each tip and of each
-certified length; a form (`FORMS`) says what those errors are; their product is the covariance.
+An identification is linearised at its result. `Sensitivity` says how its parameters follow the error of each tip and of each
+certified length; a form (`NOISE_MODELS`) says what those errors are; their product is the covariance.
 """
 
 import math
@@ -12,20 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..data.noise import ARCSEC, Noise, encoder_part, tip_covariances
+from ..core.units import ARCSEC
+from ..data.noise import Noise, encoder_covariances, tip_covariances
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
-from ..model.residuals import Measurement, differences_matrix, measured_lengths
+from ..model.measurement import Measurement, differences_matrix, length_directions
+from ..model.residuals import measured_lengths
 from ..model.weights import membership
 
 # What errors of tips are taken for. "given": encoders and seat as stated. "estimated": encoders and seat, both standard
 # deviations estimated from the residuals. "common": one variance for every coordinate of every tip. "robust": each pose's own
 # residual, corrected for its leverage (a jackknife), whatever the errors are, as long as poses are independent.
-Form = Literal["given", "estimated", "common", "robust"]
-FORMS = ("given", "estimated", "common", "robust")
+NoiseModel = Literal["given", "estimated", "common", "robust"]
+NOISE_MODELS = ("given", "estimated", "common", "robust")
 
-# Standard deviation of a tip coordinate (mm) below which noise-free data would get infinite weight.
-LEAST_SIGMA = 1e-9
 # A direction whose standard uncertainty exceeds 10 mm or 10 mrad is not determined, whatever its eigenvalue.
 _LEAST_INFORMATION = 1e-2
 _NULL = 1e-12  # eigenvalues of the information below this, of the largest, are zero
@@ -33,14 +33,14 @@ _NULL = 1e-12  # eigenvalues of the information below this, of the largest, are 
 _LEAST_REDUNDANCY = 0.05
 
 
-class Gains(NamedTuple):
+class Sensitivity(NamedTuple):
     """Derivatives of an identification's parameters by the errors of its data; mm and rad."""
 
     tips: Float[Array, "p 3 N"]
     lengths: Float[Array, "p l"]
 
 
-class Covariance(NamedTuple):
+class ParameterCovariance(NamedTuple):
     """Covariance of the free parameters, and what the data leave open."""
 
     matrix: Float[Array, "p p"]
@@ -49,10 +49,10 @@ class Covariance(NamedTuple):
     noise: Noise  # given, or as estimated: one encoder for all
     # Where the scale fix divided lengths that were held, they err by one common factor: its covariance with the parameters,
     # and, last, its variance (relative); else 0.
-    stretch: Float[Array, " w"]
+    common_scale_error: Float[Array, " w"]
 
 
-class Linear(NamedTuple):
+class Linearisation(NamedTuple):
     """An identification at its result: derivatives in natural steps of the parameters (1 mm, 1 mrad), 0 where they are fixed."""
 
     scale: Float[Array, " p"]  # natural steps, 0 where fixed
@@ -60,33 +60,11 @@ class Linear(NamedTuple):
     counted: Float[Array, "p 3 N"]  # the same as the least squares counts them: whitened by weights
     lengths: Float[Array, "l p"]  # of measured lengths
     lengths_by_tips: Float[Array, "l 3 N"]
-    shares: Float[Array, "3 3 N"]  # of a socket's mean by each of its tips
+    centroid_weights: Float[Array, "3 3 N"]  # of a socket's mean by each of its tips
     residual: Float[Array, "3 N"]  # of tips from their socket's mean, mm
 
 
-def length_covariance(
-    centroids: Float[Array, "s 3"],
-    measurement: Measurement,
-    sigma: Float[Array, ""],
-    stretch: Float[Array, "..."] | float = 1.0,
-) -> Float[Array, "l l"]:
-    """Covariance of measured minus nominal lengths, mm^2, by an arm that is ``stretch`` times too large.
-
-    Each length's own u, and the scatter of the poses over their number at each end. Lengths that share a socket share its
-    scatter, so they are correlated.
-    """
-    pull = measurement.differences[:, :, None] * _directions(centroids, measurement)[:, None, :]
-    scatter = jnp.einsum("lsc,scd,ksd->lk", pull, measurement.centroid_covariances(sigma), pull)
-    # The floor (1e-12 mm) only keeps a noise-free simulation's weights finite.
-    return jnp.diag((stretch * measurement.u) ** 2 + 1e-24) + scatter
-
-
-def _directions(centroids: Float[Array, "s 3"], measurement: Measurement) -> Float[Array, "l 3"]:
-    between = measurement.differences @ centroids
-    return between / jnp.linalg.norm(between, axis=-1, keepdims=True)
-
-
-def linearised(arm: Arm, space: Parameters, measurement: Measurement, fixed: Bool[Array, " p"]) -> Linear:
+def linearised(arm: Arm, space: Parameters, measurement: Measurement, fixed: Bool[Array, " p"]) -> Linearisation:
     """The identification at an arm; ``fixed`` parameters are held, or on a bound."""
     scale = jnp.where(fixed, 0.0, space.scale)
     tips = arm.position(measurement.q)
@@ -96,24 +74,26 @@ def linearised(arm: Arm, space: Parameters, measurement: Measurement, fixed: Boo
     if weights is None:
         means = columns @ jnp.asarray((members / np.asarray(sizes, dtype=float)[:, None]).T)
         counts = np.repeat(np.asarray(sizes, dtype=float), sizes)
-        shares = jnp.asarray(np.eye(3)[:, :, None] / counts)
+        centroid_weights = jnp.asarray(np.eye(3)[:, :, None] / counts)
     else:
         means = weights.centroids(columns, sizes)
-        spread = weights.spread @ jnp.asarray(members)
-        shares = jnp.einsum("abN,cbN,cdN->adN", spread, weights.basis, weights.root)
+        covariance = weights.centroid_factor @ jnp.asarray(members)
+        centroid_weights = jnp.einsum("abN,cbN,cdN->adN", covariance, weights.basis, weights.root)
     columns = columns - means @ jnp.asarray(members)
     if measurement.ends:
         by_parameters = measured_lengths(space.vector(arm), Parameters(arm, space.names), measurement)[1] * scale[None, :]
         ends = differences_matrix(measurement.ends, len(sizes)) @ members
-        by_tips = jnp.einsum("lN,lc,cdN->ldN", ends, _directions(measurement.centroids(tips), measurement), shares)
+        by_tips = jnp.einsum(
+            "lN,lc,cdN->ldN", ends, length_directions(measurement.centroids(tips), measurement), centroid_weights
+        )
     else:
         by_parameters, by_tips = jnp.zeros((0, len(space.names))), jnp.zeros((0, *columns.shape[1:]))
     counted = columns if weights is None else weights.whiten(columns)
-    return Linear(scale, columns, counted, by_parameters, by_tips, shares, measurement.centred(tips).T)
+    return Linearisation(scale, columns, counted, by_parameters, by_tips, centroid_weights, measurement.centred(tips).T)
 
 
 def information_of(
-    linear: Linear, sigma: Float[Array, ""], whitening: Float[Array, "l l"] | None = None
+    linear: Linearisation, sigma: Float[Array, ""], whitening: Float[Array, "l l"] | None = None
 ) -> Float[Array, "p p"]:
     """J^T W J in natural steps: of poses that scatter by ``sigma``, and with ``whitening`` of the lengths too."""
     rows = linear.counted.reshape(linear.counted.shape[0], -1)
@@ -124,26 +104,26 @@ def information_of(
     return information + lengths.T @ lengths
 
 
-def gains_of(
-    linear: Linear,
+def sensitivity_of(
+    linear: Linearisation,
     measurement: Measurement,
     inverse: Float[Array, "p p"],
     sigma: Float[Array, ""],
     whitening: Float[Array, "l l"] | None = None,
-) -> Gains:
+) -> Sensitivity:
     """Gains of one least squares, given the inverse of its information; in natural steps."""
-    weighed = linear.counted
+    weighted = linear.counted
     if measurement.weights is not None:
         # Columns are centred under the weights, so a tip's own shift of the mean meets sums that are zero.
-        weighed = jnp.einsum("abN,paN->pbN", measurement.weights.root, linear.counted)
-    by_tips = -jnp.einsum("pq,qaN->paN", inverse, weighed) / sigma**2
+        weighted = jnp.einsum("abN,paN->pbN", measurement.weights.root, linear.counted)
+    by_tips = -jnp.einsum("pq,qaN->paN", inverse, weighted) / sigma**2
     if whitening is None:
-        return Gains(by_tips, jnp.zeros((len(inverse), linear.lengths.shape[0])))
+        return Sensitivity(by_tips, jnp.zeros((len(inverse), linear.lengths.shape[0])))
     by_lengths = inverse @ linear.lengths.T @ whitening.T @ whitening
-    return Gains(by_tips - jnp.einsum("pl,lcN->pcN", by_lengths, linear.lengths_by_tips), by_lengths)
+    return Sensitivity(by_tips - jnp.einsum("pl,lcN->pcN", by_lengths, linear.lengths_by_tips), by_lengths)
 
 
-def inverted(
+def inverse_information(
     information: Float[Array, "p p"], fixed: Bool[Array, " p"]
 ) -> tuple[Float[Array, "p p"], Float[Array, "p p"], Bool[Array, " p"]]:
     """Inverse on the identifiable subspace, the projector onto what the data leave open, and which parameters are determined one
@@ -165,55 +145,55 @@ def inverted(
 
 
 def covariance_of(
-    gains: Gains,
-    linear: Linear,
+    sensitivity: Sensitivity,
+    linear: Linearisation,
     measurement: Measurement,
     errors: Float[Array, "3 3 N"],
 ) -> Float[Array, "p p"]:
     """Covariance of the parameters, natural steps, from the covariance of every tip's error and the lengths' u."""
-    moved = jnp.einsum("paN,abN->pbN", gains.tips, errors)
-    by_lengths = gains.lengths * measurement.u[None, :]
-    moved, straight = moved.reshape(len(moved), -1), gains.tips.reshape(len(moved), -1)
+    moved = jnp.einsum("paN,abN->pbN", sensitivity.tips, errors)
+    by_lengths = sensitivity.lengths * measurement.u[None, :]
+    moved, straight = moved.reshape(len(moved), -1), sensitivity.tips.reshape(len(moved), -1)
     return moved @ straight.T + by_lengths @ by_lengths.T
 
 
-def freedom_of(form: Form, sizes: tuple[int, ...], fitted: int) -> float:
+def residual_degrees_of_freedom(noise_model: NoiseModel, sizes: tuple[int, ...], fitted: int) -> float:
     """Degrees of freedom of what a form takes from the residuals: of equations, or of poses where each speaks for itself."""
-    if form == "given":
+    if noise_model == "given":
         return math.inf
     spare = sum(sizes) - len(sizes) - fitted / 3
-    return max(spare if form == "robust" else 3 * spare, 1.0)
+    return max(spare if noise_model == "robust" else 3 * spare, 1.0)
 
 
 def tip_errors(
-    form: Form,
+    noise_model: NoiseModel,
     arm: Arm,
     measurement: Measurement,
-    linear: Linear,
-    gains: Gains,
+    linear: Linearisation,
+    sensitivity: Sensitivity,
     inverse: Float[Array, "p p"],
     sigma: Float[Array, ""],
     noise: Noise | None,
 ) -> tuple[Float[Array, "3 3 N"], Noise]:
-    """Covariance of every tip's error under a form, mm^2, and the noise that is behind it (see `FORMS`)."""
+    """Covariance of every tip's error under a form, mm^2, and the noise that is behind it (see `NOISE_MODELS`)."""
     common = sigma**2 * jnp.asarray(np.broadcast_to(np.eye(3)[:, :, None], (3, 3, measurement.q.shape[0])))
     geometry = arm.geometry
-    if form == "given":
+    if noise_model == "given":
         assert noise is not None
-        return tip_covariances(geometry, measurement.turns, noise), noise
-    if form == "estimated":
-        unit = encoder_part(geometry, measurement.turns, jnp.asarray(ARCSEC))
+        return tip_covariances(geometry, measurement.sines_cosines, noise), noise
+    if noise_model == "estimated":
+        unit = encoder_covariances(geometry, measurement.sines_cosines, jnp.asarray(ARCSEC))
         arcsec2, seat2 = _components(linear, measurement, unit, sigma, inverse)
         found = Noise(encoder_arcsec=_root(arcsec2), seating=_root(seat2))
         return arcsec2 * unit + seat2 * jnp.asarray(np.eye(3)[:, :, None]), found
     as_seat = Noise(seating=sigma) if noise is None else noise
-    if form == "common":
+    if noise_model == "common":
         if noise is None:
             return common, as_seat
-        return sigma**2 * tip_covariances(geometry, measurement.turns, noise), Noise(
+        return sigma**2 * tip_covariances(geometry, measurement.sines_cosines, noise), Noise(
             encoder_arcsec=sigma * noise.encoder_arcsec, seating=sigma * noise.seating
         )
-    redundancy = jnp.eye(3)[:, :, None] - linear.shares + jnp.einsum("paN,pbN->abN", linear.columns, gains.tips)
+    redundancy = jnp.eye(3)[:, :, None] - linear.centroid_weights + jnp.einsum("paN,pbN->abN", linear.columns, sensitivity.tips)
     # What the residual would be had the pose not taken part: redundancy^-1 r, by Cramer's rule.
     cofactors = jnp.stack([jnp.cross(redundancy[(i + 1) % 3], redundancy[(i + 2) % 3], axis=0) for i in range(3)])
     determinant = jnp.sum(redundancy[0] * cofactors[0], axis=0)
@@ -223,7 +203,7 @@ def tip_errors(
 
 
 def _components(
-    linear: Linear,
+    linear: Linearisation,
     measurement: Measurement,
     unit: Float[Array, "3 3 N"],
     sigma: Float[Array, ""],

@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..calibration.checks import check_fit
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
-from ..kinematics.arm import Arm
-from ..kinematics.independence import columns_at, equations, jittered, moved_onto, nearly_parallel, settled
+from ..kinematics.arm import Arm, jacobian_at, neighbouring_arm
+from ..kinematics.independence import equations, nearly_parallel
+from ..kinematics.inverse_kinematics import project_to_centroids, project_to_targets
 from ..kinematics.parameters import Parameters
-from ..model.residuals import Measurement
+from ..model.measurement import Measurement, check_joints
 from .covariance import linearised
-from .propagation import weighing
+from .propagation import joint_weights
 
 _RANK = 1e-8  # singular values below this, of the largest, are zero
 _PRESENT = 1e-4  # of a direction's largest component: smaller ones are left out of its name
@@ -87,21 +87,21 @@ class Observability(NamedTuple):
         return found
 
 
-def observe(arm: Arm, capture: Capture, space: Parameters | None = None, *, noise: Noise | None = None) -> Observability:
+def observability(arm: Arm, capture: Capture, space: Parameters | None = None, *, noise: Noise | None = None) -> Observability:
     """What the poses and reference lengths of a capture determine of the free parameters (default: the paper's).
 
     The poses are first moved onto their sockets by this arm, a few mm at most, so that an arm that is not yet calibrated is
     judged by its geometry and not by its errors. Raises `InputError` where capture and arm do not fit.
     """
     space = Parameters.free_of(arm) if space is None else space
-    check_fit(capture, space)
+    check_joints(capture, space)
     if noise is not None:
         noise.check(arm.joints)
     base = space.arm(space.vector(arm))
     spectrum = _spectrum(base, base, capture, space, noise)
     if spectrum.rank < len(space.names):
         # A nominal arm may stand in a special position (a probe on the last axis) that the real one does not share.
-        beside = jittered(base, space)
+        beside = neighbouring_arm(base, space.names)
         other = _spectrum(beside, base, capture, space, noise)
         if other.rank > spectrum.rank:
             base, spectrum = beside, other
@@ -129,7 +129,7 @@ class _Spectrum(NamedTuple):
 
 
 def _spectrum(arm: Arm, stands: Arm, capture: Capture, space: Parameters, noise: Noise | None) -> _Spectrum:
-    rows = _rows(arm, capture, space, settled(arm, capture, stands), noise)
+    rows = _rows(arm, capture, space, project_to_centroids(arm, capture, stands), noise)
     _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
     singular = np.concatenate([singular, np.zeros(len(space.names) - len(singular))])
     rank = int(np.sum(singular > _RANK * max(singular[0], 1e-300)))
@@ -152,7 +152,7 @@ def _rows(
         poses, lengths = equations(arm, capture, space.names, q)
         return np.concatenate([poses.reshape(-1, len(scale)), lengths]) * scale
     moved = Capture({name: q[capture.owner == i] for i, name in enumerate(capture.names)}, capture.lengths)
-    measurement = Measurement.of(moved).weighed(arm.geometry, noise)
+    measurement = Measurement.of(moved).weighted(arm.geometry, noise)
     return np.asarray(whitened_equations(arm, space, measurement))
 
 
@@ -161,7 +161,7 @@ def whitened_equations(arm: Arm, space: Parameters, measurement: Measurement) ->
     """Derivatives of everything measured by the free parameters, in natural steps and in standard deviations; the measurement
     carries its weights."""
     linear = linearised(arm, space, measurement, jnp.zeros(len(space.names), dtype=bool))
-    lengths = weighing(arm, measurement, jnp.zeros(())).whitening @ linear.lengths
+    lengths = joint_weights(arm, measurement, jnp.zeros(())).whitening @ linear.lengths
     return jnp.concatenate([linear.counted.reshape(linear.counted.shape[0], -1).T, lengths])
 
 
@@ -179,14 +179,14 @@ def _named(
         return null, ()
     left, texts, directions = null, [], []
     values = np.asarray(space.vector(arm)) * space.lengths
-    stretch = np.where([name == "d_1" for name in space.names], 0.0, values)
-    size = np.linalg.norm(stretch)
-    if size > 0 and np.linalg.norm(stretch - null @ (null.T @ stretch)) < 1e-6 * size:
+    scale_direction = np.where([name == "d_1" for name in space.names], 0.0, values)
+    size = np.linalg.norm(scale_direction)
+    if size > 0 and np.linalg.norm(scale_direction - null @ (null.T @ scale_direction)) < 1e-6 * size:
         texts.append("all lengths together: the scale")
-        directions.append(stretch / size)
+        directions.append(scale_direction / size)
         # The others are told without the longest link, of which the scale has most.
-        pivot = int(np.argmax(np.abs(stretch)))
-        left = null - np.outer(stretch, null[pivot] / stretch[pivot])
+        pivot = int(np.argmax(np.abs(scale_direction)))
+        left = null - np.outer(scale_direction, null[pivot] / scale_direction[pivot])
         left = np.linalg.svd(left, full_matrices=False)[0][:, : null.shape[1] - 1]
     for direction in _sparse(left).T:
         weights = np.abs(direction) / np.abs(direction).max()
@@ -223,10 +223,10 @@ def _never(null: Float[np.ndarray, "p nullity"], arm: Arm, space: Parameters) ->
     if not null.shape[1]:
         return np.zeros(0, dtype=bool)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (100, arm.joints))
-    moved = columns_at(arm, q, space.names) * np.asarray(space.scale) @ null  # (100, 3, nullity)
+    moved = jacobian_at(arm, q, space.names) * np.asarray(space.scale) @ null  # (100, 3, nullity)
     tips = np.asarray(arm.position(q))
-    turns = np.cross(np.eye(3)[None, :, :], tips[:, None, :]).transpose(0, 2, 1)
-    rigid = np.concatenate([np.broadcast_to(np.eye(3), (100, 3, 3)), turns * 1e-3], axis=2).reshape(300, 6)
+    rotations = np.cross(np.eye(3)[None, :, :], tips[:, None, :]).transpose(0, 2, 1)
+    rigid = np.concatenate([np.broadcast_to(np.eye(3), (100, 3, 3)), rotations * 1e-3], axis=2).reshape(300, 6)
     moved = moved.reshape(300, -1)
     left = moved - rigid @ np.linalg.lstsq(rigid, moved, rcond=None)[0]
     return np.linalg.norm(left, axis=0) < 1e-6 * np.sqrt(300)
@@ -249,7 +249,7 @@ def _remedy(arm: Arm, capture: Capture, space: Parameters, wanted: int) -> str:
         (f"More poses in a socket, and {length}, would determine them.", again | far, one),
     ):
         more = Capture({**capture.sockets, **sockets}, [*capture.lengths, *lengths])
-        rows = _rows(arm, more, space, settled(arm, more), None)
+        rows = _rows(arm, more, space, project_to_centroids(arm, more), None)
         values = np.linalg.svd(rows, compute_uv=False)
         if np.sum(values > _RANK * values[0]) >= wanted:
             return text
@@ -259,5 +259,5 @@ def _remedy(arm: Arm, capture: Capture, space: Parameters, wanted: int) -> str:
 def _varied(arm: Arm, q: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Poses that hold the tip where ``q`` holds it."""
     poses = q + random.uniform(-1.5, 1.5, (60, arm.joints))
-    poses, reached = moved_onto(arm, poses, np.tile(np.asarray(arm.position(q)), (60, 1)))
+    poses, reached = project_to_targets(arm, poses, np.tile(np.asarray(arm.position(q)), (60, 1)))
     return poses[reached] if reached.any() else q[None]

@@ -130,7 +130,7 @@ def two_stages(q: np.ndarray, lower: np.ndarray, upper: np.ndarray, starts: np.n
 
 def many_of(
     q: np.ndarray, lower: np.ndarray, upper: np.ndarray, starts: np.ndarray, hold: str | None = None
-) -> aj.ManyIdentifications:
+) -> aj.calibration.ManyIdentifications:
     """The toolkit on many sets of poses; by default every length is free as in the paper."""
     captures = aj.stack_captures([aj.Capture({"A": readings}) for readings in q])
     space = aj.Parameters(simulated_arm(), NAMES)

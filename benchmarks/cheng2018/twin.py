@@ -16,7 +16,8 @@ from paper import NAMES, POSES, PUBLISHED, arm_of, box, figures_of, is_length, t
 from scipy.optimize import minimize
 
 import aacmm_jax as aj
-from aacmm_jax.data.simulation import ARCSEC, reach
+from aacmm_jax.data.simulation import ARCSEC
+from aacmm_jax.kinematics.inverse_kinematics import random_configurations
 
 # mm: three sockets well within the arm's reach of 1.4 m, since the paper does not print where its own stood.
 SOCKETS = {"Data1": (400.0, 200.0, 300.0), "Data2": (-350.0, 500.0, 150.0), "Data3": (600.0, -450.0, 550.0)}
@@ -78,7 +79,9 @@ def placed(arm: aj.Arm, length: float, count: int, seed: int) -> np.ndarray:
     direction *= length / 2 / np.linalg.norm(direction, axis=1, keepdims=True)
     ends = np.stack([centre - direction, centre + direction], axis=1)
     limits = jnp.array([(-np.pi, np.pi)] * arm.joints)
-    return np.asarray(reach(arm, jnp.asarray(ends.reshape(-1, 3)), jax.random.key(seed), limits)).reshape(count, 2, -1)
+    return np.asarray(random_configurations(arm, jnp.asarray(ends.reshape(-1, 3)), jax.random.key(seed), limits)).reshape(
+        count, 2, -1
+    )
 
 
 def draw(made: Pool, noise: Noise, count: int, seed: int) -> Twins:

@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 import aacmm_jax as aj
 from aacmm_jax.acceptance import decision
 from aacmm_jax.acceptance import suite as acceptance
-from aacmm_jax.acceptance.procedure import acceptance_procedure, record_procedure
+from aacmm_jax.acceptance.procedure import plan_procedure, simulate_procedure
 from aacmm_jax.acceptance.spheres import enclosing_sphere, fit_sphere
-from aacmm_jax.acceptance.suite import Measured, accept, measured_by
+from aacmm_jax.acceptance.suite import Measured, measured_by, run
 from aacmm_jax.files.procedures import procedure_csv, procedure_manifest
-
 from tests.refusals import assert_refused
 
 AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float)
@@ -26,13 +25,13 @@ PLACE = np.array([400.0, 200.0, 300.0])
 
 @pytest.fixture(scope="module")
 def cheng():
-    return aj.load_specification("cheng2018-simulation")
+    return aj.files.load_specification("cheng2018-simulation")
 
 
 @pytest.fixture(scope="module", params=["asme", "iso"])
 def recorded(request, cheng):
     """A noise-free acceptance test of the nominal arm."""
-    return record_procedure(acceptance_procedure(cheng.arm, request.param), cheng, cheng)
+    return simulate_procedure(plan_procedure(cheng.arm, request.param), cheng, cheng)
 
 
 # --- By hand -------------------------------------------------------------------------------------------------------------
@@ -176,20 +175,20 @@ def test_limits_that_cannot_be_are_refused(texts, said):
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda: aj.decide("a", 1, 0), "numbers of mm"),
-        (lambda: aj.decide(np.array([1.0, 2.0]), 1, 0), "numbers of mm"),
-        (lambda: aj.decide(math.nan, 1, 0), "not a number"),
-        (lambda: accept(Measured({"A": [[1, 2]]})), "'A'"),
-        (lambda: accept(Measured({"A": np.full((2, 3), 1e200)})), "beyond"),
-        (lambda: accept(Measured({"A": np.eye(3)}, (aj.ReferenceLength("A", "B", 1.0),))), "unknown socket 'B'"),
-        (lambda: accept(Measured({"A": np.eye(3)}), {"Deltam": "x"}), "limit of Deltam"),
-        (lambda: accept(Measured({"A": np.eye(3)}), {"Delta": 1.0}), "did you mean 'Deltam'"),
-        (lambda: accept(Measured({"A": np.eye(3)}), {"Deltam": aj.Limit(1, -1000)}), "divisor"),
-        (lambda: accept(Measured({"A": np.eye(3)}), u_test=-1), "standard uncertainty of the test"),
-        (lambda: accept(Measured({}, spheres=(aj.ProbedSphere("S", "probing", (PLACE + AXES,), math.nan),))), "sphere 'S'"),
-        (lambda: accept(Measured({}, spheres=(aj.ProbedSphere("S", "probe", (PLACE + AXES,), 25.0),))), "must be one of"),
+        (lambda: aj.acceptance.decide("a", 1, 0), "numbers of mm"),
+        (lambda: aj.acceptance.decide(np.array([1.0, 2.0]), 1, 0), "numbers of mm"),
+        (lambda: aj.acceptance.decide(math.nan, 1, 0), "not a number"),
+        (lambda: run(Measured({"A": [[1, 2]]})), "'A'"),
+        (lambda: run(Measured({"A": np.full((2, 3), 1e200)})), "beyond"),
+        (lambda: run(Measured({"A": np.eye(3)}, (aj.ReferenceLength("A", "B", 1.0),))), "unknown socket 'B'"),
+        (lambda: run(Measured({"A": np.eye(3)}), {"Deltam": "x"}), "limit of Deltam"),
+        (lambda: run(Measured({"A": np.eye(3)}), {"Delta": 1.0}), "did you mean 'Deltam'"),
+        (lambda: run(Measured({"A": np.eye(3)}), {"Deltam": aj.acceptance.Limit(1, -1000)}), "divisor"),
+        (lambda: run(Measured({"A": np.eye(3)}), u_test=-1), "standard uncertainty of the test"),
+        (lambda: run(Measured({}, spheres=(aj.data.ProbedSphere("S", "probing", (PLACE + AXES,), math.nan),))), "sphere 'S'"),
+        (lambda: run(Measured({}, spheres=(aj.data.ProbedSphere("S", "probe", (PLACE + AXES,), 25.0),))), "must be one of"),
         (
-            lambda: accept(Measured({}, spheres=(aj.ProbedSphere("S", "probing", (AXES, AXES[:3]), 25.0),))),
+            lambda: run(Measured({}, spheres=(aj.data.ProbedSphere("S", "probing", (AXES, AXES[:3]), 25.0),))),
             "sphere 'S', group 2",
         ),
     ],
@@ -199,7 +198,7 @@ def test_what_cannot_be_tested_is_refused(call, said):
 
 
 def test_a_plain_number_is_a_limit():
-    (test,) = accept(Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])}), {"Deltam": 0.04})
+    (test,) = run(Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])}), {"Deltam": 0.04})
     assert test.decision == "fails"
 
 
@@ -207,7 +206,7 @@ def test_every_part_has_its_own_limit_and_the_worst_decides():
     sockets = {name: np.array([[x, 0.0, 0.0]]) for name, x in (("A", 0), ("B", 100.03), ("C", 1000.03))}
     lengths = (aj.ReferenceLength("A", "B", 100.0, 0.002), aj.ReferenceLength("A", "C", 1000.0, 0.002))
     limit = {"E_Uni": decision.Limit(0.02, 40_000)}
-    (found,) = [test for test in accept(Measured(sockets, lengths), limit, 0.0) if test.title == "length error"]
+    (found,) = [test for test in run(Measured(sockets, lengths), limit, 0.0) if test.title == "length error"]
     parts = found.figures[0].parts
     # Both are off by 0.03, U is 0.004; the limits are 0.0225 and 0.045.
     assert [part.limit for part in parts] == pytest.approx([0.0225, 0.045])
@@ -233,27 +232,25 @@ def lengths_of(*entries):
         ([(0.030, 0.002, 100.0), (-0.029, 0.02, 200.0)], None, "O - P0", None),
         ([(0.029, 0.002, 100.0), (-0.030, 0.02, 200.0)], None, "O - P1", None),
         # What fails comes before what is undecided, even where that is nearer to failing by its U.
-        ([(0.050, 0.0005, 100.0), (0.040, 0.01, 200.0)], aj.Limit(0.04), "O - P0", "fails"),
+        ([(0.050, 0.0005, 100.0), (0.040, 0.01, 200.0)], aj.acceptance.Limit(0.04), "O - P0", "fails"),
         # With limits that grow, the part farthest beyond its own.
-        ([(0.050, 0.0, 100.0), (0.055, 0.0, 1000.0)], aj.Limit(0.01, 40_000), "O - P0", "fails"),
-        ([(0.010, 0.0, 100.0), (0.030, 0.0, 1000.0)], aj.Limit(0.05), "O - P1", "conforms"),
+        ([(0.050, 0.0, 100.0), (0.055, 0.0, 1000.0)], aj.acceptance.Limit(0.01, 40_000), "O - P0", "fails"),
+        ([(0.010, 0.0, 100.0), (0.030, 0.0, 1000.0)], aj.acceptance.Limit(0.05), "O - P1", "conforms"),
     ],
 )
 def test_the_worst_part_speaks_for_a_figure(entries, limit, where, decision):
-    (test,) = [
-        test for test in accept(lengths_of(*entries), {"E_Uni": limit} if limit else None) if test.title == "length error"
-    ]
+    (test,) = [test for test in run(lengths_of(*entries), {"E_Uni": limit} if limit else None) if test.title == "length error"]
     assert (test.figures[0].worst.where, test.figures[0].decision) == (where, decision)
     assert test.figures[0].value == pytest.approx(next(error for i, (error, *_) in enumerate(entries) if where == f"O - P{i}"))
 
 
 def test_names_of_sockets_change_no_limit():
     """Limits follow the length itself, whatever the sockets are called."""
-    limit = {"E_Uni": aj.Limit(0.01, 10_000)}
+    limit = {"E_Uni": aj.acceptance.Limit(0.01, 10_000)}
     for names in (("A", "B"), ("A, reading 1", "B"), ("A - B", "C"), ("A", "B - C, reading 2")):
         sockets = dict(zip(names, (np.zeros((2, 3)), np.tile([500.04, 0, 0], (2, 1))), strict=True))
         measured = Measured(sockets, (aj.ReferenceLength(*names, 500.0), aj.ReferenceLength(*names, 500.01)))
-        (test,) = [test for test in accept(measured, limit) if test.title == "length error"]
+        (test,) = [test for test in run(measured, limit) if test.title == "length error"]
         assert [part.limit for part in test.figures[0].parts] == pytest.approx([0.06, 0.06, 0.060001, 0.060001])
 
 
@@ -261,13 +258,13 @@ def test_names_of_sockets_change_no_limit():
 def test_a_limit_that_grows_needs_a_length(name):
     measured = lengths_of((0.01, 0.0, 100.0), (0.02, 0.0, 200.0))
     measured = measured._replace(sockets={**measured.sockets, "S": PLACE + np.eye(3)})
-    assert_refused(lambda: accept(measured, {name: aj.Limit(1.0, 1000)}), name, "grows with a length")
+    assert_refused(lambda: run(measured, {name: aj.acceptance.Limit(1.0, 1000)}), name, "grows with a length")
 
 
 def test_uncertainties_of_figures_by_hand():
     sockets = {name: np.array([[x, 0.0, 0.0]]) for name, x in (("A", 0), ("B", 100.03), ("C", 199.99))}
     lengths = (aj.ReferenceLength("A", "B", 100.0, 0.003), aj.ReferenceLength("A", "C", 200.0, 0.004))
-    test = accept(Measured(sockets, lengths), u_test=0.012)[0]
+    test = run(Measured(sockets, lengths), u_test=0.012)[0]
     values = {figure.name: (figure.value, figure.worst.expanded) for figure in test.figures}
     assert values["Length"] == pytest.approx((0.03, 2 * math.hypot(0.003, 0.012)))
     assert values["Length_Range"] == pytest.approx((0.04, 2 * math.sqrt(0.003**2 + 0.004**2 + 2 * 0.012**2)))
@@ -279,7 +276,7 @@ def test_uncertainties_of_figures_by_hand():
 
 
 def test_a_perfect_arm_has_no_error_and_the_full_procedure(recorded):
-    tests = accept(measured_by(recorded.nominal.arm, recorded))
+    tests = run(measured_by(recorded.nominal.arm, recorded))
     assert all(abs(part.value) < 1e-6 for test in tests for figure in test.figures for part in figure.parts)
     own = "ISO 10360-12" if len(recorded.spheres) == 2 else "ASME B89.4.22"
     for test in tests:
@@ -293,7 +290,7 @@ def test_an_arm_that_is_too_large_measures_everything_too_large(recorded):
     arm = recorded.nominal.arm
     large = aj.Arm(alpha=arm.alpha, a=grown * arm.a, d=grown * arm.d, theta=arm.theta, probe=grown * arm.probe)
     lengths = [float(length.value) for length in recorded.capture.lengths]
-    for test in accept(measured_by(large, recorded)):
+    for test in run(measured_by(large, recorded)):
         for figure in test.figures:
             for part in figure.parts:
                 expected = {
@@ -311,11 +308,11 @@ def test_an_arm_that_is_too_large_measures_everything_too_large(recorded):
 
 
 def test_a_probe_that_is_off_scatters_tips_on_a_sphere(cheng):
-    recorded = record_procedure(acceptance_procedure(cheng.arm, "asme"), cheng, cheng)
+    recorded = simulate_procedure(plan_procedure(cheng.arm, "asme"), cheng, cheng)
     off = 0.1
     space = aj.Parameters(cheng.arm, ("probe_z",))
     arm = space.arm(space.vector() + off)
-    tests = accept(measured_by(arm, recorded))
+    tests = run(measured_by(arm, recorded))
     for name, q in recorded.capture.sockets.items():
         if not name.startswith("spat"):
             continue
@@ -358,7 +355,7 @@ def test_what_a_full_procedure_needs_besides(sockets, lengths, reach, missing):
     points = {name: PLACE + 100.0 * number + np.zeros((size, 3)) for number, (name, size) in enumerate(sockets.items())}
     ball = None if reach is None else acceptance.Reach(np.zeros(3), reach)
     references = tuple(aj.ReferenceLength(*length) for length in lengths)
-    found = {test.title: test.missing for test in accept(Measured(points, references, reach=ball))}
+    found = {test.title: test.missing for test in run(Measured(points, references, reach=ball))}
     for title, wanted in missing.items():
         assert len(found[title]) == len(wanted), found[title]
         for sentence, part in zip(found[title], wanted, strict=True):
@@ -372,7 +369,7 @@ def test_zones_are_told_by_the_distance_from_the_shoulder():
     }
     (test,) = [
         test
-        for test in accept(Measured(points, reach=acceptance.Reach(shoulder, 1000.0)))
+        for test in run(Measured(points, reach=acceptance.Reach(shoulder, 1000.0)))
         if test.title.startswith("single-point a")
     ]
     found = [part.where.split("(")[1].split(" %")[0] for part in test.figures[0].parts]
@@ -383,9 +380,9 @@ def test_reach_of_arms():
     # Two links in a plane and a probe along the second: 300 + 200 + 50 when stretched; with the elbow's limits less.
     limits = [(-3, 3), (math.pi / 2, 3)]
     arm = aj.Arm(alpha=[0, 0], a=[300, 200], d=[100, 0], theta=[0, 0], probe=[50, 0, 0])
-    assert aj.reach_of(arm).radius == pytest.approx(550)
+    assert aj.kinematics.arm_reach(arm).radius == pytest.approx(550)
     bent = aj.Arm(alpha=[0, 0], a=[300, 200], d=[100, 0], theta=[0, 0], probe=[50, 0, 0], limits=limits)
-    assert aj.reach_of(bent).radius == pytest.approx(math.hypot(300, 250))
+    assert aj.kinematics.arm_reach(bent).radius == pytest.approx(math.hypot(300, 250))
 
 
 def complete_volumetric(near: int, far: int) -> Measured:
@@ -395,14 +392,14 @@ def complete_volumetric(near: int, far: int) -> Measured:
 
 @pytest.mark.parametrize(("near", "far", "missing"), [(10, 10, 0), (15, 5, 0), (19, 1, 1), (9, 10, 1), (20, 0, 2)])
 def test_a_volumetric_test_needs_both_bars_often_enough(near, far, missing):
-    (test,) = [test for test in accept(complete_volumetric(near, far)) if test.title == "volumetric"]
+    (test,) = [test for test in run(complete_volumetric(near, far)) if test.title == "volumetric"]
     assert len(test.missing) == missing, test.missing
 
 
 def test_lengths_between_the_same_sockets_are_one_position():
     measured = complete_volumetric(10, 10)
     twice = measured._replace(lengths=measured.lengths[:19] + measured.lengths[:1])
-    (test,) = [test for test in accept(twice) if test.title == "volumetric"]
+    (test,) = [test for test in run(twice) if test.title == "volumetric"]
     assert "(19 are there)" in test.missing[0]
 
 
@@ -410,7 +407,7 @@ def test_every_length_of_a_length_test_needs_its_three_readings(recorded):
     if len(recorded.spheres) == 1:
         pytest.skip("of ISO 10360-12 only")
     whole = measured_by(recorded.nominal.arm, recorded)
-    complete = lambda measured: next(test for test in accept(measured) if test.title == "length error").missing == ()  # noqa: E731
+    complete = lambda measured: next(test for test in run(measured) if test.title == "length error").missing == ()  # noqa: E731
     assert complete(whole)
     short = dict(whole.sockets) | {"bar1/01/a": whole.sockets["bar1/01/a"][:1]}
     more = {name: np.repeat(points, 2, axis=0) for name, points in short.items() if name.startswith("bar2")}
@@ -421,14 +418,14 @@ def test_every_length_of_a_length_test_needs_its_three_readings(recorded):
 def test_figures_that_could_not_fail_are_left_out(test):
     """A sphere goes through four points exactly, and the sphere round one centre has no size."""
     points = PLACE + 12.5 * AXES[[0, 1, 2, 4]]
-    found = accept(Measured({}, spheres=(aj.ProbedSphere("S", test, (points,), 25.0),)))
+    found = run(Measured({}, spheres=(aj.data.ProbedSphere("S", test, (points,), 25.0),)))
     names = {figure.name for result in found for figure in result.figures}
     assert names == {"effective-diameter": {"D_Eff"}, "probing": {"P_Size"}, "articulation": set()}[test]
 
 
 def test_a_limit_without_data_is_refused():
     sockets = {"A": PLACE + np.eye(3)}
-    assert_refused(lambda: accept(Measured(sockets), {"P_Size": decision.Limit(0.1)}), "P_Size", "nothing to measure it on")
+    assert_refused(lambda: run(Measured(sockets), {"P_Size": decision.Limit(0.1)}), "P_Size", "nothing to measure it on")
 
 
 # --- Files ----------------------------------------------------------------------------------------------------------------------
@@ -437,7 +434,7 @@ def test_a_limit_without_data_is_refused():
 def test_readings_taken_by_the_plan_come_back_through_its_manifest(recorded, cheng, tmp_path):
     """What a laboratory does: plan, record a file for each socket and group of touches, import."""
     standard = "iso" if len(recorded.spheres) == 2 else "asme"
-    procedure = acceptance_procedure(cheng.arm, standard)
+    procedure = plan_procedure(cheng.arm, standard)
     (tmp_path / "acceptance.toml").write_text(procedure_manifest(procedure, "cheng2018-simulation"))
     files: dict[str, list[str]] = {}
     for row in csv.DictReader(procedure_csv(procedure).splitlines()):
@@ -445,17 +442,17 @@ def test_readings_taken_by_the_plan_come_back_through_its_manifest(recorded, che
     for name, rows in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("\n".join(rows))
-    imported = aj.read_manifest(tmp_path / "acceptance.toml")
+    imported = aj.files.read_manifest(tmp_path / "acceptance.toml")
     assert sorted(imported.capture.names) == sorted(recorded.capture.names)
     assert len(imported.capture.lengths) == len(recorded.capture.lengths)
     assert len(imported.sources) == 1 + len(files)
-    for test in accept(measured_by(cheng.arm, imported)):
+    for test in run(measured_by(cheng.arm, imported)):
         for figure in test.figures:
             # The plan prints angles to 0.001 deg: 0.02 mm at the end of the arm, several joints together.
             assert abs(figure.value) < (0.2 if "2RMS" not in figure.name else 0.3), figure.name
     # And through HDF5.
-    aj.save_capture(tmp_path / "capture.h5", imported)
-    again = aj.load_capture(tmp_path / "capture.h5")
+    aj.files.save_capture(tmp_path / "capture.h5", imported)
+    again = aj.files.load_capture(tmp_path / "capture.h5")
     assert [sphere.name for sphere in again.spheres] == [sphere.name for sphere in imported.spheres]
     for one, other in zip(again.spheres, imported.spheres, strict=True):
         assert (one.test, one.diameter, one.u, one.stylus) == (other.test, other.diameter, other.u, other.stylus)
@@ -516,11 +513,11 @@ def test_wrong_manifests_of_points(tmp_path, change, said):
         np.savetxt(tmp_path / name, 1000 * (PLACE + 15.5 * AXES + (name == "b.txt")))
     text = POINTS.replace("sphere/touch", "touch")
     (tmp_path / "points.toml").write_text(text.replace(*(part.replace("sphere/touch", "touch") for part in change)))
-    assert_refused(lambda: aj.read_points(tmp_path / "points.toml"), "points.toml", said)
+    assert_refused(lambda: aj.files.read_points(tmp_path / "points.toml"), "points.toml", said)
 
 
 def test_an_evaluation_is_stored_whole(recorded, tmp_path):
-    from aacmm_jax.files.evaluations import EvaluationRecord
+    from aacmm_jax.acceptance.record import EvaluationRecord
 
     used = frozenset(recorded.capture.names[:1])
     record = EvaluationRecord(
@@ -532,8 +529,8 @@ def test_an_evaluation_is_stored_whole(recorded, tmp_path):
         0.001,
         {"rms_mm": 0.2},
     )
-    aj.save_evaluation(tmp_path / "e.h5", record)
-    again = aj.load_evaluation(tmp_path / "e.h5")
+    aj.files.save_evaluation(tmp_path / "e.h5", record)
+    again = aj.files.load_evaluation(tmp_path / "e.h5")
     assert (again.used, again.warnings, again.limits, again.u_test, again.maxima) == record[2:]
     # To rounding of the last bit of poses read back, the same tests come out.
     assert again.acceptance()["calibrated"] == record.acceptance()["calibrated"]
@@ -557,12 +554,12 @@ def calibrated(cheng):
     seen = capture.select(without="C")
     space = aj.Parameters.free_of(cheng.arm)
     result = aj.calibrate(cheng.arm, seen, aj.Bounds.around(cheng.arm, space, length=10.0, angle=0.0175))
-    return aj.record_of(result, aj.Recording(seen, cheng)), aj.Recording(capture, cheng)
+    return aj.calibration.record_of(result, aj.Recording(seen, cheng)), aj.Recording(capture, cheng)
 
 
 def test_only_what_was_not_seen_is_tested_with_the_uncertainty_that_is_stated(calibrated):
     record, recording = calibrated
-    found = aj.evaluation_of(record, recording, u_test=0.01).acceptance()["calibrated"]
+    found = aj.acceptance.evaluation_of(record, recording, u_test=0.01).acceptance()["calibrated"]
     parts = {figure.name: figure.parts for test in found for figure in test.figures}
     assert {part.where for part in parts["Deltam"]} == {"C"}
     assert {part.where.partition(",")[0] for part in parts["E_Uni"]} == {"A - C"}
@@ -575,65 +572,66 @@ def test_sockets_that_share_poses_with_the_calibration_are_not_new(calibrated):
     # C is new, B is known but for two poses that the calibration has not seen.
     q = recording.capture.sockets
     more = {"A": q["A"], "B": np.concatenate([q["B"], q["C"][:2] + 0.001]), "C": q["C"]}
-    evaluation = aj.evaluation_of(
+    evaluation = aj.acceptance.evaluation_of(
         record, recording._replace(capture=aj.Capture(more, recording.capture.lengths)), limits={"Deltam": 1.0}
     )
-    assert evaluation.limits == {"Deltam": aj.Limit(1.0)}
+    assert evaluation.limits == {"Deltam": aj.acceptance.Limit(1.0)}
     assert evaluation.used == {"A", "B"}
     assert "B (12 of 14 poses)" in " ".join(evaluation.warnings)
 
 
 def test_what_makes_an_evaluation_doubtful_is_said_first(calibrated):
     record, recording = calibrated
-    seen = aj.evaluation_of(record, record.recording, limits={"Deltam": aj.Limit(1.0)})
+    seen = aj.acceptance.evaluation_of(record, record.recording, limits={"Deltam": aj.acceptance.Limit(1.0)})
     words = " ".join(seen.warnings)
     assert "flatters" in words or "flatter it" in words
     assert "Nothing was stated of the uncertainty of Deltam" in words
     assert all(test.missing for test in seen.acceptance()["calibrated"])
-    failed = aj.evaluation_of(record._replace(converged=False, reason="It did not."), recording)
+    failed = aj.acceptance.evaluation_of(record._replace(converged=False, reason="It did not."), recording)
     assert "The calibration failed" in failed.warnings[0]
-    simulated = aj.evaluation_of(record, recording._replace(true=recording.nominal))
+    simulated = aj.acceptance.evaluation_of(record, recording._replace(true=recording.nominal))
     assert "simulated" in simulated.warnings[0]
 
 
 def test_an_evaluation_of_points_is_stored_whole(tmp_path):
-    from aacmm_jax.files.points_evaluations import PointsRecord, load_points, save_points
+    from aacmm_jax.acceptance.record import PointsRecord
+    from aacmm_jax.files.points_evaluations import load_points, save_points
 
-    spheres = (aj.ProbedSphere("S", "probing", (PLACE + 15.5 * AXES,), 31.0, 0.001, 0.0, 0.0002),)
+    spheres = (aj.data.ProbedSphere("S", "probing", (PLACE + 15.5 * AXES,), 31.0, 0.001, 0.0, 0.0002),)
     measured = lengths_of((0.01, 0.001, 100.0))._replace(
         spheres=spheres, reach=acceptance.Reach(np.ones(3), 900.0), measured="2026-01-31"
     )
-    record = PointsRecord(measured, {"E_Uni": aj.Limit(0.02, 49)}, 0.001)
+    record = PointsRecord(measured, {"E_Uni": aj.acceptance.Limit(0.02, 49)}, 0.001)
     save_points(tmp_path / "points.h5", record)
     again = load_points(tmp_path / "points.h5")
     assert again.acceptance() == record.acceptance()
     assert (again.limits, again.u_test, again.measured.measured) == (record.limits, record.u_test, "2026-01-31")
-    written = aj.write_report(tmp_path / "points.h5", tmp_path / "points.html")
+    written = aj.report.write_report(tmp_path / "points.h5", tmp_path / "points.html")
     assert written["verdict"].startswith("Every limit is kept")
 
 
 def test_bars_at_hand_are_planned_for(cheng):
-    procedure = acceptance_procedure(cheng.arm, "asme", bars=[1000.0, 500.5])
+    procedure = plan_procedure(cheng.arm, "asme", bars=[1000.0, 500.5])
     assert sorted({value for *_, value in procedure.lengths}) == [500.5, 1000.0]
     assert len(procedure.left_out) == 2  # neither is within the ranges of the standard, for a reach of 1359 mm
     for start, end, value in procedure.lengths:
         ends = [next(item for item in procedure.sockets if item.name == name).points[0] for name in (start, end)]
         assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(value, abs=1e-5)
-    assert_refused(lambda: acceptance_procedure(cheng.arm, "iso", bars=[500.0]), "takes 5")
+    assert_refused(lambda: plan_procedure(cheng.arm, "iso", bars=[500.0]), "takes 5")
 
 
 def test_an_arm_that_cannot_take_a_zone_goes_without_it():
-    procedure = acceptance_procedure(aj.load_arm("iiwa14"), "asme")
+    procedure = plan_procedure(aj.load_arm("iiwa14"), "asme")
     assert "0 to 20 %" in procedure.left_out[0]
     assert {item.name for item in procedure.sockets if item.name.startswith("spat")} == {"spat/middle", "spat/far"}
-    assert_refused(lambda: acceptance_procedure(aj.load_arm("iiwa14"), "asme", margin=3.0), "margin")
-    assert_refused(lambda: acceptance_procedure(aj.load_arm("iiwa14"), "vdi"), "asme or iso")
+    assert_refused(lambda: plan_procedure(aj.load_arm("iiwa14"), "asme", margin=3.0), "margin")
+    assert_refused(lambda: plan_procedure(aj.load_arm("iiwa14"), "vdi"), "asme or iso")
 
 
 @pytest.mark.parametrize("standard", ["asme", "iso"])
 def test_planned_poses_can_be_taken(cheng, standard):
     above, margin = 50.0, math.radians(10)
-    procedure = acceptance_procedure(cheng.arm, standard, above=above, margin=margin)
+    procedure = plan_procedure(cheng.arm, standard, above=above, margin=margin)
     limits = np.array(cheng.arm.limits or [(-math.pi, math.pi)] * 6)
     for item in (*procedure.sockets, *procedure.touches):
         np.testing.assert_allclose(cheng.arm.position(item.q), item.points, atol=1e-5)

@@ -15,7 +15,6 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.calibration import batch
-
 from tests import published
 
 BATCH = 50
@@ -60,7 +59,7 @@ def test_the_chunk_changes_no_bit(paper_arm, noisy_capture, box, starts):
 def test_batches_of_arms_and_captures(paper_arm):
     """Every problem its own arm and its own recording: each finds its own truth."""
     space = aj.Parameters.free_of(paper_arm)
-    true = [aj.deviated(space, length=1.0, angle=1e-3, seed=seed) for seed in range(4)]
+    true = [aj.perturbed_arm(space, length=1.0, angle=1e-3, seed=seed) for seed in range(4)]
     sockets = {"A": (400, 200, 300), "B": (600, 200, 300)}
     captures = [aj.simulate(arm, sockets, poses={"A": 30, "B": 1}, lengths=[("A", "B")], seed=i) for i, arm in enumerate(true)]
     nominal = jax.tree.map(lambda leaf: jnp.stack([leaf] * 4), paper_arm)

@@ -42,7 +42,7 @@ def test_tolerance_of_the_standard(u, digits, delta):
 
 
 @pytest.fixture(scope="module")
-def sampled(arm, bounds, capture) -> aj.Sampled:
+def sampled(arm, bounds, capture) -> aj.calibration.Sampled:
     return aj.monte_carlo(aj.calibrate(arm, capture, bounds, method="joint", noise=NOISE), capture, seed=3)
 
 
@@ -68,7 +68,7 @@ def test_lengths_that_were_held_are_divided_too(arm, capture, bounds):
     assert result.method == "two-stage"
     sampled = aj.monte_carlo(result, capture, most=20_000)
     np.testing.assert_allclose(sampled.u, sampled.linear_u, rtol=0.05)
-    alone = np.asarray(aj.uncertainty_of(result).stretch)
+    alone = np.asarray(aj.uncertainty_of(result).common_scale_error)
     assert alone[-1] == pytest.approx((float(result.scale.u) / float(result.scale.value)) ** 2, rel=0.01)
 
 
@@ -130,7 +130,7 @@ def test_cross_validation_shows_what_the_uncertainty_misses(arm, bounds, capture
     assert checked.surprising
     assert checked.excess > 3
     result = aj.calibrate(arm, bent, bounds, method="joint", noise=NOISE)
-    record = aj.record_of(result, aj.Recording(bent, aj.ArmSpecification(arm, "bent")))
+    record = aj.calibration.record_of(result, aj.Recording(bent, aj.kinematics.ArmSpecification(arm, "bent")))
     found = cautions.of_calibration(record._replace(validation=checked))
     assert found[0].startswith("Sockets left out one placement after the other err")
     assert "Trust the cross-validated figures" in found[0]
@@ -175,17 +175,21 @@ def test_refused(arm, bounds, capture, options, text):
 
 def test_files_keep_all_of_it(arm, bounds, capture, tmp_path):
     sampled = aj.bootstrap(aj.calibrate(arm, capture, bounds, method="joint", noise=NOISE), capture, trials=100)
-    nominal = aj.ArmSpecification(arm, "small")
+    nominal = aj.kinematics.ArmSpecification(arm, "small")
     result = aj.calibrate(arm, capture, bounds, noise=aj.Noise(encoder_arcsec=[1.0, 2.0, 3.0, 2.0, 1.0, 4.0], seating=0.004))
-    record = aj.record_of(result, aj.Recording(capture, nominal))._replace(
+    record = aj.calibration.record_of(result, aj.Recording(capture, nominal))._replace(
         validation=aj.cross_validate(arm, capture, bounds), sampled=sampled.table(), sampled_says="It agrees."
     )
-    aj.save_calibration(tmp_path / "c.h5", record)
-    loaded = aj.load_calibration(tmp_path / "c.h5")
+    aj.files.save_calibration(tmp_path / "c.h5", record)
+    loaded = aj.files.load_calibration(tmp_path / "c.h5")
     np.testing.assert_array_equal(loaded.noise.encoder_arcsec, record.noise.encoder_arcsec)
     assert float(loaded.noise.seating) == 0.004
-    assert (loaded.form, loaded.freedom, loaded.misfit) == ("given", np.inf, float(result.stage1.misfit))
-    np.testing.assert_array_equal(loaded.open, result.spread.open)
+    assert (loaded.noise_model, loaded.degrees_of_freedom, loaded.reduced_chi) == (
+        "given",
+        np.inf,
+        float(result.stage1.reduced_chi),
+    )
+    np.testing.assert_array_equal(loaded.open, result.parameter_covariance.open)
     for found, kept in zip(loaded.validation.groups, record.validation.groups, strict=True):
         assert found.sockets == kept.sockets
         assert (found.rms, found.rms_predicted, found.converged) == (kept.rms, kept.rms_predicted, kept.converged)
@@ -193,7 +197,7 @@ def test_files_keep_all_of_it(arm, bounds, capture, tmp_path):
     np.testing.assert_array_equal(loaded.sampled["high"], sampled.high)
     assert loaded.sampled_says == "It agrees."
     # A calibration that failed leaves residuals of any size; its file is read all the same.
-    aj.save_calibration(tmp_path / "failed.h5", record._replace(noise=aj.Noise(encoder_arcsec=1e6, seating=500.0)))
-    assert float(aj.load_calibration(tmp_path / "failed.h5").noise.seating) == 500.0
+    aj.files.save_calibration(tmp_path / "failed.h5", record._replace(noise=aj.Noise(encoder_arcsec=1e6, seating=500.0)))
+    assert float(aj.files.load_calibration(tmp_path / "failed.h5").noise.seating) == 500.0
     again = aj.uncertainty_of(loaded)
     np.testing.assert_allclose(again.u, aj.uncertainty_of(result).u)

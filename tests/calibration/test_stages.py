@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.checks import scale_is_free
-from aacmm_jax.data.noise import ARCSEC
+from aacmm_jax.calibration.scale_anchor import scale_is_free
+from aacmm_jax.core.units import ARCSEC
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def test_scale_leaves_the_base_offset_alone(paper_arm, paper_capture):
 def test_metrics_by_hand():
     """One socket with tips (0,0,0), (2,0,0), (0,4,0), (2,4,0): centroid (1,2,0), every distance sqrt(5), half range 2."""
     tips = jnp.array([[0.0, 0, 0], [2, 0, 0], [0, 4, 0], [2, 4, 0], [7, 7, 7]])
-    figures = aj.repeatability(tips, (4, 1))
+    figures = aj.model.repeatability(tips, (4, 1))
     assert float(figures.de) == pytest.approx(np.sqrt(5))
     assert float(figures.rms) == pytest.approx(np.sqrt(5))
     assert float(figures.deltam) == 2
@@ -294,7 +294,7 @@ def test_a_known_length_leaves_nothing_more_to_hold(paper_arm, space):
     assert result.hold is None
     assert float(result.de) < 1e-9
     assert float(result.arm.d[4]) == pytest.approx(501, abs=1e-8)
-    panda = aj.load_specification("panda")
+    panda = aj.files.load_specification("panda")
     assert scale_is_free(panda.arm, panda.bounds().space)  # d_7 is held, but lies along probe_z
 
 

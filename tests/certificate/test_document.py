@@ -13,10 +13,18 @@ from scipy import stats
 
 import aacmm_jax as aj
 from aacmm_jax.certificate import xml as dcc_xml
-from aacmm_jax.certificate.document import dcc, values_of_dcc
-from aacmm_jax.files.administrative_data import About, Certificate, Conformity, Item, Laboratory, Person, Reference, read_about
+from aacmm_jax.certificate.document import dcc, parse_dcc
+from aacmm_jax.files.administrative_data import (
+    AdministrativeData,
+    Certificate,
+    Conformity,
+    Item,
+    Laboratory,
+    Person,
+    Reference,
+    read_administrative_data,
+)
 from aacmm_jax.summaries.warnings import of_calibration
-
 from tests.refusals import assert_refused
 
 CREATED = "2026-03-05T10:11:12+00:00"
@@ -85,19 +93,19 @@ HOSTILE = ("<script>alert('1')</script>", 'a]]><b>"&amp;&lt;', "tab\tline\nfeed\
 
 
 @pytest.fixture(scope="module")
-def record(paper_arm) -> aj.CalibrationRecord:
+def record(paper_arm) -> aj.calibration.CalibrationRecord:
     """A calibration of an arm that is off, so as found and as left differ. One of its two lengths is exact."""
-    nominal = aj.ArmSpecification(paper_arm, "small & fine")
+    nominal = aj.kinematics.ArmSpecification(paper_arm, "small & fine")
     bounds = nominal.bounds()
     true = bounds.space.arm(np.asarray(bounds.space.vector()) + np.where(bounds.space.lengths, 0.4, 0.001))
     sockets = {"A": (400.0, 200.0, 300.0), "B": (600.0, 200.0, 300.0), "C": (500.0, 400.0, 300.0)}
     lengths = [("A", "B", 0.01), ("B", "C", 0.0)]
     poses = {"A": 40, "B": 3, "C": 1}
     capture = aj.simulate(true, sockets, poses=poses, lengths=lengths, encoder_arcsec=2.0, seating=0.005, seed=1)
-    return aj.record_of(aj.calibrate(paper_arm, capture, bounds), aj.Recording(capture, nominal))
+    return aj.calibration.record_of(aj.calibrate(paper_arm, capture, bounds), aj.Recording(capture, nominal))
 
 
-def renamed(record: aj.CalibrationRecord, *names: str) -> aj.CalibrationRecord:
+def renamed(record: aj.calibration.CalibrationRecord, *names: str) -> aj.calibration.CalibrationRecord:
     """The same calibration, with other names of sockets A, B and C."""
     other = dict(zip("ABC", names, strict=True))
     capture = record.recording.capture
@@ -107,10 +115,10 @@ def renamed(record: aj.CalibrationRecord, *names: str) -> aj.CalibrationRecord:
 
 
 @pytest.fixture(scope="module")
-def full(tmp_path_factory) -> About:
+def full(tmp_path_factory) -> AdministrativeData:
     path = tmp_path_factory.mktemp("about") / "about.toml"
     path.write_text(FULL, encoding="utf-8")
-    return read_about(path)
+    return read_administrative_data(path)
 
 
 @pytest.fixture(scope="module")
@@ -121,11 +129,15 @@ def certificates(record, full) -> dict[str, str]:
     active = record.active.copy()
     active[1:3] = (-1, 1)
     return {
-        "nothing stated": dcc(record, About(), created=CREATED),
+        "nothing stated": dcc(record, AdministrativeData(), created=CREATED),
         "all stated": dcc(record, full, created=CREATED, sources=("a.h5", "<b>.toml"), command="aacmm calibrate a.h5"),
         "hostile names": dcc(renamed(record, *HOSTILE[:3]), full, created=CREATED),
-        "on bounds": dcc(record._replace(determined=uncertain, active=active), About(), created=CREATED),
-        "joint": dcc(record._replace(method="joint", freedom=math.inf, form="given"), About(), created=CREATED),
+        "on bounds": dcc(record._replace(determined=uncertain, active=active), AdministrativeData(), created=CREATED),
+        "joint": dcc(
+            record._replace(method="joint", degrees_of_freedom=math.inf, noise_model="given"),
+            AdministrativeData(),
+            created=CREATED,
+        ),
     }
 
 
@@ -214,9 +226,9 @@ def test_elements_stand_in_the_order_of_the_schema(certificates, kind):
 
 
 def test_numbers_read_back_exactly(record):
-    text = dcc(record, About(), created=CREATED)
-    values = values_of_dcc(text)
-    factor = stats.t.ppf(0.975, record.freedom)
+    text = dcc(record, AdministrativeData(), created=CREATED)
+    values = parse_dcc(text)
+    factor = stats.t.ppf(0.975, record.degrees_of_freedom)
     coverage = {name: {x.text for x in ElementTree.fromstring(text).iter(f"{SI}coverage{name}")} for name in COVERAGE}
     assert coverage["Probability"] == {"0.95"}
     np.testing.assert_allclose([float(x or "") for x in coverage["Factor"]], [factor], rtol=1e-12)
@@ -255,19 +267,19 @@ def test_numbers_read_back_exactly(record):
 
 @pytest.mark.parametrize("value", [5e-324, -0.0, 1e-5, 0.1, 1 / 3, -123456789.125, 1.7976931348623157e308])
 def test_any_number_reads_back(record, value):
-    text = dcc(record, About(), created=CREATED)
+    text = dcc(record, AdministrativeData(), created=CREATED)
     k = f"<si:value>{record.k!r}</si:value>"
     assert text.count(k) == 1
     parent = ElementTree.Element("x")
     dcc_xml.real(parent, value, MM)
     again = ElementTree.fromstring(dcc_xml.written(parent).replace("si:", ""))[0]
-    read = values_of_dcc(text.replace(k, f"<si:value>{again.findtext('value')}</si:value>"))["As left", "Scale", "k"].value
+    read = parse_dcc(text.replace(k, f"<si:value>{again.findtext('value')}</si:value>"))["As left", "Scale", "k"].value
     assert (read, math.copysign(1, read)) == (value, math.copysign(1, value))
 
 
 def test_parameters_without_an_uncertainty_of_their_own_say_why(record, certificates):
     text = certificates["on bounds"]
-    values = values_of_dcc(text)
+    values = parse_dcc(text)
     found, left = (
         {
             quantity.findtext(f"{DCC}name/{DCC}content"): quantity.findtext(f"{DCC}description/{DCC}content")
@@ -298,9 +310,11 @@ def test_a_held_length_that_the_scale_fix_divided_says_so(record):
     fewer = {name: np.delete(getattr(record, name), i) for name in parts}
     square = {name: np.delete(np.delete(getattr(record, name), i, 0), i, 1) for name in ("covariance", "open")}
     names = tuple(name for name in record.names if name != "probe_z")
-    text = dcc(record._replace(names=names, held=(*record.held, "probe_z"), **fewer, **square), About(), created=CREATED)
+    text = dcc(
+        record._replace(names=names, held=(*record.held, "probe_z"), **fewer, **square), AdministrativeData(), created=CREATED
+    )
     assert "Not identified: held at its nominal value, and divided by k as all lengths are" in text
-    assert values_of_dcc(text)["As left", PARAMETERS, "probe_z"].expanded is None
+    assert parse_dcc(text)["As left", PARAMETERS, "probe_z"].expanded is None
 
 
 def test_what_is_stated_stands_there(certificates, full):
@@ -337,14 +351,14 @@ def test_what_is_stated_stands_there(certificates, full):
     assert "a.h5, <b>.toml" in contents(text, "*/dcc:statements")
     equipment = "*/dcc:measurementResult[1]/dcc:measuringEquipments/dcc:measuringEquipment"
     assert contents(text, f"{equipment}/dcc:name") == ["ball bar", "Reference lengths"]
-    assert values_of_dcc(text)["As left", "Scale", "k"].expanded
+    assert parse_dcc(text)["As left", "Scale", "k"].expanded
     temperature = root.find(f"*/{DCC}measurementResult/{DCC}influenceConditions//{SI}real")
     assert temperature is not None
     assert [item.text for item in temperature.iter() if item.text and item.text.strip()] == ["20.25", r"\degreecelsius", "0.1"]
 
 
 def test_nothing_is_made_up(record):
-    text = dcc(record, About(), created=CREATED)
+    text = dcc(record, AdministrativeData(), created=CREATED)
     root = ElementTree.fromstring(text)
     core = [(child.tag.removeprefix(DCC), child.text) for child in root[0][1]]
     assert ("countryCodeISO3166_1", "ZZ") in core
@@ -365,10 +379,10 @@ def test_nothing_is_made_up(record):
 
 def test_cautions_and_simulations_are_told(record):
     recording = record.recording
-    simulated = record._replace(recording=recording._replace(true=recording.nominal), misfit=3.0)
+    simulated = record._replace(recording=recording._replace(true=recording.nominal), reduced_chi=3.0)
     cautions = of_calibration(simulated)
     assert any("3 times what the given noise predicts" in sentence for sentence in cautions)
-    said = contents(dcc(simulated, About(), created=CREATED), "*/dcc:statements")
+    said = contents(dcc(simulated, AdministrativeData(), created=CREATED), "*/dcc:statements")
     assert set(cautions) <= set(said)
     assert "The readings are simulated, so this is no certificate of a real arm." in said
 
@@ -385,15 +399,15 @@ def test_cautions_and_simulations_are_told(record):
 )
 def test_the_day_of_the_calibration_stands_in_for_missing_dates(record, stated, begin, end):
     dates = {name: datetime.date.fromisoformat(text) for name, text in stated.items()}
-    text = dcc(record, About(certificate=Certificate(**dates)), created=CREATED)
+    text = dcc(record, AdministrativeData(certificate=Certificate(**dates)), created=CREATED)
     assert f"<dcc:beginPerformanceDate>{begin}<" in text
     assert f"<dcc:endPerformanceDate>{end}<" in text
 
 
 def test_the_same_calibration_has_the_same_certificate(record):
-    one, again = (dcc(record, About(), created=CREATED) for _ in range(2))
+    one, again = (dcc(record, AdministrativeData(), created=CREATED) for _ in range(2))
     assert one == again
-    other = dcc(record, About(item=Item(name="other")), created=CREATED)
+    other = dcc(record, AdministrativeData(item=Item(name="other")), created=CREATED)
     identifier = lambda text: ElementTree.fromstring(text).findtext(f"*/{DCC}coreData/{DCC}uniqueIdentifier")  # noqa: E731
     assert identifier(one) != identifier(other)
 
@@ -402,8 +416,8 @@ def test_the_same_calibration_has_the_same_certificate(record):
 def test_hostile_names_stay_text(record, name):
     record = renamed(record, name, "B", "C")
     record = record._replace(recording=record.recording._replace(nominal=record.recording.nominal._replace(name=name)))
-    text = dcc(record, About(), created=CREATED, command=name)
-    assert ("As left", "Reference lengths", f"1: {name} - B", "error") in values_of_dcc(text)
+    text = dcc(record, AdministrativeData(), created=CREATED, command=name)
+    assert ("As left", "Reference lengths", f"1: {name} - B", "error") in parse_dcc(text)
     assert contents(text, "*/dcc:items/dcc:item/dcc:name")[0] == name
     assert name in contents(text, "*/dcc:measurementResult/dcc:usedSoftware")
     assert all(element.tag.startswith((DCC, SI)) for element in ElementTree.fromstring(text).iter())
@@ -444,14 +458,16 @@ def test_any_text_survives_or_is_refused(text):
     ],
 )
 def test_what_cannot_be_certified_is_refused(record, changes, keywords, parts):
-    assert_refused(lambda: dcc(record._replace(**changes), About(), **{"created": CREATED} | keywords), *parts)
+    assert_refused(lambda: dcc(record._replace(**changes), AdministrativeData(), **{"created": CREATED} | keywords), *parts)
 
 
 def test_names_that_xml_cannot_hold_are_refused(record):
-    assert_refused(lambda: dcc(renamed(record, "A\x1b", "B", "C"), About(), created=CREATED), r"socket 'A\x1b'", "U+001B")
+    assert_refused(
+        lambda: dcc(renamed(record, "A\x1b", "B", "C"), AdministrativeData(), created=CREATED), r"socket 'A\x1b'", "U+001B"
+    )
     nominal = record.recording.nominal._replace(name="\ud800")
     broken = record._replace(recording=record.recording._replace(nominal=nominal))
-    assert_refused(lambda: dcc(broken, About(), created=CREATED), "arm", "U+D800")
+    assert_refused(lambda: dcc(broken, AdministrativeData(), created=CREATED), "arm", "U+D800")
 
 
 @pytest.mark.parametrize(
@@ -460,7 +476,9 @@ def test_names_that_xml_cannot_hold_are_refused(record):
 )
 def test_dates_that_contradict_the_calibration_are_refused(record, stated, part):
     dates = {name: datetime.date.fromisoformat(text) for name, text in stated.items()}
-    assert_refused(lambda: dcc(record, About(certificate=Certificate(**dates)), created=CREATED), part, "2026-03-05")
+    assert_refused(
+        lambda: dcc(record, AdministrativeData(certificate=Certificate(**dates)), created=CREATED), part, "2026-03-05"
+    )
 
 
 @pytest.mark.parametrize(
@@ -489,15 +507,15 @@ def test_dates_that_contradict_the_calibration_are_refused(record, stated, part)
 def test_what_is_said_about_a_certificate_is_checked(tmp_path, content, parts):
     path = tmp_path / "about.toml"
     path.write_text(content)
-    assert_refused(lambda: read_about(path), path, *parts)
+    assert_refused(lambda: read_administrative_data(path), path, *parts)
 
 
 def test_everything_about_a_certificate_is_optional(tmp_path, full):
     path = tmp_path / "about.toml"
     path.write_text("")
-    assert read_about(path) == About()
-    assert About().country == "ZZ"
-    assert About(laboratory=Laboratory(country="DE")).country == "DE"
+    assert read_administrative_data(path) == AdministrativeData()
+    assert AdministrativeData().country == "ZZ"
+    assert AdministrativeData(laboratory=Laboratory(country="DE")).country == "DE"
     assert full.country == "CH"
     assert full.person[0] == Person(name="Ada", role="head", main_signer=True)
     assert full.reference[0].certificate_number == "K 17"
@@ -518,11 +536,11 @@ def test_everything_about_a_certificate_is_optional(tmp_path, full):
     ],
 )
 def test_what_is_no_certificate_is_refused(text, parts):
-    assert_refused(lambda: values_of_dcc(text), *parts)
+    assert_refused(lambda: parse_dcc(text), *parts)
 
 
 def test_a_certificate_whose_number_was_edited_is_refused(record):
-    text = dcc(record, About(), created=CREATED)
+    text = dcc(record, AdministrativeData(), created=CREATED)
     k = f"<si:value>{record.k!r}</si:value>"
     for edited in (k.replace(".", ","), ""):
-        assert_refused(lambda edited=edited: values_of_dcc(text.replace(k, edited)), "'As left / Scale / k'", "no number")
+        assert_refused(lambda edited=edited: parse_dcc(text.replace(k, edited)), "'As left / Scale / k'", "no number")

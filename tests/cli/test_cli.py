@@ -47,7 +47,7 @@ def test_whole_path(aacmm, tmp_path):
     assert result["sockets_used"] == ["A", "B"]
     assert result["truth"]["calibrated"]["length_error_largest_mm"] < 0.1 < result["truth"]["stage1"]["length_error_largest_mm"]
     # Python reads the same calibration.
-    record = aj.load_calibration(tmp_path / "calibration.h5")
+    record = aj.files.load_calibration(tmp_path / "calibration.h5")
     assert record.k == result["scale_k"]
     space = aj.Parameters(record.recording.nominal.arm, record.names)
     values = [row["calibrated"] for row in result["parameters"]]

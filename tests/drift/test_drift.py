@@ -18,14 +18,15 @@ from typer.testing import CliRunner
 
 import aacmm_jax as aj
 from aacmm_jax.cli.compare_commands import app
-from aacmm_jax.data.noise import ARCSEC
-from aacmm_jax.data.recording import ArmSpecification, Recording
+from aacmm_jax.core.units import ARCSEC
+from aacmm_jax.data.recording import Recording
 from aacmm_jax.drift.comparison import compare, trend
 from aacmm_jax.drift.statistics import coverage_factor, effective_freedom
+from aacmm_jax.files.hdf5 import provenance
+from aacmm_jax.kinematics.specification import ArmSpecification
 from aacmm_jax.model.scale import divide_lengths
 from aacmm_jax.plot import drift as drift_figure
 from aacmm_jax.summaries.drift import drift_csv, drift_summary
-
 from tests.refusals import assert_refused
 
 SOCKETS = {"A": (400, 200, 300), "B": (700, 500, 500)}
@@ -35,7 +36,7 @@ MOVED = {"theta_4": 20 * ARCSEC, "a_2": 0.05}
 
 @pytest.fixture(scope="module")
 def specification() -> ArmSpecification:
-    return aj.load_specification("cheng2018-simulation")
+    return aj.files.load_specification("cheng2018-simulation")
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +72,7 @@ def calibrated(paper_arm, specification, space):
     found = jax.jit(lambda rows: jax.lax.map(one, rows, batch_size=20))(rows)
     found = jax.tree.map(np.asarray, found)
     records = [
-        aj.record_of(jax.tree.map(lambda leaf, i=i: jnp.asarray(leaf[i]), found), Recording(capture, specification))
+        aj.calibration.record_of(jax.tree.map(lambda leaf, i=i: jnp.asarray(leaf[i]), found), Recording(capture, specification))
         for i, capture in enumerate(captures)
     ]
     assert all(record.converged for record in records)
@@ -94,10 +95,14 @@ def shifted(record, changes, **fields):
     return record._replace(calibrated=record.calibrated._replace(arm=moved_arm(space, changes)), **fields)
 
 
-def certain(record, u, freedom=math.inf):
+def certain(record, u, degrees_of_freedom=math.inf):
     """The record with independent parameters of standard uncertainty ``u`` mm or mrad each, and no stretch."""
     steps = np.array([1e-3 if name.startswith(("alpha", "theta")) else 1.0 for name in record.names])
-    return record._replace(covariance=np.diag((u * steps) ** 2), stretch=np.zeros_like(record.stretch), freedom=freedom)
+    return record._replace(
+        covariance=np.diag((u * steps) ** 2),
+        common_scale_error=np.zeros_like(record.common_scale_error),
+        degrees_of_freedom=degrees_of_freedom,
+    )
 
 
 # Two-sided Student's t and normal quantiles, from printed tables (JCGM 100, table G.2, 95.00 %).
@@ -139,7 +144,7 @@ def test_parameters_against_numbers_worked_out_by_hand(old, new):
     np.testing.assert_allclose(found.expanded / found.u, stats.norm.ppf(0.975))
     assert [name for name, moved in zip(found.names, found.moved, strict=True) if moved] == ["theta_4"]
     assert found.joint.statistic == pytest.approx((9.9**2 + 9.7**2) / 25, rel=1e-6)
-    assert (found.joint.rank, found.joint.freedom) == (21, math.inf)
+    assert (found.joint.rank, found.joint.degrees_of_freedom) == (21, math.inf)
     assert found.joint.p == pytest.approx(stats.chi2.sf((9.9**2 + 9.7**2) / 25, 21), rel=1e-6)
     assert found.by_chance == pytest.approx(1.05)
     assert "1 of 21 parameters moved beyond its uncertainty (95 %; 1 would by chance): theta_4 by +2.04 arcsec" in " ".join(
@@ -155,15 +160,15 @@ def test_estimated_noise_takes_f(old, new, u, freedom, expected):
     """Two alike with 40 degrees of freedom each have 80 together, as two pooled variances; else Welch and Satterthwaite."""
     end = shifted(old, {"d_3": 0.02}, recording=new.recording)
     found = compare(certain(old, u[0], freedom[0]), certain(end, u[1], freedom[1]))
-    assert found.joint.freedom == pytest.approx(expected)
+    assert found.joint.degrees_of_freedom == pytest.approx(expected)
     assert found.joint.p == pytest.approx(stats.f.sf(0.02**2 / (u[0] ** 2 + u[1] ** 2) / 21, 21, expected), rel=1e-6)
     np.testing.assert_allclose(found.expanded / found.u, stats.t.ppf(0.975, expected))
 
 
 def test_robust_covariances_take_hotelling(old, new):
     """T^2 with 80 degrees of freedom of 21 parameters is 80 * 21 / 60 times F with 21 and 60."""
-    end = shifted(old, {"d_3": 0.02}, recording=new.recording, form="robust")
-    found = compare(certain(old, 0.003, 40.0)._replace(form="robust"), certain(end, 0.003, 40.0))
+    end = shifted(old, {"d_3": 0.02}, recording=new.recording, noise_model="robust")
+    found = compare(certain(old, 0.003, 40.0)._replace(noise_model="robust"), certain(end, 0.003, 40.0))
     assert found.joint.p == pytest.approx(stats.f.sf(0.02**2 / 18e-6 * 60 / (80 * 21), 21, 60), rel=1e-6)
 
 
@@ -195,7 +200,7 @@ def test_on_a_bound_or_held_there_is_no_uncertainty_of_change(old, new):
     kept = [i for i in range(21) if i != without]
     short = new._replace(
         names=tuple(old.names[i] for i in kept), covariance=new.covariance[np.ix_(kept, kept)], open=new.open[np.ix_(kept, kept)],
-        determined=new.determined[kept], active=new.active[kept], stretch=new.stretch[[*kept, 21]],
+        determined=new.determined[kept], active=new.active[kept], common_scale_error=new.common_scale_error[[*kept, 21]],
     )  # fmt: skip
     for pair, side in (((old._replace(active=active), short), "new"), ((short, old._replace(active=active)), "old")):
         found = compare(*pair)
@@ -215,10 +220,10 @@ def test_lengths_that_were_held_follow_the_scale(paper_arm, specification):
     """After two stages a held length is divided by k too, so that its share of u(k) is in every length."""
     space = aj.Parameters.free_of(paper_arm, held=("alpha_6", "a_6", "d_1", "theta_1", "probe_x", "probe_y", "a_2", "d_5"))
     capture = aj.simulate(paper_arm, SOCKETS, poses={"A": 50, "B": 10}, lengths=[("A", "B", 0.05)], encoder_arcsec=2.0, seed=3)
-    record = aj.record_of(
+    record = aj.calibration.record_of(
         aj.calibrate(paper_arm, capture, aj.Bounds.around(paper_arm, space)), Recording(capture, specification)
     )
-    assert np.any(record.stretch)
+    assert np.any(record.common_scale_error)
     found = compare(record, record, points=30).lengths
     alone = aj.uncertainty_of(record).length(found.q, found.q_end)
     np.testing.assert_allclose(found.u, math.sqrt(2) * np.asarray(alone), rtol=1e-9)
@@ -372,7 +377,7 @@ def test_two_good_calibrations_of_one_arm_have_no_cautions(old, new):
     ids=["level", "length", "joints", "type", "one", "dates", "date"],
 )  # fmt: skip
 def test_refused(old, new, ask, parts):
-    panda = aj.load_specification("panda")
+    panda = aj.files.load_specification("panda")
     other = old._replace(recording=old.recording._replace(nominal=panda), calibrated=panda)
     assert_refused(lambda: ask(old, new, other), *parts)
 
@@ -434,10 +439,10 @@ def run(tmp_path, monkeypatch):
 def saved(record, path, created, monkeypatch):
     from aacmm_jax.files import storage
 
-    genuine = storage.provenance
+    genuine = provenance
     with monkeypatch.context() as patch:
         patch.setattr(storage, "provenance", lambda kind: genuine(kind) | {"created": created})
-        aj.save_calibration(path, record)
+        aj.files.save_calibration(path, record)
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-
 from tests import published
 from tests.refusals import assert_refused
 
@@ -88,7 +87,7 @@ def test_real_arm_is_equation_18_with_its_scale_fixed():
 
 @pytest.mark.parametrize("name", MAKERS)
 def test_robots_are_their_makers(name):
-    specification = aj.load_specification(name)
+    specification = aj.files.load_specification(name)
     alpha, a, d, probe = MAKERS[name]
     assert_same_arm(
         specification.arm,
@@ -102,9 +101,9 @@ def test_robots_are_their_makers(name):
 
 
 def test_every_shipped_arm_loads_and_is_reachable_by_name():
-    assert set(aj.shipped_arms()) == {"cheng2018-ra7125", "cheng2018-simulation", "iiwa14", "panda"}
-    for name in aj.shipped_arms():
-        specification = aj.load_specification(name)
+    assert set(aj.files.shipped_arms()) == {"cheng2018-ra7125", "cheng2018-simulation", "iiwa14", "panda"}
+    for name in aj.files.shipped_arms():
+        specification = aj.files.load_specification(name)
         assert specification.name
         assert specification.bounds().space.names
 
@@ -120,7 +119,7 @@ def test_craig_table_gives_the_same_arm(tmp_path):
 
 
 def test_units_change_the_numbers_and_not_the_arm(tmp_path):
-    in_mm_and_deg = aj.load_specification(written(tmp_path, SMALL))
+    in_mm_and_deg = aj.files.load_specification(written(tmp_path, SMALL))
     turn = np.pi / 180
     one = f"alpha = {-90 * turn}, a = 0.0125, d = 0.333, theta = {1.5 * turn}, beta = {0.25 * turn}"
     two = f"alpha = {45 * turn}, a = 0.4, d = 0.0, theta = {-0.5 * turn}, beta = 0.0"
@@ -138,7 +137,7 @@ def test_units_change_the_numbers_and_not_the_arm(tmp_path):
         angle = {2 * turn}
         override = {{ probe_z = 0.06, theta_2 = {0.5 * turn} }}
     """
-    in_m_and_rad = aj.load_specification(written(tmp_path, text))
+    in_m_and_rad = aj.files.load_specification(written(tmp_path, text))
     assert_same_arm(in_m_and_rad.arm, in_mm_and_deg.arm, rtol=1e-14)
     for one, other in zip(in_m_and_rad.bounds().lower, in_mm_and_deg.bounds().lower, strict=True):
         assert float(one) == pytest.approx(float(other), rel=1e-14, abs=1e-15)
@@ -148,12 +147,12 @@ def test_units_change_the_numbers_and_not_the_arm(tmp_path):
 
 
 def test_saved_arm_reads_back_the_same_numbers(tmp_path):
-    for name in aj.shipped_arms():
+    for name in aj.files.shipped_arms():
         arm = aj.load_arm(name)
         path = tmp_path / f"{name}.toml"
-        aj.save_arm(arm, path, name="copy", source="the test")
+        aj.files.save_arm(arm, path, name="copy", source="the test")
         assert_same_arm(aj.load_arm(path), arm)
-        assert aj.load_specification(str(path)).name == "copy"
+        assert aj.files.load_specification(str(path)).name == "copy"
 
 
 @pytest.mark.parametrize(
@@ -207,4 +206,4 @@ def test_what_is_not_an_arm_file(tmp_path):
 
 def test_a_batch_of_arms_has_no_file(tmp_path):
     batch = aj.Arm(alpha=np.zeros((2, 3)), a=np.zeros(3), d=np.zeros(3))
-    assert_refused(lambda: aj.save_arm(batch, tmp_path / "arm.toml"), "one arm", "take one of it first")
+    assert_refused(lambda: aj.files.save_arm(batch, tmp_path / "arm.toml"), "one arm", "take one of it first")

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-
 from tests.refusals import assert_refused
 
 TURN = 2 * np.pi
@@ -32,7 +31,7 @@ def record(path, readings: np.ndarray, delimiter: str = ",", header: str = "") -
 def read(tmp_path, text: str) -> aj.Capture:
     path = tmp_path / "capture.toml"
     path.write_text(text)
-    return aj.read_manifest(path).capture
+    return aj.files.read_manifest(path).capture
 
 
 JOINTS = np.arange(1.0, 7.0)
@@ -114,7 +113,7 @@ def test_braces_make_a_socket_a_file(tmp_path, monkeypatch, motion, prefix, insi
     """
     (tmp_path / "capture.toml").write_text(text)
     monkeypatch.chdir(tmp_path if inside else tmp_path.parent)
-    recording = aj.read_manifest("capture.toml" if inside else f"{tmp_path.name}/capture.toml")
+    recording = aj.files.read_manifest("capture.toml" if inside else f"{tmp_path.name}/capture.toml")
     capture = recording.capture
     assert capture.names == ("left/0", "left/1", "mid-high/0", "mid-high/1")
     np.testing.assert_array_equal(capture.sockets["mid-high/0"], motion + 2)
@@ -131,10 +130,10 @@ def test_a_field_that_returns_is_the_same_text(tmp_path, motion):
 
 
 def test_an_arm_beside_the_manifest(tmp_path, motion):
-    aj.save_arm(aj.load_arm("cheng2018-simulation"), tmp_path / "arm.toml", name="ours")
+    aj.files.save_arm(aj.load_arm("cheng2018-simulation"), tmp_path / "arm.toml", name="ours")
     # With the mark that some editors put before UTF-8.
     (tmp_path / "capture.toml").write_text(SMALL.replace("cheng2018-simulation", "arm.toml"), encoding="utf-8-sig")
-    assert aj.read_manifest(tmp_path / "capture.toml").nominal.name == "ours"
+    assert aj.files.read_manifest(tmp_path / "capture.toml").nominal.name == "ours"
 
 
 LENGTH = '[[length]]\nfrom = "a"\nto = "b"\nvalue = 200.0\n'
@@ -227,5 +226,5 @@ def test_degrees_taken_for_radians(tmp_path, motion):
 
 
 def test_what_is_not_a_manifest(tmp_path):
-    assert_refused(lambda: aj.read_manifest(tmp_path / "none.toml"), "none.toml does not exist", "check the path")
-    assert_refused(lambda: aj.read_manifest(tmp_path), tmp_path, "is a folder", "name a file")
+    assert_refused(lambda: aj.files.read_manifest(tmp_path / "none.toml"), "none.toml does not exist", "check the path")
+    assert_refused(lambda: aj.files.read_manifest(tmp_path), tmp_path, "is a folder", "name a file")

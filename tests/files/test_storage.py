@@ -17,10 +17,9 @@ from hypothesis import strategies as st
 
 import aacmm_jax as aj
 from aacmm_jax.files.arms import specification_toml
-
 from tests.refusals import assert_refused
 
-LOAD = {"capture": aj.load_capture, "calibration": aj.load_calibration}
+LOAD = {"capture": aj.files.load_capture, "calibration": aj.files.load_calibration}
 
 
 @pytest.fixture(scope="module")
@@ -34,19 +33,19 @@ def good(tmp_path_factory) -> SimpleNamespace:
         limits=[(-3, 3)] * 3,
     )
     held = ("theta_1", "d_1", "d_2", "alpha_3", "a_3", "probe_x", "probe_y")
-    nominal = aj.ArmSpecification(arm, "small", held=held, override={"probe_z": 3.0})
+    nominal = aj.kinematics.ArmSpecification(arm, "small", held=held, override={"probe_z": 3.0})
     sockets = {"A": (450, 150, 350), "B": (300, 350, 400)}
     capture = aj.simulate(arm, sockets, poses={"A": 12, "B": 3}, lengths=[("A", "B", 0.01)], encoder_arcsec=2.0, seed=1)
     recording = aj.Recording(capture, nominal, nominal, seed=1)
-    record = aj.record_of(aj.calibrate(arm, capture, nominal.bounds()), recording)
+    record = aj.calibration.record_of(aj.calibrate(arm, capture, nominal.bounds()), recording)
     folder = tmp_path_factory.mktemp("good")
-    aj.save_capture(folder / "capture.h5", recording)
-    aj.save_calibration(folder / "calibration.h5", record)
+    aj.files.save_capture(folder / "capture.h5", recording)
+    aj.files.save_calibration(folder / "calibration.h5", record)
     files = {kind: folder / f"{kind}.h5" for kind in LOAD}
     writers = {
-        "capture": lambda path: aj.save_capture(path, recording),
-        "calibration": lambda path: aj.save_calibration(path, record),
-        "arm": lambda path: aj.save_arm(arm, path),
+        "capture": lambda path: aj.files.save_capture(path, recording),
+        "calibration": lambda path: aj.files.save_calibration(path, record),
+        "arm": lambda path: aj.files.save_arm(arm, path),
     }
     return SimpleNamespace(recording=recording, record=record, files=files, writers=writers)
 
@@ -113,14 +112,14 @@ def test_bad_file(tmp_path, good, kind, make, parts):
 
 def test_a_capture_is_no_calibration(tmp_path, good):
     path = good.files["capture"]
-    assert_refused(lambda: aj.load_calibration(path), path, "holds a capture", "name a calibration file")
+    assert_refused(lambda: aj.files.load_calibration(path), path, "holds a capture", "name a calibration file")
     # The other way round is meant: a calibration holds its capture.
-    assert aj.load_capture(good.files["calibration"]).capture.names == ("A", "B")
+    assert aj.files.load_capture(good.files["calibration"]).capture.names == ("A", "B")
     for name in ("stage1_arm", "parameters"):
         remove(name)(tmp_path / "bad.h5", good.files["calibration"])
-        assert_refused(lambda: aj.load_calibration(tmp_path / "bad.h5"), f"lacks the table '{name}'", "make it again")
+        assert_refused(lambda: aj.files.load_calibration(tmp_path / "bad.h5"), f"lacks the table '{name}'", "make it again")
     path = good.files["capture"] / "below.h5"
-    assert_refused(lambda: aj.load_capture(path), path, "cannot be read: not a directory", "name another")
+    assert_refused(lambda: aj.files.load_capture(path), path, "cannot be read: not a directory", "name another")
 
 
 @pytest.mark.parametrize("kind", LOAD)
@@ -142,7 +141,7 @@ def test_a_wrong_byte_is_never_a_traceback(tmp_path, good):
         wrong[position] ^= random.integers(1, 256)
         path.write_bytes(wrong)
         try:
-            aj.load_capture(path)
+            aj.files.load_capture(path)
         except aj.InputError as error:
             refused.append(str(error))
     assert len(refused) > 10
@@ -228,7 +227,7 @@ import signal, sys
 import aacmm_jax as aj
 signal.alarm(100)
 source, target = sys.argv[1:]
-recording = aj.load_capture(source)
+recording = aj.files.load_capture(source)
 """
 
 
@@ -243,7 +242,7 @@ def test_full_disk(tmp_path, good):
 import resource
 resource.setrlimit(resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
 try:
-    aj.save_capture(target, recording)
+    aj.files.save_capture(target, recording)
 except aj.InputError as error:
     print(error)
 """
@@ -269,7 +268,7 @@ def strike(*_):
 signal.signal(signal.SIGINT, strike)
 q = np.resize(np.asarray(recording.capture.q), (6000, 3))
 both = [aj.Recording(aj.Capture({name: q}), recording.nominal, seed=seed) for seed, name in enumerate(("old", "new"))]
-aj.save_capture(target, both[0])
+aj.files.save_capture(target, both[0])
 while True:
     struck = False
     try:
@@ -279,7 +278,7 @@ while True:
         for i in itertools.count():
             if struck:
                 break
-            aj.save_capture(target, both[i % 2])
+            aj.files.save_capture(target, both[i % 2])
     except KeyboardInterrupt:
         pass
     # Said only now that the exception, and with it every frame that it held, is gone.
@@ -296,7 +295,7 @@ while True:
             writer.send_signal(signal.SIGINT)
             assert writer.stdout.readline() == "stopped\n", writer.stderr.read()
             assert folder_of(tmp_path) == ["capture.h5"]
-            recording = aj.load_capture(target)
+            recording = aj.files.load_capture(target)
             assert recording.capture.names == (("old", "new")[recording.seed],)
             assert recording.capture.sizes == (6000,)
             seen.add(recording.seed)
@@ -347,13 +346,13 @@ def captures(draw, joints: int) -> dict:
     return {"sockets": sockets, "lengths": draw(lengths)}
 
 
-def specification_of(drawn: dict) -> aj.ArmSpecification:
-    return aj.ArmSpecification(**(drawn | {"arm": aj.Arm(**drawn["arm"])}))
+def specification_of(drawn: dict) -> aj.kinematics.ArmSpecification:
+    return aj.kinematics.ArmSpecification(**(drawn | {"arm": aj.Arm(**drawn["arm"])}))
 
 
 def plain(value):
     """Down to the last bit: arrays as their bytes, and the rest as it stands."""
-    if isinstance(value, aj.ArmSpecification):
+    if isinstance(value, aj.kinematics.ArmSpecification):
         return plain(value.arm), value.name, value.held, value.length, value.angle, dict(value.override)
     if isinstance(value, aj.Arm):
         return [plain(array) for array in value.geometry], value.limits
@@ -376,8 +375,8 @@ def test_round_trip_of_a_capture(tmp_path_factory, data):
     seed = data.draw(st.none() | st.integers(0, 2**63 - 1))
     recording = aj.Recording(aj.Capture(drawn["sockets"], lengths), nominal, true, seed)
     path = tmp_path_factory.mktemp("round") / "capture.h5"
-    aj.save_capture(path, recording)
-    read = aj.load_capture(path)
+    aj.files.save_capture(path, recording)
+    read = aj.files.load_capture(path)
     assert [plain(item) for item in read[:3]] == [plain(item) for item in recording[:3]]
     assert read.seed == seed
 
@@ -388,18 +387,18 @@ def test_round_trip_of_an_arm(tmp_path_factory, drawn):
     specification = specification_of(drawn)
     path = tmp_path_factory.mktemp("round") / "arm.toml"
     path.write_text(specification_toml(specification), encoding="utf-8", newline="")
-    assert plain(aj.load_specification(path)) == plain(specification)
-    aj.save_arm(specification.arm, path, name=specification.name)
+    assert plain(aj.files.load_specification(path)) == plain(specification)
+    aj.files.save_arm(specification.arm, path, name=specification.name)
     assert plain(aj.load_arm(path)) == plain(specification.arm)
 
 
 def test_round_trip_of_a_calibration(tmp_path, good):
-    read = aj.load_calibration(good.files["calibration"])
+    read = aj.files.load_calibration(good.files["calibration"])
     for name, expected in good.record._asdict().items():
         value = getattr(read, name)
         if isinstance(expected, np.ndarray):
             np.testing.assert_array_equal(value, expected, err_msg=name)
-        elif isinstance(expected, aj.ArmSpecification):
+        elif isinstance(expected, aj.kinematics.ArmSpecification):
             assert plain(value) == plain(expected), name
         elif name != "recording":
             assert value == (str(expected) if name == "reason" else expected), name
@@ -412,8 +411,8 @@ def test_names_that_no_file_can_hold(tmp_path, good, name):
     socket = good.recording._replace(capture=aj.Capture({name: q}))
     arm = good.recording._replace(nominal=good.recording.nominal._replace(name=name))
     for recording in (socket, arm):
-        assert_refused(lambda recording=recording: aj.save_capture(tmp_path / "c.h5", recording), repr(name), "rename it")
-    assert_refused(lambda: aj.save_arm(arm.nominal.arm, tmp_path / "a.toml", name=name), repr(name), "rename it")
+        assert_refused(lambda recording=recording: aj.files.save_capture(tmp_path / "c.h5", recording), repr(name), "rename it")
+    assert_refused(lambda: aj.files.save_arm(arm.nominal.arm, tmp_path / "a.toml", name=name), repr(name), "rename it")
     assert folder_of(tmp_path) == []
 
 

@@ -60,7 +60,7 @@ def test_jacobian_is_jax_own_differentiation(joints):
     """Analytic columns, JAX's forward and reverse modes through the custom rule, and through the plain chain: all equal."""
     arm = random_arm(joints, joints, beta=True)
     q = jnp.asarray(np.random.default_rng(joints).uniform(-3, 3, (4, joints)))
-    names = (*aj.parameter_names(arm), *(f"q_{i}" for i in range(1, joints + 1)))
+    names = (*aj.kinematics.parameter_names(arm), *(f"q_{i}" for i in range(1, joints + 1)))
 
     def flattened(derivative):
         geometry, by_q = derivative
@@ -68,7 +68,7 @@ def test_jacobian_is_jax_own_differentiation(joints):
         return jnp.concatenate([*by_kind, by_q], axis=-1)
 
     def one(q):
-        plain = lambda geometry, q: chain.walk(geometry, chain.turns_of(q)).tip[:, 0]  # noqa: E731 - no custom rule on the way
+        plain = lambda geometry, q: chain.forward_pass(geometry, chain.sines_cosines(q)).tip[:, 0]  # noqa: E731 - no custom rule on the way
         modes = [jax.jacfwd(chain.tip_position, (0, 1)), jax.jacrev(chain.tip_position, (0, 1)), jax.jacfwd(plain, (0, 1))]
         return [arm.jacobian(q, names), *(flattened(mode(arm.geometry, q)) for mode in modes)]
 
@@ -83,7 +83,7 @@ def test_jacobian_is_jax_own_differentiation(joints):
 def test_second_derivatives_pass_through_the_rule():
     arm = random_arm(3, 1)
     q = jnp.array([0.3, -0.7, 1.1])
-    plain = jax.hessian(lambda q: jnp.sum(chain.walk(arm.geometry, chain.turns_of(q)).tip ** 2))(q)
+    plain = jax.hessian(lambda q: jnp.sum(chain.forward_pass(arm.geometry, chain.sines_cosines(q)).tip ** 2))(q)
     for mode in (jax.hessian, lambda f: jax.jacrev(jax.jacrev(f))):
         np.testing.assert_allclose(mode(lambda q: jnp.sum(arm.position(q) ** 2))(q), plain, rtol=1e-10, atol=1e-9)
 

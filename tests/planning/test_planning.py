@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.files.plans import plan_csv, plan_summary, save_plan
+from aacmm_jax.files.plans import plan_csv, save_plan
 from aacmm_jax.planning import design as planning
 from aacmm_jax.planning import pose_refinement as refining
 from aacmm_jax.planning.fedorov_exchange import Candidates, Goal, covariance_of, exchange
+from aacmm_jax.summaries.planning import plan_summary
 
 FUNCTIONS = np.random.default_rng(5).normal(size=(12, 3))
 GOALS = {
@@ -86,12 +87,12 @@ def quick(monkeypatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def given(paper_arm) -> aj.Plan:
+def given(paper_arm) -> aj.planning.Plan:
     """Twenty poses in the demonstration's sockets."""
     sockets = {"A": (400, 200, 300), "B": (700, 500, 500)}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(refining, "_STEPS", 15)
-        return aj.plan(paper_arm, sockets=sockets, lengths=[("A", "B", 0.003)], poses=20, candidates=600, seed=4)
+        return aj.planning.plan(paper_arm, sockets=sockets, lengths=[("A", "B", 0.003)], poses=20, candidates=600, seed=4)
 
 
 def test_poses_can_be_taken(paper_arm, given):
@@ -121,7 +122,7 @@ def test_predictions_are_those_of_calibrations(paper_arm, given):
     """The prediction is the uncertainty of a joint calibration on the planned capture."""
     bounds = aj.Bounds.around(paper_arm, aj.Parameters.free_of(paper_arm))
     result = aj.calibrate(paper_arm, given.capture(), bounds, method="joint", noise=given.noise)
-    volume = aj.over_volume(aj.uncertainty_of(result), length=given.check_length, points=400, seed=9)
+    volume = aj.volumetric_uncertainty(aj.uncertainty_of(result), length=given.check_length, points=400, seed=9)
     # Other lengths than those of the prediction, so only the middle of them is alike.
     assert np.median(volume.u_length) == pytest.approx(given.predicted.median, rel=0.1)
 
@@ -136,7 +137,7 @@ def test_a_plan_is_better_than_chance_and_ten_more_are_better_still(given):
 def test_places_are_in_the_region_and_the_range(paper_arm, quick):
     region = {"z": (100.0, 900.0), "distance": (300.0, 1200.0)}
     told = []
-    found = aj.plan(
+    found = aj.planning.plan(
         paper_arm,
         sockets=3,
         poses=15,
@@ -156,7 +157,7 @@ def test_places_are_in_the_region_and_the_range(paper_arm, quick):
 
 
 def test_the_same_seed_gives_the_same_plan(paper_arm, quick):
-    one, other = (aj.plan(paper_arm, sockets=2, poses=12, candidates=200, seed=3) for _ in range(2))
+    one, other = (aj.planning.plan(paper_arm, sockets=2, poses=12, candidates=200, seed=3) for _ in range(2))
     np.testing.assert_array_equal(one.q, other.q)
 
 
@@ -207,4 +208,4 @@ REFUSED = {
 def test_refused(paper_arm, quick, case):
     options, text = REFUSED[case]
     with pytest.raises(aj.InputError, match=text):
-        aj.plan(paper_arm, **({"candidates": 200, "poses": 30} | options))
+        aj.planning.plan(paper_arm, **({"candidates": 200, "poses": 30} | options))

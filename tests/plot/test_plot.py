@@ -5,28 +5,27 @@ import pytest
 from matplotlib.figure import Figure
 
 import aacmm_jax as aj
-
 from tests.refusals import assert_refused
 
 
 @pytest.fixture(scope="module")
 def record():
-    nominal = aj.load_specification("cheng2018-simulation")
+    nominal = aj.files.load_specification("cheng2018-simulation")
     space = aj.Parameters.free_of(nominal.arm)
-    true = aj.deviated(space, length=1.0, angle=0.002, seed=2)
+    true = aj.perturbed_arm(space, length=1.0, angle=0.002, seed=2)
     capture = aj.simulate(
         true, {"A": (400, 200, 300), "B": (700, 500, 500)}, poses={"A": 40, "B": 12}, lengths=[("A", "B", 0.002)], encoder_arcsec=2, seed=2
     )  # fmt: skip
     result = aj.calibrate(nominal.arm, capture, aj.Bounds.around(nominal.arm, space, length=10.0, angle=0.0175))
-    return aj.record_of(result, aj.Recording(capture, nominal, nominal._replace(arm=true), 2))
+    return aj.calibration.record_of(result, aj.Recording(capture, nominal, nominal._replace(arm=true), 2))
 
 
 @pytest.fixture(scope="module")
 def made(record, tmp_path_factory):
     uncertainty = aj.uncertainty_of(record)
-    study = aj.make_study(arm="cheng2018-simulation", trials=4, capture={"positions_mm": [[400, 200, 300]], "poses": [20, 30]}, noise={"encoder_arcsec": 2}, identification={"method": "stage1"})  # fmt: skip
+    study = aj.study.make_study(arm="cheng2018-simulation", trials=4, capture={"positions_mm": [[400, 200, 300]], "poses": [20, 30]}, noise={"encoder_arcsec": 2}, identification={"method": "stage1"})  # fmt: skip
     path = tmp_path_factory.mktemp("plot") / "study.h5"
-    aj.run_study(study, path)
+    aj.study.run_study(study, path)
     arm, capture = record.calibrated.arm, record.recording.capture
     sockets = {name: np.asarray(arm.position(q)) for name, q in capture.sockets.items()}
     from aacmm_jax.study.results import Results
@@ -36,10 +35,10 @@ def made(record, tmp_path_factory):
         "length_parameter_errors": (record,),
         "parameter_changes": (record,),
         "length_errors": (record,),
-        "volume": (aj.over_volume(uncertainty, points=30),),
+        "volume": (aj.volumetric_uncertainty(uncertainty, points=30),),
         "correlation": (uncertainty,),
-        "singular_values": (aj.observe(arm, capture, aj.Parameters(arm, record.names)),),
-        "acceptance": (aj.accept(aj.Measured(sockets), {"Deltam": aj.Limit(0.05)}),),
+        "singular_values": (aj.observability(arm, capture, aj.Parameters(arm, record.names)),),
+        "acceptance": (aj.acceptance.run(aj.acceptance.Measured(sockets), {"Deltam": aj.acceptance.Limit(0.05)}),),
         "study": (Results.of(path), "de_stage1"),
     }
 
@@ -83,7 +82,10 @@ def test_an_arm_is_drawn_in_space(record):
     ("call", "said"),
     [
         (lambda record: aj.plot.parameter_changes(record, "lengths"), "length or angle"),
-        (lambda record: aj.plot.acceptance(aj.accept(aj.Measured({"A": np.eye(3)}))), "no figure has a limit"),
+        (
+            lambda record: aj.plot.acceptance(aj.acceptance.run(aj.acceptance.Measured({"A": np.eye(3)}))),
+            "no figure has a limit",
+        ),
         (
             lambda record: aj.plot.length_parameter_errors(record._replace(recording=record.recording._replace(true=None))),
             "simulation",

@@ -1,4 +1,4 @@
-"""Reports: what they hold, that nobody's text becomes markup, and that a real browser shows, turns, sorts and prints them."""
+"""Reports: what they hold, that nobody's text becomes markup, and that a real browser shows, sines_cosines, sorts and prints them."""
 
 import json
 import math
@@ -13,7 +13,6 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.report import charts, parts, write_report
 from aacmm_jax.report.residuals import outliers
-
 from tests.refusals import assert_refused
 
 HOSTILE = '<script>document.title="taken"</script><img src=x onerror=alert(1)> & "B" <b>bold</b>'
@@ -30,9 +29,9 @@ STUDY = {
 def written(tmp_path_factory):
     """The files and reports of a simulated arm with hostile names: calibration, evaluation, study."""
     folder = tmp_path_factory.mktemp("reports")
-    nominal = aj.load_specification("cheng2018-simulation")._replace(name=f"Arm {HOSTILE}")
+    nominal = aj.files.load_specification("cheng2018-simulation")._replace(name=f"Arm {HOSTILE}")
     space = aj.Parameters.free_of(nominal.arm)
-    true = aj.deviated(space, length=1.0, angle=0.002, seed=1)
+    true = aj.perturbed_arm(space, length=1.0, angle=0.002, seed=1)
     names = [HOSTILE, "B", "C"]
     points = dict(zip(names, [(400, 200, 300), (700, 500, 500), (-300, 600, 400)], strict=True))
     lengths = [(HOSTILE, "B", 0.002), (HOSTILE, "C", 0.002)]
@@ -42,12 +41,14 @@ def written(tmp_path_factory):
     recording = aj.Recording(capture, nominal, nominal._replace(arm=true), 1, sources=(f"{HOSTILE} (SHA-256 0)",))
     seen = recording._replace(capture=capture.select(without="C"))
     bounds = aj.Bounds.around(nominal.arm, space, length=10.0, angle=0.0175, override={"d_5": 0.2})
-    record = aj.record_of(aj.calibrate(nominal.arm, seen.capture, bounds), seen)
-    aj.save_calibration(folder / "calibration.h5", record)
-    evaluation = aj.evaluation_of(record, recording, limits={"Deltam": aj.Limit(5.0), "E_Uni": aj.Limit(1e-4)}, u_test=0.001)
+    record = aj.calibration.record_of(aj.calibrate(nominal.arm, seen.capture, bounds), seen)
+    aj.files.save_calibration(folder / "calibration.h5", record)
+    evaluation = aj.acceptance.evaluation_of(
+        record, recording, limits={"Deltam": aj.acceptance.Limit(5.0), "E_Uni": aj.acceptance.Limit(1e-4)}, u_test=0.001
+    )
     evaluation = evaluation._replace(warnings=(*evaluation.warnings, f"Beware of {HOSTILE}"))
-    aj.save_evaluation(folder / "evaluation.h5", evaluation)
-    aj.run_study(aj.make_study(**{**STUDY, "arm": nominal.arm}), folder / "study.h5")
+    aj.files.save_evaluation(folder / "evaluation.h5", evaluation)
+    aj.study.run_study(aj.study.make_study(**{**STUDY, "arm": nominal.arm}), folder / "study.h5")
     pages = {kind: folder / f"{kind}.html" for kind in ("calibration", "evaluation", "study")}
     for kind, page in pages.items():
         write_report(folder / f"{kind}.h5", page)
@@ -179,7 +180,7 @@ def test_numbers_of_a_report_stand_under_the_right_heading(written):
         assert row[parameters.columns.index("as left")].value == pytest.approx(scale * record.vectors()["calibrated"][i])
         if row[parameters.columns.index("U (95 %)")].value is not None:
             assert row[parameters.columns.index("U (95 %)")].value == pytest.approx(scale * factor * u[i])
-    volume = aj.over_volume(aj.uncertainty_of(record))
+    volume = aj.volumetric_uncertainty(aj.uncertainty_of(record))
     rows = tables["Expanded uncertainty over the working volume [mm]"].rows
     assert rows[1][3].value == pytest.approx(factor * volume.u_length.max())
     places = tables["All places"]
@@ -202,7 +203,7 @@ def test_lengths_of_a_report_by_arm_and_with_expanded_uncertainty(written):
     recording = written.evaluation.recording
     space = aj.Parameters(recording.nominal.arm, written.record.names)
     bounds = aj.Bounds.around(recording.nominal.arm, space, length=10.0, angle=0.0175)
-    record = aj.record_of(aj.calibrate(recording.nominal.arm, recording.capture, bounds), recording)
+    record = aj.calibration.record_of(aj.calibrate(recording.nominal.arm, recording.capture, bounds), recording)
     table = tables_of(calibration_report(record)[0])["Reference lengths [mm]"]
     factor, evaluations = aj.uncertainty_of(record).factor(0.95), record.evaluations()
     for i, row in enumerate(table.rows):
@@ -256,28 +257,29 @@ decision_rule = "a rule"
 
 
 def test_a_statement_that_the_file_contradicts_is_refused(written, tmp_path):
-    from aacmm_jax.files.points_evaluations import PointsRecord, save_points
+    from aacmm_jax.acceptance.record import PointsRecord
+    from aacmm_jax.files.points_evaluations import save_points
 
     (tmp_path / "pass.toml").write_text(CONFORMITY.format("pass"))
-    stated = aj.read_about(tmp_path / "pass.toml")
+    stated = aj.files.read_administrative_data(tmp_path / "pass.toml")
     for kind in ("calibration", "evaluation"):
         assert_refused(lambda kind=kind: write_report(written.folder / f"{kind}.h5", tmp_path / "r.html", stated), "simulated")
-    measured = aj.Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])})
-    save_points(tmp_path / "fails.h5", PointsRecord(measured, {"Deltam": aj.Limit(0.04)}, 0.001))
+    measured = aj.acceptance.Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])})
+    save_points(tmp_path / "fails.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.04)}, 0.001))
     assert_refused(lambda: write_report(tmp_path / "fails.h5", tmp_path / "r.html", stated), "a limit is not kept")
-    save_points(tmp_path / "passes.h5", PointsRecord(measured, {"Deltam": aj.Limit(0.06)}, 0.001))
+    save_points(tmp_path / "passes.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.06)}, 0.001))
     write_report(tmp_path / "passes.h5", tmp_path / "r.html", stated)
     assert "pass: a specification; a rule" in (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert_refused(lambda: aj.dcc(written.record, stated, created="2026-01-31T00:00:00"), "simulated")
+    assert_refused(lambda: aj.certificate.dcc(written.record, stated, created="2026-01-31T00:00:00"), "simulated")
 
 
 def test_corners_of_an_arm_by_hand():
-    from aacmm_jax.kinematics.skeleton import corners
+    from aacmm_jax.kinematics.workspace import skeleton
 
     # One joint turned by 90 degrees: up 100, then out 200 along y, then the probe 50 along the last z, tilted by alpha = -90 deg.
     arm = aj.Arm(alpha=[-math.pi / 2], a=[200], d=[100], theta=[0], probe=[0, 0, 50])
     np.testing.assert_allclose(
-        corners(arm, np.array([[math.pi / 2]]))[0], [[0, 0, 0], [0, 0, 100], [0, 200, 100], [-50, 200, 100]], atol=1e-9
+        skeleton(arm, np.array([[math.pi / 2]]))[0], [[0, 0, 0], [0, 0, 100], [0, 200, 100], [-50, 200, 100]], atol=1e-9
     )
 
 
@@ -322,7 +324,7 @@ def test_a_logarithmic_axis_marks_what_is_there():
 
 
 def test_what_cannot_be_reported_is_refused(written, tmp_path):
-    aj.save_capture(tmp_path / "capture.h5", written.record.recording)
+    aj.files.save_capture(tmp_path / "capture.h5", written.record.recording)
     assert_refused(lambda: write_report(tmp_path / "capture.h5", tmp_path / "r.html"), "capture.h5", "holds a capture")
     assert_refused(lambda: write_report(tmp_path / "none.h5", tmp_path / "r.html"), "does not exist")
     calibration = written.folder / "calibration.h5"
@@ -351,7 +353,7 @@ def test_the_command_states_the_laboratory_and_prints_for_machines(written, aacm
     for needed in ("Metrology <b>Lab</b>", "Chengdu", "7125-001", "calibration engineer"):
         assert needed in text
     dcc = aacmm("export", written.folder / "calibration.h5", "--format", "dcc", "--about", "about.toml").stdout
-    values = aj.values_of_dcc(dcc)
+    values = aj.certificate.parse_dcc(dcc)
     assert any(value.value == float(written.record.calibrated.arm.a[1]) for value in values.values())
     assert "--format dcc" in aacmm("export", written.folder / "calibration.h5", "--about", "about.toml", expect=2).stderr
 

@@ -9,7 +9,6 @@ import pytest
 import scipy.optimize
 
 import aacmm_jax as aj
-
 from tests import bounded_problems, nist
 
 PROBLEMS = 200
@@ -27,7 +26,7 @@ def solve(problem):
     )
     stats = solution.stats
     cost = 0.5 * jnp.sum(bounded_problems.residual(solution.value, problem) ** 2)
-    return solution.value, cost, stats["optimality"], aj.converged(stats["reason"])
+    return solution.value, cost, stats["optimality"], aj.calibration.converged(stats["reason"])
 
 
 @pytest.mark.parametrize("third", range(3))
@@ -96,7 +95,7 @@ def test_nist_certified_digits(shared, name):
     @jax.jit
     def fit(start):
         solution = aj.least_squares(data.residual, start, throw=False)
-        return solution.value, solution.stats["cost"], aj.converged(solution.stats["reason"])
+        return solution.value, solution.stats["cost"], aj.calibration.converged(solution.stats["reason"])
 
     for start in data.starts:
         value, cost, converged = fit(jnp.asarray(start))

@@ -17,7 +17,7 @@ matplotlib.use("Agg")
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    study = aj.make_study(
+    study = aj.study.make_study(
         name="a study",
         arm="cheng2018-simulation",
         trials=96,
@@ -29,7 +29,7 @@ def path(tmp_path_factory):
         bounds={"length_mm": [0.5, 5], "length_shift_mm": [0, 1]},
     )
     path = tmp_path_factory.mktemp("results") / "study.h5"
-    aj.run_study(study, path)
+    aj.study.run_study(study, path)
     return path
 
 
@@ -104,7 +104,7 @@ def test_concise_notation(value, se, text):
 
 
 def test_summary_says_what_the_arrays_say(path, summary):
-    data = aj.open_study(path)
+    data = aj.study.open_study(path)
     assert summary["factors"] == {"bounds.length_mm": [0.5, 5.0], "bounds.length_shift_mm": [0.0, 1.0]}
     assert summary["trials_run"] == 4 * 96
     cell = summary["results"][3]
@@ -137,7 +137,7 @@ def test_the_method_is_right(summary):
 
 
 def test_labelled_data(path):
-    data = aj.open_study(path)
+    data = aj.study.open_study(path)
     assert data.estimate.dims == ("cell", "trial", "parameter")
     grid = data[["k", "length_error"]].unstack("cell")
     assert grid.sizes == {"trial": 96, "bounds_length_mm": 2, "bounds_length_shift_mm": 2}
@@ -148,12 +148,12 @@ def test_labelled_data(path):
 
 def test_levels_that_differ_little_are_told_apart():
     points = [[[400, 200, 300]], [[400.0001, 200, 300]]]
-    study = aj.make_study(arm="cheng2018-simulation", trials=1, capture={"positions_mm": points})
+    study = aj.study.make_study(arm="cheng2018-simulation", trials=1, capture={"positions_mm": points})
     assert study.factors == {"capture.positions_mm": ["((400, 200, 300))", "((400.0001, 200, 300))"]}
 
 
 def test_a_study_that_has_just_begun_is_shown(aacmm, tmp_path):
-    study = aj.read_study("noise")
+    study = aj.study.read_study("noise")
     store.create(tmp_path / "s.h5", study, store.Layout.of(study, 1000), 1000)
     assert "No trial has ended yet" in aacmm("show", "s.h5", "--figures", "f").stdout
     assert "No trial of it has ended yet" in aacmm("show", "s.h5", "--cell", 3).stdout

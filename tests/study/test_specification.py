@@ -8,8 +8,8 @@ import aacmm_jax as aj
 CAPTURE = {"positions_mm": [[400, 200, 300]]}
 
 
-def made(**tables) -> "aj.Study":
-    return aj.make_study(**{"arm": "cheng2018-simulation", "trials": 4, "capture": CAPTURE} | tables)
+def made(**tables) -> "aj.study.Study":
+    return aj.study.make_study(**{"arm": "cheng2018-simulation", "trials": 4, "capture": CAPTURE} | tables)
 
 
 def test_lists_make_the_grid():
@@ -48,9 +48,9 @@ def test_a_recorded_capture_takes_any_method(noisy_capture, paper_arm):
     assert [setting.method for setting in study.settings] == ["two-stage", "joint"]
 
 
-@pytest.mark.parametrize("name", aj.shipped_studies())
+@pytest.mark.parametrize("name", aj.study.shipped_studies())
 def test_shipped_studies_are_read(name):
-    study = aj.read_study(name)
+    study = aj.study.read_study(name)
     assert study.factors
     assert f"{len(study.cells)} cells" in (aj.__path__ and _text(name))
 
@@ -62,11 +62,11 @@ def _text(name: str) -> str:
 
 
 def test_what_a_toml_file_names_lies_beside_it(tmp_path, noisy_capture, paper_arm):
-    aj.save_arm(paper_arm, tmp_path / "my-arm.toml", name="mine")
-    specification = aj.load_specification("cheng2018-simulation")
-    aj.save_capture(tmp_path / "rec.h5", aj.Recording(noisy_capture, specification))
+    aj.files.save_arm(paper_arm, tmp_path / "my-arm.toml", name="mine")
+    specification = aj.files.load_specification("cheng2018-simulation")
+    aj.files.save_capture(tmp_path / "rec.h5", aj.Recording(noisy_capture, specification))
     (tmp_path / "a.toml").write_text('arm = "my-arm.toml"\ntrials = 3\n[capture]\nfile = "rec.h5"\n')
-    study = aj.read_study(tmp_path / "a.toml")
+    study = aj.study.read_study(tmp_path / "a.toml")
     assert study.nominal.name == "mine"
     assert study.settings[0].sizes == noisy_capture.sizes
     assert study.settings[0].method == "two-stage"
@@ -140,7 +140,7 @@ def test_a_narrow_region_is_found(tmp_path):
     region = {"distance_mm": [690, 710]}
     for seed in range(2):
         study = made(seed=seed, trials=1, reference={"length_mm": 300, "region": region}, capture=CAPTURE | {"pool": 4096})
-        assert aj.run_study(study, tmp_path / f"{seed}.h5").finished
+        assert aj.study.run_study(study, tmp_path / f"{seed}.h5").finished
 
 
 @pytest.mark.parametrize(
@@ -170,5 +170,5 @@ def test_a_narrow_region_is_found(tmp_path):
 )
 def test_out_of_reach_is_refused_before_work(tmp_path, tables, message):
     with pytest.raises(aj.InputError, match=message):
-        aj.run_study(made(**tables), tmp_path / "s.h5")
+        aj.study.run_study(made(**tables), tmp_path / "s.h5")
     assert not list(tmp_path.glob("*.h5*"))

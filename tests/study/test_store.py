@@ -54,14 +54,14 @@ def home(tmp_path_factory) -> Path:
     """A folder with the specification, and the study run through at once."""
     folder = tmp_path_factory.mktemp("study")
     (folder / "spec.toml").write_text(SPECIFICATION)
-    outcome = aj.run_study(aj.read_study(folder / "spec.toml"), folder / "whole.h5", chunk=16)
+    outcome = aj.study.run_study(aj.study.read_study(folder / "spec.toml"), folder / "whole.h5", chunk=16)
     assert outcome.finished
     return folder
 
 
 @pytest.fixture
 def study(home):
-    return aj.read_study(home / "spec.toml")
+    return aj.study.read_study(home / "spec.toml")
 
 
 def same(one: Path, other: Path) -> None:
@@ -110,8 +110,8 @@ def test_the_chunk_changes_no_bit(home, study, tmp_path, chunk):
     trials = study.trials if chunk > 1 else 3
     if chunk == 1:
         specification = study.specification.model_copy(update={"trials": trials})
-        study = aj.Study(specification, study.nominal)
-    aj.run_study(study, tmp_path / "s.h5", chunk=chunk)
+        study = aj.study.Study(specification, study.nominal)
+    aj.study.run_study(study, tmp_path / "s.h5", chunk=chunk)
     with h5py.File(home / "whole.h5") as whole, h5py.File(tmp_path / "s.h5") as part:
         for name in whole["trials"]:
             if name != "trial":
@@ -131,9 +131,11 @@ def test_blocks_cover_every_trial_once(study):
 def test_cells_of_different_settings_share_no_block():
     """Pose counts compile to different programs; hold does too."""
     capture = {"positions_mm": [[400, 200, 300]], "poses": [10, 20], "pool": 4096}
-    study = aj.make_study(arm="cheng2018-simulation", trials=10, capture=capture, identification={"hold": ["none", "longest"]})
+    study = aj.study.make_study(
+        arm="cheng2018-simulation", trials=10, capture=capture, identification={"hold": ["none", "longest"]}
+    )
     assert store.Layout.of(study, 1000).block_cells == 1
-    widths = aj.make_study(
+    widths = aj.study.make_study(
         arm="cheng2018-simulation",
         trials=10,
         capture=capture,
@@ -147,19 +149,19 @@ def test_stopped_is_resumed(home, study, tmp_path):
     """Stopped by what watches it: everything that had ended is kept, read while unfinished, and continued."""
     path = tmp_path / "s.h5"
 
-    outcome = aj.run_study(study, path, chunk=16, watch=interrupted_at(48))
+    outcome = aj.study.run_study(study, path, chunk=16, watch=interrupted_at(48))
     assert not outcome.finished
     assert 48 <= outcome.done < outcome.total
-    data = aj.open_study(path)
+    data = aj.study.open_study(path)
     ran = data.converged.values >= 0
     assert ran.sum() == outcome.done
     np.testing.assert_array_equal(np.isnan(data.de_stage1.values), ~ran)
     data.close()
-    again = aj.run_study(study, path)
+    again = aj.study.run_study(study, path)
     assert (again.finished, again.ran) == (True, again.total - outcome.done)
     assert not store.parts_of(path).exists()
     same(home / "whole.h5", path)
-    assert aj.run_study(study, path).ran == 0
+    assert aj.study.run_study(study, path).ran == 0
 
 
 def test_a_second_run_at_the_same_time_is_refused(study, tmp_path):
@@ -168,10 +170,10 @@ def test_a_second_run_at_the_same_time_is_refused(study, tmp_path):
     def second(_):
         if not refused:
             with pytest.raises(aj.InputError, match=r"s\.h5 is being written by another process; wait for it"):
-                aj.run_study(study, tmp_path / "s.h5")
+                aj.study.run_study(study, tmp_path / "s.h5")
             refused.append(True)
 
-    assert aj.run_study(study, tmp_path / "s.h5", chunk=16, watch=second).finished
+    assert aj.study.run_study(study, tmp_path / "s.h5", chunk=16, watch=second).finished
     assert refused
     assert [item.name for item in tmp_path.iterdir()] == ["s.h5"]
 
@@ -195,23 +197,23 @@ def test_what_a_file_was_begun_with_stays(study, tmp_path, change, message, monk
     if "version" in change:
         version = change.pop("version")
         monkeypatch.setattr("importlib.metadata.version", lambda _: version)
-    other = aj.Study(study.specification.model_copy(update=change), study.nominal)
+    other = aj.study.Study(study.specification.model_copy(update=change), study.nominal)
     with pytest.raises(aj.InputError, match=message):
-        aj.run_study(other, path, **options)
+        aj.study.run_study(other, path, **options)
     assert store.parts_of(path).is_dir()
 
 
 def test_other_files_are_not_overwritten(study, tmp_path, noisy_capture):
-    aj.save_capture(tmp_path / "c.h5", aj.Recording(noisy_capture, aj.load_specification("cheng2018-simulation")))
+    aj.files.save_capture(tmp_path / "c.h5", aj.Recording(noisy_capture, aj.files.load_specification("cheng2018-simulation")))
     with pytest.raises(aj.InputError, match=r"c\.h5 holds a capture; name a study file"):
-        aj.run_study(study, tmp_path / "c.h5")
-    aj.load_capture(tmp_path / "c.h5")
+        aj.study.run_study(study, tmp_path / "c.h5")
+    aj.files.load_capture(tmp_path / "c.h5")
 
 
 def test_results_without_their_parts_are_missed(home, study, tmp_path):
     path = tmp_path / "s.h5"
     store.create(path, study, store.Layout.of(study, 16), 16)
-    for use in (aj.open_study, lambda path: aj.run_study(study, path)):
+    for use in (aj.study.open_study, lambda path: aj.study.run_study(study, path)):
         path = path.rename(tmp_path / "t.h5")
         with pytest.raises(
             aj.InputError, match=r"t\.h5 was renamed, but its results lie in s\.h5\.parts; give it its name s\.h5"
@@ -219,32 +221,32 @@ def test_results_without_their_parts_are_missed(home, study, tmp_path):
             use(path)
         path = path.rename(tmp_path / "s.h5")
     shutil.rmtree(store.parts_of(path))
-    for use in (aj.open_study, lambda path: aj.run_study(study, path)):
+    for use in (aj.study.open_study, lambda path: aj.study.run_study(study, path)):
         with pytest.raises(aj.InputError, match=r"results in the folder s\.h5\.parts, which is not beside it; put it there"):
             use(path)
     with pytest.raises(aj.InputError, match="does not exist"):
-        aj.open_study(tmp_path / "none.h5")
+        aj.study.open_study(tmp_path / "none.h5")
 
 
 def test_blocks_of_a_study_whose_file_is_gone_are_not_taken_for_anothers(home, study, tmp_path):
     path = tmp_path / "s.h5"
-    other = aj.Study(study.specification.model_copy(update={"seed": 6}), study.nominal)
-    aj.run_study(other, path, chunk=16, keep_parts=True)
+    other = aj.study.Study(study.specification.model_copy(update={"seed": 6}), study.nominal)
+    aj.study.run_study(other, path, chunk=16, keep_parts=True)
     path.unlink()
-    assert aj.run_study(study, path, chunk=16).ran == 240
+    assert aj.study.run_study(study, path, chunk=16).ran == 240
     same(home / "whole.h5", path)
 
 
 def test_a_moved_and_oddly_named_study_still_reads(home, study, tmp_path):
     """The folder is found beside the file, wherever both stand and whoever looks; percent signs are no patterns."""
     path = tmp_path / "50% of it.h5"
-    aj.run_study(study, path, chunk=16, watch=interrupted_at(1))
+    aj.study.run_study(study, path, chunk=16, watch=interrupted_at(1))
     moved = tmp_path / "elsewhere"
     moved.mkdir()
     for item in (path, store.parts_of(path)):
         item.rename(moved / item.name)
-    assert (aj.open_study(moved / path.name).converged.values >= 0).any()
-    assert aj.run_study(study, moved / path.name).finished
+    assert (aj.study.open_study(moved / path.name).converged.values >= 0).any()
+    assert aj.study.run_study(study, moved / path.name).finished
     same(home / "whole.h5", moved / path.name)
 
 
@@ -259,7 +261,7 @@ def test_killed_and_resumed_it_is_the_same(home, cache, tmp_path):
         process.kill()
         process.communicate()
         if path.exists():
-            shown = aj.open_study(path)
+            shown = aj.study.open_study(path)
             assert shown.sizes["trial"] == 60
             shown.close()
     process = command(home, cache, "-o", path, "--chunk", 16)
@@ -299,7 +301,9 @@ def test_a_full_disk_is_one_sentence_and_loses_nothing(home, cache, tmp_path):
         "import os, resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2); "
         "os.execv(sys.executable, [sys.executable, '-m', 'aacmm_jax', *sys.argv[2:]])"
     )
-    store.create(path, aj.read_study(home / "spec.toml"), store.Layout.of(aj.read_study(home / "spec.toml"), 16), 16)
+    store.create(
+        path, aj.study.read_study(home / "spec.toml"), store.Layout.of(aj.study.read_study(home / "spec.toml"), 16), 16
+    )
     for limit, what in (
         (10_000, "cell00000-trial0000000000.h5 cannot"),
         ((home / "whole.h5").stat().st_size - 10_000, "s.h5 cannot"),
@@ -312,7 +316,7 @@ def test_a_full_disk_is_one_sentence_and_loses_nothing(home, cache, tmp_path):
         assert done.stderr.count("\n") == 1
         assert what in done.stderr
         assert "cannot be written: file too large; free some space there, then run the same command again" in done.stderr
-        aj.open_study(path).close()
+        aj.study.open_study(path).close()
     process = command(home, cache, "-o", path)
     process.communicate(timeout=300)
     assert process.returncode == 0
@@ -325,7 +329,7 @@ import jax
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
 import aacmm_jax as aj
 assert len(jax.devices()) == int(sys.argv[1])
-aj.run_study(aj.read_study(sys.argv[2]), sys.argv[3], chunk=16)
+aj.study.run_study(aj.study.read_study(sys.argv[2]), sys.argv[3], chunk=16)
 """
 
 
@@ -343,23 +347,23 @@ def test_the_number_of_devices_changes_nothing(home, cache, tmp_path):
 
 def test_parts_may_stay(home, study, tmp_path):
     path = tmp_path / "s.h5"
-    assert aj.run_study(study, path, chunk=16, keep_parts=True).finished
-    assert aj.run_study(study, path).ran == 0
+    assert aj.study.run_study(study, path, chunk=16, keep_parts=True).finished
+    assert aj.study.run_study(study, path).ran == 0
     same(home / "whole.h5", path)
-    assert aj.open_study(path).attrs["finished"]
+    assert aj.study.open_study(path).attrs["finished"]
     parts = sorted(store.parts_of(path).iterdir())
     assert len(parts) == 16
     parts[3].unlink()
     with pytest.raises(aj.InputError, match=r"1 blocks are missing in s\.h5\.parts; put them there, or run the study again"):
-        aj.open_study(path)
-    assert aj.run_study(study, path).ran == 15
+        aj.study.open_study(path)
+    assert aj.study.run_study(study, path).ran == 15
     same(home / "whole.h5", path)
 
 
 def test_a_spoilt_block_runs_again(home, study, tmp_path):
     """Whatever the disk did to it: a bit, the middle, the end, all of it."""
     path = tmp_path / "s.h5"
-    aj.run_study(study, path, chunk=16, watch=interrupted_at(96))
+    aj.study.run_study(study, path, chunk=16, watch=interrupted_at(96))
     parts = sorted(store.parts_of(path).glob("*.h5"))
     assert len(parts) >= 6
     whole = parts[0].read_bytes()
@@ -369,7 +373,7 @@ def test_a_spoilt_block_runs_again(home, study, tmp_path):
     )  # fmt: skip
     for part, content in zip(parts, spoilt, strict=False):
         part.write_bytes(content)
-    aj.run_study(study, path)
+    aj.study.run_study(study, path)
     same(home / "whole.h5", path)
 
 
@@ -377,14 +381,14 @@ def test_reading_needs_no_more_files_than_one(home, study, tmp_path):
     """Where a process may open few files, HDF5 would show what it may not open as not run."""
     path = tmp_path / "s.h5"
     specification = study.specification.model_copy(update={"trials": 40})
-    aj.run_study(aj.Study(specification, study.nominal), path, chunk=1, keep_parts=True)
+    aj.study.run_study(aj.study.Study(specification, study.nominal), path, chunk=1, keep_parts=True)
     program = (
         "import resource, sys; resource.setrlimit(resource.RLIMIT_NOFILE, (60, int(sys.argv[2])))\n"
         "import aacmm_jax as aj\n"
         "from aacmm_jax.study.results import Results\n"
         "from aacmm_jax.study.statistics import study_summary\n"
         "print(study_summary(Results.of(sys.argv[1]))['trials_run'])\n"
-        "print((aj.open_study(sys.argv[1]).converged.values >= 0).sum())\n"
+        "print((aj.study.open_study(sys.argv[1]).converged.values >= 0).sum())\n"
     )
     for hard, said in ((1000, ""), (60, "more files than this process may open (60)")):
         done = subprocess.run(
@@ -397,18 +401,18 @@ def test_reading_needs_no_more_files_than_one(home, study, tmp_path):
 
 def test_any_executor(home, study, tmp_path):
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        assert aj.run_study(study, tmp_path / "s.h5", executor=pool, chunk=16).finished
+        assert aj.study.run_study(study, tmp_path / "s.h5", executor=pool, chunk=16).finished
     same(home / "whole.h5", tmp_path / "s.h5")
     with (
         ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as pool,
         pytest.raises(aj.InputError, match="the executor forks, which JAX does not survive"),
     ):
-        aj.run_study(study, tmp_path / "t.h5", executor=pool)
+        aj.study.run_study(study, tmp_path / "t.h5", executor=pool)
 
 
 def test_dask_workers_that_die_lose_nothing_and_shards_are_the_same(home, study, tmp_path):
     """Two Dask processes; one is killed in the middle. Once the blocks come back, once workers write them themselves."""
-    with aj.dask_executor("local", 2) as (executor, count):
+    with aj.study.dask_executor("local", 2) as (executor, count):
         assert count == 2
         client = executor._client
         processes = client.run(os.getpid)
@@ -419,11 +423,11 @@ def test_dask_workers_that_die_lose_nothing_and_shards_are_the_same(home, study,
                 killed.append(next(iter(processes.values())))
                 os.kill(killed[0], signal.SIGKILL)
 
-        outcome = aj.run_study(study, tmp_path / "s.h5", executor=executor, workers=count, chunk=16, watch=kill)
+        outcome = aj.study.run_study(study, tmp_path / "s.h5", executor=executor, workers=count, chunk=16, watch=kill)
         assert killed
         assert (outcome.finished, outcome.ran) == (True, 240)
         same(home / "whole.h5", tmp_path / "s.h5")
-        assert aj.run_study(study, tmp_path / "t.h5", executor=executor, workers=count, chunk=16, shards=True).finished
+        assert aj.study.run_study(study, tmp_path / "t.h5", executor=executor, workers=count, chunk=16, shards=True).finished
         same(home / "whole.h5", tmp_path / "t.h5")
 
 
@@ -437,10 +441,10 @@ def test_a_worker_that_fails_stops_the_study_and_keeps_the_rest(study, tmp_path,
 
     monkeypatch.setattr(run, "run_block", fails)
     with pytest.raises(RuntimeError, match=r"failed on its worker .MemoryError: no room.; finished blocks are kept"):
-        aj.run_study(study, tmp_path / "s.h5", chunk=16, workers=1)
+        aj.study.run_study(study, tmp_path / "s.h5", chunk=16, workers=1)
     assert len(list(store.parts_of(tmp_path / "s.h5").glob("*.h5"))) == 8
     monkeypatch.setattr(run, "run_block", real)
-    assert aj.run_study(study, tmp_path / "s.h5").ran == 120
+    assert aj.study.run_study(study, tmp_path / "s.h5").ran == 120
 
 
 def test_an_interrupt_of_the_whole_terminal_reaches_no_dask_worker(home, cache, tmp_path):
@@ -467,7 +471,7 @@ def test_an_interrupt_of_the_whole_terminal_reaches_no_dask_worker(home, cache, 
 )
 def test_strange_arguments_are_refused_before_anything_is_written(study, tmp_path, options, message):
     with pytest.raises(aj.InputError, match=message):
-        aj.run_study(study, tmp_path / "s.h5", **options)
+        aj.study.run_study(study, tmp_path / "s.h5", **options)
     assert not list(tmp_path.iterdir())
 
 

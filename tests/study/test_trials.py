@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.data.noise import ARCSEC
+from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.study import drawing, pools
-from aacmm_jax.study.trials import Block, run_block
+from aacmm_jax.study.definition import Block
+from aacmm_jax.study.trials import run_block
 
 DEVICE = jax.devices()[0]
 REFERENCE = {"length_mm": 500, "positions": 2, "poses": 3, "u_mm": 0.01, "region": {"distance_mm": [300, 1000]}}
@@ -16,16 +17,16 @@ NOISE = {"encoder_arcsec": 2.0, "seating_mm": 0.005}
 OFF = {"length_mm": 1.0, "angle_deg": 0.1}
 
 
-def made(**tables) -> "aj.Study":
+def made(**tables) -> "aj.study.Study":
     capture = {"positions_mm": [[400, 200, 300]], "poses": 30, "pool": 4096}
-    return aj.make_study(**{"arm": "cheng2018-simulation", "trials": 64, "seed": 3, "capture": capture} | tables)
+    return aj.study.make_study(**{"arm": "cheng2018-simulation", "trials": 64, "seed": 3, "capture": capture} | tables)
 
 
-def drawn(study: "aj.Study", count: int = 64, cell: int = 0) -> drawing.Drawn:
+def drawn(study: "aj.study.Study", count: int = 64, cell: int = 0) -> drawing.Drawn:
     return drawing.draw(study, study.settings[cell], np.full(count, cell), np.arange(count), DEVICE)
 
 
-def tips(study: "aj.Study", trials: drawing.Drawn) -> np.ndarray:
+def tips(study: "aj.study.Study", trials: drawing.Drawn) -> np.ndarray:
     arms = jax.vmap(study.space.arm)(jnp.asarray(trials.true))
     return np.asarray(jax.vmap(lambda arm, q: arm.position(q))(arms, jnp.asarray(trials.q)))
 

@@ -10,9 +10,9 @@ from aacmm_jax.summaries import warnings as cautions
 
 def cautions_of(capture, arm, **options):
     """Cautions of a calibration of the paper's arm on a capture."""
-    specification = aj.ArmSpecification(arm, "test")
+    specification = aj.kinematics.ArmSpecification(arm, "test")
     result = aj.calibrate(arm, capture, specification.bounds(), **options)
-    return result, " ".join(cautions.of_calibration(aj.record_of(result, aj.Recording(capture, specification))))
+    return result, " ".join(cautions.of_calibration(aj.calibration.record_of(result, aj.Recording(capture, specification))))
 
 
 def with_lengths(capture, *lengths):
@@ -58,15 +58,15 @@ def test_redundant_and_too_few(paper_arm, noisy_capture):
     sockets = noisy_capture.sockets
     few = aj.Capture({"A": sockets["A"][:8], "B": sockets["B"][:2]}, noisy_capture.lengths)
     assert "Only 4 more equations than unknowns" in cautions_of(few, paper_arm)[1]
-    specification = aj.ArmSpecification(paper_arm, "test", held=("theta_1", "d_1", "a_6", "probe_x", "probe_y"))
+    specification = aj.kinematics.ArmSpecification(paper_arm, "test", held=("theta_1", "d_1", "a_6", "probe_x", "probe_y"))
     with pytest.warns(aj.IdentifiabilityWarning, match="alpha_6 and d_6 trade off"):
         result = aj.calibrate(paper_arm, noisy_capture, specification.bounds())
-    text = " ".join(cautions.of_calibration(aj.record_of(result, aj.Recording(noisy_capture, specification))))
+    text = " ".join(cautions.of_calibration(aj.calibration.record_of(result, aj.Recording(noisy_capture, specification))))
     assert "No measurement of this kind tells these apart: alpha_6 and d_6 trade off." in text
 
 
 def test_readings_outside_the_limits():
-    panda = aj.load_specification("panda")
+    panda = aj.files.load_specification("panda")
     q = np.tile(np.deg2rad([0.0, 0, 0, -90, 0, 90, 0]), (3, 1)) + 0.01 * np.arange(3)[:, None]
     lengths = [aj.ReferenceLength("A", "B", 50.0)]
     right = aj.Capture({"A": q, "B": q + 0.1}, lengths)

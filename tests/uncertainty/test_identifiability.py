@@ -47,7 +47,9 @@ RANKS = {
 @pytest.mark.parametrize("case", RANKS)
 def test_rank_and_null_space_of_the_paper(paper_arm, single, paper_capture, case, noise):
     held, lengths, rank, directions = RANKS[case]
-    seen = aj.observe(paper_arm, paper_capture if lengths else single, aj.Parameters.free_of(paper_arm, held=held), noise=noise)
+    seen = aj.observability(
+        paper_arm, paper_capture if lengths else single, aj.Parameters.free_of(paper_arm, held=held), noise=noise
+    )
     assert seen.rank == rank
     assert {text.replace(" (changes nothing that is measured)", "") for text in seen.unseen} == directions
     structural = {text for text, never in zip(seen.unseen, seen.never, strict=True) if never}
@@ -60,7 +62,7 @@ def test_rank_and_null_space_of_the_paper(paper_arm, single, paper_capture, case
 def test_directions_move_nothing(paper_arm, single):
     """A finite step along each named direction leaves the tips of settled poses together."""
     space = aj.Parameters.free_of(paper_arm, held=("probe_x", "probe_y"))
-    seen = aj.observe(paper_arm, single, space)
+    seen = aj.observability(paper_arm, single, space)
     for direction in seen.null.T:
         moved = space.arm(np.asarray(space.vector()) + 1e-3 * direction * np.asarray(space.scale))
         tips = np.asarray(moved.position(single.q))
@@ -69,7 +71,7 @@ def test_directions_move_nothing(paper_arm, single):
 
 @pytest.mark.parametrize(("positions", "rank"), [(1, 19), (2, 21)])
 def test_lengths_alone(paper_arm, positions, rank):
-    seen = aj.observe(paper_arm, pairs(paper_arm, ENDS[:positions]))
+    seen = aj.observability(paper_arm, pairs(paper_arm, ENDS[:positions]))
     assert seen.rank == rank
     if positions == 1:
         assert seen.remedy  # tried out: it says what would help
@@ -79,14 +81,14 @@ def test_lengths_alone(paper_arm, positions, rank):
 def test_an_arm_off_by_mm_is_judged_alike(paper_arm):
     """Scattered tips would make d_1, theta_1 and the scale look determined."""
     space = aj.Parameters.free_of(paper_arm, held=("probe_x", "probe_y"))
-    true = aj.deviated(aj.Parameters.free_of(paper_arm), length=3.0, angle=0.005, seed=2)
+    true = aj.perturbed_arm(aj.Parameters.free_of(paper_arm), length=3.0, angle=0.005, seed=2)
     capture = aj.simulate(true, {"A": (400, 200, 300)}, poses=60, encoder_arcsec=5.0, seating=0.01)
-    assert aj.observe(paper_arm, capture, space).rank == 20
+    assert aj.observability(paper_arm, capture, space).rank == 20
 
 
 def test_indices_of_a_known_spectrum(paper_arm, paper_capture):
     """O1 to O5 by their definitions; all zero where a direction is lost."""
-    seen = aj.observe(paper_arm, paper_capture)
+    seen = aj.observability(paper_arm, paper_capture)
     s, m = seen.singular, 71
     assert seen.indices == pytest.approx({
         "O1": np.prod(s) ** (1 / 21) / np.sqrt(m), "O2": s[-1] / s[0], "O3": s[-1], "O4": s[-1] ** 2 / s[0], "O5": 1 / np.sum(1 / s)
@@ -107,7 +109,7 @@ def test_calibrate_warns_or_refuses(paper_arm, paper_capture):
 
 def test_few_poses_are_told_what_would_help(paper_arm, paper_capture):
     few = aj.Capture({"A": paper_capture.q[:5], "B": paper_capture.q[70:]}, paper_capture.lengths)
-    (sentence,) = aj.observe(paper_arm, few).sentences()
+    (sentence,) = aj.observability(paper_arm, few).sentences()
     assert "8 combinations of 21 parameters" in sentence
     assert "More poses in a socket" in sentence
 
@@ -119,7 +121,7 @@ def test_independent_parameters_are_the_papers(paper_arm, single, paper_capture,
     chosen = aj.Parameters.independent(paper_arm, capture)
     default = set(aj.Parameters.free_of(paper_arm).names)
     assert set(chosen.names) == (default if lengths else default - {"d_3"})
-    assert aj.observe(paper_arm, capture, chosen).rank == len(chosen.names)
+    assert aj.observability(paper_arm, capture, chosen).rank == len(chosen.names)
 
 
 def test_independent_parameters_of_a_straight_wrist():
@@ -133,19 +135,19 @@ def test_independent_parameters_of_a_straight_wrist():
 
 def test_parallel_axes_get_hayatis_angle(parallel_arm):
     capture = aj.simulate(parallel_arm, {"A": (400, 200, 300), "B": (450, 200, 300)}, poses=40, lengths=[("A", "B")])
-    seen = aj.observe(parallel_arm, capture)
+    seen = aj.observability(parallel_arm, capture)
     assert seen.parallel == (2, 3)
     assert "free beta_2" in " ".join(seen.sentences())
     chosen = aj.Parameters.independent(parallel_arm, capture)
     assert {"beta_2", "beta_3"} <= set(chosen.names)
     assert {"d_2", "d_3"} <= set(chosen.held)
-    after = aj.observe(chosen.base, capture, chosen)
+    after = aj.observability(chosen.base, capture, chosen)
     assert after.rank == len(chosen.names) == 21
     assert not after.sentences()
 
 
 def test_misfit_of_capture_and_arm(paper_arm):
     capture = aj.Capture({"A": np.zeros((3, 4))})
-    for ask in (lambda: aj.observe(paper_arm, capture), lambda: aj.Parameters.independent(paper_arm, capture)):
+    for ask in (lambda: aj.observability(paper_arm, capture), lambda: aj.Parameters.independent(paper_arm, capture)):
         with pytest.raises(aj.InputError, match="4 columns, but the arm has 6 joints"):
             ask()

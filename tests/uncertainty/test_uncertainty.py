@@ -8,9 +8,10 @@ from scipy import stats
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.sampling import batch_of
-from aacmm_jax.data.noise import ARCSEC, tip_covariances
-from aacmm_jax.kinematics.independence import settled
-from aacmm_jax.model.residuals import Measurement
+from aacmm_jax.core.units import ARCSEC
+from aacmm_jax.data.noise import tip_covariances
+from aacmm_jax.kinematics.inverse_kinematics import project_to_centroids
+from aacmm_jax.model.measurement import Measurement
 from aacmm_jax.model.scale import divide_lengths
 from aacmm_jax.model.weights import Weights, inverse_root
 from aacmm_jax.uncertainty import propagation
@@ -53,7 +54,7 @@ def test_inverse_root_is_that_of_cholesky():
 
 def test_weighted_solve_is_the_dense_generalised_least_squares(paper_arm, space, bounds, capture, result):
     """At the solution the gradient of the textbook's objective, sockets as unknowns, is zero; its curvature is the covariance."""
-    noise = tip_covariances(result.stage1.arm.geometry, Measurement.of(capture).turns, NOISE)
+    noise = tip_covariances(result.stage1.arm.geometry, Measurement.of(capture).sines_cosines, NOISE)
     inverse = jnp.linalg.inv(jnp.moveaxis(noise, -1, 0))
     ends = capture.ends()
 
@@ -108,18 +109,18 @@ def test_gains_are_derivatives_of_the_whole_calibration(paper_arm, space, bounds
     stage1, form = found.stage1, "common" if noise is None else "given"
     if method == "joint":
         scaled, sigma = divide_lengths(stage1.arm, stage1.scale.value), stage1.after.sigma / stage1.scale.value
-        measurement = Measurement.of(capture).weighed(scaled.geometry, noise)
-        weighing = propagation.weighing(scaled, measurement, sigma)
+        measurement = Measurement.of(capture).weighted(scaled.geometry, noise)
+        weighing = propagation.joint_weights(scaled, measurement, sigma)
         none = jnp.zeros(21, dtype=bool)
-        whole = propagation.of_solve(found.arm, space, measurement, none, sigma, form, noise, weighing)
+        whole = propagation.propagate_solve(found.arm, space, measurement, none, sigma, form, noise, weighing)
     else:
-        measurement = Measurement.of(capture).weighed(paper_arm.geometry, noise)
+        measurement = Measurement.of(capture).weighted(paper_arm.geometry, noise)
         held, sigma = jnp.asarray([name == "d_3" for name in space.names]), stage1.after.sigma
-        whole = propagation.of_solve(stage1.arm, space, measurement, held, sigma, form, noise)
-        whole = propagation.of_division(whole, stage1.arm, space, measurement, sigma, found.parameters)
+        whole = propagation.propagate_solve(stage1.arm, space, measurement, held, sigma, form, noise)
+        whole = propagation.propagate_division(whole, stage1.arm, space, measurement, sigma, found.parameters)
     by_joints = stage1.arm.jacobian(capture.q, [f"q_{i}" for i in range(1, 7)])
     moved = np.einsum("Nai,tNi->taN", by_joints, turns)
-    mine = np.einsum("paN,taN->tp", whole.gains.tips, moved) + shifts @ np.asarray(whole.gains.lengths).T
+    mine = np.einsum("paN,taN->tp", whole.sensitivity.tips, moved) + shifts @ np.asarray(whole.sensitivity.lengths).T
     mine = mine * np.asarray(space.scale)
     # They differ only as residuals turn with the parameters: by 4 % with the noise of a real arm, which here is a twentieth.
     assert np.abs((mine - slopes) / np.abs(slopes).max(axis=0)).max() < 0.02
@@ -167,7 +168,9 @@ def test_coverage(paper_arm, space, bounds, noise, form, least, most):
         def one(row):
             q, value = row
             lengths = [aj.ReferenceLength("A", "B", value, 0.002)]
-            found = aj.calibrate(paper_arm, aj.Capture({"A": q[:70], "B": q[70:]}, lengths), bounds, noise=noise, form=form)
+            found = aj.calibrate(
+                paper_arm, aj.Capture({"A": q[:70], "B": q[70:]}, lengths), bounds, noise=noise, noise_model=form
+            )
             return found.parameters - space.vector(), jnp.sqrt(jnp.diagonal(found.covariance))
 
         error, u = jax.jit(lambda rows: jax.lax.map(one, rows, batch_size=20))((jnp.asarray(readings), jnp.asarray(values)))
@@ -196,13 +199,13 @@ def test_tips_and_lengths(paper_arm, space, result):
 
 def test_over_the_volume(result):
     uncertainty = aj.uncertainty_of(result)
-    volume = aj.over_volume(uncertainty, points=50, length=250.0)
+    volume = aj.volumetric_uncertainty(uncertainty, points=50, length=250.0)
     np.testing.assert_allclose(np.linalg.norm(volume.start - volume.end, axis=1), 250, atol=0.5)  # by an arm beside the nominal
     np.testing.assert_allclose(volume.u_length, uncertainty.length(volume.q, volume.q_end), rtol=1e-9)
     assert volume.summary["u_length_largest_mm"] == volume.u_length.max()
     for wrong in ({"length": 1e5}, {"length": -1.0}, {"points": 0}):
         with pytest.raises(aj.InputError):
-            aj.over_volume(uncertainty, **wrong)
+            aj.volumetric_uncertainty(uncertainty, **wrong)
 
 
 def test_what_is_open_has_no_uncertainty(paper_arm, capture):
@@ -237,8 +240,8 @@ def test_intervals_and_correlations(result):
 def test_degrees_of_freedom_follow_the_form(paper_arm, capture, bounds):
     """43 poses in three sockets give 120 equations, less the 20 that stage 1 fits."""
     for form, freedom in (("estimated", 100), ("common", 100), ("robust", 40 - 20 / 3)):
-        uncertainty = aj.uncertainty_of(aj.calibrate(paper_arm, capture, bounds, form=form))
-        assert uncertainty.freedom == pytest.approx(freedom)
+        uncertainty = aj.uncertainty_of(aj.calibrate(paper_arm, capture, bounds, noise_model=form))
+        assert uncertainty.degrees_of_freedom == pytest.approx(freedom)
         assert uncertainty.factor(0.95) == pytest.approx(stats.t.ppf(0.975, freedom))
 
 
@@ -260,22 +263,22 @@ def test_estimated_noise_is_that_of_the_simulation(paper_arm, bounds):
 def test_misfit_tells_that_the_noise_is_wrong(paper_arm, capture, bounds):
     right = aj.calibrate(paper_arm, capture, bounds, noise=NOISE)
     wrong = aj.calibrate(paper_arm, capture, bounds, noise=aj.Noise(encoder_arcsec=1.0, seating=0.0025))
-    assert 0.85 < float(right.stage1.misfit) < 1.15
-    assert float(wrong.stage1.misfit) == pytest.approx(2 * float(right.stage1.misfit), rel=1e-3)
-    assert aj.calibrate(paper_arm, capture, bounds).stage1.misfit is None
+    assert 0.85 < float(right.stage1.reduced_chi) < 1.15
+    assert float(wrong.stage1.reduced_chi) == pytest.approx(2 * float(right.stage1.reduced_chi), rel=1e-3)
+    assert aj.calibrate(paper_arm, capture, bounds).stage1.reduced_chi is None
 
 
 def test_socket_bases_are_orthonormal(paper_arm, capture):
     """Sums of B^T B over a socket are the identity, whatever the weights."""
-    turns = Measurement.of(capture).turns
-    weights = Weights.of(tip_covariances(paper_arm.geometry, turns, UNEVEN), capture.sizes)
+    sines_cosines = Measurement.of(capture).sines_cosines
+    weights = Weights.of(tip_covariances(paper_arm.geometry, sines_cosines, UNEVEN), capture.sizes)
     products = np.einsum("abN,acN->Nbc", weights.basis, weights.basis)
     for i in range(3):
         np.testing.assert_allclose(products[capture.owner == i].sum(axis=0), np.eye(3), atol=1e-12)
 
 
 def test_settled_poses_rest_in_their_sockets(paper_arm, capture):
-    tips = np.asarray(paper_arm.position(settled(paper_arm, capture)))
+    tips = np.asarray(paper_arm.position(project_to_centroids(paper_arm, capture)))
     for i in range(3):
         assert np.ptp(tips[capture.owner == i], axis=0).max() < 1e-6
 
@@ -292,9 +295,9 @@ REFUSED = {
         lambda arm, capture, bounds: aj.identify(arm, capture, bounds, noise=aj.Noise(encoder_arcsec=[1, 2])),
         "2 values, but the arm has 6 joints",
     ),
-    "given without": (lambda arm, capture, bounds: aj.identify(arm, capture, bounds, form="given"), "needs the noise"),
+    "given without": (lambda arm, capture, bounds: aj.identify(arm, capture, bounds, noise_model="given"), "needs the noise"),
     "estimated with": (
-        lambda arm, capture, bounds: aj.identify(arm, capture, bounds, noise=NOISE, form="estimated"),
+        lambda arm, capture, bounds: aj.identify(arm, capture, bounds, noise=NOISE, noise_model="estimated"),
         "the noise is given",
     ),
 }

@@ -1,11 +1,8 @@
-"""Files, without any idea of arms: whole-or-nothing writes, HDF5 tables after netCDF-4's conventions, CSV."""
+"""HDF5 tables after netCDF-4's conventions, without any idea of arms."""
 
 import contextlib
-import csv
 import datetime
-import math
 import os
-import secrets
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,10 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..core.errors import InputError
+from .whole_file import ELSEWHERE, check_readable, storable, storable_name, whole_file
 
 FORMAT = "aacmm_jax"
+
+
 FORMAT_VERSION = 1
-ELSEWHERE = "choose another output path"
 
 
 class Variable(NamedTuple):
@@ -36,38 +35,6 @@ class Table(NamedTuple):
 
     variables: dict[str, Variable]
     attributes: Mapping[str, Any] = MappingProxyType({})
-
-
-@contextlib.contextmanager
-def whole_file(path: str | os.PathLike, mend: str = ELSEWHERE) -> Iterator[Path]:
-    """Write a file whole or not at all: yields a temporary path beside the target, renamed onto it at the end.
-
-    Whatever goes wrong (Ctrl-C included), the temporary file is removed and an existing target stays as it was.
-    Raises `InputError` where the path cannot be written.
-    """
-    target = Path(path)
-    # Named before it is made: an interrupt between the two must not leave a file that nobody removes.
-    temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
-    try:
-        if target.exists() and not target.is_file():
-            raise OSError(None, "it is a folder" if target.is_dir() else "it is not an ordinary file")
-        open(temporary, "xb").close()
-        yield temporary
-        with open(temporary, "rb+") as written:
-            os.fsync(written.fileno())
-        os.replace(temporary, target)
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise InputError(f"{target} cannot be written: {reason}; {mend}.") from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-
-
-def write_text(path: str | os.PathLike, text: str) -> None:
-    """Write a text file whole or not at all."""
-    with whole_file(path) as temporary:
-        temporary.write_bytes(text.encode())
 
 
 def write_tables(
@@ -151,29 +118,6 @@ class _Unbroken:
 
     def flush(self) -> None:
         """Nothing waits."""
-
-
-def storable(text: str) -> str:
-    """The same text, or `InputError` where neither HDF5 nor TOML can hold it (NUL, or a file name that is not UTF-8)."""
-    if "\0" in text or text.encode(errors="ignore").decode() != text:
-        raise InputError(f"the name {text!r} holds a character that no file can hold; rename it.")
-    return text
-
-
-def fingerprint(path: str | os.PathLike, beside: str | os.PathLike | None = None) -> str:
-    """A file's name and SHA-256, by which it can be told from every other; with its folders below ``beside``, where it lies there."""
-    import hashlib
-
-    path = Path(path)
-    check_readable(path)
-    below = beside is not None and path.is_relative_to(beside)
-    name = path.relative_to(beside).as_posix() if below and beside is not None else path.name
-    return storable_name(f"{name} (SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()})")
-
-
-def storable_name(text: str) -> str:
-    """A name from the file system or the command line in a form that HDF5 can hold: bytes that are not UTF-8 are written out."""
-    return text.encode(errors="backslashreplace").decode()
 
 
 def _versions() -> str:
@@ -263,19 +207,6 @@ def undamaged(path: str | os.PathLike) -> Iterator[None]:
         raise InputError(f"{path} is damaged, cut short or was edited; make it again.") from error
 
 
-def check_readable(path: Path) -> None:
-    """Raise `InputError` where a file is missing, a folder, or may not be read."""
-    try:
-        open(path, "rb").close()
-    except FileNotFoundError as error:
-        raise InputError(f"{path} does not exist; check the path.") from error
-    except IsADirectoryError as error:
-        raise InputError(f"{path} is a folder; name a file.") from error
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{str(path)!r} cannot be read: {reason.lower()}; name another file.") from error
-
-
 def _check_kind(path: Path, attributes: Mapping[str, Any], kinds: Sequence[str]) -> None:
     wanted = " or ".join(kinds)
     if attributes.get("format") != FORMAT:
@@ -310,61 +241,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return [_plain(item) for item in value.tolist()]
     return value.item() if isinstance(value, np.generic) else value
-
-
-def read_numbers(path: str | os.PathLike, columns: Sequence[int] | None = None) -> np.ndarray:
-    """Read a text table of numbers, ``(rows, columns)``: comma, semicolon, tab or blank between them, header lines allowed.
-
-    ``columns`` picks columns, counted from 1. Raises `InputError` that names the file, the line and the column.
-    """
-    path = Path(path)
-    check_readable(path)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} cannot be read as text; give a text file of numbers, in UTF-8.") from error
-    rows: list[list[float]] = []
-    for number, line in enumerate(lines, start=1):
-        cells = _cells(line)
-        if not cells or cells[0].startswith("#"):
-            continue
-        try:
-            rows.append([float(cell) for cell in cells])
-        except ValueError as error:
-            if not rows and not any(_is_number(cell) for cell in cells):
-                continue  # a header
-            column = next(i for i, cell in enumerate(cells, start=1) if not _is_number(cell))
-            raise InputError(
-                f"{path} line {number} column {column}: '{cells[column - 1]}' is not a number; mend it."
-            ) from error
-        if len(rows[-1]) != len(rows[0]):
-            raise InputError(
-                f"{path} line {number} has {len(rows[-1])} columns, the lines before it {len(rows[0])}; give all the same."
-            )
-        for column, value in enumerate(rows[-1], start=1):
-            if not math.isfinite(value):
-                raise InputError(f"{path} line {number} column {column}: '{cells[column - 1]}' is not finite; mend it.")
-    if not rows:
-        raise InputError(f"{path} holds no numbers; give one line a pose, with decimal points.")
-    table = np.array(rows)
-    if columns is None:
-        return table
-    for column in columns:
-        if not 1 <= column <= table.shape[1]:
-            raise InputError(f"{path} has {table.shape[1]} columns, so there is no column {column}; pick others.")
-    return table[:, [column - 1 for column in columns]]
-
-
-def _cells(line: str) -> list[str]:
-    for delimiter in (";", ",", "\t"):
-        if delimiter in line:
-            return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]
-    return line.split()
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True

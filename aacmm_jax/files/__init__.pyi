@@ -1,0 +1,17 @@
+from .administrative_data import AdministrativeData as AdministrativeData
+from .administrative_data import read_administrative_data as read_administrative_data
+from .arms import load_arm as load_arm
+from .arms import load_specification as load_specification
+from .arms import save_arm as save_arm
+from .arms import shipped_arms as shipped_arms
+from .calibrations import load_calibration as load_calibration
+from .calibrations import save_calibration as save_calibration
+from .captures import load_capture as load_capture
+from .captures import save_capture as save_capture
+from .evaluations import load_evaluation as load_evaluation
+from .evaluations import save_evaluation as save_evaluation
+from .manifest import read_manifest as read_manifest
+from .plans import save_plan as save_plan
+from .points import read_points as read_points
+from .points_evaluations import load_points as load_points
+from .points_evaluations import save_points as save_points

@@ -1,0 +1,79 @@
+"""Files written whole or not at all, their names and fingerprints."""
+
+import contextlib
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+
+from ..core.errors import InputError
+
+ELSEWHERE = "choose another output path"
+
+
+@contextlib.contextmanager
+def whole_file(path: str | os.PathLike, mend: str = ELSEWHERE) -> Iterator[Path]:
+    """Write a file whole or not at all: yields a temporary path beside the target, renamed onto it at the end.
+
+    Whatever goes wrong (Ctrl-C included), the temporary file is removed and an existing target stays as it was.
+    Raises `InputError` where the path cannot be written.
+    """
+    target = Path(path)
+    # Named before it is made: an interrupt between the two must not leave a file that nobody removes.
+    temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
+    try:
+        if target.exists() and not target.is_file():
+            raise OSError(None, "it is a folder" if target.is_dir() else "it is not an ordinary file")
+        open(temporary, "xb").close()
+        yield temporary
+        with open(temporary, "rb+") as written:
+            os.fsync(written.fileno())
+        os.replace(temporary, target)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise InputError(f"{target} cannot be written: {reason}; {mend}.") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def write_text(path: str | os.PathLike, text: str) -> None:
+    """Write a text file whole or not at all."""
+    with whole_file(path) as temporary:
+        temporary.write_bytes(text.encode())
+
+
+def check_readable(path: Path) -> None:
+    """Raise `InputError` where a file is missing, a folder, or may not be read."""
+    try:
+        open(path, "rb").close()
+    except FileNotFoundError as error:
+        raise InputError(f"{path} does not exist; check the path.") from error
+    except IsADirectoryError as error:
+        raise InputError(f"{path} is a folder; name a file.") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{str(path)!r} cannot be read: {reason.lower()}; name another file.") from error
+
+
+def fingerprint(path: str | os.PathLike, beside: str | os.PathLike | None = None) -> str:
+    """A file's name and SHA-256, by which it can be told from every other; with its folders below ``beside``, where it lies there."""
+    import hashlib
+
+    path = Path(path)
+    check_readable(path)
+    below = beside is not None and path.is_relative_to(beside)
+    name = path.relative_to(beside).as_posix() if below and beside is not None else path.name
+    return storable_name(f"{name} (SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()})")
+
+
+def storable(text: str) -> str:
+    """The same text, or `InputError` where neither HDF5 nor TOML can hold it (NUL, or a file name that is not UTF-8)."""
+    if "\0" in text or text.encode(errors="ignore").decode() != text:
+        raise InputError(f"the name {text!r} holds a character that no file can hold; rename it.")
+    return text
+
+
+def storable_name(text: str) -> str:
+    """A name from the file system or the command line in a form that HDF5 can hold: bytes that are not UTF-8 are written out."""
+    return text.encode(errors="backslashreplace").decode()

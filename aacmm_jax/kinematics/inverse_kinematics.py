@@ -1,0 +1,152 @@
+"""Inverse kinematics: poses that put the tip at given points, from random starts or as near as possible to given poses."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..core.arrays import in_chunks
+from ..core.errors import InputError
+from . import chain
+from .arm import Arm
+
+_BATCH = 256  # candidates per call: one compiled shape for every number of poses
+_ROUNDS = 12
+_STEPS = 60  # of one attempt; five of six starts arrive
+_TOLERANCE, _ARRIVED = 1e-9, 1e-6  # mm
+
+
+@runtime_checkable
+class SocketPoses(Protocol):
+    """What is needed of a capture: poses, socket after socket, and which sockets reference lengths join."""
+
+    q: Float[Array, "N n"]
+    sizes: tuple[int, ...]
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        ...
+
+    @property
+    def owner(self) -> Int[np.ndarray, " N"]:
+        """Index of the socket that each pose belongs to."""
+        ...
+
+    def ends(self) -> Int[np.ndarray, "l 2"]:
+        """Socket indices of every length's two ends."""
+        ...
+
+
+@partial(jax.jit, static_argnames=("steps",))
+def solve_to_targets(
+    geometry: chain.Geometry,
+    q: Float[Array, "c n"],
+    targets: Float[Array, "c 3"],
+    limits: Float[Array, "n 2"],
+    steps: int = _STEPS,
+) -> tuple[Float[Array, "c n"], Float[Array, " c"]]:
+    """Damped least-norm steps (at most 0.5 rad a joint, within the limits) towards the targets; final distances."""
+    low, high = limits[:, 0, None, None], limits[:, 1, None, None]
+    wanted = targets.T
+
+    def step(_, q):
+        forward = chain.forward_pass(geometry, (jnp.cos(q), jnp.sin(q)))
+        gap = wanted - forward.tip
+        # The damping fades with the distance, so that the last steps are Newton's.
+        damping = 1e-2 * jnp.sum(gap**2, axis=0) + 1e-12
+        moves = damped_inverse(chain.jacobian_columns(forward)["theta"], damping)
+        return jnp.clip(q + jnp.clip(jnp.sum(moves * gap[None], axis=1, keepdims=True), -0.5, 0.5), low, high)
+
+    q = jax.lax.fori_loop(0, steps, step, q.T[:, None, :])
+    tip = chain.forward_pass(geometry, (jnp.cos(q), jnp.sin(q))).tip
+    return q[:, 0].T, jnp.linalg.norm(wanted - tip, axis=0)
+
+
+def damped_inverse(columns: Float[Array, "n 3 N"], damping: Float[Array, " N"]) -> Float[Array, "n 3 N"]:
+    """Least change of every joint per mm that the tip shall move along each axis: J^T (J J^T + damping)^-1, pose by pose.
+
+    ``columns`` are the derivatives of the tip by the joints, mm. The inverse is written out (adjugate over determinant):
+    for matrices this small a call of a library costs ten times the arithmetic.
+    """
+    x, y, z = columns[:, 0], columns[:, 1], columns[:, 2]
+    xx, yy, zz = (jnp.sum(c * c, axis=0) + damping for c in (x, y, z))
+    xy, xz, yz = jnp.sum(x * y, axis=0), jnp.sum(x * z, axis=0), jnp.sum(y * z, axis=0)
+    adjugate = (
+        (yy * zz - yz * yz, yz * xz - xy * zz, xy * yz - yy * xz),
+        (yz * xz - xy * zz, xx * zz - xz * xz, xy * xz - xx * yz),
+        (xy * yz - yy * xz, xy * xz - xx * yz, xx * yy - xy * xy),
+    )
+    determinant = xx * adjugate[0][0] + xy * adjugate[0][1] + xz * adjugate[0][2]
+    rows = [[entry / determinant for entry in row] for row in adjugate]
+    return jnp.stack([x * row[0][None] + y * row[1][None] + z * row[2][None] for row in rows], axis=1)
+
+
+def random_configurations(
+    arm: Arm, targets: Float[Array, "m 3"], key: Array, limits: Float[Array, "n 2"], labels: Sequence[str] | None = None
+) -> Float[Array, "m n"]:
+    """One random pose for each target, within the limits, exact to 1e-9 mm.
+
+    Raises `InputError`, with the target's label, where no pose is found.
+    """
+    wanted = targets.shape[0]
+    angles = np.zeros((wanted, arm.joints))
+    missing = np.arange(wanted)
+    for round_number in range(_ROUNDS * (1 + wanted // _BATCH)):
+        # Every missing target is tried, several times at once where they are few; the first success counts.
+        tried = np.resize(missing, _BATCH)
+        start = jax.random.uniform(
+            jax.random.fold_in(key, round_number),
+            (_BATCH, arm.joints),
+            minval=limits[None, :, 0],
+            maxval=limits[None, :, 1],
+        )
+        solved, distance = (np.asarray(x) for x in solve_to_targets(arm.geometry, start, targets[tried], limits))
+        successes = np.flatnonzero(distance <= _TOLERANCE)[::-1]
+        angles[tried[successes]] = solved[successes]
+        missing = np.setdiff1d(missing, tried[successes])
+        if not len(missing):
+            return jnp.asarray(angles)
+    links = float(jnp.sum(jnp.abs(arm.a)) + jnp.sum(jnp.abs(arm.d)) + jnp.linalg.norm(arm.probe))
+    point = ", ".join(f"{x:.0f}" for x in np.asarray(targets[missing[0]]))
+    what = labels[missing[0]] if labels else "the target"
+    raise InputError(
+        f"{what} at ({point}) mm cannot be reached within the joint limits (the links together measure {links:.0f} mm); "
+        "move it closer or widen the limits."
+    )
+
+
+def project_to_targets(
+    arm: Arm, q: Float[np.ndarray, "N n"], targets: Float[np.ndarray, "N 3"], limits: Float[np.ndarray, "n 2"] | None = None
+) -> tuple[Float[np.ndarray, "N n"], Bool[np.ndarray, " N"]]:
+    """Poses moved by least steps until the tip is at its target, within limits (default: none), and which of them arrived."""
+    allowed = jnp.asarray(np.tile([-np.inf, np.inf], (arm.joints, 1)) if limits is None else limits)
+
+    def moved(rows: np.ndarray) -> np.ndarray:
+        found, distance = solve_to_targets(arm.geometry, jnp.asarray(rows[:, :-3]), jnp.asarray(rows[:, -3:]), allowed)
+        return np.hstack([np.asarray(found), np.asarray(distance)[:, None]])
+
+    found = in_chunks(moved, np.hstack([q, targets]))
+    return found[:, :-1], found[:, -1] <= _ARRIVED
+
+
+def project_to_centroids(arm: Arm, capture: SocketPoses, stands: Arm | None = None) -> Float[np.ndarray, "N n"]:
+    """The poses of a capture moved, as little as possible, until each tip rests in its socket's centroid by this arm; or by the
+    arm that ``stands`` in its place.
+
+    A nominal arm that is mm off scatters the tips, and scattered tips make directions look determined that are not: turning
+    the whole arm about its base moves them.
+    """
+    q = np.asarray(capture.q)
+    owner = capture.owner
+    by = arm if stands is None else stands
+    tips = in_chunks(lambda rows: np.asarray(by.position(rows)), q)
+    sizes = np.asarray(capture.sizes)
+    sums = np.stack([np.bincount(owner, weights=tips[:, axis]) for axis in range(3)], axis=1)
+    targets = (sums / sizes[:, None])[owner]
+    moved, reached = project_to_targets(arm, q, targets)
+    return np.where(reached[:, None], moved, q)

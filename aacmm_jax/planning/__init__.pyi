@@ -1,0 +1,2 @@
+from .design import Plan as Plan
+from .design import plan as plan

@@ -1,0 +1,13 @@
+from .axes import acceptance as acceptance
+from .axes import arm as arm
+from .axes import calibration_figure as calibration_figure
+from .axes import correlation as correlation
+from .axes import distances as distances
+from .axes import length_errors as length_errors
+from .axes import length_parameter_errors as length_parameter_errors
+from .axes import parameter_changes as parameter_changes
+from .axes import singular_values as singular_values
+from .axes import study as study
+from .axes import volume as volume
+from .drift import plot_changes as plot_changes
+from .drift import trend as trend
