@@ -80,8 +80,8 @@ class Capture(eqx.Module):
         for name, block in blocks.items():
             if block.shape[1] != width:
                 raise InputError(
-                    f"socket '{name}' has {block.shape[1]} columns, but socket '{first}' has {width}; give one column a "
-                    "joint."
+                    f"socket '{name}' has {block.shape[1]} columns, but socket '{first}' has {width}; give one "
+                    "column a joint."
                 )
         _check_different(blocks)
         self.q = joined(list(blocks.values()))
@@ -161,11 +161,13 @@ def _checked_angles(name: str, angles: Numbers) -> Array | np.ndarray:
             array = np.asarray(angles, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise InputError(
-                f"socket '{name}' has something that is not a number, or rows of unequal length; give one row of numbers a pose."
+                f"socket '{name}' has something that is not a number, or rows of unequal length; give one row of numbers "
+                "a pose."
             ) from error
     if array.ndim != 2 or 0 in array.shape:
         raise InputError(
-            f"socket '{name}' has shape {array.shape}; give one row a pose and one column a joint, at least one of each."
+            f"socket '{name}' has shape {array.shape}; give one row a pose and one column a joint, at least one of "
+            "each."
         )
     if is_concrete(array):
         _check_values(name, np.asarray(array))
@@ -193,8 +195,8 @@ def _check_values(name: str, array: np.ndarray) -> None:
     if largest > _MOST_RADIANS:
         row, column = np.argwhere(np.abs(array) == largest)[0] + 1
         raise InputError(
-            f"socket '{name}' pose {row} joint {column} is {largest:g} rad, more than four revolutions: these look like "
-            "degrees; convert with numpy.deg2rad, or state the unit in the manifest."
+            f"socket '{name}' pose {row} joint {column} is {largest:g} rad, more than four revolutions: these look "
+            "like degrees; convert with numpy.deg2rad, or state the unit in the manifest."
         )
 
 

@@ -32,9 +32,8 @@ class Noise(eqx.Module):
         self.seating = as_floats(seating, "seating")
         for what, values in (("encoder_arcsec", self.encoder), ("seating", self.seating)):
             if values.ndim > (what == "encoder_arcsec"):
-                raise InputError(
-                    f"{what} has shape {values.shape}; give one number{', or one a joint' * (what == 'encoder_arcsec')}."
-                )
+                allowed = "one number, or one a joint" if what == "encoder_arcsec" else "one number"
+                raise InputError(f"{what} has shape {values.shape}; give {allowed}.")
             if values.size == 0:
                 raise InputError(f"{what} is empty; give one number, or one a joint.")
             if is_concrete(values) and np.any(np.asarray(values) < 0):
@@ -52,8 +51,7 @@ class Noise(eqx.Module):
             joints: Number of joints of the arm.
 
         Raises:
-            InputError: Where all noise is zero, some is absurdly large, or the number of encoders is not that of
-                joints.
+            InputError: Where all noise is zero, some is absurdly large, or encoders and joints differ in number.
         """
         if is_concrete(self.encoder, self.seating) and not (
             np.any(np.asarray(self.encoder)) or np.any(np.asarray(self.seating))
@@ -61,8 +59,7 @@ class Noise(eqx.Module):
             raise InputError(
                 "noise is zero everywhere, so poses cannot be weighted by it; give a standard deviation, or no noise."
             )
-        # Not in the constructor: residuals of a calibration that failed may be as large, and its file must still be
-        # read.
+        # Not in the constructor: residuals of a failed calibration may be as large, and its file must still be read.
         for what, values in (("encoder_arcsec", self.encoder_arcsec), ("seating", self.seating)):
             if is_concrete(values) and np.any(np.asarray(values) > _MOST[what]):
                 raise InputError(f"{what} is over {_MOST[what]:g}, more than any arm's; is it in another unit?")
@@ -79,13 +76,13 @@ class Noise(eqx.Module):
         """
         if self.encoder.ndim and self.encoder.shape != (joints,):
             raise InputError(
-                f"encoder_arcsec has {self.encoder.shape[0]} values, but the arm has {joints} joints; give one number, or "
-                "one a joint."
+                f"encoder_arcsec has {self.encoder.shape[0]} values, but the arm has {joints} joints; give one number, "
+                "or one a joint."
             )
 
 
 def tip_covariances(geometry: Geometry, sines_cosines: SinesCosines, noise: Noise) -> Float[Array, "... 3 3 N"]:
-    """Covariance of the tip of every pose, mm^2: J_q S J_q^T of the encoders, plus that of the seat in every direction."""
+    """Covariance of the tip of every pose, mm^2: J_q S J_q^T of the encoders, plus the seat's in every direction."""
     # Plus (1 nm)^2: a pose in which no joint moves the tip in some direction would have an infinite weight.
     seat = (noise.seating**2 + 1e-12) * jnp.eye(3)[..., None]
     encoders = encoder_covariances(geometry, sines_cosines, noise.encoder)

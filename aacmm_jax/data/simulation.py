@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -80,8 +81,8 @@ def simulate(
     return Capture(readings, references)
 
 
-def _noise(noise: Noise | None, encoder_arcsec: float | None, seating: float | None, resolution_arcsec: float) -> Noise:
-    """The noise that was given, in whichever form."""
+def _noise(noise: Any, encoder_arcsec: Any, seating: Any, resolution_arcsec: Any) -> Noise:
+    """The noise in either form, checked."""
     short = {"encoder_arcsec": encoder_arcsec, "seating": seating}
     given = {name: value for name, value in short.items() if value is not None}
     for what, value in {**given, "resolution_arcsec": resolution_arcsec}.items():

@@ -105,7 +105,11 @@ class Study:
     """
 
     def __init__(self, specification: Specification, nominal: ArmSpecification, recording: Recording | None = None):
-        self._contents = _Contents(specification, nominal._replace(arm=single(nominal.arm)), recording)
+        single(nominal.arm)
+        if recording is not None:
+            true = None if recording.true is None else _picklable(recording.true)
+            recording = recording._replace(nominal=_picklable(recording.nominal), true=true)
+        self._contents = _Contents(specification, _picklable(nominal), recording)
         self._check()
 
     def __reduce__(self):
@@ -319,6 +323,11 @@ def _restored(digest: str, contents: _Contents) -> Study:
         shared.update({name: value for name, value in vars(study).items() if name != "_contents"}, digest=digest)
     vars(study).update(shared)
     return study
+
+
+def _picklable(specification: ArmSpecification) -> ArmSpecification:
+    """The same arm file with a plain dict: its default for ``override``, a mapping proxy, cannot be pickled."""
+    return specification._replace(override=dict(specification.override))
 
 
 def pool_capacity(study: Study, fixture: Fixture) -> tuple[int, int]:

@@ -160,7 +160,7 @@ def _certified(
 
 
 def _noise(keys: Array, shape: tuple[int, ...]) -> Float[Array, "w ..."]:
-    """Standard normal noise for every trial; in float32, which takes a third of the time: noise needs no more digits."""
+    """Standard normal noise for every trial, in float32: a third of the time, and noise needs no more digits."""
     return jax.vmap(lambda k: jax.random.normal(k, shape, dtype=jnp.float32))(keys).astype(jnp.float64)
 
 
@@ -194,7 +194,7 @@ def _joint_changes(
     inverse: Float[Array, "n 3 w N"],
     target: Float[Array, "w 3 N"],
 ) -> Float[Array, "n w N"]:
-    """Changes of the joints that bring the tips of the true arms to their targets; NaN for a trial that does not arrive.
+    """Changes of the joints that bring the tips of the true arms to their targets; NaN where they do not arrive.
 
     Every step uses the damped inverse of the pool, computed for the nominal arm (a chord method: each step leaves about
     a hundredth of the error). A trial takes steps until it has arrived; one that does not (an arm nearly straight, far
@@ -262,7 +262,7 @@ def _rotated(cosine: Array, sine: Array, angle: Array) -> tuple[Array, Array]:
 
 
 def _tip(links: Geometry, twist: tuple[Array, Array], cosine: Array, sine: Array) -> tuple[Array, ...]:
-    """The tip alone, from the probe back to the base: one vector instead of a frame. ``cosine`` is that of q + theta."""
+    """The tip alone, from the probe back to the base: one vector instead of a frame. ``cosine`` is of q + theta."""
     (cos_twist, sin_twist), (x, y, z) = twist, links.probe
     for i in reversed(range(cosine.shape[0])):
         if links.beta is not None:
@@ -274,7 +274,7 @@ def _tip(links: Geometry, twist: tuple[Array, Array], cosine: Array, sine: Array
 
 
 def _readings(static: _Static, q: Float[Array, "n w N"], keys: Array, values: CellValues) -> Float[Array, "n w N"]:
-    """Encoder readings: eccentricity (a first harmonic of the angle, its coefficients drawn by joint), noise and rounding."""
+    """Readings: eccentricity (a first harmonic of the angle, its coefficients drawn by joint), noise and rounding."""
     n, _, poses = q.shape
     if static.eccentric:
         harmonics = jax.vmap(lambda k: jax.random.normal(k, (2, n)))(keys[:, 1]) * values.eccentricity[:, None, None]

@@ -74,7 +74,7 @@ def _client(distributed: Any, address: str, workers: int | None) -> Iterator[Any
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Processes started within ignore interrupts: Ctrl-C reaches all processes of a terminal, but workers finish blocks."""
+    """Processes started within ignore Ctrl-C, which reaches all processes of a terminal; workers finish blocks."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -86,7 +86,7 @@ def _interrupts_ignored() -> Iterator[None]:
 
 
 def _affinity_plugin(distributed: Any) -> Any:
-    """Restricts every worker to its part of the cores; otherwise each would use all of them, and wait for the others."""
+    """Restricts every worker to its part of the cores; otherwise each would use all, and wait for the others."""
 
     class Affinity(distributed.WorkerPlugin):
         name = "aacmm-affinity"

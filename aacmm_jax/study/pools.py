@@ -32,7 +32,7 @@ _STARTS = 8  # configurations tried at each end of a candidate placement
 
 
 class Pool(NamedTuple):
-    """A row for each configuration: q, cos and sin of q + theta, its damped inverse (n, 3), and the point that it reaches.
+    """A row for each configuration: q, cos and sin of q + theta, damped inverse (n, 3), and the point that it reaches.
 
     ``first``, ``placements`` and ``poses`` are the first row and the capacity of each fixture:
     row = first + ((part * placements + placement) * ends + end) * poses + pose.
@@ -220,7 +220,7 @@ def _placements(arm: Arm, fixture: Fixture, limits: Array, key: Array, count: in
             return np.array(found[:count])
     kind = "socket" if fixture.length is None else f"reference length of {fixture.length:g} mm"
     raise InputError(
-        f"a {kind} has no placement in its region that the arm reaches within its joint limits; widen or move the region."
+        f"a {kind} has no placement in its region within reach and joint limits of the arm; widen or move the region."
     )
 
 

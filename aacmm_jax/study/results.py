@@ -64,7 +64,7 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
 
 
 def _allow_files(count: int, path: Path) -> None:
-    """Allow this process so many open files: HDF5 opens all blocks at once, and shows those that it cannot open as not run."""
+    """Allow so many open files: HDF5 opens all blocks at once, and shows those that it cannot open as not run."""
     try:
         import resource
     except ImportError:  # not a system with such limits
@@ -74,8 +74,8 @@ def _allow_files(count: int, path: Path) -> None:
     if soft != resource.RLIM_INFINITY and soft < needed:
         if hard != resource.RLIM_INFINITY and hard < needed:
             raise InputError(
-                f"{path} consists of {count} blocks, more files than this process may open ({hard}); let the study end, or "
-                "raise the limit."
+                f"{path} consists of {count} blocks, more files than this process may open ({hard}); let the study "
+                "end, or raise the limit."
             )
         resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
 
@@ -109,7 +109,7 @@ class Results(NamedTuple):
         return self._columns([name], cell)[name]
 
     def columns(self, cell: int) -> dict[str, np.ndarray]:
-        """Everything of one cell that is one number a trial; ``group`` is the part of the pool that a trial drew from."""
+        """Arrays of one cell with one number a trial; ``group`` is the part of the pool that a trial drew from."""
         found = self._columns([name for name, kind in VARIABLES.items() if not kind.by_parameter], cell)
         return found | {"group": np.arange(self.study.trials) % POOL_PARTS}
 
@@ -122,7 +122,7 @@ class Results(NamedTuple):
         return found
 
     def errors(self, cell: int) -> Iterator[tuple[Float[np.ndarray, "t p"], np.ndarray, np.ndarray]]:
-        """Of converged trials, some at a time: errors of the parameters (estimate minus truth), active bounds, groups."""
+        """Of converged trials, some at a time: parameter errors (estimate minus truth), active bounds, groups."""
         with undamaged(self.path):
             for part, rows in store.rows_of(self.path, self.stored, ["converged", "estimate", "true", "active"], cell):
                 good = rows["converged"] == 1

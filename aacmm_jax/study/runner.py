@@ -175,7 +175,7 @@ def _completed(
     stopped: threading.Event,
     resources: Callable[[int], _Resources],
 ) -> Iterator[tuple[Block, Any]]:
-    """Results of blocks as they end, at most ``queued`` submitted at a time; once ``stopped``, only of those running."""
+    """Results of blocks as they end, at most ``queued`` at a time; once ``stopped``, only of those running."""
     waiting, submitted = deque(enumerate(blocks)), dict[Future, Block]()
     try:
         while submitted or (waiting and not stopped.is_set()):
@@ -196,8 +196,8 @@ def _completed(
                     raise
                 except Exception as error:
                     raise RuntimeError(
-                        f"block {block} failed on its worker ({type(error).__name__}: {error}); finished blocks are kept, "
-                        "run again to continue"
+                        f"block {block} failed on its worker ({type(error).__name__}: {error}); finished blocks are "
+                        "kept, run again to continue"
                     ) from error
                 yield block, result
     finally:

@@ -151,8 +151,8 @@ class CaptureTable(_Table):
 
 
 class NoiseTable(_Table):
-    """Standard deviations: of a reading, of a coordinate of the seated tip, and of both coefficients of every encoder's first
-    harmonic; and the resolution of a reading."""
+    """Standard deviations of a reading, of a coordinate of the seated tip, and of both coefficients of every encoder's
+    first harmonic; and the resolution of a reading."""
 
     encoder_arcsec: Levels[Amount] = [0.0]
     resolution_arcsec: Levels[Amount] = [0.0]
@@ -199,7 +199,7 @@ class ReferenceTable(_Table):
 
 
 class IdentificationTable(_Table):
-    """How the arm is identified. ``start``: at the nominal arm, or at random within the bounds (but for the scale anchor)."""
+    """How the arm is identified. ``start``: the nominal arm, or random within the bounds (but for the scale anchor)."""
 
     method: Levels[Literal["stage1", "two-stage", "joint"]] | None = None
     hold: Levels[str] = ["longest"]
@@ -238,11 +238,9 @@ class Specification(_Table):
             raise ValueError(
                 "method two-stage or joint needs a reference length; add a [reference], or use method = 'stage1'."
             )
-        if reference is not None and reference.length_mm is not None:
-            if reference.region is None and self.capture.region is None:
-                raise ValueError(
-                    "a reference length at random needs a region; give it in [reference], or give ends_mm."
-                )
+        at_random = reference is not None and reference.length_mm is not None and reference.region is None
+        if at_random and self.capture.region is None:
+            raise ValueError("a reference length at random needs a region; give it in [reference], or give ends_mm.")
         return self
 
     def factors(self) -> dict[str, list]:

@@ -159,7 +159,7 @@ def _parameters(results: Results, cell: int) -> dict[str, Any]:
 
 
 def correlation(results: Results, cell: int) -> Float[np.ndarray, "p p"]:
-    """Correlation of parameter errors over the converged trials of a cell (counted from 0); 0 for one that never varies."""
+    """Correlation of parameter errors over the converged trials of a cell (counted from 0); 0 where one is constant."""
     count, first, second = 0, 0.0, 0.0
     for error, _, _ in results.errors(cell):
         count, first, second = count + len(error), first + error.sum(axis=0), second + error.T @ error

@@ -68,8 +68,8 @@ def _dataset(group: Any, name: str, layout: Layout, shape: tuple[int, ...]) -> A
     """An array of results, compressed, each block a chunk; resizable, as a chunk may not exceed a fixed size."""
     chunks = layout.shape(name, layout.block_cells, layout.block_trials)
     return group.create_dataset(
-        name, shape, VARIABLES[name].dtype, chunks=chunks, maxshape=(None,) * len(shape), shuffle=True, compression="gzip",
-        fillvalue=fill_of(name),
+        name, shape, VARIABLES[name].dtype, chunks=chunks, maxshape=(None,) * len(shape), shuffle=True,
+        compression="gzip", fillvalue=fill_of(name),
     )  # fmt: skip
 
 
@@ -271,8 +271,8 @@ def check_parts(path: Path, stored: StoredStudy) -> None:
     missing = sum(1 for _ in layout.blocks()) - len(finished_blocks(path, layout))
     if stored.finished and missing:
         raise InputError(
-            f"{missing} blocks are missing in {stored.parts}; put them there, or run the study again with --resume to make "
-            "them."
+            f"{missing} blocks are missing in {stored.parts}; put them there, or run the study again with --resume to "
+            "make them."
         )
 
 
