@@ -137,7 +137,7 @@ def project_to_targets(
 def newton_steps_to_targets(
     arm: Arm, q: Float[Array, "N n"], targets: Float[Array, "N 3"], steps: int
 ) -> Float[Array, "N n"]:
-    """Configurations near their targets moved onto them by a few least-norm Newton steps; differentiable, without limits."""
+    """Configurations near their targets, projected by a few least-norm Newton steps; differentiable, without limits."""
 
     def step(q: Array, _: None) -> tuple[Array, None]:
         forward = chain.forward_pass(arm.geometry, chain.sines_cosines(q))
