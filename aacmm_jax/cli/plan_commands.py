@@ -109,7 +109,7 @@ def plan(
     points = dict(socket_option(text) for text in socket or ())
     if len(points) < len(socket or ()):
         raise InputError("a socket is named twice in --socket; give each its own name.")
-    with plan_display.progress() as tell:
+    with plan_display.progress() as progress:
         found = run(
             specification.arm,
             sockets=points or (4 if sockets is None else sockets),
@@ -126,7 +126,7 @@ def plan(
             candidates=candidates,
             check_length=check_length_mm,
             seed=seed,
-            tell=tell,
+            progress=progress,
         )
     save_plan(output, found)
     summary: dict[str, Any] = plan_summary(found, specification.name) | {"written": str(output)}

@@ -134,6 +134,19 @@ def project_to_targets(
     return found[:, :-1], found[:, -1] <= _ARRIVED
 
 
+def newton_steps_to_targets(
+    arm: Arm, q: Float[Array, "N n"], targets: Float[Array, "N 3"], steps: int
+) -> Float[Array, "N n"]:
+    """Configurations near their targets, projected by a few least-norm Newton steps; differentiable, without limits."""
+
+    def step(q: Array, _: None) -> tuple[Array, None]:
+        forward = chain.forward_pass(arm.geometry, chain.sines_cosines(q))
+        moves = damped_inverse(chain.jacobian_columns(forward)["theta"], jnp.full(q.shape[0], 1e-6))
+        return q + jnp.sum(moves * (targets.T - forward.tip)[None], axis=1).T, None
+
+    return jax.lax.scan(step, q, None, length=steps)[0]
+
+
 def project_to_centroids(arm: Arm, capture: SocketPoses, stands: Arm | None = None) -> Float[np.ndarray, "N n"]:
     """The poses of a capture moved, as little as possible, until each tip rests in its socket's centroid by this arm; or by the
     arm that ``stands`` in its place.

@@ -1,13 +1,16 @@
 """Where an arm can be: its reach, its lowest point, poses at given points, and poses as lines in space."""
 
-from typing import NamedTuple, Protocol, runtime_checkable
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..core.arrays import in_chunks
+from ..core.errors import InputError
 from .arm import Arm, joint_limits
 from .chain import Geometry, forward_pass, sines_cosines
 from .inverse_kinematics import project_to_targets
@@ -66,7 +69,8 @@ def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"
     def lines(rows: np.ndarray) -> np.ndarray:
         forward = forward_pass(arm.geometry, sines_cosines(jnp.asarray(rows)))
         before, after, axis = (
-            np.asarray(part).reshape(arm.joints, 3, -1) for part in (forward.origin_before, forward.origin, forward.z_before)
+            np.asarray(part).reshape(arm.joints, 3, -1)
+            for part in (forward.origin_before, forward.origin, forward.z_before)
         )
         offset = before + np.asarray(arm.d)[:, None, None] * axis
         both = np.stack([offset, after], axis=1).reshape(2 * arm.joints, 3, -1)
@@ -92,33 +96,38 @@ def total_link_length(arm: Arm) -> float:
     return float(np.abs(arm.a).sum() + np.abs(np.asarray(arm.d)[1:]).sum() + np.linalg.norm(np.asarray(arm.probe)))
 
 
-@runtime_checkable
-class SearchRegion(Protocol):
-    """Where poses may be: of a `Scene`, or of whoever else looks for poses."""
+class SearchRegion(NamedTuple):
+    """Where configurations are looked for, and the random numbers that the search uses."""
 
-    @property
-    def arm(self) -> Arm:
-        """The arm."""
-        ...
-
-    @property
-    def limits(self) -> Float[np.ndarray, "n 2"]:
-        """Lowest and highest reading of each joint, rad."""
-        ...
-
-    @property
-    def above(self) -> float:
-        """Height below which no joint and no tip comes, mm."""
-        ...
+    arm: Arm
+    limits: Float[np.ndarray, "n 2"]  # lowest and highest reading of each joint, rad
+    above: float  # height in the base frame below which no joint and no tip comes, mm
+    random: np.random.Generator
 
     def draw(self, count: int) -> Float[np.ndarray, "c n"]:
-        """Poses at random within the limits."""
-        ...
+        """Random configurations within the limits."""
+        return self.random.uniform(self.limits[:, 0], self.limits[:, 1], (count, self.arm.joints))
 
 
-def configurations_at(scene: SearchRegion, points: Float[np.ndarray, "s 3"], each: int) -> tuple[np.ndarray, np.ndarray]:
-    """Poses from ``each`` random starts for each socket that arrived within the limits, and the socket of each."""
+def search_region(
+    arm: Arm, limits: Sequence[Sequence[float]] | None, margin: float, above: float, seed: int
+) -> SearchRegion:
+    """The region ``margin`` (rad) inside the joint limits (default: the arm's own) and ``above`` (mm) the table."""
+    if seed < 0:
+        raise InputError(f"seed is {seed}; give zero or a positive number.")
+    allowed = np.asarray(joint_limits(arm, limits))
+    if not (math.isfinite(margin) and 0 <= margin < np.min(allowed[:, 1] - allowed[:, 0]) / 2):
+        raise InputError(
+            f"a margin of {math.degrees(margin):g} deg leaves a joint no range within its limits; give a smaller one."
+        )
+    return SearchRegion(arm, allowed + margin * np.array([1.0, -1.0]), above, np.random.default_rng(seed))
+
+
+def configurations_at(
+    region: SearchRegion, points: Float[np.ndarray, "s 3"], each: int
+) -> tuple[Float[np.ndarray, "c n"], Int[np.ndarray, " c"]]:
+    """Configurations that reach the points from ``each`` random starts a point, and the index of each one's point."""
     owner = np.repeat(np.arange(len(points)), each)
-    q, arrived = project_to_targets(scene.arm, scene.draw(len(owner)), points[owner], scene.limits)
-    good = arrived & (lowest_point(scene.arm, q) >= scene.above)
+    q, arrived = project_to_targets(region.arm, region.draw(len(owner)), points[owner], region.limits)
+    good = arrived & (lowest_point(region.arm, q) >= region.above)
     return q[good], owner[good]

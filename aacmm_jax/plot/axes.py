@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..acceptance.suite import AcceptanceTest
+from ..acceptance.metrics import AcceptanceTest
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.arrays import Numbers
 from ..core.errors import InputError
@@ -201,7 +201,7 @@ def singular_values(seen: Observability, axes: Any = None) -> Any:
 
 def acceptance(tests: Sequence[AcceptanceTest], axes: Any = None) -> Any:
     """The worst value of every figure with a limit, as a share of it, with U: it conforms where the whole bar lies below 1."""
-    figures = [figure for test in tests for figure in test.figures if figure.worst.limit]
+    figures = [figure for test in tests for figure in test.metrics if figure.worst.limit]
     if not figures:
         raise InputError("no figure has a limit to be drawn against; give limits to accept.")
     axes = _axes(axes)
