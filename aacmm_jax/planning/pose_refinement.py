@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..kinematics.arm import Arm
-from ..kinematics.chain import forward_pass, jacobian_columns, sines_cosines
+from ..kinematics.chain import forward_pass, sines_cosines
 from ..kinematics.inverse_kinematics import damped_inverse, project_to_targets
+from ..kinematics.jacobian import jacobian_columns
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import lowest_point
 from ..model.measurement import Measurement

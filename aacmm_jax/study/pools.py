@@ -20,6 +20,7 @@ from ..core.errors import InputError
 from ..kinematics import chain
 from ..kinematics.arm import Arm
 from ..kinematics.inverse_kinematics import damped_inverse, solve_to_targets
+from ..kinematics.jacobian import jacobian_columns
 from .definition import BATCHES, Setting, Stand, Study, pose_choice
 from .specification import Region
 
@@ -166,7 +167,7 @@ def _tried(arm: Arm, start: np.ndarray, points: np.ndarray, limits: Array) -> tu
 @jax.jit
 def _try(geometry: chain.Geometry, start: Array, points: Array, limits: Array) -> tuple[Array, Array]:
     q, distance = solve_to_targets(geometry, start, points, limits, _STEPS)
-    columns = chain.jacobian_columns(chain.forward_pass(geometry, chain.sines_cosines(q)))["theta"]
+    columns = jacobian_columns(chain.forward_pass(geometry, chain.sines_cosines(q)))["theta"]
     moves = damped_inverse(columns, jnp.zeros(q.shape[0]))
     stiffness = jnp.sqrt(jnp.sum(columns**2, axis=(0, 1)) * jnp.sum(moves**2, axis=(0, 1)))
     return q, (distance <= _TOLERANCE) & (stiffness <= _STRAIGHT)
@@ -184,7 +185,7 @@ def _rows(arm: Arm, q: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 @jax.jit
 def _moves(geometry: chain.Geometry, q: Array) -> Array:
-    columns = chain.jacobian_columns(chain.forward_pass(geometry, chain.sines_cosines(q)))["theta"]
+    columns = jacobian_columns(chain.forward_pass(geometry, chain.sines_cosines(q)))["theta"]
     return jnp.moveaxis(damped_inverse(columns, jnp.zeros(q.shape[0])), -1, 0).reshape(q.shape[0], -1)
 
 

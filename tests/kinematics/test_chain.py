@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.kinematics import chain
+from aacmm_jax.kinematics import chain, jacobian
 
 
 def random_arm(joints: int, seed: int, *, beta: bool = False, batch: tuple[int, ...] = ()) -> aj.Arm:
@@ -69,7 +69,7 @@ def test_jacobian_is_jax_own_differentiation(joints):
 
     def one(q):
         plain = lambda geometry, q: chain.forward_pass(geometry, chain.sines_cosines(q)).tip[:, 0]  # noqa: E731 - no custom rule on the way
-        modes = [jax.jacfwd(chain.tip_position, (0, 1)), jax.jacrev(chain.tip_position, (0, 1)), jax.jacfwd(plain, (0, 1))]
+        modes = [jax.jacfwd(jacobian.tip_position, (0, 1)), jax.jacrev(jacobian.tip_position, (0, 1)), jax.jacfwd(plain, (0, 1))]
         return [arm.jacobian(q, names), *(flattened(mode(arm.geometry, q)) for mode in modes)]
 
     analytic, *others = jax.jit(jax.vmap(one))(q)
