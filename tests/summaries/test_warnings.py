@@ -62,7 +62,7 @@ def test_redundant_and_too_few(paper_arm, noisy_capture):
     with pytest.warns(aj.IdentifiabilityWarning, match="alpha_6 and d_6 trade off"):
         result = aj.calibrate(paper_arm, noisy_capture, specification.bounds())
     text = " ".join(cautions.of_calibration(aj.calibration.record_of(result, aj.Recording(noisy_capture, specification))))
-    assert "No measurement of this kind tells these apart: alpha_6 and d_6 trade off." in text
+    assert "No measurement of this kind can separate: alpha_6 and d_6 trade off." in text
 
 
 def test_readings_outside_the_limits():
