@@ -54,7 +54,7 @@ class TradeOff(NamedTuple):
                 f"to within {1e3 * self.movement:.2g} um"
             )
         if np.isfinite(self.u):
-            text += f" (u = {self.u:.2g} {_step(first)}"
+            text += f" (u = {self.u:.3g} {_step(first)}"
             text += f", bounds +-{self.half_width:.3g} {_step(first)})" if np.isfinite(self.half_width) else ")"
         return text
 
