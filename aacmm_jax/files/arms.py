@@ -123,7 +123,11 @@ def _specification(path: Path, choose: bool) -> ArmSpecification:
     if model.convention == "craig":
         # Rx(alpha_{i-1}) Tx(a_{i-1}) Rz Tz: the link after joint i is in row i + 1; there is none after the last joint.
         links = [*links[1:], (0.0, 0.0)]
-    beta = None if all(row.beta is None for row in rows) else [angle * (0.0 if row.beta is None else row.beta) for row in rows]
+    beta = (
+        None
+        if all(row.beta is None for row in rows)
+        else [angle * (0.0 if row.beta is None else row.beta) for row in rows]
+    )
     try:
         arm = Arm(
             alpha=[angle * twist for twist, _ in links],

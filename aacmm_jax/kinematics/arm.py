@@ -24,19 +24,17 @@ _PROBE_AXES = ("x", "y", "z")
 
 
 class Arm(eqx.Module):
-    """A serial arm. One joint: T = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)]; the tip is ``probe`` in the last frame.
+    """A serial arm of revolute joints, T = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)] each, with a probe.
 
     Every parameter is ``(..., n)`` for n joints; leading shapes are a batch of arms and broadcast against those of q.
     Source: Denavit and Hartenberg 1955; Cheng et al. 2018, eq. 1.
 
     Args:
-        alpha: Link twists ``(..., n)``, rad.
-        a: Link lengths ``(..., n)``, mm.
-        d: Link offsets ``(..., n)``, mm.
-        theta: Zero offsets of the joints ``(..., n)``, rad; by default 0.
-        beta: Hayati and Mirmirani's (1985) additional angles for nearly parallel axes ``(..., n)``, rad; by default unused.
-        probe: Tip in the last frame ``(..., 3)``, mm.
-        limits: Lowest and highest reading of each joint, n pairs, rad; not calibrated, but respected when poses are made.
+        alpha: Link twists ``(..., n)``, rad. a: Link lengths ``(..., n)``, mm. d: Link offsets ``(..., n)``, mm.
+        theta: Zero offsets of the joints ``(..., n)``, rad; by default 0. beta: Hayati and Mirmirani's (1985)
+        additional angles for nearly parallel axes ``(..., n)``, rad; by default unused. probe: Tip in the last frame
+        ``(..., 3)``, mm. limits: Lowest and highest reading of each joint, n pairs, rad; not calibrated, but
+        respected when poses are made.
 
     Raises:
         InputError: Shapes do not fit together, or a value is not finite.
@@ -73,7 +71,9 @@ class Arm(eqx.Module):
         for kind in ("a", "d", "theta", "beta"):
             array = getattr(self, kind)
             if array is not None and array.shape[-1:] != (joints,):
-                raise InputError(f"{kind} has shape {array.shape}, but alpha has {joints} joints; give one value per joint.")
+                raise InputError(
+                    f"{kind} has shape {array.shape}, but alpha has {joints} joints; give one value per joint."
+                )
         if self.probe.shape[-1:] != (3,):
             raise InputError(f"probe has shape {self.probe.shape}; give its three coordinates (x, y, z) in mm.")
         arrays = [array for array in (self.alpha, self.a, self.d, self.theta, self.beta) if array is not None]
@@ -147,7 +147,9 @@ class Arm(eqx.Module):
     def _checked(self, q: Numbers) -> Float[Array, "... n"]:
         array = as_array(q, "q")
         if array.shape[-1:] != (self.joints,):
-            raise InputError(f"q has shape {array.shape}, but the arm has {self.joints} joints; the last axis is the joint.")
+            raise InputError(
+                f"q has shape {array.shape}, but the arm has {self.joints} joints; the last axis is the joint."
+            )
         return array
 
 
@@ -177,7 +179,7 @@ def parameter_names(arm: Arm) -> tuple[str, ...]:
 
 
 def locate(arm: Arm, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
-    """Kind and 0-based index of a parameter name: ``d_3 -> ("d", 2)``. Raises `InputError` naming the nearest spelling."""
+    """Kind and 0-based index of a parameter name: ``d_3 -> ("d", 2)``; an `InputError` names the nearest spelling."""
     kinds = ("alpha", "a", "d", "theta", "beta", *extra)
     kind, _, index = name.rpartition("_") if isinstance(name, str) else ("", "", "")
     if kind == "probe" and index in _PROBE_AXES:
@@ -189,9 +191,11 @@ def locate(arm: Arm, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
 
 
 def with_arrays(arm: Arm, **changes: Array | None) -> Arm:
-    """`Arm.replace` for whole arrays inside numerical code: without its checks, so that a diverged iteration may hold NaN."""
+    """`Arm.replace` for whole arrays without its checks: in numerical code a diverged iteration may hold NaN."""
     kinds = tuple(changes)
-    return eqx.tree_at(lambda x: [getattr(x, kind) for kind in kinds], arm, list(changes.values()), is_leaf=lambda x: x is None)
+    return eqx.tree_at(
+        lambda x: [getattr(x, kind) for kind in kinds], arm, list(changes.values()), is_leaf=lambda x: x is None
+    )
 
 
 def joint_limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[Array, "n 2"]:
@@ -223,7 +227,7 @@ def is_length(name: str) -> bool:
 def with_values(
     geometry: Geometry, vector: Float[Array, "... p"], indices: tuple[tuple[str, int], ...]
 ) -> dict[str, Float[Array, "... n"]]:
-    """The arrays of parameters, by kind, that change when the parameters at ``indices`` take the values of ``vector``."""
+    """The arrays, by kind, that change when the parameters at ``indices`` take the values of ``vector``."""
     changed = {}
     for kind in dict.fromkeys(kind for kind, _ in indices):
         before = getattr(geometry, kind)
@@ -244,7 +248,9 @@ def natural_steps(names: Sequence[str]) -> Float[np.ndarray, " p"]:
 
 
 def neighbouring_arm(arm: Arm, names: Sequence[str]) -> Arm:
-    """The arm with the named parameters changed by about 1 mm and 1 mrad: without the exact alignments of a nominal arm."""
+    """The arm with the named parameters changed by about 1 mm and 1 mrad, so that nothing is exactly aligned."""
     steps = np.random.default_rng(0).normal(size=len(names)) * natural_steps(names)
     vector = np.array([value_of(arm, name) for name in names]) + steps
-    return with_arrays(arm, **with_values(arm.geometry, jnp.asarray(vector), tuple(locate(arm, name) for name in names)))
+    return with_arrays(
+        arm, **with_values(arm.geometry, jnp.asarray(vector), tuple(locate(arm, name) for name in names))
+    )

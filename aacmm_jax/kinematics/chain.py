@@ -1,9 +1,9 @@
 """The Denavit-Hartenberg chain: one forward pass from base to tip. Its derivatives are in `jacobian`.
 
 Layout of the arrays: joints first, then the batch, then the three components of a vector, then the N configurations:
-``(n, ..., 3, N)``. One loop over the joints works on contiguous rows of configurations, which suits XLA on a CPU and on a
-GPU. (Measured, 70 configurations x 21 columns on one core: 30 us; unrolled joint by joint 180-580 us, because XLA then
-computes the chain again for every column, and compiling takes four times as long.)
+``(n, ..., 3, N)``. One loop over the joints works on contiguous rows of configurations, which suits XLA on a CPU and
+on a GPU. (Measured, 70 configurations x 21 columns on one core: 30 us; unrolled joint by joint 180-580 us, because
+XLA then computes the chain again for every column, and compiling takes four times as long.)
 """
 
 from typing import Any, NamedTuple
@@ -42,8 +42,9 @@ class ForwardPass(NamedTuple):
 
 
 def joints_first(values: Any, rank: int) -> Any:
-    """``(..., n) -> (n, ..., 1, N)``: the last axis first, ``rank`` batch axes, and an axis for vector components before the
-    last. Accepts NumPy and JAX arrays.
+    """``(..., n) -> (n, ..., 1, N)``: the last axis first, ``rank`` batch axes, and one for components before the last.
+
+    Accepts NumPy and JAX arrays.
     """
     moved = values.transpose(values.ndim - 1, *range(values.ndim - 1))
     batch = (1,) * (rank - moved.ndim + 1) + moved.shape[1:]
@@ -101,7 +102,9 @@ def forward_pass(geometry: Geometry, sines_cosines: SinesCosines) -> ForwardPass
     return ForwardPass(frame, tip, *axes)
 
 
-def components_last(rows: Float[Array, "... 3 N"], geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 3"]:
+def components_last(
+    rows: Float[Array, "... 3 N"], geometry: Geometry, q: Float[Array, "... n"]
+) -> Float[Array, "... 3"]:
     """``(..., 3, N) -> (..., N, 3)``; without the axis of configurations where neither q nor the arm has a batch."""
     moved = jnp.moveaxis(rows, -2, -1)
     return moved if max(leaf.ndim for leaf in jax.tree.leaves((geometry, q))) > 1 else moved[0]
@@ -113,5 +116,7 @@ def tip_pose(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 
     forward = forward_pass(geometry, sines_cosines(q))
     columns = [components_last(rows, geometry, q) for rows in (*forward.frame, forward.tip)]
     top = jnp.stack(columns, axis=-1)
-    bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]).reshape((1,) * (top.ndim - 1) + (4,)), (*top.shape[:-2], 1, 4))
+    bottom = jnp.broadcast_to(
+        jnp.array([0.0, 0.0, 0.0, 1.0]).reshape((1,) * (top.ndim - 1) + (4,)), (*top.shape[:-2], 1, 4)
+    )
     return jnp.concatenate([top, bottom], axis=-2)

@@ -1,4 +1,4 @@
-"""A largest set of parameters that data determine: derivatives of tips and lengths, and a choice of independent columns."""
+"""A largest set of parameters that data determine: a choice of independent columns of derivatives."""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ NEARLY_PARALLEL = 0.02  # |sin alpha|, about 1 degree
 def equations(
     arm: Arm, capture: SocketPoses, names: Sequence[str], q: Float[np.ndarray, "N n"]
 ) -> tuple[Float[np.ndarray, "N 3 p"], Float[np.ndarray, "l p"]]:
-    """Derivatives at configurations ``q``: of tips less the mean of their socket, and of reference lengths; mm per mm or rad."""
+    """Derivatives of tips less their socket's mean, and of reference lengths, at configurations; mm per mm or rad."""
     columns = jacobian_at(arm, q, names)
     owner, sizes = capture.owner, np.asarray(capture.sizes, dtype=float)
     starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
@@ -45,10 +45,11 @@ def nearly_parallel(arm: Arm) -> list[int]:
 def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, ...]]:
     """A largest set of parameters that a capture determines, and the arm (with beta where needed).
 
-    Parameters are taken one after the other, and fixed where those taken before can imitate them: nonzero lengths first, then
-    angles, lengths that are nominally zero, the probe and the last link; the longest link comes last of all, so that it is
-    fixed where no reference length fixes the scale. Where neighbouring axes are nearly parallel, ``d_i`` is fixed and
-    ``beta_i`` is free. At last the first parameter of every near-degenerate combination is fixed (`near_degeneracy`).
+    Parameters are taken one after the other, and fixed where those taken before can imitate them: nonzero lengths
+    first, then angles, lengths that are nominally zero, the probe and the last link; the longest link comes last of
+    all, so that it is fixed where no reference length fixes the scale. Where neighbouring axes are nearly parallel,
+    ``d_i`` is fixed and ``beta_i`` is free. At last the first parameter of every near-degenerate combination is fixed
+    (`near_degeneracy`).
     """
     if arm.joints != capture.joints:
         raise InputError(
@@ -60,8 +61,8 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
     order = _order(arm, parallel)
     taken: tuple[str, ...] = ()
     for _ in range(5):
-        # Without the exact alignments of the nominal arm. Fixed parameters keep their nominal values, which may make others
-        # redundant, so the choice is repeated.
+        # Without the exact alignments of the nominal arm. Fixed parameters keep their nominal values, which may make
+        # others redundant, so the choice is repeated.
         neighbour = neighbouring_arm(arm, taken or tuple(order))
         poses, lengths = equations(neighbour, capture, order, project_to_centroids(neighbour, capture, targets_of=arm))
         before, taken = taken, _independent(neighbour, order, np.concatenate([poses.reshape(-1, len(order)), lengths]))
@@ -77,7 +78,9 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
 
 def tip_movements(poses: Float[np.ndarray, "N 3 p"], lengths: Float[np.ndarray, "l p"]) -> Float[np.ndarray, "r p"]:
     """`equations` as rows whose sum of squares is the mean square over the poses plus that over the lengths."""
-    return np.concatenate([poses.reshape(-1, poses.shape[-1]) / math.sqrt(len(poses)), lengths / math.sqrt(max(len(lengths), 1))])
+    return np.concatenate(
+        [poses.reshape(-1, poses.shape[-1]) / math.sqrt(len(poses)), lengths / math.sqrt(max(len(lengths), 1))]
+    )
 
 
 class _GenericPoses(NamedTuple):
@@ -121,7 +124,9 @@ def _independent(arm: Arm, order: list[str], rows: Float[np.ndarray, "r p"]) -> 
         column = whole
         for _ in range(2):  # twice is enough for orthogonality to rounding
             column = column - basis @ (basis.T @ column)
-        least = 1e-7 * (1.0 if locate(arm, name)[0] in LENGTHS else 1e3)  # small at the tip for steps of 1 mm and 1 mrad
+        least = 1e-7 * (
+            1.0 if locate(arm, name)[0] in LENGTHS else 1e3
+        )  # small at the tip for steps of 1 mm and 1 mrad
         size = float(np.linalg.norm(column))
         if size > max(_INDEPENDENT * float(np.linalg.norm(whole)), least) and basis.shape[1] < rows.shape[0]:
             taken.append(name)

@@ -59,7 +59,7 @@ def solve_to_targets(
     limits: Float[Array, "n 2"],
     steps: int = _STEPS,
 ) -> tuple[Float[Array, "c n"], Float[Array, " c"]]:
-    """Damped least-norm steps from ``q`` towards the targets, clipped to the limits: configurations and final distances, mm.
+    """Damped least-norm steps from ``q`` to the targets, within the limits: configurations and final distances, mm.
 
     Each joint moves by at most 0.5 rad in a step.
     """
@@ -80,7 +80,9 @@ def solve_to_targets(
     return q[:, 0].T, jnp.linalg.norm(wanted - tip, axis=0)
 
 
-def newton_projection(geometry: Geometry, q: Float[Array, "N n"], targets: Float[Array, "N 3"], steps: int) -> Float[Array, "N n"]:
+def newton_projection(
+    geometry: Geometry, q: Float[Array, "N n"], targets: Float[Array, "N 3"], steps: int
+) -> Float[Array, "N n"]:
     """Configurations brought to their targets by a fixed number of least-norm steps: differentiable, without limits."""
 
     def step(rows: Array, _: None) -> tuple[Array, None]:
@@ -93,14 +95,15 @@ def newton_projection(geometry: Geometry, q: Float[Array, "N n"], targets: Float
 
 
 def least_norm_inverse(geometry: Geometry, q: Float[Array, "N n"]) -> Float[Array, "n 3 N"]:
-    """Least change of every joint per mm that the tip moves along each axis, at configurations (pseudo-inverse Jacobian)."""
+    """Least change of every joint per mm that the tip moves along each axis: the pseudo-inverse of the Jacobian."""
     return damped_inverse(jacobian_columns(forward_pass(geometry, sines_cosines(q)))["theta"], jnp.zeros(q.shape[0]))
 
 
 def damped_inverse(columns: Float[Array, "n ... 3 N"], damping: Float[Array, "... N"]) -> Float[Array, "n ... 3 N"]:
     """J^T (J J^T + damping)^-1 for each configuration, from ``columns``, the derivatives of the tip by the joints, mm.
 
-    The inverse is written out (adjugate over determinant): for matrices this small a library call costs ten times the arithmetic.
+    The inverse is written out (adjugate over determinant): for matrices this small a library call costs ten times the
+    arithmetic.
     """
     x, y, z = columns[..., 0, :], columns[..., 1, :], columns[..., 2, :]
     xx, yy, zz = (jnp.sum(c * c, axis=0) + damping for c in (x, y, z))
@@ -144,15 +147,18 @@ def random_configurations(
     point = ", ".join(f"{x:.0f}" for x in np.asarray(targets[missing[0]]))
     what = labels[missing[0]] if labels else "the target"
     raise InputError(
-        f"{what} at ({point}) mm cannot be reached within the joint limits (the links together measure {links:.0f} mm); "
-        "move it closer or widen the limits."
+        f"{what} at ({point}) mm cannot be reached within the joint limits (the links together measure {links:.0f} "
+        "mm); move it closer or widen the limits."
     )
 
 
 def project_to_targets(
-    arm: Arm, q: Float[np.ndarray, "N n"], targets: Float[np.ndarray, "N 3"], limits: Float[np.ndarray, "n 2"] | None = None
+    arm: Arm,
+    q: Float[np.ndarray, "N n"],
+    targets: Float[np.ndarray, "N 3"],
+    limits: Float[np.ndarray, "n 2"] | None = None,
 ) -> tuple[Float[np.ndarray, "N n"], Bool[np.ndarray, " N"]]:
-    """Configurations moved by least-norm steps to their targets within limits (default: none), and which of them arrived."""
+    """Configurations moved by least-norm steps to their targets within limits (default: none), and which arrived."""
     allowed = jnp.asarray(np.tile([-np.inf, np.inf], (arm.joints, 1)) if limits is None else limits)
 
     def moved(rows: np.ndarray) -> np.ndarray:
@@ -166,8 +172,9 @@ def project_to_targets(
 def project_to_centroids(arm: Arm, capture: SocketPoses, targets_of: Arm | None = None) -> Float[np.ndarray, "N n"]:
     """The configurations of a capture moved by least-norm steps until each tip is at its socket's centroid.
 
-    ``targets_of`` is the arm that the centroids come from; by default the same. With a nominal arm that is some mm wrong the
-    tips scatter, and scattered tips make directions look determined that are not, such as a rotation about the base.
+    ``targets_of`` is the arm that the centroids come from; by default the same. With a nominal arm that is some mm
+    wrong the tips scatter, and scattered tips make directions look determined that are not, such as a rotation about
+    the base.
     """
     q = np.asarray(capture.q)
     owner = capture.owner

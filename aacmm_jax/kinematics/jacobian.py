@@ -38,7 +38,7 @@ def jacobian_columns(forward: ForwardPass) -> dict[str, Float[Array, "k ... 3 N"
 
 @partial(jax.jit, static_argnames=("indices",))
 def stacked_jacobian_columns(forward: ForwardPass, indices: tuple[tuple[str, int], ...]) -> Float[Array, "... p 3 N"]:
-    """The Jacobian columns of some parameters, each a kind (``q`` counts as ``theta``) and a 0-based index, in that order."""
+    """The Jacobian columns of some parameters, each a kind (``q`` counts as ``theta``) and a 0-based index."""
     columns = jacobian_columns(forward)
     chosen = [columns["theta" if kind == "q" else kind][i] for kind, i in indices]
     return jnp.stack(chosen, axis=-3) if chosen else jnp.zeros((*forward.tip.shape[:-2], 0, *forward.tip.shape[-2:]))
@@ -77,7 +77,9 @@ def tip_position(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "
 
 
 @partial(jax.jit, static_argnames=("indices",))
-def tip_jacobian(geometry: Geometry, q: Float[Array, "... n"], indices: tuple[tuple[str, int], ...]) -> Float[Array, "... 3 p"]:
+def tip_jacobian(
+    geometry: Geometry, q: Float[Array, "... n"], indices: tuple[tuple[str, int], ...]
+) -> Float[Array, "... 3 p"]:
     """Derivative of the tip by some parameters, each a kind (``alpha`` ... ``probe``, or ``q``) and a 0-based index."""
     stacked = stacked_jacobian_columns(forward_pass(geometry, sines_cosines(q)), indices)
     columns = jnp.moveaxis(stacked, -1, -3)

@@ -1,20 +1,22 @@
 """Near-degenerate parameters: combinations whose change the tips hardly show, whatever their rank says.
 
-A matrix of derivatives has full rank as soon as no combination of parameters leaves the tips exactly where they are. That says
-nothing of how well the combination is determined: a probe 0.6 mm off the last axis gives ``theta_6`` a rank of its own, but
-1 mrad of it moves no tip by more than 0.3 um once ``a_6`` and the probe have followed. So directions are judged by size.
+A matrix of derivatives has full rank as soon as no combination of parameters leaves the tips exactly where they are.
+That says nothing of how well the combination is determined: a probe 0.6 mm off the last axis gives ``theta_6`` a rank
+of its own, but 1 mrad of it moves no tip by more than 0.3 um once ``a_6`` and the probe have followed. So directions
+are judged by size.
 
-Let m be the RMS movement of the tips (mm) per natural step (1 mm or 1 mrad) along a direction, after the best imitation by all
-other free parameters. Then
+Let m be the RMS movement of the tips (mm) per natural step (1 mm or 1 mrad) along a direction, after the best
+imitation by all other free parameters. Then
 
-* without knowledge of the noise, the direction is near-degenerate where m < 2 um per step (`LEAST_MOVEMENT`): over the default
-  half-width of a bound (10 mm, 17.5 mrad) it moves the tips by less than 35 um, about the single-point repeatability of a good
-  arm, and less than the errors that the Denavit-Hartenberg model leaves in any (some 0.1 mm in robots). Such errors are alike in
-  neighbouring poses, so that more poses do not average them away. Well-conditioned arms have 10 um per step and more in their
-  weakest direction (the arms of Cheng et al. 2018: 20 um);
+* without knowledge of the noise, the direction is near-degenerate where m < 2 um per step (`LEAST_MOVEMENT`): over
+  the default half-width of a bound (10 mm, 17.5 mrad) it moves the tips by less than 35 um, about the single-point
+  repeatability of a good arm, and less than the errors that the Denavit-Hartenberg model leaves (0.1 mm in robots).
+  Such errors are alike in neighbouring poses, so that more poses do not average them away. Well-conditioned arms have
+  10 um per step and more in their weakest direction (the arms of Cheng et al. 2018: 20 um);
 * where the noise is known, also where its standard uncertainty u exceeds half of the half-width h of its bounds: with
-  independent normal errors of covariance W^-1, u^2 = 1 / (v^T J^T W J v). A parameter with a rectangular distribution over its
-  bounds has u = h / sqrt(3) = 0.58 h (JCGM 100, 4.3.7): there the data add little to what the bounds say anyway.
+  independent normal errors of covariance W^-1, u^2 = 1 / (v^T J^T W J v). A parameter with a rectangular distribution
+  over its bounds has u = h / sqrt(3) = 0.58 h (JCGM 100, 4.3.7): there the data add little to what the bounds say
+  anyway.
 """
 
 from collections.abc import Sequence
@@ -74,11 +76,11 @@ def trade_offs(
         whitened: The same equations in standard deviations, where the noise is known.
         half_widths: Of the bounds, in natural steps; needed with ``whitened``.
     """
-    chosen = np.ones(len(names)) if whitened is None or half_widths is None else np.where(half_widths > 0, half_widths, 1e-12)
+    units = np.ones(len(names)) if half_widths is None else np.where(half_widths > 0, half_widths, 1e-12)
     rows = movements if whitened is None else whitened
     # One uncertainty in units of the bounds: the singular values of the scaled rows are its inverse.
-    _, singular, vectors = np.linalg.svd(rows * chosen, full_matrices=False)
-    singular, vectors = singular[singular > _ZERO * max(singular[0], 1e-300)], vectors[: len(singular)] * chosen
+    _, singular, vectors = np.linalg.svd(rows * units, full_matrices=False)
+    singular, vectors = singular[singular > _ZERO * max(singular[0], 1e-300)], vectors[: len(singular)] * units
     vectors = vectors[: len(singular)] / np.linalg.norm(vectors[: len(singular)], axis=1, keepdims=True)
     weak = np.linalg.norm(movements @ vectors.T, axis=0) < LEAST_MOVEMENT
     if whitened is not None:
@@ -105,7 +107,9 @@ def _trade_off(
     direction = np.zeros(len(names))
     direction[~fixed], direction[i] = -amounts, 1.0
     largest = np.abs(amounts).max(initial=0.0)
-    order = [j for j in np.argsort(-np.abs(direction), kind="stable") if j != i and abs(direction[j]) > _PARTNER * largest]
+    order = [
+        j for j in np.argsort(-np.abs(direction), kind="stable") if j != i and abs(direction[j]) > _PARTNER * largest
+    ]
     return TradeOff(
         names=(names[i], *(names[j] for j in order)),
         amounts=(1.0, *(float(-direction[j]) for j in order)),

@@ -34,8 +34,8 @@ class Parameters(eqx.Module):
     def free_of(cls, arm: Arm, *, held: Iterable[str] | None = None, free: Iterable[str] = ()) -> "Parameters":
         """Free parameters by name: by default the 4n - 3 of Cheng et al. 2018, in their order.
 
-        These are all but ``d_1``, ``theta_1`` (they move the base frame), ``a_n``, ``alpha_n`` (redundant with the probe),
-        ``probe_x`` and ``probe_y``.
+        These are all but ``d_1``, ``theta_1`` (they move the base frame), ``a_n``, ``alpha_n`` (redundant with the
+        probe), ``probe_x`` and ``probe_y``.
 
         Args:
             arm: The arm; it supplies the values of the fixed parameters.
@@ -57,22 +57,24 @@ class Parameters(eqx.Module):
                 raise InputError(f"parameter '{name}' is named as held and as free; name it once.")
         if arm.beta is None and any(name.startswith("beta_") for name in (*held, *free)):
             arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
-        wanted = [name for name in parameter_names(arm) if name not in held and (name in free or not name.startswith("beta_"))]
+        wanted = [
+            name for name in parameter_names(arm) if name not in held and (name in free or not name.startswith("beta_"))
+        ]
         if not wanted:
             raise InputError("every parameter is held, so nothing is left to identify; hold fewer.")
         return cls(base=arm, names=tuple(wanted))
 
     @classmethod
     def independent(cls, arm: Arm, capture: SocketPoses | None = None) -> "Parameters":
-        """A largest set of parameters that a capture can determine well; redundant ones are fixed at their nominal values.
+        """A largest set of parameters that a capture determines well; redundant ones are fixed at their nominal values.
 
-        Fixed too is one parameter of every near-degenerate combination (`near_degeneracy`). For the paper's arm with a reference
-        length these are its 21; without one, the longest link is fixed too. Where neighbouring axes are nearly parallel, d of
-        the first is fixed and Hayati's beta is free instead.
+        Fixed too is one parameter of every near-degenerate combination (`near_degeneracy`). For the paper's arm with
+        a reference length these are its 21; without one, the longest link is fixed too. Where neighbouring axes are
+        nearly parallel, d of the first is fixed and Hayati's beta is free instead.
 
         Args:
-            arm: The nominal arm.
-            capture: The poses and reference lengths; by default poses over the whole workspace with one reference length.
+            arm: The nominal arm. capture: The poses and reference lengths; by default poses over the whole workspace
+            with one reference length.
 
         Raises:
             InputError: The capture has another number of joints, or determines nothing.
@@ -105,7 +107,9 @@ class Parameters(eqx.Module):
         """Position of a free parameter in the vector; raises `InputError` if it is not free."""
         if name not in self.names:
             locate(self.base, name)
-            raise InputError(f"parameter '{name}' is held, not free; free it, or name a free one, such as '{self.names[0]}'.")
+            raise InputError(
+                f"parameter '{name}' is held, not free; free it, or name a free one, such as '{self.names[0]}'."
+            )
         return self.names.index(name)
 
     def vector(self, arm: Arm | None = None) -> Float[Array, "... p"]:
@@ -182,14 +186,17 @@ class Bounds(eqx.Module):
         self.upper = as_array(upper, "upper")
         for what, bound in (("lower", self.lower), ("upper", self.upper)):
             if bound.shape[-1:] != (len(space.names),):
-                raise InputError(f"{what} has shape {bound.shape}, but {len(space.names)} parameters are free; give one each.")
+                raise InputError(
+                    f"{what} has shape {bound.shape}, but {len(space.names)} parameters are free; give one each."
+                )
         if is_concrete(self.lower, self.upper):
             wrong = ~(np.asarray(self.lower) <= np.asarray(self.upper))  # also true for NaN
             if wrong.any():
                 i = int(np.argwhere(wrong)[0][-1])
                 low, high = np.asarray(self.lower)[..., i].ravel()[0], np.asarray(self.upper)[..., i].ravel()[0]
                 raise InputError(
-                    f"bounds of {space.names[i]} are {low:g} to {high:g}; the lower must be a number not above the upper."
+                    f"bounds of {space.names[i]} are {low:g} to {high:g}; the lower must be a number not above the "
+                    "upper."
                 )
 
     @classmethod

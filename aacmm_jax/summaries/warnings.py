@@ -41,7 +41,7 @@ def of_capture(recording: Recording) -> list[str]:
 
 
 def of_calibration(record: CalibrationRecord, seen: Observability | None = None) -> list[str]:
-    """Everything about a calibration that should be read before its numbers; ``seen`` is the result of `observed`, if known."""
+    """What should be read about a calibration before its numbers; ``seen`` is the result of `observed`, if known."""
     seen = observed(record) if seen is None else seen
     found = [] if record.converged else [record.reason]
     found += _validation(record)
@@ -50,7 +50,7 @@ def of_calibration(record: CalibrationRecord, seen: Observability | None = None)
 
 
 def observed(record: CalibrationRecord) -> Observability:
-    """What the data of a calibration determine about the calibrated arm, given the noise and the bounds of the calibration."""
+    """What the data of a calibration determine about the calibrated arm, given its noise and bounds."""
     arm, capture = record.calibrated.arm, record.recording.capture
     covariances = tip_covariances(arm.geometry, sines_cosines(jnp.asarray(capture.q)), record.noise)
     sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
@@ -66,16 +66,17 @@ def _validation(record: CalibrationRecord) -> list[str]:
         found.append(
             f"Sockets left out one placement after the other have errors {validation.excess:.1f} times their predicted "
             f"uncertainty ({validation.rms:.3g} mm RMS instead of {validation.rms_predicted:.3g}, lengths "
-            f"{validation.length_rms:.3g} mm instead of {validation.length_u:.3g}): errors of neighbouring poses are alike, as "
-            "of effects outside the D-H model (compliant joints, eccentric encoders). Use the cross-validated values; every u "
-            "below is too small."
+            f"{validation.length_rms:.3g} mm instead of {validation.length_u:.3g}): errors of neighbouring poses are "
+            "alike, as of effects outside the D-H model (compliant joints, eccentric encoders). Use the cross-validated "
+            "values; every u below is too small."
         )
     if record.reduced_chi is not None and not 1 / _EXCESS < record.reduced_chi < _EXCESS:
         word = "small" if record.reduced_chi > 1 else "large"
         factor = max(record.reduced_chi, 1 / record.reduced_chi)
         found.append(
-            f"Residuals are {record.reduced_chi:.2g} times what the given noise predicts, and every uncertainty below follows "
-            f"from that noise: it is about {factor:.2g} times too {word}. Check the noise, or leave it out to have it estimated."
+            f"Residuals are {record.reduced_chi:.2g} times what the given noise predicts, and every uncertainty below "
+            f"follows from that noise: it is about {factor:.2g} times too {word}. Check the noise, or leave it out to "
+            "have it estimated."
         )
     return found
 
@@ -84,17 +85,21 @@ def _scale(record: CalibrationRecord) -> list[str]:
     k = record.k
     stage1 = _sides(record)
     if not plausible(k):
-        unit = next((u for u, factor in (("m", 1000), ("cm", 10), ("inch", 1 / 25.4)) if abs(k / factor - 1) < 0.1), None)
+        unit = next(
+            (u for u, factor in (("m", 1000), ("cm", 10), ("inch", 1 / 25.4)) if abs(k / factor - 1) < 0.1), None
+        )
         hint = f"are the lengths in {unit} by mistake?" if unit else "check units, sockets, lengths and arm."
         return [f"k = {k:.6g} cannot be the scale of this arm; {hint}"]
     if record.hold is None and stage1:
         word = "shrank" if k < 1 else "stretched"
         return [
-            f"Stage 1 ran with every length free and {word} the arm to k = {k:.5f} until a bound stopped it: {_some(stage1)}. "
-            "The scale fix undoes that; hold a length (--hold) to avoid it."
+            f"Stage 1 ran with every length free and {word} the arm to k = {k:.5f} until a bound stopped it: "
+            f"{_some(stage1)}. The scale fix undoes that; hold a length (--hold) to avoid it."
         ]
     if record.hold is not None and abs(k - 1) > max(_SUSPICIOUS_SCALE, 3 * record.u_k):
-        return [f"k = {k:.5f} is far from 1: is {record.hold} at its nominal value, and is each reference length right?"]
+        return [
+            f"k = {k:.5f} is far from 1: is {record.hold} at its nominal value, and is each reference length right?"
+        ]
     return []
 
 
@@ -113,11 +118,15 @@ def _bounds(record: CalibrationRecord, seen: Observability) -> list[str]:
     found = []
     if weak:
         found.append(
-            f"On a bound because the data hardly determine them: {_some(weak)}; fix one parameter of each combination named "
-            "below (--held), and do not widen the bounds. Until then the width of the bounds is part of their uncertainties."
+            f"On a bound because the data hardly determine them: {_some(weak)}; fix one parameter of each combination "
+            "named below (--held), and do not widen the bounds. Until then the width of the bounds is part of their "
+            "uncertainties."
         )
     if others:
-        found.append(f"On a bound: {_some(others)}; widen the bounds unless they are known limits. Uncertainties leave these out.")
+        found.append(
+            f"On a bound: {_some(others)}; widen the bounds unless they are known limits. Uncertainties leave these "
+            "out."
+        )
     return found
 
 
@@ -132,7 +141,9 @@ def _data(record: CalibrationRecord) -> list[str]:
     if len(far):
         worst = sorted(far, key=lambda i: -distances[i])
         names = [f"{capture.names[owner[i]]} pose {i - first[owner[i]] + 1} ({distances[i]:.3g} mm)" for i in worst]
-        found.append(f"Poses far from their socket, where {typical:.2g} mm is typical: {_some(names)}; was the tip seated?")
+        found.append(
+            f"Poses far from their socket, where {typical:.2g} mm is typical: {_some(names)}; was the tip seated?"
+        )
     error = np.asarray(evaluation.error)
     normalised = np.abs(error) / np.hypot(np.asarray(evaluation.u), 1e-9)
     wrong = [
@@ -145,16 +156,16 @@ def _data(record: CalibrationRecord) -> list[str]:
     surplus = 3 * sum(size - 1 for size in capture.sizes) - (len(record.names) - 1)
     if surplus < (len(record.names) - 1) / 2:
         found.append(
-            f"Only {surplus} more equations than unknowns, which makes the residuals small whatever the errors are; record more "
-            "poses."
+            f"Only {surplus} more equations than unknowns, which makes the residuals small whatever the errors are; "
+            "record more poses."
         )
     error, u = np.asarray(evaluation.error), np.asarray(evaluation.u)
     birge = float(np.sqrt(np.sum((error / u) ** 2) / (len(error) - 1))) if len(error) > 1 and np.all(u > 0) else 0.0
     if birge > _EXCESS:
         found.append(
-            f"The {len(error)} reference lengths disagree {birge:.2g} times as much as their u and the scatter of the poses "
-            "predict (Birge ratio), and u(k) has been multiplied by it. Look for a wrong length, or for errors outside the D-H "
-            "model."
+            f"The {len(error)} reference lengths disagree {birge:.2g} times as much as their u and the scatter of the "
+            "poses predict (Birge ratio), and u(k) has been multiplied by it. Look for a wrong length, or for errors "
+            "outside the D-H model."
         )
     if len(capture.lengths) == 1:
         found.append("One reference length fixes the scale, so its own error is no check; keep another for checking.")
@@ -170,8 +181,8 @@ def _identifiability(record: CalibrationRecord, seen: Observability) -> list[str
     weak = [name for name in weak if name not in named]
     if weak:
         found.append(
-            f"Determined only together, hardly one by one: {_some(weak, 12)}. Tips and lengths that follow from them have an "
-            "uncertainty, but these have none of their own; fix the redundant ones (--held)."
+            f"Determined only together, hardly one by one: {_some(weak, 12)}. Tips and lengths that follow from them "
+            "have an uncertainty, but these have none of their own; fix the redundant ones (--held)."
         )
     u, width = np.sqrt(np.diag(record.covariance)), (record.upper - record.lower) / 2
     loose = [
@@ -185,7 +196,9 @@ def _identifiability(record: CalibrationRecord, seen: Observability) -> list[str
             "fix some (--held), or record poses that separate them."
         )
     scaled = [
-        name for name in record.held if is_length(name) and name != "d_1" and value_of(record.recording.nominal.arm, name) != 0
+        name
+        for name in record.held
+        if is_length(name) and name != "d_1" and value_of(record.recording.nominal.arm, name) != 0
     ]
     if scaled:
         found.append(f"The scale fix divides every length by k, fixed ones too: {_some(scaled)}.")

@@ -1,15 +1,16 @@
 """The uncertainty of parameters that are on a bound only because the data hardly determine them.
 
-A covariance at active bounds is conditional: the parameter on its bound counts as known, and all others follow from that. This
-is right where the data would carry the parameter well past its bound, so that the bound is knowledge. It is wrong where the
-parameter drifted there along a near-degenerate direction (`kinematics.near_degeneracy`): then the bound is the accidental end of
-that direction, and the parameters that imitate each other inherit a false exactness from it.
+A covariance at active bounds is conditional: the parameter on its bound counts as known, and all others follow from
+that. This is right where the data would carry the parameter well past its bound, so that the bound is knowledge. It
+is wrong where the parameter drifted there along a near-degenerate direction (`kinematics.near_degeneracy`): then the
+bound is the accidental end of that direction, and the parameters that imitate each other inherit a false exactness
+from it.
 
-For such a parameter i, with the best imitation v of one step of it by the parameters inside their bounds, the data leave
-everything between the bounds equally likely. With a half-width h, the mean square of a rectangular distribution about an
-estimate at its edge is (2 h)^2 / 3 (JCGM 100, F.2.4.5: an offset that is not corrected counts in full), and (2 h)^2 / 3 v v^T
-is added to the covariance. The information on v includes the reference lengths, so that the scale of an arm that stage 1 shrank
-to its bounds is not meant: the lengths determine it.
+For such a parameter i, with the best imitation v of one step of it by the parameters inside their bounds, the data
+leave everything between the bounds equally likely. With a half-width h, the mean square of a rectangular distribution
+about an estimate at its edge is (2 h)^2 / 3 (JCGM 100, F.2.4.5: an offset that is not corrected counts in full), and
+(2 h)^2 / 3 v v^T is added to the covariance. The information on v includes the reference lengths, so that the scale
+of an arm that stage 1 shrank to its bounds is not meant: the lengths determine it.
 """
 
 import dataclasses
@@ -75,5 +76,5 @@ def with_active_bounds(
     weak = information_along * (SHARE_OF_BOUNDS * half_widths) ** 2 < 1
     weak = on_bound & (weak | (movement < LEAST_MOVEMENT**2 * size))
     variance = jnp.where(weak, (2 * half_widths) ** 2 / 3, 0.0)
-    added = space.scale[:, None] * ((directions * variance) @ directions.T) * space.scale[None, :]
+    added = space.scale[:, None] * ((directions * variance[None, :]) @ directions.T) * space.scale[None, :]
     return known._replace(matrix=matrix + added)

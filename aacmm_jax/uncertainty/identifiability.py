@@ -1,4 +1,4 @@
-"""What a capture determines: rank, undetermined directions by parameter names, near-degenerate ones, observability indices."""
+"""What a capture determines: rank, undetermined and near-degenerate directions, observability indices."""
 
 from typing import NamedTuple
 
@@ -27,8 +27,8 @@ _NAMED = 4
 class Observability(NamedTuple):
     """What a capture determines of the free parameters of an arm, as NumPy arrays.
 
-    Derivatives are in natural steps (1 mm, 1 mrad) and, where the noise is given, in its standard deviations; else in mm.
-    ``null`` ``(p, nullity)`` are directions that change nothing that was recorded.
+    Derivatives are in natural steps (1 mm, 1 mrad) and, where the noise is given, in its standard deviations; else in
+    mm. ``null`` ``(p, nullity)`` are directions that change nothing that was recorded.
     """
 
     names: tuple[str, ...]
@@ -51,9 +51,9 @@ class Observability(NamedTuple):
     def indices(self) -> dict[str, float]:
         """Observability indices O1 to O5, larger is better; all 0 if a direction is not determined.
 
-        O1 = (prod s)^(1/L) / sqrt(m), O2 = s_L / s_1, O3 = s_L, O4 = s_L^2 / s_1, O5 = 1 / sum(1 / s), for the L singular
-        values s_1 >= ... >= s_L of m poses. Sources: Borm and Menq 1991; Driels and Pathre 1990; Nahvi et al. 1994; Nahvi
-        and Hollerbach 1996; Sun and Hollerbach 2008.
+        O1 = (prod s)^(1/L) / sqrt(m), O2 = s_L / s_1, O3 = s_L, O4 = s_L^2 / s_1, O5 = 1 / sum(1 / s), for the L
+        singular values s_1 >= ... >= s_L of m poses. Sources: Borm and Menq 1991; Driels and Pathre 1990; Nahvi et
+        al. 1994; Nahvi and Hollerbach 1996; Sun and Hollerbach 2008.
         """
         s = self.singular
         if self.rank < len(self.names):
@@ -83,13 +83,13 @@ class Observability(NamedTuple):
                 texts.append(f"{len(self.trade_offs) - _NAMED} more combinations")
             first = ", ".join(trade_off.names[0] for trade_off in self.trade_offs)
             found.append(
-                f"Hardly determined by these data: {'; '.join(texts)}. Fix one of each, such as {first} (--held); wider bounds "
-                "do not help."
+                f"Hardly determined by these data: {'; '.join(texts)}. Fix one of each, such as {first} (--held); "
+                "wider bounds do not help."
             )
         for i in self.parallel:
             found.append(
-                f"Axes {i} and {i + 1} are nearly parallel, where d_{i} and d_{i + 1} trade off and a small tilt has no D-H "
-                f"parameters: fix d_{i} and free beta_{i} (--free beta_{i})."
+                f"Axes {i} and {i + 1} are nearly parallel, where d_{i} and d_{i + 1} trade off and a small tilt has "
+                f"no D-H parameters: fix d_{i} and free beta_{i} (--free beta_{i})."
             )
         return found
 
@@ -105,17 +105,18 @@ def observability(
 ) -> Observability:
     """What the poses and reference lengths of a capture determine of the free parameters.
 
-    The poses are first moved to their socket's centroid by this arm, a few mm at most, so that the errors of an arm that is
-    not yet calibrated do not look like information. For near-degenerate directions see `kinematics.near_degeneracy`.
+    The poses are first moved to their socket's centroid by this arm, a few mm at most, so that the errors of an arm
+    that is not yet calibrated do not look like information. For near-degenerate directions see
+    `kinematics.near_degeneracy`.
 
     Args:
-        arm: The arm, nominal or calibrated.
-        capture: Poses and reference lengths.
-        space: The free parameters; by default those of ``bounds``, else those of `Parameters.free_of`.
-        noise: Of readings and seat, if known: the equations are then weighted by it.
-        sigma: Standard deviation of a tip coordinate, mm, such as that of the residuals; with ``noise`` it follows from that.
+        arm: The arm, nominal or calibrated. capture: Poses and reference lengths. space: The free parameters; by
+        default those of ``bounds``, else those of `Parameters.free_of`. noise: Of readings and seat, if known: the
+        equations are then weighted by it. sigma: Standard deviation of a tip coordinate, mm, such as that of the
+        residuals; with ``noise`` it follows from that.
             With it near-degenerate is also what the data determine hardly better than the bounds.
-        bounds: Bounds that ``sigma`` is compared with; by default of +-10 mm and +-17.5 mrad, the default of `Bounds.around`.
+        bounds: Bounds that ``sigma`` is compared with; by default of +-10 mm and +-17.5 mrad, the default of
+        `Bounds.around`.
 
     Raises:
         InputError: Capture and arm do not fit.
@@ -186,10 +187,12 @@ def _trade_offs(
     sizes = np.asarray(capture.sizes, dtype=float)
     u = np.array([float(length.u) for length in capture.lengths])
     u_lengths = np.sqrt(u**2 + sigma**2 * np.sum(1 / sizes[capture.ends()], axis=1)) if len(u) else u
-    whitened = np.concatenate([
-        spectrum.poses.reshape(-1, len(space.names)) / sigma,
-        spectrum.lengths / u_lengths[:, None],
-    ])
+    whitened = np.concatenate(
+        [
+            spectrum.poses.reshape(-1, len(space.names)) / sigma,
+            spectrum.lengths / u_lengths[:, None],
+        ]
+    )
     default = np.where(space.lengths, 10.0, 17.5)
     half = default
     if bounds is not None:
@@ -205,8 +208,10 @@ def _lacks_beta(space: Parameters, i: int) -> bool:
 
 @eqx.filter_jit
 def whitened_equations(arm: Arm, space: Parameters, measurement: Measurement) -> Float[Array, "rows p"]:
-    """Derivatives of everything measured by the free parameters, in natural steps and in standard deviations; the measurement
-    carries its weights."""
+    """Derivatives of everything measured by the free parameters, in natural steps and standard deviations.
+
+    The measurement has weights.
+    """
     linear = linearised(arm, space, measurement, jnp.zeros(len(space.names), dtype=bool))
     lengths = joint_weights(arm, measurement, jnp.zeros(())).whitening @ linear.lengths
     return jnp.concatenate([linear.counted.reshape(linear.counted.shape[0], -1).T, lengths])
@@ -217,7 +222,9 @@ def _remedy(arm: Arm, capture: Capture, space: Parameters, rank: int) -> str:
     random = np.random.default_rng(0)
     limits = np.asarray(joint_limits(arm, None))
     # The zero byte keeps the invented sockets apart from those of the capture.
-    more_sockets = {f"\0{i}": q[None] for i, q in enumerate(random.uniform(limits[:, 0], limits[:, 1], (4, arm.joints)))}
+    more_sockets = {
+        f"\0{i}": q[None] for i, q in enumerate(random.uniform(limits[:, 0], limits[:, 1], (4, arm.joints)))
+    }
     one = [ReferenceLength("\0000", "\0001", 1.0)]
     two = [*one, ReferenceLength("\0002", "\0003", 1.0)]
     first = next(iter(capture.sockets))

@@ -51,7 +51,7 @@ def _text(names: list[str]) -> str:
 
 
 def structural(null: Float[np.ndarray, "p nullity"], arm: Arm, space: Parameters) -> Bool[np.ndarray, " nullity"]:
-    """Which directions move the tip, in any pose, only as a rigid motion of the whole arm: no socket and no length shows it."""
+    """Which directions move the tip, in any pose, only as a rigid motion of the whole arm, which no capture shows."""
     if not null.shape[1]:
         return np.zeros(0, dtype=bool)
     count = _CONFIGURATIONS

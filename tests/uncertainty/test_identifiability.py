@@ -17,7 +17,10 @@ def single(paper_arm) -> aj.Capture:
 def parallel_arm() -> aj.Arm:
     """Three parallel axes, as on many robots."""
     return aj.Arm(
-        alpha=np.radians([90, 0, 0, 90, -90, 0]), a=[0, -425, -392, 0, 0, 0], d=[89, 0, 0, 109, 95, 82], probe=(30, 10, 100)
+        alpha=np.radians([90, 0, 0, 90, -90, 0]),
+        a=[0, -425, -392, 0, 0, 0],
+        d=[89, 0, 0, 109, 95, 82],
+        probe=(30, 10, 100),
     )
 
 
@@ -91,7 +94,8 @@ def test_indices_of_a_known_spectrum(paper_arm, paper_capture):
     seen = aj.observability(paper_arm, paper_capture)
     s, m = seen.singular, 71
     assert seen.indices == pytest.approx({
-        "O1": np.prod(s) ** (1 / 21) / np.sqrt(m), "O2": s[-1] / s[0], "O3": s[-1], "O4": s[-1] ** 2 / s[0], "O5": 1 / np.sum(1 / s)
+        "O1": np.prod(s) ** (1 / 21) / np.sqrt(m), "O2": s[-1] / s[0], "O3": s[-1], "O4": s[-1] ** 2 / s[0],
+        "O5": 1 / np.sum(1 / s),
     })  # fmt: skip
     assert np.all(np.diff(s) <= 0)
     assert seen.condition < s[0] / s[-1] * 2
@@ -116,7 +120,7 @@ def test_few_poses_are_told_what_would_help(paper_arm, paper_capture):
 
 @pytest.mark.parametrize("lengths", [0, 1])
 def test_independent_parameters_are_the_papers(paper_arm, single, paper_capture, lengths):
-    """With a length the 21; without, the longest link is held besides. A whole set: everything is determined, nothing could be added."""
+    """With a length the 21; without, the longest link is fixed too. All are determined, none could be added."""
     capture = paper_capture if lengths else single
     chosen = aj.Parameters.independent(paper_arm, capture)
     default = set(aj.Parameters.free_of(paper_arm).names)
@@ -125,7 +129,7 @@ def test_independent_parameters_are_the_papers(paper_arm, single, paper_capture,
 
 
 def test_independent_parameters_of_a_straight_wrist():
-    """On the Panda the probe lies along the last axis: theta_6 and alpha_6 are then imitated by a_6, d_6 and the probe."""
+    """The Panda's probe lies along its last axis: theta_6 and alpha_6 are imitated by a_6, d_6 and the probe."""
     panda = aj.load_arm("panda")
     capture = aj.simulate(panda, {"A": (400, 200, 300), "B": (450, 200, 300)}, poses=40, lengths=[("A", "B")])
     chosen = aj.Parameters.independent(panda, capture)
