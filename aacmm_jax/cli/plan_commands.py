@@ -72,7 +72,6 @@ def plan(
     from ..data.noise import Noise
     from ..files.arms import load_specification
     from ..files.plans import save_plan
-    from ..kinematics.parameters import Parameters
     from ..planning.design import plan as run
     from ..summaries.planning import plan_summary
     from . import acceptance_display, plan_display
@@ -118,7 +117,7 @@ def plan(
             u=u_mm,
             lengths=[length_option(text) for text in length or ()],
             region=dict(axes) if axes else None,
-            space=Parameters.free_of(specification.arm, held=specification.held),
+            space=specification.space(),
             noise=Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm),
             criterion=criterion,
             margin=math.radians(margin_deg),

@@ -8,7 +8,8 @@ from jaxtyping import Array, Float
 from ..core.arrays import Numbers, as_floats, is_concrete
 from ..core.errors import InputError
 from ..core.units import ARCSEC
-from ..kinematics.chain import Geometry, SinesCosines, forward_pass, jacobian_columns
+from ..kinematics.chain import Geometry, SinesCosines, forward_pass
+from ..kinematics.jacobian import jacobian_columns
 
 _MOST = {"encoder_arcsec": 36_000.0, "seating": 100.0}  # ten degrees; mm
 

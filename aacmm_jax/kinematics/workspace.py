@@ -1,4 +1,4 @@
-"""Where an arm can be: its reach, its lowest point, poses at given points, and poses as lines in space."""
+"""The workspace of an arm: its reach, lowest point, configurations at given points, and links as lines in space."""
 
 import math
 from collections.abc import Sequence
@@ -19,33 +19,33 @@ _STARTS, _SWEEPS = 256, 30
 
 
 class Reach(NamedTuple):
-    """The ball that an arm's tip stays in, mm."""
+    """The smallest ball about the shoulder that contains all positions of the tip, mm."""
 
-    shoulder: Float[np.ndarray, " 3"]  # its centre: on the first axis, d_1 above the base
+    shoulder: Float[np.ndarray, " 3"]  # on the first axis, d_1 above the base
     radius: float
 
 
 def arm_reach(arm: Arm) -> Reach:
-    """How far the tip can be from the shoulder within the joint limits.
+    """Largest distance of the tip from the shoulder within the joint limits.
 
-    Along one joint the squared distance is a constant and a sinusoid, so three of its values tell where it is largest. From many
-    starts, joint after joint is set there until nothing changes: exact but for the choice of starts, and quick.
+    As a function of one joint the squared distance is a constant plus a sinusoid, so its maximum follows from three
+    values. From many random starts, joint after joint is set to its maximum until nothing changes.
     """
     shoulder = np.array([0.0, 0.0, float(arm.d[0])])
     limits = np.asarray(joint_limits(arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_STARTS, arm.joints))
 
-    def squared(poses: np.ndarray) -> np.ndarray:
-        return np.sum((np.asarray(arm.position(poses)) - shoulder) ** 2, axis=-1)
+    def squared(configurations: np.ndarray) -> np.ndarray:
+        return np.sum((np.asarray(arm.position(configurations)) - shoulder) ** 2, axis=-1)
 
     best = 0.0
     for _ in range(_SWEEPS):
-        for joint in range(1, arm.joints):  # the first only turns the whole arm
-            turned = np.repeat(q[None], 3, axis=0)
-            turned[1, :, joint], turned[2, :, joint] = q[:, joint] + 2 * np.pi / 3, q[:, joint] - 2 * np.pi / 3
-            here, ahead, behind = squared(turned)
+        for joint in range(1, arm.joints):  # the first rotates the whole arm about the shoulder's axis
+            three = np.repeat(q[None], 3, axis=0)
+            three[1, :, joint], three[2, :, joint] = q[:, joint] + 2 * np.pi / 3, q[:, joint] - 2 * np.pi / 3
+            middle, after, before = squared(three)
             # f(t) = c + A cos t + B sin t about the present angle.
-            cosine, sine = (2 * here - ahead - behind) / 3, (ahead - behind) / np.sqrt(3)
+            cosine, sine = (2 * middle - after - before) / 3, (after - before) / np.sqrt(3)
             highest = q[:, joint] + np.arctan2(sine, cosine)
             low, high = limits[joint]
             whole = highest + 2 * np.pi * np.ceil((low - highest) / (2 * np.pi))
@@ -64,7 +64,7 @@ def arm_reach(arm: Arm) -> Reach:
 
 
 def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"]:
-    """Corners of the arm in each pose, mm: the base, for each joint the end of its offset and of its link, and the tip (``c`` = 2 n + 2)."""
+    """Corners of the arm, mm: the base, the end of each joint's offset and of its link, and the tip (c = 2 n + 2)."""
 
     def lines(rows: np.ndarray) -> np.ndarray:
         forward = forward_pass(arm.geometry, sines_cosines(jnp.asarray(rows)))
@@ -81,7 +81,7 @@ def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"
 
 
 def lowest_point(arm: Arm, q: Float[np.ndarray, "c n"]) -> Float[np.ndarray, " c"]:
-    """Height of each pose's lowest joint or tip in the base frame, mm; the base itself left out."""
+    """Height of the lowest joint or tip in the base frame, mm, without the base itself, for each configuration."""
     return in_chunks(lambda rows: np.asarray(_lowest(arm.geometry, jnp.asarray(rows))), q)
 
 
@@ -92,7 +92,7 @@ def _lowest(geometry: Geometry, q: Array) -> Float[Array, " c"]:
 
 
 def total_link_length(arm: Arm) -> float:
-    """What the links and the probe measure together, without the base's height, mm."""
+    """Sum of the lengths of the links and the probe, without the base's height d_1, mm."""
     return float(np.abs(arm.a).sum() + np.abs(np.asarray(arm.d)[1:]).sum() + np.linalg.norm(np.asarray(arm.probe)))
 
 

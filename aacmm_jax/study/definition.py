@@ -165,7 +165,7 @@ class Study:
         """The free parameters, on the nominal arm."""
         held = self.specification.identification.held
         with _naming("identification.held"):
-            return Parameters.free_of(self.nominal.arm, held=self.nominal.held if held is None else held)
+            return self.nominal.space() if held is None else Parameters.free_of(self.nominal.arm, held=held)
 
     @cached_property
     def digest(self) -> str:

@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..kinematics.arm import with_values
-from ..kinematics.chain import Geometry, forward_pass, jacobian_columns
+from ..kinematics.chain import Geometry, forward_pass
 from ..kinematics.inverse_kinematics import damped_inverse
+from ..kinematics.jacobian import jacobian_columns
 from .definition import POOL_PARTS, CellValues, Setting, Study
 from .pools import Pool, pool_of
 

@@ -20,6 +20,7 @@ from ..core.errors import InputError
 from ..kinematics import chain
 from ..kinematics.arm import Arm
 from ..kinematics.inverse_kinematics import damped_inverse, solve_to_targets
+from ..kinematics.jacobian import jacobian_columns
 from .definition import POOL_PARTS, Fixture, Setting, Study, pool_capacity
 from .specification import Region
 
@@ -181,7 +182,7 @@ def _solved(arm: Arm, start: np.ndarray, points: np.ndarray, limits: Array) -> t
 @jax.jit
 def _solve(geometry: chain.Geometry, start: Array, points: Array, limits: Array) -> tuple[Array, Array]:
     q, distance = solve_to_targets(geometry, start, points, limits, _STEPS)
-    columns = chain.jacobian_columns(chain.forward_pass(geometry, chain.sines_cosines(q)))["theta"]
+    columns = jacobian_columns(chain.forward_pass(geometry, chain.sines_cosines(q)))["theta"]
     inverse = damped_inverse(columns, jnp.zeros(q.shape[0]))
     condition = jnp.sqrt(jnp.sum(columns**2, axis=(0, 1)) * jnp.sum(inverse**2, axis=(0, 1)))
     return q, (distance <= _TOLERANCE) & (condition <= _MOST_CONDITION)
@@ -199,7 +200,7 @@ def _rows(arm: Arm, q: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 @jax.jit
 def _inverse(geometry: chain.Geometry, q: Array) -> Array:
-    columns = chain.jacobian_columns(chain.forward_pass(geometry, chain.sines_cosines(q)))["theta"]
+    columns = jacobian_columns(chain.forward_pass(geometry, chain.sines_cosines(q)))["theta"]
     return jnp.moveaxis(damped_inverse(columns, jnp.zeros(q.shape[0])), -1, 0).reshape(q.shape[0], -1)
 
 
