@@ -10,6 +10,7 @@ from ..calibration.checks import plausible
 from ..calibration.record import CalibrationRecord
 from ..data.recording import Recording
 from ..kinematics.arm import Arm
+from ..kinematics.chain import Geometry
 from ..kinematics.specification import ArmSpecification
 from .decision import Limit
 from .suite import AcceptanceTest, Measured, checked_limits, measured_by, run, unstated
@@ -111,10 +112,12 @@ def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:
 
 
 def _same(one: Arm, other: Arm) -> bool:
-    return one.joints == other.joints and all(
-        np.array_equal(np.asarray(getattr(one, kind)), np.asarray(getattr(other, kind)))
-        for kind in ("alpha", "a", "d", "theta", "probe")
-    )
+    """Whether two arms have the same parameters; an arm without beta is one whose beta is zero."""
+
+    def parameters(arm: Arm) -> Geometry:
+        return arm.geometry._replace(beta=np.zeros(arm.joints) if arm.beta is None else arm.beta)
+
+    return all(map(np.array_equal, parameters(one), parameters(other)))
 
 
 MAXIMA = ("rms_mm", "deltam_mm", "length_error_largest_mm")

@@ -3,7 +3,6 @@
 None touches matplotlib's global state; save one with ``axes.figure.savefig("name.pdf")``. All are readable in grey.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ from ..acceptance.suite import AcceptanceTest
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.arrays import Numbers
 from ..core.errors import InputError
+from ..core.units import ARCSEC
 from ..files.whole_file import whole_file
 from ..kinematics.arm import Arm, is_length
 from ..model.measurement import Measurement
@@ -26,7 +26,6 @@ from .drift import trend as trend
 if TYPE_CHECKING:
     from ..study.results import Results
 
-_ARCSEC = 3600 * 180 / math.pi
 _DARK, _WARM, _LIGHT = "#1b3a6b", "#d95f02", "0.65"
 _STAGES: Mapping[str, Mapping[str, Any]] = {
     "nominal": {"label": "as found", "color": _LIGHT, "marker": "o"},
@@ -79,7 +78,7 @@ def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any
     axes = _axes(axes)
     uncertainty, vectors = uncertainty_of(record), record.vectors()
     chosen = [i for i, name in enumerate(record.names) if is_length(name) == (kind == "length")]
-    scale = 1.0 if kind == "length" else _ARCSEC
+    scale = 1.0 if kind == "length" else 1 / ARCSEC
     change = scale * (vectors["calibrated"] - vectors["nominal"])[chosen]
     expanded = scale * uncertainty.factor() * np.asarray(uncertainty.u)[chosen]
     known = np.isfinite(expanded)
@@ -226,7 +225,7 @@ def study(results: "Results", figure: str = "length_error", axes: Any = None) ->
         raise InputError(f"a study has no figure '{figure}'; choose one of {', '.join(FIGURES)}.")
     axes = _axes(axes)
     cells = range(len(results.study.cells))
-    scale, unit = (_ARCSEC, " [arcsec]") if figure.startswith("angle") else (1.0, "" if figure[0] in "ks" else " [mm]")
+    scale, unit = (1 / ARCSEC, " [arcsec]") if figure.startswith("angle") else (1.0, "" if figure[0] in "ks" else " [mm]")
     for cell in cells:
         values = results.column(figure, cell)[results.column("converged", cell) == 1]
         values = scale * values[np.isfinite(values)]

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
+from ..core.units import ARCSEC
 from ..files.whole_file import whole_file
 from ..study.results import Results
 from ..study.specification import unit
@@ -14,7 +15,6 @@ from ..study.statistics import FIGURES, correlation
 
 _BEFORE, _AFTER = "#d95f02", "#1b3a6b"
 _UNITS = {"de": "mm", "deltam": "mm", "length_error": "mm", "angle_error": "arcsec"}
-_ARCSEC = 3600 * 180 / np.pi
 _WIDTHS = ("bounds.length_mm", "bounds.angle_deg")
 _SHIFTS = ("bounds.length_shift_mm", "bounds.angle_shift_deg")
 
@@ -179,7 +179,7 @@ def _there(results: Results, name: str) -> str | None:
 
 def _values(results: Results, name: str, cells: Sequence[int]) -> np.ndarray:
     """A figure of the converged trials of some cells; angles in arcseconds."""
-    factor = _ARCSEC if name.startswith("angle") else 1.0
+    factor = 1 / ARCSEC if name.startswith("angle") else 1.0
     rows = [results.column(name, cell)[results.column("converged", cell) == 1] for cell in cells]
     values = factor * np.concatenate(rows)
     return values[np.isfinite(values)]

@@ -7,12 +7,13 @@ import numpy as np
 
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord, uncertainty_of
+from ..core.units import ARCSEC, DEG
 from ..summaries.calibration import calibration_summary
 from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
 from . import charts
 from .knowledge import bounds_section, correlations_section, observability_section, sampled_section, volume_section
-from .parts import ARCSEC, Chart, Report, Section, Table, decimals_of, number, shown, text
+from .parts import Chart, Report, Section, Table, decimals_of, number, shown, text
 from .residuals import figures_table, length_rows, residual_chart, socket_table
 from .scene import arms_of
 
@@ -127,7 +128,7 @@ def _found_and_left(record: CalibrationRecord, summary: dict[str, Any], evaluati
             [text(title), *(number(scale * summary["truth"][stage][key]) for stage in stages)]
             for key, title, scale in (
                 ("length_error_largest_mm", "largest error of a length parameter [mm]", 1.0),
-                ("angle_error_largest_rad", "largest error of an angle parameter [arcsec]", ARCSEC),
+                ("angle_error_largest_rad", "largest error of an angle parameter [arcsec]", 1 / ARCSEC),
             )
         ]
         blocks.append(Table("Against the true arm of the simulation", ("", *stages.values()), rows))
@@ -194,7 +195,7 @@ def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict
 def _parameters(record: CalibrationRecord, summary: dict[str, Any], factor: float) -> Section:
     rows, plotted = [], {"mm": [], "rad": []}
     for row in summary["parameters"]:
-        scale, unit = (1.0, "mm") if row["unit"] == "mm" else (180 / math.pi, "deg")
+        scale, unit = (1.0, "mm") if row["unit"] == "mm" else (1 / DEG, "deg")
         u = None if row["u"] is None else factor * scale * row["u"]
         decimals = decimals_of(u)
         change = scale * (row["calibrated"] - row["nominal"])
@@ -222,7 +223,7 @@ def _parameters(record: CalibrationRecord, summary: dict[str, Any], factor: floa
     ]
     for unit, title, scale, label in (
         ("mm", "Change of length parameters", 1.0, "mm"),
-        ("rad", "Change of angle parameters", ARCSEC, "arcsec"),
+        ("rad", "Change of angle parameters", 1 / ARCSEC, "arcsec"),
     ):
         if plotted[unit]:
             names, changes, u = zip(*plotted[unit], strict=True)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.record import CalibrationRecord
+from ..core.units import DEG
 from ..kinematics.arm import is_length
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
@@ -144,7 +145,7 @@ def bounds_section(record: CalibrationRecord, summary: dict[str, Any]) -> Sectio
     stage1 = summary["active_stage1"]
     rows, inside = [], []
     for i, name in enumerate(record.names):
-        scale, unit = (1.0, "mm") if is_length(name) else (180 / math.pi, "deg")
+        scale, unit = (1.0, "mm") if is_length(name) else (1 / DEG, "deg")
         width = record.upper[i] - record.lower[i]
         share = 2 * (vector[i] - record.lower[i]) / width - 1 if np.isfinite(width) and width > 0 else math.nan
         side = summary["active"].get(name) or stage1.get(name)

@@ -5,7 +5,6 @@ import math
 from typing import Any, NamedTuple
 
 _NOTHING = 1e-9  # mm: rounding
-ARCSEC = 3600 * 180 / math.pi
 
 
 class Cell(NamedTuple):

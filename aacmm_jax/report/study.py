@@ -4,20 +4,21 @@ from typing import Any
 
 import numpy as np
 
+from ..core.units import ARCSEC
 from ..study.results import Results
 from ..study.statistics import FIGURES, study_summary
 from . import charts
-from .parts import ARCSEC, Cell, Chart, Report, Section, Table, number, shown, text
+from .parts import Cell, Chart, Report, Section, Table, number, shown, text
 
 # What is shown: the figure's name, its factor and unit.
 _SHOWN = (
     ("length_error", 1.0, "mm"),
-    ("angle_error", ARCSEC, "arcsec"),
+    ("angle_error", 1 / ARCSEC, "arcsec"),
     ("de", 1.0, "mm"),
     ("deltam", 1.0, "mm"),
     ("scale_error", 1e6, "parts in a million"),
     ("length_error_stage1", 1.0, "mm"),
-    ("angle_error_stage1", ARCSEC, "arcsec"),
+    ("angle_error_stage1", 1 / ARCSEC, "arcsec"),
     ("de_stage1", 1.0, "mm"),
     ("deltam_stage1", 1.0, "mm"),
     ("k", 1.0, ""),
@@ -185,7 +186,7 @@ def _parameter_sections(summary: dict[str, Any]) -> list[Section]:
     rows = []
     for label, cell in zip(_labels(summary), summary["results"], strict=True):
         for row in cell.get("parameters", [])[: 4000 // max(summary["cells"], 1)]:
-            factor, unit = (ARCSEC, "arcsec") if row.get("unit") == "rad" else (1.0, "mm")
+            factor, unit = (1 / ARCSEC, "arcsec") if row.get("unit") == "rad" else (1.0, "mm")
             rows.append(
                 [
                     text(label),

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from ..calibration.checks import check_enough
 from ..calibration.scale_anchor import scale_anchor
 from ..core.errors import InputError, nearest
-from ..core.units import ARCSEC
+from ..core.units import ARCSEC, DEG
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..files.arms import load_specification, specification_toml
@@ -236,7 +236,7 @@ class Study:
     def _numbers(self, cell: Mapping[str, Any]) -> tuple:
         space, nominal, table = self.space, self.nominal, self.specification.bounds
         deviations = [_deviation(cell, name) for name in space.names]
-        factor = np.where(self._lengths, 1.0, math.pi / 180)
+        factor = np.where(self._lengths, 1.0, DEG)
         width = factor * [one.uniform if one.normal is None else one.normal for one in deviations]
         length, angle = cell.get("bounds.length_mm"), cell.get("bounds.angle_deg")
         length = nominal.length if length is None else length

@@ -16,7 +16,7 @@ from paper import NAMES, POSES, PUBLISHED, arm_of, box, figures_of, is_length, t
 from scipy.optimize import minimize
 
 import aacmm_jax as aj
-from aacmm_jax.data.simulation import ARCSEC
+from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.kinematics.inverse_kinematics import random_configurations
 
 # mm: three sockets well within the arm's reach of 1.4 m, since the paper does not print where its own stood.

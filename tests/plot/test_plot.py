@@ -64,7 +64,7 @@ def test_figures_hold_the_numbers(record, made):
     changes = aj.plot.parameter_changes(record, "angle").containers[0].lines[0].get_ydata()
     vectors = record.vectors()
     angles = [i for i, name in enumerate(record.names) if name.startswith(("alpha", "theta"))]
-    expected = np.degrees((vectors["calibrated"] - vectors["nominal"])[angles]) * 3600
+    expected = (vectors["calibrated"] - vectors["nominal"])[angles] / aj.units.ARCSEC
     np.testing.assert_allclose(changes, expected)
     values = aj.plot.singular_values(*made["singular_values"]).lines[0].get_ydata()
     np.testing.assert_allclose(values, made["singular_values"][0].singular)

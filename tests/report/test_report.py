@@ -176,7 +176,7 @@ def test_numbers_of_a_report_stand_under_the_right_heading(written):
     u = np.sqrt(np.diag(record.covariance))
     for row in parameters.rows:
         i = record.names.index(row[0].text)
-        scale = 180 / math.pi if row[1].text == "deg" else 1.0
+        scale = 1 / aj.units.DEG if row[1].text == "deg" else 1.0
         assert row[parameters.columns.index("as left")].value == pytest.approx(scale * record.vectors()["calibrated"][i])
         if row[parameters.columns.index("U (95 %)")].value is not None:
             assert row[parameters.columns.index("U (95 %)")].value == pytest.approx(scale * factor * u[i])

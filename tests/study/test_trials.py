@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.core.units import ARCSEC
+from aacmm_jax.core.units import ARCSEC, DEG
 from aacmm_jax.study import drawing, pools
 from aacmm_jax.study.definition import Block
 from aacmm_jax.study.trials import run_block
@@ -78,7 +78,7 @@ def test_no_pose_twice_and_all_within_the_limits(paper_arm):
 def test_deviations_have_their_distributions():
     study = made(deviation={"length_mm": 1.0, "d_mm": {"normal": 0.3}, "angle_deg": 0.1, "theta_deg": 0.0})
     trials = drawn(study, 4000)
-    off = (trials.true - np.asarray(study.space.vector())) / np.where(study.space.lengths, 1.0, np.pi / 180)
+    off = (trials.true - np.asarray(study.space.vector())) / np.where(study.space.lengths, 1.0, DEG)
     kinds = {kind: off[:, [n.startswith(kind + "_") for n in study.space.names]] for kind in ("a", "d", "alpha", "theta")}
     assert 0.99 < np.abs(kinds["a"]).max() <= 1
     assert kinds["a"].std() == pytest.approx(1 / 3**0.5, rel=0.02)
