@@ -1,1 +1,0 @@
-"""The figure of a calibration that the command line draws."""
