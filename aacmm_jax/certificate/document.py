@@ -11,8 +11,8 @@ from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity, held_by_xml
 from ..summaries.warnings import of_calibration, plausible
-from .results import add_results, uncertainty_says
-from .xml import DCC, SI, XSI, contact, identifications, ours, put, software, theirs, written
+from .measurement_results import add_results, uncertainty_says
+from .xml_elements import DCC, SI, XSI, contact, identifications, ours, put, software, theirs, written
 
 VERSION = "3.3.0"
 _PREFIXES = {"dcc": DCC, "si": SI}

@@ -102,7 +102,7 @@ def calibrate(
         record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
     save_calibration(output, record)
     if figure is not None:
-        from ..plot.axes import calibration_figure
+        from ..plot.calibration import calibration_figure
 
         calibration_figure(record, figure)
     show_summary(calibration_summary(record) | {"written": str(output)}, as_json, display.calibration)

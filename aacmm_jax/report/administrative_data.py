@@ -3,7 +3,7 @@
 from typing import Any
 
 from .about import _ADDRESS, _ALWAYS, _NOT, _WHERE_STATED, _stated, _temperature
-from .parts import Section, Table, text
+from .elements import Section, Table, text
 
 
 def administrative_section(about: Any, tested: bool) -> Section:

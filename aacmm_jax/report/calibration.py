@@ -12,10 +12,10 @@ from ..summaries.calibration import calibration_summary
 from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
 from . import charts
-from .knowledge import bounds_section, correlations_section, observability_section, sampled_section, volume_section
-from .parts import Chart, Report, Section, Table, decimals_of, number, shown, text
+from .uncertainty import bounds_section, correlations_section, observability_section, sampled_section, volume_section
+from .elements import Chart, Report, Section, Table, decimals_of, number, shown, text
 from .residuals import figures_table, length_rows, residual_chart, socket_table
-from .scene import arms_of
+from .arm_view import arms_of
 
 
 def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any]]:

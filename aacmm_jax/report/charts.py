@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from .parts import plain
+from .elements import plain
 
 DARK, WARM, LIGHT = "#1b3a6b", "#c8560a", "#9aa3ad"
 _FONT = {"family": "system-ui, sans-serif", "size": 13, "color": "#1a1a1a"}

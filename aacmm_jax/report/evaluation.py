@@ -13,9 +13,9 @@ from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
 from ..summaries.evaluation import evaluation_summary, points_summary
 from . import charts
-from .parts import Cell, Chart, Report, Section, Table, number, shown, text
+from .elements import Cell, Chart, Report, Section, Table, number, shown, text
 from .residuals import figures_table, length_rows, residual_chart, socket_table
-from .scene import arms_of
+from .arm_view import arms_of
 
 _MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}
 _STAGES = {"nominal": "as found", "calibrated": "as left"}

@@ -8,7 +8,7 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..data.capture import Capture
 from . import charts
-from .parts import Cell, Chart, Table, number, shown, text
+from .elements import Cell, Chart, Table, number, shown, text
 
 _FIGURES = (
     ("de_mm", "DE, mean distance of poses from their socket's centroid"),

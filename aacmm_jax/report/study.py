@@ -8,7 +8,7 @@ from ..core.units import ARCSEC
 from ..study.results import Results
 from ..study.statistics import FIGURES, study_summary
 from . import charts
-from .parts import Cell, Chart, Report, Section, Table, number, shown, text
+from .elements import Cell, Chart, Report, Section, Table, number, shown, text
 
 # What is shown: the figure's name, its factor and unit.
 _SHOWN = (

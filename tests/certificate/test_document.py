@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 import aacmm_jax as aj
-from aacmm_jax.certificate import xml as dcc_xml
+from aacmm_jax.certificate import xml_elements
 from aacmm_jax.certificate.document import dcc, parse_dcc
 from aacmm_jax.files.administrative_data import (
     AdministrativeData,
@@ -271,8 +271,8 @@ def test_any_number_reads_back(record, value):
     k = f"<si:value>{record.k!r}</si:value>"
     assert text.count(k) == 1
     parent = ElementTree.Element("x")
-    dcc_xml.real(parent, value, MM)
-    again = ElementTree.fromstring(dcc_xml.written(parent).replace("si:", ""))[0]
+    xml_elements.real(parent, value, MM)
+    again = ElementTree.fromstring(xml_elements.written(parent).replace("si:", ""))[0]
     read = parse_dcc(text.replace(k, f"<si:value>{again.findtext('value')}</si:value>"))["As left", "Scale", "k"].value
     assert (read, math.copysign(1, read)) == (value, math.copysign(1, value))
 
@@ -434,8 +434,8 @@ def test_any_text_survives_or_is_refused(text):
         from aacmm_jax.files.administrative_data import held_by_xml
 
         parent = ElementTree.Element("x")
-        dcc_xml.theirs(parent, "name", held_by_xml(text, "a name"))
-        return ElementTree.fromstring(dcc_xml.written(parent).replace("dcc:", "").encode()).findtext("name/content")
+        xml_elements.theirs(parent, "name", held_by_xml(text, "a name"))
+        return ElementTree.fromstring(xml_elements.written(parent).replace("dcc:", "").encode()).findtext("name/content")
 
     if is_held_by_xml(text):
         assert there_and_back() == text

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.report import charts, parts, write_report
+from aacmm_jax.report import charts, elements, write_report
 from aacmm_jax.report.residuals import outliers
 from tests.refusals import assert_refused
 
@@ -136,7 +136,7 @@ def test_a_calibration_report_says_what_the_calibration_found(written):
     assert f"{record.k:.8f}" in found.text
     for name, value, u in zip(record.names, record.vectors()["calibrated"], np.sqrt(np.diag(record.covariance)), strict=True):
         if name.startswith("a_") and u > 0:
-            decimals = parts.decimals_of(1.99 * u)
+            decimals = elements.decimals_of(1.99 * u)
             assert f"{value:.{decimals}f}".replace("-", "−") in found.text, name
     assert "on the upper bound" in found.text or "on the lower bound" in found.text
     assert "Read this first" in found.text
@@ -154,7 +154,7 @@ def tables_of(report):
     found = {}
     for section in report.sections:
         for block in section.blocks:
-            table = block.table if isinstance(block, parts.Chart) else block if isinstance(block, parts.Table) else None
+            table = block.table if isinstance(block, elements.Chart) else block if isinstance(block, elements.Table) else None
             if table is not None:
                 found[table.caption] = table
     return found
@@ -186,7 +186,7 @@ def test_numbers_of_a_report_stand_under_the_right_heading(written):
     places = tables["All places"]
     np.testing.assert_allclose([row[4].value for row in places.rows], factor * volume.u_length)
     charts_by_id = {
-        block.id: block for section in report.sections for block in section.blocks if isinstance(block, parts.Chart)
+        block.id: block for section in report.sections for block in section.blocks if isinstance(block, elements.Chart)
     }
     np.testing.assert_allclose(charts_by_id["volume"].figure["data"][0]["marker"]["color"], factor * volume.u_length, rtol=1e-3)
     change = charts_by_id["change-mm"].figure["data"][0]
@@ -232,7 +232,7 @@ def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
 
 def test_poses_alone_in_their_socket_show_no_scatter(written):
     from aacmm_jax.report.residuals import residual_chart, socket_table
-    from aacmm_jax.report.scene import arms_of
+    from aacmm_jax.report.arm_view import arms_of
 
     arm, q = written.record.calibrated.arm, written.record.recording.capture.q
     capture = aj.Capture({"A": q[:10], "B": q[10:11]})
@@ -310,11 +310,11 @@ def test_outliers_by_hand():
     ],
 )
 def test_numbers_are_shown(value, decimals, signed, expected):
-    assert parts.shown(value, decimals, signed=signed) == expected
+    assert elements.shown(value, decimals, signed=signed) == expected
 
 
 def test_missing_numbers_are_told_from_infinite_ones():
-    assert [parts.number(value).text for value in (None, math.nan, math.inf)] == ["–", "–", "not determined"]
+    assert [elements.number(value).text for value in (None, math.nan, math.inf)] == ["–", "–", "not determined"]
 
 
 def test_a_logarithmic_axis_marks_what_is_there():

@@ -12,7 +12,7 @@ from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
 from . import charts
-from .parts import Chart, Section, Table, number, shown, text
+from .elements import Chart, Section, Table, number, shown, text
 
 
 def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], factor: float) -> Section:

@@ -13,7 +13,7 @@ from ..files.administrative_data import check_conformity
 from ..files.hdf5 import read_tables
 from ..files.whole_file import fingerprint, write_text
 from .administrative_data import administrative_section
-from .parts import Arms, Chart, Report, Table
+from .elements import Arms, Chart, Report, Table
 
 _FOLDER = Path(__file__).parent
 KINDS = ("calibration", "evaluation", "study")
@@ -119,8 +119,8 @@ def page_of(report: Report, origin: list[tuple[str, list[str]]]) -> str:
 
     template = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
-    ).from_string((_FOLDER / "page.html").read_text(encoding="utf-8"))
-    programs = [get_plotlyjs(), (_FOLDER / "page.js").read_text(encoding="utf-8")]
+    ).from_string((_FOLDER / "page_template.html").read_text(encoding="utf-8"))
+    programs = [get_plotlyjs(), (_FOLDER / "page_script.js").read_text(encoding="utf-8")]
     blocks = [block for section in report.sections for block in section.blocks]
     return template.render(
         report=report,
@@ -130,7 +130,7 @@ def page_of(report: Report, origin: list[tuple[str, list[str]]]) -> str:
         is_arms=lambda block: isinstance(block, Arms),
         charts={block.id: block.figure for block in blocks if isinstance(block, Chart)},
         scenes={block.id: block.data for block in blocks if isinstance(block, Arms)},
-        style=(_FOLDER / "page.css").read_text(encoding="utf-8"),
+        style=(_FOLDER / "page_style.css").read_text(encoding="utf-8"),
         programs=programs,
         mark=hashlib.sha256(repr(origin).encode()).hexdigest()[:12],
         hashes=[_hash(program) for program in programs],

@@ -8,7 +8,7 @@ from ..calibration.evaluation import Evaluation
 from ..data.capture import Capture
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach, skeleton
-from .parts import Arms
+from .elements import Arms
 from .residuals import shared_distances
 
 _MOST = 150  # poses that a page holds

@@ -13,7 +13,7 @@ from ..data.capture import ReferenceLength
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
 from ..kinematics.arm import Arm, is_length, parameter_names
 from ..kinematics.parameters import Parameters
-from .xml import CELSIUS, LEVEL, MILLIMETRE, ONE, RADIAN, identifications, ours, put, real, software, theirs
+from .xml_elements import CELSIUS, LEVEL, MILLIMETRE, ONE, RADIAN, identifications, ours, put, real, software, theirs
 
 _METHODS = {"two-stage": "from repeatability first, and then the scale from the lengths", "joint": "from both jointly"}
 _FIGURES = {
