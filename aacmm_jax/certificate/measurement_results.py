@@ -1,4 +1,4 @@
-"""The measurement results of a certificate: the same readings as found, with the nominal arm, and as left, with the calibrated one."""
+"""The measurement results of a certificate: the same readings as found (nominal arm) and as left (calibrated arm)."""
 
 import math
 from collections.abc import Sequence
@@ -13,10 +13,22 @@ from ..data.capture import ReferenceLength
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
 from ..kinematics.arm import Arm, is_length, parameter_names
 from ..kinematics.parameters import Parameters
-from .xml_elements import CELSIUS, LEVEL, MILLIMETRE, ONE, RADIAN, identifications, ours, put, real, software, theirs
+from .xml_elements import (
+    CELSIUS,
+    LEVEL,
+    MILLIMETRE,
+    ONE,
+    RADIAN,
+    add,
+    add_english,
+    add_identifications,
+    add_real,
+    add_software,
+    add_text,
+)
 
 _METHODS = {"two-stage": "from repeatability first, and then the scale from the lengths", "joint": "from both jointly"}
-_FIGURES = {
+_METRICS = {
     "DE": "Mean distance of the tip from its mean position in the socket",
     "Deltam": "Largest half range of a coordinate of the tip in a socket",
     "RMS": "Root mean square distance of the tip from its mean position in the socket",
@@ -26,12 +38,14 @@ _FIGURES = {
 class _Stage(NamedTuple):
     name: str
     status: str
-    says: str
+    description: str
     arm: Arm
     evaluation: Evaluation
 
 
-def add_results(results: Element, record: CalibrationRecord, about: AdministrativeData, command: str) -> None:
+def add_results(
+    parent: Element, record: CalibrationRecord, administrative_data: AdministrativeData, command: str
+) -> None:
     """Add both measurement results of a calibration."""
     evaluations = record.evaluations()
     found = "The readings, evaluated with the nominal parameters, those before the calibration."
@@ -40,162 +54,171 @@ def add_results(results: Element, record: CalibrationRecord, about: Administrati
         _Stage("As found", "beforeAdjustment", found, record.recording.nominal.arm, evaluations["nominal"]),
         _Stage("As left", "afterAdjustment", left, record.calibrated.arm, evaluations["calibrated"]),
     ):
-        _measurement(put(results, "measurementResult"), record, about, stage, command)
+        _add_measurement(add(parent, "measurementResult"), record, administrative_data, stage, command)
 
 
-def uncertainty_says(record: CalibrationRecord) -> str:
-    """How the uncertainties were evaluated, and what they do not hold."""
+def uncertainty_statement(record: CalibrationRecord) -> str:
+    """How the uncertainties were evaluated, and what they do not include."""
     noise = "as it was given" if record.noise_model == "given" else "as estimated from the residuals"
-    freedom = "infinitely many" if math.isinf(record.degrees_of_freedom) else f"{record.degrees_of_freedom:.4g}"
+    count = "infinitely many" if math.isinf(record.degrees_of_freedom) else f"{record.degrees_of_freedom:.4g}"
     return (
-        f"Expanded uncertainties are standard uncertainties times {uncertainty_of(record).factor(LEVEL):.4g}, the coverage factor of "
-        f"Student's t for {freedom} degrees of freedom and a coverage probability of {LEVEL:.0%}. They follow, by the law of propagation "
-        f"of uncertainty, from the noise of the readings, {noise}, and from the uncertainty of the reference lengths. They hold for "
-        "each parameter alone; the parameters are correlated. Errors that the Denavit-Hartenberg model does not describe are not in them."
+        f"Expanded uncertainties are standard uncertainties times {uncertainty_of(record).factor(LEVEL):.4g}, the "
+        f"coverage factor of Student's t for {count} degrees of freedom and a coverage probability of {LEVEL:.0%}. "
+        f"They follow, by the law of propagation of uncertainty, from the noise of the readings, {noise}, and from the "
+        "uncertainty of the reference lengths. They apply to each parameter alone; the parameters are correlated. "
+        "Errors that the Denavit-Hartenberg model does not describe are not included."
     )
 
 
-def _measurement(
-    measurement: Element, record: CalibrationRecord, about: AdministrativeData, stage: _Stage, command: str
+def _add_measurement(
+    measurement: Element, record: CalibrationRecord, given: AdministrativeData, stage: _Stage, command: str
 ) -> None:
-    ours(measurement, "name", stage.name)
-    ours(measurement, "description", stage.says)
+    add_english(measurement, "name", stage.name)
+    add_english(measurement, "description", stage.description)
     lengths = record.recording.capture.lengths
-    _methods(put(measurement, "usedMethods"), record)
-    software(measurement, "usedSoftware", command)
-    _equipment(put(measurement, "measuringEquipments"), lengths, about.reference)
-    _conditions(put(measurement, "influenceConditions"), about, stage)
-    results = put(measurement, "results")
+    _add_methods(add(measurement, "usedMethods"), record)
+    add_software(measurement, "usedSoftware", command)
+    _add_equipment(add(measurement, "measuringEquipments"), lengths, given.reference)
+    _add_conditions(add(measurement, "influenceConditions"), given, stage)
+    results = add(measurement, "results")
     factor = uncertainty_of(record).factor(LEVEL)
-    _repeatability(results, stage)
-    fixed = stage.name == "As left" and record.fixed_by_one_length
-    _lengths(results, lengths, stage, factor, fixed)
-    _parameters(results, record, stage, factor)
-    if stage.name == "As left":
-        _scale(results, record, factor)
+    _add_repeatability(results, stage)
+    left = stage.name == "As left"
+    _add_lengths(results, lengths, stage, factor, fixed_scale=left and record.fixed_by_one_length)
+    _add_parameters(results, record, stage, factor)
+    if left:
+        _add_scale(results, record, factor)
 
 
-def _methods(methods: Element, record: CalibrationRecord) -> None:
+def _add_methods(parent: Element, record: CalibrationRecord) -> None:
     capture = record.recording.capture
-    method = put(methods, "usedMethod")
-    ours(method, "name", "Identification of Denavit-Hartenberg parameters")
-    ours(
+    method = add(parent, "usedMethod")
+    add_english(method, "name", "Identification of Denavit-Hartenberg parameters")
+    add_english(
         method,
         "description",
-        f"The tip rested in {len(capture.sizes)} sockets, in {sum(capture.sizes)} poses; the sockets are {len(capture.lengths)} reference "
-        f"lengths apart. Parameters were identified by bounded least squares, {_METHODS.get(record.method, record.method)}: those with which "
-        "the positions of the tip in each socket agree best, and the distances between the sockets with the reference lengths.",
+        f"Number of sockets in which the tip was seated: {len(capture.sizes)}; of poses: {sum(capture.sizes)}; of "
+        f"reference lengths between sockets: {len(capture.lengths)}. Parameters were identified by bounded least "
+        f"squares, {_METHODS.get(record.method, record.method)}: those with which the positions of the tip in each "
+        "socket agree best, and the distances between the sockets with the reference lengths.",
     )
-    method = put(methods, "usedMethod", refers="basic_methodMeasurementUncertainty")
-    ours(method, "name", "Evaluation of measurement uncertainty")
-    ours(method, "description", uncertainty_says(record))
-    put(method, "norm", "JCGM 100:2008")
+    method = add(parent, "usedMethod", ref_type="basic_methodMeasurementUncertainty")
+    add_english(method, "name", "Evaluation of measurement uncertainty")
+    add_english(method, "description", uncertainty_statement(record))
+    add(method, "norm", "JCGM 100:2008")
 
 
-def _equipment(equipments: Element, lengths: Sequence[ReferenceLength], references: Sequence[Reference]) -> None:
+def _add_equipment(parent: Element, lengths: Sequence[ReferenceLength], references: Sequence[Reference]) -> None:
     for reference in references:
-        equipment = put(equipments, "measuringEquipment")
-        theirs(equipment, "name", reference.name)
+        equipment = add(parent, "measuringEquipment")
+        add_text(equipment, "name", reference.name)
         if reference.manufacturer is not None:
-            theirs(put(equipment, "manufacturer"), "name", reference.manufacturer)
+            add_text(add(equipment, "manufacturer"), "name", reference.manufacturer)
         if reference.model is not None:
-            put(equipment, "model", reference.model)
+            add(equipment, "model", reference.model)
         serial = ("manufacturer", reference.serial_number, "Serial number")
-        identifications(equipment, [serial, ("other", reference.certificate_number, "Number of its calibration certificate")])
-    equipment = put(equipments, "measuringEquipment")
-    ours(equipment, "name", "Reference lengths")
+        certificate = ("other", reference.certificate_number, "Number of its calibration certificate")
+        add_identifications(equipment, [serial, certificate])
+    equipment = add(parent, "measuringEquipment")
+    add_english(equipment, "name", "Reference lengths")
     if not references:
-        ours(equipment, "description", f"Artefact: {NOT_STATED}")
-    quantities = put(equipment, "measuringEquipmentQuantities")
+        add_english(equipment, "description", f"Artefact: {NOT_STATED}")
+    quantities = add(equipment, "measuringEquipmentQuantities")
     for number, length in enumerate(lengths, start=1):
-        quantity = put(quantities, "measuringEquipmentQuantity")
-        theirs(quantity, "name", _length_name(number, length))
-        real(quantity, float(length.value), MILLIMETRE, float(length.u))
+        quantity = add(quantities, "measuringEquipmentQuantity")
+        add_text(quantity, "name", _length_name(number, length))
+        add_real(quantity, float(length.value), MILLIMETRE, float(length.u))
 
 
-def _conditions(conditions: Element, about: AdministrativeData, stage: _Stage) -> None:
-    condition, given = put(conditions, "influenceCondition"), about.certificate
-    ours(condition, "name", "Ambient temperature")
-    put(condition, "status", stage.status)
-    data = put(condition, "data")
-    if given.temperature_celsius is None:
-        ours(data, "text", NOT_STATED)
+def _add_conditions(parent: Element, given: AdministrativeData, stage: _Stage) -> None:
+    condition = add(parent, "influenceCondition")
+    add_english(condition, "name", "Ambient temperature")
+    add(condition, "status", stage.status)
+    data = add(condition, "data")
+    if given.certificate.temperature_celsius is None:
+        add_english(data, "text", NOT_STATED)
         return
-    quantity = put(data, "quantity")
-    ours(quantity, "name", "Ambient temperature")
-    real(quantity, given.temperature_celsius, CELSIUS, given.temperature_u_celsius)
+    quantity = add(data, "quantity")
+    add_english(quantity, "name", "Ambient temperature")
+    add_real(quantity, given.certificate.temperature_celsius, CELSIUS, given.certificate.temperature_u_celsius)
 
 
-def _result(results: Element, name: str, says: str) -> Element:
-    result = put(results, "result")
-    ours(result, "name", name)
-    ours(result, "description", says)
-    return put(result, "data")
+def _add_result(parent: Element, name: str, description: str) -> Element:
+    result = add(parent, "result")
+    add_english(result, "name", name)
+    add_english(result, "description", description)
+    return add(result, "data")
 
 
-def _repeatability(results: Element, stage: _Stage) -> None:
-    spread = stage.evaluation.repeatability
-    figures = {"DE": float(spread.de), "Deltam": float(spread.deltam), "RMS": float(spread.rms)}
-    if not all(map(math.isfinite, figures.values())):  # one pose in every socket
+def _add_repeatability(results: Element, stage: _Stage) -> None:
+    found = stage.evaluation.repeatability
+    metrics = {"DE": float(found.de), "Deltam": float(found.deltam), "RMS": float(found.rms)}
+    if not all(map(math.isfinite, metrics.values())):  # one pose in every socket
         return
-    data = _result(results, "Repeatability", "Over all sockets with more than one pose.")
-    for name, value in figures.items():
-        quantity = put(data, "quantity")
-        ours(quantity, "name", name)
-        ours(quantity, "description", _FIGURES[name])
-        real(quantity, value, MILLIMETRE)
+    data = _add_result(results, "Repeatability", "Over all sockets with more than one pose.")
+    for name, value in metrics.items():
+        quantity = add(data, "quantity")
+        add_english(quantity, "name", name)
+        add_english(quantity, "description", _METRICS[name])
+        add_real(quantity, value, MILLIMETRE)
 
 
 def _length_name(number: int, length: ReferenceLength) -> str:
-    """Numbered: names of sockets may hold anything, so two pairs of them can read alike."""
+    """Numbered, since different pairs of sockets can read alike: their names may contain anything."""
     return f"{number}: {length.start} - {length.end}"
 
 
-def _lengths(results: Element, lengths: Sequence[ReferenceLength], stage: _Stage, factor: float, fixed: bool) -> None:
-    data = _result(
+def _add_lengths(
+    results: Element, lengths: Sequence[ReferenceLength], stage: _Stage, factor: float, fixed_scale: bool
+) -> None:
+    data = _add_result(
         results,
         "Reference lengths",
-        "An error is the measured value minus the calibrated one; its uncertainty is that of the calibrated value and of the scatter of "
-        "the poses at both ends.",
+        "An error is the measured value minus the calibrated one; its uncertainty is that of the calibrated value and "
+        "of the scatter of the poses at both ends.",
     )
     columns = (np.asarray(column) for column in (stage.evaluation.measured, stage.evaluation.error, stage.evaluation.u))
     for number, (length, measured, error, error_u) in enumerate(zip(lengths, *columns, strict=True), start=1):
-        row = put(data, "list")
-        theirs(row, "name", _length_name(number, length))
-        entries = [
+        row = add(data, "list")
+        add_text(row, "name", _length_name(number, length))
+        values = [
             ("calibrated value", "basic_referenceValue", length.value, float(length.u)),
             ("measured value", "basic_measuredValue", measured, math.nan),
             ("error", "basic_measurementError", error, float(error_u)),
         ]
-        if fixed:  # zero by construction: no measurement
-            ours(
+        if fixed_scale:
+            add_english(
                 row,
                 "description",
-                "This length fixed the scale, so that the arm measures it as calibrated by construction; no error was measured.",
+                "This length fixed the scale, so that the arm measures it as calibrated by construction; no error was "
+                "measured.",
             )
-            entries = entries[:1]
-        for name, refers, value, u in entries:
-            quantity = put(row, "quantity", refers=refers)
-            ours(quantity, "name", name)
+            values = values[:1]
+        for name, ref_type, value, u in values:
+            quantity = add(row, "quantity", ref_type=ref_type)
+            add_english(quantity, "name", name)
             if name == "calibrated value" and u == 0:
-                ours(quantity, "description", "Taken as exact")
-            real(quantity, float(value), MILLIMETRE, u if _is_known(u) else None, factor)
+                add_english(quantity, "description", "Taken as exact")
+            add_real(quantity, float(value), MILLIMETRE, u if _is_known(u) else None, factor)
 
 
-def _parameters(results: Element, record: CalibrationRecord, stage: _Stage, factor: float) -> None:
-    data = _result(
+def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, factor: float) -> None:
+    data = _add_result(
         results,
         "Denavit-Hartenberg parameters",
-        "Standard convention; of one joint: Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta). The probe is the tip in the last frame.",
+        "Standard convention; of one joint: Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta). The probe is the tip in the "
+        "last frame.",
     )
     nominal = _values(record.recording.nominal.arm)
     for name, value in _values(stage.arm).items():
-        words, u = ("", None) if stage.name == "As found" else _knowledge(record, name, value == nominal.get(name, 0.0))
-        quantity = put(data, "quantity")
-        ours(quantity, "name", name)
-        if words:
-            ours(quantity, "description", words)
-        real(quantity, value, MILLIMETRE if is_length(name) else RADIAN, u, factor)
+        note, u = "", None
+        if stage.name == "As left":
+            note, u = _note_and_uncertainty(record, name, value == nominal.get(name, 0.0))
+        quantity = add(data, "quantity")
+        add_english(quantity, "name", name)
+        if note:
+            add_english(quantity, "description", note)
+        add_real(quantity, value, MILLIMETRE if is_length(name) else RADIAN, u, factor)
 
 
 def _values(arm: Arm) -> dict[str, float]:
@@ -204,15 +227,16 @@ def _values(arm: Arm) -> dict[str, float]:
     return dict(zip(names, map(float, np.asarray(Parameters(arm, names).vector())), strict=True))
 
 
-def _knowledge(record: CalibrationRecord, name: str, unchanged: bool) -> tuple[str, float | None]:
-    """What is to be said of a calibrated parameter, and its standard uncertainty, where it has one of its own."""
+def _note_and_uncertainty(record: CalibrationRecord, name: str, unchanged: bool) -> tuple[str, float | None]:
+    """A note on a calibrated parameter, and its standard uncertainty if it has one of its own."""
     if name not in record.names:
-        return f"Not identified: held at its nominal value{'' if unchanged else ', and divided by k as all lengths are'}", None
+        divided = "" if unchanged else ", and divided by k as all lengths are"
+        return f"Not identified: fixed at its nominal value{divided}", None
     i = record.names.index(name)
     u = float(np.sqrt(record.covariance[i, i]))
     if record.active[i]:
         bound = f"On its {'lower' if record.active[i] < 0 else 'upper'} bound"
-        if is_length(name) and record.method == "two-stage" and u > 0 and _is_known(u):  # such a length still follows k
+        if is_length(name) and record.method == "two-stage" and _is_known(u):  # such a length still follows k
             return f"{bound} in stage 1; the uncertainty is that of k", u
         return f"{bound}, so it has no uncertainty of its own", None
     if not (record.determined[i] and _is_known(u)):
@@ -220,11 +244,11 @@ def _knowledge(record: CalibrationRecord, name: str, unchanged: bool) -> tuple[s
     return "", u
 
 
-def _scale(results: Element, record: CalibrationRecord, factor: float) -> None:
-    says = "Reference lengths as the arm measured them before its scale was set, over their calibrated values."
-    quantity = put(_result(results, "Scale", says), "quantity")
-    ours(quantity, "name", "k")
-    real(quantity, record.k, ONE, record.u_k if _is_known(record.u_k) else None, factor)
+def _add_scale(results: Element, record: CalibrationRecord, factor: float) -> None:
+    description = "Reference lengths as the arm measured them before its scale was set, over their calibrated values."
+    quantity = add(_add_result(results, "Scale", description), "quantity")
+    add_english(quantity, "name", "k")
+    add_real(quantity, record.k, ONE, record.u_k if _is_known(record.u_k) else None, factor)
 
 
 def _is_known(u: float) -> bool:

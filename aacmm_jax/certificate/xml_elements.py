@@ -1,4 +1,4 @@
-"""The elements that a Digital Calibration Certificate is put together from: texts, contacts, software, values with units after D-SI.
+"""The elements of a Digital Calibration Certificate: texts, contacts, software, values with units after D-SI.
 
 Elements and their order are those of the published schemas, https://ptb.de/dcc/v3.3.0/dcc.xsd and
 https://ptb.de/si/v2.2.1/SI_Format.xsd.
@@ -15,29 +15,29 @@ LEVEL = 0.95  # coverage probability of every expanded uncertainty
 MILLIMETRE, RADIAN, ONE, CELSIUS = r"\milli\metre", r"\radian", r"\one", r"\degreecelsius"
 
 
-def put(parent: Element, tag: str, text: str | None = None, refers: str | None = None) -> Element:
-    """A new last child in the namespace of the DCC; ``refers`` is its ``refType``."""
+def add(parent: Element, tag: str, text: str | None = None, ref_type: str | None = None) -> Element:
+    """A new last child in the namespace of the DCC."""
     element = SubElement(parent, f"dcc:{tag}")
     element.text = text
-    if refers is not None:
-        element.set("refType", refers)
+    if ref_type is not None:
+        element.set("refType", ref_type)
     return element
 
 
-def ours(parent: Element, tag: str, text: str) -> None:
-    """A child that holds a term or sentence of this package, in English."""
-    put(put(parent, tag), "content", text).set("lang", "en")
+def add_english(parent: Element, tag: str, text: str) -> None:
+    """A child with a term or sentence of this package, in English."""
+    add(add(parent, tag), "content", text).set("lang", "en")
 
 
-def theirs(parent: Element, tag: str, text: str) -> None:
-    """A child that holds a name or text given by people, in whatever language."""
-    put(put(parent, tag), "content", text)
+def add_text(parent: Element, tag: str, text: str) -> None:
+    """A child with a name or text given by people, in whatever language."""
+    add(add(parent, tag), "content", text)
 
 
-def real(parent: Element, value: float, unit: str, u: float | None = None, factor: float | None = None) -> None:
-    """A value with its uncertainty, where it has one: standard ``u``, and expanded by ``factor`` where that is given."""
+def add_real(parent: Element, value: float, unit: str, u: float | None = None, factor: float | None = None) -> None:
+    """A value, perhaps with its uncertainty: the standard one ``u``, or expanded by ``factor`` if that is given."""
     quantity = SubElement(parent, "si:real")
-    # The shortest text that is read back as the same number.
+    # repr is the shortest text that is read back as the same number.
     SubElement(quantity, "si:value").text = repr(float(value))
     SubElement(quantity, "si:unit").text = unit
     if u is None:
@@ -53,50 +53,54 @@ def real(parent: Element, value: float, unit: str, u: float | None = None, facto
     SubElement(expanded, "si:coverageProbability").text = repr(LEVEL)
 
 
-def identifications(parent: Element, entries: Iterable[tuple[str, str | None, str]]) -> None:
+def add_identifications(parent: Element, entries: Iterable[tuple[str, str | None, str]]) -> None:
     """Identifications (issuer, value, name); those without a value are left out."""
     given = [entry for entry in entries if entry[1] is not None]
     if not given:
         return
-    listed = put(parent, "identifications")
+    identifications = add(parent, "identifications")
     for issuer, value, name in given:
-        identification = put(listed, "identification")
-        put(identification, "issuer", issuer)
-        put(identification, "value", value)
-        ours(identification, "name", name)
+        identification = add(identifications, "identification")
+        add(identification, "issuer", issuer)
+        add(identification, "value", value)
+        add_english(identification, "name", name)
 
 
-def contact(parent: Element, tag: str, given: Contact) -> None:
-    """A name with an address; the schema wants a location, so it says where none is stated."""
-    element = put(parent, tag)
-    theirs(element, "name", given.name)
-    for child, text in (("eMail", given.email), ("phone", given.phone)):
+def add_contact(parent: Element, tag: str, contact: Contact) -> None:
+    """A name with an address. The schema requires a location; it says so if none is stated."""
+    element = add(parent, tag)
+    add_text(element, "name", contact.name)
+    for child, text in (("eMail", contact.email), ("phone", contact.phone)):
         if text is not None:
-            put(element, child, text)
-    location = put(element, "location")
-    address = {"city": given.city, "countryCode": given.country, "postCode": given.postal_code, "street": given.street}
-    for child, text in address.items():
+            add(element, child, text)
+    location = add(element, "location")
+    for child, text in (
+        ("city", contact.city),
+        ("countryCode", contact.country),
+        ("postCode", contact.postal_code),
+        ("street", contact.street),
+    ):
         if text is not None:
-            put(location, child, text)
+            add(location, child, text)
     if not len(location):
-        ours(location, "further", NOT_STATED)
+        add_english(location, "further", NOT_STATED)
 
 
-def software(parent: Element, tag: str, command: str = "") -> None:
-    """This package and its release, and with which command it was run."""
+def add_software(parent: Element, tag: str, command: str = "") -> None:
+    """This package, its release, and the command that was run."""
     from importlib import metadata
 
-    element = put(put(parent, tag), "software")
-    theirs(element, "name", "aacmm_jax")
-    put(element, "release", f"v{metadata.version('aacmm_jax')}")
-    put(element, "type", "application")
+    element = add(add(parent, tag), "software")
+    add_text(element, "name", "aacmm_jax")
+    add(element, "release", f"v{metadata.version('aacmm_jax')}")
+    add(element, "type", "application")
     if command:
-        theirs(element, "description", command)
+        add_text(element, "description", command)
 
 
-def written(root: Element) -> str:
-    """The text of a file in UTF-8."""
+def xml_text(root: Element) -> str:
+    """The text of an XML file in UTF-8."""
     ElementTree.indent(root)
-    # Readers take a bare carriage return for a line feed.
+    # XML readers take a bare carriage return for a line feed.
     body = ElementTree.tostring(root, encoding="unicode").replace("\r", "&#13;")
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{body}\n'

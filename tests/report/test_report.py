@@ -134,7 +134,9 @@ def test_a_calibration_report_says_what_the_calibration_found(written):
     found = Page(written.pages["calibration"].read_text(encoding="utf-8"))
     record = written.record
     assert f"{record.k:.8f}" in found.text
-    for name, value, u in zip(record.names, record.vectors()["calibrated"], np.sqrt(np.diag(record.covariance)), strict=True):
+    for name, value, u in zip(
+        record.names, record.vectors()["calibrated"], np.sqrt(np.diag(record.covariance)), strict=True
+    ):
         if name.startswith("a_") and u > 0:
             decimals = elements.decimals_of(1.99 * u)
             assert f"{value:.{decimals}f}".replace("-", "−") in found.text, name
@@ -146,7 +148,9 @@ def test_a_calibration_report_says_what_the_calibration_found(written):
         assert needed in found.text
     scene = json.loads(found.held["scenes"])["scene"]
     q = np.asarray(record.recording.capture.q)
-    np.testing.assert_allclose([pose["points"][-1] for pose in scene["poses"]], record.calibrated.arm.position(q), atol=0.06)
+    np.testing.assert_allclose(
+        [pose["points"][-1] for pose in scene["poses"]], record.calibrated.arm.position(q), atol=0.06
+    )
     assert all(pose["points"][0] == [0, 0, 0] for pose in scene["poses"])
 
 
@@ -154,7 +158,13 @@ def tables_of(report):
     found = {}
     for section in report.sections:
         for block in section.blocks:
-            table = block.table if isinstance(block, elements.Chart) else block if isinstance(block, elements.Table) else None
+            table = (
+                block.table
+                if isinstance(block, elements.Chart)
+                else block
+                if isinstance(block, elements.Table)
+                else None
+            )
             if table is not None:
                 found[table.caption] = table
     return found
@@ -177,7 +187,9 @@ def test_numbers_of_a_report_stand_under_the_right_heading(written):
     for row in parameters.rows:
         i = record.names.index(row[0].text)
         scale = 1 / aj.units.DEG if row[1].text == "deg" else 1.0
-        assert row[parameters.columns.index("as left")].value == pytest.approx(scale * record.vectors()["calibrated"][i])
+        assert row[parameters.columns.index("as left")].value == pytest.approx(
+            scale * record.vectors()["calibrated"][i]
+        )
         if row[parameters.columns.index("U (95 %)")].value is not None:
             assert row[parameters.columns.index("U (95 %)")].value == pytest.approx(scale * factor * u[i])
     volume = aj.volumetric_uncertainty(aj.uncertainty_of(record))
@@ -188,7 +200,9 @@ def test_numbers_of_a_report_stand_under_the_right_heading(written):
     charts_by_id = {
         block.id: block for section in report.sections for block in section.blocks if isinstance(block, elements.Chart)
     }
-    np.testing.assert_allclose(charts_by_id["volume"].figure["data"][0]["marker"]["color"], factor * volume.u_length, rtol=1e-3)
+    np.testing.assert_allclose(
+        charts_by_id["volume"].figure["data"][0]["marker"]["color"], factor * volume.u_length, rtol=1e-3
+    )
     change = charts_by_id["change-mm"].figure["data"][0]
     i = record.names.index(change["x"][0])
     vectors = record.vectors()
@@ -244,7 +258,9 @@ def test_poses_alone_in_their_socket_show_no_scatter(written):
     assert len(residual_chart("r", "R", capture, {"as left": evaluation}).figure["data"][0]["x"]) == 10
     assert (
         "no scatter"
-        in residual_chart("r", "R", aj.Capture({"B": q[:1]}), {"as left": aj.evaluate(arm, aj.Capture({"B": q[:1]}))}).words
+        in residual_chart(
+            "r", "R", aj.Capture({"B": q[:1]}), {"as left": aj.evaluate(arm, aj.Capture({"B": q[:1]}))}
+        ).words
     )
 
 
@@ -263,14 +279,16 @@ def test_a_statement_that_the_file_contradicts_is_refused(written, tmp_path):
     (tmp_path / "pass.toml").write_text(CONFORMITY.format("pass"))
     stated = aj.files.read_administrative_data(tmp_path / "pass.toml")
     for kind in ("calibration", "evaluation"):
-        assert_refused(lambda kind=kind: write_report(written.folder / f"{kind}.h5", tmp_path / "r.html", stated), "simulated")
+        assert_refused(
+            lambda kind=kind: write_report(written.folder / f"{kind}.h5", tmp_path / "r.html", stated), "simulated"
+        )
     measured = aj.acceptance.Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])})
     save_points(tmp_path / "fails.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.04)}, 0.001))
     assert_refused(lambda: write_report(tmp_path / "fails.h5", tmp_path / "r.html", stated), "a limit is not kept")
     save_points(tmp_path / "passes.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.06)}, 0.001))
     write_report(tmp_path / "passes.h5", tmp_path / "r.html", stated)
     assert "pass: a specification; a rule" in (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert_refused(lambda: aj.certificate.dcc(written.record, stated, created="2026-01-31T00:00:00"), "simulated")
+    assert_refused(lambda: aj.certificate.dcc_xml(written.record, stated, created="2026-01-31T00:00:00"), "simulated")
 
 
 def test_corners_of_an_arm_by_hand():
@@ -355,7 +373,9 @@ def test_the_command_states_the_laboratory_and_prints_for_machines(written, aacm
     dcc = aacmm("export", written.folder / "calibration.h5", "--format", "dcc", "--about", "about.toml").stdout
     values = aj.certificate.parse_dcc(dcc)
     assert any(value.value == float(written.record.calibrated.arm.a[1]) for value in values.values())
-    assert "--format dcc" in aacmm("export", written.folder / "calibration.h5", "--about", "about.toml", expect=2).stderr
+    assert (
+        "--format dcc" in aacmm("export", written.folder / "calibration.h5", "--about", "about.toml", expect=2).stderr
+    )
 
 
 # --- A real browser -----------------------------------------------------------------------------------------------------------
@@ -367,7 +387,13 @@ def browser():
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if chromium is None:
         pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
-    quiet = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
+    quiet = [
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+    ]
     with api.sync_playwright() as playwright:
         running = playwright.chromium.launch(executable_path=chromium, args=quiet)
         yield running
