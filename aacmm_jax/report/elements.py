@@ -1,22 +1,22 @@
-"""What a report is made of: sections of text, tables and charts, without any idea of how they are shown."""
+"""The elements of a report, independent of how they are shown: sections of text, tables, charts and views."""
 
 import html
 import math
 from typing import Any, NamedTuple
 
-_NOTHING = 1e-9  # mm: rounding
+_ZERO = 1e-9  # mm: smaller numbers are rounding errors
 
 
 class Cell(NamedTuple):
-    """One entry of a table: what is shown, what it is sorted by (None: the text), and a mark ("good", "bad", "unsure", "outlier")."""
+    """One cell of a table."""
 
     text: str
-    value: float | None = None
-    mark: str = ""
+    value: float | None = None  # what the column is sorted by; None: the text
+    mark: str = ""  # "good", "bad", "unsure", "outlier"
 
 
 class Table(NamedTuple):
-    """A table with headings; rows of cells. Columns whose cells have values are set flush right."""
+    """A table with headings; columns whose cells have values are right-aligned."""
 
     caption: str
     columns: tuple[str, ...]
@@ -24,28 +24,28 @@ class Table(NamedTuple):
 
     @property
     def numeric(self) -> list[bool]:
-        """Which columns hold numbers."""
+        """Which columns contain numbers."""
         return [any(row[i].value is not None for row in self.rows) for i in range(len(self.columns))]
 
 
 class Chart(NamedTuple):
-    """A figure for Plotly (traces and layout as plain dictionaries), what it shows in words, and the numbers behind it."""
+    """A figure for Plotly (traces and layout as plain dictionaries), a description, and the table of its numbers."""
 
     id: str
     title: str
-    words: str
+    description: str
     figure: dict[str, Any]
     table: Table | None = None
     height: int = 380
-    printed: bool = False  # whether the numbers behind it belong on paper too
+    printed: bool = False  # whether the table is printed on paper as well
 
 
-class Arms(NamedTuple):
-    """The arm in its poses, to be turned: see `scene`."""
+class ArmView(NamedTuple):
+    """An interactive view of the arm in its poses: see `arm_view`."""
 
     id: str
     title: str
-    words: str
+    description: str
     data: dict[str, Any]
 
 
@@ -54,11 +54,11 @@ class Section(NamedTuple):
 
     id: str
     title: str
-    blocks: list["str | Table | Chart | Arms"]
+    blocks: list["str | Table | Chart | ArmView"]
 
 
 class Report(NamedTuple):
-    """A whole report, in the order in which it is read."""
+    """A whole report, in reading order."""
 
     title: str
     subtitle: str
@@ -69,35 +69,35 @@ class Report(NamedTuple):
     sections: list[Section]
 
 
-def text(value: object, mark: str = "") -> Cell:
-    """A cell of words."""
+def text_cell(value: object, mark: str = "") -> Cell:
+    """A cell of text."""
     return Cell(str(value), None, mark)
 
 
-def number(value: float | None, decimals: int = 4, *, signed: bool = False, mark: str = "") -> Cell:
-    """A cell with a number; a dash where there is none."""
+def number_cell(value: float | None, decimals: int = 4, *, signed: bool = False, mark: str = "") -> Cell:
+    """A cell with a number; a dash for None and NaN."""
     if value is None or not math.isfinite(value):
         return Cell("–" if value is None or math.isnan(value) else "not determined", None, mark)
-    return Cell(shown(value, decimals, signed=signed), float(value), mark)
+    return Cell(format_number(value, decimals, signed=signed), float(value), mark)
 
 
-def shown(value: float, decimals: int = 4, *, signed: bool = False) -> str:
-    """A number with so many decimals; in powers of ten where these would hide it."""
+def format_number(value: float, decimals: int = 4, *, signed: bool = False) -> str:
+    """A number with a fixed number of decimals, or in powers of ten if these would not show it."""
     sign = "+" if signed else ""
-    if abs(value) < _NOTHING:
+    if abs(value) < _ZERO:
         value = 0.0
     if value != 0 and abs(value) < 0.5 * 10**-decimals:
         return f"{value:{sign}.1e}".replace("-", "−")
     return f"{value:{sign}.{decimals}f}".replace("-", "−")
 
 
-def decimals_of(u: float | None, otherwise: int = 4) -> int:
+def decimals_for(u: float | None, default: int = 4) -> int:
     """Decimals that show two digits of an uncertainty."""
     if u is None or not math.isfinite(u) or u <= 0:
-        return otherwise
+        return default
     return min(max(1 - math.floor(math.log10(u)), 0), 9)
 
 
-def plain(value: object) -> str:
-    """Text for Plotly, which takes some tags for formatting: names are shown as they are."""
+def escaped(value: object) -> str:
+    """Text for Plotly, which interprets some tags: names appear as they are."""
     return html.escape(str(value), quote=False)

@@ -1,4 +1,4 @@
-"""One HTML page that holds everything: text, charts, the arm to be turned, style and program; nothing is fetched."""
+"""One self-contained HTML page: text, charts, the view of the arm, style and scripts."""
 
 import base64
 import hashlib
@@ -9,27 +9,49 @@ from typing import Any
 
 from ..acceptance.record import SIMULATED
 from ..core.errors import InputError
-from ..files.administrative_data import check_conformity
+from ..files.administrative_data import AdministrativeData, check_conformity
 from ..files.hdf5 import read_tables
 from ..files.whole_file import fingerprint, write_text
 from .administrative_data import administrative_section
-from .elements import Arms, Chart, Report, Table
+from .elements import ArmView, Chart, Report, Table
 
-_FOLDER = Path(__file__).parent
 KINDS = ("calibration", "evaluation", "study")
+_FOLDER = Path(__file__).parent
 
 
-def write_report(source: str | os.PathLike, target: str | os.PathLike, about: Any = None) -> dict[str, Any]:
-    """Write the report of a calibration, an evaluation or a study (HDF5) as one HTML file, whole or not at all.
+def write_report(
+    source: str | os.PathLike, target: str | os.PathLike, administrative_data: AdministrativeData | None = None
+) -> dict[str, Any]:
+    """Write the report of a calibration, an evaluation or a study as one HTML file.
 
-    ``about`` (an `about.About`) adds laboratory, customer, item, persons, dates and artefacts.
+    Args:
+        source: The HDF5 file of the calibration, the evaluation or the study.
+        target: The HTML file to write, whole or not at all.
+        administrative_data: Laboratory, customer, item, persons, dates and artefacts, shown in a section of their own.
 
-    Returns what was written, and what it warns of. Raises `InputError` where the file cannot be read, or the report not written.
+    Returns:
+        Title, verdict, warnings and size of the report.
+
+    Raises:
+        InputError: If the source cannot be read or the target not written, or the administrative data state a
+            conformity that the source contradicts.
     """
     source, target = Path(source), Path(target)
     if target.exists() and source.exists() and target.samefile(source):
         raise InputError(f"{target} is the file that the report is of; choose another output.")
-    page, report = report_of(source, about)
+    stored = read_tables(source, KINDS, without=("trials",))
+    kind = stored.attributes["kind"]
+    report, simulated, decision = _REPORTS[kind](source, stored.attributes)
+    if simulated:
+        warnings = list(dict.fromkeys([SIMULATED, *report.warnings]))
+        mark = "bad" if report.verdict_mark == "bad" else "unsure"
+        report = report._replace(warnings=warnings, verdict_mark=mark)
+    if administrative_data is not None:
+        tested = kind == "evaluation"
+        check_conformity(administrative_data, simulated=simulated, decision=decision, tested=tested)
+        section = administrative_section(administrative_data, tested)
+        report = report._replace(sections=[section, *report.sections])
+    page = _render(report, _origin(source, stored.attributes))
     write_text(target, page)
     return {
         "kind": "report",
@@ -42,26 +64,7 @@ def write_report(source: str | os.PathLike, target: str | os.PathLike, about: An
     }
 
 
-def report_of(source: Path, about: Any = None) -> tuple[str, Report]:
-    """The page of a file, and the report that it shows."""
-    stored = read_tables(source, KINDS, without=("trials",))
-    report, simulated, decision = _MAKERS[stored.attributes["kind"]](source, stored.attributes)
-    if simulated:
-        report = report._replace(
-            warnings=list(dict.fromkeys([SIMULATED, *report.warnings])), verdict_mark=_unsure(report.verdict_mark)
-        )
-    if about is not None:
-        tested = stored.attributes["kind"] == "evaluation"
-        check_conformity(about, simulated=simulated, decision=decision, tested=tested)
-        report = report._replace(sections=[administrative_section(about, tested), *report.sections])
-    return page_of(report, made_by(source, stored.attributes)), report
-
-
-def _unsure(mark: str) -> str:
-    return "bad" if mark == "bad" else "unsure"
-
-
-def _of_calibration(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+def _calibration(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
     from ..files.calibrations import load_calibration
     from .calibration import calibration_report
 
@@ -69,74 +72,78 @@ def _of_calibration(source: Path, attributes: dict[str, Any]) -> tuple[Report, b
     return calibration_report(record)[0], record.recording.true is not None, None
 
 
-def _of_evaluation(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
-    from .evaluation import evaluation_report, overall, points_report
+def _evaluation(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+    from .evaluation import evaluation_report, overall_decision, points_report
 
     if attributes.get("of") == "points":
         from ..files.points_evaluations import load_points
 
         report, summary = points_report(load_points(source))
-        return report, False, overall(summary)
+        return report, False, overall_decision(summary)
     from ..files.evaluations import load_evaluation
 
     record = load_evaluation(source)
     report, summary = evaluation_report(record)
-    return report, record.recording.true is not None, overall(summary)
+    return report, record.recording.true is not None, overall_decision(summary)
 
 
-def _of_study(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+def _study(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
     from ..study.results import Results
     from .study import study_report
 
     return study_report(Results.of(source))[0], False, None
 
 
-_MAKERS: dict[str, Callable[[Path, dict[str, Any]], tuple[Report, bool, str | None]]] = {
-    "calibration": _of_calibration,
-    "evaluation": _of_evaluation,
-    "study": _of_study,
+# By the kind of file: the report, whether it is of a simulation, and the overall decision of its acceptance tests.
+_REPORTS: dict[str, Callable[[Path, dict[str, Any]], tuple[Report, bool, str | None]]] = {
+    "calibration": _calibration,
+    "evaluation": _evaluation,
+    "study": _study,
 }
 
 
-def made_by(source: Path, attributes: dict[str, Any]) -> list[tuple[str, list[str]]]:
-    """How the file came about, and how to make it again."""
+def _origin(source: Path, attributes: dict[str, Any]) -> list[tuple[str, list[str]]]:
+    """How the file was made, and how to reproduce it."""
     return [
         ("File", [fingerprint(source)]),
         ("Measured on", [str(attributes.get("measured") or "not stated")]),
-        ("Made on", [str(attributes["created"])]),
+        ("Created on", [str(attributes["created"])]),
         ("Command", [str(attributes["command"])]),
         ("aacmm_jax", [str(attributes["package_version"])]),
-        ("With", [attributes.get("versions") or "not recorded"]),
+        ("Versions", [attributes.get("versions") or "not recorded"]),
         ("Seed", ["none" if attributes.get("seed") is None else str(attributes["seed"])]),
-        ("From", [str(line) for line in attributes.get("sources") or ["not recorded"]]),
+        ("Sources", [str(line) for line in attributes.get("sources") or ["not recorded"]]),
     ]
 
 
-def page_of(report: Report, origin: list[tuple[str, list[str]]]) -> str:
-    """The HTML of a report. Everything that people wrote is shown as text: Jinja escapes it, and only this page's own programs run."""
+def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
+    """The HTML of a report. Jinja escapes texts given by people, and only the page's own scripts run."""
     import jinja2
     from plotly.offline import get_plotlyjs
 
+    def read(name: str) -> str:
+        return (_FOLDER / name).read_text(encoding="utf-8")
+
     template = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
-    ).from_string((_FOLDER / "page_template.html").read_text(encoding="utf-8"))
-    programs = [get_plotlyjs(), (_FOLDER / "page_script.js").read_text(encoding="utf-8")]
+    ).from_string(read("page_template.html"))
+    scripts = [get_plotlyjs(), read("page_script.js")]
     blocks = [block for section in report.sections for block in section.blocks]
     return template.render(
         report=report,
         origin=origin,
         is_chart=lambda block: isinstance(block, Chart),
         is_table=lambda block: isinstance(block, Table),
-        is_arms=lambda block: isinstance(block, Arms),
+        is_arm_view=lambda block: isinstance(block, ArmView),
         charts={block.id: block.figure for block in blocks if isinstance(block, Chart)},
-        scenes={block.id: block.data for block in blocks if isinstance(block, Arms)},
-        style=(_FOLDER / "page_style.css").read_text(encoding="utf-8"),
-        programs=programs,
+        scenes={block.id: block.data for block in blocks if isinstance(block, ArmView)},
+        style=read("page_style.css"),
+        scripts=scripts,
         mark=hashlib.sha256(repr(origin).encode()).hexdigest()[:12],
-        hashes=[_hash(program) for program in programs],
+        hashes=[_script_hash(script) for script in scripts],
     )
 
 
-def _hash(program: str) -> str:
-    """By which the page's content security policy knows a program of its own."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(program.encode()).digest()).decode()
+def _script_hash(script: str) -> str:
+    """The source expression by which the page's content security policy allows one of its own scripts."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
