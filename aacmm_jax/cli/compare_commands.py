@@ -53,9 +53,9 @@ def compare(
     summary["kept"], summary["failed"] = change_exceeded(found.drifts[-1].lengths, max_length_change_mm)
     written = []
     if figure is not None:
-        from ..plot.drift import save_trend
+        from ..plot import save_drift_trend
 
-        save_trend(found, figure)
+        save_drift_trend(found, figure)
         written.append(str(figure))
     if csv is not None:
         write_text(csv, drift_csv(found, labels))

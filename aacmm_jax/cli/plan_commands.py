@@ -139,7 +139,7 @@ def _procedure(
     from ..acceptance.procedure import plan_procedure
     from ..files.procedures import procedure_csv, procedure_manifest
     from ..files.whole_file import write_text
-    from ..summaries.procedure import procedure_summary
+    from ..summaries.planning import procedure_summary
 
     if manifest is not None:
         _check_output(manifest, arm)

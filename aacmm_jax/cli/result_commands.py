@@ -205,13 +205,13 @@ def export(
 
 
 def _certificate(calibration: Path, record: Any, about: Path | None) -> str:
-    from ..certificate.document import dcc
+    from ..certificate import dcc_xml
     from ..files.administrative_data import AdministrativeData as Stated
     from ..files.administrative_data import read_administrative_data
 
     made = read_tables(calibration, ("calibration",)).attributes
     sources = [fingerprint(calibration), *record.recording.sources]
-    return dcc(
+    return dcc_xml(
         record,
         Stated() if about is None else read_administrative_data(about),
         created=made["created"],

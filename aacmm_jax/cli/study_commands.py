@@ -139,7 +139,7 @@ def _ended(outcome: Any, output: Path) -> None:
 
 def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool) -> None:
     """Print a study's results, and draw its figures."""
-    from ..plot.study import write_figures
+    from ..plot import save_study_figures
     from ..study.results import Results
     from ..study.statistics import study_summary
     from . import study_display
@@ -149,6 +149,6 @@ def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool
         raise InputError(f"{file} has {len(results.study.cells)} cells, so there is no cell {cell}; name another.")
     summary = with_spinner("Reading", lambda: study_summary(results, cell))
     if figures is not None:
-        paths = with_spinner("Drawing", lambda: write_figures(results, figures))
+        paths = with_spinner("Drawing", lambda: save_study_figures(results, figures))
         summary["figures_written"] = [str(path) for path in paths]
     show_summary(summary, as_json, study_display.study if cell is None else study_display.one_cell)

@@ -8,6 +8,7 @@ import numpy as np
 from ..calibration.checks import plausible
 from ..calibration.record import CalibrationRecord
 from ..calibration.results import active_names
+from ..core.units import INCH, M
 from ..data.noise import tip_covariances
 from ..data.recording import Recording
 from ..kinematics.arm import is_length, value_of
@@ -86,7 +87,7 @@ def _scale(record: CalibrationRecord) -> list[str]:
     stage1 = _sides(record)
     if not plausible(k):
         unit = next(
-            (u for u, factor in (("m", 1000), ("cm", 10), ("inch", 1 / 25.4)) if abs(k / factor - 1) < 0.1), None
+            (u for u, factor in (("m", M), ("cm", 10), ("inch", 1 / INCH)) if abs(k / factor - 1) < 0.1), None
         )
         hint = f"are the lengths in {unit} by mistake?" if unit else "check units, sockets, lengths and arm."
         return [f"k = {k:.6g} cannot be the scale of this arm; {hint}"]

@@ -437,7 +437,7 @@ def test_a_trend_is_in_the_order_of_its_dates(calibrated):
 def test_figures_draw_the_numbers(calibrated, tmp_path):
     given, dates = [calibrated[i] for i in (0, 1, 2 * PAIRS)], ["2026-01-01", "2026-02-01", "2026-07-01"]
     table = trend(given, dates, points=40)
-    upper, lower = drift_figure.trend(table)
+    upper, lower = drift_figure.drift_trend(table)
     named = {text.get_text().split()[0] for text in upper.texts}
     assert named == {name for name, moved in zip(table.names, table.moved[-1], strict=True) if moved}
     i = table.names.index("a_2")
@@ -447,10 +447,10 @@ def test_figures_draw_the_numbers(calibrated, tmp_path):
     np.testing.assert_allclose(found.get_ydata(), [1e3 * drift.lengths.rms for drift in table.drifts])
     # January is 31 of 181 days: places are in proportion to time.
     np.testing.assert_allclose(found.get_xdata(), [2 * 31 / 181, 2])
-    two = drift_figure.trend(trend(given[::2], dates[::2], points=40))
+    two = drift_figure.drift_trend(trend(given[::2], dates[::2], points=40))
     assert [label.get_text() for label in two[0].get_xticklabels()] == list(table.names)
     for suffix, start in (("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")):
-        drift_figure.save_trend(table, tmp_path / f"trend.{suffix}")
+        drift_figure.save_drift_trend(table, tmp_path / f"trend.{suffix}")
         assert (tmp_path / f"trend.{suffix}").read_bytes().startswith(start)
 
 

@@ -1,34 +1,35 @@
 "use strict";
 (() => {
-  const held = (id) => JSON.parse(document.getElementById(id).textContent);
+  const parsed = (id) => JSON.parse(document.getElementById(id).textContent);
 
-  // Charts: drawn by Plotly, and once more as a picture of fixed width for paper.
-  const charts = held("charts");
+  // Charts: drawn by Plotly, and again as a picture of fixed width for paper.
+  const charts = parsed("charts");
   const narrow = () => document.documentElement.clientWidth < 600;
-  async function draw(place) {
-    const { data, layout } = charts[place.dataset.chart];
+  async function draw(container) {
+    const { data, layout } = charts[container.dataset.chart];
     const config = { responsive: true, displaylogo: false, displayModeBar: narrow() ? false : "hover",
       modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
     const size = narrow() ? 11 : 13;
-    await Plotly.newPlot(place, data, { ...layout, autosize: true, font: { ...layout.font, size } }, config);
-    const height = Math.round(place.clientHeight);
-    const url = await Plotly.toImage({ data, layout: { ...layout, autosize: false } }, { format: "svg", width: 700, height });
+    await Plotly.newPlot(container, data, { ...layout, autosize: true, font: { ...layout.font, size } }, config);
+    const height = Math.round(container.clientHeight);
+    const image = { format: "svg", width: 700, height };
+    const url = await Plotly.toImage({ data, layout: { ...layout, autosize: false } }, image);
     const picture = new Image();
     picture.className = "paper";
-    picture.alt = place.getAttribute("aria-label");
+    picture.alt = container.getAttribute("aria-label");
     picture.src = url;
-    place.append(picture);
+    container.append(picture);
     await picture.decode().catch(() => {});
-    place.dataset.drawn = "yes";
+    container.dataset.drawn = "yes";
   }
 
-  // Lists of files, and the parts that decisions rest on, are folded on the screen and open on paper.
+  // Lists of files and the tables of parts are collapsed on the screen and open on paper.
   const folded = () => [...document.querySelectorAll(".origin details:not([open]), details[data-print]:not([open])")];
   let opened = [];
   window.addEventListener("beforeprint", () => { opened = folded(); for (const one of opened) one.open = true; });
   window.addEventListener("afterprint", () => { for (const one of opened) one.open = false; });
 
-  // Tables: a heading sorts by its column, and once more the other way round.
+  // Tables: a click on a heading sorts by its column, a second click in reverse.
   for (const button of document.querySelectorAll("button.sort")) {
     button.addEventListener("click", () => {
       const heading = button.closest("th"), row = heading.parentElement, table = heading.closest("table");
@@ -44,21 +45,22 @@
       lines.sort((one, other) => {
         const a = key(one), b = key(other);
         if (a !== null && b !== null) return down ? b - a : a - b;
-        if (a !== null || b !== null) return a === null ? 1 : -1; // what has no number comes last
-        const order = one.children[column].textContent.localeCompare(other.children[column].textContent, "en", { numeric: true });
+        if (a !== null || b !== null) return a === null ? 1 : -1; // rows without a number come last
+        const [first, second] = [one, other].map((line) => line.children[column].textContent);
+        const order = first.localeCompare(second, "en", { numeric: true });
         return down ? -order : order;
       });
       body.append(...lines);
     });
   }
 
-  // The arm: lines in space, turned about the vertical and tilted, drawn as SVG, so that paper and every screen can show it.
+  // The arm: lines in space, rotated about the vertical and tilted, as SVG, which prints and scales.
   const SVG = "http://www.w3.org/2000/svg";
-  function scene(place) {
-    const { sockets, poses, reach } = held("scenes")[place.dataset.scene];
+  function scene(container) {
+    const { sockets, poses, reach } = parsed("scenes")[container.dataset.scene];
     const view = { turn: -0.9, tilt: 0.45, size: 1, pose: 0 };
     const svg = document.createElementNS(SVG, "svg");
-    place.append(svg);
+    container.append(svg);
     const all = [[0, 0, 0], ...sockets.map((s) => s.at), ...poses.flatMap((p) => p.points)];
     const middle = [0, 1, 2].map((i) => (Math.min(...all.map((p) => p[i])) + Math.max(...all.map((p) => p[i]))) / 2);
     const extent = Math.max(...all.map((p) => Math.hypot(...p.map((x, i) => x - middle[i]))), 1);
@@ -75,31 +77,35 @@
       const [x, y, z] = point.map((value, i) => value - middle[i]);
       const c = Math.cos(view.turn), s = Math.sin(view.turn), ct = Math.cos(view.tilt), st = Math.sin(view.tilt);
       const across = c * x - s * y, away = s * x + c * y;
-      const width = place.clientWidth || 640, height = place.clientHeight || 480;
+      const width = container.clientWidth || 640, height = container.clientHeight || 480;
       const scale = (view.size * 0.48 * Math.min(width, height)) / extent;
       return [width / 2 + scale * across, height / 2 - scale * (ct * z + st * away), ct * away - st * z];
     }
     const path = (points) => points.map((p) => project(p).slice(0, 2).map((x) => x.toFixed(1)).join(",")).join(" ");
     function render() {
-      const width = place.clientWidth || 640, height = place.clientHeight || 480;
+      const width = container.clientWidth || 640, height = container.clientHeight || 480;
       svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
       svg.replaceChildren();
-      // The floor: circles about the first axis, a fraction of the reach apart, and the axes of the base.
-      for (const share of [0.25, 0.5, 0.75, 1]) {
-        const ring = Array.from({ length: 73 }, (_, i) => [share * reach * Math.cos((i * Math.PI) / 36), share * reach * Math.sin((i * Math.PI) / 36), 0]);
+      // The base plane: circles about the first axis at fractions of the reach, and the axes of the base.
+      for (const fraction of [0.25, 0.5, 0.75, 1]) {
+        const angles = Array.from({ length: 73 }, (_, i) => (i * Math.PI) / 36);
+        const ring = angles.map((angle) => [fraction * reach * Math.cos(angle), fraction * reach * Math.sin(angle), 0]);
         add("polyline", { points: path(ring), fill: "none", stroke: "#d5dae0", "stroke-width": 1 });
       }
       for (const [axis, name] of [[[1, 0, 0], "x"], [[0, 1, 0], "y"], [[0, 0, 1], "z"]]) {
         const end = axis.map((v) => v * 0.3 * reach);
-        add("polyline", { points: path([[0, 0, 0], end]), stroke: "#333", "stroke-width": 1.5, "stroke-dasharray": "5 3" });
+        const points = path([[0, 0, 0], end]);
+        add("polyline", { points, stroke: "#333", "stroke-width": 1.5, "stroke-dasharray": "5 3" });
         const [x, y] = project(axis.map((v) => v * 0.34 * reach));
         add("text", { x, y, "font-size": 13, "font-style": "italic", "text-anchor": "middle" }, name);
       }
       for (const pose of shadows) {
-        add("polyline", { points: path(pose.points), fill: "none", stroke: "#9aa3ad", "stroke-width": 1, "stroke-opacity": 0.55, "stroke-linejoin": "round" });
+        add("polyline", { points: path(pose.points), fill: "none", stroke: "#9aa3ad", "stroke-width": 1,
+          "stroke-opacity": 0.55, "stroke-linejoin": "round" });
       }
       const now = poses[view.pose];
-      add("polyline", { points: path(now.points), fill: "none", stroke: "#1b3a6b", "stroke-width": 5, "stroke-linejoin": "round", "stroke-linecap": "round" });
+      add("polyline", { points: path(now.points), fill: "none", stroke: "#1b3a6b", "stroke-width": 5,
+        "stroke-linejoin": "round", "stroke-linecap": "round" });
       for (const point of now.points) {
         const [cx, cy] = project(point);
         add("circle", { cx, cy, r: 4, fill: "#fff", stroke: "#1b3a6b", "stroke-width": 2 });
@@ -108,11 +114,12 @@
       for (const socket of sockets) {
         const [x, y] = project(socket.at);
         add("path", { d: `M${x - 6},${y}h12M${x},${y - 6}v12`, stroke: "#c8560a", "stroke-width": 2.5 });
-        if (labelled) add("text", { x: x + 9, y: y - 7, "font-size": 13, fill: "#7a3400", stroke: "#fff", "stroke-width": 3, "paint-order": "stroke" }, socket.name);
+        const style = { "font-size": 13, fill: "#7a3400", stroke: "#fff", "stroke-width": 3, "paint-order": "stroke" };
+        if (labelled) add("text", { x: x + 9, y: y - 7, ...style }, socket.name);
       }
-      place.dataset.turn = view.turn.toFixed(3);
-      place.dataset.tilt = view.tilt.toFixed(3);
-      place.dataset.drawn = "yes";
+      container.dataset.turn = view.turn.toFixed(3);
+      container.dataset.tilt = view.tilt.toFixed(3);
+      container.dataset.drawn = "yes";
     }
     function change(what) {
       if (what === "left") view.turn -= 0.15;
@@ -123,44 +130,49 @@
       if (what === "smaller") view.size = Math.max(view.size / 1.15, 0.4);
       render();
     }
-    const keys = { ArrowLeft: "left", ArrowRight: "right", ArrowUp: "up", ArrowDown: "down", "+": "larger", "=": "larger", "-": "smaller" };
-    place.addEventListener("keydown", (event) => {
+    const keys = { ArrowLeft: "left", ArrowRight: "right", ArrowUp: "up", ArrowDown: "down",
+      "+": "larger", "=": "larger", "-": "smaller" };
+    container.addEventListener("keydown", (event) => {
       if (!keys[event.key]) return;
       event.preventDefault();
       change(keys[event.key]);
     });
     let last = null;
-    place.addEventListener("pointerdown", (event) => {
+    container.addEventListener("pointerdown", (event) => {
       last = [event.clientX, event.clientY];
-      place.setPointerCapture(event.pointerId);
+      container.setPointerCapture(event.pointerId);
     });
-    place.addEventListener("pointermove", (event) => {
+    container.addEventListener("pointermove", (event) => {
       if (!last) return;
       view.turn += (event.clientX - last[0]) * 0.008;
       view.tilt = Math.min(Math.max(view.tilt + (event.clientY - last[1]) * 0.008, -0.3), Math.PI / 2);
       last = [event.clientX, event.clientY];
       render();
     });
-    for (const end of ["pointerup", "pointercancel"]) place.addEventListener(end, () => { last = null; });
-    const figure = place.closest("figure"), slider = figure.querySelector("input"), told = figure.querySelector("output");
-    for (const button of figure.querySelectorAll("button[data-do]")) button.addEventListener("click", () => change(button.dataset.do));
+    for (const end of ["pointerup", "pointercancel"]) container.addEventListener(end, () => { last = null; });
+    const figure = container.closest("figure");
+    const slider = figure.querySelector("input"), output = figure.querySelector("output");
+    for (const button of figure.querySelectorAll("button[data-do]")) {
+      button.addEventListener("click", () => change(button.dataset.do));
+    }
     slider.max = poses.length;
     const choose = () => {
       view.pose = Number(slider.value) - 1;
       const pose = poses[view.pose];
-      const away = pose.distance === null ? "alone in its socket" : `${pose.distance.toPrecision(3)} mm from its socket's centroid`;
-      told.textContent = `${pose.label}: ${away}`;
+      const distance = pose.distance === null
+        ? "the only pose of its socket" : `${pose.distance.toPrecision(3)} mm from its socket's centroid`;
+      output.textContent = `${pose.label}: ${distance}`;
       render();
     };
     slider.addEventListener("input", choose);
     choose();
-    new ResizeObserver(render).observe(place);
+    new ResizeObserver(render).observe(container);
     for (const when of ["beforeprint", "afterprint"]) window.addEventListener(when, render);
   }
 
-  for (const place of document.querySelectorAll("[data-scene]")) scene(place);
+  for (const container of document.querySelectorAll("[data-scene]")) scene(container);
   (async () => {
-    for (const place of document.querySelectorAll("[data-chart]")) await draw(place);
+    for (const container of document.querySelectorAll("[data-chart]")) await draw(container);
     document.body.dataset.ready = "yes";
   })();
 })();
