@@ -16,15 +16,13 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 install_import_hook("aacmm_jax", "tests.run_time_types.checked")
 import aacmm_jax as aj  # noqa: E402 - the hook checks what is imported after it
 
-SHARED = Path(__file__).resolve().parents[2] / "shared"
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
 @pytest.fixture(scope="session")
-def shared() -> Path:
-    """Folder of real captures and published numbers, which stands beside a developer's checkout only."""
-    if not (SHARED / "data" / "mukca").is_dir():
-        pytest.skip("the shared data stand beside a developer's checkout only")
-    return SHARED
+def mukca() -> Path:
+    """Folder of the real captures, with a manifest for each set."""
+    return EXAMPLES / "mukca"
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 """The reproduction of the paper: its page is whole, traceable, and what the code gives."""
 
 import json
-import re
 import sys
 from pathlib import Path
 
@@ -88,9 +87,3 @@ def test_printed_figures_that_the_audit_recomputes():
         values, lengths = np.array(published.IDENTIFIED[number]), published.LENGTHS
         assert values[lengths] @ truth[lengths] / (truth[lengths] @ truth[lengths]) == pytest.approx(k, abs=5e-6)
         assert np.abs(values - truth)[lengths].max() == pytest.approx(error, abs=5e-4)
-
-
-def test_the_published_numbers_are_the_shared_ones(shared):
-    """The project's copy says the same as the copy that was checked against the paper."""
-    numbers = lambda path: re.sub(r"#.*", "", path.read_text())  # noqa: E731
-    assert numbers(FOLDER / "published.toml").split() == numbers(shared / "paper/published.toml").split()

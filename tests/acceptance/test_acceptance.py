@@ -403,9 +403,8 @@ def test_lengths_between_the_same_sockets_are_one_position():
     assert "(19 are there)" in test.missing[0]
 
 
+@pytest.mark.parametrize("recorded", ["iso"], indirect=True)
 def test_every_length_of_a_length_test_needs_its_three_readings(recorded):
-    if len(recorded.spheres) == 1:
-        pytest.skip("of ISO 10360-12 only")
     whole = measured_by(recorded.nominal.arm, recorded)
     complete = lambda measured: next(test for test in run(measured) if test.title == "length error").missing == ()  # noqa: E731
     assert complete(whole)
