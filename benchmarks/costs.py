@@ -55,7 +55,11 @@ def kinematics(rounds: int, poses: int = 10_000) -> list[Row]:
         rounds,
     )
     python = peer_python("pinocchio")
-    named = {"position": "tip", "jacobian": "Jacobian by q, 6 columns", "regressor": "regressor by placements, 36 columns"}
+    named = {
+        "position": "tip",
+        "jacobian": "Jacobian by q, 6 columns",
+        "regressor": "regressor by placements, 36 columns",
+    }
     if python:
         peer = run_peer(python, HERE / "peers/pinocchio/measure.py", task, rounds=rounds)
         difference = float(np.max(np.abs(peer["tips"] - np.asarray(task.arm.position(task.q)))))
@@ -73,7 +77,8 @@ def identifications(rounds: int) -> list[Row]:
     batches = (100, 1_000, 10_000, 100_000) if on_cpu else (100, 1_000, 10_000, 100_000, 1_000_000)
     tasks = {f"batch {count:,}": (task, count) for count in batches}
     tasks |= {
-        f"{poses:,} poses": (Task(poses, hold="d_3"), max(16, min(2_000, 140_000 // poses))) for poses in (70, 700, 7_000)
+        f"{poses:,} poses": (Task(poses, hold="d_3"), max(16, min(2_000, 140_000 // poses)))
+        for poses in (70, 700, 7_000)
     }
     tasks["70,000 poses"] = (Task(70_000, hold="d_3"), 4)
     tasks |= {f"{joints} joints": (joints_task(joints), 1_000) for joints in range(3, 10)}
@@ -189,7 +194,11 @@ def commands(rounds: int) -> list[Row]:
                 times["cold"].append(run(*calibrate, JAX_COMPILATION_CACHE_DIR=f"{folder}/cold-{turn}"))
             times["warm"].append(run(*calibrate))
             times["import"].append(run(sys.executable, "-c", "import jax, optimistix"))
-    named = {"cold": "aacmm calibrate, cold", "warm": "aacmm calibrate, warm", "import": "python -c 'import jax, optimistix'"}
+    named = {
+        "cold": "aacmm calibrate, cold",
+        "warm": "aacmm calibrate, warm",
+        "import": "python -c 'import jax, optimistix'",
+    }
     base = statistics.median(times["import"])
     return [
         {"what": named[key], "seconds": statistics.median(t), "of_the_import": statistics.median(t) / base}

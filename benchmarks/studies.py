@@ -175,7 +175,13 @@ def kills() -> dict:
         last = command(folder, "-o", path, *arguments)
         last.communicate()
         left = sorted(item.name for item in Path(folder).iterdir())
-        return {"kills": 20, "blocks_kept": parts_at, "exit": last.returncode, "difference": differs(whole, path), "left": left}
+        return {
+            "kills": 20,
+            "blocks_kept": parts_at,
+            "exit": last.returncode,
+            "difference": differs(whole, path),
+            "left": left,
+        }
 
 
 def disk() -> dict:

@@ -117,7 +117,9 @@ def table_of(title: str, rows: list[Row]) -> Table:
     for i, column in enumerate(columns):
         table.add_column(column.replace("_", " "), justify="left" if i == 0 else "right")
     for row in rows:
-        table.add_row(*("absent" if row.get("absent") and i == 1 else shown(row.get(key)) for i, key in enumerate(columns)))
+        table.add_row(
+            *("absent" if row.get("absent") and i == 1 else shown(row.get(key)) for i, key in enumerate(columns))
+        )
     return table
 
 

@@ -70,7 +70,9 @@ def calibrated(study, drawn, lengths, method, noise, form, hold="d_3"):
 
     def one(row):
         q, value, true = row
-        result = aj.calibrate(arm, capture_of(q, value), bounds, method=method, noise=noise, noise_model=form, hold=hold)
+        result = aj.calibrate(
+            arm, capture_of(q, value), bounds, method=method, noise=noise, noise_model=form, hold=hold
+        )
         uncertainty = aj.uncertainty_of(result)
         factor.append(uncertainty.factor(0.95))
 
@@ -116,7 +118,11 @@ def coverage(trials: int = 10_000) -> dict:
             begun = time.perf_counter()
             errors, u, factor, active, good = calibrated(study, drawn, lengths, method, noise, form)
             row = coverage_row(np.abs(errors) <= factor * u, study.space.names)
-            row |= {"factor": round(factor, 3), "converged": float(good.mean()), "active": int(np.any(active, axis=1).sum())}
+            row |= {
+                "factor": round(factor, 3),
+                "converged": float(good.mean()),
+                "active": int(np.any(active, axis=1).sum()),
+            }
             row["seconds"] = round(time.perf_counter() - begun, 1)
             found[f"{method}, {form}"] = row
             print(method, form, row, flush=True)
@@ -199,7 +205,11 @@ def bounded(trials: int = 10_000) -> dict:
             inside = (np.abs(errors) <= factor * u).astype(float)
             inside[:, :p][active != 0] = np.nan  # on a bound: flagged, no interval is claimed
             row = {"active": round(100 * float(held.mean()), 1), "truth_outside": round(100 * float(outside.mean()), 1)}
-            for what, rows in (("none active", ~held), ("active, truth inside", held & ~outside), ("truth outside", outside)):
+            for what, rows in (
+                ("none active", ~held),
+                ("active, truth inside", held & ~outside),
+                ("truth outside", outside),
+            ):
                 if rows.sum() > 50:
                     row[what] = coverage_row(inside[rows], study.space.names)
             found[f"half-width {width} mm, {method}, hold {hold}"] = row
@@ -258,7 +268,9 @@ def judged(arm, space, capture, start, end, draws) -> dict:
     values = np.array([float(r.value) for r in lengths]) + 0.002 * random.normal(size=(draws, len(lengths)))
     many = aj.calibrate_many(arm, batch_of(capture, q, values), bounds.lower, bounds.upper, method="joint", noise=NOISE)
     measured = _measured(space, jnp.asarray(many.parameters), jnp.asarray(start), jnp.asarray(end))
-    off = 1e3 * (np.asarray(measured) - np.linalg.norm(np.asarray(arm.position(start)) - np.asarray(arm.position(end)), axis=1))
+    off = 1e3 * (
+        np.asarray(measured) - np.linalg.norm(np.asarray(arm.position(start)) - np.asarray(arm.position(end)), axis=1)
+    )
     rms = np.sqrt(np.mean(off**2, axis=0))
     # The largest of 400 estimates is too large by chance: the length of the largest prediction is looked at too.
     at = int(np.argmax(predicted))

@@ -67,7 +67,13 @@ def noisy_capture(paper_arm) -> "aj.Capture":
     """The paper's simulation with the noise of a real arm: 2 arcsec and 5 um."""
     sockets = {"A": (400, 200, 300), "B": (600, 200, 300)}
     return aj.simulate(
-        paper_arm, sockets, poses={"A": 70, "B": 5}, lengths=[("A", "B", 0.002)], encoder_arcsec=2.0, seating=0.005, seed=5
+        paper_arm,
+        sockets,
+        poses={"A": 70, "B": 5},
+        lengths=[("A", "B", 0.002)],
+        encoder_arcsec=2.0,
+        seating=0.005,
+        seed=5,
     )
 
 

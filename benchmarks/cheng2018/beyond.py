@@ -16,7 +16,12 @@ WIDTHS = (1.0, 2.0, 5.0, 10.0, 20.0)  # mm
 SOCKETS, POSES, LENGTHS = (1, 2, 4), (16, 32, 70, 140), (1, 2, 4)
 BARS = (50.0, 100.0, twin.REFERENCE, 400.0)  # mm
 # Where a reference length lies: distance of its middle from the second joint, and its direction.
-PLACES = {"near, radial": (450.0, 0), "near, tangential": (450.0, 1), "far, radial": (850.0, 0), "far, tangential": (850.0, 1)}
+PLACES = {
+    "near, radial": (450.0, 0),
+    "near, tangential": (450.0, 1),
+    "far, radial": (850.0, 0),
+    "far, tangential": (850.0, 1),
+}
 NOISE = twin.Noise(2.0, 0.005, 0.0)
 
 
@@ -35,7 +40,9 @@ def noise_and_box() -> list[dict[str, float]]:
             anywhere = random_starts(truth - half, truth + half, TRIALS, 22)
             # What is held stays where it starts: there it is right.
             for name, hold, start in (("free", None, anywhere), ("held", "d_3", truth)):
-                many = aj.identify_many(twin.true_arm(), captures, truth - half, truth + half, start, space=space, hold=hold)
+                many = aj.identify_many(
+                    twin.true_arm(), captures, truth - half, truth + half, start, space=space, hold=hold
+                )
                 k = twin.lengths_of(many.parameters, drawn.reference).mean(axis=1) / twin.REFERENCE
                 low, middle, high = np.percentile(k, [2.5, 50, 97.5])
                 line |= {f"k_low_{name}": low, f"k_median_{name}": middle, f"k_high_{name}": high}

@@ -63,7 +63,12 @@ def minimise(q: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndar
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it tells that its quasi-Newton update was skipped
         found = minimize(
-            objective, start, jac=True, method="trust-constr", bounds=Bounds(lower, upper), options={"maxiter": ITERATIONS}
+            objective,
+            start,
+            jac=True,
+            method="trust-constr",
+            bounds=Bounds(lower, upper),
+            options={"maxiter": ITERATIONS},
         )
     return found.x, int(found.nit)
 

@@ -70,7 +70,8 @@ def write_table(path: Path, table: list[dict]) -> None:
         writer = csv.DictWriter(file, list(table[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(
-            {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in line.items()} for line in table
+            {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in line.items()}
+            for line in table
         )
 
 

@@ -27,7 +27,10 @@ import aacmm_jax as aj
 
 SAMPLE = 4  # reruns of the paper's method that are run again each time, of each simulation
 SEARCHES, SEARCHED_SHIFTS = 6, (0.0, 5.0)  # of the paper's method in each box
-SHIFTS, WIDTHS = (-5.0, -2.5, 0.0, 2.5, 5.0), (1.0, 2.0, 5.0, 10.0, 20.0)  # mm: where length boxes are centred, and how wide
+SHIFTS, WIDTHS = (
+    (-5.0, -2.5, 0.0, 2.5, 5.0),
+    (1.0, 2.0, 5.0, 10.0, 20.0),
+)  # mm: where length boxes are centred, and how wide
 
 
 def half_scale(rows: list[Row]) -> None:
@@ -56,7 +59,11 @@ def half_scale(rows: list[Row]) -> None:
 def simulation(number: int, rows: list[Row], methods: list[dict[str, float]]) -> dict[str, np.ndarray]:
     """One row of Table 1: recomputed, by the paper's method and by this toolkit over all sets of poses."""
     printed, truth = PUBLISHED["simulation"][str(number)], vector("simulation", "nominal")
-    values, lengths, name = vector("simulation", str(number), "identified"), is_length(), f"Table 1, simulation {number}"
+    values, lengths, name = (
+        vector("simulation", str(number), "identified"),
+        is_length(),
+        f"Table 1, simulation {number}",
+    )
     lower, upper = box("simulation", str(number))
     starts = random_starts(lower, upper, SETS, number)
     many = many_of(pose_sets(), lower, upper, starts)
@@ -142,7 +149,8 @@ def methods_rerun(rows: list[Row]) -> list[dict[str, float]]:
     stored = paper_method.stored()
     again = paper_method.rerun(SAMPLE)
     pairs = [
-        (line, next(s for s in stored if (s["simulation"], s["set"]) == (line["simulation"], line["set"]))) for line in again
+        (line, next(s for s in stored if (s["simulation"], s["set"]) == (line["simulation"], line["set"])))
+        for line in again
     ]
     # A search of 300 iterations magnifies the last bit of another processor; its outcome agrees to a few per cent.
     same = sum(abs(line["k"] - old["k"]) < 1e-3 for line, old in pairs)

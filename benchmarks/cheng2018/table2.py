@@ -57,7 +57,11 @@ def scale(rows: list[Row]) -> tuple[float, float]:
 
 def elements(rows: list[Row], k: float) -> None:
     """Every number of Table 2 against eq. 18 and the scale fix."""
-    reference, given, table = PUBLISHED["experiment"]["length_reference"], vector("experiment", "identified"), printed_table()
+    reference, given, table = (
+        PUBLISHED["experiment"]["length_reference"],
+        vector("experiment", "identified"),
+        printed_table(),
+    )
     printed_k = reference["mean"] / reference["nominal"]
     for i, name in enumerate(NAMES):
         if is_length()[i]:

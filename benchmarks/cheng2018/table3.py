@@ -53,7 +53,10 @@ def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
             )
         )
 
-    nominal, printed_k = check["nominal"], experiment["length_reference"]["mean"] / experiment["length_reference"]["nominal"]
+    nominal, printed_k = (
+        check["nominal"],
+        experiment["length_reference"]["mean"] / experiment["length_reference"]["nominal"],
+    )
     largest = max(check["maximum"] - nominal, nominal - check["minimum"])
     mean = np.mean([table3[name] for name in twin.SOCKETS])
     fitted, held_out = "fitted, with the others of Table 3; ", np.mean([table3["Data2"], table3["Data3"]])
@@ -72,11 +75,19 @@ def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
     note = f"averages in the set identified from: held out alone it is {held_out:.4f}; {fitted}"
     line("Table 3 mean [mm]", table3["mean"], lambda o: o.deltam.mean(axis=1), note, f"{mean:.4f}")
     note = f"matched by taking {twin.READINGS} readings an end; "
-    line("4.2 range of four lengths [mm]", experiment["length_reference"]["range"], lambda o: np.ptp(o.reference, axis=1), note)
+    line(
+        "4.2 range of four lengths [mm]",
+        experiment["length_reference"]["range"],
+        lambda o: np.ptp(o.reference, axis=1),
+        note,
+    )
     line("4.4 largest length [mm]", check["maximum"], lambda o: o.plate.max(axis=1) + twin.PLATE)
     line("4.4 smallest length [mm]", check["minimum"], lambda o: o.plate.min(axis=1) + twin.PLATE)
     line(
-        "4.4 largest deviation [mm]", check["max_deviation"], lambda o: np.abs(o.plate).max(axis=1), recomputed=f"{largest:.4f}"
+        "4.4 largest deviation [mm]",
+        check["max_deviation"],
+        lambda o: np.abs(o.plate).max(axis=1),
+        recomputed=f"{largest:.4f}",
     )
     line(
         "4.4 range [mm]",

@@ -64,7 +64,9 @@ def pool() -> Pool:
     count = POSES * _POOL
     sockets = aj.simulate(arm, SOCKETS, poses=count, seed=11).sockets
     bars = {}
-    for seed, (name, length, wanted) in enumerate((("reference", REFERENCE, 400), ("plate", PLATE, PLACEMENTS * _POOL))):
+    for seed, (name, length, wanted) in enumerate(
+        (("reference", REFERENCE, 400), ("plate", PLATE, PLACEMENTS * _POOL))
+    ):
         bars[name] = placed(arm, length, wanted, seed)
     return Pool(np.stack([sockets[name] for name in SOCKETS]), bars["reference"], bars["plate"])
 
@@ -79,9 +81,9 @@ def placed(arm: aj.Arm, length: float, count: int, seed: int) -> np.ndarray:
     direction *= length / 2 / np.linalg.norm(direction, axis=1, keepdims=True)
     ends = np.stack([centre - direction, centre + direction], axis=1)
     limits = jnp.array([(-np.pi, np.pi)] * arm.joints)
-    return np.asarray(random_configurations(arm, jnp.asarray(ends.reshape(-1, 3)), jax.random.key(seed), limits)).reshape(
-        count, 2, -1
-    )
+    return np.asarray(
+        random_configurations(arm, jnp.asarray(ends.reshape(-1, 3)), jax.random.key(seed), limits)
+    ).reshape(count, 2, -1)
 
 
 def draw(made: Pool, noise: Noise, count: int, seed: int) -> Twins:
@@ -101,10 +103,12 @@ def recorded(q: np.ndarray, noise: Noise, harmonics: np.ndarray, generator: np.r
     """What the encoders read in exact poses ``(t, ..., 6)``."""
     shift = noise.seating_mm * generator.normal(size=(*q.shape[:-1], 3))
     sine, cosine = (part.reshape(part.shape[0], *(1,) * (q.ndim - 2), part.shape[1]) for part in harmonics)
-    seated = q + np.asarray(_least_move(jnp.asarray(q.reshape(-1, q.shape[-1])), jnp.asarray(shift.reshape(-1, 3)))).reshape(
-        q.shape
+    seated = q + np.asarray(
+        _least_move(jnp.asarray(q.reshape(-1, q.shape[-1])), jnp.asarray(shift.reshape(-1, 3)))
+    ).reshape(q.shape)
+    return (
+        seated + sine * np.sin(q) + cosine * np.cos(q) + noise.encoder_arcsec * ARCSEC * generator.normal(size=q.shape)
     )
-    return seated + sine * np.sin(q) + cosine * np.cos(q) + noise.encoder_arcsec * ARCSEC * generator.normal(size=q.shape)
 
 
 @jax.jit
@@ -195,7 +199,9 @@ def medians(result: Outcome) -> dict[str, float]:
     }
 
 
-def fitted_noise(made: Pool, kinds: tuple[int, ...] = (0, 1, 2), targets: int = 3, count: int = 100, seed: int = 5) -> Noise:
+def fitted_noise(
+    made: Pool, kinds: tuple[int, ...] = (0, 1, 2), targets: int = 3, count: int = 100, seed: int = 5
+) -> Noise:
     """The noise whose median twin comes closest, in ratios, to the printed figures (the first ``targets`` of them).
 
     ``kinds`` names the parts of `Noise` that are used; the others are zero.
