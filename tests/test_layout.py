@@ -1,4 +1,4 @@
-"""The structure that a newcomer relies on: folders, direction of imports, size of modules, public names, foreign names."""
+"""The structure that a newcomer relies on: folders, direction of imports, size of modules, public and foreign names."""
 
 import ast
 import importlib
@@ -98,7 +98,8 @@ def test_every_public_name_resolves(stub):
 def test_every_public_name_has_a_docstring(name, value):
     text = value.__doc__ or ""
     # What `NamedTuple` and `dataclass` write where there is none is the signature.
-    assert text.strip() and not text.startswith(f"{name.rsplit('.', 1)[1]}("), name
+    assert text.strip()
+    assert not text.startswith(f"{name.rsplit('.', 1)[1]}(")
 
 
 def test_no_module_is_named_like_a_public_function():

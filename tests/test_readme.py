@@ -28,12 +28,12 @@ def test_study_is_read(tmp_path):
     assert len(aj.study.read_study(tmp_path / "study.toml").cells) == 6
 
 
-def test_what_a_certificate_states_is_read(tmp_path):
+def test_administrative_data_is_read(tmp_path):
     (tmp_path / "laboratory.toml").write_text(blocks("toml")[2].replace("# conformity", "conformity"))
-    about = aj.files.read_administrative_data(tmp_path / "laboratory.toml")
-    # Every key that there is stands in the example.
-    stated = about.model_dump(exclude_unset=True)
-    for part, model in ((name, field.annotation) for name, field in type(about).model_fields.items()):
+    data = aj.files.read_administrative_data(tmp_path / "laboratory.toml")
+    # The example has every key.
+    stated = data.model_dump(exclude_unset=True)
+    for part, model in ((name, field.annotation) for name, field in type(data).model_fields.items()):
         entry = stated[part][0] if isinstance(stated[part], list) else stated[part]
         if part not in ("customer", "person", "reference", "conformity"):
             assert set(entry) == set(model.model_fields), part

@@ -1,4 +1,4 @@
-"""The figures: what the paper's 2, 3, 6 and 8 can be taken to show (the text does not say), its scale law, and what it did not draw. Readable in grey."""
+"""Figures: the paper's 2, 3, 6 and 8 as far as its text defines them, its scale law, and others; legible in grey."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -126,7 +126,8 @@ def distributions(runs: Table) -> Any:
 
 
 def box_and_scale(table: Table) -> Any:
-    """k against the boxes of the lengths: this toolkit by where they are centred (left), the paper's method by their width (right)."""
+    """k against the boxes of the lengths: this toolkit by where they are centred (left), the paper's method by their
+    width (right)."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(7.2, 3.2), sharey=True, width_ratios=(1.5, 1))
     widths = sorted({line["half_width_mm"] for line in table})
     for i, ((marker, colour), width) in enumerate(zip(MARKS, widths, strict=True)):
@@ -314,7 +315,8 @@ def draw(tables: dict[str, Table], folder: Path) -> dict[str, str]:
         "reference_lengths": lambda: references(tables["reference_lengths"]),
     }
     about = {
-        "figure2": simulation, "figure3": simulation, "scale_law": scale_law, "distributions": distributions, "k_against_box": box_and_scale,
+        "figure2": simulation, "figure3": simulation, "scale_law": scale_law, "distributions": distributions,
+        "k_against_box": box_and_scale,
         "figure6": repeatability, "figure8": plate, "twins": twins, "stages": stages, "noise_and_box": sliding,
         "sockets_poses_lengths": buying, "reference_lengths": references,
     }  # fmt: skip
@@ -323,4 +325,4 @@ def draw(tables: dict[str, Table], folder: Path) -> dict[str, str]:
             figure = make()
             figure.savefig(folder / f"{name}.png", metadata={"Software": None})
             plt.close(figure)
-    return {name: (function.__doc__ or "").strip() for name, function in about.items()}
+    return {name: " ".join((function.__doc__ or "").split()) for name, function in about.items()}

@@ -1,4 +1,4 @@
-"""Table 1 and section 3: what identification from one fixed point can find without noise, and what decides its scale."""
+"""Table 1 and section 3: what identification from one point can find without noise, and what determines its scale."""
 
 import itertools
 
@@ -51,7 +51,8 @@ def half_scale(rows: list[Row]) -> None:
                 f"3.1 Deltam, {what} [mm]",
                 simulation[f"deltam_{key}"],
                 toolkit=f"{deltam[digits][key]:.1e} on readings of {digits} decimals",
-                verdict=f"what angles of {digits} decimals give (the nearest number of decimals); exact ones give {exact:.0e}; half scale, {ratio:.2f} times as much",
+                verdict=f"what angles of {digits} decimals give (the nearest number of decimals); "
+                f"exact ones give {exact:.0e}; half scale, {ratio:.2f} times as much",
             )
         )
 
@@ -127,7 +128,7 @@ def simulation(number: int, rows: list[Row], methods: list[dict[str, float]]) ->
 
 
 def two_stages(q: np.ndarray, lower: np.ndarray, upper: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Parameters after both stages: one length held where it starts, and the scale fixed with one exact length of 200 mm."""
+    """Parameters after both stages: one length held at its start, the scale fixed with one exact length of 200 mm."""
     found = many_of(q, lower, upper, starts, hold="d_3").parameters
     ends = np.asarray(aj.simulate(simulated_arm(), {"A": (400, 200, 300), "B": (600, 200, 300)}, poses=1, seed=2).q)
     tips = tips_of(found, np.broadcast_to(ends, (len(found), *ends.shape)))
@@ -201,7 +202,7 @@ def boxes() -> list[dict[str, float]]:
 
 
 def narrower(rows: list[Row], table: list[dict[str, float]]) -> None:
-    """The claim that smaller boxes scale less, for boxes centred on the truth, beside it, and past it."""
+    """The claim that smaller boxes scale less, for boxes that are centred on the truth, contain it, or miss it."""
     inside = [line for line in table if line["truth_inside"]]
 
     def largest(shift: float, width: float, *keys: str) -> float:
@@ -210,7 +211,7 @@ def narrower(rows: list[Row], table: list[dict[str, float]]) -> None:
 
     centred = {width: largest(0.0, width, "k_lowest_method", "k_highest_method") for width in WIDTHS}
     mine = {width: largest(0.0, width, "k_low", "k_high") for width in WIDTHS}
-    beside = {width: largest(5.0, width, "k_median_method") for width in WIDTHS if width >= 5}
+    shifted = {width: largest(5.0, width, "k_median_method") for width in WIDTHS if width >= 5}
     missed = min(line["de_median_mm"] for line in table if not line["truth_inside"])
     shown = lambda of: "; ".join(f"+/-{width:g} mm {value:.4f}" for width, value in of.items())  # noqa: E731
     holds = all(a <= b for a, b in itertools.pairwise(centred.values()))
@@ -218,11 +219,11 @@ def narrower(rows: list[Row], table: list[dict[str, float]]) -> None:
         row(
             "3.2 smaller boxes scale less: largest |k - 1|",
             "claimed",
-            method=f"centred on the truth: {shown(centred)}; 5 mm beside it, median: {shown(beside)}",
+            method=f"centred on the truth: {shown(centred)}; 5 mm beside it, median: {shown(shifted)}",
             toolkit=f"centred on the truth: {shown(mine)}",
             verdict=("holds" if holds else "does not hold")
             + " for boxes centred on the truth, "
-            + ("holds" if list(beside.values()) == sorted(beside.values()) else "does not hold")
+            + ("holds" if list(shifted.values()) == sorted(shifted.values()) else "does not hold")
             + f" for boxes 5 mm beside it; a box that misses the truth leaves DE of {missed:.2g} mm or more",
         )
     )
