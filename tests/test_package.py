@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def test_an_unknown_name_is_an_attribute_error():
     assert set(aj.__all__) <= set(dir(aj))
     assert pickle.loads(pickle.dumps(aj.load_arm)) is aj.load_arm
-    with pytest.raises(AttributeError, match="attribute '?lod_arm"):
+    with pytest.raises(AttributeError, match=r"attribute '?lod_arm"):
         aj.lod_arm  # noqa: B018
 
 

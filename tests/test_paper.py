@@ -23,7 +23,7 @@ def test_default_parameters_are_the_papers(paper_arm):
 @pytest.mark.parametrize("hold", [None, "d_3"])
 @pytest.mark.parametrize("number", [1, 2])
 def test_noise_free_simulation_from_random_starts(paper_arm, paper_capture, number, hold):
-    """Table 1: DE is rounding error from every start (paper: 7e-5 and 8e-5 mm), and one length then gives all others."""
+    """Table 1: DE is rounding error from every start (paper: 7e-5 and 8e-5 mm), then one length gives the others."""
     space = aj.Parameters.free_of(paper_arm)
     bounds, truth = box(space, number), np.asarray(space.vector(paper_arm))
     fraction = np.random.default_rng(number).uniform(size=(STARTS, len(space.names)))
