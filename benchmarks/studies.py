@@ -65,7 +65,7 @@ def once(trials: int, repeats: int, bare: int) -> dict:
 def forget_pools() -> None:
     from aacmm_jax.study import drawing, pools
 
-    for cached in (pools._pool, pools._stand_table, drawing._prepared):
+    for cached in (pools._pool, pools._fixture_table, drawing._prepared):
         cached.cache_clear()
 
 
@@ -75,13 +75,13 @@ def bare_seconds(study) -> float:
 
     import aacmm_jax as aj
     from aacmm_jax.study.drawing import draw
-    from aacmm_jax.study.trials import _capture
+    from aacmm_jax.study.trials import captures_of
 
     total = 0.0
     for cell in range(CELLS):
         setting = study.settings[cell]
         drawn = draw(study, setting, np.full(study.trials, cell), np.arange(study.trials), jax.devices()[0])
-        problem = (study.nominal.arm, _capture(study, setting, drawn), drawn.lower, drawn.upper, drawn.start)
+        problem = (study.nominal.arm, captures_of(study, setting, drawn), drawn.lower, drawn.upper, drawn.start)
         if cell < 2:  # both ways of holding, compiled
             aj.identify_many(*problem, space=study.space, hold=setting.hold)
         began = time.perf_counter()

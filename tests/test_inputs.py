@@ -55,7 +55,7 @@ def shifted(given: SimpleNamespace, **changes: float) -> np.ndarray:
         (lambda q: {"A": q[0]}, ["socket 'A' has shape (6,)", "one row a pose and one column a joint"]),
         (lambda q: {"A": q[:0]}, ["socket 'A' has shape (0, 6)", "at least one"]),
         (lambda q: {}, ["at least one socket"]),
-        (lambda q: {"A": q, "B": q}, ["sockets 'A' and 'B' hold the very same poses", "given twice?"]),
+        (lambda q: {"A": q, "B": q}, ["sockets 'A' and 'B' have exactly the same poses", "given twice?"]),
         (
             lambda q: {"A": with_value(np.rad2deg(q), 2, 6, 178.5)},
             ["socket 'A' pose 2 joint 6 is 178.5 rad", "degrees", "numpy.deg2rad"],

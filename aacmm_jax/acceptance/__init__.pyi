@@ -1,14 +1,14 @@
+from .asme_b89_4_22 import spat as spat
 from .decision import Limit as Limit
 from .decision import decide as decide
+from .iso_10360_12 import articulated_location as articulated_location
+from .iso_10360_12 import form_error as form_error
+from .jjf_1408 import half_range as half_range
+from .lengths import two_rms as two_rms
+from .metrics import METRICS as METRICS
 from .metrics import AcceptanceTest as AcceptanceTest
 from .metrics import Measured as Measured
 from .metrics import Metric as Metric
-from .metrics import articulated_location as articulated_location
-from .metrics import form_error as form_error
-from .metrics import half_range as half_range
-from .metrics import size_error as size_error
-from .metrics import spat as spat
-from .metrics import two_rms as two_rms
 from .procedure import Procedure as Procedure
 from .procedure import plan_procedure as plan_procedure
 from .procedure import simulate_procedure as simulate_procedure
@@ -17,5 +17,6 @@ from .record import PointsRecord as PointsRecord
 from .record import evaluation_of as evaluation_of
 from .spheres import enclosing_sphere as enclosing_sphere
 from .spheres import fit_sphere as fit_sphere
+from .spheres import size_error as size_error
 from .suite import measured_by as measured_by
 from .suite import run as run

@@ -1,5 +1,7 @@
-"""Spheres through measured points: the one of least squares, and the smallest that holds them all."""
+"""Spheres: fitted by least squares, and the smallest around points; and what the tests of touched spheres share."""
 
+import contextlib
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -7,9 +9,11 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError
+from ..data.sphere import ProbedSphere
 
-_LEAST = 4  # points that a sphere needs
-_ONE_PLACE = 1e-7  # of the points' spread
+EXACT_POINTS = 4  # a sphere goes through so many points exactly, so they have no form error
+_DIAMETERS = (10.0, 51.0)  # mm: 10 to 50 after ASME B89.4.22, 10 to 51 after ISO 10360 (background knowledge)
+_COINCIDENT = 1e-7  # distance of two points, relative to the extent of all, below which they count as one
 
 
 class FittedSphere(NamedTuple):
@@ -21,46 +25,67 @@ class FittedSphere(NamedTuple):
 
     @property
     def form(self) -> float:
-        """Span of the points' distances from the centre, largest less smallest, mm."""
+        """Largest less smallest distance of the points from the centre, mm."""
         return float(np.ptp(self.residuals))
 
 
 def fit_sphere(points: Numbers) -> FittedSphere:
-    """The sphere whose surface is nearest to points ``(m, 3)``, mm, in the sense of least squares of distances (not of their squares).
+    """Fit a sphere by least squares of the points' distances from its surface.
 
-    Solved by SciPy's Levenberg-Marquardt (MINPACK) from the algebraic solution. Raises `InputError` for fewer than four points, and
-    for points that lie in a plane or too close together to fix a sphere.
+    Solved by SciPy's Levenberg-Marquardt method (MINPACK), from the algebraic solution.
+
+    Args:
+        points: Points ``(m, 3)``, mm.
+
+    Returns:
+        The sphere, mm.
+
+    Raises:
+        InputError: There are fewer than four points, or they lie in one plane.
     """
     from scipy import optimize
 
     given = points_of(points, "points on a sphere")
-    if len(given) < _LEAST:
-        raise InputError(f"a sphere needs at least {_LEAST} points, but {len(given)} are given; touch it in more places.")
+    if len(given) < EXACT_POINTS:
+        raise InputError(
+            f"a sphere needs at least {EXACT_POINTS} points, but {len(given)} are given; touch it at more points."
+        )
     middle = given.mean(axis=0)
     centred = given - middle
     size = float(np.linalg.norm(centred, axis=1).max())
     if size == 0 or np.linalg.svd(centred / size, compute_uv=False)[2] < 1e-6:
-        raise InputError("the points on a sphere lie in one plane, so they fix none; touch it all round.")
+        raise InputError("the points on a sphere lie in one plane, which determines no sphere; touch it on all sides.")
     # |p|^2 = 2 c.p + (r^2 - |c|^2) is linear in the centre; with lengths of about 1 it is also well conditioned.
     scaled = centred / size
     rows = np.column_stack([2 * scaled, np.ones(len(scaled))])
     start = np.linalg.lstsq(rows, np.sum(scaled**2, axis=1), rcond=None)[0]
     radius = np.sqrt(max(start[3] + start[:3] @ start[:3], 1e-12))
 
-    def distances(unknown: np.ndarray) -> np.ndarray:
+    def residuals(unknown: np.ndarray) -> np.ndarray:
         return np.linalg.norm(scaled - unknown[:3], axis=1) - unknown[3]
 
-    def slopes(unknown: np.ndarray) -> np.ndarray:
+    def jacobian(unknown: np.ndarray) -> np.ndarray:
         away = unknown[:3] - scaled
         return np.column_stack([away / np.linalg.norm(away, axis=1, keepdims=True), -np.ones(len(scaled))])
 
     guess = np.append(start[:3], radius)
-    found = optimize.least_squares(distances, guess, slopes, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)  # pyright: ignore[reportArgumentType]
+    solve: Any = optimize.least_squares
+    found = solve(residuals, guess, jacobian, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
     return FittedSphere(middle + size * found.x[:3], float(size * found.x[3]), size * found.fun)
 
 
 def enclosing_sphere(points: Numbers) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Centre and radius, mm, of the smallest sphere that holds all points ``(m, 3)`` (Welzl's algorithm, by the package miniball)."""
+    """Find the smallest sphere that contains all points, by Welzl's algorithm (package miniball).
+
+    Args:
+        points: Points ``(m, 3)``, mm.
+
+    Returns:
+        Its centre ``(3,)`` and its radius, mm.
+
+    Raises:
+        InputError: ``points`` has another shape, or no rows.
+    """
     import miniball
 
     given = points_of(points, "points")
@@ -68,19 +93,64 @@ def enclosing_sphere(points: Numbers) -> tuple[Float[np.ndarray, " 3"], float]:
     size = float(np.abs(given - middle).max())
     if size == 0:
         return middle, 0.0
-    # Two points in nearly one place would make the algorithm's small systems singular; all points count again in the radius.
+    # Nearly coincident points would make the algorithm's small systems singular; all points count again in the radius.
     apart: list[np.ndarray] = []
     for point in (given - middle) / size:
-        if all(np.linalg.norm(point - other) > _ONE_PLACE for other in apart):
+        if all(np.linalg.norm(point - other) > _COINCIDENT for other in apart):
             apart.append(point)
     found: Any = miniball.get_bounding_ball(np.array(apart), rng=np.random.default_rng(0))
     centre = middle + size * found[0]
     return centre, float(np.linalg.norm(given - centre, axis=1).max())
 
 
+def size_error(points: Numbers, diameter: float, stylus: float = 0.0) -> float:
+    """Diameter of the least-squares sphere, less the diameters of the probe's ball and of the calibrated sphere.
+
+    Source: of 25 points P_Size.Sph.1x25 (ISO 10360-12:2016), of 9 the error of the effective diameter (ASME
+    B89.4.22-2004); the formula is stated from secondary sources.
+
+    Args:
+        points: Points ``(m, 3)`` of the probe's centre, mm.
+        diameter: Calibrated diameter, mm.
+        stylus: Diameter of the probe's ball, mm; 0 if the points lie on the sphere itself.
+
+    Returns:
+        The error, mm.
+
+    Raises:
+        InputError: The points do not determine a sphere.
+    """
+    return 2 * fit_sphere(points).radius - stylus - diameter
+
+
 def points_of(points: Numbers, what: str) -> Float[np.ndarray, "m 3"]:
     """Points ``(m, 3)``, at least one, as a NumPy array, or `InputError` that names ``what``."""
     array = np.asarray(as_floats(points, what))
     if array.ndim != 2 or array.shape[1] != 3 or not len(array):
-        raise InputError(f"{what} have shape {array.shape}; give one row (x, y, z) in mm a point, and at least one.")
+        raise InputError(f"{what} have shape {array.shape}; give (x, y, z) in mm, one row per point, at least one row.")
     return array
+
+
+@contextlib.contextmanager
+def errors_named(sphere: ProbedSphere, group: int | None = None) -> Iterator[None]:
+    """Add the sphere, and which of its groups, to the text of an `InputError`."""
+    try:
+        yield
+    except InputError as error:
+        where = f"sphere '{sphere.name}'" + ("" if group is None else f", group {group}")
+        raise InputError(f"{where}: {error}") from error
+
+
+def missing_touches(sphere: ProbedSphere, *, groups: int, points: int, of: str) -> list[str]:
+    """What a complete test of a sphere would also need; ``of`` says what its groups are."""
+    found = []
+    if not _DIAMETERS[0] <= sphere.diameter <= _DIAMETERS[1]:
+        found.append(
+            f"a sphere of {_DIAMETERS[0]:g} to {_DIAMETERS[1]:g} mm ('{sphere.name}' has {sphere.diameter:g} mm)"
+        )
+    if len(sphere.groups) < groups:
+        found.append(f"{groups} {of} of sphere '{sphere.name}' ({len(sphere.groups)} are there)")
+    fewest = min(len(group) for group in sphere.groups)
+    if fewest < points:
+        found.append(f"{points} points per group on sphere '{sphere.name}' (one has {fewest})")
+    return found

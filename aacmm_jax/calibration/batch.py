@@ -20,7 +20,7 @@ from ..core.arrays import Numbers, as_array
 from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.noise import Noise
-from ..kinematics.arm import Arm, is_length, replace
+from ..kinematics.arm import Arm, is_length
 from ..kinematics.parameters import Parameters
 from ..model.measurement import check_joints
 from ..solver.levenberg_marquardt import Reason, reasons
@@ -304,7 +304,7 @@ def _problems(
         if value.ndim not in (1, 2) or value.shape[-1] != p:
             raise InputError(f"{what} has shape {value.shape}; give ({p},) or (batch, {p}), since {p} parameters are free.")
     if arm.beta is None and space.base.beta is not None:
-        arm = replace(arm, beta=jnp.zeros_like(arm.alpha))
+        arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
     lengths = [[np.asarray(getattr(r, key)) for r in capture.lengths] for key in ("value", "u")]
     nominal, u = (np.stack(values, axis=-1) if values else np.zeros(0) for values in lengths)
     geometry = jax.tree.map(np.asarray, arm.geometry)

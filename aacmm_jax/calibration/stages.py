@@ -22,6 +22,7 @@ from ..model.scale import divide_lengths
 from ..solver.bounded import BoundedLevenbergMarquardt, least_squares
 from ..solver.levenberg_marquardt import Reason
 from ..uncertainty import propagation
+from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
 from ..uncertainty.identifiability import observability
 from .checks import based_on, check_enough, check_noise_model, check_start
@@ -143,7 +144,18 @@ class _Task(NamedTuple):
 
 @eqx.filter_jit
 def _identify(task: _Task) -> Identification:
-    return _stage1(task)[0]
+    found, _ = _stage1(task)
+    parameter_covariance = with_active_bounds(
+        found.parameter_covariance,
+        found.arm,
+        task.space,
+        task.measurement,
+        found.active,
+        task.bounds,
+        found.after.sigma,
+        task.hold,
+    )
+    return eqx.tree_at(lambda result: result.parameter_covariance, found, parameter_covariance)
 
 
 def _stage1(task: _Task) -> tuple[Identification, propagation.Propagated]:
@@ -218,6 +230,9 @@ def _calibrate(task: _Task, method: str) -> Calibration:
         ).parameter_covariance
     tips = calibrated.position(measurement.q)
     after = repeatability(tips, measurement.sizes, fitted=len(space.names))
+    parameter_covariance = with_active_bounds(
+        parameter_covariance, calibrated, space, measurement, active, task.bounds, stage1.after.sigma
+    )
     return Calibration(
         arm=calibrated,
         parameters=parameters,

@@ -61,14 +61,14 @@ def simulate(
     from ..data.simulation import simulate as run
     from ..files.arms import load_specification
     from ..files.captures import save_capture
-    from ..kinematics.parameters import Parameters, perturbed_arm
+    from ..kinematics.parameters import perturbed_arm
     from ..summaries.calibration import capture_summary
     from . import display
 
     nominal = load_specification(arm)
     true = load_specification(true_arm) if true_arm else nominal
     if deviate_length_mm or deviate_angle_deg:
-        space = Parameters.free_of(true.arm, held=true.held)
+        space = true.space()
         drawn = perturbed_arm(space, length=deviate_length_mm, angle=math.radians(deviate_angle_deg), seed=seed)
         true = true._replace(arm=drawn, name=f"{true.name}, deviated")
     if acceptance is not None:

@@ -67,7 +67,8 @@ def compare(
 
 def _compared(records: list, created: list[str], labels: list[str], level: float, length: float | None) -> Any:
     """The trend over all files; of two, in the order in which they are named, whatever their dates."""
-    from ..drift.comparison import Trend, compare, moment, trend
+    from ..drift.comparison import compare, moment, trend
+    from ..drift.results import Trend
 
     if len(records) > 2:
         found = trend(records, created, level=level, length=length, labels=labels)
@@ -77,13 +78,13 @@ def _compared(records: list, created: list[str], labels: list[str], level: float
                 "measured, where the manifest states it, and else when the file was made."
             )
             first = found.drifts[0]
-            found = found._replace(drifts=(first._replace(cautions=(caution, *first.cautions)), *found.drifts[1:]))
+            found = found._replace(drifts=(first._replace(warnings=(caution, *first.warnings)), *found.drifts[1:]))
         return found
     drift = compare(*records, level=level, length=length, labels=labels)
     dates = tuple(moment(date) for date in created)
     if dates[1] < dates[0]:
         caution = f"{labels[1]} was made before {labels[0]} ({dates[1]:%Y-%m-%d %H:%M} and {dates[0]:%Y-%m-%d %H:%M}): is the order right?"
-        drift = drift._replace(cautions=(*drift.cautions, caution))
+        drift = drift._replace(warnings=(*drift.warnings, caution))
     return Trend(dates, (0, 1), (drift,))
 
 

@@ -97,7 +97,7 @@ def _changes(console: Console, rows: list[dict[str, Any]]) -> None:
         table.add_row(first["parameter"], "um" if length else "arcsec", *cells)
     console.print(table)
     if any(row["moved"] is None for _, entry in shown for row in entry["parameters"]):
-        console.print("?: without an uncertainty, since it was held, on a bound or left open in one of the two.")
+        console.print("?: without an uncertainty, since it was fixed, on a bound or left open in one of the two.")
 
 
 def _decimals(expanded: float | None, default: int) -> int:

@@ -19,8 +19,8 @@ def bounds(
     single: Sequence[str],
 ) -> Bounds:
     """The box: what the arm's file proposes, changed by what the command line says."""
-    names = _names(held) if held is not None else nominal.held
-    space = Parameters.free_of(nominal.arm, held=names, free=_names(free or ""))
+    names, released = (nominal.held, nominal.free) if held is None else (_names(held), ())
+    space = Parameters.free_of(nominal.arm, held=names, free=dict.fromkeys((*released, *_names(free or ""))))
     override = {name: width for name, width in nominal.override.items() if name in space.names}
     for text in single:
         name, _, width = text.partition("=")

@@ -72,7 +72,6 @@ def plan(
     from ..data.noise import Noise
     from ..files.arms import load_specification
     from ..files.plans import save_plan
-    from ..kinematics.parameters import Parameters
     from ..planning.design import plan as run
     from ..summaries.planning import plan_summary
     from . import acceptance_display, plan_display
@@ -109,7 +108,7 @@ def plan(
     points = dict(socket_option(text) for text in socket or ())
     if len(points) < len(socket or ()):
         raise InputError("a socket is named twice in --socket; give each its own name.")
-    with plan_display.progress() as tell:
+    with plan_display.progress() as progress:
         found = run(
             specification.arm,
             sockets=points or (4 if sockets is None else sockets),
@@ -118,7 +117,7 @@ def plan(
             u=u_mm,
             lengths=[length_option(text) for text in length or ()],
             region=dict(axes) if axes else None,
-            space=Parameters.free_of(specification.arm, held=specification.held),
+            space=specification.space(),
             noise=Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm),
             criterion=criterion,
             margin=math.radians(margin_deg),
@@ -126,7 +125,7 @@ def plan(
             candidates=candidates,
             check_length=check_length_mm,
             seed=seed,
-            tell=tell,
+            progress=progress,
         )
     save_plan(output, found)
     summary: dict[str, Any] = plan_summary(found, specification.name) | {"written": str(output)}

@@ -50,10 +50,10 @@ def evaluate(
 ) -> None:
     """Try a calibration on a capture, with sockets it has never seen, and run every acceptance test that the capture holds."""
     from ..acceptance.decision import read_limits
-    from ..acceptance.suite import FIGURES
+    from ..acceptance.metrics import METRICS
     from . import acceptance_display
 
-    limits = read_limits(mpe or [], FIGURES)
+    limits = read_limits(mpe or [], METRICS)
     maxima = {"rms_mm": max_rms_mm, "deltam_mm": max_deltam_mm, "length_error_largest_mm": max_length_error_mm}
     maxima = {name: value for name, value in maxima.items() if value is not None}
     if capture is None:

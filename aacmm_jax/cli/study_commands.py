@@ -42,7 +42,7 @@ def study(
     as_json: Json = False,
 ) -> None:
     """Run thousands of simulated calibrations; run again, it goes on where it was."""
-    from ..study.runner import Progress, run_study
+    from ..study.runner import StudyProgress, run_study
     from ..study.store import read
 
     if resume and not output.exists():
@@ -64,7 +64,7 @@ def study(
             return run_study(asked, output, executor=executor, workers=count, watch=watch, **options)
 
     with _bar(asked) as show_progress:
-        outcome = run(lambda progress: show_progress(progress) if isinstance(progress, Progress) else None)
+        outcome = run(lambda progress: show_progress(progress) if isinstance(progress, StudyProgress) else None)
     summary = {
         "kind": "study",
         "written": str(output),
@@ -83,7 +83,7 @@ def study(
 def _asked(specification: str, trials: int | None, seed: int | None) -> Any:
     from ..files.toml import validated
     from ..study.definition import Study
-    from ..study.shipped import read_study
+    from ..study.sources import read_study
 
     asked = read_study(specification)
     changes = {name: value for name, value in (("trials", trials), ("seed", seed)) if value is not None}

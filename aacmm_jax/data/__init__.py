@@ -1,4 +1,4 @@
-"""What is recorded: captures, their noise, and simulated recordings."""
+"""Captures, their noise, probed spheres, and simulated captures."""
 
 import lazy_loader as _lazy_loader
 

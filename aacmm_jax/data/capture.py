@@ -1,4 +1,4 @@
-"""What was recorded: joint angles taken while the tip rested in fixed sockets, and known lengths between sockets."""
+"""Captures: joint readings taken while the tip rested in fixed sockets, and reference lengths between sockets."""
 
 import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,14 +12,21 @@ from jaxtyping import Array, Float, Int
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError, nearest
 
-# Encoders of arms with unlimited joints count a few turns at most; readings beyond this are degrees taken for radians.
+# Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
 _MOST_RADIANS = 8 * np.pi
 
 
 class ReferenceLength(eqx.Module):
-    """A physical artefact: the distance between two sockets.
+    """A physical artefact: the certified distance between two sockets.
 
-    ``value`` is its calibrated length and ``u`` the standard uncertainty (k = 1) of that length, both in mm.
+    Args:
+        start: Name of the socket at one end.
+        end: Name of the socket at the other end.
+        value: Calibrated length, scalar, mm.
+        u: Standard uncertainty (k = 1) of ``value``, scalar, mm.
+
+    Raises:
+        InputError: Where both ends are one socket, ``value`` is not positive or ``u`` is negative.
     """
 
     start: str = eqx.field(static=True)
@@ -35,7 +42,7 @@ class ReferenceLength(eqx.Module):
             raise InputError(f"{where} joins a socket to itself; name two different sockets.")
         if self.value.ndim or self.u.ndim:
             raise InputError(f"{where} needs one value and one u, in mm.")
-        # NumPy does the looking: inside jit even a constant becomes a tracer once JAX computes with it.
+        # `float`, not JAX: inside jit even a constant becomes a tracer once JAX computes with it.
         if is_concrete(self.value) and not 0 < float(self.value) < np.inf:
             raise InputError(f"{where} is {float(self.value):g} mm; a length must be positive and finite.")
         if is_concrete(self.u) and not 0 <= float(self.u) < np.inf:
@@ -45,14 +52,19 @@ class ReferenceLength(eqx.Module):
 
 
 class Capture(eqx.Module):
-    """Poses grouped by the socket that held the tip, and reference lengths between sockets.
+    """Poses grouped by the socket in which the tip rested, and reference lengths between sockets.
 
-    ``Capture(sockets={"A": q, ...}, lengths=[ReferenceLength("A", "B", value=201.513, u=0.002)])`` with q ``(m, n)`` in
-    rad. A socket's position is unknown and is eliminated by the centroid of its poses; one pose an end is enough for a
-    length. All poses are kept in one ``(N, n)`` array, socket after socket, because that is what is fast.
+    A socket's position is unknown and is eliminated by the centroid of its poses; one pose at an end is enough for a
+    length. All poses are kept in one array ``q`` of shape ``(N, n)``, socket after socket, so that they are evaluated
+    together.
 
-    Raises `InputError` for angles that are not finite or look like degrees, for sockets of different joint counts, and
-    for lengths that join unknown or identical sockets.
+    Args:
+        sockets: Socket name -> joint readings, shape ``(m, n)``, rad; m poses may differ from socket to socket.
+        lengths: Reference lengths between these sockets.
+
+    Raises:
+        InputError: For readings that are not finite or look like degrees, sockets of different joint counts or with the
+            same poses, and lengths that join unknown sockets.
     """
 
     q: Float[Array, "N n"]
@@ -68,7 +80,8 @@ class Capture(eqx.Module):
         for name, block in blocks.items():
             if block.shape[1] != width:
                 raise InputError(
-                    f"socket '{name}' has {block.shape[1]} columns, but socket '{first}' has {width}; give one column a joint."
+                    f"socket '{name}' has {block.shape[1]} columns, but socket '{first}' has {width}; give one "
+                    "column a joint."
                 )
         _check_different(blocks)
         self.q = joined(list(blocks.values()))
@@ -90,23 +103,34 @@ class Capture(eqx.Module):
 
     @property
     def sockets(self) -> dict[str, Float[Array | np.ndarray, "m n"]]:
-        """Joint angles by socket, rad."""
+        """Joint readings by socket, ``(m, n)`` each, rad."""
         q = np.asarray(self.q) if is_concrete(self.q) else self.q
         ends = np.cumsum(self.sizes)
         return {name: q[end - size : end] for name, size, end in zip(self.names, self.sizes, ends, strict=True)}
 
     @property
     def owner(self) -> Int[np.ndarray, " N"]:
-        """Index of the socket that each pose belongs to, ``(N,)``."""
+        """Index of the socket of each pose, ``(N,)``."""
         return np.repeat(np.arange(len(self.sizes)), self.sizes)
 
     def ends(self) -> Int[np.ndarray, "l 2"]:
-        """Socket indices of every length's two ends."""
+        """Socket indices of both ends of every reference length, ``(l, 2)``."""
         pairs = [(self.names.index(length.start), self.names.index(length.end)) for length in self.lengths]
         return np.array(pairs, dtype=int).reshape(-1, 2)
 
     def select(self, only: Iterable[str] | str | None = None, without: Iterable[str] | str = ()) -> "Capture":
-        """The sockets whose names match ``only`` and not ``without`` (shell patterns), with the lengths among them."""
+        """Select sockets by name, with the reference lengths between them.
+
+        Args:
+            only: Names or shell patterns (``"hole_*"``) of the sockets to keep; None keeps all.
+            without: Names or shell patterns of sockets to leave out.
+
+        Returns:
+            A capture of the remaining sockets, in their order.
+
+        Raises:
+            InputError: Where a pattern matches no socket, or no socket remains.
+        """
         only = [only] if isinstance(only, str) else only
         without = [without] if isinstance(without, str) else list(without)
         kept = list(self.names) if only is None else _matching(self.names, only)
@@ -136,10 +160,14 @@ def _checked_angles(name: str, angles: Numbers) -> Array | np.ndarray:
         try:
             array = np.asarray(angles, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise InputError(f"socket '{name}' holds something that is not a number, or rows of unequal length.") from error
+            raise InputError(
+                f"socket '{name}' has something that is not a number, or rows of unequal length; give one row of numbers "
+                "a pose."
+            ) from error
     if array.ndim != 2 or 0 in array.shape:
         raise InputError(
-            f"socket '{name}' has shape {array.shape}; give one row a pose and one column a joint, at least one of each."
+            f"socket '{name}' has shape {array.shape}; give one row a pose and one column a joint, at least one of "
+            "each."
         )
     if is_concrete(array):
         _check_values(name, np.asarray(array))
@@ -147,13 +175,13 @@ def _checked_angles(name: str, angles: Numbers) -> Array | np.ndarray:
 
 
 def _check_different(blocks: Mapping[str, Array | np.ndarray]) -> None:
-    """Two sockets with the very same poses are one file given twice."""
+    """Refuse two sockets with exactly the same poses: one file given twice."""
     seen: dict[bytes, str] = {}
     for name, block in blocks.items():
         if is_concrete(block) and block.shape[0] > 1:
             twin = seen.setdefault(np.asarray(block).tobytes(), name)
             if twin != name:
-                raise InputError(f"sockets '{twin}' and '{name}' hold the very same poses; is one file given twice?")
+                raise InputError(f"sockets '{twin}' and '{name}' have exactly the same poses; is one file given twice?")
 
 
 def _check_values(name: str, array: np.ndarray) -> None:
@@ -167,13 +195,23 @@ def _check_values(name: str, array: np.ndarray) -> None:
     if largest > _MOST_RADIANS:
         row, column = np.argwhere(np.abs(array) == largest)[0] + 1
         raise InputError(
-            f"socket '{name}' pose {row} joint {column} is {largest:g} rad, more than four sines_cosines: these look like degrees; "
-            "convert with numpy.deg2rad, or state the unit in the manifest."
+            f"socket '{name}' pose {row} joint {column} is {largest:g} rad, more than four revolutions: these look "
+            "like degrees; convert with numpy.deg2rad, or state the unit in the manifest."
         )
 
 
 def stack_captures(captures: Iterable[Capture]) -> Capture:
-    """A batch of captures of the same shape (sockets, poses, lengths) for `identify_many`."""
+    """Stack captures into a batch for `identify_many`.
+
+    Args:
+        captures: Captures with the same sockets, numbers of poses, joints and reference lengths.
+
+    Returns:
+        A capture whose ``q`` is ``(batch, N, n)`` and whose lengths are ``(batch,)``; rad and mm.
+
+    Raises:
+        InputError: Where the captures differ in shape.
+    """
     captures = list(captures)
     if len({(c.names, c.sizes, tuple((r.start, r.end) for r in c.lengths), c.joints) for c in captures}) != 1:
         raise InputError("captures of a batch must have the same sockets, numbers of poses, joints and lengths.")

@@ -1,4 +1,4 @@
-"""What files hold besides numbers: an arm with its name and its proposed identification, a capture with its arms."""
+"""A recording: a capture with the arms that it belongs to and its origin."""
 
 from typing import NamedTuple
 
@@ -8,12 +8,22 @@ from .sphere import ProbedSphere
 
 
 class Recording(NamedTuple):
-    """A capture with the nominal arm that recorded it and, for a simulation, the true one."""
+    """A capture with the nominal arm that recorded it and, for a simulation, the true one.
+
+    Args:
+        capture: The poses, rad, and reference lengths, mm.
+        nominal: The nominal arm, its name and its proposed identification.
+        true: The arm that generated a simulated capture.
+        seed: Seed of a simulated capture.
+        spheres: Spheres probed for acceptance tests.
+        sources: Files that it was read from, as name and SHA-256, the latest first.
+        measured: Day of the recording, ISO 8601; empty where not stated.
+    """
 
     capture: Capture
     nominal: ArmSpecification
     true: ArmSpecification | None = None
     seed: int | None = None
     spheres: tuple[ProbedSphere, ...] = ()
-    sources: tuple[str, ...] = ()  # files that it was read from: name and SHA-256, the latest first
-    measured: str = ""  # day on which it was recorded, ISO 8601; empty where that is not stated
+    sources: tuple[str, ...] = ()
+    measured: str = ""

@@ -1,7 +1,8 @@
-"""Recordings made up: poses of an arm that reach given points, with the noise of encoders and of the probe's seat."""
+"""Simulated captures: poses of an arm that reach given points, with noise of the encoders and of the seat."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from ..core.units import ARCSEC
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture, ReferenceLength
+from .noise import Noise
 
 
 def simulate(
@@ -22,45 +24,56 @@ def simulate(
     *,
     poses: int | Mapping[str, int] = 70,
     lengths: Iterable[ReferenceLength | tuple] = (),
-    encoder_arcsec: float = 0.0,
+    noise: Noise | None = None,
+    encoder_arcsec: float | None = None,
+    seating: float | None = None,
     resolution_arcsec: float = 0.0,
-    seating: float = 0.0,
     limits: Sequence[Sequence[float]] | None = None,
     seed: int = 0,
 ) -> Capture:
-    """Record a capture with a simulated arm; noise-free unless asked otherwise.
+    """Record a capture with a simulated arm; without noise unless asked for.
 
-    - ``sockets``: socket name -> position (x, y, z) in mm, in the base frame.
-    - ``poses``: how many poses hold each socket, or a number per socket.
-    - ``lengths``: `ReferenceLength` objects as they are; or ``("A", "B")`` and ``("A", "B", u)``, whose certified value
-      is the true distance, plus an error drawn with standard deviation u (mm).
-    - ``encoder_arcsec``: standard deviation of a reading; ``resolution_arcsec``: readings are rounded to multiples of it.
-    - ``seating``: standard deviation, a coordinate, of the tip's centre about the socket's, mm.
-    - ``limits``: lowest and highest reading of each joint, rad; by default the arm's own, else half a turn each way.
+    Poses start at random within the limits and reach their point by least-norm steps, so that the poses of a redundant
+    arm differ in all joints. The same seed gives the same capture.
 
-    Poses start at random within the limits and are moved onto the point by least-norm steps, so they spread over the
-    freedom that a redundant arm has left. The same seed gives the same capture.
+    Args:
+        arm: One arm.
+        sockets: Socket name -> position ``(3,)`` in the base frame, mm.
+        poses: Number of poses in each socket, or socket name -> number.
+        lengths: `ReferenceLength` objects, taken as they are; or ``("A", "B")`` and ``("A", "B", u)``, whose certified
+            value is the true distance plus an error drawn with standard deviation u, mm.
+        noise: Standard deviations of the readings, for all encoders or one a joint, and of the seat.
+        encoder_arcsec: Short form of ``Noise(encoder_arcsec=...)``.
+        seating: Short form of ``Noise(seating=...)``, mm.
+        resolution_arcsec: Readings are rounded to multiples of it; 0 for none.
+        limits: Lowest and highest reading of each joint, ``(n, 2)``, rad; by default the arm's own, else +-pi.
+        seed: Seed of poses and noise.
 
-    Raises `InputError` for a point out of reach and for noise that is negative.
+    Returns:
+        The capture: readings in rad, lengths in mm.
+
+    Raises:
+        InputError: For a point out of reach, negative noise, and noise given in both forms.
     """
-    for what, value in (("encoder_arcsec", encoder_arcsec), ("resolution_arcsec", resolution_arcsec), ("seating", seating)):
-        if not (math.isfinite(value) and value >= 0):
-            raise InputError(f"{what} is {value:g}; noise must be zero or positive.")
+    noise = _noise(noise, encoder_arcsec, seating, resolution_arcsec)
     if not is_single(arm):
         raise InputError("simulate takes one arm, not a batch; take one of it first.")
+    noise.check_joints(arm.joints)
     if not sockets:
         raise InputError("simulate needs at least one socket with its position.")
     limits_array = joint_limits(arm, limits)
     points = {name: socket_point(name, point) for name, point in sockets.items()}
     counts = _counts(points, poses)
-    key = jax.random.key(seed)
-    reach_key, seat_key, encoder_key, length_key = jax.random.split(key, 4)
+    reach_key, seat_key, encoder_key, length_key = jax.random.split(jax.random.key(seed), 4)
     owner = [name for name, count in counts.items() for _ in range(count)]
-    exact = jnp.asarray(np.repeat(np.stack([np.asarray(point) for point in points.values()]), list(counts.values()), axis=0))
-    targets = exact + seating * jax.random.normal(seat_key, exact.shape)
+    rows = np.stack([np.asarray(point) for point in points.values()])
+    exact = jnp.asarray(np.repeat(rows, list(counts.values()), axis=0))
+    targets = exact + noise.seating * jax.random.normal(seat_key, exact.shape)
     references = _reference_lengths(points, lengths, length_key)
-    angles = random_configurations(arm, targets, reach_key, limits_array, labels=[f"socket '{name}'" for name in owner])
-    angles = angles + encoder_arcsec * ARCSEC * jax.random.normal(encoder_key, angles.shape)
+    labels = [f"socket '{name}'" for name in owner]
+    angles = random_configurations(arm, targets, reach_key, limits_array, labels=labels)
+    encoder = jnp.broadcast_to(noise.encoder, (1, arm.joints))
+    angles = angles + encoder * jax.random.normal(encoder_key, angles.shape)
     if resolution_arcsec > 0:
         angles = jnp.round(angles / (resolution_arcsec * ARCSEC)) * (resolution_arcsec * ARCSEC)
     ends = np.cumsum(list(counts.values()))
@@ -68,11 +81,33 @@ def simulate(
     return Capture(readings, references)
 
 
+def _noise(noise: Any, encoder_arcsec: Any, seating: Any, resolution_arcsec: Any) -> Noise:
+    """The noise in either form, checked."""
+    short = {"encoder_arcsec": encoder_arcsec, "seating": seating}
+    given = {name: value for name, value in short.items() if value is not None}
+    for what, value in {**given, "resolution_arcsec": resolution_arcsec}.items():
+        if np.ndim(value):
+            raise InputError(
+                f"{what} has shape {np.shape(value)}; give one number, or noise=aj.Noise(...) for one a joint."
+            )
+        if not (math.isfinite(value) and value >= 0):
+            raise InputError(f"{what} is {value:g}; noise must be zero or positive.")
+    if noise is None:
+        return Noise(**given)
+    if not isinstance(noise, Noise):
+        raise InputError(f"noise is a {type(noise).__name__}; give aj.Noise(encoder_arcsec=..., seating=...).")
+    if given:
+        raise InputError(f"simulate is given noise and {' and '.join(given)}; put all of it into noise.")
+    return noise
+
+
 def socket_point(name: str, point: Numbers) -> Float[Array, " 3"]:
     """A socket's position, mm, or `InputError` that names the socket."""
     array = as_floats(point, f"position of socket '{name}'")
     if array.shape != (3,):
-        raise InputError(f"position of socket '{name}' has shape {array.shape}; give its three coordinates (x, y, z) in mm.")
+        raise InputError(
+            f"position of socket '{name}' has shape {array.shape}; give its three coordinates (x, y, z) in mm."
+        )
     return array
 
 

@@ -1,4 +1,4 @@
-"""Reference spheres as they were touched, for acceptance tests."""
+"""Reference spheres probed for acceptance tests."""
 
 from typing import Literal, NamedTuple, get_args
 
@@ -13,23 +13,31 @@ SPHERE_TESTS = get_args(SphereTest)
 
 
 class ProbedSphere(NamedTuple):
-    """A reference sphere as it was touched, for acceptance tests; it takes no part in a calibration. mm and rad.
+    """A reference sphere as it was probed for an acceptance test; it takes no part in a calibration.
 
-    ``groups`` are joint angles ``(m, n)`` or points ``(m, 3)`` of the probe's centre, one group for each sphere that is fitted: the repeats of
-    ASME's effective diameter, the 25 points of ISO's probing test, or the orientations of its articulation test.
+    Args:
+        name: Name of the sphere.
+        test: The test that it is for.
+        groups: Joint readings ``(m, n)``, rad, or centres of the probe ``(m, 3)``, mm; one group for each sphere that
+            is fitted: the repeats of ASME's effective diameter, the 25 points of ISO's probing test, or the
+            orientations of its articulation test.
+        diameter: Calibrated diameter, mm.
+        u: Standard uncertainty (k = 1) of the diameter, mm.
+        stylus: Diameter of the probe's ball, mm; 0 where the points are on the sphere itself.
+        form: Calibrated form error of the sphere, mm.
     """
 
     name: str
     test: SphereTest
     groups: tuple[Float[np.ndarray, "m n"], ...]
-    diameter: float  # calibrated
-    u: float = 0.0  # standard uncertainty of the diameter
-    stylus: float = 0.0  # diameter of the ball of the probe; 0 where points lie on the sphere itself
-    form: float = 0.0  # calibrated form error of the sphere
+    diameter: float
+    u: float = 0.0
+    stylus: float = 0.0
+    form: float = 0.0
 
 
 def checked_sphere(sphere: ProbedSphere, columns: int | None = None) -> ProbedSphere:
-    """The same sphere with its groups as arrays, or `InputError` that names it."""
+    """The same sphere with its groups as arrays, or `InputError` that names the sphere."""
     where = f"sphere '{sphere.name}'"
     if sphere.test not in SPHERE_TESTS:
         raise InputError(f"{where}: test is '{sphere.test}'; it must be one of {', '.join(SPHERE_TESTS)}.")
@@ -40,14 +48,16 @@ def checked_sphere(sphere: ProbedSphere, columns: int | None = None) -> ProbedSp
         ("form", sphere.form, 0.0),
     ):
         if not (np.isfinite(value) and value >= least):
-            raise InputError(f"{where}: {what} is {value:g} mm; it must be {'positive' if least else 'zero or positive'}.")
+            raise InputError(
+                f"{where}: {what} is {value:g} mm; it must be {'positive' if least else 'zero or positive'}."
+            )
     groups = tuple(np.asarray(as_floats(group, where)) for group in sphere.groups)
     for group in groups:
         if group.ndim != 2 or not len(group) or (columns is not None and group.shape[1] != columns):
             raise InputError(
-                f"{where} has a group of shape {group.shape}; give one row a touched point"
+                f"{where} has a group of shape {group.shape}; give one row a probed point"
                 + (f" and {columns} columns." if columns is not None else ".")
             )
     if not groups:
-        raise InputError(f"{where} has no touched points; give at least one group.")
+        raise InputError(f"{where} has no probed points; give at least one group.")
     return sphere._replace(groups=groups)

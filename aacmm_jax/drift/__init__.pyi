@@ -1,4 +1,4 @@
-from .comparison import Drift as Drift
-from .comparison import Trend as Trend
 from .comparison import compare as compare
 from .comparison import trend as trend
+from .results import Drift as Drift
+from .results import Trend as Trend

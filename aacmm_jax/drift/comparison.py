@@ -1,65 +1,21 @@
-"""What happened to an arm between calibrations: parameters that moved beyond their uncertainty, and what that does to lengths."""
+"""Calibrations of one arm compared: parameters that changed beyond their uncertainty, and the effect on lengths."""
 
 import datetime
-import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..calibration.checks import plausible
 from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
-from ..core.units import ARCSEC
-from ..kinematics.arm import Arm, is_length, parameter_names
+from ..kinematics.arm import Arm, parameter_names
 from ..kinematics.parameters import Parameters
 from ..uncertainty.volume import default_length, sample_lengths
-from .statistics import Joint, LengthChange, coverage_factor, effective_freedom, length_change, tested
+from .results import Drift, Trend, some
+from .statistics import FIXED, ON_BOUND, coverage_factor, effective_degrees_of_freedom, joint_test, length_change
 
-_NAMED = 6  # how many parameters a sentence names
 _PAIR = ("the old calibration", "the new calibration")
-
-
-class Drift(NamedTuple):
-    """Two calibrations compared, as NumPy arrays in the order of ``names``: mm and rad."""
-
-    names: tuple[str, ...]  # free in either
-    old: Float[np.ndarray, " p"]
-    new: Float[np.ndarray, " p"]
-    u: Float[np.ndarray, " p"]  # standard uncertainty of the change; NaN where there is none
-    degrees_of_freedom: Float[np.ndarray, " p"]  # its effective degrees of freedom
-    expanded: Float[np.ndarray, " p"]
-    without: tuple[str, ...]  # why a change has no uncertainty; empty where it has one
-    level: float
-    joint: Joint
-    lengths: LengthChange
-    cautions: tuple[str, ...]  # what should be read before any number
-
-    @property
-    def change(self) -> Float[np.ndarray, " p"]:
-        """New less old."""
-        return self.new - self.old
-
-    @property
-    def moved(self) -> Bool[np.ndarray, " p"]:
-        """Which parameters moved beyond their expanded uncertainty; False where there is none."""
-        return np.abs(self.change) > np.where(np.isnan(self.expanded), np.inf, self.expanded)
-
-    @property
-    def by_chance(self) -> float:
-        """How many parameters would exceed their expanded uncertainty on average, had nothing moved."""
-        return (1 - self.level) * self.without.count("")
-
-    def sentences(self) -> list[str]:
-        """What to say of it, the gravest first."""
-        return [*self.cautions, *self.findings()]
-
-    def findings(self) -> list[str]:
-        """What came out, without the cautions."""
-        told = [_of_all(self), _of_each(self), _of_lengths(self.lengths, self.level), _of_size(self.lengths)]
-        told.append(_of_those_without(self))
-        return [sentence for sentence in told if sentence]
 
 
 def compare(
@@ -72,50 +28,31 @@ def compare(
     seed: int = 0,
     labels: Sequence[str] = _PAIR,
 ) -> Drift:
-    """Compare two calibrations of one arm: every parameter that is free in either, and lengths of ``length`` mm (default 300, or half
-    the reach of a small arm) from ``points`` places of the volume. Sentences call the two by their ``labels``.
+    """Compare two calibrations of one arm: every parameter that is free in either, and lengths over the volume.
 
-    The two are taken as independent, so variances add (JCGM 100, 5.1.2) and effective degrees of freedom follow Welch and
-    Satterthwaite (annex G.4). What they share, such as the error of one artefact's certified length, cancels in the change,
-    and makes its uncertainty too large rather than too small. k is no parameter of the arm but a correction of stage 1, so it
-    is not compared. Raises `InputError` for arms of different numbers of joints, a level that is no share, and lengths that
-    do not fit into the volume.
+    The two are taken as independent, so variances add (JCGM 100, 5.1.2) and effective degrees of freedom follow Welch
+    and Satterthwaite (annex G.4). A common error, such as that of one artefact's certified length, cancels in the
+    change, so the uncertainty is then too large rather than too small. k is not compared: it is a correction of stage 1,
+    not a parameter of the arm.
+
+    Args:
+        old: The earlier calibration.
+        new: The later calibration.
+        level: Coverage of the expanded uncertainties, between 0 and 1.
+        points: Number of lengths over the volume.
+        length: Their length, mm (default: 300, or half the reach of a small arm).
+        seed: Seed of their positions.
+        labels: How sentences name the two.
+
+    Returns:
+        Changes with their uncertainties, a test of all together, the change of lengths, and warnings.
+
+    Raises:
+        InputError: The arms have different numbers of joints, ``level`` is out of range, or the lengths do not fit into
+            the volume.
     """
     _check([old, new], level, labels)
-    return _compared(old, new, _union([old, new]), level, _readings(old, points, length, seed), labels)
-
-
-class Trend(NamedTuple):
-    """Any number of calibrations of one arm, in the order of their dates, each compared with the first."""
-
-    dates: tuple[datetime.datetime, ...]
-    order: tuple[int, ...]  # which of the calibrations given each is
-    drifts: tuple[Drift, ...]  # of the second, third ... against the first; all have the same names
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Parameters that are free in any of them."""
-        return self.drifts[0].names
-
-    @property
-    def change(self) -> Float[np.ndarray, "c p"]:
-        """Change of every parameter from the first calibration, mm and rad; the first row is zero."""
-        return np.stack([np.zeros(len(self.names)), *(drift.change for drift in self.drifts)])
-
-    @property
-    def expanded(self) -> Float[np.ndarray, "c p"]:
-        """Expanded uncertainty of these changes; NaN where there is none, as in the first row."""
-        return np.stack([np.full(len(self.names), np.nan), *(drift.expanded for drift in self.drifts)])
-
-    @property
-    def moved(self) -> Bool[np.ndarray, "c p"]:
-        """Which changes are beyond their expanded uncertainty."""
-        return np.stack([np.zeros(len(self.names), dtype=bool), *(drift.moved for drift in self.drifts)])
-
-    @property
-    def cautions(self) -> list[str]:
-        """What should be read first, each said once."""
-        return list(dict.fromkeys(sentence for drift in self.drifts for sentence in drift.cautions))
+    return _compared(old, new, _names([old, new]), level, _lengths(old, points, length, seed), labels)
 
 
 def trend(
@@ -128,11 +65,25 @@ def trend(
     seed: int = 0,
     labels: Sequence[str] | None = None,
 ) -> Trend:
-    """Every calibration against the first in time, by the same lengths; arguments as for `compare`.
+    """Compare every calibration with the first in time, by the same lengths.
 
-    ``dates`` are datetimes or their ISO form, as the attribute ``created`` of a calibration's file; without a time zone they
-    are UTC. All changes share the error of the first calibration: where every later one differs alike, it is the first that
-    was off. Raises `InputError` as `compare` does, for fewer than two, and for a date that is none.
+    All changes share the error of the first calibration: if all later ones differ alike, the first was probably wrong.
+
+    Args:
+        records: Two or more calibrations of one arm, in any order.
+        dates: Their dates: datetimes or ISO 8601 texts, such as the attribute ``created`` of a calibration's file; UTC
+            without a time zone.
+        level: As for `compare`.
+        points: As for `compare`.
+        length: As for `compare`.
+        seed: As for `compare`.
+        labels: How sentences name the calibrations (default: number and date).
+
+    Returns:
+        The comparisons in the order of the dates.
+
+    Raises:
+        InputError: As for `compare`; or there are fewer than two calibrations, or a date is not one.
     """
     if len(records) < 2:
         raise InputError("a trend needs at least two calibrations; give more.")
@@ -144,9 +95,9 @@ def trend(
     names = [f"calibration {number} ({moments[i]:%Y-%m-%d})" for number, i in enumerate(order, start=1)]
     names = names if labels is None else [labels[i] for i in order]
     _check(sorted_records, level, names)
-    readings = _readings(sorted_records[0], points, length, seed)
+    lengths = _lengths(sorted_records[0], points, length, seed)
     drifts = [
-        _compared(sorted_records[0], record, _union(sorted_records), level, readings, (names[0], name))
+        _compared(sorted_records[0], record, _names(sorted_records), level, lengths, (names[0], name))
         for record, name in zip(sorted_records[1:], names[1:], strict=True)
     ]
     return Trend(tuple(moments[i] for i in order), tuple(order), tuple(drifts))
@@ -157,14 +108,15 @@ def _compared(
     new: CalibrationRecord,
     names: tuple[str, ...],
     level: float,
-    readings: tuple[float, np.ndarray, np.ndarray],
+    lengths: tuple[float, np.ndarray, np.ndarray],
     labels: Sequence[str],
 ) -> Drift:
+    """``lengths``: their length, and the configurations at both ends."""
     before, after = (_values(record.calibrated.arm, names) for record in (old, new))
-    without = _without(old, new, names)
-    known = np.array([not reason for reason in without])
+    reasons = _reasons(old, new, names)
+    known = np.array([not reason for reason in reasons])
     u_old, u_new = (np.where(known, _standard_uncertainties(record, names), 0.0) for record in (old, new))
-    degrees_of_freedom = effective_freedom(u_old, old.degrees_of_freedom, u_new, new.degrees_of_freedom)
+    degrees_of_freedom = effective_degrees_of_freedom(u_old, old.degrees_of_freedom, u_new, new.degrees_of_freedom)
     u = np.where(known, np.hypot(u_old, u_new), np.nan)
     return Drift(
         names=names,
@@ -173,64 +125,65 @@ def _compared(
         u=u,
         degrees_of_freedom=degrees_of_freedom,
         expanded=coverage_factor(level, degrees_of_freedom) * u,
-        without=without,
+        reasons=reasons,
         level=level,
-        joint=tested(old, new, names, without, after - before, level),
-        lengths=length_change(old, new, level, readings),
-        cautions=tuple(_warnings(old, new, labels)),
+        joint_test=joint_test(old, new, names, reasons, after - before, level),
+        lengths=length_change(old, new, level, lengths),
+        warnings=tuple(_warnings(old, new, labels)),
     )
 
 
-def _values(arm: Arm, names: tuple[str, ...]) -> np.ndarray:
+def _values(arm: Arm, names: tuple[str, ...]) -> Float[np.ndarray, " p"]:
     return np.asarray(Parameters(arm, names).vector())
 
 
-def _union(records: Sequence[CalibrationRecord]) -> tuple[str, ...]:
-    """Names that are free in any of them: those of the first in its order, then what others add."""
+def _names(records: Sequence[CalibrationRecord]) -> tuple[str, ...]:
+    """Parameters that are free in any calibration: those of the first in its order, then those that others add."""
     return tuple(dict.fromkeys(name for record in records for name in record.names))
 
 
-def _readings(record: CalibrationRecord, points: int, length: float | None, seed: int) -> tuple[float, np.ndarray, np.ndarray]:
+def _lengths(
+    record: CalibrationRecord, points: int, length: float | None, seed: int
+) -> tuple[float, np.ndarray, np.ndarray]:
     arm = record.calibrated.arm
     length = default_length(arm) if length is None else length
     return (length, *sample_lengths(arm, points, length=length, seed=seed))
 
 
-def _without(old: CalibrationRecord, new: CalibrationRecord, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Why the change of each parameter has no uncertainty: held, on a bound, or left open by the data."""
-    found = [[_reason(record, name) for name in names] for record in (old, new)]
-    return tuple(
-        "" if not (one or two) else f"{one} in both" if one == two else " and ".join(
-            f"{reason} in the {which} one" for reason, which in ((one, "old"), (two, "new")) if reason
-        )
-        for one, two in zip(*found, strict=True)
-    )  # fmt: skip
+def _reasons(old: CalibrationRecord, new: CalibrationRecord, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Why the change of each parameter has no uncertainty; empty if it has one."""
+    found = []
+    for one, two in ((_reason(old, name), _reason(new, name)) for name in names):
+        parts = [f"{one} in both"] if one == two else [f"{one} in the old one", f"{two} in the new one"]
+        found.append(" and ".join(part for part, reason in zip(parts, (one, two), strict=False) if reason))
+    return tuple(found)
 
 
 def _reason(record: CalibrationRecord, name: str) -> str:
     if name not in record.names:
-        return "held"
+        return FIXED
     i = record.names.index(name)
     if record.active[i]:
-        return "on a bound"
+        return ON_BOUND
     known = record.determined[i] and record.open[i, i] < 1e-6 and np.isfinite(record.covariance[i, i])
     return "" if known else "left open by the data"
 
 
-def _standard_uncertainties(record: CalibrationRecord, names: tuple[str, ...]) -> np.ndarray:
-    """Standard uncertainties in the order of ``names``; 0 for what is held."""
+def _standard_uncertainties(record: CalibrationRecord, names: tuple[str, ...]) -> Float[np.ndarray, " p"]:
+    """Standard uncertainties in the order of ``names``; 0 for fixed parameters."""
     known = dict(zip(record.names, np.sqrt(np.diag(record.covariance)), strict=True))
     return np.array([known.get(name, 0.0) for name in names])
 
 
 def _check(records: Sequence[CalibrationRecord], level: float, labels: Sequence[str]) -> None:
-    """Raise `InputError` for what cannot be compared at all."""
+    """Raise `InputError` for what cannot be compared."""
     if not 0 < level < 1:
-        raise InputError(f"level is {level:g}; give a share between 0 and 1, for example 0.95.")
+        raise InputError(f"level is {level:g}; give a number between 0 and 1, for example 0.95.")
     for record in records:
         if not isinstance(record, CalibrationRecord):
             raise InputError(
-                f"a {type(record).__name__} cannot be compared; give records, from aj.files.load_calibration or aj.calibration.record_of."
+                f"a {type(record).__name__} cannot be compared; give records, from aj.files.load_calibration or "
+                "aj.calibration.record_of."
             )
     arms = [record.recording.nominal for record in records]
     for arm, label in zip(arms, labels, strict=True):
@@ -242,39 +195,39 @@ def _check(records: Sequence[CalibrationRecord], level: float, labels: Sequence[
 
 
 def moment(date: datetime.datetime | str) -> datetime.datetime:
-    """A date with its time zone; without one it is UTC. Raises `InputError` for what is no date."""
+    """A date with its time zone, UTC by default. Raises `InputError` for a text that is not a date."""
     try:
         found = datetime.datetime.fromisoformat(date) if isinstance(date, str) else date
     except ValueError as error:
-        raise InputError(f"'{date}' is no date; give it like 2026-03-01 or 2026-03-01T12:00:00+00:00.") from error
+        raise InputError(f"'{date}' is not a date; give it like 2026-03-01 or 2026-03-01T12:00:00+00:00.") from error
     return found if found.tzinfo else found.replace(tzinfo=datetime.UTC)
 
 
 def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str]) -> list[str]:
-    """What makes a comparison doubtful, the gravest first."""
+    """What makes a comparison doubtful, the most serious first."""
     found = []
     for record, label in zip((old, new), labels, strict=True):
         if not record.converged:
             found.append(f"Failed: {label}. {record.reason} Its changes mean nothing.")
         elif not plausible(record.k):
             found.append(f"Implausible: {label}, with k = {record.k:.6g}. Check its units, sockets, lengths and arm.")
-    found += [sentence for sentence in (_shared(old, new, labels), _other_arm(old, new, labels)) if sentence]
+    found += [sentence for sentence in (_common_poses(old, new, labels), _other_arm(old, new, labels)) if sentence]
     if old.method != new.method:
         found.append(
-            f"Of different methods: {labels[0]} is {old.method}, {labels[1]} {new.method}; some of the change is the method's."
+            f"Different methods: {labels[0]} is {old.method}, {labels[1]} {new.method}; that explains part of the change."
         )
     for one, other, label in ((old, new, labels[0]), (new, old, labels[1])):
         alone = [name for name in one.names if name not in other.names]
         if alone:
             found.append(
-                f"Free in {label} only: {_some(alone)}. What they hold there, other parameters may hold in the other one; "
-                "lengths can be compared all the same."
+                f"Free in {label} only: {some(alone)}. Other parameters may compensate for them in the other one; "
+                "lengths can still be compared."
             )
     return found
 
 
-def _shared(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str]) -> str:
-    """A sentence on readings that both calibrations are of: then they are not independent."""
+def _common_poses(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str]) -> str:
+    """A sentence on poses that both calibrations use, which makes them dependent; empty if there are none."""
     rows = [{row.tobytes() for row in np.asarray(record.recording.capture.q)} for record in (old, new)]
     common = len(rows[0] & rows[1])
     if not common:
@@ -284,101 +237,22 @@ def _shared(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str
         same = old.names == new.names and np.array_equal(both[0], both[1])
         what = "are one and the same calibration" if same else "are of the same capture"
         return f"Not independent: {labels[0]} and {labels[1]} {what}, so this says nothing about drift."
-    return f"Not independent: {labels[0]} and {labels[1]} share {common} of {len(rows[1])} poses, so the uncertainties of the changes are wrong."
+    return (
+        f"Not independent: {labels[0]} and {labels[1]} share {common} of {len(rows[1])} poses, so the uncertainties of "
+        "the changes are wrong."
+    )
 
 
 def _other_arm(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str]) -> str:
-    """A sentence where the two started from different nominal arms."""
+    """A sentence on different nominal arms; empty if they are equal."""
     nominal = [record.recording.nominal for record in (old, new)]
     names = tuple(dict.fromkeys(name for specification in nominal for name in parameter_names(specification.arm)))
     values = [_values(specification.arm, names) for specification in nominal]
     other = [name for name, one, two in zip(names, *values, strict=True) if one != two]
     if not other:
         return ""
+    one, two = (f"'{specification.name}' of {label}" for specification, label in zip(nominal, labels, strict=True))
     return (
-        f"The nominal arms differ in {_some(other)} ('{nominal[0].name}' of {labels[0]}, '{nominal[1].name}' of {labels[1]}): is it the same "
-        "arm? Of what was held, the difference counts as drift."
+        f"The nominal arms differ in {some(other)} ({one}, {two}): is it the same arm? Differences of fixed parameters "
+        "count as drift."
     )
-
-
-def _of_all(drift: Drift) -> str:
-    joint = drift.joint
-    if math.isnan(joint.p):
-        return "Together the changes cannot be tested: too few parameters or poses determine them in both calibrations."
-    law = f"chi-square {joint.statistic:.1f} with {joint.rank} degrees of freedom"
-    if math.isfinite(joint.degrees_of_freedom):
-        law = f"F {joint.statistic / joint.rank:.2f} with {joint.rank} and {joint.degrees_of_freedom:.0f} degrees of freedom"
-    chance = "p < 0.0001" if joint.p < 1e-4 else f"p = {joint.p:.2g}"
-    start = f"Together, the changes of {len(joint.names)} parameters are"
-    if joint.p >= 1 - drift.level:
-        return f"{start} no more than their uncertainties explain ({law}, {chance})."
-    causes = [f"{name} by {in_words(name, amount)}" for name, amount in joint.causes]
-    few = f" A change of these alone would explain all of it: {', '.join(causes)}." if causes else ""
-    return (
-        f"{start} more than their uncertainties explain ({law}, {chance}): the arm has changed, or errors are at work that the "
-        f"uncertainties leave out.{few}"
-    )
-
-
-def _of_each(drift: Drift) -> str:
-    compared, moved = drift.without.count(""), np.flatnonzero(drift.moved)
-    if not compared:
-        return ""
-    chance = f"{drift.by_chance:.0f}" if drift.by_chance >= 0.95 else f"{drift.by_chance:.1g}"
-    count = f"{len(moved) or 'None'} of {compared} parameters moved beyond {'their' if len(moved) != 1 else 'its'} uncertainty"
-    start = f"{count} ({100 * drift.level:g} %; {chance} would by chance)"
-    if not len(moved):
-        return f"{start}."
-    worst = sorted(moved, key=lambda i: -abs(drift.change[i]) / drift.expanded[i])
-    each = [_moved(drift, int(i)) for i in worst]
-    return f"{start}: {_some(each)}."
-
-
-def _moved(drift: Drift, i: int) -> str:
-    name = drift.names[i]
-    return f"{name} by {in_words(name, drift.change[i])} (U = {in_words(name, drift.expanded[i], '')})"
-
-
-def _of_lengths(lengths: LengthChange, level: float) -> str:
-    if not np.all(np.isfinite(lengths.u)):
-        return (
-            f"Lengths of {lengths.length:g} mm changed by {lengths.rms:.4f} mm RMS, at most {lengths.largest:+.4f} mm, but the data of one "
-            "calibration leave them open, so nothing says whether that is drift."
-        )
-    share = 100 * float(np.mean(lengths.moved))
-    return (
-        f"Lengths of {lengths.length:g} mm over the volume changed by {lengths.rms:.4f} mm RMS, where the uncertainties alone would give "
-        f"{lengths.rms_by_chance:.4f} mm, and at most by {lengths.largest:+.4f} mm; {share:.0f} % of them moved beyond their uncertainty "
-        f"({100 * (1 - level):.2g} % would by chance)."
-    )
-
-
-def _of_size(lengths: LengthChange) -> str:
-    if not math.isfinite(lengths.u_size):
-        return ""
-    relation = "beyond" if abs(lengths.size) > lengths.expanded_size else "within"
-    word = "longer" if lengths.size > 0 else "shorter"
-    return (
-        f"On average the same lengths measure {1e6 * abs(lengths.size):.1f} um/m {word} than before (U = {1e6 * lengths.expanded_size:.1f} um/m), "
-        f"which is {relation} the uncertainty."
-    )
-
-
-def _of_those_without(drift: Drift) -> str:
-    reasons = {}
-    for name, reason in zip(drift.names, drift.without, strict=True):
-        if reason:
-            reasons.setdefault(reason, []).append(name)
-    told = [f"{_some(names)} ({reason})" for reason, names in reasons.items()]
-    return f"Without an uncertainty of change: {'; '.join(told)}." if told else ""
-
-
-def in_words(name: str, value: float, sign: str = "+") -> str:
-    """A change of a parameter in um or arcsec, to three digits."""
-    shown, unit = (1e3 * value, "um") if is_length(name) else (value / ARCSEC, "arcsec")
-    decimals = max(2 - math.floor(math.log10(abs(shown))), 0) if shown else 0
-    return f"{shown:{sign}.{min(decimals, 3)}f} {unit}"
-
-
-def _some(items: list[str]) -> str:
-    return ", ".join(items[:_NAMED]) + (f" and {len(items) - _NAMED} more" if len(items) > _NAMED else "")

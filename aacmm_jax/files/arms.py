@@ -1,19 +1,23 @@
-"""Arms in files: TOML for people, one row a joint, and the arms that ship with the package."""
+"""Arms in TOML files, one row per joint, and the arms that ship with the package."""
 
 import math
 import os
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
 
 from ..core.errors import InputError, nearest
 from ..kinematics.arm import Arm
+from ..kinematics.parameters import Parameters
 from ..kinematics.specification import ArmSpecification, single
 from .toml import read_toml
 from .whole_file import storable, write_text
+
+if TYPE_CHECKING:
+    from tomlkit import TOMLDocument
 
 _LENGTH_UNITS = {"mm": 1.0, "m": 1000.0}
 _ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180}
@@ -34,6 +38,7 @@ class _Joint(_Strict):
 
 class _Identification(_Strict):
     held: list[str] | None = None
+    free: list[str] = []
     length: PositiveFloat = 10.0
     angle: PositiveFloat | None = None
     override: dict[str, PositiveFloat] = {}
@@ -47,7 +52,7 @@ class _ArmModel(_Strict):
     angle_unit: Literal["rad", "deg"]
     probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] = [0.0, 0.0, 0.0]
     joint: Annotated[list[_Joint], Field(min_length=1)]
-    identification: _Identification = _Identification()
+    identification: _Identification | None = None
 
     @model_validator(mode="after")
     def _all_or_none(self) -> "_ArmModel":
@@ -71,32 +76,58 @@ def shipped_arms() -> tuple[str, ...]:
 
 
 def load_arm(source: str | os.PathLike) -> Arm:
-    """An arm by shipped name (``"cheng2018-simulation"``) or from a TOML file. Raises `InputError` where neither is found."""
-    return load_specification(source).arm
+    """The arm of a file.
+
+    Args:
+        source: Name of a shipped arm (``"cheng2018-simulation"``), or path of a TOML file.
+
+    Raises:
+        InputError: There is neither, or the file is not an arm's.
+    """
+    return _read(source, choose=False).arm
 
 
 def load_specification(source: str | os.PathLike) -> ArmSpecification:
-    """An arm with its name and its proposed identification, by shipped name or from a TOML file."""
+    """The arm of a file with its name and its proposed identification.
+
+    A file without an ``[identification]`` table gets the parameters that thorough data would determine well, of
+    `Parameters.independent`, and the default bounds.
+
+    Args:
+        source: Name of a shipped arm, or path of a TOML file.
+
+    Raises:
+        InputError: There is neither, or the file is not an arm's.
+    """
+    return _read(source, choose=True)
+
+
+def _read(source: str | os.PathLike, *, choose: bool) -> ArmSpecification:
+    """``choose``: whether parameters are chosen for a file that proposes none."""
     if isinstance(source, str) and source in shipped_arms():
         with resources.as_file(resources.files("aacmm_jax.files") / "shipped_arms" / f"{source}.toml") as path:
-            return _specification(path)
+            return _specification(path, choose)
     path = Path(source)
     if not path.exists() and path.suffix != ".toml":
         raise InputError(
             f"'{source}' is neither a file nor an arm that ships with the package{nearest(str(source), shipped_arms())}"
         )
-    return _specification(path)
+    return _specification(path, choose)
 
 
-def _specification(path: Path) -> ArmSpecification:
+def _specification(path: Path, choose: bool) -> ArmSpecification:
     model = read_toml(path, _ArmModel)
     length, angle = _LENGTH_UNITS[model.length_unit], _ANGLE_UNITS[model.angle_unit]
     rows = model.joint
     links = [(row.alpha, row.a) for row in rows]
     if model.convention == "craig":
-        # Rx(alpha_{i-1}) Tx(a_{i-1}) Rz Tz: the link after joint i stands in row i + 1; after the last there is none.
+        # Rx(alpha_{i-1}) Tx(a_{i-1}) Rz Tz: the link after joint i is in row i + 1; there is none after the last joint.
         links = [*links[1:], (0.0, 0.0)]
-    beta = None if all(row.beta is None for row in rows) else [angle * (0.0 if row.beta is None else row.beta) for row in rows]
+    beta = (
+        None
+        if all(row.beta is None for row in rows)
+        else [angle * (0.0 if row.beta is None else row.beta) for row in rows]
+    )
     try:
         arm = Arm(
             alpha=[angle * twist for twist, _ in links],
@@ -107,11 +138,14 @@ def _specification(path: Path) -> ArmSpecification:
             probe=[length * x for x in model.probe],
             limits=None if rows[0].limits is None else [[angle * x for x in row.limits or ()] for row in rows],
         )
-        wanted = model.identification
+        name, wanted = model.name or path.stem, model.identification
+        if wanted is None:
+            return _chosen(arm, name) if choose else ArmSpecification(arm, name)
         specification = ArmSpecification(
             arm=arm,
-            name=model.name or path.stem,
+            name=name,
             held=None if wanted.held is None else tuple(wanted.held),
+            free=tuple(wanted.free),
             length=wanted.length * length,
             angle=0.0175 if wanted.angle is None else wanted.angle * angle,
             override={
@@ -125,18 +159,45 @@ def _specification(path: Path) -> ArmSpecification:
     return specification
 
 
+def _chosen(arm: Arm, name: str) -> ArmSpecification:
+    """The identification for an arm whose file proposes none."""
+    try:
+        space = Parameters.independent(arm)
+    except InputError:  # an arm of one or two joints, which has one configuration for each position of the tip
+        return ArmSpecification(arm, name)
+    held = tuple(name for name in space.held if not name.startswith("beta_"))
+    return ArmSpecification(arm, name, held, free=tuple(name for name in space.names if name.startswith("beta_")))
+
+
 def save_arm(arm: Arm, path: str | os.PathLike, *, name: str = "", source: str = "") -> None:
     """Write an arm as TOML: standard convention, mm and rad, digits enough to read back the same numbers."""
     write_text(path, arm_toml(arm, name=name, source=source))
 
 
 def arm_toml(arm: Arm, *, name: str = "", source: str = "") -> str:
-    """The text of an arm file: standard convention, mm and rad."""
-    return specification_toml(ArmSpecification(arm, name), source=source)
+    """The text of an arm file without a proposed identification: standard convention, mm and rad."""
+    return _document(ArmSpecification(arm, name), source).as_string()
 
 
 def specification_toml(specification: ArmSpecification, *, source: str = "") -> str:
     """The text of an arm file with its proposed identification: standard convention, mm and rad."""
+    import tomlkit
+
+    document = _document(specification, source)
+    proposed = tomlkit.table()
+    if specification.held is not None:
+        proposed["held"] = list(specification.held)
+    if specification.free:
+        proposed["free"] = list(specification.free)
+    proposed["length"] = float(specification.length)
+    proposed["angle"] = float(specification.angle)
+    if specification.override:
+        proposed["override"] = {name: float(width) for name, width in specification.override.items()}
+    document["identification"] = proposed
+    return document.as_string()
+
+
+def _document(specification: ArmSpecification, source: str) -> "TOMLDocument":
     import tomlkit
 
     document = tomlkit.document()
@@ -159,12 +220,4 @@ def specification_toml(specification: ArmSpecification, *, source: str = "") -> 
             row["limits"] = list(arm.limits[i])
         rows.append(row)
     document["joint"] = rows
-    wanted = tomlkit.table()
-    if specification.held is not None:
-        wanted["held"] = list(specification.held)
-    wanted["length"] = float(specification.length)
-    wanted["angle"] = float(specification.angle)
-    if specification.override:
-        wanted["override"] = {name: float(width) for name, width in specification.override.items()}
-    document["identification"] = wanted
-    return tomlkit.dumps(document)
+    return document

@@ -164,6 +164,7 @@ def arm_table(specification: ArmSpecification) -> Table:
         "override_names": list(specification.override) or None,
         "override_half_widths": [float(width) for width in specification.override.values()] or None,
         "held": None if specification.held is None else ",".join(specification.held),
+        "free": ",".join(specification.free) or None,
     }
     return Table(variables, attributes)
 
@@ -197,4 +198,5 @@ def specification_of(path: str | os.PathLike, stored: Stored, table: str) -> Arm
         length=attributes.get("half_width_length_mm", 10.0),
         angle=attributes.get("half_width_angle_rad", 0.0175),
         override=dict(override),
+        free=tuple(name for name in attributes.get("free", "").split(",") if name),
     )

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..acceptance.decision import Limit
+from ..acceptance.metrics import METRICS
 from ..acceptance.record import MAXIMA, EvaluationRecord
-from ..acceptance.suite import FIGURES, checked_limits
+from ..acceptance.suite import checked_limits
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .hdf5 import Stored, Table, Variable, need, read_tables, undamaged, write_tables
 
@@ -44,14 +45,14 @@ def limits_in(stored: Stored) -> dict[str, Limit]:
     table = stored.tables["limits"]
     rows = zip(table["figure"], table["fixed"], table["divisor"], strict=True)
     found = {str(name): Limit(float(fixed), float(divisor)) for name, fixed, divisor in rows}
-    if not all(name in FIGURES and 0 <= limit.fixed < math.inf and limit.divisor > 0 for name, limit in found.items()):
+    if not all(name in METRICS and 0 <= limit.fixed < math.inf and limit.divisor > 0 for name, limit in found.items()):
         raise ValueError("a limit that this package would not have written")  # `storage.undamaged` says what that means
     return found
 
 
 def _figure_table(record: EvaluationRecord) -> Table:
     """The results, for other programs; this package computes them again."""
-    rows = [(stage, test, figure) for stage, tests in record.acceptance().items() for test in tests for figure in test.figures]
+    rows = [(stage, test, figure) for stage, tests in record.acceptance().items() for test in tests for figure in test.metrics]
     columns = {
         "arm": ([stage for stage, *_ in rows], "", "arm that measured"),
         "standard": ([test.standard for _, test, _ in rows], "", "standard of the test"),

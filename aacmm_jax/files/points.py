@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..acceptance.suite import Measured
+from ..acceptance.metrics import Measured
 from ..core.errors import InputError, nearest
 from ..kinematics.workspace import Reach
 from .manifest import PointsManifest, recorded

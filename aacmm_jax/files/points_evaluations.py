@@ -4,8 +4,8 @@ import os
 
 import numpy as np
 
+from ..acceptance.metrics import Measured
 from ..acceptance.record import PointsRecord
-from ..acceptance.suite import Measured
 from ..kinematics.workspace import Reach
 from .captures import lengths_of, reference_table, sphere_table, spheres_of
 from .evaluations import limit_table, limits_in

@@ -5,7 +5,9 @@ import io
 
 import numpy as np
 
-from ..acceptance.procedure import TITLES, TOUCHED, Item, Procedure
+from ..acceptance.procedure import TOUCHED, Procedure
+from ..acceptance.procedure_items import Item
+from ..acceptance.standards import PLANNED
 
 _DIRECTION = ("probe_direction_x", "probe_direction_y", "probe_direction_z")  # the last frame's z axis
 
@@ -37,7 +39,7 @@ def file_of(procedure: Procedure, item: Item) -> str:
 def procedure_manifest(procedure: Procedure, arm: str) -> str:
     """A manifest for the readings: one text file for each socket, end of a bar, and group of touches. Calibrated values are to be filled in."""
     lines = [
-        f"# {TITLES[procedure.standard]}, as planned. Put the calibrated values and standard uncertainties of your artefacts in, record a file for each",
+        f"# {PLANNED[procedure.standard]}, as planned. Put the calibrated values and standard uncertainties of your artefacts in, record a file for each",
         "# socket and group of touches (one row a pose, in the order of the plan), then: aacmm import THIS.toml -o acceptance.h5",
         f"arm = {_quoted(arm)}",
         "# date = 2026-01-31   # when it was recorded",

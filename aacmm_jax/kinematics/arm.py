@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,8 +13,8 @@ from jaxtyping import Array, Float
 
 from ..core.arrays import Numbers, as_array, as_floats, in_chunks
 from ..core.errors import InputError, nearest
-from . import chain
-from .chain import Geometry
+from .chain import Geometry, tip_pose
+from .jacobian import tip_jacobian, tip_position
 
 # Steps of about 1 mm and 1 mrad are comparable at the tip of an arm of about 1 m.
 _LENGTH_STEP, _ANGLE_STEP = 1.0, 1e-3
@@ -23,15 +24,20 @@ _PROBE_AXES = ("x", "y", "z")
 
 
 class Arm(eqx.Module):
-    """A serial arm. One joint: T = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)]; the tip is ``probe`` in the last frame.
+    """A serial arm of revolute joints, T = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)] each, with a probe.
 
-    Shapes: every parameter is ``(..., n)`` for n joints and ``probe`` is ``(..., 3)``; leading shapes are a batch of
-    arms and broadcast against those of q. Units: mm and rad.
+    Every parameter is ``(..., n)`` for n joints; leading shapes are a batch of arms and broadcast against those of q.
+    Source: Denavit and Hartenberg 1955; Cheng et al. 2018, eq. 1.
 
-    Source: Denavit and Hartenberg 1955; Cheng et al. 2018, eq. 1; ``beta`` is Hayati and Mirmirani's (1985) extra
-    angle for near-parallel axes, absent (None) unless used.
+    Args:
+        alpha: Link twists ``(..., n)``, rad. a: Link lengths ``(..., n)``, mm. d: Link offsets ``(..., n)``, mm.
+        theta: Zero offsets of the joints ``(..., n)``, rad; by default 0. beta: Hayati and Mirmirani's (1985)
+        additional angles for nearly parallel axes ``(..., n)``, rad; by default unused. probe: Tip in the last frame
+        ``(..., 3)``, mm. limits: Lowest and highest reading of each joint, n pairs, rad; not calibrated, but
+        respected when poses are made.
 
-    Raises `InputError` where shapes do not fit together or a value is not finite.
+    Raises:
+        InputError: Shapes do not fit together, or a value is not finite.
     """
 
     alpha: Float[Array, "... n"]  # link twist, rad
@@ -40,8 +46,7 @@ class Arm(eqx.Module):
     theta: Float[Array, "... n"]  # joint zero offset, rad
     beta: Float[Array, "... n"] | None  # Hayati's angle, rad
     probe: Float[Array, "... 3"]  # tip in the last frame, mm
-    # Lowest and highest reading of each joint, rad. Static: limits are not calibrated, only respected by `simulate`.
-    limits: tuple[tuple[float, float], ...] | None = eqx.field(static=True)
+    limits: tuple[tuple[float, float], ...] | None = eqx.field(static=True)  # rad
 
     def __init__(
         self,
@@ -61,12 +66,14 @@ class Arm(eqx.Module):
         self.beta = None if beta is None else as_floats(beta, "beta")
         self.probe = as_floats(probe, "probe")
         if self.alpha.ndim == 0 or self.alpha.shape[-1] == 0:
-            raise InputError("alpha needs one value a joint, and an arm at least one joint.")
+            raise InputError("alpha needs one value per joint, and an arm at least one joint.")
         joints = self.alpha.shape[-1]
         for kind in ("a", "d", "theta", "beta"):
             array = getattr(self, kind)
             if array is not None and array.shape[-1:] != (joints,):
-                raise InputError(f"{kind} has shape {array.shape}, but alpha has {joints} joints; give one value a joint.")
+                raise InputError(
+                    f"{kind} has shape {array.shape}, but alpha has {joints} joints; give one value per joint."
+                )
         if self.probe.shape[-1:] != (3,):
             raise InputError(f"probe has shape {self.probe.shape}; give its three coordinates (x, y, z) in mm.")
         arrays = [array for array in (self.alpha, self.a, self.d, self.theta, self.beta) if array is not None]
@@ -85,31 +92,64 @@ class Arm(eqx.Module):
         return self.alpha.shape[-1]
 
     @property
-    def geometry(self) -> chain.Geometry:
-        """The parameters without the limits, as the kinematic kernels take them."""
-        return chain.Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe)
+    def geometry(self) -> Geometry:
+        """The parameters without the limits."""
+        return Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe)
 
     def position(self, q: Numbers) -> Float[Array, "... 3"]:
         """Tip in the base frame, mm, at joint angles q in rad: ``(..., n) -> (..., 3)``."""
-        return chain.tip_position(self.geometry, self._checked(q))
+        return tip_position(self.geometry, self._checked(q))
 
     def pose(self, q: Numbers) -> Float[Array, "... 4 4"]:
-        """Homogeneous pose of the last frame moved to the tip, mm: ``(..., n) -> (..., 4, 4)``."""
-        return chain.tip_pose(self.geometry, self._checked(q))
+        """Homogeneous transform of the last frame, with the tip (mm) as its origin: ``(..., n) -> (..., 4, 4)``."""
+        return tip_pose(self.geometry, self._checked(q))
 
     def jacobian(self, q: Numbers, names: Sequence[str] | None = None) -> Float[Array, "... 3 p"]:
-        """Exact derivative of the tip by named parameters, ``(..., n) -> (..., 3, p)``; mm per mm or mm per rad.
+        """Exact derivative of the tip by named parameters: analytic, equal to ``jax.jacfwd`` to rounding.
 
-        ``names`` are parameter names (``alpha_1`` ... ``probe_z``) or joint readings ``q_1`` ... ``q_n``; by default all
-        parameters, in the order of `parameter_names`. Analytic, equal to ``jax.jacfwd`` to rounding.
+        Args:
+            q: Joint angles ``(..., n)``, rad.
+            names: Parameter names (``alpha_1`` ... ``probe_z``) or joint readings ``q_1`` ... ``q_n``; by default all
+                parameters, in the order of `parameter_names`.
+
+        Returns:
+            ``(..., 3, p)``, mm per mm or mm per rad.
+
+        Raises:
+            InputError: A name is unknown, or q has another number of joints.
         """
         names = parameter_names(self) if names is None else names
-        return chain.tip_jacobian(self.geometry, self._checked(q), tuple(locate(self, n, extra=("q",)) for n in names))
+        return tip_jacobian(self.geometry, self._checked(q), tuple(locate(self, n, extra=("q",)) for n in names))
+
+    def replace(self, **changes: Any) -> "Arm":
+        """The same arm with some values replaced, checked as a new arm is; also on traced values.
+
+        Args:
+            **changes: By parameter name (``d_3=750.0``), or a whole argument of the constructor (``probe=(0, 0, 131)``,
+                ``beta=None``); mm and rad. A single parameter is set after whole arguments.
+
+        Raises:
+            InputError: A name is unknown, or the arm that results is refused.
+        """
+        whole = ("alpha", "a", "d", "theta", "beta", "probe", "limits")
+        arguments: dict[str, Any] = {key: changes.get(key, getattr(self, key)) for key in whole}
+        for name, value in changes.items():
+            if name in whole:
+                continue
+            kind, i = locate(self, name)
+            value = as_floats(math.nan if value is None else value, name)
+            array = jnp.zeros_like(self.alpha) if arguments[kind] is None else as_floats(arguments[kind], kind)
+            array = jnp.broadcast_to(array, (*np.broadcast_shapes(array.shape[:-1], value.shape), array.shape[-1]))
+            chosen = np.arange(array.shape[-1]) == i
+            arguments[kind] = jnp.where(chosen, value[..., None], array)
+        return Arm(**arguments)
 
     def _checked(self, q: Numbers) -> Float[Array, "... n"]:
         array = as_array(q, "q")
         if array.shape[-1:] != (self.joints,):
-            raise InputError(f"q has shape {array.shape}, but the arm has {self.joints} joints; the last axis is the joint.")
+            raise InputError(
+                f"q has shape {array.shape}, but the arm has {self.joints} joints; the last axis is the joint."
+            )
         return array
 
 
@@ -117,7 +157,7 @@ def checked_limits(limits: Sequence[Sequence[float]], joints: int) -> tuple[tupl
     """Lowest and highest reading of each joint, rad, or `InputError` that names the joint."""
     rows = [tuple(float(reading) for reading in row) for row in limits]
     if len(rows) != joints or any(len(row) != 2 for row in rows):
-        raise InputError(f"limits must be {joints} rows of (lowest, highest) in rad, one a joint.")
+        raise InputError(f"limits must be {joints} rows of (lowest, highest) in rad, one per joint.")
     for i, (low, high) in enumerate(rows, start=1):
         if not -math.inf < low < high < math.inf:
             raise InputError(
@@ -139,7 +179,7 @@ def parameter_names(arm: Arm) -> tuple[str, ...]:
 
 
 def locate(arm: Arm, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
-    """Kind and 0-based index of a parameter name: ``d_3 -> ("d", 2)``. Raises `InputError` naming the nearest spelling."""
+    """Kind and 0-based index of a parameter name: ``d_3 -> ("d", 2)``; an `InputError` names the nearest spelling."""
     kinds = ("alpha", "a", "d", "theta", "beta", *extra)
     kind, _, index = name.rpartition("_") if isinstance(name, str) else ("", "", "")
     if kind == "probe" and index in _PROBE_AXES:
@@ -150,14 +190,16 @@ def locate(arm: Arm, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
     raise InputError(f"unknown parameter '{name}' of a {arm.joints}-joint arm{nearest(str(name), known)}")
 
 
-def replace(arm: Arm, **changes: Array | None) -> Arm:
-    """The same arm with some parameters replaced, by kind (``a=...``); nothing is checked, so it works on tracers."""
+def with_arrays(arm: Arm, **changes: Array | None) -> Arm:
+    """`Arm.replace` for whole arrays without its checks: in numerical code a diverged iteration may hold NaN."""
     kinds = tuple(changes)
-    return eqx.tree_at(lambda x: [getattr(x, kind) for kind in kinds], arm, list(changes.values()), is_leaf=lambda x: x is None)
+    return eqx.tree_at(
+        lambda x: [getattr(x, kind) for kind in kinds], arm, list(changes.values()), is_leaf=lambda x: x is None
+    )
 
 
 def joint_limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[Array, "n 2"]:
-    """Lowest and highest reading of each joint: those given, else the arm's own, else half a turn each way; rad."""
+    """Lowest and highest reading of each joint: those given, else the arm's own, else -pi to pi; rad."""
     rows = limits if limits is not None else arm.limits
     if rows is None:
         rows = [(-math.pi, math.pi)] * arm.joints
@@ -165,12 +207,12 @@ def joint_limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[Ar
 
 
 def jacobian_at(arm: Arm, q: Float[np.ndarray, "N n"], names: Sequence[str]) -> Float[np.ndarray, "N 3 p"]:
-    """Derivatives of the tips by named parameters at poses."""
+    """Derivatives of the tips by named parameters at N configurations."""
     return in_chunks(lambda rows: np.asarray(arm.jacobian(rows, names)), q)
 
 
 def value_of(arm: Arm, name: str) -> np.ndarray:
-    """Value of a named parameter of a concrete arm, mm or rad; with the arm's batch, if it has one."""
+    """Value of a named parameter of a concrete arm, mm or rad, with the arm's batch axes."""
     # Read with NumPy: under jit even a constant arm's values become tracers once JAX computes with them.
     kind, i = locate(arm, name)
     return np.asarray(getattr(arm, kind))[..., i]
@@ -181,23 +223,23 @@ def is_length(name: str) -> bool:
     return name.rpartition("_")[0] in LENGTHS
 
 
-@partial(jax.jit, static_argnames=("entries",))
+@partial(jax.jit, static_argnames=("indices",))
 def with_values(
-    geometry: Geometry, vector: Float[Array, "... p"], entries: tuple[tuple[str, int], ...]
+    geometry: Geometry, vector: Float[Array, "... p"], indices: tuple[tuple[str, int], ...]
 ) -> dict[str, Float[Array, "... n"]]:
-    """The kinds of parameters that ``vector`` holds some of, kind -> array, with its values put in their places."""
-    found = {}
-    for kind in dict.fromkeys(kind for kind, _ in entries):
-        held = getattr(geometry, kind)
-        sources = np.arange(held.shape[-1])
-        for position, (other, i) in enumerate(entries):
+    """The arrays, by kind, that change when the parameters at ``indices`` take the values of ``vector``."""
+    changed = {}
+    for kind in dict.fromkeys(kind for kind, _ in indices):
+        before = getattr(geometry, kind)
+        sources = np.arange(before.shape[-1])
+        for position, (other, i) in enumerate(indices):
             if other == kind:
-                sources[i] = held.shape[-1] + position
-        batch = np.broadcast_shapes(held.shape[:-1], vector.shape[:-1])
-        both = [jnp.broadcast_to(values, (*batch, values.shape[-1])) for values in (held, vector)]
+                sources[i] = before.shape[-1] + position
+        batch = np.broadcast_shapes(before.shape[:-1], vector.shape[:-1])
+        both = [jnp.broadcast_to(values, (*batch, values.shape[-1])) for values in (before, vector)]
         # One gather from known positions: a third as many operations to trace and compile as a scatter.
-        found[kind] = jnp.concatenate(both, axis=-1).at[..., sources].get(mode="promise_in_bounds")
-    return found
+        changed[kind] = jnp.concatenate(both, axis=-1).at[..., sources].get(mode="promise_in_bounds")
+    return changed
 
 
 def natural_steps(names: Sequence[str]) -> Float[np.ndarray, " p"]:
@@ -206,7 +248,9 @@ def natural_steps(names: Sequence[str]) -> Float[np.ndarray, " p"]:
 
 
 def neighbouring_arm(arm: Arm, names: Sequence[str]) -> Arm:
-    """The arm with the named parameters off by about 1 mm and 1 mrad: out of a special position that only the nominal arm has."""
+    """The arm with the named parameters changed by about 1 mm and 1 mrad, so that nothing is exactly aligned."""
     steps = np.random.default_rng(0).normal(size=len(names)) * natural_steps(names)
     vector = np.array([value_of(arm, name) for name in names]) + steps
-    return replace(arm, **with_values(arm.geometry, jnp.asarray(vector), tuple(locate(arm, name) for name in names)))
+    return with_arrays(
+        arm, **with_values(arm.geometry, jnp.asarray(vector), tuple(locate(arm, name) for name in names))
+    )

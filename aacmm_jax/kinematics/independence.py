@@ -1,26 +1,29 @@
-"""Which parameters a capture can tell apart at all: the tips' derivatives, made consistent, and a choice of independent ones."""
+"""A largest set of parameters that data determine: a choice of independent columns of derivatives."""
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
-from .arm import LENGTHS, Arm, jacobian_at, locate, neighbouring_arm, replace
-from .inverse_kinematics import SocketPoses, project_to_centroids
+from .arm import LENGTHS, Arm, jacobian_at, joint_limits, locate, natural_steps, neighbouring_arm
+from .inverse_kinematics import SocketPoses, project_to_centroids, project_to_targets
+from .near_degeneracy import trade_offs
 
 _OFF_AXIS = 5.0  # mm
-_INDEPENDENT = 1e-6  # of a column's size must stand apart from the columns chosen before it
+_INDEPENDENT = 1e-6  # least share of a column that the columns chosen before it do not imitate
+_SOCKETS, _STARTS = 6, 40  # of generic data: 240 configurations, one compiled program
 NEARLY_PARALLEL = 0.02  # |sin alpha|, about 1 degree
 
 
 def equations(
     arm: Arm, capture: SocketPoses, names: Sequence[str], q: Float[np.ndarray, "N n"]
 ) -> tuple[Float[np.ndarray, "N 3 p"], Float[np.ndarray, "l p"]]:
-    """Derivatives of what a capture determines: tips less their socket's mean, and reference lengths; poses at ``q``."""
+    """Derivatives of tips less their socket's mean, and of reference lengths, at configurations; mm per mm or rad."""
     columns = jacobian_at(arm, q, names)
     owner, sizes = capture.owner, np.asarray(capture.sizes, dtype=float)
     starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
@@ -35,46 +38,95 @@ def equations(
 
 
 def nearly_parallel(arm: Arm) -> list[int]:
-    """Joints, from 1, whose axis is nearly parallel to the next: there plain D-H is singular (Hayati and Mirmirani 1985)."""
+    """Joints, from 1, whose axis is nearly parallel to the next, where D-H is singular (Hayati and Mirmirani 1985)."""
     return [i + 1 for i in range(arm.joints - 1) if abs(np.sin(float(arm.alpha[i]))) < NEARLY_PARALLEL]
 
 
 def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, ...]]:
-    """A largest set of parameters that a capture determines, in the package's order, and the arm (with beta where needed).
+    """A largest set of parameters that a capture determines, and the arm (with beta where needed).
 
-    Taken one after the other, and held where those taken before can imitate them: nonzero lengths first, then angles, lengths
-    that are nominally zero, the probe and the last link; the longest link comes last of all, so that it is held where no
-    reference length fixes the scale. Where neighbouring axes are nearly parallel, ``d_i`` is held and ``beta_i`` freed.
+    Parameters are taken one after the other, and fixed where those taken before can imitate them: nonzero lengths
+    first, then angles, lengths that are nominally zero, the probe and the last link; the longest link comes last of
+    all, so that it is fixed where no reference length fixes the scale. Where neighbouring axes are nearly parallel,
+    ``d_i`` is fixed and ``beta_i`` is free. At last the first parameter of every near-degenerate combination is fixed
+    (`near_degeneracy`).
     """
     if arm.joints != capture.joints:
         raise InputError(
-            f"the capture has {capture.joints} columns, but the arm has {arm.joints} joints; give one column a joint."
+            f"the capture has {capture.joints} columns, but the arm has {arm.joints} joints; give one column per joint."
         )
     parallel = nearly_parallel(arm)
     if parallel and arm.beta is None:
-        arm = replace(arm, beta=jnp.zeros_like(arm.alpha))
+        arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
     order = _order(arm, parallel)
     taken: tuple[str, ...] = ()
     for _ in range(5):
-        # Out of a special position, but with what is held at its nominal value, which may make others redundant in its turn.
-        beside = neighbouring_arm(arm, taken or tuple(order))
-        before, taken = taken, _independent(beside, arm, capture, order)
+        # Without the exact alignments of the nominal arm. Fixed parameters keep their nominal values, which may make
+        # others redundant, so the choice is repeated.
+        neighbour = neighbouring_arm(arm, taken or tuple(order))
+        poses, lengths = equations(neighbour, capture, order, project_to_centroids(neighbour, capture, targets_of=arm))
+        before, taken = taken, _independent(neighbour, order, np.concatenate([poses.reshape(-1, len(order)), lengths]))
         if taken == before or not taken:
             break
+    if taken:
+        columns = [order.index(name) for name in taken]
+        rows = tip_movements(poses, lengths) * natural_steps(order)
+        weak = {trade_off.names[0] for trade_off in trade_offs(rows[:, columns], taken)}
+        taken = tuple(name for name in taken if name not in weak)
     return arm, taken
 
 
-def _independent(arm: Arm, stands: Arm, capture: SocketPoses, order: list[str]) -> tuple[str, ...]:
-    """Those whose columns stand apart from the columns of those before them; poses hold sockets where another arm puts them."""
-    poses, lengths = equations(arm, capture, order, project_to_centroids(arm, capture, stands))
-    rows = np.concatenate([poses.reshape(-1, len(order)), lengths])
+def tip_movements(poses: Float[np.ndarray, "N 3 p"], lengths: Float[np.ndarray, "l p"]) -> Float[np.ndarray, "r p"]:
+    """`equations` as rows whose sum of squares is the mean square over the poses plus that over the lengths."""
+    return np.concatenate(
+        [poses.reshape(-1, poses.shape[-1]) / math.sqrt(len(poses)), lengths / math.sqrt(max(len(lengths), 1))]
+    )
+
+
+class _GenericPoses(NamedTuple):
+    """Poses all over the workspace; has what `SocketPoses` asks for."""
+
+    q: Float[np.ndarray, "N n"]
+    sizes: tuple[int, ...]
+
+    @property
+    def joints(self) -> int:
+        return self.q.shape[1]
+
+    @property
+    def owner(self) -> Int[np.ndarray, " N"]:
+        return np.repeat(np.arange(len(self.sizes)), self.sizes)
+
+    def ends(self) -> Int[np.ndarray, "l 2"]:
+        return np.array([[0, 1]])
+
+
+def generic_poses(arm: Arm) -> SocketPoses:
+    """What a thorough calibration would record, without noise: poses in several sockets and one reference length.
+
+    The sockets are where random configurations within the limits put the tip; the same arm always gets the same.
+    """
+    random = np.random.default_rng(0)
+    limits = np.asarray(joint_limits(arm, None))
+    first = random.uniform(limits[:, 0], limits[:, 1], (_SOCKETS, arm.joints))
+    owner = np.repeat(np.arange(_SOCKETS), _STARTS)
+    starts = random.uniform(limits[:, 0], limits[:, 1], (len(owner), arm.joints))
+    q, arrived = project_to_targets(arm, starts, np.asarray(arm.position(first))[owner], limits)
+    sockets = [np.concatenate([first[i : i + 1], q[arrived & (owner == i)]]) for i in range(_SOCKETS)]
+    return _GenericPoses(np.concatenate(sockets), tuple(len(socket) for socket in sockets))
+
+
+def _independent(arm: Arm, order: list[str], rows: Float[np.ndarray, "r p"]) -> tuple[str, ...]:
+    """The parameters whose columns those before them do not imitate (Gram-Schmidt)."""
     basis = np.zeros((rows.shape[0], 0))
     taken = []
     for name, whole in zip(order, rows.T, strict=True):
         column = whole
         for _ in range(2):  # twice is enough for orthogonality to rounding
             column = column - basis @ (basis.T @ column)
-        least = 1e-7 * (1.0 if locate(arm, name)[0] in LENGTHS else 1e3)  # small at the tip for steps of 1 mm and 1 mrad
+        least = 1e-7 * (
+            1.0 if locate(arm, name)[0] in LENGTHS else 1e3
+        )  # small at the tip for steps of 1 mm and 1 mrad
         size = float(np.linalg.norm(column))
         if size > max(_INDEPENDENT * float(np.linalg.norm(whole)), least) and basis.shape[1] < rows.shape[0]:
             taken.append(name)

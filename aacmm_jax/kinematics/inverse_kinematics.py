@@ -1,4 +1,11 @@
-"""Inverse kinematics: poses that put the tip at given points, from random starts or as near as possible to given poses."""
+"""Inverse kinematics: configurations that put the tip at targets. The only implementation; all others call it.
+
+* `random_configurations`: one at each target, from random starts; for simulation.
+* `project_to_targets`: given ones moved to their targets by least-norm steps within limits, and which of them arrived.
+* `project_to_centroids`: those of a capture moved until each socket's tips coincide.
+* `newton_projection`: a fixed number of steps, differentiable; for optimisers.
+* `solve_to_targets`, `least_norm_inverse`, `damped_inverse`: their parts, for callers with a jit of their own.
+"""
 
 from collections.abc import Sequence
 from functools import partial
@@ -11,21 +18,30 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
-from . import chain
 from .arm import Arm
+from .chain import Geometry, forward_pass, sines_cosines
+from .jacobian import jacobian_columns
 
-_BATCH = 256  # candidates per call: one compiled shape for every number of poses
+_BATCH = 256  # candidates per call: one compiled shape for every number of targets
 _ROUNDS = 12
-_STEPS = 60  # of one attempt; five of six starts arrive
+_STEPS = 60  # of one attempt; five of six random starts converge
 _TOLERANCE, _ARRIVED = 1e-9, 1e-6  # mm
+_LARGEST_STEP = 0.5  # rad
 
 
 @runtime_checkable
 class SocketPoses(Protocol):
-    """What is needed of a capture: poses, socket after socket, and which sockets reference lengths join."""
+    """The part of a capture that kinematics needs: poses, socket after socket, and the ends of reference lengths."""
 
-    q: Float[Array, "N n"]
-    sizes: tuple[int, ...]
+    @property
+    def q(self) -> Float[Array | np.ndarray, "N n"]:
+        """Joint readings, rad."""
+        ...
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Number of poses of each socket."""
+        ...
 
     @property
     def joints(self) -> int:
@@ -44,36 +60,59 @@ class SocketPoses(Protocol):
 
 @partial(jax.jit, static_argnames=("steps",))
 def solve_to_targets(
-    geometry: chain.Geometry,
+    geometry: Geometry,
     q: Float[Array, "c n"],
     targets: Float[Array, "c 3"],
     limits: Float[Array, "n 2"],
     steps: int = _STEPS,
 ) -> tuple[Float[Array, "c n"], Float[Array, " c"]]:
-    """Damped least-norm steps (at most 0.5 rad a joint, within the limits) towards the targets; final distances."""
+    """Damped least-norm steps from ``q`` to the targets, within the limits: configurations and final distances, mm.
+
+    Each joint moves by at most 0.5 rad in a step.
+    """
     low, high = limits[:, 0, None, None], limits[:, 1, None, None]
     wanted = targets.T
 
     def step(_, q):
-        forward = chain.forward_pass(geometry, (jnp.cos(q), jnp.sin(q)))
+        forward = forward_pass(geometry, (jnp.cos(q), jnp.sin(q)))
         gap = wanted - forward.tip
-        # The damping fades with the distance, so that the last steps are Newton's.
+        # The damping vanishes with the distance, so that the last steps are Newton's.
         damping = 1e-2 * jnp.sum(gap**2, axis=0) + 1e-12
-        moves = damped_inverse(chain.jacobian_columns(forward)["theta"], damping)
-        return jnp.clip(q + jnp.clip(jnp.sum(moves * gap[None], axis=1, keepdims=True), -0.5, 0.5), low, high)
+        inverse = damped_inverse(jacobian_columns(forward)["theta"], damping)
+        change = jnp.sum(inverse * gap[None], axis=1, keepdims=True)
+        return jnp.clip(q + jnp.clip(change, -_LARGEST_STEP, _LARGEST_STEP), low, high)
 
     q = jax.lax.fori_loop(0, steps, step, q.T[:, None, :])
-    tip = chain.forward_pass(geometry, (jnp.cos(q), jnp.sin(q))).tip
+    tip = forward_pass(geometry, (jnp.cos(q), jnp.sin(q))).tip
     return q[:, 0].T, jnp.linalg.norm(wanted - tip, axis=0)
 
 
-def damped_inverse(columns: Float[Array, "n 3 N"], damping: Float[Array, " N"]) -> Float[Array, "n 3 N"]:
-    """Least change of every joint per mm that the tip shall move along each axis: J^T (J J^T + damping)^-1, pose by pose.
+def newton_projection(
+    geometry: Geometry, q: Float[Array, "N n"], targets: Float[Array, "N 3"], steps: int
+) -> Float[Array, "N n"]:
+    """Configurations brought to their targets by a fixed number of least-norm steps: differentiable, without limits."""
 
-    ``columns`` are the derivatives of the tip by the joints, mm. The inverse is written out (adjugate over determinant):
-    for matrices this small a call of a library costs ten times the arithmetic.
+    def step(rows: Array, _: None) -> tuple[Array, None]:
+        forward = forward_pass(geometry, sines_cosines(rows))
+        gap = targets.T - forward.tip
+        inverse = damped_inverse(jacobian_columns(forward)["theta"], jnp.full(rows.shape[0], 1e-6))
+        return rows + jnp.sum(inverse * gap[None], axis=1).T, None
+
+    return jax.lax.scan(step, q, None, length=steps)[0]
+
+
+def least_norm_inverse(geometry: Geometry, q: Float[Array, "N n"]) -> Float[Array, "n 3 N"]:
+    """Least change of every joint per mm that the tip moves along each axis: the pseudo-inverse of the Jacobian."""
+    return damped_inverse(jacobian_columns(forward_pass(geometry, sines_cosines(q)))["theta"], jnp.zeros(q.shape[0]))
+
+
+def damped_inverse(columns: Float[Array, "n ... 3 N"], damping: Float[Array, "... N"]) -> Float[Array, "n ... 3 N"]:
+    """J^T (J J^T + damping)^-1 for each configuration, from ``columns``, the derivatives of the tip by the joints, mm.
+
+    The inverse is written out (adjugate over determinant): for matrices this small a library call costs ten times the
+    arithmetic.
     """
-    x, y, z = columns[:, 0], columns[:, 1], columns[:, 2]
+    x, y, z = columns[..., 0, :], columns[..., 1, :], columns[..., 2, :]
     xx, yy, zz = (jnp.sum(c * c, axis=0) + damping for c in (x, y, z))
     xy, xz, yz = jnp.sum(x * y, axis=0), jnp.sum(x * z, axis=0), jnp.sum(y * z, axis=0)
     adjugate = (
@@ -83,21 +122,21 @@ def damped_inverse(columns: Float[Array, "n 3 N"], damping: Float[Array, " N"]) 
     )
     determinant = xx * adjugate[0][0] + xy * adjugate[0][1] + xz * adjugate[0][2]
     rows = [[entry / determinant for entry in row] for row in adjugate]
-    return jnp.stack([x * row[0][None] + y * row[1][None] + z * row[2][None] for row in rows], axis=1)
+    return jnp.stack([x * row[0][None] + y * row[1][None] + z * row[2][None] for row in rows], axis=-2)
 
 
 def random_configurations(
     arm: Arm, targets: Float[Array, "m 3"], key: Array, limits: Float[Array, "n 2"], labels: Sequence[str] | None = None
 ) -> Float[Array, "m n"]:
-    """One random pose for each target, within the limits, exact to 1e-9 mm.
+    """One random configuration for each target, within the limits, exact to 1e-9 mm.
 
-    Raises `InputError`, with the target's label, where no pose is found.
+    Raises `InputError`, with the target's label, if none is found.
     """
     wanted = targets.shape[0]
     angles = np.zeros((wanted, arm.joints))
     missing = np.arange(wanted)
     for round_number in range(_ROUNDS * (1 + wanted // _BATCH)):
-        # Every missing target is tried, several times at once where they are few; the first success counts.
+        # Every missing target is tried, several times at once if they are few; the first success counts.
         tried = np.resize(missing, _BATCH)
         start = jax.random.uniform(
             jax.random.fold_in(key, round_number),
@@ -115,15 +154,18 @@ def random_configurations(
     point = ", ".join(f"{x:.0f}" for x in np.asarray(targets[missing[0]]))
     what = labels[missing[0]] if labels else "the target"
     raise InputError(
-        f"{what} at ({point}) mm cannot be reached within the joint limits (the links together measure {links:.0f} mm); "
-        "move it closer or widen the limits."
+        f"{what} at ({point}) mm cannot be reached within the joint limits (the links together measure {links:.0f} "
+        "mm); move it closer or widen the limits."
     )
 
 
 def project_to_targets(
-    arm: Arm, q: Float[np.ndarray, "N n"], targets: Float[np.ndarray, "N 3"], limits: Float[np.ndarray, "n 2"] | None = None
+    arm: Arm,
+    q: Float[np.ndarray, "N n"],
+    targets: Float[np.ndarray, "N 3"],
+    limits: Float[np.ndarray, "n 2"] | None = None,
 ) -> tuple[Float[np.ndarray, "N n"], Bool[np.ndarray, " N"]]:
-    """Poses moved by least steps until the tip is at its target, within limits (default: none), and which of them arrived."""
+    """Configurations moved by least-norm steps to their targets within limits (default: none), and which arrived."""
     allowed = jnp.asarray(np.tile([-np.inf, np.inf], (arm.joints, 1)) if limits is None else limits)
 
     def moved(rows: np.ndarray) -> np.ndarray:
@@ -134,17 +176,30 @@ def project_to_targets(
     return found[:, :-1], found[:, -1] <= _ARRIVED
 
 
-def project_to_centroids(arm: Arm, capture: SocketPoses, stands: Arm | None = None) -> Float[np.ndarray, "N n"]:
-    """The poses of a capture moved, as little as possible, until each tip rests in its socket's centroid by this arm; or by the
-    arm that ``stands`` in its place.
+def newton_steps_to_targets(
+    arm: Arm, q: Float[Array, "N n"], targets: Float[Array, "N 3"], steps: int
+) -> Float[Array, "N n"]:
+    """Configurations near their targets, projected by a few least-norm Newton steps; differentiable, without limits."""
 
-    A nominal arm that is mm off scatters the tips, and scattered tips make directions look determined that are not: turning
-    the whole arm about its base moves them.
+    def step(q: Array, _: None) -> tuple[Array, None]:
+        forward = forward_pass(arm.geometry, sines_cosines(q))
+        moves = damped_inverse(jacobian_columns(forward)["theta"], jnp.full(q.shape[0], 1e-6))
+        return q + jnp.sum(moves * (targets.T - forward.tip)[None], axis=1).T, None
+
+    return jax.lax.scan(step, q, None, length=steps)[0]
+
+
+def project_to_centroids(arm: Arm, capture: SocketPoses, targets_of: Arm | None = None) -> Float[np.ndarray, "N n"]:
+    """The configurations of a capture moved by least-norm steps until each tip is at its socket's centroid.
+
+    ``targets_of`` is the arm that the centroids come from; by default the same. With a nominal arm that is some mm
+    wrong the tips scatter, and scattered tips make directions look determined that are not, such as a rotation about
+    the base.
     """
     q = np.asarray(capture.q)
     owner = capture.owner
-    by = arm if stands is None else stands
-    tips = in_chunks(lambda rows: np.asarray(by.position(rows)), q)
+    source = arm if targets_of is None else targets_of
+    tips = in_chunks(lambda rows: np.asarray(source.position(rows)), q)
     sizes = np.asarray(capture.sizes)
     sums = np.stack([np.bincount(owner, weights=tips[:, axis]) for axis in range(3)], axis=1)
     targets = (sums / sizes[:, None])[owner]

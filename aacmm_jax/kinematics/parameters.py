@@ -1,4 +1,4 @@
-"""Which numbers of an arm are free, and within what bounds."""
+"""Which parameters of an arm are free, and within what bounds."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -12,15 +12,19 @@ from jaxtyping import Array, Float
 
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError
-from .arm import Arm, is_length, locate, natural_steps, parameter_names, replace, with_values
-from .independence import independent_names
+from .arm import Arm, is_length, locate, natural_steps, parameter_names, with_arrays, with_values
+from .independence import generic_poses, independent_names
 from .inverse_kinematics import SocketPoses
 
 
 class Parameters(eqx.Module):
-    """The free parameters of an arm, in order, and the arm that supplies the held ones.
+    """The free parameters of an arm, in order, and the arm that supplies the fixed ones.
 
     ``vector(arm)`` reads them into ``(p,)`` (mm and rad mixed); ``arm(vector)`` writes them back.
+
+    Args:
+        base: The arm that fixed parameters are taken from.
+        names: Names of the free parameters.
     """
 
     base: Arm
@@ -28,13 +32,18 @@ class Parameters(eqx.Module):
 
     @classmethod
     def free_of(cls, arm: Arm, *, held: Iterable[str] | None = None, free: Iterable[str] = ()) -> "Parameters":
-        """Free parameters of an arm.
+        """Free parameters by name: by default the 4n - 3 of Cheng et al. 2018, in their order.
 
-        By default the 4n - 3 of Cheng et al. 2018 in their order: everything but ``d_1``, ``theta_1`` (they move the
-        base frame), ``a_n``, ``alpha_n`` (redundant with the probe), ``probe_x`` and ``probe_y``. ``held`` replaces that
-        list: everything else of alpha, a, d, theta and probe is then free. ``free`` releases more, beta included.
+        These are all but ``d_1``, ``theta_1`` (they move the base frame), ``a_n``, ``alpha_n`` (redundant with the
+        probe), ``probe_x`` and ``probe_y``.
 
-        Raises `InputError` for a name that the arm has not, or one that is both held and free.
+        Args:
+            arm: The arm; it supplies the values of the fixed parameters.
+            held: Names of the fixed parameters, instead of the six above; beta is fixed unless in ``free``.
+            free: Names that are free in addition, beta included.
+
+        Raises:
+            InputError: The arm has no such parameter, or one is named as held and as free.
         """
         n = arm.joints
         free = (free,) if isinstance(free, str) else tuple(free)
@@ -47,20 +56,30 @@ class Parameters(eqx.Module):
             if name in held:
                 raise InputError(f"parameter '{name}' is named as held and as free; name it once.")
         if arm.beta is None and any(name.startswith("beta_") for name in (*held, *free)):
-            arm = replace(arm, beta=jnp.zeros_like(arm.alpha))
-        wanted = [name for name in parameter_names(arm) if name not in held and (name in free or not name.startswith("beta_"))]
+            arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
+        wanted = [
+            name for name in parameter_names(arm) if name not in held and (name in free or not name.startswith("beta_"))
+        ]
         if not wanted:
             raise InputError("every parameter is held, so nothing is left to identify; hold fewer.")
         return cls(base=arm, names=tuple(wanted))
 
     @classmethod
-    def independent(cls, arm: Arm, capture: SocketPoses) -> "Parameters":
-        """A largest set of free parameters that a capture can determine; what is redundant is held at its nominal value.
+    def independent(cls, arm: Arm, capture: SocketPoses | None = None) -> "Parameters":
+        """A largest set of parameters that a capture determines well; redundant ones are fixed at their nominal values.
 
-        For the paper's arm with a reference length these are its 21; without, the longest link is held too. Where neighbouring
-        axes are nearly parallel, d of the first is held and Hayati's beta freed in its place.
+        Fixed too is one parameter of every near-degenerate combination (`near_degeneracy`). For the paper's arm with
+        a reference length these are its 21; without one, the longest link is fixed too. Where neighbouring axes are
+        nearly parallel, d of the first is fixed and Hayati's beta is free instead.
+
+        Args:
+            arm: The nominal arm. capture: The poses and reference lengths; by default poses over the whole workspace
+            with one reference length.
+
+        Raises:
+            InputError: The capture has another number of joints, or determines nothing.
         """
-        base, names = independent_names(arm, capture)
+        base, names = independent_names(arm, generic_poses(arm) if capture is None else capture)
         if not names:
             raise InputError("the capture determines no parameter at all; record more poses in its sockets.")
         return cls(base=base, names=tuple(name for name in parameter_names(base) if name in names))
@@ -85,15 +104,29 @@ class Parameters(eqx.Module):
         return tuple(locate(self.base, name) for name in self.names)
 
     def index(self, name: str) -> int:
-        """Position of a free parameter; `InputError` where it is not free."""
+        """Position of a free parameter in the vector; raises `InputError` if it is not free."""
         if name not in self.names:
             locate(self.base, name)
-            raise InputError(f"parameter '{name}' is held, not free; free it, or name a free one, such as '{self.names[0]}'.")
+            raise InputError(
+                f"parameter '{name}' is held, not free; free it, or name a free one, such as '{self.names[0]}'."
+            )
         return self.names.index(name)
 
     def vector(self, arm: Arm | None = None) -> Float[Array, "... p"]:
-        """The free parameters of an arm (by default the base arm) as ``(..., p)``, mm and rad."""
+        """The free parameters of an arm as ``(..., p)``, mm and rad.
+
+        Args:
+            arm: An arm with as many joints as the base arm; by default the base arm.
+
+        Raises:
+            InputError: The arm has another number of joints.
+        """
         arm = self.base if arm is None else arm
+        if arm.joints != self.base.joints:
+            raise InputError(
+                f"the arm has {arm.joints} joints, but these are parameters of an arm with {self.base.joints}; "
+                "choose the free parameters of this arm (Parameters.free_of)."
+            )
         known = is_concrete(*arm.geometry)
         tools: Any = np if known else jnp  # see `joined`
         values = {kind: tools.asarray(getattr(arm, kind)) for kind in ("alpha", "a", "d", "theta", "probe")}
@@ -101,14 +134,23 @@ class Parameters(eqx.Module):
         return joined(tools.broadcast_arrays(*(values[kind][..., i] for kind, i in self.indices())), axis=-1, new=True)
 
     def arm(self, vector: Numbers) -> Arm:
-        """The base arm with its free parameters taken from ``(p,)``. Use ``vmap`` for a batch of vectors."""
+        """The base arm with its free parameters taken from a vector.
+
+        Args:
+            vector: Values in the order of ``names``, ``(..., p)``, mm and rad; leading axes give a batch of arms.
+
+        Raises:
+            InputError: The vector does not have p values.
+        """
         vector = as_array(vector, "vector")
         if vector.shape[-1:] != (len(self.names),):
             raise InputError(
                 f"vector has shape {vector.shape}, but {len(self.names)} parameters are free; give one value each."
             )
-        changes = with_values(self.base.geometry, vector, self.indices())
-        return replace(self.base, **changes)
+        base = self.base
+        if base.beta is None and any(kind == "beta" for kind, _ in self.indices()):
+            base = base.replace(beta=jnp.zeros_like(base.alpha))
+        return with_arrays(base, **with_values(base.geometry, vector, self.indices()))
 
 
 def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
@@ -123,9 +165,15 @@ def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
 
 
 class Bounds(eqx.Module):
-    """A box for the free parameters: ``lower`` and ``upper`` are ``(p,)``, mm and rad; infinities are allowed.
+    """Bounds of the free parameters.
 
-    Raises `InputError` where a lower bound is above its upper one, or shapes do not fit.
+    Args:
+        space: The free parameters.
+        lower: Lower bounds ``(p,)``, mm and rad; may be infinite.
+        upper: Upper bounds ``(p,)``.
+
+    Raises:
+        InputError: A lower bound is above its upper one, or shapes do not fit.
     """
 
     space: Parameters
@@ -138,14 +186,17 @@ class Bounds(eqx.Module):
         self.upper = as_array(upper, "upper")
         for what, bound in (("lower", self.lower), ("upper", self.upper)):
             if bound.shape[-1:] != (len(space.names),):
-                raise InputError(f"{what} has shape {bound.shape}, but {len(space.names)} parameters are free; give one each.")
+                raise InputError(
+                    f"{what} has shape {bound.shape}, but {len(space.names)} parameters are free; give one each."
+                )
         if is_concrete(self.lower, self.upper):
             wrong = ~(np.asarray(self.lower) <= np.asarray(self.upper))  # also true for NaN
             if wrong.any():
                 i = int(np.argwhere(wrong)[0][-1])
                 low, high = np.asarray(self.lower)[..., i].ravel()[0], np.asarray(self.upper)[..., i].ravel()[0]
                 raise InputError(
-                    f"bounds of {space.names[i]} are {low:g} to {high:g}; the lower must be a number not above the upper."
+                    f"bounds of {space.names[i]} are {low:g} to {high:g}; the lower must be a number not above the "
+                    "upper."
                 )
 
     @classmethod
@@ -158,9 +209,17 @@ class Bounds(eqx.Module):
         angle: float = 0.0175,
         override: Mapping[str, float] | None = None,
     ) -> "Bounds":
-        """A box centred on an arm: half-widths for lengths (mm), for angles (rad) and, by name, for single parameters.
+        """A box centred on an arm; the default half-widths are the paper's, 10 mm and about 1 degree.
 
-        The defaults are the paper's: 10 mm and about 1 degree.
+        Args:
+            arm: The arm in the middle of the box, with as many joints as the space's.
+            space: The free parameters.
+            length: Half-width for lengths, mm.
+            angle: Half-width for angles, rad.
+            override: Half-widths of single parameters by name, mm or rad.
+
+        Raises:
+            InputError: A half-width is negative, a name is not free, or the arm does not fit the parameters.
         """
         widths = np.where(space.lengths, float(length), float(angle))
         for name, width in (override or {}).items():
@@ -173,15 +232,22 @@ class Bounds(eqx.Module):
         return cls(space, centre - widths, centre + widths)
 
     def active(self, vector: Float[Array, "... p"]) -> "Array":
-        """Which parameters of ``(..., p)`` sit on a bound: -1 on the lower, +1 on the upper, 0 inside."""
+        """Which parameters of ``(..., p)`` are on a bound: -1 on the lower, +1 on the upper, 0 inside."""
         on_lower, on_upper = vector <= self.lower, vector >= self.upper
         return jnp.where(on_lower, -1, jnp.where(on_upper, 1, 0))
 
 
 def perturbed_arm(space: Parameters, *, length: float, angle: float, seed: int = 0) -> Arm:
-    """An arm that differs from the space's base: free lengths by up to ``length`` mm, free angles by up to ``angle`` rad.
+    """The space's base arm with random errors of its free parameters, uniform and independent, as of manufacture.
 
-    Uniform and independent; what the maker's tolerances might have left.
+    Args:
+        space: The free parameters and their base arm.
+        length: Largest error of a length, mm.
+        angle: Largest error of an angle, rad.
+        seed: Seed of the errors.
+
+    Raises:
+        InputError: A largest error is negative or not finite.
     """
     for what, value in (("length", length), ("angle", angle)):
         if not (math.isfinite(value) and value >= 0):

@@ -1,13 +1,16 @@
-"""Where an arm can be: its reach, its lowest point, poses at given points, and poses as lines in space."""
+"""The workspace of an arm: its reach, lowest point, configurations at given points, and links as lines in space."""
 
-from typing import NamedTuple, Protocol, runtime_checkable
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..core.arrays import in_chunks
+from ..core.errors import InputError
 from .arm import Arm, joint_limits
 from .chain import Geometry, forward_pass, sines_cosines
 from .inverse_kinematics import project_to_targets
@@ -16,33 +19,33 @@ _STARTS, _SWEEPS = 256, 30
 
 
 class Reach(NamedTuple):
-    """The ball that an arm's tip stays in, mm."""
+    """The smallest ball about the shoulder that contains all positions of the tip, mm."""
 
-    shoulder: Float[np.ndarray, " 3"]  # its centre: on the first axis, d_1 above the base
+    shoulder: Float[np.ndarray, " 3"]  # on the first axis, d_1 above the base
     radius: float
 
 
 def arm_reach(arm: Arm) -> Reach:
-    """How far the tip can be from the shoulder within the joint limits.
+    """Largest distance of the tip from the shoulder within the joint limits.
 
-    Along one joint the squared distance is a constant and a sinusoid, so three of its values tell where it is largest. From many
-    starts, joint after joint is set there until nothing changes: exact but for the choice of starts, and quick.
+    As a function of one joint the squared distance is a constant plus a sinusoid, so its maximum follows from three
+    values. From many random starts, joint after joint is set to its maximum until nothing changes.
     """
     shoulder = np.array([0.0, 0.0, float(arm.d[0])])
     limits = np.asarray(joint_limits(arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_STARTS, arm.joints))
 
-    def squared(poses: np.ndarray) -> np.ndarray:
-        return np.sum((np.asarray(arm.position(poses)) - shoulder) ** 2, axis=-1)
+    def squared(configurations: np.ndarray) -> np.ndarray:
+        return np.sum((np.asarray(arm.position(configurations)) - shoulder) ** 2, axis=-1)
 
     best = 0.0
     for _ in range(_SWEEPS):
-        for joint in range(1, arm.joints):  # the first only turns the whole arm
-            turned = np.repeat(q[None], 3, axis=0)
-            turned[1, :, joint], turned[2, :, joint] = q[:, joint] + 2 * np.pi / 3, q[:, joint] - 2 * np.pi / 3
-            here, ahead, behind = squared(turned)
+        for joint in range(1, arm.joints):  # the first rotates the whole arm about the shoulder's axis
+            three = np.repeat(q[None], 3, axis=0)
+            three[1, :, joint], three[2, :, joint] = q[:, joint] + 2 * np.pi / 3, q[:, joint] - 2 * np.pi / 3
+            middle, after, before = squared(three)
             # f(t) = c + A cos t + B sin t about the present angle.
-            cosine, sine = (2 * here - ahead - behind) / 3, (ahead - behind) / np.sqrt(3)
+            cosine, sine = (2 * middle - after - before) / 3, (after - before) / np.sqrt(3)
             highest = q[:, joint] + np.arctan2(sine, cosine)
             low, high = limits[joint]
             whole = highest + 2 * np.pi * np.ceil((low - highest) / (2 * np.pi))
@@ -61,12 +64,13 @@ def arm_reach(arm: Arm) -> Reach:
 
 
 def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"]:
-    """Corners of the arm in each pose, mm: the base, for each joint the end of its offset and of its link, and the tip (``c`` = 2 n + 2)."""
+    """Corners of the arm, mm: the base, the end of each joint's offset and of its link, and the tip (c = 2 n + 2)."""
 
     def lines(rows: np.ndarray) -> np.ndarray:
         forward = forward_pass(arm.geometry, sines_cosines(jnp.asarray(rows)))
         before, after, axis = (
-            np.asarray(part).reshape(arm.joints, 3, -1) for part in (forward.origin_before, forward.origin, forward.z_before)
+            np.asarray(part).reshape(arm.joints, 3, -1)
+            for part in (forward.origin_before, forward.origin, forward.z_before)
         )
         offset = before + np.asarray(arm.d)[:, None, None] * axis
         both = np.stack([offset, after], axis=1).reshape(2 * arm.joints, 3, -1)
@@ -77,7 +81,7 @@ def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"
 
 
 def lowest_point(arm: Arm, q: Float[np.ndarray, "c n"]) -> Float[np.ndarray, " c"]:
-    """Height of each pose's lowest joint or tip in the base frame, mm; the base itself left out."""
+    """Height of the lowest joint or tip in the base frame, mm, without the base itself, for each configuration."""
     return in_chunks(lambda rows: np.asarray(_lowest(arm.geometry, jnp.asarray(rows))), q)
 
 
@@ -88,37 +92,42 @@ def _lowest(geometry: Geometry, q: Array) -> Float[Array, " c"]:
 
 
 def total_link_length(arm: Arm) -> float:
-    """What the links and the probe measure together, without the base's height, mm."""
+    """Sum of the lengths of the links and the probe, without the base's height d_1, mm."""
     return float(np.abs(arm.a).sum() + np.abs(np.asarray(arm.d)[1:]).sum() + np.linalg.norm(np.asarray(arm.probe)))
 
 
-@runtime_checkable
-class SearchRegion(Protocol):
-    """Where poses may be: of a `Scene`, or of whoever else looks for poses."""
+class SearchRegion(NamedTuple):
+    """Where configurations are looked for, and the random numbers that the search uses."""
 
-    @property
-    def arm(self) -> Arm:
-        """The arm."""
-        ...
-
-    @property
-    def limits(self) -> Float[np.ndarray, "n 2"]:
-        """Lowest and highest reading of each joint, rad."""
-        ...
-
-    @property
-    def above(self) -> float:
-        """Height below which no joint and no tip comes, mm."""
-        ...
+    arm: Arm
+    limits: Float[np.ndarray, "n 2"]  # lowest and highest reading of each joint, rad
+    above: float  # height in the base frame below which no joint and no tip comes, mm
+    random: np.random.Generator
 
     def draw(self, count: int) -> Float[np.ndarray, "c n"]:
-        """Poses at random within the limits."""
-        ...
+        """Random configurations within the limits."""
+        return self.random.uniform(self.limits[:, 0], self.limits[:, 1], (count, self.arm.joints))
 
 
-def configurations_at(scene: SearchRegion, points: Float[np.ndarray, "s 3"], each: int) -> tuple[np.ndarray, np.ndarray]:
-    """Poses from ``each`` random starts for each socket that arrived within the limits, and the socket of each."""
+def search_region(
+    arm: Arm, limits: Sequence[Sequence[float]] | None, margin: float, above: float, seed: int
+) -> SearchRegion:
+    """The region ``margin`` (rad) inside the joint limits (default: the arm's own) and ``above`` (mm) the table."""
+    if seed < 0:
+        raise InputError(f"seed is {seed}; give zero or a positive number.")
+    allowed = np.asarray(joint_limits(arm, limits))
+    if not (math.isfinite(margin) and 0 <= margin < np.min(allowed[:, 1] - allowed[:, 0]) / 2):
+        raise InputError(
+            f"a margin of {math.degrees(margin):g} deg leaves a joint no range within its limits; give a smaller one."
+        )
+    return SearchRegion(arm, allowed + margin * np.array([1.0, -1.0]), above, np.random.default_rng(seed))
+
+
+def configurations_at(
+    region: SearchRegion, points: Float[np.ndarray, "s 3"], each: int
+) -> tuple[Float[np.ndarray, "c n"], Int[np.ndarray, " c"]]:
+    """Configurations that reach the points from ``each`` random starts a point, and the index of each one's point."""
     owner = np.repeat(np.arange(len(points)), each)
-    q, arrived = project_to_targets(scene.arm, scene.draw(len(owner)), points[owner], scene.limits)
-    good = arrived & (lowest_point(scene.arm, q) >= scene.above)
+    q, arrived = project_to_targets(region.arm, region.draw(len(owner)), points[owner], region.limits)
+    good = arrived & (lowest_point(region.arm, q) >= region.above)
     return q[good], owner[good]

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..kinematics.chain import Geometry, SinesCosines, forward_pass, stacked_jacobian_columns
+from ..kinematics.chain import Geometry, SinesCosines, forward_pass
+from ..kinematics.jacobian import stacked_jacobian_columns
 from ..kinematics.parameters import Parameters
 from ..solver.levenberg_marquardt import Model
 from .measurement import Measurement, averaging_matrix, differences_matrix

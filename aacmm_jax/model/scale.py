@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
 from ..data.capture import Capture
-from ..kinematics.arm import Arm, replace
+from ..kinematics.arm import Arm
 from .measurement import Measurement, length_covariance
 from .metrics import repeatability
 
@@ -37,7 +37,7 @@ def divide_lengths(arm: Arm, k: Float[Array, ""]) -> Arm:
     """
     k = k[..., None]
     d = jnp.concatenate([arm.d[..., :1], arm.d[..., 1:] / k], axis=-1)
-    return replace(arm, a=arm.a / k, d=d, probe=arm.probe / k)
+    return arm.replace(a=arm.a / k, d=d, probe=arm.probe / k)
 
 
 def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> ScaleFix:

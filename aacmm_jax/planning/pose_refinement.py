@@ -1,28 +1,27 @@
-"""A design's poses moved by a gradient method, their tips kept in place."""
+"""The poses of a design improved by a gradient method, their tips kept in their sockets."""
 
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..kinematics.arm import Arm
-from ..kinematics.chain import forward_pass, jacobian_columns, sines_cosines
-from ..kinematics.inverse_kinematics import damped_inverse, project_to_targets
+from ..kinematics.chain import sines_cosines
+from ..kinematics.inverse_kinematics import newton_steps_to_targets, project_to_targets
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import lowest_point
 from ..model.measurement import Measurement
 from ..uncertainty.identifiability import whitened_equations
-from .placement import Place, Scene
+from .placement import DesignProblem, FixturePlacement
 
-_STEPS = 80
-_ONTO = 4  # Newton's steps that bring a moved pose back into its socket, inside the derivative
+_ITERATIONS = 80
+_NEWTON_STEPS = 4  # that bring a moved pose back into its socket, inside the derivative
 
 
 class _Design(eqx.Module):
-    """Everything the criterion needs but the poses; sockets in order."""
+    """What the criterion depends on, except the poses; sockets in order."""
 
     arm: Arm
     space: Parameters
@@ -32,65 +31,57 @@ class _Design(eqx.Module):
 
 
 def refined(
-    scene: Scene,
-    place: Place,
+    problem: DesignProblem,
+    placement: FixturePlacement,
     q: Float[np.ndarray, "N n"],
     owner: Int[np.ndarray, " N"],
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None],
 ) -> Float[np.ndarray, "N n"]:
-    """Poses with a criterion at least as good as that of ``q`` (socket after socket), within the limits, in their sockets to 1e-6 mm."""
+    """Configurations within the limits, in their sockets to 1e-6 mm, with an objective no worse than that of ``q``.
+
+    ``q`` is in the order of the sockets; ``progress`` is called with the fraction done.
+    """
     from scipy import optimize
 
-    sizes = tuple(int(n) for n in np.bincount(owner, minlength=len(place.points)))
-    lengths = [np.linalg.norm(place.points[b] - place.points[a]) for a, b in place.ends]
+    sizes = tuple(int(n) for n in np.bincount(owner, minlength=len(placement.points)))
+    lengths = [np.linalg.norm(placement.points[b] - placement.points[a]) for a, b in placement.ends]
     measurement = Measurement(
         q=jnp.asarray(q),
         sines_cosines=sines_cosines(jnp.asarray(q)),
         nominal=jnp.asarray(np.array(lengths)),
-        u=jnp.asarray(np.array(place.u)),
+        u=jnp.asarray(np.array(placement.u)),
         sizes=sizes,
-        ends=place.ends,
+        ends=placement.ends,
     )
-    targets = place.points[owner]
-    design = _Design(scene.arm, scene.space, jnp.asarray(targets), measurement, jnp.asarray(scene.goal.functions))
+    targets = placement.points[owner]
+    functions = jnp.asarray(problem.objective.functions)
+    design = _Design(problem.arm, problem.space, jnp.asarray(targets), measurement, functions)
 
     @eqx.filter_jit
     @eqx.filter_value_and_grad
-    def criterion(moved: Array, design: _Design) -> Array:
-        at = _onto(design.arm, moved, design.targets)
+    def objective(moved: Array, design: _Design) -> Array:
+        at = newton_steps_to_targets(design.arm, moved, design.targets, _NEWTON_STEPS)
         fresh = eqx.tree_at(lambda m: (m.q, m.sines_cosines), design.measurement, (at, sines_cosines(at)))
-        rows = whitened_equations(design.arm, design.space, fresh.weighted(design.arm.geometry, scene.noise))
+        rows = whitened_equations(design.arm, design.space, fresh.weighted(design.arm.geometry, problem.noise))
         information = rows.T @ rows + 1e-4 * jnp.eye(rows.shape[1])
-        return scene.goal._replace(functions=design.functions).value(jnp.linalg.inv(information))
+        return problem.objective._replace(functions=design.functions).value(jnp.linalg.inv(information))
 
     done = 0
 
-    def told(_: np.ndarray) -> None:
+    def iterated(_: np.ndarray) -> None:
         nonlocal done
         done += 1
-        if tell:
-            tell(min(done / _STEPS, 1.0))
+        progress(min(done / _ITERATIONS, 1.0))
 
-    def both(flat: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = criterion(jnp.asarray(flat.reshape(q.shape)), design)
-        return float(value), np.asarray(slope).ravel()
+    def value_and_gradient(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = objective(jnp.asarray(flat.reshape(q.shape)), design)
+        return float(value), np.asarray(gradient).ravel()
 
-    bounds = np.tile(scene.limits, (len(q), 1))
+    region = problem.region
     solution = optimize.minimize(
-        both, q.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, callback=told, options={"maxiter": _STEPS}
-    )
-    better, arrived = project_to_targets(scene.arm, solution.x.reshape(q.shape), targets, scene.limits)
-    better = np.where((arrived & (lowest_point(scene.arm, better) >= scene.above))[:, None], better, q)
-    return better if both(better.ravel())[0] <= both(q.ravel())[0] else q
-
-
-def _onto(arm: Arm, q: Float[Array, "N n"], targets: Float[Array, "N 3"]) -> Float[Array, "N n"]:
-    """Poses brought onto their targets by least steps, differentiably."""
-
-    def step(rows: Array, _: None) -> tuple[Array, None]:
-        forward = forward_pass(arm.geometry, sines_cosines(rows))
-        gap = targets.T - forward.tip
-        moves = damped_inverse(jacobian_columns(forward)["theta"], jnp.full(rows.shape[0], 1e-6))
-        return rows + jnp.sum(moves * gap[None], axis=1).T, None
-
-    return jax.lax.scan(step, q, None, length=_ONTO)[0]
+        value_and_gradient, q.ravel(), jac=True, method="L-BFGS-B", bounds=np.tile(region.limits, (len(q), 1)),
+        callback=iterated, options={"maxiter": _ITERATIONS},
+    )  # fmt: skip
+    better, arrived = project_to_targets(problem.arm, solution.x.reshape(q.shape), targets, region.limits)
+    better = np.where((arrived & (lowest_point(problem.arm, better) >= region.above))[:, None], better, q)
+    return better if value_and_gradient(better.ravel())[0] <= value_and_gradient(q.ravel())[0] else q

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..acceptance.suite import AcceptanceTest
+from ..acceptance.metrics import AcceptanceTest
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.arrays import Numbers
 from ..core.errors import InputError
@@ -201,7 +201,7 @@ def singular_values(seen: Observability, axes: Any = None) -> Any:
 
 def acceptance(tests: Sequence[AcceptanceTest], axes: Any = None) -> Any:
     """The worst value of every figure with a limit, as a share of it, with U: it conforms where the whole bar lies below 1."""
-    figures = [figure for test in tests for figure in test.figures if figure.worst.limit]
+    figures = [figure for test in tests for figure in test.metrics if figure.worst.limit]
     if not figures:
         raise InputError("no figure has a limit to be drawn against; give limits to accept.")
     axes = _axes(axes)
@@ -220,10 +220,10 @@ def acceptance(tests: Sequence[AcceptanceTest], axes: Any = None) -> Any:
 
 def study(results: "Results", figure: str = "length_error", axes: Any = None) -> Any:
     """One figure of a study in every cell: median, and from the 5th to the 95th percentile of the converged trials."""
-    from ..study.statistics import FIGURES
+    from ..study.statistics import METRICS
 
-    if figure not in FIGURES:
-        raise InputError(f"a study has no figure '{figure}'; choose one of {', '.join(FIGURES)}.")
+    if figure not in METRICS:
+        raise InputError(f"a study has no figure '{figure}'; choose one of {', '.join(METRICS)}.")
     axes = _axes(axes)
     cells = range(len(results.study.cells))
     scale, unit = (_ARCSEC, " [arcsec]") if figure.startswith("angle") else (1.0, "" if figure[0] in "ks" else " [mm]")
@@ -234,7 +234,7 @@ def study(results: "Results", figure: str = "length_error", axes: Any = None) ->
             low, middle, high = np.percentile(values, (5, 50, 95))
             axes.errorbar(cell + 1, middle, yerr=[[middle - low], [high - middle]], fmt="s", color=_DARK, capsize=4)
     axes.set_xticks([cell + 1 for cell in cells] if len(cells) <= 30 else axes.get_xticks())
-    _titled(axes, "cell", FIGURES[figure] + unit)
+    _titled(axes, "cell", METRICS[figure] + unit)
     return axes
 
 

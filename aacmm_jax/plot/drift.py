@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..drift.comparison import Drift, Trend, in_words
+from ..drift.results import Drift, Trend, in_words
 from ..files.whole_file import whole_file
 
 FORMATS = ("png", "svg", "pdf")
@@ -107,7 +107,7 @@ def plot_lengths(table: Trend, axes: Any, places: np.ndarray | None = None) -> A
 
 def plot_parameters(drift: Drift, axes: Any) -> Any:
     """Of two calibrations: every parameter's change over its expanded uncertainty, those beyond it filled and by name."""
-    chosen = [i for i, reason in enumerate(drift.without) if not reason]
+    chosen = [i for i, reason in enumerate(drift.reasons) if not reason]
     safe = np.where(drift.expanded > 0, drift.expanded, 1.0)
     ratio = np.where(drift.expanded > 0, drift.change / safe, np.nan)[chosen]
     places = np.arange(len(chosen))
@@ -155,7 +155,7 @@ def plot_length_changes(drift: Drift, axes: Any) -> Any:
 
 
 def _left_out(drift: Drift) -> str:
-    count = len(drift.names) - drift.without.count("")
+    count = len(drift.names) - drift.compared
     return f"\nnot shown: {count} without an uncertainty of change" if count else ""
 
 

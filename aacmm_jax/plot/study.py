@@ -10,7 +10,7 @@ from ..core.errors import InputError
 from ..files.whole_file import whole_file
 from ..study.results import Results
 from ..study.specification import unit
-from ..study.statistics import FIGURES, correlation
+from ..study.statistics import METRICS, correlation
 
 _BEFORE, _AFTER = "#d95f02", "#1b3a6b"
 _UNITS = {"de": "mm", "deltam": "mm", "length_error": "mm", "angle_error": "arcsec"}
@@ -172,7 +172,7 @@ def convergence_map(results: Results) -> Any:
 def _there(results: Results, name: str) -> str | None:
     """The figure, or what stands for it where the study has no scale fix."""
     for candidate in (name, f"{name}_stage1"):
-        if candidate in FIGURES and any(len(_values(results, candidate, [cell])) for cell in range(len(results.study.cells))):
+        if candidate in METRICS and any(len(_values(results, candidate, [cell])) for cell in range(len(results.study.cells))):
             return candidate
     return None
 
@@ -252,7 +252,7 @@ def _axis(factor: str) -> str:
 
 def _title(name: str) -> str:
     measure = _UNITS.get(name.removesuffix("_stage1"), "1")
-    return f"{FIGURES[name].removesuffix(' after the scale fix')} [{measure}]"
+    return f"{METRICS[name].removesuffix(' after the scale fix')} [{measure}]"
 
 
 def _spans(values: list[np.ndarray]) -> bool:

@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from ..acceptance.decision import worst
+from ..acceptance.metrics import METRICS, AcceptanceTest, Metric
 from ..acceptance.record import EvaluationRecord, PointsRecord
-from ..acceptance.suite import FIGURES, AcceptanceTest, Figure
+from ..acceptance.standards import EDITIONS
 from ..calibration.evaluation import Evaluation, evaluate
 from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
@@ -97,13 +98,6 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
     return facts
 
 
-_EDITIONS = {
-    "JJF 1408": "JJF 1408-2013",
-    "ASME B89.4.22": "ASME B89.4.22-2004",
-    "ISO 10360-12": "ISO 10360-12:2016",
-}
-
-
 def _acceptance(tests: list[AcceptanceTest], rows: list[dict[str, Any]], u_test: float) -> list:
     """Every test as a table, what its full procedure would need besides, and the parts that its figures rest on."""
     if not rows:
@@ -131,7 +125,7 @@ def _acceptance(tests: list[AcceptanceTest], rows: list[dict[str, Any]], u_test:
         )
         lines = []
         for figure in test["figures"]:
-            line = [text(figure["name"]), text(FIGURES[figure["name"]])]
+            line = [text(figure["name"]), text(METRICS[figure["name"]])]
             if before:
                 line += [number(figure["as_found_mm"])] + ([_sign(figure["as_found_decision"])] if limited else [])
             line += [number(figure["value_mm"]), _expanded(figure["expanded_mm"])]
@@ -141,7 +135,7 @@ def _acceptance(tests: list[AcceptanceTest], rows: list[dict[str, Any]], u_test:
                 else []
             )
             lines.append([*line, text(figure["where"])])
-        blocks.append(Table(f"{_EDITIONS[test['standard']]}: {test['title']} [mm]", tuple(columns), lines))
+        blocks.append(Table(f"{EDITIONS[test['standard']]}: {test['title']} [mm]", tuple(columns), lines))
         if test["missing"]:
             blocks.append(f"This was not the full procedure; it also needs {'; '.join(test['missing'])}.")
     parts = [
@@ -151,8 +145,8 @@ def _acceptance(tests: list[AcceptanceTest], rows: list[dict[str, Any]], u_test:
             _part(part.decision),
         ]
         for test in tests
-        for figure in test.figures
-        for part in figure.parts
+        for figure in test.metrics
+        for part in figure.values
         if not limited or part.limit is not None
     ]
     title = "Every part of every figure with a limit [mm]" if limited else "Every part of every figure [mm]"
@@ -199,7 +193,7 @@ def points_report(record: PointsRecord) -> tuple[Report, dict[str, Any]]:
     tests = record.acceptance()
     summary = points_summary(record, tests)
     verdict, mark = _verdict(summary)
-    chart = next((figure for test in tests for figure in test.figures if figure.name == "E_Uni"), None)
+    chart = next((figure for test in tests for figure in test.metrics if figure.name == "E_Uni"), None)
     sections = [
         Section(
             "acceptance",
@@ -221,7 +215,7 @@ def _part(decision: Any) -> Cell:
 
 def _margins(tests: list[AcceptanceTest]) -> Chart:
     """Every figure's worst value with U; where limits were given as a share of them."""
-    figures = [figure for test in tests for figure in test.figures]
+    figures = [figure for test in tests for figure in test.metrics]
     limited = [figure for figure in figures if figure.worst.limit is not None]
     if limited:
         least = 1e-6  # mm: a limit of zero is drawn as this
@@ -264,7 +258,7 @@ def _lengths(record: EvaluationRecord, tests: list[AcceptanceTest], left: Evalua
     capture = record.recording.capture
     if not capture.lengths:
         return []
-    figure = next((figure for test in tests for figure in test.figures if figure.name == "E_Uni"), None)
+    figure = next((figure for test in tests for figure in test.metrics if figure.name == "E_Uni"), None)
     blocks: list = []
     if figure is not None:
         blocks.append(_length_chart(figure))
@@ -292,13 +286,13 @@ def _known(u: Any) -> float | None:
     return float(u) if np.isfinite(u) else None
 
 
-def _length_chart(figure: Figure) -> Chart:
-    lengths = [part.length or 0.0 for part in figure.parts]
-    hover = [f"{part.where}: {shown(part.value, signed=True)} mm" for part in figure.parts]
-    trace = charts.dots("single readings, with U", lengths, [part.value for part in figure.parts], charts.DARK, "circle",
-                        hover=hover, bars=[part.expanded for part in figure.parts], size=5)  # fmt: skip
+def _length_chart(figure: Metric) -> Chart:
+    lengths = [part.length or 0.0 for part in figure.values]
+    hover = [f"{part.where}: {shown(part.value, signed=True)} mm" for part in figure.values]
+    trace = charts.dots("single readings, with U", lengths, [part.value for part in figure.values], charts.DARK, "circle",
+                        hover=hover, bars=[part.expanded for part in figure.values], size=5)  # fmt: skip
     traces = [trace]
-    limits = sorted((length, part.limit) for length, part in zip(lengths, figure.parts, strict=True) if part.limit is not None)
+    limits = sorted((length, part.limit) for length, part in zip(lengths, figure.values, strict=True) if part.limit is not None)
     if limits:
         x, y = [length for length, _ in limits], np.array([limit for _, limit in limits])
         line = {"mode": "lines", "line": {"color": "#444", "dash": "dash", "width": 1.5}}

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..study.results import Results
-from ..study.statistics import FIGURES, study_summary
+from ..study.statistics import METRICS, study_summary
 from . import charts
 from .parts import ARCSEC, Cell, Chart, Report, Section, Table, number, shown, text
 
@@ -149,7 +149,7 @@ def _figure_section(summary: dict[str, Any], name: str, factor: float, unit: str
     trace = charts.dots("median, 5 to 95 %", places, middle, charts.DARK, "square", hover=hover)
     error = {"type": "data", "symmetric": False, "color": charts.DARK, "thickness": 1.4, "width": 5}
     trace["error_y"] = error | {"array": (high - middle).tolist(), "arrayminus": (middle - low).tolist()}
-    title = FIGURES[name]
+    title = METRICS[name]
     heading = title if name == "k" else f"{title[0].upper()}{title[1:]}"
     axis, axis_title = _cell_axis(summary, places)
     # Positive figures over a wide span of cells are read on a logarithmic axis.

@@ -1,12 +1,10 @@
-"""A study with everything it needs: its specification, the nominal arm, perhaps a recording; and what each cell comes to."""
+"""A study: its specification, the nominal arm, perhaps a recording; and the programs and values of every cell."""
 
 import hashlib
 import math
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,50 +12,51 @@ from jaxtyping import Bool, Float
 
 from ..calibration.checks import check_enough
 from ..calibration.scale_anchor import scale_anchor
-from ..core.errors import InputError, nearest
+from ..core.errors import InputError
 from ..core.units import ARCSEC
 from ..data.capture import Capture
 from ..data.recording import Recording
-from ..files.arms import load_specification, specification_toml
-from ..files.captures import load_capture
-from ..files.toml import read_toml
-from ..files.whole_file import storable
+from ..files.arms import specification_toml
 from ..kinematics.arm import Arm, checked_limits, is_length
 from ..kinematics.parameters import Parameters
 from ..kinematics.specification import ArmSpecification, single
-from .specification import Point, Region, Specification, checked, label
+from .specification import Point, Region, Specification, label
 
-_KINDS = {"a": "a_mm", "d": "d_mm", "probe": "probe_mm", "alpha": "alpha_deg", "theta": "theta_deg", "beta": "beta_deg"}
+POOL_PARTS = 32  # independent parts of a pose pool; trial t draws from part t modulo this
+_DEVIATIONS = {
+    **{"a": "a_mm", "d": "d_mm", "probe": "probe_mm"},
+    **{"alpha": "alpha_deg", "theta": "theta_deg", "beta": "beta_deg"},
+}
 
 
 @contextmanager
-def _at(place: str) -> Iterator[None]:
-    """Names the place in the specification that a refusal is about."""
+def _naming(key: str) -> Iterator[None]:
+    """Prefix an error with the key of the specification that it is about."""
     try:
         yield
     except InputError as error:
-        raise InputError(f"{place}: {error}") from error
+        raise InputError(f"{key}: {error}") from error
 
 
-class Stand(NamedTuple):
-    """What holds the tip: a socket (one end), or a reference length with two."""
+class Fixture(NamedTuple):
+    """What fixes the tip: a socket (one end), or a reference length (two ends)."""
 
     name: str
     poses: int  # at each end
-    points: tuple[Point, ...] | None  # where it stands, mm; or None: at random in the region
+    points: tuple[Point, ...] | None  # positions of the ends, mm; None: drawn at random in the region
     region: Region | None = None
     length: float | None = None  # of a reference length at random, mm
 
     @property
     def ends(self) -> int:
-        """Points that hold the tip."""
+        """Number of points at which the tip is fixed."""
         return len(self.points) if self.points is not None else 1 if self.length is None else 2
 
 
 class Setting(NamedTuple):
-    """What fixes the compiled programs of a cell, and the poses it draws from."""
+    """What determines the compiled program of a cell, and its pose pool."""
 
-    stands: tuple[Stand, ...]
+    fixtures: tuple[Fixture, ...]
     limits: tuple[tuple[float, float], ...]  # rad
     hold: str | None
     method: str
@@ -67,11 +66,11 @@ class Setting(NamedTuple):
     @property
     def sizes(self) -> tuple[int, ...]:
         """Poses in each socket."""
-        return tuple(stand.poses for stand in self.stands for _ in range(stand.ends))
+        return tuple(fixture.poses for fixture in self.fixtures for _ in range(fixture.ends))
 
 
-class Numbers(NamedTuple):
-    """What differs from cell to cell but compiles to the same program; the first axis is the cell. mm and rad."""
+class CellValues(NamedTuple):
+    """What differs from cell to cell within one compiled program; the first axis is the cell. mm and rad."""
 
     width: Float[np.ndarray, "c p"]  # of the deviation
     normal: Bool[np.ndarray, "c p"]
@@ -91,17 +90,30 @@ class _Contents(NamedTuple):
 
 
 class Study:
-    """A Monte Carlo study of calibrations: made by `make_study` and `read_study`, run by `run_study`.
+    """A Monte Carlo study of calibrations: made by `make_study` and `read_study`, run by `run_study`. Immutable.
 
-    Immutable; pickles to its contents, so that it can be sent to workers.
+    Studies are equal where they give the same numbers (`digest`), whatever their names and the sources of their files.
+    A copy or an unpickled study, as workers receive it, keeps its own contents.
+
+    Args:
+        specification: What is asked.
+        nominal: The nominal arm, its name and its proposed identification; mm and rad.
+        recording: The capture whose configurations are used, where the specification names one.
+
+    Raises:
+        InputError: Whatever can be known to be wrong before work starts, but for fixtures out of reach.
     """
 
     def __init__(self, specification: Specification, nominal: ArmSpecification, recording: Recording | None = None):
-        self._contents = _Contents(specification, nominal._replace(arm=single(nominal.arm)), recording)
+        single(nominal.arm)
+        if recording is not None:
+            true = None if recording.true is None else _picklable(recording.true)
+            recording = recording._replace(nominal=_picklable(recording.nominal), true=true)
+        self._contents = _Contents(specification, _picklable(nominal), recording)
         self._check()
 
     def __reduce__(self):
-        return _restored, (self.digest + self.specification.name, *self._contents)
+        return _restored, (self.digest, self._contents)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Study) and self.digest == other.digest
@@ -111,7 +123,7 @@ class Study:
 
     @property
     def specification(self) -> Specification:
-        """What was asked."""
+        """What is asked."""
         return self._contents.specification
 
     @property
@@ -121,7 +133,7 @@ class Study:
 
     @property
     def recording(self) -> Recording | None:
-        """The capture whose poses are used, where the study names one."""
+        """The recording whose configurations are used, where the study names one."""
         return self._contents.recording
 
     @property
@@ -136,7 +148,7 @@ class Study:
 
     @cached_property
     def cells(self) -> list[dict[str, Any]]:
-        """The grid: of each cell, every level by its dotted name."""
+        """The cells of the grid: of each, every level by its dotted name."""
         return self.specification.cells()
 
     @cached_property
@@ -152,171 +164,179 @@ class Study:
     def space(self) -> Parameters:
         """The free parameters, on the nominal arm."""
         held = self.specification.identification.held
-        with _at("identification.held"):
-            return Parameters.free_of(self.nominal.arm, held=self.nominal.held if held is None else held)
-
-    @cached_property
-    def _lengths(self) -> Bool[np.ndarray, " p"]:
-        return self.space.lengths
-
-    @cached_property
-    def _vector(self) -> Float[np.ndarray, " p"]:
-        return np.asarray(self.space.vector())
+        with _naming("identification.held"):
+            return self.nominal.space() if held is None else Parameters.free_of(self.nominal.arm, held=held)
 
     @cached_property
     def digest(self) -> str:
-        """Two studies with the same digest give the same numbers."""
+        """SHA-256 of all that the numbers depend on: studies with the same digest give the same numbers."""
         arm = specification_toml(self.nominal._replace(name=""))
         content = [self.specification.model_dump_json(exclude={"name", "arm"}), arm]
         if self.capture is not None:
+            q, names, sizes = np.asarray(self.capture.q), self.capture.names, self.capture.sizes
             lengths = [(r.start, r.end, float(r.value), float(r.u)) for r in self.capture.lengths]
-            content += [np.asarray(self.capture.q).tobytes().hex(), repr((self.capture.names, self.capture.sizes, lengths))]
+            content += [q.tobytes().hex(), repr((names, sizes, lengths))]
         return hashlib.sha256("\n".join(content).encode()).hexdigest()
 
     @cached_property
     def settings(self) -> list[Setting]:
         """The setting of each cell."""
-        holds = {name: self._hold(name) for name in dict.fromkeys(cell["identification.hold"] for cell in self.cells)}
-        recorded = self._recorded_stands()
-        return [self._setting(cell, holds[cell["identification.hold"]], recorded) for cell in self.cells]
+        anchors = {
+            hold: self._scale_anchor(hold) for hold in dict.fromkeys(c["identification.hold"] for c in self.cells)
+        }
+        recorded = self._recorded_fixtures()
+        return [self._setting(cell, anchors[cell["identification.hold"]], recorded) for cell in self.cells]
 
     @cached_property
     def eccentric(self) -> bool:
         """Whether any cell has eccentric encoders (their sines are then computed for all)."""
-        return bool(np.any(self.numbers.eccentricity > 0))
+        return bool(np.any(self.cell_values.eccentricity > 0))
 
     @cached_property
-    def numbers(self) -> Numbers:
-        """The numbers of all cells."""
-        return Numbers(*(np.array(column) for column in zip(*map(self._numbers, self.cells), strict=True)))
+    def cell_values(self) -> CellValues:
+        """The values of all cells."""
+        return CellValues(*(np.array(column) for column in zip(*map(self._values_of, self.cells), strict=True)))
 
     @cached_property
     def most_poses(self) -> dict[int, int]:
         """The most poses that any cell takes at an end, of sockets (1) and of reference lengths (2)."""
-        stands = {stand for setting in dict.fromkeys(self.settings) for stand in setting.stands}
-        return {ends: max((stand.poses for stand in stands if stand.ends == ends), default=0) for ends in (1, 2)}
+        fixtures = {fixture for setting in dict.fromkeys(self.settings) for fixture in setting.fixtures}
+        return {ends: max((one.poses for one in fixtures if one.ends == ends), default=0) for ends in (1, 2)}
 
-    def _recorded_stands(self) -> tuple[Stand, ...] | None:
+    def _recorded_fixtures(self) -> tuple[Fixture, ...] | None:
         if self.capture is None:
             return None
         rows = zip(self.capture.names, self.capture.sizes, _centroids(self.nominal.arm, self.capture), strict=True)
-        return tuple(Stand(name, size, (point,)) for name, size, point in rows)
+        return tuple(Fixture(name, size, (point,)) for name, size, point in rows)
 
-    def _setting(self, cell: Mapping[str, Any], hold: str | None, recorded: tuple[Stand, ...] | None) -> Setting:
+    def _setting(self, cell: Mapping[str, Any], hold: str | None, recorded: tuple[Fixture, ...] | None) -> Setting:
         arm, method, random_start = self.nominal.arm, self._method(cell), cell["identification.start"] == "random"
         if recorded is not None:
             return Setting(recorded, (), hold, method, random_start, recorded=True)
         region, poses = cell.get("capture.region"), cell["capture.poses"]
         points = cell.get("capture.positions_mm")
         if points is not None:
-            stands = [Stand(f"S{i + 1}", poses, (tuple(point),)) for i, point in enumerate(points)]
+            fixtures = [Fixture(f"S{i + 1}", poses, (tuple(point),)) for i, point in enumerate(points)]
         else:
-            stands = [Stand(f"S{i + 1}", poses, None, region) for i in range(cell["capture.sockets"])]
-        stands += _reference_stands(cell, region)
+            fixtures = [Fixture(f"S{i + 1}", poses, None, region) for i in range(cell["capture.sockets"])]
+        fixtures += _reference_fixtures(cell, region)
         degrees = cell.get("capture.joint_limits_deg")
         if degrees is not None and len(degrees) != arm.joints:
             raise InputError(
-                f"capture.joint_limits_deg has {len(degrees)} rows, but the arm has {arm.joints} joints; give [lowest, highest] "
-                "for each."
+                f"capture.joint_limits_deg has {len(degrees)} rows, but the arm has {arm.joints} joints; give "
+                "[lowest, highest] for each."
             )
         rows = arm.limits if degrees is None else [[math.radians(x) for x in pair] for pair in degrees]
         limits = checked_limits([(-math.pi, math.pi)] * arm.joints if rows is None else rows, arm.joints)
-        return Setting(tuple(stands), tuple((float(a), float(b)) for a, b in limits), hold, method, random_start, False)
+        return Setting(
+            tuple(fixtures), tuple((float(a), float(b)) for a, b in limits), hold, method, random_start, False
+        )
 
     def _method(self, cell: Mapping[str, Any]) -> str:
         if "identification.method" in cell:
             return cell["identification.method"]
-        has_lengths = bool(self.capture.lengths) if self.capture is not None else self.specification.reference is not None
-        return "two-stage" if has_lengths else "stage1"
+        if self.capture is not None:
+            return "two-stage" if self.capture.lengths else "stage1"
+        return "stage1" if self.specification.reference is None else "two-stage"
 
-    def _hold(self, hold: str) -> str | None:
-        with _at("identification.hold"):
+    def _scale_anchor(self, hold: str) -> str | None:
+        with _naming("identification.hold"):
             return scale_anchor(self.space, self.nominal.arm, None if hold == "none" else hold)
 
-    def _numbers(self, cell: Mapping[str, Any]) -> tuple:
-        space, nominal, table = self.space, self.nominal, self.specification.bounds
+    def _values_of(self, cell: Mapping[str, Any]) -> tuple:
+        """The fields of `CellValues` for one cell."""
+        space, nominal, override = self.space, self.nominal, self.specification.bounds.override
+        is_length_of = space.lengths
         deviations = [_deviation(cell, name) for name in space.names]
-        factor = np.where(self._lengths, 1.0, math.pi / 180)
-        width = factor * [one.uniform if one.normal is None else one.normal for one in deviations]
+        unit = np.where(is_length_of, 1.0, math.pi / 180)
+        width = unit * [one.uniform if one.normal is None else one.normal for one in deviations]
         length, angle = cell.get("bounds.length_mm"), cell.get("bounds.angle_deg")
         length = nominal.length if length is None else length
         angle = nominal.angle if angle is None else math.radians(angle)
-        half = np.where(self._lengths, length, angle)
-        for name, value in (nominal.override if table.override is None else table.override).items():
-            if table.override is not None or name in space.names:
-                with _at("bounds.override"):
-                    half[space.index(name)] = value if table.override is None else value * factor[space.index(name)]
-        shift = np.where(self._lengths, cell["bounds.length_shift_mm"], math.radians(cell["bounds.angle_shift_deg"]))
-        noise = [cell[f"noise.{name}"] for name in ("encoder_arcsec", "resolution_arcsec", "seating_mm", "eccentricity_arcsec")]
+        half = np.where(is_length_of, length, angle)
+        for name, value in (nominal.override if override is None else override).items():
+            if override is not None or name in space.names:
+                with _naming("bounds.override"):
+                    half[space.index(name)] = value if override is None else value * unit[space.index(name)]
+        shift = np.where(is_length_of, cell["bounds.length_shift_mm"], math.radians(cell["bounds.angle_shift_deg"]))
+        centre = self._nominal_vector
         return (
             width,
             [one.normal is not None for one in deviations],
-            self._vector - half + shift,
-            self._vector + half + shift,
-            *(value * (1.0 if i == 2 else ARCSEC) for i, value in enumerate(noise)),
+            centre - half + shift,
+            centre + half + shift,
+            cell["noise.encoder_arcsec"] * ARCSEC,
+            cell["noise.resolution_arcsec"] * ARCSEC,
+            cell["noise.seating_mm"],
+            cell["noise.eccentricity_arcsec"] * ARCSEC,
             cell.get("reference.u_mm", math.nan),
         )
 
+    @cached_property
+    def _nominal_vector(self) -> Float[np.ndarray, " p"]:
+        return np.asarray(self.space.vector())
+
     def _check(self) -> None:
-        """Everything that can be known to be wrong before work starts, but for what cannot be reached."""
-        recorded = self.capture is not None
-        if recorded and self.specification.reference is not None:
+        """Refuse everything that can be known to be wrong before work starts, but for what cannot be reached."""
+        capture, pool = self.capture, self.specification.capture.pool
+        if capture is not None and self.specification.reference is not None:
             raise InputError("the capture file brings its reference lengths; leave [reference] out.")
-        if recorded and self.capture.joints != self.nominal.arm.joints:  # pyright: ignore[reportOptionalMemberAccess]
+        if capture is not None and capture.joints != self.nominal.arm.joints:
             raise InputError("the capture and the arm differ in their number of joints; name the arm that recorded it.")
         unknowns = len(self.space.names) - int(self.space.lengths.any())
         for setting in dict.fromkeys(self.settings):
             check_enough(setting.sizes, unknowns)
-            if setting.method != "stage1" and recorded and not self.capture.lengths:  # pyright: ignore
-                raise InputError("the capture file holds no reference length; use method = 'stage1', or another file.")
-            for stand in () if recorded else setting.stands:
-                placements, poses = pose_choice(self, stand)
-                if stand.points is None and placements < 2:
+            if setting.method != "stage1" and capture is not None and not capture.lengths:
+                raise InputError("the capture file has no reference length; use method = 'stage1', or another file.")
+            for fixture in () if capture is not None else setting.fixtures:
+                placements, poses = pool_capacity(self, fixture)
+                if fixture.points is None and placements < 2:
                     raise InputError(
-                        f"a capture.pool of {self.specification.capture.pool} poses has room for less than two places of "
-                        f"{stand.poses} poses in each of its {BATCHES} parts; give at least {2 * BATCHES * stand.ends * poses}."
+                        f"a capture.pool of {pool} poses holds fewer than two placements of {fixture.poses} poses in "
+                        f"each of its {POOL_PARTS} parts; give at least {2 * POOL_PARTS * fixture.ends * poses}."
                     )
-                if stand.poses > poses:
+                if fixture.poses > poses:
                     raise InputError(
-                        f"{stand.poses} poses are more than the pool has for a socket ({poses}); give a "
-                        f"larger capture.pool than {self.specification.capture.pool}."
+                        f"{fixture.poses} poses are more than the pool has for a socket ({poses}); give a larger "
+                        f"capture.pool than {pool}."
                     )
-        _ = self.numbers  # its checks
+        _ = self.cell_values  # its checks
 
 
 @lru_cache(maxsize=4)
-def _known(digest: str, contents: "_Lazy") -> Study:
-    return Study(*contents.contents)
+def _derived(digest: str) -> dict[str, Any]:
+    """What this process has derived from studies of one digest: filled by the first that is restored, shared by all."""
+    return {}
 
 
-class _Lazy:
-    """Contents that count as equal to any others, so that the digest alone decides what is known."""
+def _restored(digest: str, contents: _Contents) -> Study:
+    """A copied or unpickled study, with its own contents.
 
-    def __init__(self, contents: tuple):
-        self.contents = contents
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Lazy)
-
-    def __hash__(self) -> int:
-        return 0
-
-
-def _restored(digest: str, *contents: Any) -> Study:
-    """A pickled study: the one that this process has already, where it has, with all that it has worked out."""
-    return _known(digest, _Lazy(contents))
+    What is derived from them depends on the digest alone: a worker receives the study with every block, and derives
+    once.
+    """
+    study = object.__new__(Study)
+    study._contents = contents
+    shared = _derived(digest)
+    if not shared:
+        study._check()
+        shared.update({name: value for name, value in vars(study).items() if name != "_contents"}, digest=digest)
+    vars(study).update(shared)
+    return study
 
 
-BATCHES = 32  # independent pools; trial t draws from pool t modulo this
+def _picklable(specification: ArmSpecification) -> ArmSpecification:
+    """The same arm file with a plain dict: its default for ``override``, a mapping proxy, cannot be pickled."""
+    return specification._replace(override=dict(specification.override))
 
 
-def pose_choice(study: Study, stand: Stand) -> tuple[int, int]:
-    """Placements of a stand in each batch's pool, and poses at each of its ends (a power of two)."""
-    share = study.specification.capture.pool // (BATCHES * stand.ends)
-    if stand.points is not None:
-        return 1, 2 ** int(math.log2(share))
-    poses = max(2 ** math.ceil(math.log2(1.25 * study.most_poses[stand.ends])), 16)
-    return share // poses, poses
+def pool_capacity(study: Study, fixture: Fixture) -> tuple[int, int]:
+    """Placements of a fixture in each part of its pool, and poses at each of its ends (a power of two)."""
+    rows = study.specification.capture.pool // (POOL_PARTS * fixture.ends)
+    if fixture.points is not None:
+        return 1, 2 ** int(math.log2(rows))
+    poses = max(2 ** math.ceil(math.log2(1.25 * study.most_poses[fixture.ends])), 16)
+    return rows // poses, poses
 
 
 def _centroids(arm: Arm, capture: Capture) -> list[Point]:
@@ -324,87 +344,18 @@ def _centroids(arm: Arm, capture: Capture) -> list[Point]:
     return [tuple(tips[end - size : end].mean(axis=0).tolist()) for size, end in zip(capture.sizes, ends, strict=True)]
 
 
-def _reference_stands(cell: Mapping[str, Any], region: Region | None) -> list[Stand]:
+def _reference_fixtures(cell: Mapping[str, Any], region: Region | None) -> list[Fixture]:
     if "reference.poses" not in cell:
         return []
     poses, region = cell["reference.poses"], cell.get("reference.region", region)
     if "reference.ends_mm" in cell:
         pairs = cell["reference.ends_mm"]
-        return [Stand(f"L{i + 1}", poses, (tuple(a), tuple(b))) for i, (a, b) in enumerate(pairs)]
+        return [Fixture(f"L{i + 1}", poses, (tuple(a), tuple(b))) for i, (a, b) in enumerate(pairs)]
     length = cell["reference.length_mm"]
-    return [Stand(f"L{i + 1}", poses, None, region, length) for i in range(cell["reference.positions"])]
+    return [Fixture(f"L{i + 1}", poses, None, region, length) for i in range(cell["reference.positions"])]
 
 
 def _deviation(cell: Mapping[str, Any], name: str) -> Any:
     """The distribution of one free parameter: that of its kind, else that of all lengths or angles."""
     general = "length_mm" if is_length(name) else "angle_deg"
-    return cell.get(f"deviation.{_KINDS[name.rpartition('_')[0]]}", cell[f"deviation.{general}"])
-
-
-def study_of_file(path: str | os.PathLike) -> Study:
-    """Read a study's specification (TOML); the arm and the capture it names lie beside it, or ship with the package.
-
-    Raises `InputError` that names the file, the place in it and the mend.
-    """
-    path = Path(path)
-    specification = read_toml(path, Specification)
-    if not specification.arm and specification.capture.file is None:
-        raise InputError(f"{path}: 'arm' is missing; add it.")
-    try:
-        recording = None
-        if specification.capture.file is not None:
-            recording = load_capture(path.parent / specification.capture.file)
-        nominal = recording.nominal if recording is not None and not specification.arm else _arm(path.parent, specification.arm)
-        return Study(specification, nominal, recording)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-
-
-def _arm(folder: Path, name: str) -> ArmSpecification:
-    beside = folder / name
-    return load_specification(beside if name.endswith(".toml") or beside.is_file() else name)
-
-
-def make_study(
-    *,
-    arm: Arm | ArmSpecification | str | os.PathLike,
-    trials: int,
-    capture: Capture | Mapping[str, Any],
-    seed: int = 0,
-    name: str = "",
-    **tables: Mapping[str, Any],
-) -> Study:
-    """A study from Python: ``deviation``, ``noise``, ``bounds``, ``reference`` and ``identification`` are tables as in TOML.
-
-    ``arm`` is an arm, a shipped name or a file; ``capture`` a table, or a `Capture` whose poses are used. Any value of a
-    table may be a list; the study is their grid. Raises `InputError` in one sentence.
-    """
-    nominal = arm if isinstance(arm, ArmSpecification) else ArmSpecification(arm) if isinstance(arm, Arm) else None
-    nominal = load_specification(arm) if nominal is None else nominal  # pyright: ignore[reportArgumentType]
-    unknown = [key for key in tables if key not in ("deviation", "noise", "bounds", "reference", "identification")]
-    if unknown:
-        known = ["deviation", "noise", "bounds", "reference", "identification"]
-        raise InputError(f"a study has no table '{unknown[0]}'{nearest(unknown[0], known)}")
-    recording = None
-    if isinstance(capture, Capture):
-        recording, capture = Recording(capture, nominal), {"file": "(in memory)"}
-    elif not isinstance(capture, Mapping):
-        raise InputError(f"capture is a {type(capture).__name__}; give a table (positions_mm, sockets or file), or a Capture.")
-    elif capture.get("file") is not None:
-        recording = load_capture(capture["file"])
-    specification = checked(name=storable(name), arm=nominal.name, trials=trials, seed=seed, capture=capture, **tables)
-    return Study(specification, nominal, recording)
-
-
-class Block(NamedTuple):
-    """Trials of some cells: all of one setting."""
-
-    first_cell: int
-    last_cell: int  # not included
-    first_trial: int
-    last_trial: int  # not included
-
-    @property
-    def size(self) -> int:
-        """How many trials it holds."""
-        return (self.last_cell - self.first_cell) * (self.last_trial - self.first_trial)
+    return cell.get(f"deviation.{_DEVIATIONS[name.rpartition('_')[0]]}", cell[f"deviation.{general}"])

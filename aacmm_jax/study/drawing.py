@@ -1,7 +1,10 @@
-"""Trials drawn from counter-based keys (seed, cell, trial): the true arm, what its encoders read, the box and the start.
+"""Trials drawn from counter-based keys (seed, cell, trial): the true arm, the readings, the box and the start.
 
-A trial's numbers depend on its key alone, not on what is drawn beside it. A pose of the pool is exact for the nominal arm; for
-the trial's true arm its joints are moved, by least-norm steps, until the tip stands on its (unseated) point again.
+A trial's numbers depend on its key alone, not on what else is drawn. A configuration of the pool is exact for the
+nominal arm; for the trial's true arm its joints are changed until the tip is at its point (displaced by the seating
+error) again. That is inverse kinematics, but not by `solve_to_targets`: all trials of a pool share the damped inverses
+of the nominal arm, and cos and sin follow by angle addition, which takes a tenth of the time and rounds differently, so
+that results would change.
 """
 
 import math
@@ -14,18 +17,19 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..kinematics.arm import with_values
-from ..kinematics.chain import Geometry, forward_pass, jacobian_columns
+from ..kinematics.chain import Geometry, forward_pass
 from ..kinematics.inverse_kinematics import damped_inverse
-from .definition import BATCHES, Numbers, Setting, Study
+from ..kinematics.jacobian import jacobian_columns
+from .definition import POOL_PARTS, CellValues, Setting, Study
 from .pools import Pool, pool_of
 
 _WIDTH = 16  # trials at a time: of one width, so that every trial's arithmetic is the same whatever the chunk
 _TOLERANCE = 1e-9  # mm: how far from its point a tip may end
-_MOST_STEPS = 40  # a few microns take 3, the paper's tolerances 5 or 6
+_MOST_STEPS = 40  # deviations of a few microns take 3, the paper's tolerances 5 or 6
 
 
 class Drawn(NamedTuple):
-    """Trials, as `identify_many` takes them; mm and rad. Where a pose could not be moved onto its point, q is NaN."""
+    """Trials, as `identify_many` takes them; mm and rad. q is NaN where the true arm did not reach its points."""
 
     q: Float[Any, "t N n"]
     true: Float[Any, "t p"]
@@ -36,19 +40,19 @@ class Drawn(NamedTuple):
     u: Float[Any, "t l"]
 
 
-class _Shape(NamedTuple):
-    """What fixes the compiled program."""
+class _Static(NamedTuple):
+    """What determines the compiled program."""
 
-    stands: tuple[tuple[int, int, int, int, int], ...]  # first row, placements, ends, poses in the pool, poses taken
+    fixtures: tuple[tuple[int, int, int, int, int], ...]  # first row, placements, ends, poses in the pool, poses taken
     lengths: tuple[tuple[int, int], ...]  # first poses of both ends
-    entries: tuple[tuple[str, int], ...]
+    indices: tuple[tuple[str, int], ...]  # of the free parameters: kind and joint
     recorded: bool
-    held: int | None  # position of the length that stage 1 holds
+    anchor: int | None  # index of the length that stage 1 fixes
     random_start: bool
     eccentric: bool
 
 
-class _Given(NamedTuple):
+class _Shared(NamedTuple):
     """Arrays that all trials share."""
 
     table: Any  # (rows, columns)
@@ -57,203 +61,209 @@ class _Given(NamedTuple):
     recorded_u: Any  # (l,)
 
 
-def draw(study: Study, setting: Setting, cells: Int[np.ndarray, " t"], trials: Int[np.ndarray, " t"], device: Any) -> Drawn:
+def draw(
+    study: Study, setting: Setting, cells: Int[np.ndarray, " t"], trials: Int[np.ndarray, " t"], device: Any
+) -> Drawn:
     """Trials ``trials`` of cells ``cells``, all of one setting, as NumPy arrays."""
-    shape, given = _prepared(study, setting, device)
+    static, shared = _prepared(study, setting, device)
     count = len(cells)
-    room = -(-count // _WIDTH) * _WIDTH
-    cells, trials = (np.resize(numbers, room) for numbers in (cells, trials))
-    rows = Numbers(*(column[cells] for column in study.numbers))
+    padded = -(-count // _WIDTH) * _WIDTH
+    cells, trials = (np.resize(numbers, padded) for numbers in (cells, trials))
+    values = CellValues(*(column[cells] for column in study.cell_values))
     seed = np.asarray(study.specification.seed)
     with jax.default_device(device):
-        drawn = _draw(shape, given, *jax.device_put((seed, cells, trials, rows), device))
+        drawn = _draw(static, shared, *jax.device_put((seed, cells, trials, values), device))
     return Drawn(*(np.asarray(leaf)[:count] for leaf in drawn))
 
 
 @lru_cache(maxsize=16)
-def _prepared(study: Study, setting: Setting, device: Any) -> tuple[_Shape, _Given]:
+def _prepared(study: Study, setting: Setting, device: Any) -> tuple[_Static, _Shared]:
     """What all trials of a setting share, on the device."""
     pool = pool_of(study, setting)
-    shape = _shape(study, setting, pool)
-    u = np.array([float(length.u) for length in study.capture.lengths]) if study.capture else np.zeros(len(shape.lengths))
-    given = _Given(pool.table, study.nominal.arm.geometry, np.asarray(study.space.vector()), u)
-    return shape, jax.device_put(given, device)
+    static = _static(study, setting, pool)
+    u = [float(length.u) for length in study.capture.lengths] if study.capture else [0.0] * len(static.lengths)
+    shared = _Shared(pool.table, study.nominal.arm.geometry, np.asarray(study.space.vector()), np.array(u))
+    return static, jax.device_put(shared, device)
 
 
-def _shape(study: Study, setting: Setting, pool: Pool) -> _Shape:
-    stands = tuple(
-        (first, placements, stand.ends, poses, stand.poses)
-        for stand, first, placements, poses in zip(setting.stands, pool.first, pool.placements, pool.poses, strict=True)
+def _static(study: Study, setting: Setting, pool: Pool) -> _Static:
+    fixtures = tuple(
+        (first, placements, fixture.ends, poses, fixture.poses)
+        for fixture, first, placements, poses in zip(setting.fixtures, *pool[1:], strict=True)
     )
     starts = np.cumsum([0, *setting.sizes])
-    ends = [(int(starts[a]), int(starts[b])) for a, b in ends_of(study, setting)]
-    held = None if setting.hold is None else study.space.index(setting.hold)
-    return _Shape(stands, tuple(ends), study.space.indices(), setting.recorded, held, setting.random_start, study.eccentric)
+    ends = tuple((int(starts[a]), int(starts[b])) for a, b in ends_of(study, setting))
+    anchor = None if setting.hold is None else study.space.index(setting.hold)
+    indices = study.space.indices()
+    return _Static(fixtures, ends, indices, setting.recorded, anchor, setting.random_start, study.eccentric)
 
 
 def ends_of(study: Study, setting: Setting) -> list[tuple[int, int]]:
     """The reference lengths, as pairs of sockets."""
     if study.capture is not None:
         return [(int(a), int(b)) for a, b in study.capture.ends()]
-    first = np.cumsum([0, *(stand.ends for stand in setting.stands)])
-    return [(int(i), int(i) + 1) for stand, i in zip(setting.stands, first, strict=False) if stand.ends == 2]
+    first = np.cumsum([0, *(fixture.ends for fixture in setting.fixtures)])
+    return [(int(i), int(i) + 1) for fixture, i in zip(setting.fixtures, first, strict=False) if fixture.ends == 2]
 
 
-@partial(jax.jit, static_argnames=("shape",))
-def _draw(shape: _Shape, given: _Given, seed: Array, cells: Array, trials: Array, rows: Numbers) -> Drawn:
+@partial(jax.jit, static_argnames=("static",))
+def _draw(static: _Static, shared: _Shared, seed: Array, cells: Array, trials: Array, values: CellValues) -> Drawn:
     key = jax.random.key(seed, impl="threefry2x32")
 
-    def some(block: tuple) -> Drawn:
-        cell, trial, numbers = block
+    def some(chunk: tuple) -> Drawn:
+        cell, trial, values = chunk
         keys = jax.vmap(lambda c, t: jax.random.fold_in(jax.random.fold_in(key, c), t))(cell, trial)
-        return _block(shape, given, keys, trial, numbers)
+        return _chunk(static, shared, keys, trial, values)
 
-    blocks = jax.tree.map(lambda leaf: leaf.reshape(-1, _WIDTH, *leaf.shape[1:]), (cells, trials, rows))
-    return jax.tree.map(lambda leaf: leaf.reshape(len(trials), *leaf.shape[2:]), jax.lax.map(some, blocks))
+    chunks = jax.tree.map(lambda leaf: leaf.reshape(-1, _WIDTH, *leaf.shape[1:]), (cells, trials, values))
+    return jax.tree.map(lambda leaf: leaf.reshape(len(trials), *leaf.shape[2:]), jax.lax.map(some, chunks))
 
 
-def _block(shape: _Shape, given: _Given, keys: Array, trials: Int[Array, " w"], numbers: Numbers) -> Drawn:
-    """One block of trials."""
-    n, p = given.geometry.alpha.shape[-1], given.nominal.shape[0]
+def _chunk(static: _Static, shared: _Shared, keys: Array, trials: Int[Array, " w"], values: CellValues) -> Drawn:
+    """`_WIDTH` trials."""
+    n, p = shared.geometry.alpha.shape[-1], shared.nominal.shape[0]
     parts = jax.vmap(lambda k: jax.random.split(k, 7))(keys)
-    poses = sum(ends * taken for _, _, ends, _, taken in shape.stands)
+    poses = sum(ends * taken for _, _, ends, _, taken in static.fixtures)
     normal = jax.vmap(lambda k: jax.random.normal(k, (p,)))(parts[:, 0])
-    # The same draw serves both: its rank among all normal draws is uniform.
-    off = numbers.width * jnp.where(numbers.normal, normal, jax.scipy.special.erf(normal / math.sqrt(2)))
-    true = given.nominal[None] + off
-    found = given.table.at[_chosen(shape, parts[:, 1], trials)].get(mode="promise_in_bounds")
+    # One draw for both distributions: its rank among all normal draws is uniform.
+    deviation = values.width * jnp.where(values.normal, normal, jax.scipy.special.erf(normal / math.sqrt(2)))
+    true = shared.nominal[None] + deviation
+    found = shared.table.at[_chosen(static, parts[:, 1], trials)].get(mode="promise_in_bounds")
     columns = jax.lax.optimization_barrier(jnp.moveaxis(found, -1, 0))  # (columns, w, N)
     q, cosine, sine = columns[:n], columns[n : 2 * n], columns[2 * n : 3 * n]
-    moves = columns[3 * n : 6 * n].reshape(n, 3, _WIDTH, poses)
+    inverse = columns[3 * n : 6 * n].reshape(n, 3, _WIDTH, poses)
     point = jnp.swapaxes(columns[6 * n :], 0, 1)  # (w, 3, N)
-    target = point + numbers.seating[:, None, None] * _noise(parts[:, 2], (3, poses))
-    geometry = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_WIDTH, *leaf.shape)), given.geometry)
-    geometry = geometry._replace(**with_values(geometry, true, shape.entries))
-    q = q + _moved(geometry, cosine, sine, moves, target)
-    q = q - jnp.swapaxes(geometry.theta - given.geometry.theta[None], 0, 1)[:, :, None]
-    reading = _read(shape, q, parts[:, 3:5], numbers)
-    value, u = _certified(
-        shape, point, parts[:, 5], jnp.where(jnp.isnan(numbers.u)[:, None], given.recorded_u[None], numbers.u[:, None])
-    )
-    start = jnp.broadcast_to(given.nominal, true.shape)
-    if shape.random_start:
-        share = jax.vmap(lambda k: jax.random.uniform(k, (p,)))(parts[:, 6])
-        free = jnp.asarray(np.arange(p) != (-1 if shape.held is None else shape.held))[None]
-        start = jnp.where(free, numbers.lower + share * (numbers.upper - numbers.lower), start)
-    return Drawn(jnp.moveaxis(reading, 0, -1), true, numbers.lower, numbers.upper, start, value, u)
+    target = point + values.seating[:, None, None] * _noise(parts[:, 2], (3, poses))
+    geometry = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_WIDTH, *leaf.shape)), shared.geometry)
+    geometry = geometry._replace(**with_values(geometry, true, static.indices))
+    q = q + _joint_changes(geometry, cosine, sine, inverse, target)
+    q = q - jnp.swapaxes(geometry.theta - shared.geometry.theta[None], 0, 1)[:, :, None]
+    reading = _readings(static, q, parts[:, 3:5], values)
+    u = jnp.where(jnp.isnan(values.u)[:, None], shared.recorded_u[None], values.u[:, None])
+    value, u = _certified(static, point, parts[:, 5], u)
+    start = jnp.broadcast_to(shared.nominal, true.shape)
+    if static.random_start:
+        fraction = jax.vmap(lambda k: jax.random.uniform(k, (p,)))(parts[:, 6])
+        free = jnp.asarray(np.arange(p) != (-1 if static.anchor is None else static.anchor))[None]
+        start = jnp.where(free, values.lower + fraction * (values.upper - values.lower), start)
+    return Drawn(jnp.moveaxis(reading, 0, -1), true, values.lower, values.upper, start, value, u)
 
 
-def _certified(shape: _Shape, point: Float[Array, "w 3 N"], keys: Array, u: Float[Array, "w l"]) -> tuple[Array, Array]:
-    """Certified values of the reference lengths, off by their u."""
-    if not shape.lengths:
+def _certified(
+    static: _Static, point: Float[Array, "w 3 N"], keys: Array, u: Float[Array, "w l"]
+) -> tuple[Array, Array]:
+    """Certified values of the reference lengths, with an error of standard deviation u."""
+    if not static.lengths:
         return jnp.zeros((_WIDTH, 0)), jnp.zeros((_WIDTH, 0))
-    apart = jnp.stack([point[:, :, b] - point[:, :, a] for a, b in shape.lengths], axis=1)
-    u = jnp.broadcast_to(u, apart.shape[:2])
-    return jnp.linalg.norm(apart, axis=-1) + u * jax.vmap(lambda k: jax.random.normal(k, apart.shape[1:2]))(keys), u
+    between = jnp.stack([point[:, :, b] - point[:, :, a] for a, b in static.lengths], axis=1)
+    u = jnp.broadcast_to(u, between.shape[:2])
+    return jnp.linalg.norm(between, axis=-1) + u * jax.vmap(lambda k: jax.random.normal(k, between.shape[1:2]))(keys), u
 
 
 def _noise(keys: Array, shape: tuple[int, ...]) -> Float[Array, "w ..."]:
-    """Standard normal noise for every trial. Drawn in float32, which takes a third of the time: noise needs no more digits."""
+    """Standard normal noise for every trial, in float32: a third of the time, and noise needs no more digits."""
     return jax.vmap(lambda k: jax.random.normal(k, shape, dtype=jnp.float32))(keys).astype(jnp.float64)
 
 
-def _chosen(shape: _Shape, keys: Array, trials: Int[Array, " w"]) -> Int[Array, "w N"]:
-    """Rows of the pool for every trial: of each stand one placement, and different poses of it at each end.
+def _chosen(static: _Static, keys: Array, trials: Int[Array, " w"]) -> Int[Array, "w N"]:
+    """Rows of the pool for every trial: of each fixture one placement, and different configurations at each end.
 
-    The poses are those first + j * step modulo the pool's size, a power of two, with an odd step: no pose comes twice, and
-    since the pool is in random order, any such choice is as good as another.
+    They are first + j * step modulo the pool's size, a power of two, with an odd step: none comes twice, and since the
+    pool is in random order, any such choice is as good as another.
     """
-    if shape.recorded:
-        size = sum(taken for *_, taken in shape.stands)
+    if static.recorded:
+        size = sum(taken for *_, taken in static.fixtures)
         return jnp.broadcast_to(jnp.arange(size), (_WIDTH, size))
-    batch = trials % BATCHES
-    most = max(ends for _, _, ends, _, _ in shape.stands)
-    bits = jax.vmap(lambda k: jax.random.bits(k, (len(shape.stands), 1 + 2 * most), dtype=jnp.uint32))(keys)
+    part = trials % POOL_PARTS
+    most = max(ends for _, _, ends, _, _ in static.fixtures)
+    bits = jax.vmap(lambda k: jax.random.bits(k, (len(static.fixtures), 1 + 2 * most), dtype=jnp.uint32))(keys)
     bits = (bits >> 1).astype(jnp.int64)
     chosen = []
-    for i, (first, placements, ends, poses, taken) in enumerate(shape.stands):
-        place = (batch * placements + bits[:, i, 0] % placements) * ends
+    for i, (first, placements, ends, poses, taken) in enumerate(static.fixtures):
+        placement = (part * placements + bits[:, i, 0] % placements) * ends
         for end in range(ends):
             begin, step = bits[:, i, 1 + 2 * end, None], 2 * bits[:, i, 2 + 2 * end, None] + 1
             pose = (begin + step * jnp.arange(taken)[None]) % poses
-            chosen.append(first + (place[:, None] + end) * poses + pose)
+            chosen.append(first + (placement[:, None] + end) * poses + pose)
     return jnp.concatenate(chosen, axis=1)
 
 
-def _moved(
+def _joint_changes(
     geometry: Geometry,
     cosine: Float[Array, "n w N"],
     sine: Float[Array, "n w N"],
-    moves: Float[Array, "n 3 w N"],
+    inverse: Float[Array, "n 3 w N"],
     target: Float[Array, "w 3 N"],
 ) -> Float[Array, "n w N"]:
-    """Change of the joints that brings the tips of the true arms onto their targets; NaN for a trial where nothing does.
+    """Changes of the joints that bring the tips of the true arms to their targets; NaN where they do not arrive.
 
-    Every step uses the least moves of the pool, made for the nominal arm (a chord method: each step leaves about a
-    hundredth of the error). cos and sin follow by angle addition. A trial takes steps until it has arrived; one that has not
-    (an arm nearly straight, far from nominal) starts again with damped steps of its own.
+    Every step uses the damped inverse of the pool, computed for the nominal arm (a chord method: each step leaves about
+    a hundredth of the error). A trial takes steps until it has arrived; one that does not (an arm nearly straight, far
+    from nominal) starts again with damped steps of its own.
     """
     rows = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1)[:, :, None], geometry)
-    # Barriers keep XLA from computing them anew for every pose, and the tip for every joint.
+    # Barriers keep XLA from computing them again for every pose, and the tip for every joint.
     links, *twist = jax.lax.optimization_barrier((rows, jnp.cos(rows.alpha), jnp.sin(rows.alpha)))
 
     def gap_of(cosine: Array, sine: Array) -> tuple[Array, Array]:
         gap = jax.lax.optimization_barrier(target - jnp.stack(_tip(links, (twist[0], twist[1]), cosine, sine), axis=1))
         return gap, jnp.max(jnp.abs(gap), axis=(1, 2))
 
-    def more(state: tuple) -> Array:
+    def unfinished(state: tuple) -> Array:
         return (state[0] < _MOST_STEPS) & jnp.any(state[-1] > _TOLERANCE)
 
     def step(state: tuple) -> tuple:
-        number, change, cosine, sine, gap, off = state
-        move = sum(moves[:, i] * gap[None, :, i] for i in range(3))
-        move = jnp.where((off > _TOLERANCE)[None, :, None], move, 0.0)
-        cosine, sine = _turned(cosine, sine, move)
+        number, change, cosine, sine, gap, distance = state
+        move = sum(inverse[:, i] * gap[None, :, i] for i in range(3))
+        move = jnp.where((distance > _TOLERANCE)[None, :, None], move, 0.0)
+        cosine, sine = _rotated(cosine, sine, move)
         return number + 1, change + move, cosine, sine, *gap_of(cosine, sine)
 
     begin = (jnp.asarray(0), jnp.zeros_like(cosine), cosine, sine, *gap_of(cosine, sine))
-    _, change, _, _, _, off = jax.lax.while_loop(more, step, begin)
-    arrived = off <= _TOLERANCE
+    _, change, _, _, _, distance = jax.lax.while_loop(unfinished, step, begin)
+    arrived = distance <= _TOLERANCE
 
     def again() -> Array:
-        slow, off = _moved_slowly(geometry, cosine, sine, target)
-        return jnp.where(arrived[None, :, None], change, jnp.where((off <= _TOLERANCE)[None, :, None], slow, jnp.nan))
+        damped, distance = _damped_changes(geometry, cosine, sine, target)
+        return jnp.where(
+            arrived[None, :, None], change, jnp.where((distance <= _TOLERANCE)[None, :, None], damped, jnp.nan)
+        )
 
     return jax.lax.cond(jnp.all(arrived), lambda: change, again)
 
 
-def _moved_slowly(geometry: Geometry, cosine: Array, sine: Array, target: Array) -> tuple[Array, Array]:
-    """The same by damped least-norm steps with the true arm's own derivatives; and how far off each trial ends, mm."""
-    turned = jax.tree.map(lambda leaf: leaf[:, None, :], geometry._replace(theta=jnp.zeros_like(geometry.theta)))
+def _damped_changes(geometry: Geometry, cosine: Array, sine: Array, target: Array) -> tuple[Array, Array]:
+    """The same by damped least-norm steps with the true arm's own derivatives; and the final distances, mm."""
+    zeroed = jax.tree.map(lambda leaf: leaf[:, None, :], geometry._replace(theta=jnp.zeros_like(geometry.theta)))
 
     def step(_: Array, state: tuple) -> tuple:
         change, cosine, sine, _ = state
-        forward = forward_pass(turned, (cosine[:, :, None], sine[:, :, None]))
+        forward = forward_pass(zeroed, (cosine[:, :, None], sine[:, :, None]))
         gap = target - forward.tip
-        moves = jax.vmap(damped_inverse, in_axes=(1, 0), out_axes=1)(
+        inverse = jax.vmap(damped_inverse, in_axes=(1, 0), out_axes=1)(
             jacobian_columns(forward)["theta"], 1e-2 * jnp.sum(gap**2, axis=1) + 1e-12
         )
-        move = jnp.clip(jnp.sum(moves * gap[None], axis=2), -0.2, 0.2)
-        return change + move, *_turned(cosine, sine, move), jnp.max(jnp.abs(gap), axis=(1, 2))
+        move = jnp.clip(jnp.sum(inverse * gap[None], axis=2), -0.2, 0.2)
+        return change + move, *_rotated(cosine, sine, move), jnp.max(jnp.abs(gap), axis=(1, 2))
 
     begin = (jnp.zeros_like(cosine), cosine, sine, jnp.zeros(_WIDTH))
-    change, *_, off = jax.lax.fori_loop(0, _MOST_STEPS, step, begin)
-    return change, off
+    change, *_, distance = jax.lax.fori_loop(0, _MOST_STEPS, step, begin)
+    return change, distance
 
 
-def _turned(cosine: Array, sine: Array, move: Array) -> tuple[Array, Array]:
-    """cos and sin of an angle after a small turn, by their series: exact to rounding up to 0.2 rad, and a tenth of the time."""
-    square = move * move
-    sine_move, cosine_move = jnp.ones_like(move), jnp.ones_like(move)
+def _rotated(cosine: Array, sine: Array, angle: Array) -> tuple[Array, Array]:
+    """cos and sin after a small rotation, by their series: exact to rounding up to 0.2 rad, and a tenth of the time."""
+    square = angle * angle
+    sine_ratio, cosine_ratio = jnp.ones_like(angle), jnp.ones_like(angle)
     for k in (9, 7, 5, 3):
-        sine_move = 1 - square * (1 / (k * (k - 1))) * sine_move
-        cosine_move = 1 - square * (1 / ((k + 1) * k)) * cosine_move
-    cosine_move, sine_move = 1 - square * 0.5 * cosine_move, move * sine_move
-    return cosine * cosine_move - sine * sine_move, sine * cosine_move + cosine * sine_move
+        sine_ratio = 1 - square * (1 / (k * (k - 1))) * sine_ratio
+        cosine_ratio = 1 - square * (1 / ((k + 1) * k)) * cosine_ratio
+    cos_angle, sin_angle = 1 - square * 0.5 * cosine_ratio, angle * sine_ratio
+    return cosine * cos_angle - sine * sin_angle, sine * cos_angle + cosine * sin_angle
 
 
 def _tip(links: Geometry, twist: tuple[Array, Array], cosine: Array, sine: Array) -> tuple[Array, ...]:
-    """The tip alone, forward from the probe back to the base: one vector instead of a frame. ``cosine`` of q + theta."""
+    """The tip alone, from the probe back to the base: one vector instead of a frame. ``cosine`` is of q + theta."""
     (cos_twist, sin_twist), (x, y, z) = twist, links.probe
     for i in reversed(range(cosine.shape[0])):
         if links.beta is not None:
@@ -264,13 +274,13 @@ def _tip(links: Geometry, twist: tuple[Array, Array], cosine: Array, sine: Array
     return tuple(jnp.broadcast_to(part, cosine.shape[1:]) for part in (x, y, z))
 
 
-def _read(shape: _Shape, q: Float[Array, "n w N"], keys: Array, numbers: Numbers) -> Float[Array, "n w N"]:
-    """What the encoders read: eccentricity (a first harmonic of the angle, its two parts drawn for every joint), noise, resolution."""
+def _readings(static: _Static, q: Float[Array, "n w N"], keys: Array, values: CellValues) -> Float[Array, "n w N"]:
+    """Readings: eccentricity (a first harmonic of the angle, its coefficients drawn by joint), noise and rounding."""
     n, _, poses = q.shape
-    if shape.eccentric:
-        parts = jax.vmap(lambda k: jax.random.normal(k, (2, n)))(keys[:, 1]) * numbers.eccentricity[:, None, None]
-        parts = jnp.moveaxis(parts, 0, -1)[..., None]
-        q = q + parts[0] * jnp.sin(q) + parts[1] * jnp.cos(q)
-    q = q + numbers.encoder[None, :, None] * jnp.moveaxis(_noise(keys[:, 0], (n, poses)), 0, 1)
-    step = numbers.resolution[None, :, None]
+    if static.eccentric:
+        harmonics = jax.vmap(lambda k: jax.random.normal(k, (2, n)))(keys[:, 1]) * values.eccentricity[:, None, None]
+        harmonics = jnp.moveaxis(harmonics, 0, -1)[..., None]
+        q = q + harmonics[0] * jnp.sin(q) + harmonics[1] * jnp.cos(q)
+    q = q + values.encoder[None, :, None] * jnp.moveaxis(_noise(keys[:, 0], (n, poses)), 0, 1)
+    step = values.resolution[None, :, None]
     return jnp.where(step > 0, jnp.round(q / jnp.where(step > 0, step, 1.0)) * step, q)

@@ -1,4 +1,4 @@
-"""Dask as the executor of a study: a scheduler somewhere, or a cluster of processes on this machine."""
+"""Dask as the executor of a study: a running scheduler, or a cluster of processes on this machine."""
 
 import os
 import signal
@@ -12,16 +12,23 @@ import jax
 
 from ..core.errors import InputError
 
-_ATTEMPTS = 3  # of a block whose worker died, beyond the first
+_RETRIES = 3  # of a block whose worker died
 
 
 @contextmanager
 def dask_executor(address: str, workers: int | None = None) -> Iterator[tuple[Executor, int]]:
-    """An executor on a Dask cluster, and its number of workers.
+    """Connect to a Dask cluster, or start one on this machine; a context manager.
 
-    ``address``: of a scheduler (``tcp://host:8786``; or a scheduler file), or ``local`` for ``workers`` processes on this
-    machine (default: one a core), each kept to its share of the cores. Raises `InputError` where Dask is not installed, or
-    nobody answers.
+    Args:
+        address: Of a scheduler (``tcp://host:8786``, or a scheduler file); or ``local`` for processes on this machine,
+            each restricted to its part of the cores.
+        workers: Number of local processes; default: one a core.
+
+    Returns:
+        The executor for `run_study`, and its number of workers.
+
+    Raises:
+        InputError: Where Dask is not installed, no scheduler answers, or the cluster has no workers.
     """
     try:
         import distributed
@@ -30,19 +37,21 @@ def dask_executor(address: str, workers: int | None = None) -> Iterator[tuple[Ex
     with _client(distributed, address, workers) as client:
         count = len(client.scheduler_info(n_workers=-1)["workers"])
         if not count:
-            raise InputError(f"the Dask cluster at {address} has no workers; start some, for example: dask worker {address}")
-        yield client.get_executor(retries=_ATTEMPTS, pure=False), count
+            raise InputError(
+                f"the Dask cluster at {address} has no workers; start some, for example: dask worker {address}"
+            )
+        yield client.get_executor(retries=_RETRIES, pure=False), count
 
 
 @contextmanager
 def _client(distributed: Any, address: str, workers: int | None) -> Iterator[Any]:
     if address != "local":
         if workers is not None:
-            raise InputError("the workers of a running Dask cluster are its own; leave --workers out.")
+            raise InputError("a running Dask cluster has its own workers; leave --workers out.")
         target = {"scheduler_file": address} if os.path.isfile(address) else {"address": address}
         try:
             client = distributed.Client(**target, timeout=5)
-        except Exception as error:  # of a dozen kinds: no such file or host, no answer, not a scheduler's file
+        except Exception as error:  # of a dozen types: no such file or host, no answer, not a scheduler's file
             raise InputError(f"no Dask scheduler answers at {address}; start one, or use --dask local.") from error
         with client:
             yield client
@@ -54,16 +63,18 @@ def _client(distributed: Any, address: str, workers: int | None) -> Iterator[Any
         # Programs that this process compiled need not be compiled again by every worker.
         environment["JAX_COMPILATION_CACHE_DIR"] = jax.config.jax_compilation_cache_dir  # pyright: ignore
         environment["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
-    with _undisturbed():
-        cluster = distributed.LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0", env=environment)
+    with _interrupts_ignored():
+        cluster = distributed.LocalCluster(
+            n_workers=count, threads_per_worker=1, dashboard_address=":0", env=environment
+        )
     with cluster, distributed.Client(cluster) as client:
-        client.register_plugin(_share_plugin(distributed)(cores, count))
+        client.register_plugin(_affinity_plugin(distributed)(cores, count))
         yield client
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Processes started meanwhile ignore interrupts: Ctrl-C reaches all processes of a terminal, and the workers shall end their blocks."""
+def _interrupts_ignored() -> Iterator[None]:
+    """Processes started within ignore Ctrl-C, which reaches all processes of a terminal; workers finish blocks."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -74,11 +85,11 @@ def _undisturbed() -> Iterator[None]:
         signal.signal(signal.SIGINT, former)
 
 
-def _share_plugin(distributed: Any) -> Any:
-    """Keeps every worker to its share of the cores; else all would compute on all, and wait for one another."""
+def _affinity_plugin(distributed: Any) -> Any:
+    """Restricts every worker to its part of the cores; otherwise each would use all, and wait for the others."""
 
-    class Share(distributed.WorkerPlugin):
-        name = "aacmm-share"
+    class Affinity(distributed.WorkerPlugin):
+        name = "aacmm-affinity"
 
         def __init__(self, cores: list[int], count: int):
             self.cores, self.count = cores, count
@@ -86,7 +97,7 @@ def _share_plugin(distributed: Any) -> Any:
         def setup(self, worker: Any) -> None:
             if hasattr(os, "sched_setaffinity"):
                 number = int(worker.name) % self.count
-                share = self.cores[number * len(self.cores) // self.count : (number + 1) * len(self.cores) // self.count]
-                os.sched_setaffinity(0, share or self.cores)
+                part = self.cores[number * len(self.cores) // self.count : (number + 1) * len(self.cores) // self.count]
+                os.sched_setaffinity(0, part or self.cores)
 
-    return Share
+    return Affinity

@@ -1,4 +1,4 @@
-"""What a study asks: tables that people write in TOML or pass from Python. Any value may be a list; the study is their grid.
+"""Specification of a study: tables in TOML or from Python. Any value may be a list; the study is the grid of all lists.
 
 Every number has its unit in its name. After validation every factor is a list, of one level where one value was given.
 """
@@ -23,19 +23,19 @@ from pydantic import (
 
 from ..files.toml import validated
 
-# More cells than this are a slip of the pen: a grid of four factors with ten levels each.
+# More cells than a grid of four factors with ten levels each are a mistake.
 MOST_CELLS = 10_000
 MOST_TRIALS = 10**10
 MOST_POOL = 2**24
 
 
 def _depth(value: Any) -> int:
-    """How deep lists stand in lists."""
+    """Depth of nested lists."""
     return 1 + max(map(_depth, value), default=0) if isinstance(value, list | tuple) else 0
 
 
 def _levels_of(natural: int) -> BeforeValidator:
-    """One level becomes a list of one. ``natural``: how deep lists stand in a single level."""
+    """One level becomes a list of one. ``natural``: depth of the lists in a single level."""
     return BeforeValidator(
         lambda value: value if isinstance(value, list | tuple) and (not value or _depth(value) > natural) else [value]
     )
@@ -71,7 +71,7 @@ class _Table(BaseModel):
 
 
 class Distribution(_Table):
-    """How far a kind of parameter may be off: uniform within a half-width, or normal with a standard deviation.
+    """Deviation of one kind of parameter: uniform within a half-width, or normal with a standard deviation.
 
     A plain number is a uniform half-width.
     """
@@ -92,9 +92,9 @@ class Distribution(_Table):
 
 
 class DeviationTable(_Table):
-    """How the true arm differs from the nominal one, independently for every free parameter.
+    """Deviation of the true arm from the nominal one, independent for every free parameter.
 
-    ``length_mm`` and ``angle_deg`` hold for all lengths and angles; a kind named apart takes precedence.
+    ``length_mm`` and ``angle_deg`` apply to all lengths and angles that have no table entry of their own.
     """
 
     length_mm: Levels[Distribution] = [Distribution(uniform=0.0)]
@@ -108,7 +108,7 @@ class DeviationTable(_Table):
 
 
 class Region(_Table):
-    """Where sockets and reference lengths may stand, in the base frame: ranges of x, y, z, and of the distance from its origin."""
+    """Positions allowed for sockets and reference lengths, in the base frame: x, y, z, and distance from the origin."""
 
     x_mm: Pair | None = None
     y_mm: Pair | None = None
@@ -123,8 +123,10 @@ class Region(_Table):
 
 
 class CaptureTable(_Table):
-    """What is recorded: ``positions_mm`` of fixed sockets, or a number of ``sockets`` at random in a ``region``, or the poses of
-    a capture ``file``. ``poses`` are those in each socket; ``pool`` how many the study makes for each socket to draw from."""
+    """``positions_mm`` of sockets, or a number of ``sockets`` at random in a ``region``, or a capture ``file``.
+
+    ``poses`` is their number in each socket, ``pool`` the number that the study generates for each socket to draw from.
+    """
 
     file: str | None = None
     positions_mm: Annotated[list[Points], _levels_of(2), Field(min_length=1), AfterValidator(_different)] | None = None
@@ -140,16 +142,17 @@ class CaptureTable(_Table):
             raise ValueError("give one of positions_mm, sockets (with a region) and file.")
         if self.sockets is not None and self.region is None:
             raise ValueError("sockets at random need a region.")
-        made = {"poses", "region", "joint_limits_deg", "pool"} & self.model_fields_set
-        if self.file is not None and made:
-            raise ValueError(f"{sorted(made)[0]} says how poses are made, but file gives them; leave one of the two out.")
+        generated = {"poses", "region", "joint_limits_deg", "pool"} & self.model_fields_set
+        if self.file is not None and generated:
+            raise ValueError(f"{min(generated)} is for generated poses, but file gives them; leave one of the two out.")
         if not 4096 <= self.pool <= MOST_POOL:
             raise ValueError(f"pool is {self.pool}; give 4096 to {MOST_POOL} poses, or leave it out.")
         return self
 
 
 class NoiseTable(_Table):
-    """Standard deviations: of a reading, of a coordinate of the seat, and of both first harmonics of every encoder; and the step of a reading."""
+    """Standard deviations of a reading, of a coordinate of the seated tip, and of both coefficients of every encoder's
+    first harmonic; and the resolution of a reading."""
 
     encoder_arcsec: Levels[Amount] = [0.0]
     resolution_arcsec: Levels[Amount] = [0.0]
@@ -158,7 +161,7 @@ class NoiseTable(_Table):
 
 
 class BoundsTable(_Table):
-    """The box of the identification: half-widths (default: those that the arm's file proposes) about the nominal arm, its centre shifted."""
+    """Bounds: half-widths (default: those of the arm's file) about the nominal arm, and shifts of their centre."""
 
     length_mm: Levels[Amount] | None = None
     angle_deg: Levels[Amount] | None = None
@@ -168,14 +171,17 @@ class BoundsTable(_Table):
 
 
 class ReferenceTable(_Table):
-    """The reference length: how long, at how many positions, with how many poses at each end, and its standard uncertainty.
+    """The reference length, its number of positions, of poses at each end, and its standard uncertainty.
 
-    It lies at random in the ``region`` (default: that of the capture), or where ``ends_mm`` says, whose distance it then has.
+    It is placed at random in the ``region`` (default: that of the capture), or between ``ends_mm``, which define its
+    length.
     """
 
     length_mm: Levels[Positive] | None = None
     positions: Levels[Annotated[int, Field(ge=1, le=1000)]] = [1]
-    ends_mm: Annotated[list[Annotated[list[Ends], Field(min_length=1)]], _levels_of(3), Field(min_length=1)] | None = None
+    ends_mm: Annotated[list[Annotated[list[Ends], Field(min_length=1)]], _levels_of(3), Field(min_length=1)] | None = (
+        None
+    )
     poses: Levels[Count] = [5]
     u_mm: Levels[Amount] = [0.0]
     region: Levels[Region] | None = None
@@ -185,15 +191,15 @@ class ReferenceTable(_Table):
         if (self.length_mm is None) == (self.ends_mm is None):
             raise ValueError("give either length_mm, for lengths at random in the region, or ends_mm.")
         if self.ends_mm is not None and "positions" in self.model_fields_set:
-            raise ValueError("ends_mm says how many positions there are; leave positions out.")
+            raise ValueError("ends_mm determines the number of positions; leave positions out.")
         for start, end in itertools.chain(*(self.ends_mm or [])):
             if start == end:
-                raise ValueError("ends_mm holds two ends at the same place; move one of them.")
+                raise ValueError("ends_mm has two ends at the same position; move one of them.")
         return self
 
 
 class IdentificationTable(_Table):
-    """How the arm is identified. ``start``: at the nominal arm, or at random in the box (but for the held length)."""
+    """How the arm is identified. ``start``: the nominal arm, or random within the bounds (but for the scale anchor)."""
 
     method: Levels[Literal["stage1", "two-stage", "joint"]] | None = None
     hold: Levels[str] = ["longest"]
@@ -203,7 +209,7 @@ class IdentificationTable(_Table):
 
 
 class Specification(_Table):
-    """A study. Lists anywhere (but in ``override`` and ``held``) are factors of the grid, the last varying fastest."""
+    """A study. Lists (but for ``override`` and ``held``) are factors of the grid, the last varying fastest."""
 
     name: str = ""
     arm: str = ""
@@ -224,25 +230,21 @@ class Specification(_Table):
             grid = " x ".join(f"{size} of {name}" for name, size in sizes.items())
             raise ValueError(f"the grid has {cells:,} cells ({grid}), more than {MOST_CELLS:,}; give shorter lists.")
         if cells * self.trials > MOST_TRIALS:
-            raise ValueError(f"{cells} cells of {self.trials:,} trials are more than {MOST_TRIALS:,}; give fewer trials.")
-        if (
-            self.reference is None
-            and self.capture.file is None
-            and set(self.identification.method or ()) & {"two-stage", "joint"}
-        ):
-            raise ValueError("method two-stage or joint needs a reference length; add a [reference], or use method = 'stage1'.")
-        bar = self.reference is not None and self.reference.length_mm is not None
-        if bar and self.reference.region is None and self.capture.region is None:  # pyright: ignore[reportOptionalMemberAccess]
-            raise ValueError("a reference length at random needs a region; give it in [reference], or say ends_mm.")
+            raise ValueError(
+                f"{cells} cells of {self.trials:,} trials are more than {MOST_TRIALS:,}; give fewer trials."
+            )
+        reference, scaled = self.reference, set(self.identification.method or ()) & {"two-stage", "joint"}
+        if reference is None and self.capture.file is None and scaled:
+            raise ValueError(
+                "method two-stage or joint needs a reference length; add a [reference], or use method = 'stage1'."
+            )
+        at_random = reference is not None and reference.length_mm is not None and reference.region is None
+        if at_random and self.capture.region is None:
+            raise ValueError("a reference length at random needs a region; give it in [reference], or give ends_mm.")
         return self
 
-    @property
-    def methods(self) -> list[str]:
-        """The methods asked for; by default two-stage where there is a reference length, else stage 1 alone."""
-        return list(self.identification.method or ["stage1" if self.reference is None else "two-stage"])
-
     def factors(self) -> dict[str, list]:
-        """What has more than one level: dotted name -> levels, in the order of the tables."""
+        """Values with more than one level: dotted name -> levels, in the order of the tables."""
         return {name: levels for name, levels in self._levels() if len(levels) > 1}
 
     def _levels(self) -> Iterator[tuple[str, list]]:
@@ -254,13 +256,13 @@ class Specification(_Table):
                     yield f"{table}.{name}", value
 
     def cells(self) -> list[dict[str, Any]]:
-        """Every cell of the grid: dotted name -> its level, of every factor and every constant."""
+        """Every cell of the grid: dotted name -> level, of every factor and every constant."""
         names, levels = zip(*self._levels(), strict=True)
         return [dict(zip(names, chosen, strict=True)) for chosen in itertools.product(*levels)]
 
 
 def label(level: Any) -> float | str:
-    """A level as it stands in tables: a number as it is, anything else as a short text."""
+    """A level as shown in tables: a number as it is, anything else as a short text."""
     if isinstance(level, Distribution) and level.uniform is not None:
         return level.uniform
     return float(level) if isinstance(level, int | float) else _label(level)
@@ -282,7 +284,7 @@ def unit(name: str) -> str:
 
 
 def checked(**tables: Any) -> Specification:
-    """A specification from Python values, those of NumPy included, or `InputError` in one sentence."""
+    """A specification from Python or NumPy values, or `InputError` in one sentence."""
     return validated(Specification, _python(tables), "the study")
 
 

@@ -1,8 +1,8 @@
-"""What trials show of each cell, with Monte Carlo standard errors.
+"""Statistics of the trials of each cell, with Monte Carlo standard errors.
 
-Trials of a cell fall into groups that share nothing: each draws from its own pool of poses. Standard errors come from the
-scatter between groups, so they hold the whole Monte Carlo error, that of the finite pools included, and need no formula for
-the statistic: a group at a time is left out (delete-a-group jackknife).
+Trials of a cell fall into groups that are independent of each other: each draws from its own part of the pose pool.
+Standard errors come from the scatter between groups, so they contain the whole Monte Carlo error, that of the finite
+pools included, and need no formula for the statistic: one group at a time is left out (delete-a-group jackknife).
 """
 
 from collections.abc import Callable
@@ -13,10 +13,11 @@ from jaxtyping import Float, Int
 
 from ..solver.levenberg_marquardt import Reason, numbers_of
 from .results import Results
+from .specification import label
 
-FIGURES = {
+METRICS = {
     "k": "k, measured / nominal",
-    "scale": "scale that stage 1 left, found / true",
+    "scale": "scale after stage 1, found / true",
     "scale_error": "scale after the fix, found / true - 1",
     "de_stage1": "DE before the scale fix",
     "deltam_stage1": "Deltam before the scale fix",
@@ -31,7 +32,7 @@ PERCENTILES = (5, 50, 95)
 
 
 def study_summary(results: Results, only: int | None = None) -> dict[str, Any]:
-    """A study, cell by cell (or one cell, counted from 1), with the unit in every key; what ``aacmm show --json`` prints."""
+    """A study, cell by cell (or one cell, counted from 1), units in the keys; what ``aacmm show --json`` prints."""
     study = results.study
     cells = [cell_summary(results, cell) for cell in range(len(study.cells)) if only is None or cell == only - 1]
     return {
@@ -49,34 +50,31 @@ def study_summary(results: Results, only: int | None = None) -> dict[str, Any]:
 
 
 def cell_summary(results: Results, cell: int) -> dict[str, Any]:
-    """One cell (counted from 0)."""
+    """Statistics of one cell (counted from 0)."""
     columns = results.columns(cell)
     ran = columns["converged"] >= 0
     columns = {name: values[ran] for name, values in columns.items()}
     good = columns["converged"] == 1
     levels = results.study.cells[cell]
-    labels = {name: _plain(levels[name], values) for name, values in results.study.factors.items()}
-    reasons = {name: int(number) for name, number in _reasons().items()}
+    labels = {name: _label(levels[name], values) for name, values in results.study.factors.items()}
     found: dict[str, Any] = {
         "cell": cell + 1,
         "factors": labels,
         "trials_run": int(ran.sum()),
         "converged": statistic(np.mean, good.astype(float), columns["group"]),
         "truth_inside": statistic(np.mean, columns["truth_inside"].astype(float), columns["group"]),
-        "reasons": {name: int(np.sum(columns["reason"] == number)) for name, number in reasons.items()},
+        "reasons": {name: int(np.sum(columns["reason"] == number)) for name, number in _reasons().items()},
         "steps_mean": float(columns["steps"].mean()) if ran.any() else None,
         "figures": {},
     }
-    for name in FIGURES:
-        there = good & np.isfinite(columns[name])
-        if there.any():
-            found["figures"][name] = spread_of(columns[name][there], columns["group"][there])
+    for name in METRICS:
+        known = good & np.isfinite(columns[name])
+        if known.any():
+            found["figures"][name] = distribution(columns[name][known], columns["group"][known])
     return found | _parameters(results, cell)
 
 
-def _plain(level: Any, labels: list) -> float | str:
-    from .specification import label
-
+def _label(level: Any, labels: list) -> float | str:
     return label(level) if isinstance(labels[0], float) else str(label(level))
 
 
@@ -85,8 +83,8 @@ def _reasons() -> dict[str, int]:
     return {name: int(numbers_of(getattr(Reason, name))) for name in names}
 
 
-def spread_of(values: Float[np.ndarray, " t"], groups: Int[np.ndarray, " t"]) -> dict[str, Any]:
-    """Mean, spread (standard deviation) and percentiles, each with its standard error."""
+def distribution(values: Float[np.ndarray, " t"], groups: Int[np.ndarray, " t"]) -> dict[str, Any]:
+    """Mean, standard deviation (key "spread") and percentiles, each with its standard error."""
     order = np.argsort(values)
     values, groups = values[order], groups[order]
     found = {"mean": statistic(np.mean, values, groups)}
@@ -99,11 +97,12 @@ def spread_of(values: Float[np.ndarray, " t"], groups: Int[np.ndarray, " t"]) ->
 
 
 def statistic(function: Callable, values: np.ndarray, groups: Int[np.ndarray, " t"]) -> dict[str, Any]:
-    """A statistic of trials and its Monte Carlo standard error (None where there are too few groups to tell)."""
+    """A statistic of trials and its Monte Carlo standard error (None where there are too few groups)."""
     if not len(values):
         return {"value": None, "se": None}
     value = np.asarray(function(values))
-    # Groups to leave out hold at least the root of all trials: fewer would not tell of a percentile (Shao and Wu 1989).
+    # Groups of at least the square root of all trials: the jackknife of a percentile that leaves out fewer at a time is
+    # inconsistent (Shao and Wu 1989).
     groups = groups % max(int(len(values) ** 0.5), 2)
     members = np.unique(groups)
     count = len(members)
@@ -112,58 +111,55 @@ def statistic(function: Callable, values: np.ndarray, groups: Int[np.ndarray, " 
         return {"value": value.tolist(), "se": none}
     rest = np.array([function(values[groups != group]) for group in members])
     se = np.sqrt((count - 1) / count * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0))
-    # No scatter at all (every trial converged) says nothing of how far the value may be off.
+    # No scatter at all (every trial converged) does not mean that the value has no error.
     return {"value": value.tolist(), "se": none if not np.any(se) else se.tolist()}
 
 
 def _percentiles(ordered: Float[np.ndarray, " t"]) -> Float[np.ndarray, " q"]:
-    """Percentiles of values in order, between neighbours linearly (as `numpy.percentile`, which would sort once more)."""
+    """Percentiles of sorted values, linear between neighbours as in `numpy.percentile` (which would sort again)."""
     return np.interp(np.array(PERCENTILES) / 100 * (len(ordered) - 1), np.arange(len(ordered)), ordered)
 
 
 def _parameters(results: Results, cell: int) -> dict[str, Any]:
-    """Bias and spread of every parameter and its share on a bound, from sums over pieces, group by group."""
+    """Bias and standard deviation of every parameter and how often it is on a bound, from sums over groups."""
     space = results.study.space
     names, lengths, groups = space.names, space.lengths, {}
     for error, active, group in results.errors(cell):
         for g in np.unique(group):
-            mine = group == g
-            sums = (mine.sum(), error[mine].sum(axis=0), (error[mine] ** 2).sum(axis=0), (active[mine] != 0).sum(axis=0))
-            extra = int(np.any(active[mine] != 0, axis=1).sum())
-            groups[g] = tuple(a + b for a, b in zip(groups.get(g, (0, 0, 0, 0, 0)), (*sums, extra), strict=True))
+            rows = group == g
+            on_bound = active[rows] != 0
+            moments = (rows.sum(), error[rows].sum(axis=0), (error[rows] ** 2).sum(axis=0))
+            sums = (*moments, on_bound.sum(axis=0), int(on_bound.any(axis=1).sum()))
+            groups[g] = tuple(a + b for a, b in zip(groups.get(g, (0, 0, 0, 0, 0)), sums, strict=True))
     if not groups:
         return {"on_a_bound": {"value": None, "se": None}, "parameters": []}
     count, first, second, active, any_active = (np.array(column) for column in zip(*groups.values(), strict=True))
 
-    def moments(chosen: np.ndarray) -> np.ndarray:
+    def statistics(chosen: np.ndarray) -> np.ndarray:
         n = max(count[chosen].sum(), 1)
         mean = first[chosen].sum(axis=0) / n
-        spread = np.sqrt(np.maximum(second[chosen].sum(axis=0) / n - mean**2, 0) * n / max(n - 1, 1))
-        share = active[chosen].sum(axis=0) / n
-        return np.stack([mean, spread, share, np.full(len(names), any_active[chosen].sum() / n)])
+        deviation = np.sqrt(np.maximum(second[chosen].sum(axis=0) / n - mean**2, 0) * n / max(n - 1, 1))
+        fraction = active[chosen].sum(axis=0) / n
+        return np.stack([mean, deviation, fraction, np.full(len(names), any_active[chosen].sum() / n)])
 
-    value, se = moments(np.full(len(count), True)), np.full((4, len(names)), np.nan)
+    value, se = statistics(np.full(len(count), True)), np.full((4, len(names)), np.nan)
     if len(count) > 1:
-        rest = np.array([moments(np.arange(len(count)) != g) for g in range(len(count))])
+        rest = np.array([statistics(np.arange(len(count)) != g) for g in range(len(count))])
         se = np.sqrt((len(count) - 1) / len(count) * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0))
-    both = lambda row, i: {"value": float(value[row, i]), "se": None if np.isnan(se[row, i]) else float(se[row, i])}  # noqa: E731
-    return {
-        "on_a_bound": both(3, 0),
-        "parameters": [
-            {
-                "parameter": name,
-                "unit": "mm" if lengths[i] else "rad",
-                "bias": both(0, i),
-                "spread": both(1, i),
-                "on_a_bound": both(2, i),
-            }
-            for i, name in enumerate(names)
-        ],
-    }
+
+    def entry(row: int, i: int) -> dict[str, Any]:
+        return {"value": float(value[row, i]), "se": None if np.isnan(se[row, i]) else float(se[row, i])}
+
+    parameters = [
+        {"parameter": name, "unit": "mm" if lengths[i] else "rad"}
+        | {key: entry(row, i) for row, key in enumerate(("bias", "spread", "on_a_bound"))}
+        for i, name in enumerate(names)
+    ]
+    return {"on_a_bound": entry(3, 0), "parameters": parameters}
 
 
 def correlation(results: Results, cell: int) -> Float[np.ndarray, "p p"]:
-    """Correlation of the errors of the parameters over the converged trials of a cell (counted from 0); 0 where one never varies."""
+    """Correlation of parameter errors over the converged trials of a cell (counted from 0); 0 where one is constant."""
     count, first, second = 0, 0.0, 0.0
     for error, _, _ in results.errors(cell):
         count, first, second = count + len(error), first + error.sum(axis=0), second + error.T @ error
@@ -171,6 +167,6 @@ def correlation(results: Results, cell: int) -> Float[np.ndarray, "p p"]:
     if count < 2:
         return np.full((p, p), np.nan)
     covariance = second / count - np.outer(first / count, first / count)
-    spread = np.sqrt(np.maximum(np.diag(covariance), 0))
-    both = np.outer(spread, spread)
-    return np.divide(covariance, both, out=np.zeros_like(both), where=both > 0)
+    deviation = np.sqrt(np.maximum(np.diag(covariance), 0))
+    scale = np.outer(deviation, deviation)
+    return np.divide(covariance, scale, out=np.zeros_like(scale), where=scale > 0)

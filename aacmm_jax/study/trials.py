@@ -10,27 +10,30 @@ import numpy as np
 from ..calibration.batch import calibrate_many, identify_many
 from ..data.capture import Capture, ReferenceLength
 from ..solver.levenberg_marquardt import numbers_of
-from .definition import Block, Setting, Study
+from .definition import Setting, Study
 from .drawing import Drawn, draw, ends_of
+from .layout import Block
 
 
 def run_block(study: Study, block: Block, *, device: Any = None, workers: int | None = None) -> dict[str, np.ndarray]:
-    """Results of a block: name -> array ``(cells, trials, ...)``; what each is, `variables` in `store` says.
+    """Results of a block: name -> array ``(cells, trials, ...)``; `VARIABLES` in `layout` says what each is.
 
-    It depends on nothing but the study and which trials they are: not on the block, the machine's load, or the order; and on the
-    kind of processor to rounding.
+    They depend on the study and on which trials they are, and on nothing else: not on the block, the machine's load or
+    the order; on the kind of processor to rounding.
     """
-    cells = np.repeat(np.arange(block.first_cell, block.last_cell), block.last_trial - block.first_trial)
-    trials = np.tile(np.arange(block.first_trial, block.last_trial), block.last_cell - block.first_cell)
+    count, each = block.shape
+    cells = np.repeat(np.arange(block.first_cell, block.last_cell), each)
+    trials = np.tile(np.arange(block.first_trial, block.last_trial), count)
     setting = study.settings[block.first_cell]
     devices = jax.local_devices() if device is None else [device]
     drawn = draw(study, setting, cells, trials, devices[0])
     found = _identified(study, setting, drawn, devices, workers)
-    shape = (block.last_cell - block.first_cell, block.last_trial - block.first_trial)
-    return {name: values.reshape(*shape, *values.shape[1:]) for name, values in found.items()}
+    return {name: values.reshape(*block.shape, *values.shape[1:]) for name, values in found.items()}
 
 
-def _identified(study: Study, setting: Setting, drawn: Drawn, devices: list[Any], workers: int | None) -> dict[str, np.ndarray]:
+def _identified(
+    study: Study, setting: Setting, drawn: Drawn, devices: list[Any], workers: int | None
+) -> dict[str, np.ndarray]:
     options = {
         "space": study.space,
         "hold": setting.hold,
@@ -38,7 +41,7 @@ def _identified(study: Study, setting: Setting, drawn: Drawn, devices: list[Any]
         "devices": devices,
         "workers": workers,
     }
-    capture = _capture(study, setting, drawn)
+    capture = captures_of(study, setting, drawn)
     problem = (study.nominal.arm, capture, drawn.lower, drawn.upper, drawn.start)
     if setting.method == "stage1":
         many = stage1 = identify_many(*problem, **options)
@@ -47,28 +50,29 @@ def _identified(study: Study, setting: Setting, drawn: Drawn, devices: list[Any]
         many = calibrate_many(*problem, method=setting.method, **options)  # pyright: ignore[reportArgumentType]
         stage1, k = many.stage1, many.k
     lengths = study.space.lengths
-    # How much too large stage 1 left the arm: the factor that best turns the true lengths into those found. Rows are contiguous,
-    # so that each is summed in the same order however many there are.
+    # Scale of the arm: the factor that best maps the true lengths onto the identified ones. Rows are contiguous, so
+    # that each is summed in the same order however many there are.
     true = np.where(lengths, drawn.true, 0.0)
     scale, scale_after = (
-        (found.parameters * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300) for found in (stage1, many)
+        (found.parameters * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300)
+        for found in (stage1, many)
     )
-    fixed = setting.method != "stage1"
+    scaled = setting.method != "stage1"
     return {
         "converged": many.converged.astype(np.int8),
         "reason": np.asarray(numbers_of(many.result), dtype=np.int8),
         "steps": many.steps.astype(np.int32),
         "k": k,
         "scale": scale,
-        "scale_error": scale_after - 1 if fixed else np.full(len(k), np.nan),
+        "scale_error": scale_after - 1 if scaled else np.full(len(k), np.nan),
         "de_stage1": stage1.de,
         "deltam_stage1": stage1.deltam,
         "length_error_stage1": _largest(stage1.parameters - drawn.true, lengths),
         "angle_error_stage1": _largest(stage1.parameters - drawn.true, ~lengths),
-        "de": many.de if fixed else np.full(len(k), np.nan),
-        "deltam": many.deltam if fixed else np.full(len(k), np.nan),
-        "length_error": _largest(many.parameters - drawn.true, lengths, fixed),
-        "angle_error": _largest(many.parameters - drawn.true, ~lengths, fixed),
+        "de": many.de if scaled else np.full(len(k), np.nan),
+        "deltam": many.deltam if scaled else np.full(len(k), np.nan),
+        "length_error": _largest(many.parameters - drawn.true, lengths, scaled),
+        "angle_error": _largest(many.parameters - drawn.true, ~lengths, scaled),
         "truth_inside": np.all((drawn.true >= drawn.lower) & (drawn.true <= drawn.upper), axis=1).astype(np.int8),
         "active": many.active.astype(np.int8),
         "estimate": many.parameters,
@@ -76,12 +80,12 @@ def _identified(study: Study, setting: Setting, drawn: Drawn, devices: list[Any]
     }
 
 
-def _largest(error: np.ndarray, which: np.ndarray, there: bool = True) -> np.ndarray:
-    return np.abs(error[:, which]).max(axis=1, initial=0.0) if there else np.full(len(error), np.nan)
+def _largest(error: np.ndarray, which: np.ndarray, present: bool = True) -> np.ndarray:
+    return np.abs(error[:, which]).max(axis=1, initial=0.0) if present else np.full(len(error), np.nan)
 
 
-def _capture(study: Study, setting: Setting, drawn: Drawn) -> Capture:
-    """The trials' recordings as a batch."""
+def captures_of(study: Study, setting: Setting, drawn: Drawn) -> Capture:
+    """The captures of drawn trials as a batch."""
     template = _template(study, setting)
     lengths = tuple(
         eqx.tree_at(lambda r: (r.value, r.u), length, (drawn.value[:, i], drawn.u[:, i]))
@@ -92,8 +96,8 @@ def _capture(study: Study, setting: Setting, drawn: Drawn) -> Capture:
 
 @lru_cache(maxsize=64)
 def _template(study: Study, setting: Setting) -> Capture:
-    """One recording of the right shape; its numbers do not matter."""
-    names = [f"{stand.name}{'ab'[end] if stand.ends == 2 else ''}" for stand in setting.stands for end in range(stand.ends)]
+    """One capture of the right shape; its numbers do not matter."""
+    names = [f"{one.name}{'ab'[end] if one.ends == 2 else ''}" for one in setting.fixtures for end in range(one.ends)]
     angles = np.random.default_rng(0).uniform(-1, 1, (sum(setting.sizes), study.nominal.arm.joints))
     rows = np.split(angles, np.cumsum(setting.sizes)[:-1])
     lengths = [ReferenceLength(names[a], names[b], 1.0) for a, b in ends_of(study, setting)]

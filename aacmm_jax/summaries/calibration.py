@@ -39,7 +39,7 @@ def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
         "name": specification.name,
         "joints": joints,
         "probe_mm": np.asarray(arm.probe).tolist(),
-        "held": list(Parameters.free_of(arm, held=specification.held).held),
+        "held": list(specification.space().held),
     }
 
 

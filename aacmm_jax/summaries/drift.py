@@ -6,21 +6,21 @@ from typing import Any
 
 import numpy as np
 
-from ..drift.comparison import Drift, Trend
+from ..drift.results import Drift, Trend
 from ..drift.statistics import LengthChange
 from ..kinematics.arm import is_length
 
 
 def drift_summary(drift: Drift) -> dict[str, Any]:
     """Two calibrations compared; None where something is not known or has no end."""
-    joint = drift.joint
+    joint = drift.joint_test
     return {
         "kind": "comparison",
         "level": drift.level,
-        "warnings": list(drift.cautions),
+        "warnings": list(drift.warnings),
         "findings": drift.findings(),
         "parameters": _rows(drift),
-        "compared": drift.without.count(""),
+        "compared": drift.compared,
         "moved": int(drift.moved.sum()),
         "moved_by_chance": drift.by_chance,
         "joint": {
@@ -43,7 +43,7 @@ def compared_summary(trend: Trend, labels: list[str], arm: str) -> dict[str, Any
     summary = {"kind": "comparison", "arm": arm, "old": labels[trend.order[0]], "new": labels[trend.order[-1]]}
     summary |= {"old_created": trend.dates[0].isoformat(), "new_created": trend.dates[-1].isoformat()}
     summary |= drift_summary(trend.drifts[-1])
-    return summary | {"warnings": trend.cautions, "trend": trend_summary(trend, labels)}
+    return summary | {"warnings": trend.warnings, "trend": trend_summary(trend, labels)}
 
 
 def change_exceeded(lengths: LengthChange, limit: float | None) -> tuple[list[str], list[str]]:
@@ -68,8 +68,8 @@ def lengths_summary(lengths: LengthChange) -> dict[str, Any]:
         "percentile_95_mm": lengths.percentile_95,
         "largest_mm": lengths.largest,
         "mean_mm": float(np.mean(lengths.change)),
-        "mean_um_per_m": 1e6 * lengths.size,
-        "mean_expanded_um_per_m": _finite(1e6 * lengths.expanded_size),
+        "mean_um_per_m": 1e6 * lengths.scale_change,
+        "mean_expanded_um_per_m": _finite(1e6 * lengths.expanded_scale_change),
         "moved_share": float(np.mean(lengths.moved)),
     }
 
@@ -83,7 +83,7 @@ def trend_summary(trend: Trend, labels: list[str]) -> list[dict[str, Any]]:
             "created": date.isoformat(),
             "moved": int(drift.moved.sum()),
             "moved_by_chance": drift.by_chance,
-            "p": _finite(drift.joint.p),
+            "p": _finite(drift.joint_test.p),
             "lengths": lengths_summary(drift.lengths),
             "parameters": _rows(drift),
         })  # fmt: skip
@@ -113,8 +113,8 @@ def _rows(drift: Drift) -> list[dict[str, Any]]:
             "change": float(drift.change[i]),
             "u": _finite(drift.u[i]),
             "expanded": _finite(drift.expanded[i]),
-            "moved": bool(drift.moved[i]) if not drift.without[i] else None,
-            "without": drift.without[i] or None,
+            "moved": bool(drift.moved[i]) if not drift.reasons[i] else None,
+            "without": drift.reasons[i] or None,
         }
         for i, name in enumerate(drift.names)
     ]

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from ..acceptance.metrics import METRICS, AcceptanceTest, Metric, MetricValue
 from ..acceptance.record import EvaluationRecord, PointsRecord, unstated_uncertainty_warning
-from ..acceptance.suite import FIGURES, AcceptanceTest, Figure, Part
 from ..calibration.evaluation import Evaluation, evaluate
 from ..data.capture import Capture
 from .calibration import figures, length_figures, tables
@@ -19,7 +19,7 @@ def evaluation_summary(record: EvaluationRecord, tests: dict[str, list[Acceptanc
     A length counts as held out where at least one of its ends was never identified from. ``tests`` (`EvaluationRecord.acceptance`)
     are run where they are not given.
     """
-    capture, unseen = record.recording.capture, record.unseen()
+    capture, unseen = record.recording.capture, record.held_out_lengths()
     summary: dict[str, Any] = {
         "kind": "evaluation",
         "arm": record.recording.nominal.name,
@@ -69,33 +69,33 @@ def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = No
 
 def acceptance_summary(tests: list[AcceptanceTest], before: list[AcceptanceTest] | None = None) -> list[dict[str, Any]]:
     """Acceptance tests, with the figures of the arm as found beside those as left where both are given."""
-    earlier = {(test.title, figure.name): figure for test in before or () for figure in test.figures}
+    earlier = {(test.title, figure.name): figure for test in before or () for figure in test.metrics}
     return [
         {
             "standard": test.standard,
             "title": test.title,
             "decision": test.decision,
             "missing": list(test.missing),
-            "figures": [_figure(figure, earlier.get((test.title, figure.name))) for figure in test.figures],
+            "figures": [_figure(figure, earlier.get((test.title, figure.name))) for figure in test.metrics],
         }
         for test in tests
     ]
 
 
-def _figure(figure: Figure, earlier: Figure | None) -> dict[str, Any]:
+def _figure(figure: Metric, earlier: Metric | None) -> dict[str, Any]:
     return {
         "name": figure.name,
-        "what": FIGURES[figure.name],
+        "what": METRICS[figure.name],
         "decision": figure.decision,
         **_part(figure.worst),
         "as_found_mm": None if earlier is None else earlier.value,
         "as_found_decision": None if earlier is None else earlier.decision,
         "failing": figure.failing,
-        "parts": [_part(part) | {"decision": part.decision} for part in figure.parts],
+        "parts": [_part(part) | {"decision": part.decision} for part in figure.values],
     }
 
 
-def _part(part: Part) -> dict[str, Any]:
+def _part(part: MetricValue) -> dict[str, Any]:
     return {"where": part.where, "value_mm": part.value, "expanded_mm": part.expanded, "limit_mm": part.limit}
 
 

@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from ..acceptance.procedure import TITLES, Procedure
+from ..acceptance.procedure import Procedure
+from ..acceptance.standards import PLANNED
 
 
 def procedure_summary(procedure: Procedure, arm: str) -> dict[str, Any]:
@@ -13,7 +14,7 @@ def procedure_summary(procedure: Procedure, arm: str) -> dict[str, Any]:
     return {
         "kind": "acceptance plan",
         "arm": arm,
-        "standard": TITLES[procedure.standard],
+        "standard": PLANNED[procedure.standard],
         "poses": procedure.poses,
         "reach_mm": procedure.reach.radius,
         "shoulder_mm": procedure.reach.shoulder.tolist(),

@@ -1,22 +1,25 @@
-"""What a user should know before trusting a capture or a calibration: one sentence each, the gravest first."""
+"""Warnings about a capture or a calibration: one sentence each, the most serious first."""
 
 import math
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..calibration.checks import plausible
 from ..calibration.record import CalibrationRecord
 from ..calibration.results import active_names
+from ..data.noise import tip_covariances
 from ..data.recording import Recording
 from ..kinematics.arm import is_length, value_of
-from ..kinematics.parameters import Parameters
+from ..kinematics.chain import sines_cosines
+from ..kinematics.parameters import Bounds, Parameters
 from ..uncertainty.identifiability import Observability, observability
 
-_SUSPICIOUS_SCALE = 0.005  # a held link is not off by more than this; its nominal value or a reference length is wrong
-_LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 where the D-H model misses something
+_SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a reference length is wrong
+_LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 through errors outside the D-H model
 _POSE_OUTLIER = 8.0  # in median distances
-_HONEST = 1.5  # errors may exceed their prediction by so much before it is said
-_NAMED = 5  # how many of a kind are named
+_EXCESS = 1.5  # ratio of errors to their prediction that is reported
+_NAMED = 5  # items of a list that are named
 
 
 def of_capture(recording: Recording) -> list[str]:
@@ -38,36 +41,42 @@ def of_capture(recording: Recording) -> list[str]:
 
 
 def of_calibration(record: CalibrationRecord, seen: Observability | None = None) -> list[str]:
-    """Everything about a calibration that should be read before its numbers. ``seen`` saves looking again: see `observed`."""
+    """What should be read about a calibration before its numbers; ``seen`` is the result of `observed`, if known."""
+    seen = observed(record) if seen is None else seen
     found = [] if record.converged else [record.reason]
     found += _validation(record)
-    found += [*_scale(record), *of_capture(record.recording), *_bounds(record), *_data(record)]
-    return found + _identifiability(record, observed(record) if seen is None else seen)
+    found += [*_scale(record), *of_capture(record.recording), *_bounds(record, seen), *_data(record)]
+    return found + _identifiability(record, seen)
 
 
 def observed(record: CalibrationRecord) -> Observability:
-    """What the data of a calibration determine, about the calibrated arm."""
-    arm = record.calibrated.arm
-    return observability(arm, record.recording.capture, Parameters(arm, record.names))
+    """What the data of a calibration determine about the calibrated arm, given its noise and bounds."""
+    arm, capture = record.calibrated.arm, record.recording.capture
+    covariances = tip_covariances(arm.geometry, sines_cosines(jnp.asarray(capture.q)), record.noise)
+    sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
+    space = Parameters(arm, record.names)
+    return observability(arm, capture, space, sigma=sigma, bounds=Bounds(space, record.lower, record.upper))
 
 
 def _validation(record: CalibrationRecord) -> list[str]:
-    """What cross-validation found, where it contradicts the uncertainty; and noise that the residuals contradict."""
+    """Results of cross-validation that contradict the uncertainty, and residuals that contradict the given noise."""
     found = []
     validation = record.validation
     if validation is not None and validation.surprising:
         found.append(
-            f"Sockets left out one placement after the other err {validation.excess:.1f} times as much as their uncertainty predicts "
-            f"({validation.rms:.3g} mm RMS against {validation.rms_predicted:.3g}, lengths {validation.length_rms:.3g} mm against "
-            f"{validation.length_u:.3g}): errors of neighbouring poses are alike, so the D-H model misses something (joints that "
-            "give way, eccentric encoders). Trust the cross-validated figures; every u below is too small."
+            f"Sockets left out one placement after the other have errors {validation.excess:.1f} times their predicted "
+            f"uncertainty ({validation.rms:.3g} mm RMS instead of {validation.rms_predicted:.3g}, lengths "
+            f"{validation.length_rms:.3g} mm instead of {validation.length_u:.3g}): errors of neighbouring poses are "
+            "alike, as of effects outside the D-H model (compliant joints, eccentric encoders). Use the cross-validated "
+            "values; every u below is too small."
         )
-    if record.reduced_chi is not None and not 1 / _HONEST < record.reduced_chi < _HONEST:
+    if record.reduced_chi is not None and not 1 / _EXCESS < record.reduced_chi < _EXCESS:
         word = "small" if record.reduced_chi > 1 else "large"
         factor = max(record.reduced_chi, 1 / record.reduced_chi)
         found.append(
-            f"Residuals are {record.reduced_chi:.2g} times what the given noise predicts, and every uncertainty below rests on that noise: it is "
-            f"about {factor:.2g} times too {word}. Check the noise, or leave it out to have it estimated."
+            f"Residuals are {record.reduced_chi:.2g} times what the given noise predicts, and every uncertainty below "
+            f"follows from that noise: it is about {factor:.2g} times too {word}. Check the noise, or leave it out to "
+            "have it estimated."
         )
     return found
 
@@ -76,21 +85,25 @@ def _scale(record: CalibrationRecord) -> list[str]:
     k = record.k
     stage1 = _sides(record)
     if not plausible(k):
-        unit = next((u for u, factor in (("m", 1000), ("cm", 10), ("inch", 1 / 25.4)) if abs(k / factor - 1) < 0.1), None)
+        unit = next(
+            (u for u, factor in (("m", 1000), ("cm", 10), ("inch", 1 / 25.4)) if abs(k / factor - 1) < 0.1), None
+        )
         hint = f"are the lengths in {unit} by mistake?" if unit else "check units, sockets, lengths and arm."
         return [f"k = {k:.6g} cannot be the scale of this arm; {hint}"]
     if record.hold is None and stage1:
         word = "shrank" if k < 1 else "stretched"
         return [
-            f"Stage 1 ran with every length free and {word} the arm to k = {k:.5f} until a bound stopped it: {_some(stage1)}. "
-            "The scale fix undoes that; hold a length (--hold) to avoid it."
+            f"Stage 1 ran with every length free and {word} the arm to k = {k:.5f} until a bound stopped it: "
+            f"{_some(stage1)}. The scale fix undoes that; hold a length (--hold) to avoid it."
         ]
     if record.hold is not None and abs(k - 1) > max(_SUSPICIOUS_SCALE, 3 * record.u_k):
-        return [f"k = {k:.5f} is far from 1: is {record.hold} at its nominal value, and is each reference length right?"]
+        return [
+            f"k = {k:.5f} is far from 1: is {record.hold} at its nominal value, and is each reference length right?"
+        ]
     return []
 
 
-def _bounds(record: CalibrationRecord) -> list[str]:
+def _bounds(record: CalibrationRecord, seen: Observability) -> list[str]:
     sides = _sides(record)
     if not sides or (record.hold is None and len(sides) < len(record.names) / 3):
         return []
@@ -99,21 +112,38 @@ def _bounds(record: CalibrationRecord) -> list[str]:
             f"{len(sides)} of {len(record.names)} parameters are on a bound, so the arm does not fit the data: "
             "check unit, order of columns, sockets and arm."
         ]
-    return [f"On a bound: {_some(sides)}; widen the bounds unless they are known limits. Uncertainties leave these out."]
+    traded = {name for trade_off in seen.trade_offs for name in trade_off.names}
+    weak = [side for side in sides if side.split(" ")[0] in traded]
+    others = [side for side in sides if side not in weak]
+    found = []
+    if weak:
+        found.append(
+            f"On a bound because the data hardly determine them: {_some(weak)}; fix one parameter of each combination "
+            "named below (--held), and do not widen the bounds. Until then the width of the bounds is part of their "
+            "uncertainties."
+        )
+    if others:
+        found.append(
+            f"On a bound: {_some(others)}; widen the bounds unless they are known limits. Uncertainties leave these "
+            "out."
+        )
+    return found
 
 
 def _data(record: CalibrationRecord) -> list[str]:
     capture = record.recording.capture
     evaluation = record.evaluations()["calibrated"]
-    spread, owner = np.asarray(evaluation.distances), capture.owner
+    distances, owner = np.asarray(evaluation.distances), capture.owner
     first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
     found = []
-    typical = float(np.median(spread))
-    far = np.flatnonzero(spread > _POSE_OUTLIER * typical) if typical > 1e-6 else []
+    typical = float(np.median(distances))
+    far = np.flatnonzero(distances > _POSE_OUTLIER * typical) if typical > 1e-6 else []
     if len(far):
-        worst = sorted(far, key=lambda i: -spread[i])
-        names = [f"{capture.names[owner[i]]} pose {i - first[owner[i]] + 1} ({spread[i]:.3g} mm)" for i in worst]
-        found.append(f"Poses far from their socket, where {typical:.2g} mm is typical: {_some(names)}; was the tip seated?")
+        worst = sorted(far, key=lambda i: -distances[i])
+        names = [f"{capture.names[owner[i]]} pose {i - first[owner[i]] + 1} ({distances[i]:.3g} mm)" for i in worst]
+        found.append(
+            f"Poses far from their socket, where {typical:.2g} mm is typical: {_some(names)}; was the tip seated?"
+        )
     error = np.asarray(evaluation.error)
     normalised = np.abs(error) / np.hypot(np.asarray(evaluation.u), 1e-9)
     wrong = [
@@ -123,50 +153,55 @@ def _data(record: CalibrationRecord) -> list[str]:
     ]
     if wrong:
         found.append(f"Reference lengths that disagree with the arm: {_some(wrong)}; check their values and sockets.")
-    freedom = 3 * sum(size - 1 for size in capture.sizes) - (len(record.names) - 1)
-    if freedom < (len(record.names) - 1) / 2:
+    surplus = 3 * sum(size - 1 for size in capture.sizes) - (len(record.names) - 1)
+    if surplus < (len(record.names) - 1) / 2:
         found.append(
-            f"Only {freedom} more equations than unknowns: the small residuals are the fit's own doing; record more poses."
+            f"Only {surplus} more equations than unknowns, which makes the residuals small whatever the errors are; "
+            "record more poses."
         )
     error, u = np.asarray(evaluation.error), np.asarray(evaluation.u)
     birge = float(np.sqrt(np.sum((error / u) ** 2) / (len(error) - 1))) if len(error) > 1 and np.all(u > 0) else 0.0
-    if birge > _HONEST:
+    if birge > _EXCESS:
         found.append(
-            f"The {len(error)} reference lengths disagree {birge:.2g} times as much as their u and the scatter of the poses allow (Birge "
-            "ratio); u(k) has been enlarged by as much. Look for a wrong length, or for errors that the D-H model does not hold."
+            f"The {len(error)} reference lengths disagree {birge:.2g} times as much as their u and the scatter of the "
+            "poses predict (Birge ratio), and u(k) has been multiplied by it. Look for a wrong length, or for errors "
+            "outside the D-H model."
         )
     if len(capture.lengths) == 1:
-        found.append("One reference length fixes the scale, so its own error says nothing; keep another for checking.")
+        found.append("One reference length fixes the scale, so its own error is no check; keep another for checking.")
     return found
 
 
 def _identifiability(record: CalibrationRecord, seen: Observability) -> list[str]:
     found = seen.sentences()
     weak = [name for name, known in zip(record.names, record.determined, strict=True) if not known]
-    # Those that no noise-free capture could determine either are told above; the rest are lost in the noise.
-    lost = np.abs(seen.null).max(axis=1, initial=0.0) > 1e-3
-    weak = [name for name in weak if not lost[record.names.index(name)]]
+    # Named above are those that the same capture could not determine without noise either, and near-degenerate ones.
+    named = {record.names[i] for i in np.flatnonzero(np.abs(seen.null).max(axis=1, initial=0.0) > 1e-3)}
+    named |= {name for trade_off in seen.trade_offs for name in trade_off.names}
+    weak = [name for name in weak if name not in named]
     if weak:
         found.append(
-            f"Hardly determined one by one, only together: {_some(weak, 12)}. The tips and lengths that follow from them are (see their "
-            "uncertainty), but these have none of their own; hold the redundant ones (--held)."
+            f"Determined only together, hardly one by one: {_some(weak, 12)}. Tips and lengths that follow from them "
+            "have an uncertainty, but these have none of their own; fix the redundant ones (--held)."
         )
     u, width = np.sqrt(np.diag(record.covariance)), (record.upper - record.lower) / 2
     loose = [
         name
         for i, name in enumerate(record.names)
-        if record.determined[i] and u[i] > (0.5 * width[i] if np.isfinite(width[i]) else np.inf)
+        if record.determined[i] and name not in named and u[i] > (0.5 * width[i] if np.isfinite(width[i]) else np.inf)
     ]
     if loose:
         found.append(
             f"Hardly determined, with a standard uncertainty over half of what the bounds allow: {_some(loose)}; "
-            "hold some (--held), or record poses that tell them apart."
+            "fix some (--held), or record poses that separate them."
         )
     scaled = [
-        name for name in record.held if is_length(name) and name != "d_1" and value_of(record.recording.nominal.arm, name) != 0
+        name
+        for name in record.held
+        if is_length(name) and name != "d_1" and value_of(record.recording.nominal.arm, name) != 0
     ]
     if scaled:
-        found.append(f"The scale fix divides every length by k, held ones too: {_some(scaled)}.")
+        found.append(f"The scale fix divides every length by k, fixed ones too: {_some(scaled)}.")
     return found
 
 

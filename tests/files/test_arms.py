@@ -94,8 +94,9 @@ def test_robots_are_their_makers(name):
         aj.Arm(alpha=np.deg2rad(alpha), a=a, d=d, probe=probe, limits=specification.arm.limits),
         rtol=1e-15,
     )
-    # Joint 7 is redundant with the probe, all three coordinates of which are unknown to 60 mm; one length is held besides.
-    assert set(specification.held) == {"theta_1", "d_1", "alpha_7", "a_7", "theta_7", "d_7"}
+    # Joint 7 is redundant with the probe, all three coordinates of which are unknown to 60 mm; and since the probe
+    # lies along the last axis, the angles of joint 6 are imitated by a_6, d_6 and the probe.
+    assert set(specification.held) == {"theta_1", "d_1", "alpha_6", "theta_6", "alpha_7", "a_7", "theta_7", "d_7"}
     assert specification.override == {f"probe_{axis}": 60.0 for axis in "xyz"}
     assert specification.angle == pytest.approx(np.deg2rad(2))
 
@@ -195,7 +196,9 @@ def test_bad_file(tmp_path, old, new, parts):
 def test_what_is_not_an_arm_file(tmp_path):
     (tmp_path / "folder.toml").mkdir()
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    craig = 'convention = "craig"\nlength_unit = "mm"\nangle_unit = "deg"\njoint = [{ alpha = 0, a = 0, d = 1, beta = 1 }]'
+    craig = (
+        'convention = "craig"\nlength_unit = "mm"\nangle_unit = "deg"\njoint = [{ alpha = 0, a = 0, d = 1, beta = 1 }]'
+    )
     assert_refused(lambda: aj.load_arm(written(tmp_path, craig)), "beta", "standard form", "leave it out")
     assert_refused(lambda: aj.load_arm("pandaa"), "'pandaa' is neither a file nor an arm", "did you mean 'panda'?")
     assert_refused(lambda: aj.load_arm("zzz"), "'zzz'", "known are cheng2018-ra7125")

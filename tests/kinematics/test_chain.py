@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.kinematics import chain
+from aacmm_jax.kinematics import chain, jacobian
 
 
 def random_arm(joints: int, seed: int, *, beta: bool = False, batch: tuple[int, ...] = ()) -> aj.Arm:
@@ -41,7 +41,9 @@ def by_matrices(arm: aj.Arm, q: np.ndarray) -> np.ndarray:
 
     pose = np.eye(4)
     for i in range(arm.joints):
-        pose = pose @ turn(2, q[i] + arm.theta[i]) @ slide(0, 0, arm.d[i]) @ slide(arm.a[i], 0, 0) @ turn(0, arm.alpha[i])
+        pose = (
+            pose @ turn(2, q[i] + arm.theta[i]) @ slide(0, 0, arm.d[i]) @ slide(arm.a[i], 0, 0) @ turn(0, arm.alpha[i])
+        )
         if arm.beta is not None:
             pose = pose @ turn(1, arm.beta[i])
     return pose @ slide(*np.asarray(arm.probe))
@@ -59,7 +61,7 @@ def test_pose_is_the_textbook_product(joints, beta):
 
 @pytest.mark.parametrize("joints", range(2, 10))
 def test_jacobian_is_jax_own_differentiation(joints):
-    """Analytic columns, JAX's forward and reverse modes through the custom rule, and through the plain chain: all equal."""
+    """Analytic columns; JAX's forward and reverse modes through the custom rule; and the plain chain: all equal."""
     arm = random_arm(joints, joints, beta=True)
     q = jnp.asarray(np.random.default_rng(joints).uniform(-3, 3, (4, joints)))
     names = (*aj.kinematics.parameter_names(arm), *(f"q_{i}" for i in range(1, joints + 1)))
@@ -70,8 +72,14 @@ def test_jacobian_is_jax_own_differentiation(joints):
         return jnp.concatenate([*by_kind, by_q], axis=-1)
 
     def one(q):
-        plain = lambda geometry, q: chain.forward_pass(geometry, chain.sines_cosines(q)).tip[:, 0]  # noqa: E731 - no custom rule on the way
-        modes = [jax.jacfwd(chain.tip_position, (0, 1)), jax.jacrev(chain.tip_position, (0, 1)), jax.jacfwd(plain, (0, 1))]
+        def plain(geometry, q):
+            return chain.forward_pass(geometry, chain.sines_cosines(q)).tip[:, 0]
+
+        modes = [
+            jax.jacfwd(jacobian.tip_position, (0, 1)),
+            jax.jacrev(jacobian.tip_position, (0, 1)),
+            jax.jacfwd(plain, (0, 1)),
+        ]
         return [arm.jacobian(q, names), *(flattened(mode(arm.geometry, q)) for mode in modes)]
 
     analytic, *others = jax.jit(jax.vmap(one))(q)
@@ -100,7 +108,8 @@ def test_batches_broadcast(arm_batch, pose_batch):
     assert arm.pose(q).shape == (*shape, 4, 4)
     assert arm.jacobian(q, ("alpha_1", "probe_y")).shape == (*shape, 3, 2)
     full = {
-        kind: np.broadcast_to(np.asarray(getattr(arm, kind)), (*shape, 3)) for kind in ("alpha", "a", "d", "theta", "probe")
+        kind: np.broadcast_to(np.asarray(getattr(arm, kind)), (*shape, 3))
+        for kind in ("alpha", "a", "d", "theta", "probe")
     }
     angles = np.broadcast_to(q, (*shape, 3))
     for index in np.ndindex(*shape):

@@ -9,8 +9,9 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.cli.study_display import concise
 from aacmm_jax.study import store
+from aacmm_jax.study.layout import Layout
 from aacmm_jax.study.results import Results
-from aacmm_jax.study.statistics import spread_of, statistic, study_summary
+from aacmm_jax.study.statistics import distribution, statistic, study_summary
 
 matplotlib.use("Agg")
 
@@ -35,8 +36,10 @@ def path(tmp_path_factory):
 
 def test_percentiles_are_numpys():
     values = np.random.default_rng(0).normal(size=101)
-    found = spread_of(values, np.arange(101) % 32)
-    np.testing.assert_allclose([found[f"p{q}"]["value"] for q in (5, 50, 95)], np.percentile(values, (5, 50, 95)), rtol=1e-14)
+    found = distribution(values, np.arange(101) % 32)
+    np.testing.assert_allclose(
+        [found[f"p{q}"]["value"] for q in (5, 50, 95)], np.percentile(values, (5, 50, 95)), rtol=1e-14
+    )
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +84,9 @@ def test_standard_errors_where_groups_differ_are_those_of_repetition(name, count
     function, generator, groups = STATISTICS[name][0], np.random.default_rng(count), np.arange(count) % 32
     studies = [generator.normal(size=count) + generator.normal(size=32)[groups] for _ in range(300)]
     found = [statistic(function, values, groups)["se"] for values in studies[:60]]
-    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(np.std([function(values) for values in studies]), rel=0.25)
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(
+        np.std([function(values) for values in studies]), rel=0.25
+    )
 
 
 @pytest.mark.parametrize(
@@ -133,7 +138,9 @@ def test_the_method_is_right(summary):
     assert abs(scale["value"]) < 4 * scale["se"]
     pulls = [row["bias"]["value"] / row["bias"]["se"] for row in cell["parameters"]]
     assert np.max(np.abs(pulls)) < 5
-    assert cell["figures"]["length_error"]["p50"]["value"] < 0.1 * cell["figures"]["length_error_stage1"]["p50"]["value"]
+    assert (
+        cell["figures"]["length_error"]["p50"]["value"] < 0.1 * cell["figures"]["length_error_stage1"]["p50"]["value"]
+    )
 
 
 def test_labelled_data(path):
@@ -154,7 +161,7 @@ def test_levels_that_differ_little_are_told_apart():
 
 def test_a_study_that_has_just_begun_is_shown(aacmm, tmp_path):
     study = aj.study.read_study("noise")
-    store.create(tmp_path / "s.h5", study, store.Layout.of(study, 1000), 1000)
+    store.create(tmp_path / "s.h5", study, Layout.of(study, 1000), 1000)
     assert "No trial has ended yet" in aacmm("show", "s.h5", "--figures", "f").stdout
     assert "No trial of it has ended yet" in aacmm("show", "s.h5", "--cell", 3).stdout
 

@@ -1,5 +1,7 @@
 """What a study asks: what is read, and what is refused before any work."""
 
+import inspect
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,8 @@ CAPTURE = {"positions_mm": [[400, 200, 300]]}
 
 
 def made(**tables) -> "aj.study.Study":
-    return aj.study.make_study(**{"arm": "cheng2018-simulation", "trials": 4, "capture": CAPTURE} | tables)
+    make_study = inspect.unwrap(aj.study.make_study)  # refusals as users see them, without the types checked in tests
+    return make_study(**{"arm": "cheng2018-simulation", "trials": 4, "capture": CAPTURE} | tables)
 
 
 def test_lists_make_the_grid():
@@ -29,17 +32,19 @@ def test_lists_make_the_grid():
     # The last factor varies fastest, the first slowest.
     probe = study.space.index("probe_z")
     d_3 = study.space.index("d_3")
-    numbers = study.numbers
-    assert (numbers.width[0, d_3], numbers.width[-1, d_3]) == (0.5, 1.0)
-    assert numbers.normal[:, probe].all()
-    assert not numbers.normal[:, d_3].any()
-    centre = (numbers.lower + numbers.upper)[:, d_3] / 2
+    values = study.cell_values
+    assert (values.width[0, d_3], values.width[-1, d_3]) == (0.5, 1.0)
+    assert values.normal[:, probe].all()
+    assert not values.normal[:, d_3].any()
+    centre = (values.lower + values.upper)[:, d_3] / 2
     assert centre[4] - centre[0] == pytest.approx(4.0)
-    assert (numbers.upper - numbers.lower)[0, d_3] == pytest.approx(2.0)
+    assert (values.upper - values.lower)[0, d_3] == pytest.approx(2.0)
 
 
 def test_numpys_numbers_are_numbers():
-    study = made(noise={"encoder_arcsec": np.array([1, 2.0])}, deviation={"length_mm": np.float32(1), "angle_deg": np.int64(2)})
+    study = made(
+        noise={"encoder_arcsec": np.array([1, 2.0])}, deviation={"length_mm": np.float32(1), "angle_deg": np.int64(2)}
+    )
     assert study.factors == {"noise.encoder_arcsec": [1.0, 2.0]}
 
 
@@ -94,22 +99,28 @@ def test_what_a_toml_file_names_lies_beside_it(tmp_path, noisy_capture, paper_ar
         ({"capture": {"sockets": 2}}, "sockets at random need a region"),
         ({"capture": {"sockets": 2, "region": {"x_mm": [0, 1]}}}, "a region needs distance_mm, or x_mm, y_mm and z_mm"),
         ({"capture": {"sockets": 2, "region": {"distance_mm": [2, 1]}}}, "2 to 1 is no range"),
-        ({"capture": CAPTURE | {"poses": 7}}, "7 poses in 1 socket give 18 equations, but 20 unknowns need at least 8 poses"),
+        (
+            {"capture": CAPTURE | {"poses": 7}},
+            "7 poses in 1 socket give 18 equations, but 20 unknowns need at least 8 poses",
+        ),
         ({"capture": CAPTURE | {"poses": [70, 7]}}, "need at least 8 poses"),
         ({"capture": CAPTURE | {"poses": 3000}}, "3000 poses are more than the pool has"),
         (
             {"capture": {"sockets": 1, "region": {"distance_mm": [300, 900]}, "poses": 100, "pool": 4096}},
-            "room for less than two places of 100 poses .* give at least 8192",
+            "holds fewer than two placements of 100 poses .* give at least 8192",
         ),
         ({"trials": 10**9}, "'trials' must be less than or equal to 100000000"),
         ({"capture": CAPTURE | {"pool": 10**9}}, "pool is 1000000000; give 4096 to 16777216"),
         ({"capture": CAPTURE | {"poses": 10**9}}, "'capture.poses' must be less than or equal to 100000"),
         ({"capture": 5}, "capture is a int; give a table"),
-        ({"capture": CAPTURE | {"joint_limits_deg": [[-10, 10]]}}, "joint_limits_deg has 1 rows, but the arm has 6 joints"),
+        (
+            {"capture": CAPTURE | {"joint_limits_deg": [[-10, 10]]}},
+            "joint_limits_deg has 1 rows, but the arm has 6 joints",
+        ),
         ({"capture": {"file": "a.h5", "poses": 5}}, "a.h5 does not exist"),
         ({"reference": {"u_mm": 0.1}}, "give either length_mm, .* or ends_mm"),
         ({"reference": {"length_mm": 300}}, "a reference length at random needs a region"),
-        ({"reference": {"ends_mm": [[[0, 0, 0], [0, 0, 0]]]}}, "two ends at the same place"),
+        ({"reference": {"ends_mm": [[[0, 0, 0], [0, 0, 0]]]}}, "two ends at the same position"),
         ({"identification": {"method": "joint"}}, "needs a reference length"),
         (
             {"identification": {"method": "both"}},
@@ -139,31 +150,42 @@ def test_a_narrow_region_is_found(tmp_path):
     """A 300 mm length in a shell 20 mm thick: one candidate in thousands lies inside."""
     region = {"distance_mm": [690, 710]}
     for seed in range(2):
-        study = made(seed=seed, trials=1, reference={"length_mm": 300, "region": region}, capture=CAPTURE | {"pool": 4096})
+        study = made(
+            seed=seed, trials=1, reference={"length_mm": 300, "region": region}, capture=CAPTURE | {"pool": 4096}
+        )
         assert aj.study.run_study(study, tmp_path / f"{seed}.h5").finished
 
 
 @pytest.mark.parametrize(
     ("tables", "message"),
     [
-        ({"capture": {"positions_mm": [[400, 200, 300], [3000, 0, 0]]}}, r"socket S2 at \(3000, 0, 0\) mm cannot be reached"),
+        (
+            {"capture": {"positions_mm": [[400, 200, 300], [3000, 0, 0]]}},
+            r"socket S2 at \(3000, 0, 0\) mm cannot be reached",
+        ),
         (
             {"capture": {"sockets": 1, "region": {"distance_mm": [300, 900]}, "poses": 100, "pool": 4096}},
-            "room for less than two places of 100 poses .* give at least 8192",
+            "holds fewer than two placements of 100 poses .* give at least 8192",
         ),
         ({"trials": 10**9}, "'trials' must be less than or equal to 100000000"),
         ({"capture": CAPTURE | {"pool": 10**9}}, "pool is 1000000000; give 4096 to 16777216"),
         ({"capture": CAPTURE | {"poses": 10**9}}, "'capture.poses' must be less than or equal to 100000"),
         ({"capture": 5}, "capture is a int; give a table"),
-        ({"capture": CAPTURE | {"joint_limits_deg": [[-1, 1]] * 6}}, r"socket S1 at \(400, 200, 300\) mm cannot be reached"),
-        ({"capture": {"sockets": 1, "region": {"distance_mm": [3000, 3100]}}}, "a socket finds no place in its region"),
+        (
+            {"capture": CAPTURE | {"joint_limits_deg": [[-1, 1]] * 6}},
+            r"socket S1 at \(400, 200, 300\) mm cannot be reached",
+        ),
+        (
+            {"capture": {"sockets": 1, "region": {"distance_mm": [3000, 3100]}}},
+            "a socket has no placement in its region",
+        ),
         (
             {"reference": {"length_mm": 500, "region": {"x_mm": [300, 310], "y_mm": [0, 10], "z_mm": [0, 400]}}},
-            "a reference length of 500 mm finds no place in its region",
+            "a reference length of 500 mm has no placement in its region",
         ),
         (
             {"reference": {"length_mm": 2900, "region": {"distance_mm": [100, 1000]}}},
-            "a reference length of 2900 mm finds no place in its region",
+            "a reference length of 2900 mm has no placement in its region",
         ),
     ],
     ids=str,

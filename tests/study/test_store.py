@@ -1,5 +1,6 @@
 """A study's file: whole at every moment, continued whatever happened, the same however it was run."""
 
+import inspect
 import multiprocessing
 import os
 import shutil
@@ -15,8 +16,8 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.study import runner as run
-from aacmm_jax.study import store
+from aacmm_jax.study import runner, store
+from aacmm_jax.study.layout import Layout, parts_of
 
 ROOT = Path(__file__).resolve().parents[2]
 SPECIFICATION = """
@@ -88,7 +89,7 @@ def until_parts(path: Path, count: int, process: subprocess.Popen) -> None:
     """Wait until so many blocks are kept, or the process has ended."""
     deadline = time.monotonic() + 120
     while process.poll() is None and time.monotonic() < deadline:
-        if len(list(store.parts_of(path).glob("*.h5"))) >= count:
+        if len(list(parts_of(path).glob("*.h5"))) >= count:
             return
         time.sleep(0.002)
 
@@ -121,7 +122,7 @@ def test_the_chunk_changes_no_bit(home, study, tmp_path, chunk):
 
 def test_blocks_cover_every_trial_once(study):
     for chunk in (1, 7, 16, 60, 100, 125, 10_000):
-        layout = store.Layout.of(study, chunk)
+        layout = Layout.of(study, chunk)
         seen = np.zeros((layout.cells, layout.trials), dtype=int)
         for block in layout.blocks():
             seen[block.first_cell : block.last_cell, block.first_trial : block.last_trial] += 1
@@ -134,7 +135,7 @@ def test_cells_of_different_settings_share_no_block():
     study = aj.study.make_study(
         arm="cheng2018-simulation", trials=10, capture=capture, identification={"hold": ["none", "longest"]}
     )
-    assert store.Layout.of(study, 1000).block_cells == 1
+    assert Layout.of(study, 1000).block_cells == 1
     widths = aj.study.make_study(
         arm="cheng2018-simulation",
         trials=10,
@@ -142,7 +143,7 @@ def test_cells_of_different_settings_share_no_block():
         noise={"encoder_arcsec": [1, 2, 3]},
         bounds={"length_mm": [1, 2]},
     )
-    assert store.Layout.of(widths, 1000).block_cells == 6
+    assert Layout.of(widths, 1000).block_cells == 6
 
 
 def test_stopped_is_resumed(home, study, tmp_path):
@@ -159,7 +160,7 @@ def test_stopped_is_resumed(home, study, tmp_path):
     data.close()
     again = aj.study.run_study(study, path)
     assert (again.finished, again.ran) == (True, again.total - outcome.done)
-    assert not store.parts_of(path).exists()
+    assert not parts_of(path).exists()
     same(home / "whole.h5", path)
     assert aj.study.run_study(study, path).ran == 0
 
@@ -185,13 +186,13 @@ def test_a_second_run_at_the_same_time_is_refused(study, tmp_path):
         ({"trials": 61}, "holds another study .trials differs."),
         ({"chunk": 20}, "was begun with chunks of 16 trials; leave the chunk out"),
         ({"chunk": 0}, "chunk is 0; give a whole number of at least 1"),
-        ({"version": "9.9"}, "was begun with aacmm_jax .*; go on with that version"),
+        ({"version": "9.9"}, "was begun with aacmm_jax .*; continue with that version"),
     ],
     ids=str,
 )
 def test_what_a_file_was_begun_with_stays(study, tmp_path, change, message, monkeypatch):
     path = tmp_path / "s.h5"
-    store.create(path, study, store.Layout.of(study, 16), 16)
+    store.create(path, study, Layout.of(study, 16), 16)
     change = dict(change)
     options = {"chunk": change.pop("chunk")} if "chunk" in change else {}
     if "version" in change:
@@ -200,11 +201,13 @@ def test_what_a_file_was_begun_with_stays(study, tmp_path, change, message, monk
     other = aj.study.Study(study.specification.model_copy(update=change), study.nominal)
     with pytest.raises(aj.InputError, match=message):
         aj.study.run_study(other, path, **options)
-    assert store.parts_of(path).is_dir()
+    assert parts_of(path).is_dir()
 
 
 def test_other_files_are_not_overwritten(study, tmp_path, noisy_capture):
-    aj.files.save_capture(tmp_path / "c.h5", aj.Recording(noisy_capture, aj.files.load_specification("cheng2018-simulation")))
+    aj.files.save_capture(
+        tmp_path / "c.h5", aj.Recording(noisy_capture, aj.files.load_specification("cheng2018-simulation"))
+    )
     with pytest.raises(aj.InputError, match=r"c\.h5 holds a capture; name a study file"):
         aj.study.run_study(study, tmp_path / "c.h5")
     aj.files.load_capture(tmp_path / "c.h5")
@@ -212,17 +215,19 @@ def test_other_files_are_not_overwritten(study, tmp_path, noisy_capture):
 
 def test_results_without_their_parts_are_missed(home, study, tmp_path):
     path = tmp_path / "s.h5"
-    store.create(path, study, store.Layout.of(study, 16), 16)
+    store.create(path, study, Layout.of(study, 16), 16)
     for use in (aj.study.open_study, lambda path: aj.study.run_study(study, path)):
         path = path.rename(tmp_path / "t.h5")
         with pytest.raises(
-            aj.InputError, match=r"t\.h5 was renamed, but its results lie in s\.h5\.parts; give it its name s\.h5"
+            aj.InputError, match=r"t\.h5 was renamed, but its results are in s\.h5\.parts; rename it back to s\.h5"
         ):
             use(path)
         path = path.rename(tmp_path / "s.h5")
-    shutil.rmtree(store.parts_of(path))
+    shutil.rmtree(parts_of(path))
     for use in (aj.study.open_study, lambda path: aj.study.run_study(study, path)):
-        with pytest.raises(aj.InputError, match=r"results in the folder s\.h5\.parts, which is not beside it; put it there"):
+        with pytest.raises(
+            aj.InputError, match=r"results in the folder s\.h5\.parts, which is missing; put it next to the file"
+        ):
             use(path)
     with pytest.raises(aj.InputError, match="does not exist"):
         aj.study.open_study(tmp_path / "none.h5")
@@ -243,7 +248,7 @@ def test_a_moved_and_oddly_named_study_still_reads(home, study, tmp_path):
     aj.study.run_study(study, path, chunk=16, watch=interrupted_at(1))
     moved = tmp_path / "elsewhere"
     moved.mkdir()
-    for item in (path, store.parts_of(path)):
+    for item in (path, parts_of(path)):
         item.rename(moved / item.name)
     assert (aj.study.open_study(moved / path.name).converged.values >= 0).any()
     assert aj.study.run_study(study, moved / path.name).finished
@@ -280,7 +285,7 @@ def test_an_interrupt_finishes_the_blocks_in_work_and_says_how_to_go_on(home, ca
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 130, errors
-    kept = len(list(store.parts_of(path).glob("*.h5")))
+    kept = len(list(parts_of(path).glob("*.h5")))
     assert kept >= 3
     assert f"Stopped; {4 * kept:,} of 2,400 trials are kept. Go on with: aacmm study --resume -o {path}" in errors
     assert "Traceback" not in errors
@@ -302,7 +307,7 @@ def test_a_full_disk_is_one_sentence_and_loses_nothing(home, cache, tmp_path):
         "os.execv(sys.executable, [sys.executable, '-m', 'aacmm_jax', *sys.argv[2:]])"
     )
     store.create(
-        path, aj.study.read_study(home / "spec.toml"), store.Layout.of(aj.study.read_study(home / "spec.toml"), 16), 16
+        path, aj.study.read_study(home / "spec.toml"), Layout.of(aj.study.read_study(home / "spec.toml"), 16), 16
     )
     for limit, what in (
         (10_000, "cell00000-trial0000000000.h5 cannot"),
@@ -315,7 +320,9 @@ def test_a_full_disk_is_one_sentence_and_loses_nothing(home, cache, tmp_path):
         assert done.returncode == 2, done.stderr
         assert done.stderr.count("\n") == 1
         assert what in done.stderr
-        assert "cannot be written: file too large; free some space there, then run the same command again" in done.stderr
+        assert (
+            "cannot be written: file too large; free some space there, then run the same command again" in done.stderr
+        )
         aj.study.open_study(path).close()
     process = command(home, cache, "-o", path)
     process.communicate(timeout=300)
@@ -342,7 +349,9 @@ def test_the_number_of_devices_changes_nothing(home, cache, tmp_path):
     )  # fmt: skip
     with h5py.File(home / "whole.h5") as one, h5py.File(tmp_path / "s.h5") as two:
         for name in store.VARIABLES:
-            np.testing.assert_allclose(one["trials"][name][()], two["trials"][name][()], rtol=0, atol=1e-9, err_msg=name)
+            np.testing.assert_allclose(
+                one["trials"][name][()], two["trials"][name][()], rtol=0, atol=1e-9, err_msg=name
+            )
 
 
 def test_parts_may_stay(home, study, tmp_path):
@@ -351,10 +360,12 @@ def test_parts_may_stay(home, study, tmp_path):
     assert aj.study.run_study(study, path).ran == 0
     same(home / "whole.h5", path)
     assert aj.study.open_study(path).attrs["finished"]
-    parts = sorted(store.parts_of(path).iterdir())
+    parts = sorted(parts_of(path).iterdir())
     assert len(parts) == 16
     parts[3].unlink()
-    with pytest.raises(aj.InputError, match=r"1 blocks are missing in s\.h5\.parts; put them there, or run the study again"):
+    with pytest.raises(
+        aj.InputError, match=r"1 blocks are missing in s\.h5\.parts; put them there, or run the study again"
+    ):
         aj.study.open_study(path)
     assert aj.study.run_study(study, path).ran == 15
     same(home / "whole.h5", path)
@@ -364,7 +375,7 @@ def test_a_spoilt_block_runs_again(home, study, tmp_path):
     """Whatever the disk did to it: a bit, the middle, the end, all of it."""
     path = tmp_path / "s.h5"
     aj.study.run_study(study, path, chunk=16, watch=interrupted_at(96))
-    parts = sorted(store.parts_of(path).glob("*.h5"))
+    parts = sorted(parts_of(path).glob("*.h5"))
     assert len(parts) >= 6
     whole = parts[0].read_bytes()
     dataset = h5py.File(parts[0])["estimate"].id.get_chunk_info(0).byte_offset
@@ -427,23 +438,25 @@ def test_dask_workers_that_die_lose_nothing_and_shards_are_the_same(home, study,
         assert killed
         assert (outcome.finished, outcome.ran) == (True, 240)
         same(home / "whole.h5", tmp_path / "s.h5")
-        assert aj.study.run_study(study, tmp_path / "t.h5", executor=executor, workers=count, chunk=16, shards=True).finished
+        assert aj.study.run_study(
+            study, tmp_path / "t.h5", executor=executor, workers=count, chunk=16, shards=True
+        ).finished
         same(home / "whole.h5", tmp_path / "t.h5")
 
 
 def test_a_worker_that_fails_stops_the_study_and_keeps_the_rest(study, tmp_path, monkeypatch):
-    real = run.run_block
+    real = runner.run_block
 
     def fails(study, block, **options):
         if block.first_cell == 2:
             raise MemoryError("no room")
         return real(study, block, **options)
 
-    monkeypatch.setattr(run, "run_block", fails)
+    monkeypatch.setattr(runner, "run_block", fails)
     with pytest.raises(RuntimeError, match=r"failed on its worker .MemoryError: no room.; finished blocks are kept"):
         aj.study.run_study(study, tmp_path / "s.h5", chunk=16, workers=1)
-    assert len(list(store.parts_of(tmp_path / "s.h5").glob("*.h5"))) == 8
-    monkeypatch.setattr(run, "run_block", real)
+    assert len(list(parts_of(tmp_path / "s.h5").glob("*.h5"))) == 8
+    monkeypatch.setattr(runner, "run_block", real)
     assert aj.study.run_study(study, tmp_path / "s.h5").ran == 120
 
 
@@ -471,7 +484,7 @@ def test_an_interrupt_of_the_whole_terminal_reaches_no_dask_worker(home, cache, 
 )
 def test_strange_arguments_are_refused_before_anything_is_written(study, tmp_path, options, message):
     with pytest.raises(aj.InputError, match=message):
-        aj.study.run_study(study, tmp_path / "s.h5", **options)
+        inspect.unwrap(aj.study.run_study)(study, tmp_path / "s.h5", **options)  # without the types checked in tests
     assert not list(tmp_path.iterdir())
 
 

@@ -8,7 +8,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.study import drawing, pools
-from aacmm_jax.study.definition import Block
+from aacmm_jax.study.layout import Block
 from aacmm_jax.study.trials import run_block
 
 DEVICE = jax.devices()[0]
@@ -58,7 +58,7 @@ def test_without_noise_every_true_tip_stands_on_its_point(arm, deviation):
     length = np.linalg.norm(ends[:, :, 0, 0] - ends[:, :, 1, 0], axis=-1)
     np.testing.assert_allclose(length, 200, atol=1e-8)
     np.testing.assert_allclose(trials.value, 200, atol=1e-8)
-    assert np.ptp(trials.true, axis=0).min() > 0.5 * 2 * study.numbers.width[0].min()
+    assert np.ptp(trials.true, axis=0).min() > 0.5 * 2 * study.cell_values.width[0].min()
 
 
 def test_no_pose_twice_and_all_within_the_limits(paper_arm):
@@ -79,7 +79,9 @@ def test_deviations_have_their_distributions():
     study = made(deviation={"length_mm": 1.0, "d_mm": {"normal": 0.3}, "angle_deg": 0.1, "theta_deg": 0.0})
     trials = drawn(study, 4000)
     off = (trials.true - np.asarray(study.space.vector())) / np.where(study.space.lengths, 1.0, np.pi / 180)
-    kinds = {kind: off[:, [n.startswith(kind + "_") for n in study.space.names]] for kind in ("a", "d", "alpha", "theta")}
+    kinds = {
+        kind: off[:, [n.startswith(kind + "_") for n in study.space.names]] for kind in ("a", "d", "alpha", "theta")
+    }
     assert 0.99 < np.abs(kinds["a"]).max() <= 1
     assert kinds["a"].std() == pytest.approx(1 / 3**0.5, rel=0.02)
     assert kinds["d"].std() == pytest.approx(0.3, rel=0.02)
@@ -91,7 +93,8 @@ def test_deviations_have_their_distributions():
 
 
 @pytest.mark.parametrize(
-    "part", ["encoder_arcsec", "seating_mm", "resolution_arcsec", pytest.param("eccentricity_arcsec", marks=pytest.mark.slow)]
+    "part",
+    ["encoder_arcsec", "seating_mm", "resolution_arcsec", pytest.param("eccentricity_arcsec", marks=pytest.mark.slow)],
 )
 def test_noise_is_what_was_asked(part):
     """The same keys with and without one part of the noise differ by that part."""
@@ -162,7 +165,9 @@ STUDIES = {
 @pytest.fixture(scope="module", params=["two-stage", "joint", pytest.param("stage1", marks=pytest.mark.slow)])
 def whole(request):
     reference = {} if request.param == "stage1" else {"reference": REFERENCE}
-    study = made(deviation=OFF, noise=NOISE, bounds={"length_mm": [3, 10]}, identification=STUDIES[request.param], **reference)
+    study = made(
+        deviation=OFF, noise=NOISE, bounds={"length_mm": [3, 10]}, identification=STUDIES[request.param], **reference
+    )
     return study, run_block(study, Block(0, 2, 0, 40))
 
 

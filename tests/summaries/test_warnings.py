@@ -12,7 +12,9 @@ def cautions_of(capture, arm, **options):
     """Cautions of a calibration of the paper's arm on a capture."""
     specification = aj.kinematics.ArmSpecification(arm, "test")
     result = aj.calibrate(arm, capture, specification.bounds(), **options)
-    return result, " ".join(cautions.of_calibration(aj.calibration.record_of(result, aj.Recording(capture, specification))))
+    return result, " ".join(
+        cautions.of_calibration(aj.calibration.record_of(result, aj.Recording(capture, specification)))
+    )
 
 
 def with_lengths(capture, *lengths):
@@ -21,7 +23,12 @@ def with_lengths(capture, *lengths):
 
 @pytest.mark.parametrize(
     ("factor", "said"),
-    [(1.0, None), (1e-3, "are the lengths in m by mistake?"), (0.1, "are the lengths in cm by mistake?"), (1.02, "far from 1")],
+    [
+        (1.0, None),
+        (1e-3, "are the lengths in m by mistake?"),
+        (0.1, "are the lengths in cm by mistake?"),
+        (1.02, "far from 1"),
+    ],
 )
 def test_a_wrong_reference_length(paper_arm, noisy_capture, factor, said):
     true = float(noisy_capture.lengths[0].value)
@@ -58,11 +65,15 @@ def test_redundant_and_too_few(paper_arm, noisy_capture):
     sockets = noisy_capture.sockets
     few = aj.Capture({"A": sockets["A"][:8], "B": sockets["B"][:2]}, noisy_capture.lengths)
     assert "Only 4 more equations than unknowns" in cautions_of(few, paper_arm)[1]
-    specification = aj.kinematics.ArmSpecification(paper_arm, "test", held=("theta_1", "d_1", "a_6", "probe_x", "probe_y"))
+    specification = aj.kinematics.ArmSpecification(
+        paper_arm, "test", held=("theta_1", "d_1", "a_6", "probe_x", "probe_y")
+    )
     with pytest.warns(aj.IdentifiabilityWarning, match="alpha_6 and d_6 trade off"):
         result = aj.calibrate(paper_arm, noisy_capture, specification.bounds())
-    text = " ".join(cautions.of_calibration(aj.calibration.record_of(result, aj.Recording(noisy_capture, specification))))
-    assert "No measurement of this kind tells these apart: alpha_6 and d_6 trade off." in text
+    text = " ".join(
+        cautions.of_calibration(aj.calibration.record_of(result, aj.Recording(noisy_capture, specification)))
+    )
+    assert "No measurement of this kind can separate: alpha_6 and d_6 trade off." in text
 
 
 def test_readings_outside_the_limits():

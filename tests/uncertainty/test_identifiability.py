@@ -17,7 +17,10 @@ def single(paper_arm) -> aj.Capture:
 def parallel_arm() -> aj.Arm:
     """Three parallel axes, as on many robots."""
     return aj.Arm(
-        alpha=np.radians([90, 0, 0, 90, -90, 0]), a=[0, -425, -392, 0, 0, 0], d=[89, 0, 0, 109, 95, 82], probe=(30, 10, 100)
+        alpha=np.radians([90, 0, 0, 90, -90, 0]),
+        a=[0, -425, -392, 0, 0, 0],
+        d=[89, 0, 0, 109, 95, 82],
+        probe=(30, 10, 100),
     )
 
 
@@ -51,8 +54,8 @@ def test_rank_and_null_space_of_the_paper(paper_arm, single, paper_capture, case
         paper_arm, paper_capture if lengths else single, aj.Parameters.free_of(paper_arm, held=held), noise=noise
     )
     assert seen.rank == rank
-    assert {text.replace(" (changes nothing that is measured)", "") for text in seen.unseen} == directions
-    structural = {text for text, never in zip(seen.unseen, seen.never, strict=True) if never}
+    assert {text.replace(" (changes nothing that is measured)", "") for text in seen.undetermined} == directions
+    structural = {text for text, never in zip(seen.undetermined, seen.structural, strict=True) if never}
     assert not any("scale" in text for text in structural)
     assert len(structural) == len(directions) - ("all lengths together: the scale" in directions)
     if not lengths:
@@ -75,7 +78,7 @@ def test_lengths_alone(paper_arm, positions, rank):
     assert seen.rank == rank
     if positions == 1:
         assert seen.remedy  # tried out: it says what would help
-        assert not any(seen.never)
+        assert not any(seen.structural)
 
 
 def test_an_arm_off_by_mm_is_judged_alike(paper_arm):
@@ -91,7 +94,8 @@ def test_indices_of_a_known_spectrum(paper_arm, paper_capture):
     seen = aj.observability(paper_arm, paper_capture)
     s, m = seen.singular, 71
     assert seen.indices == pytest.approx({
-        "O1": np.prod(s) ** (1 / 21) / np.sqrt(m), "O2": s[-1] / s[0], "O3": s[-1], "O4": s[-1] ** 2 / s[0], "O5": 1 / np.sum(1 / s)
+        "O1": np.prod(s) ** (1 / 21) / np.sqrt(m), "O2": s[-1] / s[0], "O3": s[-1], "O4": s[-1] ** 2 / s[0],
+        "O5": 1 / np.sum(1 / s),
     })  # fmt: skip
     assert np.all(np.diff(s) <= 0)
     assert seen.condition < s[0] / s[-1] * 2
@@ -116,7 +120,7 @@ def test_few_poses_are_told_what_would_help(paper_arm, paper_capture):
 
 @pytest.mark.parametrize("lengths", [0, 1])
 def test_independent_parameters_are_the_papers(paper_arm, single, paper_capture, lengths):
-    """With a length the 21; without, the longest link is held besides. A whole set: everything is determined, nothing could be added."""
+    """With a length the 21; without, the longest link is fixed too. All are determined, none could be added."""
     capture = paper_capture if lengths else single
     chosen = aj.Parameters.independent(paper_arm, capture)
     default = set(aj.Parameters.free_of(paper_arm).names)
@@ -125,12 +129,12 @@ def test_independent_parameters_are_the_papers(paper_arm, single, paper_capture,
 
 
 def test_independent_parameters_of_a_straight_wrist():
-    """On the Panda the probe lies along the last axis: 25 with a length (4 a joint, less the base and what the probe repeats)."""
+    """The Panda's probe lies along its last axis: theta_6 and alpha_6 are imitated by a_6, d_6 and the probe."""
     panda = aj.load_arm("panda")
     capture = aj.simulate(panda, {"A": (400, 200, 300), "B": (450, 200, 300)}, poses=40, lengths=[("A", "B")])
     chosen = aj.Parameters.independent(panda, capture)
-    assert len(chosen.names) == 25
-    assert set(chosen.held) == {"d_1", "theta_1", "a_7", "alpha_7", "theta_7", "d_7"}
+    assert set(chosen.held) == {"d_1", "theta_1", "a_7", "alpha_7", "theta_7", "d_7", "theta_6", "alpha_6"}
+    assert len(chosen.names) == 23
 
 
 def test_parallel_axes_get_hayatis_angle(parallel_arm):

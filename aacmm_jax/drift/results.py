@@ -1,0 +1,181 @@
+"""Results of comparing calibrations: `Drift` of two, `Trend` of any number, and the sentences that state them."""
+
+import datetime
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..core.units import ARCSEC
+from ..kinematics.arm import is_length
+from .statistics import JointTest, LengthChange
+
+_NAMED = 6  # how many parameters a sentence names
+
+
+class Drift(NamedTuple):
+    """Two calibrations compared, as NumPy arrays in the order of ``names``: mm and rad."""
+
+    names: tuple[str, ...]  # free in either
+    old: Float[np.ndarray, " p"]
+    new: Float[np.ndarray, " p"]
+    u: Float[np.ndarray, " p"]  # standard uncertainty of the change; NaN if it has none
+    degrees_of_freedom: Float[np.ndarray, " p"]  # effective ones of the change
+    expanded: Float[np.ndarray, " p"]  # expanded uncertainty of the change
+    reasons: tuple[str, ...]  # why a change has no uncertainty; empty if it has one
+    level: float  # coverage of the expanded uncertainties
+    joint_test: JointTest
+    lengths: LengthChange
+    warnings: tuple[str, ...]  # what makes the comparison doubtful
+
+    @property
+    def change(self) -> Float[np.ndarray, " p"]:
+        """New less old."""
+        return self.new - self.old
+
+    @property
+    def moved(self) -> Bool[np.ndarray, " p"]:
+        """Which parameters changed beyond their expanded uncertainty; False for those without one."""
+        return np.abs(self.change) > np.where(np.isnan(self.expanded), np.inf, self.expanded)
+
+    @property
+    def compared(self) -> int:
+        """How many changes have an uncertainty."""
+        return self.reasons.count("")
+
+    @property
+    def by_chance(self) -> float:
+        """How many parameters would exceed their expanded uncertainty on average if nothing had changed."""
+        return (1 - self.level) * self.compared
+
+    def sentences(self) -> list[str]:
+        """Warnings and findings."""
+        return [*self.warnings, *self.findings()]
+
+    def findings(self) -> list[str]:
+        """What was found: of all parameters together, of each, of lengths, and of parameters without uncertainty."""
+        sentences = (_of_all(self), _of_each(self), _of_lengths(self), _of_scale(self.lengths), _of_undetermined(self))
+        return [sentence for sentence in sentences if sentence]
+
+
+class Trend(NamedTuple):
+    """Any number of calibrations of one arm, in the order of their dates, each compared with the first."""
+
+    dates: tuple[datetime.datetime, ...]
+    order: tuple[int, ...]  # index of each among the calibrations given
+    drifts: tuple[Drift, ...]  # of the second, third ... against the first; all with the same names
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters that are free in any of them."""
+        return self.drifts[0].names
+
+    @property
+    def change(self) -> Float[np.ndarray, "c p"]:
+        """Change of every parameter from the first calibration, mm and rad; the first row is zero."""
+        return np.stack([np.zeros(len(self.names)), *(drift.change for drift in self.drifts)])
+
+    @property
+    def expanded(self) -> Float[np.ndarray, "c p"]:
+        """Expanded uncertainty of these changes; NaN if there is none, as in the first row."""
+        return np.stack([np.full(len(self.names), np.nan), *(drift.expanded for drift in self.drifts)])
+
+    @property
+    def moved(self) -> Bool[np.ndarray, "c p"]:
+        """Which changes are beyond their expanded uncertainty."""
+        return np.stack([np.zeros(len(self.names), dtype=bool), *(drift.moved for drift in self.drifts)])
+
+    @property
+    def warnings(self) -> list[str]:
+        """What makes the comparisons doubtful, each sentence once."""
+        return list(dict.fromkeys(sentence for drift in self.drifts for sentence in drift.warnings))
+
+
+def _of_all(drift: Drift) -> str:
+    test = drift.joint_test
+    if math.isnan(test.p):
+        return "Together the changes cannot be tested: too few parameters or poses determine them in both calibrations."
+    law = f"chi-square {test.statistic:.1f} with {test.rank} degrees of freedom"
+    if math.isfinite(test.degrees_of_freedom):
+        ratio = test.statistic / test.rank
+        law = f"F {ratio:.2f} with {test.rank} and {test.degrees_of_freedom:.0f} degrees of freedom"
+    probability = "p < 0.0001" if test.p < 1e-4 else f"p = {test.p:.2g}"
+    start = f"Together, the changes of {len(test.names)} parameters are"
+    if test.p >= 1 - drift.level:
+        return f"{start} no more than their uncertainties explain ({law}, {probability})."
+    causes = [f"{name} by {in_words(name, amount)}" for name, amount in test.causes]
+    few = f" A change of these alone would explain all of it: {', '.join(causes)}." if causes else ""
+    return (
+        f"{start} more than their uncertainties explain ({law}, {probability}): the arm has changed, or there are "
+        f"errors that the uncertainties leave out.{few}"
+    )
+
+
+def _of_each(drift: Drift) -> str:
+    moved = np.flatnonzero(drift.moved)
+    if not drift.compared:
+        return ""
+    chance = f"{drift.by_chance:.0f}" if drift.by_chance >= 0.95 else f"{drift.by_chance:.1g}"
+    whose = "its" if len(moved) == 1 else "their"
+    count = f"{len(moved) or 'None'} of {drift.compared} parameters moved beyond {whose} uncertainty"
+    start = f"{count} ({100 * drift.level:g} %; {chance} would by chance)"
+    if not len(moved):
+        return f"{start}."
+    worst = sorted(moved, key=lambda i: -abs(drift.change[i]) / drift.expanded[i])
+    each = [_moved(drift, int(i)) for i in worst]
+    return f"{start}: {some(each)}."
+
+
+def _moved(drift: Drift, i: int) -> str:
+    name = drift.names[i]
+    return f"{name} by {in_words(name, drift.change[i])} (U = {in_words(name, drift.expanded[i], '')})"
+
+
+def _of_lengths(drift: Drift) -> str:
+    lengths = drift.lengths
+    start = f"Lengths of {lengths.length:g} mm"
+    if not np.all(np.isfinite(lengths.u)):
+        return (
+            f"{start} changed by {lengths.rms:.4f} mm RMS, at most {lengths.largest:+.4f} mm, but the data of one "
+            "calibration leave them open, so this may not be drift."
+        )
+    percent = 100 * float(np.mean(lengths.moved))
+    return (
+        f"{start} over the volume changed by {lengths.rms:.4f} mm RMS, where the uncertainties alone would give "
+        f"{lengths.rms_by_chance:.4f} mm, and at most by {lengths.largest:+.4f} mm; {percent:.0f} % of them moved beyond "
+        f"their uncertainty ({100 * (1 - drift.level):.2g} % would by chance)."
+    )
+
+
+def _of_scale(lengths: LengthChange) -> str:
+    if not math.isfinite(lengths.u_scale_change):
+        return ""
+    relation = "beyond" if abs(lengths.scale_change) > lengths.expanded_scale_change else "within"
+    word = "longer" if lengths.scale_change > 0 else "shorter"
+    return (
+        f"On average the same lengths measure {1e6 * abs(lengths.scale_change):.1f} um/m {word} than before "
+        f"(U = {1e6 * lengths.expanded_scale_change:.1f} um/m), which is {relation} the uncertainty."
+    )
+
+
+def _of_undetermined(drift: Drift) -> str:
+    names: dict[str, list[str]] = {}
+    for name, reason in zip(drift.names, drift.reasons, strict=True):
+        if reason:
+            names.setdefault(reason, []).append(name)
+    groups = [f"{some(group)} ({reason})" for reason, group in names.items()]
+    return f"Without an uncertainty of change: {'; '.join(groups)}." if groups else ""
+
+
+def in_words(name: str, value: float, sign: str = "+") -> str:
+    """A change of a parameter in um or arcsec, to three digits."""
+    shown, unit = (1e3 * value, "um") if is_length(name) else (value / ARCSEC, "arcsec")
+    decimals = max(2 - math.floor(math.log10(abs(shown))), 0) if shown else 0
+    return f"{shown:{sign}.{min(decimals, 3)}f} {unit}"
+
+
+def some(names: Sequence[str]) -> str:
+    """Names for a sentence, not too many."""
+    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")

@@ -1,0 +1,142 @@
+"""Near-degenerate parameters: combinations whose change the tips hardly show, whatever their rank says.
+
+A matrix of derivatives has full rank as soon as no combination of parameters leaves the tips exactly where they are.
+That says nothing of how well the combination is determined: a probe 0.6 mm off the last axis gives ``theta_6`` a rank
+of its own, but 1 mrad of it moves no tip by more than 0.3 um once ``a_6`` and the probe have followed. So directions
+are judged by size.
+
+Let m be the RMS movement of the tips (mm) per natural step (1 mm or 1 mrad) along a direction, after the best
+imitation by all other free parameters. Then
+
+* without knowledge of the noise, the direction is near-degenerate where m < 2 um per step (`LEAST_MOVEMENT`): over
+  the default half-width of a bound (10 mm, 17.5 mrad) it moves the tips by less than 35 um, about the single-point
+  repeatability of a good arm, and less than the errors that the Denavit-Hartenberg model leaves (0.1 mm in robots).
+  Such errors are alike in neighbouring poses, so that more poses do not average them away. Well-conditioned arms have
+  10 um per step and more in their weakest direction (the arms of Cheng et al. 2018: 20 um);
+* where the noise is known, also where its standard uncertainty u exceeds half of the half-width h of its bounds: with
+  independent normal errors of covariance W^-1, u^2 = 1 / (v^T J^T W J v). A parameter with a rectangular distribution
+  over its bounds has u = h / sqrt(3) = 0.58 h (JCGM 100, 4.3.7): there the data add little to what the bounds say
+  anyway.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .arm import is_length
+
+LEAST_MOVEMENT = 2e-3  # mm at the tips per natural step
+SHARE_OF_BOUNDS = 0.5  # of a half-width, that a standard uncertainty may reach
+_ZERO = 1e-8  # singular values below this, of the largest, are zero: exact degeneracy, which is named elsewhere
+_PARTNER = 0.05  # of the largest partner of a parameter: smaller ones are not named
+_PARTNERS_NAMED = 3
+
+
+class TradeOff(NamedTuple):
+    """A near-degenerate direction: a parameter and those that imitate it. Amounts in natural steps (1 mm, 1 mrad)."""
+
+    names: tuple[str, ...]  # the parameter to fix, then those that imitate it, the strongest first
+    amounts: tuple[float, ...]  # how much of each imitates one step of the first; 1 for the first
+    movement: float  # what one step moves the tips after the imitation, RMS, mm
+    u: float  # standard uncertainty of the first from the data, in steps; infinite where the noise is not known
+    half_width: float  # of the bounds of the first, in steps; infinite where not known
+
+    @property
+    def text(self) -> str:
+        """The trade-off in words."""
+        first, *others = self.names
+        text = f"one {_step(first)} of {first} changes the tips by {1e3 * self.movement:.2g} um"
+        if others:
+            pairs = zip(self.amounts[1 : 1 + _PARTNERS_NAMED], others[:_PARTNERS_NAMED], strict=False)
+            imitation = _listed([f"{amount:.2g} {_step(name)} of {name}" for amount, name in pairs])
+            text = (
+                f"{_listed([first, others[0]])} trade off: 1 {_step(first)} of {first} is imitated by {imitation} "
+                f"to within {1e3 * self.movement:.2g} um"
+            )
+        if np.isfinite(self.u):
+            text += f" (u = {self.u:.3g} {_step(first)}"
+            text += f", bounds +-{self.half_width:.3g} {_step(first)})" if np.isfinite(self.half_width) else ")"
+        return text
+
+
+def trade_offs(
+    movements: Float[np.ndarray, "r p"],
+    names: Sequence[str],
+    *,
+    whitened: Float[np.ndarray, "w p"] | None = None,
+    half_widths: Float[np.ndarray, " p"] | None = None,
+) -> tuple[TradeOff, ...]:
+    """Near-degenerate directions of a linearised identification, the weakest first.
+
+    Args:
+        movements: Rows whose sum of squares along a direction is the squared RMS movement, mm, per natural step.
+        names: The parameters of the columns.
+        whitened: The same equations in standard deviations, where the noise is known.
+        half_widths: Of the bounds, in natural steps; needed with ``whitened``.
+    """
+    units = np.ones(len(names)) if half_widths is None else np.where(half_widths > 0, half_widths, 1e-12)
+    rows = movements if whitened is None else whitened
+    # One uncertainty in units of the bounds: the singular values of the scaled rows are its inverse.
+    _, singular, vectors = np.linalg.svd(rows * units, full_matrices=False)
+    singular, vectors = singular[singular > _ZERO * max(singular[0], 1e-300)], vectors[: len(singular)] * units
+    vectors = vectors[: len(singular)] / np.linalg.norm(vectors[: len(singular)], axis=1, keepdims=True)
+    weak = np.linalg.norm(movements @ vectors.T, axis=0) < LEAST_MOVEMENT
+    if whitened is not None:
+        weak |= singular * SHARE_OF_BOUNDS < 1
+    if not weak.any():
+        return ()
+    leading = reduced_echelon(vectors[weak].T)[1]
+    fixed = np.isin(np.arange(len(names)), leading)
+    found = [_trade_off(int(i), fixed, movements, names, whitened, half_widths) for i in leading]
+    return tuple(sorted(found, key=lambda item: item.movement))
+
+
+def _trade_off(
+    i: int,
+    fixed: Bool[np.ndarray, " p"],
+    movements: Float[np.ndarray, "r p"],
+    names: Sequence[str],
+    whitened: Float[np.ndarray, "w p"] | None,
+    half_widths: Float[np.ndarray, " p"] | None,
+) -> TradeOff:
+    """The best imitation of one step of parameter i by all that do not lead a trade-off themselves."""
+    rows = movements if whitened is None else whitened
+    amounts = np.linalg.lstsq(rows[:, ~fixed], rows[:, i], rcond=_ZERO)[0]
+    direction = np.zeros(len(names))
+    direction[~fixed], direction[i] = -amounts, 1.0
+    largest = np.abs(amounts).max(initial=0.0)
+    order = [
+        j for j in np.argsort(-np.abs(direction), kind="stable") if j != i and abs(direction[j]) > _PARTNER * largest
+    ]
+    return TradeOff(
+        names=tuple(names[j] for j in (i, *order)),
+        amounts=(1.0, *(float(-direction[j]) for j in order)),
+        movement=float(np.linalg.norm(movements @ direction)),
+        u=np.inf if whitened is None else float(1 / max(np.linalg.norm(whitened @ direction), 1e-300)),
+        half_width=np.inf if half_widths is None else float(half_widths[i]),
+    )
+
+
+def reduced_echelon(basis: Float[np.ndarray, "p r"]) -> tuple[Float[np.ndarray, "p r"], list[int]]:
+    """The same space by vectors that are each 0 at the other vectors' leading parameters, and these parameters."""
+    rows, leading = basis.T.copy(), []
+    for i in range(len(rows)):
+        # The parameter that the remaining vectors change most leads; its vector is moved to row i.
+        column = int(np.argmax(np.linalg.norm(rows[i:], axis=0)))
+        row = i + int(np.argmax(np.abs(rows[i:, column])))
+        rows[[i, row]] = rows[[row, i]]
+        rows[i] /= rows[i, column]
+        others = np.arange(len(rows)) != i
+        rows[others] -= np.outer(rows[others, column], rows[i])
+        leading.append(column)
+    return rows.T, leading
+
+
+def _step(name: str) -> str:
+    return "mm" if is_length(name) else "mrad"
+
+
+def _listed(items: list[str]) -> str:
+    return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)

@@ -1,1 +1,0 @@
-"""Poses of an arm as lines in space."""

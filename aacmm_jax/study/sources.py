@@ -1,0 +1,127 @@
+"""Where studies come from: tables from Python (`make_study`), TOML files, and those that ship with the package."""
+
+import os
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from ..core.errors import InputError, nearest
+from ..data.capture import Capture
+from ..data.recording import Recording
+from ..files.arms import load_specification
+from ..files.captures import load_capture
+from ..files.toml import read_toml
+from ..files.whole_file import storable
+from ..kinematics.arm import Arm
+from ..kinematics.specification import ArmSpecification
+from .definition import Study
+from .specification import Specification, checked
+
+_TABLES = ("deviation", "noise", "bounds", "reference", "identification")
+
+
+def make_study(
+    *,
+    arm: Arm | ArmSpecification | str | os.PathLike,
+    trials: int,
+    capture: Capture | Mapping[str, Any],
+    seed: int = 0,
+    name: str = "",
+    **tables: Mapping[str, Any],
+) -> Study:
+    """Make a study from Python; any value of a table may be a list, and the study is the grid of all lists.
+
+    Args:
+        arm: The nominal arm, a shipped name or a file.
+        trials: Trials in each cell of the grid.
+        capture: A table (``positions_mm``, ``sockets`` with a ``region``, or ``file``), or a `Capture` whose
+            configurations are used.
+        seed: Seed of all random numbers.
+        name: Title in tables and reports.
+        **tables: ``deviation``, ``noise``, ``bounds``, ``reference`` and ``identification``, as in TOML; the unit of
+            every number is in its name.
+
+    Returns:
+        The study, checked but not run.
+
+    Raises:
+        InputError: For an unknown table, key or value, naming it.
+    """
+    nominal = arm if isinstance(arm, ArmSpecification) else ArmSpecification(arm) if isinstance(arm, Arm) else None
+    nominal = load_specification(arm) if nominal is None else nominal  # pyright: ignore[reportArgumentType]
+    for key in tables:
+        if key not in _TABLES:
+            raise InputError(f"a study has no table '{key}'{nearest(key, _TABLES)}")
+    recording = None
+    if isinstance(capture, Capture):
+        recording, capture = Recording(capture, nominal), {"file": "(in memory)"}
+    elif not isinstance(capture, Mapping):
+        raise InputError(
+            f"capture is a {type(capture).__name__}; give a table (positions_mm, sockets or file), or a Capture."
+        )
+    elif capture.get("file") is not None:
+        recording = load_capture(capture["file"])
+    specification = checked(name=storable(name), arm=nominal.name, trials=trials, seed=seed, capture=capture, **tables)
+    return Study(specification, nominal, recording)
+
+
+def shipped_studies() -> tuple[str, ...]:
+    """List the studies that ship with the package.
+
+    Returns:
+        Their names, in alphabetical order, for `read_study`.
+    """
+    return tuple(
+        sorted(item.name.removesuffix(".toml") for item in _shipped().iterdir() if item.name.endswith(".toml"))
+    )
+
+
+def read_study(source: str | os.PathLike) -> Study:
+    """Read a study.
+
+    Args:
+        source: A shipped name (``"bound-sensitivity"``), or a TOML file; the arm and the capture that it names are
+            files in the same folder, or ship with the package.
+
+    Returns:
+        The study, checked but not run.
+
+    Raises:
+        InputError: Naming the file, the key in it, and what to do.
+    """
+    if isinstance(source, str) and source in shipped_studies():
+        with resources.as_file(_shipped() / f"{source}.toml") as path:
+            return _study_of_file(path)
+    try:
+        exists = Path(source).exists()
+    except OSError:  # a name too long to be one
+        exists = False
+    if not exists and Path(source).suffix != ".toml":
+        known = nearest(str(source), shipped_studies())
+        raise InputError(f"'{source}' is neither a file nor a study that ships with the package{known}")
+    return _study_of_file(Path(source))
+
+
+def _shipped() -> Any:
+    return resources.files("aacmm_jax.study") / "shipped_studies"
+
+
+def _study_of_file(path: Path) -> Study:
+    specification = read_toml(path, Specification)
+    if not specification.arm and specification.capture.file is None:
+        raise InputError(f"{path}: 'arm' is missing; add it.")
+    try:
+        recording = None
+        if specification.capture.file is not None:
+            recording = load_capture(path.parent / specification.capture.file)
+        if recording is not None and not specification.arm:
+            return Study(specification, recording.nominal, recording)
+        return Study(specification, _arm(path.parent, specification.arm), recording)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _arm(folder: Path, name: str) -> ArmSpecification:
+    neighbour = folder / name
+    return load_specification(neighbour if name.endswith(".toml") or neighbour.is_file() else name)
