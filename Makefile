@@ -1,30 +1,59 @@
-# make demo   set up and run the demonstration
-# make test   set up and run the tests (make test-slow: those that take long)
-# make check  lint and types
-# make bench  identifications a second, against every contender that is installed
-# make reproduce  Cheng et al. 2018, recomputed: benchmarks/cheng2018/REPRODUCTION.md (two minutes on 2 cores)
-# make peers  install the contenders that need a Python environment of their own
-# Everything is installed into .venv in this folder.
+# make demo         set up and run the demonstration: the paper's simulated arm, and a real Franka Panda
+# make test         set up and run the tests (make test-slow: those that take long)
+# make check        lint, types and import contracts
+# make test-newest  a selection of the tests with the newest versions that pyproject.toml allows, installed from scratch
+# make test-lowest  the same with the lowest
+# make bench        identifications a second, against every contender that is installed
+# make reproduce    Cheng et al. 2018, recomputed: benchmarks/cheng2018/REPRODUCTION.md (two minutes on 2 cores)
+# make peers        install the contenders that need a Python environment of their own
+# Everything is installed into .venv in this folder (test-newest and test-lowest: .venv-newest, .venv-lowest).
 
 PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
 BIN := .venv/bin
+INSTALL := -m pip install --quiet --disable-pip-version-check
+PYTEST := -m pytest -n auto --dist loadscope --no-loadscope-reorder
+# Numerics, differentiation, storage and the command line on real captures: what a change of a dependency breaks first.
+SELECTION := tests/test_package.py tests/kinematics tests/solver tests/calibration/test_stages.py \
+	tests/files/test_storage.py tests/test_real_captures.py
+PANDA := aacmm-demo/panda
 
-.PHONY: demo test test-slow check bench peers reproduce clean
+.PHONY: demo test test-slow test-newest test-lowest check bench peers reproduce clean
 
 demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
+	@echo
+	@echo "A real Franka Panda, calibrated in six placements of a tool with two sockets, evaluated in two others:"
+	$(BIN)/aacmm import examples/mukca/capture.toml -o $(PANDA)-capture.h5 > /dev/null
+	$(BIN)/aacmm calibrate $(PANDA)-capture.h5 -o $(PANDA)-calibration.h5 --without 'mid_left/*' --without 'mid_right/*'
+	$(BIN)/aacmm evaluate $(PANDA)-calibration.h5 $(PANDA)-capture.h5 -o $(PANDA)-evaluation.h5
+	$(BIN)/aacmm report $(PANDA)-calibration.h5 -o $(PANDA)-report.html
 
 test: .venv/.test
-	$(BIN)/python -m pytest -n auto --dist loadscope --no-loadscope-reorder
+	$(BIN)/python $(PYTEST)
 
 test-slow: .venv/.test
-	$(BIN)/python -m pytest -n auto --dist loadscope --no-loadscope-reorder -m slow
+	$(BIN)/python $(PYTEST) -m slow
+
+test-newest:
+	rm -rf .venv-newest
+	$(PYTHON) -m venv .venv-newest
+	.venv-newest/bin/python $(INSTALL) --upgrade --upgrade-strategy eager --editable '.[selection]'
+	.venv-newest/bin/python -m pip list --disable-pip-version-check
+	.venv-newest/bin/python $(PYTEST) $(SELECTION)
+
+# Old releases warn of what newer releases of others deprecate.
+test-lowest:
+	rm -rf .venv-lowest
+	$(PYTHON) -m venv .venv-lowest
+	.venv-lowest/bin/python $(INSTALL) --constraint requirements/lowest.txt --editable '.[selection]'
+	.venv-lowest/bin/python $(PYTEST) -W ignore::DeprecationWarning $(SELECTION)
 
 check: .venv/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/lint-imports --no-cache
 
 bench: .venv/.test
 	$(BIN)/python benchmarks/throughput.py
@@ -43,17 +72,17 @@ benchmarks/peers/%/.venv/.done: benchmarks/peers/%/requirements.txt
 	@test -n "$(PYTHON)" || { echo "aacmm_jax needs Python 3.11 or later; install it, or name one with make PYTHON=..."; exit 1; }
 	$(PYTHON) -m venv .venv
 
-.venv/.run: pyproject.toml | .venv/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+.venv/.run: pyproject.toml requirements/tested.txt | .venv/bin/python
+	$(BIN)/python $(INSTALL) --constraint requirements/tested.txt --editable .
 	touch $@
 
-.venv/.test: pyproject.toml | .venv/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+.venv/.test: pyproject.toml requirements/tested.txt | .venv/bin/python
+	$(BIN)/python $(INSTALL) --constraint requirements/tested.txt --editable '.[test]'
 	touch $@ .venv/.run
 
-.venv/.dev: pyproject.toml | .venv/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+.venv/.dev: pyproject.toml requirements/tested.txt | .venv/bin/python
+	$(BIN)/python $(INSTALL) --constraint requirements/tested.txt --editable '.[dev]'
 	touch $@ .venv/.test .venv/.run
 
 clean:
-	rm -rf .venv aacmm-demo
+	rm -rf .venv .venv-newest .venv-lowest aacmm-demo

@@ -1,4 +1,4 @@
-"""Who identifies the paper's problem: this toolkit, Ceres, SciPy, stock Optimistix, pybotics. Each takes a `Task` and starts."""
+"""Solvers of the paper's problem: this toolkit, Ceres, SciPy, stock Optimistix, pybotics; each takes a `Task`."""
 
 import shutil
 import subprocess
@@ -22,7 +22,7 @@ ASKED_DE = 1e-9
 
 
 class Task:
-    """The problems, in the forms that the contenders take."""
+    """The problems, in the forms that the contenders need."""
 
     def __init__(self, poses: int = 70, hold: str | None = None):
         self.arm = aj.load_arm("cheng2018-simulation")
@@ -60,7 +60,7 @@ def ours_alone(task: Task, starts: np.ndarray) -> Found:
 
 
 def ceres(binary: Path, threads: int = 2) -> Contender:
-    """C++ with automatic differentiation, bounds, DENSE_NORMAL_CHOLESKY; problems spread over threads."""
+    """C++ with automatic differentiation, bounds, DENSE_NORMAL_CHOLESKY; problems distributed over threads."""
 
     def run(task: Task, starts: np.ndarray) -> Found:
         arm, n = task.arm, task.arm.joints
@@ -108,34 +108,34 @@ def scipy_trf(analytic: bool) -> Contender:
 
 def numpy_functions(task: Task) -> tuple[Callable, Callable]:
     """Residual and Jacobian in NumPy, all poses at once."""
-    entries, arm, q = task.space.indices(), task.arm, task.q
+    indices, arm, q = task.space.indices(), task.arm, task.q
     n, poses = arm.joints, len(q)
     base = {kind: np.asarray(getattr(arm, kind)) for kind in ("alpha", "a", "d", "theta", "probe")}
 
-    def walk(vector: np.ndarray):
+    def forward_pass(vector: np.ndarray):
         values = {kind: array.copy() for kind, array in base.items()}
-        for value, (kind, i) in zip(vector, entries, strict=True):
+        for value, (kind, i) in zip(vector, indices, strict=True):
             values[kind][i] = value
         x, y, z = (np.tile(axis, (poses, 1)) for axis in np.eye(3))
         origin, axes = np.zeros((poses, 3)), []
         for i in range(n):
-            turn = q[:, i] + values["theta"][i]
-            c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
-            new_x, turned = c * x + s * y, c * y - s * x
+            angle = q[:, i] + values["theta"][i]
+            c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+            new_x, rotated_y = c * x + s * y, c * y - s * x
             new_origin = origin + values["d"][i] * z + values["a"][i] * new_x
             ca, sa = np.cos(values["alpha"][i]), np.sin(values["alpha"][i])
             axes.append((z, origin, new_x, new_origin))
-            x, y, z, origin = new_x, ca * turned + sa * z, ca * z - sa * turned, new_origin
+            x, y, z, origin = new_x, ca * rotated_y + sa * z, ca * z - sa * rotated_y, new_origin
         return origin + values["probe"][0] * x + values["probe"][1] * y + values["probe"][2] * z, axes, (x, y, z)
 
     def residual(vector: np.ndarray) -> np.ndarray:
-        tip = walk(vector)[0]
+        tip = forward_pass(vector)[0]
         return (tip - tip.mean(axis=0)).ravel()
 
     def jacobian(vector: np.ndarray) -> np.ndarray:
-        tip, axes, frame = walk(vector)
+        tip, axes, frame = forward_pass(vector)
         columns = []
-        for kind, i in entries:
+        for kind, i in indices:
             if kind == "probe":
                 column = frame[i]
             else:
@@ -152,7 +152,7 @@ def numpy_functions(task: Task) -> tuple[Callable, Callable]:
 def stock_optimistix(own_rule: bool) -> Contender:
     """`optimistix.LevenbergMarquardt` under vmap, as a user would write it: no bounds, QR.
 
-    ``own_rule``: with this package's arm and so its analytic derivative; else with a chain of 4 x 4 matrices in plain JAX.
+    ``own_rule``: with this package's arm and its analytic derivative; else with a chain of 4 x 4 matrices in plain JAX.
     """
 
     def residual(z, args):
@@ -164,7 +164,10 @@ def stock_optimistix(own_rule: bool) -> Contender:
     @jax.jit
     def solve(starts, args):
         solver = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
-        one = lambda start: optx.least_squares(residual, solver, start, args, max_steps=200, throw=False).value  # noqa: E731
+
+        def one(start):
+            return optx.least_squares(residual, solver, start, args, max_steps=200, throw=False).value
+
         return jax.vmap(one)(starts)
 
     def run(task: Task, starts: np.ndarray) -> Found:
@@ -178,14 +181,14 @@ def stock_optimistix(own_rule: bool) -> Contender:
 
 
 def product_of_matrices(arm: aj.Arm, q: jax.Array) -> jax.Array:
-    """The tip, as a textbook writes it: one homogeneous matrix a joint, multiplied."""
-    pose = jnp.eye(4)
+    """The tip as in a textbook: the product of one homogeneous matrix a joint."""
+    transform = jnp.eye(4)
     for i in range(arm.joints):
         c, s = jnp.cos(q[i] + arm.theta[i]), jnp.sin(q[i] + arm.theta[i])
         ca, sa, a, d = jnp.cos(arm.alpha[i]), jnp.sin(arm.alpha[i]), arm.a[i], arm.d[i]
         rows = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0.0, sa, ca, d], [0.0, 0.0, 0.0, 1.0]]
-        pose = pose @ jnp.stack([jnp.stack([jnp.asarray(x, dtype=float) for x in row]) for row in rows])
-    return (pose @ jnp.append(arm.probe, 1.0))[:3]
+        transform = transform @ jnp.stack([jnp.stack([jnp.asarray(x, dtype=float) for x in row]) for row in rows])
+    return (transform @ jnp.append(arm.probe, 1.0))[:3]
 
 
 def pybotics(python: Path) -> Contender:

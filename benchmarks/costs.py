@@ -1,4 +1,4 @@
-"""What things cost: kinematics per pose, identifications by size of problem, memory, calls and whole processes, arithmetic."""
+"""Costs: kinematics per pose, identifications by size of problem, memory, calls and whole processes, arithmetic."""
 
 import os
 import statistics
@@ -26,8 +26,8 @@ def seconds_of(call: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
-def in_turns(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
-    """Seconds of every call, in sines_cosines, so that all meet the same mood of the machine; a first call of each is not counted."""
+def alternating(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
+    """Seconds of every call; the calls alternate, so that all see the same load, and a first call is not counted."""
     for call in calls.values():
         jax.block_until_ready(call())
     times: dict[str, list[float]] = {name: [] for name in calls}
@@ -44,7 +44,7 @@ def kinematics(rounds: int, poses: int = 10_000) -> list[Row]:
     vector = np.asarray(task.space.vector())
     residual, jacobian = numpy_functions(task)
     names, joints = task.space.names, [f"q_{i + 1}" for i in range(task.arm.joints)]
-    times = in_turns(
+    times = alternating(
         {
             "tip: aacmm_jax": lambda: task.arm.position(task.q),
             "tip: NumPy, vectorised": lambda: residual(vector),
@@ -55,7 +55,11 @@ def kinematics(rounds: int, poses: int = 10_000) -> list[Row]:
         rounds,
     )
     python = peer_python("pinocchio")
-    named = {"position": "tip", "jacobian": "Jacobian by q, 6 columns", "regressor": "regressor by placements, 36 columns"}
+    named = {
+        "position": "tip",
+        "jacobian": "Jacobian by q, 6 columns",
+        "regressor": "regressor by placements, 36 columns",
+    }
     if python:
         peer = run_peer(python, HERE / "peers/pinocchio/measure.py", task, rounds=rounds)
         difference = float(np.max(np.abs(peer["tips"] - np.asarray(task.arm.position(task.q)))))
@@ -73,25 +77,23 @@ def identifications(rounds: int) -> list[Row]:
     batches = (100, 1_000, 10_000, 100_000) if on_cpu else (100, 1_000, 10_000, 100_000, 1_000_000)
     tasks = {f"batch {count:,}": (task, count) for count in batches}
     tasks |= {
-        f"{poses:,} poses": (Task(poses, hold="d_3"), max(16, min(2_000, 140_000 // poses))) for poses in (70, 700, 7_000)
+        f"{poses:,} poses": (Task(poses, hold="d_3"), max(16, min(2_000, 140_000 // poses)))
+        for poses in (70, 700, 7_000)
     }
     tasks["70,000 poses"] = (Task(70_000, hold="d_3"), 4)
     tasks |= {f"{joints} joints": (joints_task(joints), 1_000) for joints in range(3, 10)}
     starts = {name: each.starts(count, 1) for name, (each, count) in tasks.items()}
-    many = lambda name: aj.identify_many(  # noqa: E731
-        tasks[name][0].arm,
-        tasks[name][0].capture,
-        tasks[name][0].lower,
-        tasks[name][0].upper,
-        starts[name],
-        hold=tasks[name][0].hold,
-    )
+
+    def many(name: str) -> aj.calibration.ManyIdentifications:
+        each = tasks[name][0]
+        return aj.identify_many(each.arm, each.capture, each.lower, each.upper, starts[name], hold=each.hold)
+
     solved = {name: many(name) for name in tasks}
     times: dict[str, list[float]] = {name: [] for name in tasks}
-    for turn in range(rounds):
+    for number in range(rounds):
         for name in tasks:
-            if turn < 3 or "100,000" not in name:
-                # A short batch is repeated until it takes as long as a clock and a scheduler can be trusted with.
+            if number < 3 or "100,000" not in name:
+                # A short batch is repeated for 0.3 s, so that clock and scheduler do not matter.
                 repeats = max(1, round(0.3 / max(min(times[name], default=0.3), 1e-3)))
                 times[name].append(
                     seconds_of(lambda name=name, repeats=repeats: [many(name) for _ in range(repeats)]) / repeats
@@ -152,7 +154,8 @@ def peak(count: int) -> float:
 def calls() -> list[Row]:
     """First and second call in a fresh process without a compilation cache, seconds."""
     program = (
-        "import time, numpy as np\nfrom contenders import Task\nimport aacmm_jax as aj\nt = Task(hold='d_3'); s = t.starts(1000, 1)\n"
+        "import time, numpy as np\nfrom contenders import Task\nimport aacmm_jax as aj\n"
+        "t = Task(hold='d_3'); s = t.starts(1000, 1)\n"
         "b = aj.Bounds(t.space, t.lower, t.upper)\n"
         "one = lambda: float(aj.identify(t.arm, t.capture, b, hold='d_3', start=s[0]).de)\n"
         "many = lambda: aj.identify_many(t.arm, t.capture, t.lower, t.upper, s, hold='d_3')\n"
@@ -168,7 +171,7 @@ def calls() -> list[Row]:
 
 
 def commands(rounds: int) -> list[Row]:
-    """Whole processes, in sines_cosines: a cold and a warm `aacmm calibrate` on 70 poses, and the import of its two heaviest parts."""
+    """Whole processes, alternating: `aacmm calibrate` on 70 poses, cold and warm, and its heaviest imports."""
     program = str(Path(sys.executable).with_name("aacmm"))
     with tempfile.TemporaryDirectory() as folder:
         sockets = ["--socket", "A=400,200,300", "--socket", "B=600,200,300", "--poses", "70", "--poses", "B=1"]
@@ -184,12 +187,16 @@ def commands(rounds: int) -> list[Row]:
         calibrate = (program, "calibrate", "capture.h5", "-o", "calibration.h5")
         run(*calibrate)
         times: dict[str, list[float]] = {"cold": [], "warm": [], "import": []}
-        for turn in range(rounds):
-            if turn < 3:
-                times["cold"].append(run(*calibrate, JAX_COMPILATION_CACHE_DIR=f"{folder}/cold-{turn}"))
+        for number in range(rounds):
+            if number < 3:
+                times["cold"].append(run(*calibrate, JAX_COMPILATION_CACHE_DIR=f"{folder}/cold-{number}"))
             times["warm"].append(run(*calibrate))
             times["import"].append(run(sys.executable, "-c", "import jax, optimistix"))
-    named = {"cold": "aacmm calibrate, cold", "warm": "aacmm calibrate, warm", "import": "python -c 'import jax, optimistix'"}
+    named = {
+        "cold": "aacmm calibrate, cold",
+        "warm": "aacmm calibrate, warm",
+        "import": "python -c 'import jax, optimistix'",
+    }
     base = statistics.median(times["import"])
     return [
         {"what": named[key], "seconds": statistics.median(t), "of_the_import": statistics.median(t) / base}
@@ -202,7 +209,7 @@ def arithmetic(rounds: int) -> list[Row]:
 
     Counted for one evaluation of N poses, n joints and p free parameters: the chain 33 n N, a cross product and a
     difference for each of 2n rotations 24 n N, and the Gram matrix with the gradient 2 p (p + 1) 3 N. What a step adds
-    (factorisation, judging) is time but not counted, so the share is a lower bound.
+    (factorisation, acceptance) is time but not counted, so the share is a lower bound.
     """
     task, count = Task(hold="d_3"), 10_000
     starts = task.starts(count, 1)
@@ -211,7 +218,7 @@ def arithmetic(rounds: int) -> list[Row]:
     product = jax.jit(lambda m: m @ m)
     many = lambda: aj.identify_many(task.arm, task.capture, task.lower, task.upper, starts, hold="d_3")  # noqa: E731
     evaluations = float(np.sum(many().steps))
-    times = in_turns({"evaluations": lambda: many().de, "product": lambda: product(matrix)}, rounds)
+    times = alternating({"evaluations": lambda: many().de, "product": lambda: product(matrix)}, rounds)
     poses, n, p = len(task.q), task.arm.joints, len(task.space.names) - 1
     operations = poses * (57 * n + 6 * p * (p + 1))
     reached = operations * evaluations / statistics.median(times["evaluations"]) / 1e9

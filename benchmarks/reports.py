@@ -1,7 +1,8 @@
-"""What a report costs and whether a real browser shows it: ``python benchmarks/reports.py [folder of real captures]``.
+"""The cost of a report, and whether a browser shows it: ``python benchmarks/reports.py``.
 
-Writes the reports of the demonstration, of a real capture where there is one, of an acceptance test and of a study; times the command in fresh processes (the second
-of two counts: programs are compiled by then); opens each in Chromium at 400 and 1600 px; and keeps the figures in results/. Screenshots and PDFs go to a folder that is printed.
+Writes the reports of the demonstration, of the real Panda in examples/mukca, of an acceptance test and of a study;
+times the command in fresh processes (the second of two counts: programs are compiled by then); opens each report in
+Chromium at 400 and 1600 px; and keeps the measurements in results/. It prints the folder of screenshots and PDFs.
 """
 
 import datetime
@@ -14,6 +15,7 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
+PANDA = HERE.parent / "examples/mukca/capture.toml"
 STUDY = """
 arm = "cheng2018-simulation"
 trials = 200
@@ -21,18 +23,6 @@ seed = 1
 capture = { positions_mm = [[400, 200, 300]], poses = [20, 70] }
 noise = { encoder_arcsec = [1, 2, 5], seating_mm = 0.005 }
 reference = { length_mm = 500, u_mm = 0.002, region = { distance_mm = [300, 1000] } }
-"""
-MANIFEST = """
-arm = "panda"
-angles = {{ unit = "rad" }}
-[[socket]]
-name = "{{place}}/{{hole}}"
-file = "{folder}/panda_2_clean/{{place}}/hole_{{hole}}.csv"
-[[length]]
-from = "{{place}}/0"
-to = "{{place}}/1"
-value = 50.0
-u = 0.01
 """
 
 
@@ -47,47 +37,27 @@ def run(folder: Path, *arguments: str) -> float:
     return time.perf_counter() - start
 
 
-def files(folder: Path, real: Path | None) -> dict[str, str]:
+def files(folder: Path) -> dict[str, str]:
     """The files to report on, by what they are."""
     run(folder, "demo", "demo")
-    run(
-        folder,
-        "simulate",
-        "demo/nominal.toml",
-        "--true-arm",
-        "demo/true.toml",
-        "--acceptance",
-        "iso",
-        "--encoder-arcsec",
-        "2",
-        "-o",
-        "iso.h5",
-    )
-    run(
-        folder,
-        "evaluate",
-        "demo/calibration.h5",
-        "iso.h5",
-        "--mpe",
-        "E_Uni=0.05+L/20000",
-        "--test-u-mm",
-        "0.001",
-        "-o",
-        "acceptance.h5",
-    )
+    acceptance = ("--true-arm", "demo/true.toml", "--acceptance", "iso", "--encoder-arcsec", "2")
+    run(folder, "simulate", "demo/nominal.toml", *acceptance, "-o", "iso.h5")
+    limits = ("--mpe", "E_Uni=0.05+L/20000", "--test-u-mm", "0.001")
+    run(folder, "evaluate", "demo/calibration.h5", "iso.h5", *limits, "-o", "acceptance.h5")
     (folder / "study.toml").write_text(STUDY)
     run(folder, "study", "study.toml", "-o", "study.h5")
-    found = {"demo": "demo/calibration.h5", "acceptance test": "acceptance.h5", "study": "study.h5"}
-    if real is not None:
-        (folder / "real.toml").write_text(MANIFEST.format(folder=real.as_posix()))
-        run(folder, "import", "real.toml", "-o", "real-capture.h5")
-        run(folder, "calibrate", "real-capture.h5", "-o", "real.h5", "--without", "mid_*/*")
-        found["real capture"] = "real.h5"
-    return found
+    run(folder, "import", str(PANDA), "-o", "real-capture.h5")
+    run(folder, "calibrate", "real-capture.h5", "-o", "real.h5", "--without", "mid_*/*")
+    return {
+        "demo": "demo/calibration.h5",
+        "acceptance test": "acceptance.h5",
+        "study": "study.h5",
+        "real capture": "real.h5",
+    }
 
 
 def shown(page: Path, shots: Path) -> dict:
-    """What Chromium makes of a page."""
+    """What Chromium shows of a page, requests and complains about."""
     from playwright.sync_api import sync_playwright
 
     found = {}
@@ -127,10 +97,9 @@ def shown(page: Path, shots: Path) -> dict:
 
 
 def main() -> None:
-    real = Path(sys.argv[1]).resolve() if len(sys.argv) > 1 else None
     folder = Path(tempfile.mkdtemp(prefix="aacmm-reports-"))
     results = {}
-    for name, file in files(folder, real).items():
+    for name, file in files(folder).items():
         page = folder / f"{name.replace(' ', '-')}.html"
         seconds = [run(folder, "report", file, "-o", page.name) for _ in range(3)]
         results[name] = {"seconds": [round(x, 2) for x in seconds], "MB": round(page.stat().st_size / 1e6, 2)}

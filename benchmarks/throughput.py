@@ -1,9 +1,9 @@
-"""Identifications a second, every contender on the same problems, tolerance and machine, in one run and in sines_cosines.
+"""Identifications a second: every contender on the same problems, tolerance and machine, alternating in one run.
 
-The problem is the paper's: 70 noise-free poses, 21 parameters, random starts in simulation 1's box, DE <= 1e-9 mm asked of every
-problem. Then what kinematics, sizes of problems, memory, calls and whole commands cost. Prints tables (medians, and the spread over the
-rounds) and writes all as JSON into benchmarks/results/. Contenders that are not installed are named as absent;
-`make peers` installs those that Python can.
+The problem is the paper's: 70 noise-free poses, 21 parameters, random starts in the box of simulation 1, and DE of at
+most 1e-9 mm in every problem. Then the costs of kinematics, sizes of problems, memory, calls and whole commands. Prints
+tables (medians, and the range over the rounds) and writes everything as JSON into benchmarks/results/. Contenders that
+are not installed are named as absent; `make peers` installs those that pip can.
 
     python benchmarks/throughput.py [--rounds 5] [--only contenders --only kinematics ...]
 """
@@ -52,9 +52,9 @@ def race(task: Task, entrants: dict[str, tuple[Contender | None, int]], rounds: 
         run(task, task.starts(count, 0))  # compile, warm up
     rates: dict[str, list[float]] = {name: [] for name in present}
     des: dict[str, list[np.ndarray]] = {name: [] for name in present}
-    for turn in range(1, rounds + 1):
+    for number in range(1, rounds + 1):
         for name, (run, count) in present.items():
-            seconds, found = run(task, task.starts(count, turn))
+            seconds, found = run(task, task.starts(count, number))
             rates[name].append(count / seconds)
             des[name].append(task.de(found))
     rows = []
@@ -117,7 +117,9 @@ def table_of(title: str, rows: list[Row]) -> Table:
     for i, column in enumerate(columns):
         table.add_column(column.replace("_", " "), justify="left" if i == 0 else "right")
     for row in rows:
-        table.add_row(*("absent" if row.get("absent") and i == 1 else shown(row.get(key)) for i, key in enumerate(columns)))
+        table.add_row(
+            *("absent" if row.get("absent") and i == 1 else shown(row.get(key)) for i, key in enumerate(columns))
+        )
     return table
 
 

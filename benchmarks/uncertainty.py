@@ -1,7 +1,7 @@
 """Are the uncertainties right? Coverage of 95 % intervals, planning against random poses, and real captures.
 
-``python benchmarks/uncertainty.py [PART ...]`` runs the parts named (default: all but ``real``, which needs the captures:
-``real --captures FOLDER``) and writes ``results/uncertainty-DATE-PART.json``. About 20 minutes on two cores in all.
+``python benchmarks/uncertainty.py [PART ...]`` runs the parts named (default: all) and writes
+``results/uncertainty-DATE-PART.json``. About 20 minutes on two cores in all.
 """
 
 import argparse
@@ -23,13 +23,14 @@ from aacmm_jax.kinematics.inverse_kinematics import project_to_targets
 from aacmm_jax.study.drawing import draw
 from aacmm_jax.uncertainty.volume import sample_lengths
 
+CAPTURES = Path(__file__).resolve().parents[1] / "examples/mukca"
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
 SIZES, NAMES = (70, 5, 5), ("S", "A", "B")
 ENDS = [[[400, 200, 300], [700, 500, 500]]]
 
 
 def study_of(trials: int, length_bound: float) -> aj.study.Study:
-    """The paper's arm off by up to 1 mm and 0.1 deg; 70 poses in a socket, five at each end of one length with u = 2 um."""
+    """The paper's arm off by up to 1 mm and 0.1 deg; 70 poses in a socket, five at each end of a length, u = 2 um."""
     return aj.study.make_study(
         arm="cheng2018-simulation",
         trials=trials,
@@ -61,8 +62,8 @@ def lengths_over_volume(arm: aj.Arm) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.concatenate(column) for column in zip(*pairs, strict=True))
 
 
-def calibrated(study, drawn, lengths, method, noise, form, hold="d_3"):
-    """Every trial by `aj.calibrate`: normalised errors of parameters, k and lengths, the factor, and which are active."""
+def calibrated(study, drawn, lengths, method, noise, noise_model, hold="d_3"):
+    """Every trial by `aj.calibrate`: errors of parameters, k and lengths, their u, coverage factor, active bounds."""
     arm, space = study.nominal.arm, study.space
     bounds = aj.Bounds(space, drawn.lower[0], drawn.upper[0])
     start, end = (jnp.asarray(q) for q in lengths)
@@ -70,7 +71,9 @@ def calibrated(study, drawn, lengths, method, noise, form, hold="d_3"):
 
     def one(row):
         q, value, true = row
-        result = aj.calibrate(arm, capture_of(q, value), bounds, method=method, noise=noise, noise_model=form, hold=hold)
+        result = aj.calibrate(
+            arm, capture_of(q, value), bounds, method=method, noise=noise, noise_model=noise_model, hold=hold
+        )
         uncertainty = aj.uncertainty_of(result)
         factor.append(uncertainty.factor(0.95))
 
@@ -112,20 +115,24 @@ def coverage(trials: int = 10_000) -> dict:
     drawn, lengths = drawn_of(study, trials), lengths_over_volume(study.nominal.arm)
     found = {"trials": trials}
     for method in ("joint", "two-stage"):
-        for noise, form in ((NOISE, "given"), (None, "estimated"), (None, "common"), (None, "robust")):
+        for noise, noise_model in ((NOISE, "given"), (None, "estimated"), (None, "common"), (None, "robust")):
             begun = time.perf_counter()
-            errors, u, factor, active, good = calibrated(study, drawn, lengths, method, noise, form)
+            errors, u, factor, active, good = calibrated(study, drawn, lengths, method, noise, noise_model)
             row = coverage_row(np.abs(errors) <= factor * u, study.space.names)
-            row |= {"factor": round(factor, 3), "converged": float(good.mean()), "active": int(np.any(active, axis=1).sum())}
+            row |= {
+                "factor": round(factor, 3),
+                "converged": float(good.mean()),
+                "active": int(np.any(active, axis=1).sum()),
+            }
             row["seconds"] = round(time.perf_counter() - begun, 1)
-            found[f"{method}, {form}"] = row
-            print(method, form, row, flush=True)
+            found[f"{method}, {noise_model}"] = row
+            print(method, noise_model, row, flush=True)
     return found
 
 
 def sampled(trials: int = 10_000, draws: int = 199, length_bound: float = 10.0) -> dict:
-    """Monte Carlo intervals: of each calibration, 199 repetitions about its own result; the interval is between the 5th and the
-    195th, which holds one more independent draw in 190 of 200 cases."""
+    """Monte Carlo intervals: of each calibration, 199 repetitions about its own result; the interval is from the 5th to
+    the 195th, which contains one more independent draw in 190 of 200 cases."""
     study = study_of(trials, length_bound)
     drawn, lengths = drawn_of(study, trials), lengths_over_volume(study.nominal.arm)
     arm, space = study.nominal.arm, study.space
@@ -199,7 +206,11 @@ def bounded(trials: int = 10_000) -> dict:
             inside = (np.abs(errors) <= factor * u).astype(float)
             inside[:, :p][active != 0] = np.nan  # on a bound: flagged, no interval is claimed
             row = {"active": round(100 * float(held.mean()), 1), "truth_outside": round(100 * float(outside.mean()), 1)}
-            for what, rows in (("none active", ~held), ("active, truth inside", held & ~outside), ("truth outside", outside)):
+            for what, rows in (
+                ("none active", ~held),
+                ("active, truth inside", held & ~outside),
+                ("truth outside", outside),
+            ):
                 if rows.sum() > 50:
                     row[what] = coverage_row(inside[rows], study.space.names)
             found[f"half-width {width} mm, {method}, hold {hold}"] = row
@@ -208,7 +219,7 @@ def bounded(trials: int = 10_000) -> dict:
 
 
 def planned(sets: int = 100) -> dict:
-    """Planned poses against 70 random ones: the largest uncertainty of 400 lengths of 300 mm, by formula and by simulation."""
+    """Planned against 70 random poses: the largest uncertainty of 400 lengths of 300 mm, by formula and simulation."""
     arm = aj.load_arm("cheng2018-simulation")
     space = aj.Parameters.free_of(arm)
     start, end = sample_lengths(arm, 400, length=300.0, seed=99)
@@ -220,27 +231,27 @@ def planned(sets: int = 100) -> dict:
             plan = aj.planning.plan(arm, sockets=4, poses=25, seed=seed, above=above)
             seconds = time.perf_counter() - begun
             row = {"seed": seed, "table": above == 0.0, "seconds": round(seconds, 1)}
-            row |= judged(arm, space, plan.capture(), start, end, 1000)
+            row |= largest_uncertainty(arm, space, plan.capture(), start, end, 1000)
             found["plans"].append(row)
             print("plan", row, flush=True)
     given = {"S": (400, 200, 300), "A": (400, 200, 300), "B": (700, 500, 500)}
     planned_sockets = plan.sockets
+    demonstration = {name: given[name] for name in "AB"}
+    one, two = [("A", "B", 0.0)], [("A", "B", 0.0), ("C", "D", 0.0)]
     for name, sockets, poses, lengths in (
-        ("70 random: 60 and 10 in the demonstration's sockets", {k: given[k] for k in "AB"}, {"A": 60, "B": 10}, [("A", "B", 0.002)]),
-        ("70 random: 35 and 35 in the demonstration's sockets", {k: given[k] for k in "AB"}, 35, [("A", "B", 0.002)]),
-        ("70 random in the last plan's sockets", planned_sockets, {"A": 18, "B": 18, "C": 17, "D": 17}, [("A", "B", 0.002), ("C", "D", 0.002)]),
-        ("25 random in the last plan's sockets", planned_sockets, {"A": 7, "B": 6, "C": 6, "D": 6}, [("A", "B", 0.002), ("C", "D", 0.002)]),
-    ):  # fmt: skip
-        rows = [
-            judged(arm, space, aj.simulate(arm, sockets, poses=poses, lengths=[(*pair[:2], 0.0) for pair in lengths], seed=s), start, end, 100)
-            for s in range(sets)
-        ]  # fmt: skip
+        ("70 random: 60 and 10 in the demonstration's sockets", demonstration, {"A": 60, "B": 10}, one),
+        ("70 random: 35 and 35 in the demonstration's sockets", demonstration, 35, one),
+        ("70 random in the last plan's sockets", planned_sockets, {"A": 18, "B": 18, "C": 17, "D": 17}, two),
+        ("25 random in the last plan's sockets", planned_sockets, {"A": 7, "B": 6, "C": 6, "D": 6}, two),
+    ):
+        captures = (aj.simulate(arm, sockets, poses=poses, lengths=lengths, seed=seed) for seed in range(sets))
+        rows = [largest_uncertainty(arm, space, capture, start, end, 100) for capture in captures]
         found[name] = {key: round(float(np.median([row[key] for row in rows])), 2) for key in rows[0]}
         print(name, found[name], flush=True)
     return found
 
 
-def judged(arm, space, capture, start, end, draws) -> dict:
+def largest_uncertainty(arm, space, capture, start, end, draws) -> dict:
     """Largest standard uncertainty of lengths, um: predicted, and found in simulated calibrations."""
     lengths = [aj.ReferenceLength(r.start, r.end, r.value, 0.002) for r in capture.lengths]
     capture = aj.Capture(capture.sockets, lengths)
@@ -258,13 +269,20 @@ def judged(arm, space, capture, start, end, draws) -> dict:
     values = np.array([float(r.value) for r in lengths]) + 0.002 * random.normal(size=(draws, len(lengths)))
     many = aj.calibrate_many(arm, batch_of(capture, q, values), bounds.lower, bounds.upper, method="joint", noise=NOISE)
     measured = _measured(space, jnp.asarray(many.parameters), jnp.asarray(start), jnp.asarray(end))
-    off = 1e3 * (np.asarray(measured) - np.linalg.norm(np.asarray(arm.position(start)) - np.asarray(arm.position(end)), axis=1))
+    off = 1e3 * (
+        np.asarray(measured) - np.linalg.norm(np.asarray(arm.position(start)) - np.asarray(arm.position(end)), axis=1)
+    )
     rms = np.sqrt(np.mean(off**2, axis=0))
     # The largest of 400 estimates is too large by chance: the length of the largest prediction is looked at too.
     at = int(np.argmax(predicted))
-    return {"largest_predicted": round(float(predicted.max()), 2), "found_there": round(float(rms[at]), 2),
-            "median_predicted": round(float(np.median(predicted)), 2), "median_found": round(float(np.median(rms)), 2),
-            "largest_found": round(float(rms.max()), 2)}  # fmt: skip
+    metrics = {
+        "largest_predicted": predicted.max(),
+        "found_there": rms[at],
+        "median_predicted": np.median(predicted),
+        "median_found": np.median(rms),
+        "largest_found": rms.max(),
+    }
+    return {name: round(float(value), 2) for name, value in metrics.items()}
 
 
 @eqx.filter_jit
@@ -276,23 +294,19 @@ def _measured(space, vectors, start, end):
     return jax.lax.map(one, vectors, batch_size=100)
 
 
-def real(folder: Path) -> dict:
-    """Recorded captures: what the placements identified from predict of the placement left out, and what is found there."""
-    from aacmm_jax.calibration.cross_validation import cross_validate
-
+def real() -> dict:
+    """Recorded captures: errors in each placement left out, predicted from the others and found."""
     found = {}
-    for name, arm, bound in (("panda_2_clean", "panda", None), ("panda_6", "panda", 10.0), ("kuka_14", "iiwa14", None)):
-        places = sorted(path.name for path in (folder / name).iterdir() if path.is_dir())
-        sockets = {
-            f"{place}/{hole}": np.loadtxt(folder / name / place / f"hole_{hole}.csv", delimiter=",")
-            for place in places
-            for hole in (0, 1)
-        }
-        capture = aj.Capture(sockets, [aj.ReferenceLength(f"{p}/0", f"{p}/1", 50.0, 0.01) for p in places])
-        nominal = aj.files.load_specification(arm)
+    for name, manifest, bound in (
+        ("panda_2_clean", "capture", None),
+        ("panda_6", "panda_6", 10.0),
+        ("kuka_14", "kuka_14", None),
+    ):
+        recording = aj.files.read_manifest(CAPTURES / f"{manifest}.toml")
+        capture, nominal = recording.capture, recording.nominal
         nominal = nominal if bound is None else nominal._replace(length=bound)
         for method in ("two-stage", "joint"):
-            checked = cross_validate(nominal.arm, capture, nominal.bounds(), method=method, hold="d_3")
+            checked = aj.cross_validate(nominal.arm, capture, nominal.bounds(), method=method, hold="d_3")
             row = {
                 "rms_mm": checked.rms,
                 "rms_predicted_mm": checked.rms_predicted,
@@ -305,24 +319,17 @@ def real(folder: Path) -> dict:
     return found
 
 
-PARTS = {"coverage": coverage, "sampled": sampled, "bounded": bounded, "planned": planned}
+PARTS = {"coverage": coverage, "sampled": sampled, "bounded": bounded, "planned": planned, "real": real}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", nargs="*", choices=[*PARTS, "real", []], default=[])
-    parser.add_argument("--captures", type=Path, help="folder of the MUKCa captures, for the part real")
+    parser.add_argument("part", nargs="*", choices=[*PARTS, []], default=[])
     parser.add_argument("--trials", type=int, help="instead of 10,000")
     given = parser.parse_args()
     for part in given.part or list(PARTS):
-        if part == "real":
-            if given.captures is None:
-                parser.error("the part real needs --captures FOLDER")
-            found = real(given.captures)
-        elif part == "planned" or given.trials is None:
-            found = PARTS[part]()
-        else:
-            found = PARTS[part](given.trials)
+        trials = () if part in ("planned", "real") or given.trials is None else (given.trials,)
+        found = PARTS[part](*trials)
         path = Path(__file__).parent / "results" / f"uncertainty-{datetime.date.today()}-{part}.json"
         path.write_text(json.dumps(found, indent=1) + "\n")
 

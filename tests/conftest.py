@@ -1,4 +1,4 @@
-"""Strictness for all tests: shapes checked at run time, no silent promotion of rank or dtype, warnings are errors."""
+"""Strictness for all tests: shapes checked at run time, no silent promotion of rank or dtype; and common fixtures."""
 
 import os
 import subprocess
@@ -14,17 +14,15 @@ from . import run_time_types as run_time_types  # named in the hook below, as an
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 install_import_hook("aacmm_jax", "tests.run_time_types.checked")
-import aacmm_jax as aj  # noqa: E402 - the hook checks what is imported after it
+import aacmm_jax as aj  # noqa: E402 - the hook is never removed, and checks every module imported after it
 
-SHARED = Path(__file__).resolve().parents[2] / "shared"
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
 @pytest.fixture(scope="session")
-def shared() -> Path:
-    """Folder of real captures and published numbers, which stands beside a developer's checkout only."""
-    if not (SHARED / "data" / "mukca").is_dir():
-        pytest.skip("the shared data stand beside a developer's checkout only")
-    return SHARED
+def mukca() -> Path:
+    """Folder of the real captures, with a manifest for each set."""
+    return EXAMPLES / "mukca"
 
 
 @pytest.fixture(scope="session")
@@ -69,21 +67,41 @@ def noisy_capture(paper_arm) -> "aj.Capture":
     """The paper's simulation with the noise of a real arm: 2 arcsec and 5 um."""
     sockets = {"A": (400, 200, 300), "B": (600, 200, 300)}
     return aj.simulate(
-        paper_arm, sockets, poses={"A": 70, "B": 5}, lengths=[("A", "B", 0.002)], encoder_arcsec=2.0, seating=0.005, seed=5
+        paper_arm,
+        sockets,
+        poses={"A": 70, "B": 5},
+        lengths=[("A", "B", 0.002)],
+        encoder_arcsec=2.0,
+        seating=0.005,
+        seed=5,
     )
 
 
-# Modules that take longest, the longest first: started last, one of them would keep a single worker busy at the end.
-_LONGEST = """
-cli/test_cli study/test_trials uncertainty/test_uncertainty calibration/test_stages report/test_report study/test_store
-solver/test_solver calibration/test_sampling planning/test_planning drift/test_drift test_real_captures test_readme
-acceptance/test_acceptance uncertainty/test_identifiability kinematics/test_chain study/test_results calibration/test_batch
-test_paper
-""".split()
+# Modules in decreasing order of their run time: a long one started last would keep a single worker busy at the end.
+LONGEST = (
+    "cli/test_cli",
+    "study/test_trials",
+    "uncertainty/test_uncertainty",
+    "calibration/test_stages",
+    "report/test_report",
+    "study/test_store",
+    "solver/test_solver",
+    "calibration/test_sampling",
+    "planning/test_planning",
+    "drift/test_drift",
+    "test_real_captures",
+    "test_readme",
+    "acceptance/test_acceptance",
+    "uncertainty/test_identifiability",
+    "kinematics/test_chain",
+    "study/test_results",
+    "calibration/test_batch",
+    "test_paper",
+)
 
 
 def pytest_collection_modifyitems(items):
-    """Modules in order of their length (with ``--no-loadscope-reorder``); within them nothing changes places."""
+    """Sort the modules by run time (needs ``--no-loadscope-reorder``); the order within a module is kept."""
     here = Path(__file__).parent
-    rank = {name: number for number, name in enumerate(_LONGEST)}
+    rank = {name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.relative_to(here).with_suffix("").as_posix(), len(rank)))

@@ -1,4 +1,4 @@
-"""The benchmark scripts run, measure the same thing for everybody, and name who is absent."""
+"""The benchmark scripts run, measure the same thing for every contender, and name those that are absent."""
 
 import json
 import subprocess
@@ -35,16 +35,8 @@ def test_contenders_minimise_the_same_residual(contenders):
 
 
 def test_a_part_runs_and_names_who_is_absent(tmp_path):
-    command = [
-        sys.executable,
-        ROOT / "benchmarks/throughput.py",
-        "--rounds",
-        "1",
-        "--only",
-        "kinematics",
-        "--results",
-        tmp_path,
-    ]
+    options = ["--rounds", "1", "--only", "kinematics", "--results", tmp_path]
+    command = [sys.executable, ROOT / "benchmarks/throughput.py", *options]
     done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=tmp_path, timeout=300)
     (file,) = tmp_path.glob("throughput-*.json")
     rows = json.loads(file.read_text())["results"]["kinematics"]

@@ -1,20 +1,25 @@
-"""The package's face: every name is there, whether it is imported at once or when first asked for."""
+"""The package as it is imported: names that are loaded late, shapes checked in every module, a readable description."""
 
+import importlib
 import pickle
+import pkgutil
+import re
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
 import aacmm_jax as aj
 
+ROOT = Path(__file__).resolve().parents[1]
 
-def test_every_public_name_is_there():
-    for name in aj.__all__:
-        assert getattr(aj, name) is not None
+
+def test_an_unknown_name_is_an_attribute_error():
     assert set(aj.__all__) <= set(dir(aj))
     assert pickle.loads(pickle.dumps(aj.load_arm)) is aj.load_arm
-    with pytest.raises(AttributeError, match="no attribute 'lod_arm'"):
+    with pytest.raises(AttributeError, match=r"attribute '?lod_arm"):
         aj.lod_arm  # noqa: B018
 
 
@@ -22,9 +27,52 @@ def test_every_public_name_is_there():
     "line",
     [
         "from aacmm_jax import *; print(load_arm('panda').joints)",
-        "import aacmm_jax; print(aacmm_jax.arm_files.load_arm('panda').joints)",
+        "import aacmm_jax; print(aacmm_jax.files.load_arm('panda').joints)",
     ],
 )
 def test_late_names_in_a_fresh_process(line):
     done = subprocess.run([sys.executable, "-c", line], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, "7\n"), done.stderr
+
+
+def test_every_module_is_checked_at_run_time():
+    """The hook of ``conftest.py`` checks the types of every module, whenever it is imported."""
+    for info in pkgutil.walk_packages(aj.__path__, "aacmm_jax."):
+        if info.name != "aacmm_jax.__main__":
+            loader = importlib.import_module(info.name).__spec__.loader
+            assert type(loader).__name__ == "_JaxtypingLoader", info.name
+
+
+LATE = """
+import sys
+import tests.conftest  # as pytest does, before anything else
+import aacmm_jax as aj, jax.numpy as jnp, jaxtyping
+
+assert "aacmm_jax.model.metrics" not in sys.modules
+measured = aj.model.repeatability
+assert "aacmm_jax.model.metrics" in sys.modules
+assert float(measured(jnp.zeros((4, 3)), (4,)).de) == 0.0
+try:
+    measured(jnp.zeros((4, 2)), (4,))
+except jaxtyping.TypeCheckError:
+    print("caught")
+"""
+
+
+def test_a_wrong_shape_is_caught_in_a_module_that_is_imported_late():
+    done = subprocess.run([sys.executable, "-c", LATE], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "caught\n"), done.stderr
+
+
+@pytest.mark.parametrize("link", ["docs/scaling.md", "docs/demo.png"])
+def test_the_description_on_an_index_has_no_relative_links(link):
+    """It is the README, whose links to files and images become paths in the source distribution."""
+    readme = (ROOT / "README.md").read_text()
+    assert f"]({link})" in readme
+    hook = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["metadata"]["hooks"][
+        "fancy-pypi-readme"
+    ]
+    for substitution in hook["substitutions"]:
+        readme = re.sub(substitution["pattern"], substitution["replacement"], readme)
+    assert all(target.startswith("https://") for target in re.findall(r"\]\(([^)]*)\)", readme))
+    assert f"`{link}`" in readme

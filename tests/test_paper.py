@@ -23,12 +23,12 @@ def test_default_parameters_are_the_papers(paper_arm):
 @pytest.mark.parametrize("hold", [None, "d_3"])
 @pytest.mark.parametrize("number", [1, 2])
 def test_noise_free_simulation_from_random_starts(paper_arm, paper_capture, number, hold):
-    """Table 1: every start converges to a DE of rounding error (paper: 7e-5 and 8e-5 mm), and one length then gives all."""
+    """Table 1: DE is rounding error from every start (paper: 7e-5 and 8e-5 mm), then one length gives the others."""
     space = aj.Parameters.free_of(paper_arm)
     bounds, truth = box(space, number), np.asarray(space.vector(paper_arm))
-    share = np.random.default_rng(number).uniform(size=(STARTS, len(space.names)))
+    fraction = np.random.default_rng(number).uniform(size=(STARTS, len(space.names)))
     lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)
-    starts = jnp.asarray(lower + (upper - lower) * share)
+    starts = jnp.asarray(lower + (upper - lower) * fraction)
 
     @jax.jit
     def run(starts):
@@ -47,8 +47,8 @@ def test_noise_free_simulation_from_random_starts(paper_arm, paper_capture, numb
 
 
 def test_scale_from_the_centre_of_the_second_box(paper_arm, paper_capture):
-    """With no length held the least-squares step has no part along the true direction, so stage 1 lands on the projection
-    of the start on it: k = <start, truth> / <truth, truth> over the lengths. That is Table 1's 6.6 mm."""
+    """With no length held the least-squares step has no component along the true lengths, so stage 1 ends at the
+    projection of the start on them: k = <start, truth> / <truth, truth> over the lengths. That is Table 1's 6.6 mm."""
     space = aj.Parameters.free_of(paper_arm)
     bounds = box(space, 2)
     centre = (bounds.lower + bounds.upper) / 2

@@ -1,7 +1,6 @@
-"""The reproduction of the paper: its page is whole, traceable, and what the code gives."""
+"""The reproduction of the paper: REPRODUCTION.md is complete, traceable, and what the code gives."""
 
 import json
-import re
 import sys
 from pathlib import Path
 
@@ -39,28 +38,18 @@ def test_every_row_has_a_verdict_and_a_line_of_code(rows):
 
 
 def test_every_published_number_has_its_row(rows):
-    """All that section 3, 4 and the tables print: figure by figure, and the vectors element by element."""
+    """All that sections 3 and 4 and the tables print: number by number, and the vectors element by element."""
     what = [row["what"] for row in rows]
     for prefix, count in (("eq. 16: ", 22), ("eq. 17: ", 22), ("eq. 18: ", 21), ("Table 2: ", 25), ("4.2 length ", 4)):
         assert sum(name.startswith(prefix) for name in what) == count, prefix
-    figures = (
+    tables = (
         "Table 1, simulation 1",
         "Table 1, simulation 2",
-        "Table 3 Data1",
-        "Table 3 Data2",
-        "Table 3 Data3",
-        "Table 3 mean",
+        *(f"Table 3 {x}" for x in ("Data1", "Data2", "Data3", "mean")),
     )
-    figures += (
-        "4.1 DE",
-        "4.1 Deltam",
-        "4.4 largest length",
-        "4.4 smallest",
-        "4.4 largest deviation",
-        "4.4 range",
-        "4.4 two RMS",
-    )
-    for name in (*figures, "4.4 improvement", "4.2 four lengths: mean", "3.1 Deltam, nominal", "3.1 Deltam, same"):
+    plate = ("largest length", "smallest", "largest deviation", "range", "two RMS", "improvement")
+    others = ("3.1 Deltam, nominal", "3.1 Deltam, same", "4.1 DE", "4.1 Deltam", "4.2 four lengths: mean")
+    for name in (*tables, *others, *(f"4.4 {x}" for x in plate)):
         assert any(row.startswith(name) for row in what), name
 
 
@@ -81,16 +70,10 @@ def test_the_papers_method_gives_its_stored_run(paper):
     assert again["k"] == pytest.approx(first["k"], abs=1e-3)
 
 
-def test_printed_figures_that_the_audit_recomputes():
-    """Against the paper's own text, not our output: eq. 16 and 17 are scaled copies of the truth."""
+def test_printed_numbers_that_are_recomputed():
+    """Against the paper's text instead of this project's output: eq. 16 and 17 are scaled copies of the true arm."""
     truth = np.array(published.NOMINAL)
     for number, k, error in ((1, 0.99946, 0.403), (2, 1.00882, 6.618)):
         values, lengths = np.array(published.IDENTIFIED[number]), published.LENGTHS
         assert values[lengths] @ truth[lengths] / (truth[lengths] @ truth[lengths]) == pytest.approx(k, abs=5e-6)
         assert np.abs(values - truth)[lengths].max() == pytest.approx(error, abs=5e-4)
-
-
-def test_the_published_numbers_are_the_shared_ones(shared):
-    """The project's copy says the same as the copy that was checked against the paper."""
-    numbers = lambda path: re.sub(r"#.*", "", path.read_text())  # noqa: E731
-    assert numbers(FOLDER / "published.toml").split() == numbers(shared / "paper/published.toml").split()

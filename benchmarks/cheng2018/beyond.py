@@ -1,4 +1,4 @@
-"""What the paper did not ask: noise and free lengths; what sockets, poses and lengths buy; a poor reference length."""
+"""Questions beyond the paper: noise with free lengths; the effect of sockets, poses and lengths; a poor reference."""
 
 import itertools
 
@@ -9,6 +9,7 @@ import twin
 from paper import NAMES, Row, box, is_length, random_starts, row
 
 import aacmm_jax as aj
+from aacmm_jax.kinematics.inverse_kinematics import random_configurations
 
 TRIALS = 200
 NOISES = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)  # arcsec, of a reading
@@ -16,7 +17,12 @@ WIDTHS = (1.0, 2.0, 5.0, 10.0, 20.0)  # mm
 SOCKETS, POSES, LENGTHS = (1, 2, 4), (16, 32, 70, 140), (1, 2, 4)
 BARS = (50.0, 100.0, twin.REFERENCE, 400.0)  # mm
 # Where a reference length lies: distance of its middle from the second joint, and its direction.
-PLACES = {"near, radial": (450.0, 0), "near, tangential": (450.0, 1), "far, radial": (850.0, 0), "far, tangential": (850.0, 1)}
+PLACES = {
+    "near, radial": (450.0, 0),
+    "near, tangential": (450.0, 1),
+    "far, radial": (850.0, 0),
+    "far, tangential": (850.0, 1),
+}
 NOISE = twin.Noise(2.0, 0.005, 0.0)
 
 
@@ -33,9 +39,11 @@ def noise_and_box() -> list[dict[str, float]]:
             half = np.where(is_length(), width, (upper - lower) / 2)
             line = {"encoder_arcsec": noise, "half_width_mm": width}
             anywhere = random_starts(truth - half, truth + half, TRIALS, 22)
-            # What is held stays where it starts: there it is right.
+            # A length that is held keeps its starting value, which is the true one.
             for name, hold, start in (("free", None, anywhere), ("held", "d_3", truth)):
-                many = aj.identify_many(twin.true_arm(), captures, truth - half, truth + half, start, space=space, hold=hold)
+                many = aj.identify_many(
+                    twin.true_arm(), captures, truth - half, truth + half, start, space=space, hold=hold
+                )
                 k = twin.lengths_of(many.parameters, drawn.reference).mean(axis=1) / twin.REFERENCE
                 low, middle, high = np.percentile(k, [2.5, 50, 97.5])
                 line |= {f"k_low_{name}": low, f"k_median_{name}": middle, f"k_high_{name}": high}
@@ -44,8 +52,8 @@ def noise_and_box() -> list[dict[str, float]]:
     return table
 
 
-def buying() -> list[dict[str, float]]:
-    """RMS of lengths of 300 mm all over the volume, by sockets, poses in all, and reference lengths (u = 2 um each)."""
+def sockets_poses_lengths() -> list[dict[str, float]]:
+    """RMS of lengths of 300 mm over the volume, by sockets, total poses, and reference lengths (u = 2 um each)."""
     arm = twin.true_arm()
     points = [(400, 200, 300), (-350, 500, 150), (600, -450, 550), (-300, -600, 700)]
     names = [f"S{i}" for i in range(len(points))]
@@ -69,9 +77,8 @@ def buying() -> list[dict[str, float]]:
         reference = bars[generator.integers(len(bars), size=(TRIALS, max(LENGTHS)))]
         measured = twin.lengths_of(many.parameters, twin.recorded(reference, NOISE, nothing, generator))
         measured = measured + 0.002 * generator.normal(size=measured.shape)
-        plate = plates[
-            generator.integers(len(plates), size=(TRIALS, 50))
-        ]  # exact readings: the arm's own error, not the reading's
+        # Exact readings: the error of the arm, without that of the readings.
+        plate = plates[generator.integers(len(plates), size=(TRIALS, 50))]
         for lengths in LENGTHS:
             k = measured[:, :lengths].mean(axis=1) / twin.REFERENCE
             fixed = np.where(is_length(), many.parameters / k[:, None], many.parameters)
@@ -90,7 +97,7 @@ def buying() -> list[dict[str, float]]:
 
 
 def references() -> list[dict[str, float | str]]:
-    """u of k, and what is left on 300 mm, by how long the reference is, where it lies, and its own error u."""
+    """u of k, and the remaining error of 300 mm, by length, position and standard uncertainty of the reference."""
     made, table = twin.pool(), []
     twins = twin.draw(made, NOISE, TRIALS, 41)
     stage1 = twin.identified(twins, "d_3")
@@ -101,8 +108,9 @@ def references() -> list[dict[str, float | str]]:
         for length in BARS:
             ends = _bar(distance, direction, length)
             limits = jnp.array([(-np.pi, np.pi)] * 6)
-            spread = jnp.asarray(np.repeat(ends, 100, axis=0))
-            poses = np.asarray(twin.reach(twin.true_arm(), spread, jax.random.key(43), limits)).reshape(2, 100, 6)
+            targets = jnp.asarray(np.repeat(ends, 100, axis=0))
+            poses = random_configurations(twin.true_arm(), targets, jax.random.key(43), limits)
+            poses = np.asarray(poses).reshape(2, 100, 6)
             pick = generator.integers(100, size=(TRIALS, 2))
             exact = np.stack([poses[0][pick[:, 0]], poses[1][pick[:, 1]]], axis=1)[:, None]
             read = twin.recorded(exact, NOISE, np.zeros((2, TRIALS, 6)), generator)
@@ -132,7 +140,7 @@ def _bar(distance: float, direction: int, length: float) -> np.ndarray:
 
 
 def run() -> tuple[list[Row], dict[str, list[dict]]]:
-    noise, bought, bars = noise_and_box(), buying(), references()
+    noise, accuracy, bars = noise_and_box(), sockets_poses_lengths(), references()
     rows: list[Row] = []
     at = {(x["half_width_mm"], x["encoder_arcsec"]): x for x in noise}
     noisy = [x for x in noise if x["encoder_arcsec"] > 0]
@@ -144,48 +152,57 @@ def run() -> tuple[list[Row], dict[str, list[dict]]]:
             "beyond: a free scale shrinks as far as the box lets it",
             "-",
             toolkit="; ".join(
-                f"+/-{width:g} mm: k = {at[width, 2.0]['k_median_free']:.4f}, noise-free {at[width, 0.0]['k_median_free']:.4f}"
+                f"+/-{width:g} mm: k = {at[width, 2.0]['k_median_free']:.4f}, "
+                f"noise-free {at[width, 0.0]['k_median_free']:.4f}"
                 for width in WIDTHS
             ),
-            verdict=f"squared distances, random starts, {noisy[0]['encoder_arcsec']:g} to {max(NOISES):g} arcsec: at least {100 * min(x['on_a_bound_free'] for x in noisy):.0f} % end on a bound in every cell; "
-            f"noise-free at most {100 * max(x['on_a_bound_free'] for x in exact):.1f} %, but as small an arm (medians of k within {apart:.0e} of those at 2 arcsec); with d_3 held at its true value 95 % of k lie within {worst:.1e} of 1",
+            verdict=f"squared distances, random starts, {noisy[0]['encoder_arcsec']:g} to {max(NOISES):g} arcsec: "
+            f"at least {100 * min(x['on_a_bound_free'] for x in noisy):.0f} % end on a bound in every cell; "
+            f"noise-free at most {100 * max(x['on_a_bound_free'] for x in exact):.1f} %, but as small an arm "
+            f"(medians of k within {apart:.0e} of those at 2 arcsec); "
+            f"with d_3 held at its true value 95 % of k lie within {worst:.1e} of 1",
         )
     )
-    best = {(x["sockets"], x["poses"], x["lengths"]): x["rms_mm"] for x in bought}
-    gains = {
+    best = {(x["sockets"], x["poses"], x["lengths"]): x["rms_mm"] for x in accuracy}
+    improved = {
         "4 lengths": best[1, 70, 4],
         "140 poses": best[1, 140, 1],
         "4 sockets": best[4, 70, 1],
         "all three": best[4, 140, 4],
     }
-    order = sorted(gains, key=lambda what: gains[what])
+    order = sorted(improved, key=lambda what: improved[what])
+    standard_error = max(x["rms_standard_error_mm"] for x in accuracy if x["poses"] >= 70)
     rows.append(
         row(
             "beyond: what buys accuracy on 300 mm [mm RMS]",
             "-",
             toolkit=f"1 socket, 70 poses, 1 length: {best[1, 70, 1]:.4f}; instead "
-            + "; ".join(f"{what}: {gains[what]:.4f}" for what in order),
+            + "; ".join(f"{what}: {improved[what]:.4f}" for what in order),
             verdict="in this order: "
             + ", ".join(order)
-            + f" (standard error of each median at most {max(x['rms_standard_error_mm'] for x in bought if x['poses'] >= 70):.4f}; noise {NOISE.encoder_arcsec:g} arcsec and {1e3 * NOISE.seating_mm:g} um)",
+            + f" (standard error of each median at most {standard_error:.4f}; "
+            f"noise {NOISE.encoder_arcsec:g} arcsec and {1e3 * NOISE.seating_mm:g} um)",
         )
     )
     of = {(x["place"], x["length_mm"], x["u_mm"]): float(x["u_k"]) for x in bars}
     left = {(x["place"], x["length_mm"], x["u_mm"]): float(x["rms_300_mm"]) for x in bars}
     short, long, where = min(BARS), max(BARS), "far, tangential"
-    at_hand = [of[place, twin.REFERENCE, 0.0] for place in PLACES]
+    by_position = [of[place, twin.REFERENCE, 0.0] for place in PLACES]
     rows.append(
         row(
             "beyond: a poor reference length, u of k",
             "-",
-            toolkit=f"{long:g} mm {of[where, long, 0.0]:.2g}; {short:g} mm {of[where, short, 0.0]:.2g}; {short:g} mm known to 10 um {of[where, short, 0.01]:.2g}",
+            toolkit=f"{long:g} mm {of[where, long, 0.0]:.2g}; {short:g} mm {of[where, short, 0.0]:.2g}; "
+            f"{short:g} mm known to 10 um {of[where, short, 0.01]:.2g}",
             verdict=(
-                f"short: {of[where, short, 0.0] / of[where, long, 0.0]:.0f} times from {long:g} to {short:g} mm, and 300 mm are then off by {left[where, short, 0.0]:.3f} mm instead of {left[where, long, 0.0]:.3f}; "
-                f"badly placed: {max(at_hand) / min(at_hand):.1f} times between the best and the worst of {len(PLACES)} places; wrong by u: the last figure before"
+                f"short: {of[where, short, 0.0] / of[where, long, 0.0]:.0f} times from {long:g} to {short:g} mm, "
+                f"and 300 mm are then off by {left[where, short, 0.0]:.3f} mm instead of {left[where, long, 0.0]:.3f}; "
+                f"badly placed: {max(by_position) / min(by_position):.1f} times between the best and the worst of "
+                f"{len(PLACES)} places; wrong by u: the last figure before"
             ),
         )
     )
-    return rows, {"noise_and_box": noise, "sockets_poses_lengths": bought, "reference_lengths": bars}
+    return rows, {"noise_and_box": noise, "sockets_poses_lengths": accuracy, "reference_lengths": bars}
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The figures: what the paper's 2, 3, 6 and 8 can be taken to show (the text does not say), its scale law, and what it did not draw. Readable in grey."""
+"""Figures: the paper's 2, 3, 6 and 8 as far as its text defines them, its scale law, and others; legible in grey."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -33,7 +33,9 @@ def column(table: Table, key: str) -> np.ndarray:
     return np.array([line[key] for line in table])
 
 
-def joined_points(axes: Any, part: Table, x: str, y: str, mark: tuple[str, str], label: str, factor: float = 1.0) -> None:
+def joined_points(
+    axes: Any, part: Table, x: str, y: str, mark: tuple[str, str], label: str, factor: float = 1.0
+) -> None:
     """One series of a table, its points joined by a thin line."""
     style = {"color": mark[1], "markeredgecolor": DARK, "linewidth": 0.9, "label": label}
     axes.plot(column(part, x), factor * column(part, y), mark[0] + "-", **style)
@@ -51,9 +53,15 @@ def simulation(number: int) -> Any:
     for name, found, marker, colour in pairs:
         tips = tips_of(found[None], q[None])[0]
         distance = np.linalg.norm(tips - tips.mean(axis=0), axis=1)
-        axes.plot(np.arange(1, len(q) + 1), distance, marker, color=colour, markeredgecolor=DARK, markersize=3.5, label=name)
+        axes.plot(
+            np.arange(1, len(q) + 1), distance, marker, color=colour, markeredgecolor=DARK, markersize=3.5, label=name
+        )
     axes.axhline(
-        PUBLISHED["simulation"][str(number)]["de"], color=DARK, linestyle="--", linewidth=0.9, label="mean printed in the paper"
+        PUBLISHED["simulation"][str(number)]["de"],
+        color=DARK,
+        linestyle="--",
+        linewidth=0.9,
+        label="mean printed in the paper",
     )
     axes.set(
         xlabel=f"pose of simulation {number}, the set whose DE is the median",
@@ -118,7 +126,8 @@ def distributions(runs: Table) -> Any:
 
 
 def box_and_scale(table: Table) -> Any:
-    """k against the boxes of the lengths: this toolkit by where they are centred (left), the paper's method by their width (right)."""
+    """k against the boxes of the lengths: this toolkit by where they are centred (left), the paper's method by their
+    width (right)."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(7.2, 3.2), sharey=True, width_ratios=(1.5, 1))
     widths = sorted({line["half_width_mm"] for line in table})
     for i, ((marker, colour), width) in enumerate(zip(MARKS, widths, strict=True)):
@@ -149,7 +158,9 @@ def box_and_scale(table: Table) -> Any:
         )
     for axes in (left, right):
         axes.axhline(1, color=DARK, linewidth=0.8)
-    left.set(xlabel="shift of the boxes' centre [mm] (open: the truth is outside)", ylabel="k: median, and 95 % or extremes")
+    left.set(
+        xlabel="shift of the boxes' centre [mm] (open: the truth is outside)", ylabel="k: median, and 95 % or extremes"
+    )
     right.set(xlabel="half-width [mm]", xscale="log", xticks=widths)
     right.xaxis.set_major_formatter(matplotlib.ticker.ScalarFormatter())
     right.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
@@ -254,8 +265,12 @@ def buying(table: Table) -> Any:
     for axes, count in zip(grid, lengths, strict=True):
         for (marker, colour), sockets in zip(MARKS, sorted({line["sockets"] for line in table}), strict=False):
             part = [line for line in table if line["sockets"] == sockets and line["lengths"] == count]
-            joined_points(axes, part, "poses", "rms_mm", (marker, colour), f"{sockets} socket{'s' * (sockets > 1)}", factor=1e3)
-        axes.set(xlabel=f"poses in all; {count} reference length{'s' * (count > 1)}", xscale="log", xticks=[16, 32, 70, 140])
+            joined_points(
+                axes, part, "poses", "rms_mm", (marker, colour), f"{sockets} socket{'s' * (sockets > 1)}", factor=1e3
+            )
+        axes.set(
+            xlabel=f"poses in all; {count} reference length{'s' * (count > 1)}", xscale="log", xticks=[16, 32, 70, 140]
+        )
         axes.xaxis.set_major_formatter(matplotlib.ticker.ScalarFormatter())
         axes.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
     grid[0].set(ylabel="RMS error of 300 mm lengths [µm]", ylim=(0, None))
@@ -300,7 +315,8 @@ def draw(tables: dict[str, Table], folder: Path) -> dict[str, str]:
         "reference_lengths": lambda: references(tables["reference_lengths"]),
     }
     about = {
-        "figure2": simulation, "figure3": simulation, "scale_law": scale_law, "distributions": distributions, "k_against_box": box_and_scale,
+        "figure2": simulation, "figure3": simulation, "scale_law": scale_law, "distributions": distributions,
+        "k_against_box": box_and_scale,
         "figure6": repeatability, "figure8": plate, "twins": twins, "stages": stages, "noise_and_box": sliding,
         "sockets_poses_lengths": buying, "reference_lengths": references,
     }  # fmt: skip
@@ -309,4 +325,4 @@ def draw(tables: dict[str, Table], folder: Path) -> dict[str, str]:
             figure = make()
             figure.savefig(folder / f"{name}.png", metadata={"Software": None})
             plt.close(figure)
-    return {name: (function.__doc__ or "").strip() for name, function in about.items()}
+    return {name: " ".join((function.__doc__ or "").split()) for name, function in about.items()}

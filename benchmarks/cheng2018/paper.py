@@ -1,4 +1,4 @@
-"""Cheng et al. 2018 (doi 10.1155/2018/1760190): its printed numbers, its arms and boxes, and the rows of the reproduction."""
+"""Cheng et al. 2018 (doi 10.1155/2018/1760190): printed numbers, arms and boxes, and the rows of the reproduction."""
 
 import inspect
 import tomllib
@@ -15,12 +15,12 @@ HERE = Path(__file__).resolve().parent
 PUBLISHED: dict[str, Any] = tomllib.loads((HERE / "published.toml").read_text())
 NAMES: tuple[str, ...] = tuple(PUBLISHED["parameter_order"])
 POSES: int = PUBLISHED["simulation"]["poses"]
-SOCKET = (400.0, 200.0, 300.0)  # mm; the paper does not print where its simulated socket stood
+SOCKET = (400.0, 200.0, 300.0)  # mm; the paper does not print the position of its simulated socket
 SETS = 1_000  # independent sets of poses
 
 
 class Row(NamedTuple):
-    """One published number and what became of it; each column holds text ready to print."""
+    """One published number beside its recomputed values; each column holds text ready to print."""
 
     what: str
     printed: str
@@ -32,7 +32,7 @@ class Row(NamedTuple):
 
 
 def row(what: str, printed: Any, *, recomputed: Any = "-", method: Any = "-", toolkit: Any = "-", verdict: str) -> Row:
-    """A row that knows the line of code it was made on."""
+    """A row with the line of code that made it."""
     caller = inspect.stack()[1]
     columns = (value if isinstance(value, str) else f"{value:.6g}" for value in (printed, recomputed, method, toolkit))
     return Row(what, *columns, verdict, f"{Path(caller.filename).name}:{caller.lineno}")
@@ -52,7 +52,7 @@ def simulated_arm() -> aj.Arm:
 
 
 def arm_of(values: np.ndarray) -> aj.Arm:
-    """The arm with the paper's 21 parameters; the other four as the paper holds them."""
+    """The arm with the paper's 21 parameters; the other four fixed as in the paper."""
     fixed = PUBLISHED["fixed"]
     base = aj.Arm(
         alpha=[0.0] * 5 + [fixed["alpha_6"]],
@@ -76,7 +76,7 @@ def scale_to(values: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def pose_sets(count: int = SETS) -> np.ndarray:
-    """Independent sets of noise-free poses of the simulated arm on one point, ``(count, 70, 6)``: the first of ``SETS``."""
+    """The first ``count`` of ``SETS`` independent sets of noise-free poses of the simulated arm, ``(count, 70, 6)``."""
     return _all_sets()[:count]
 
 
@@ -109,15 +109,13 @@ def tips_of(values: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _positions(arms: aj.Arm, q: jnp.ndarray) -> jnp.ndarray:
-    spread = lambda leaf: jnp.broadcast_to(leaf, (q.shape[0], leaf.shape[-1]))[:, None, :]  # noqa: E731
-    whole = aj.Arm(
-        alpha=spread(arms.alpha), a=spread(arms.a), d=spread(arms.d), theta=spread(arms.theta), probe=spread(arms.probe)
-    )
-    return whole.position(q)
+    batched = lambda leaf: jnp.broadcast_to(leaf, (q.shape[0], leaf.shape[-1]))[:, None, :]  # noqa: E731
+    kinds = {kind: batched(getattr(arms, kind)) for kind in ("alpha", "a", "d", "theta", "probe")}
+    return aj.Arm(**kinds).position(q)
 
 
 def place(value: float, sample: np.ndarray) -> str:
-    """Where a printed number lies among many reruns: its percentile, and the middle 95 % of the sample."""
+    """Position of a printed number in a sample of reruns: its percentile, and the middle 95 % of the sample."""
     low, middle, high = (number(x) for x in np.percentile(sample, [2.5, 50, 97.5]))
     share = 100 * np.mean(sample <= value)
     inside = "within" if 2.5 <= share <= 97.5 else "outside"

@@ -1,7 +1,8 @@
 """The paper's method: an interior-point search that minimises DE itself within the box (section 3.2).
 
-MATLAB's `fmincon` is what the paper's words fit; SciPy's `trust-constr` is the nearest open interior point. It is given exact
-gradients and 300 iterations, about what fmincon's default of 3,000 evaluations allows with 21 finite differences.
+The paper's description fits MATLAB's `fmincon`; SciPy's `trust-constr` is the nearest open interior-point method. It is
+given exact gradients and 300 iterations, about what fmincon's default of 3,000 evaluations allows with 21 finite
+differences.
 
     python benchmarks/cheng2018/paper_method.py      # all 1,000 sets of both simulations, about 20 minutes on 2 cores
 
@@ -61,9 +62,14 @@ def minimise(q: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndar
         return float(value), np.asarray(gradient)
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it tells that its quasi-Newton update was skipped
+        warnings.simplefilter("ignore")  # SciPy warns of every quasi-Newton update that it skips
         found = minimize(
-            objective, start, jac=True, method="trust-constr", bounds=Bounds(lower, upper), options={"maxiter": ITERATIONS}
+            objective,
+            start,
+            jac=True,
+            method="trust-constr",
+            bounds=Bounds(lower, upper),
+            options={"maxiter": ITERATIONS},
         )
     return found.x, int(found.nit)
 
@@ -80,7 +86,7 @@ def one_in_box(given: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]) -> 
 
 
 def many_in_boxes(problems: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Parameters that the method finds in many problems, spread over the cores."""
+    """Parameters that the method finds in many problems, on all cores."""
     with ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn")) as pool:
         return np.array(list(pool.map(one_in_box, problems)))
 
@@ -97,7 +103,7 @@ def one(simulation: int, q: np.ndarray, number: int) -> dict[str, float]:
 
 
 def rerun(count: int) -> list[dict[str, float]]:
-    """The first reruns of both simulations, spread over the cores."""
+    """The first reruns of both simulations, on all cores."""
     q = pose_sets(count)
     rows = []
     with ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn")) as pool:

@@ -1,7 +1,8 @@
-"""Everything of Cheng et al. 2018 that can be recomputed, in one run (`make reproduce`, under three minutes on 2 cores).
+"""Everything of Cheng et al. 2018 that can be recomputed, in one run (`make reproduce`, three minutes on 2 cores).
 
-Writes results/*.csv, results/rows.json and results/*.png, and REPRODUCTION.md: for every published number what is printed, what the printed
-vectors give, what the paper's method gives when rerun, what this toolkit gives, and a verdict with the line of code that made it.
+Writes results/*.csv, results/rows.json, results/*.png and REPRODUCTION.md. The latter gives for every published number:
+the printed value, what the printed vectors give, what the paper's method gives when rerun, what this toolkit gives, and
+a verdict with the line of code that made it.
 """
 
 import csv
@@ -25,21 +26,32 @@ import table3
 from paper import HERE, PUBLISHED, Row
 
 VECTORS = ("eq. 16: ", "eq. 17: ", "eq. 18: ", "Table 2: ")
-HEADER = """# Cheng et al. 2018, reproduced and questioned
+# A backslash joins two lines: the paragraphs of REPRODUCTION.md are longer than the lines of this file.
+HEADER = """\
+# Cheng et al. 2018, reproduced and questioned
 
-Every result that the paper prints (doi 10.1155/2018/1760190), against what its own printed vectors give, its method rerun, and this
-toolkit. Made by `make reproduce`; no figure below is typed in but the published ones, and the last column names the line that made
+Every result that the paper prints (doi 10.1155/2018/1760190), against what its own printed vectors give, \
+its method rerun, and this
+toolkit. Made by `make reproduce`; no figure below is typed in but the published ones, and the last column \
+names the line that made
 each row. Lengths in mm, angles in rad unless a unit is given.
 
 - **Recomputed** uses printed numbers only.
-- **Paper's method**: for the simulations, an interior-point search on DE within the printed box, every length free (`paper_method.py`); all runs stop at 300 iterations, so what they
-  leave of DE, Deltam and the angles depends on that number. For the experiment, whose recordings (figshare 6223811) could not be had here, made-up twins (`twin.py`): with every length free as the paper has it, but
+- **Paper's method**: for the simulations, an interior-point search on DE within the printed box, every length free \
+(`paper_method.py`); all runs stop at 300 iterations, so what they
+  leave of DE, Deltam and the angles depends on that number. For the experiment, whose recordings (figshare 6223811) \
+could not be had here, made-up twins (`twin.py`): with every length free as the paper has it, but
   by squared distances; the interior point itself is in the row on k.
-- **This toolkit** minimises squared distances within the same box: for the simulations with every length free, and after both stages; for the experiment with `d_3` held in stage 1.
+- **This toolkit** minimises squared distances within the same box: for the simulations with every length \
+free, and after both stages; for the experiment with `d_3` held in stage 1.
 - A verdict that gives a percentage says where the printed number lies among the reruns.
-- Not printed, and therefore chosen here: where the simulated socket stood, where the searches began (at random in the box), where the three sockets, the
-  reference length and the plate of the experiment stood (all round the arm, every joint turning fully), and how many readings made one end of a length (ten, in one pose; a tip on the plate is one reading). In the joint solve an end counts as one pose.
-- Repaired, because print lost an element: the simulation's nominal vector (one zero of theta), the upper bounds of simulation 1 (a joined "7210"
+- Not printed, and therefore chosen here: where the simulated socket stood, where the searches began \
+(at random in the box), where the three sockets, the
+  reference length and the plate of the experiment stood (all round the arm, every joint turning fully), and how many \
+readings made one end of a length (ten, in one pose; a tip on the plate is one reading). \
+In the joint solve an end counts as one pose.
+- Repaired, because print lost an element: the simulation's nominal vector (one zero of theta), the upper bounds \
+of simulation 1 (a joined "7210"
   and one theta) and of the experiment (one theta).
 """
 
@@ -70,7 +82,8 @@ def write_table(path: Path, table: list[dict]) -> None:
         writer = csv.DictWriter(file, list(table[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(
-            {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in line.items()} for line in table
+            {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in line.items()}
+            for line in table
         )
 
 
@@ -79,7 +92,8 @@ def page(rows: list[Row], about: dict[str, str]) -> str:
     counted = sum(len(value) if isinstance(value, list) else 1 for value in leaves(PUBLISHED))
     parts = [
         HEADER,
-        f"Python {platform.python_version()}, JAX {jax.__version__}, NumPy {np.__version__}. {len(rows)} rows; published.toml holds {counted} values, bounds and nominal vectors among them.\n",
+        f"Python {platform.python_version()}, JAX {jax.__version__}, NumPy {np.__version__}. {len(rows)} rows; "
+        f"published.toml holds {counted} values, bounds and nominal vectors among them.\n",
         "## Figures and claims\n",
         markdown([row for row in rows if row not in vectors]),
         "## The vectors, element by element\n",

@@ -1,4 +1,4 @@
-"""Table 1 and section 3: what identification from one fixed point can find without noise, and what decides its scale."""
+"""Table 1 and section 3: what identification from one point can find without noise, and what determines its scale."""
 
 import itertools
 
@@ -27,7 +27,10 @@ import aacmm_jax as aj
 
 SAMPLE = 4  # reruns of the paper's method that are run again each time, of each simulation
 SEARCHES, SEARCHED_SHIFTS = 6, (0.0, 5.0)  # of the paper's method in each box
-SHIFTS, WIDTHS = (-5.0, -2.5, 0.0, 2.5, 5.0), (1.0, 2.0, 5.0, 10.0, 20.0)  # mm: where length boxes are centred, and how wide
+SHIFTS, WIDTHS = (
+    (-5.0, -2.5, 0.0, 2.5, 5.0),
+    (1.0, 2.0, 5.0, 10.0, 20.0),
+)  # mm: where length boxes are centred, and how wide
 
 
 def half_scale(rows: list[Row]) -> None:
@@ -48,7 +51,8 @@ def half_scale(rows: list[Row]) -> None:
                 f"3.1 Deltam, {what} [mm]",
                 simulation[f"deltam_{key}"],
                 toolkit=f"{deltam[digits][key]:.1e} on readings of {digits} decimals",
-                verdict=f"what angles of {digits} decimals give (the nearest number of decimals); exact ones give {exact:.0e}; half scale, {ratio:.2f} times as much",
+                verdict=f"what angles of {digits} decimals give (the nearest number of decimals); "
+                f"exact ones give {exact:.0e}; half scale, {ratio:.2f} times as much",
             )
         )
 
@@ -56,7 +60,11 @@ def half_scale(rows: list[Row]) -> None:
 def simulation(number: int, rows: list[Row], methods: list[dict[str, float]]) -> dict[str, np.ndarray]:
     """One row of Table 1: recomputed, by the paper's method and by this toolkit over all sets of poses."""
     printed, truth = PUBLISHED["simulation"][str(number)], vector("simulation", "nominal")
-    values, lengths, name = vector("simulation", str(number), "identified"), is_length(), f"Table 1, simulation {number}"
+    values, lengths, name = (
+        vector("simulation", str(number), "identified"),
+        is_length(),
+        f"Table 1, simulation {number}",
+    )
     lower, upper = box("simulation", str(number))
     starts = random_starts(lower, upper, SETS, number)
     many = many_of(pose_sets(), lower, upper, starts)
@@ -120,7 +128,7 @@ def simulation(number: int, rows: list[Row], methods: list[dict[str, float]]) ->
 
 
 def two_stages(q: np.ndarray, lower: np.ndarray, upper: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Parameters after both stages: one length held where it starts, and the scale fixed with one exact length of 200 mm."""
+    """Parameters after both stages: one length held at its start, the scale fixed with one exact length of 200 mm."""
     found = many_of(q, lower, upper, starts, hold="d_3").parameters
     ends = np.asarray(aj.simulate(simulated_arm(), {"A": (400, 200, 300), "B": (600, 200, 300)}, poses=1, seed=2).q)
     tips = tips_of(found, np.broadcast_to(ends, (len(found), *ends.shape)))
@@ -142,7 +150,8 @@ def methods_rerun(rows: list[Row]) -> list[dict[str, float]]:
     stored = paper_method.stored()
     again = paper_method.rerun(SAMPLE)
     pairs = [
-        (line, next(s for s in stored if (s["simulation"], s["set"]) == (line["simulation"], line["set"]))) for line in again
+        (line, next(s for s in stored if (s["simulation"], s["set"]) == (line["simulation"], line["set"])))
+        for line in again
     ]
     # A search of 300 iterations magnifies the last bit of another processor; its outcome agrees to a few per cent.
     same = sum(abs(line["k"] - old["k"]) < 1e-3 for line, old in pairs)
@@ -193,7 +202,7 @@ def boxes() -> list[dict[str, float]]:
 
 
 def narrower(rows: list[Row], table: list[dict[str, float]]) -> None:
-    """The claim that smaller boxes scale less, for boxes centred on the truth, beside it, and past it."""
+    """The claim that smaller boxes scale less, for boxes that are centred on the truth, contain it, or miss it."""
     inside = [line for line in table if line["truth_inside"]]
 
     def largest(shift: float, width: float, *keys: str) -> float:
@@ -202,7 +211,7 @@ def narrower(rows: list[Row], table: list[dict[str, float]]) -> None:
 
     centred = {width: largest(0.0, width, "k_lowest_method", "k_highest_method") for width in WIDTHS}
     mine = {width: largest(0.0, width, "k_low", "k_high") for width in WIDTHS}
-    beside = {width: largest(5.0, width, "k_median_method") for width in WIDTHS if width >= 5}
+    shifted = {width: largest(5.0, width, "k_median_method") for width in WIDTHS if width >= 5}
     missed = min(line["de_median_mm"] for line in table if not line["truth_inside"])
     shown = lambda of: "; ".join(f"+/-{width:g} mm {value:.4f}" for width, value in of.items())  # noqa: E731
     holds = all(a <= b for a, b in itertools.pairwise(centred.values()))
@@ -210,11 +219,11 @@ def narrower(rows: list[Row], table: list[dict[str, float]]) -> None:
         row(
             "3.2 smaller boxes scale less: largest |k - 1|",
             "claimed",
-            method=f"centred on the truth: {shown(centred)}; 5 mm beside it, median: {shown(beside)}",
+            method=f"centred on the truth: {shown(centred)}; 5 mm beside it, median: {shown(shifted)}",
             toolkit=f"centred on the truth: {shown(mine)}",
             verdict=("holds" if holds else "does not hold")
             + " for boxes centred on the truth, "
-            + ("holds" if list(beside.values()) == sorted(beside.values()) else "does not hold")
+            + ("holds" if list(shifted.values()) == sorted(shifted.values()) else "does not hold")
             + f" for boxes 5 mm beside it; a box that misses the truth leaves DE of {missed:.2g} mm or more",
         )
     )

@@ -58,7 +58,11 @@ def scale(rows: list[Row]) -> tuple[float, float]:
 
 def elements(rows: list[Row], k: float) -> None:
     """Every number of Table 2 against eq. 18 and the scale fix."""
-    reference, given, table = PUBLISHED["experiment"]["length_reference"], vector("experiment", "identified"), printed_table()
+    reference, given, table = (
+        PUBLISHED["experiment"]["length_reference"],
+        vector("experiment", "identified"),
+        printed_table(),
+    )
     printed_k = reference["mean"] / reference["nominal"]
     for i, name in enumerate(NAMES):
         if is_length()[i]:
@@ -98,10 +102,10 @@ def held(rows: list[Row]) -> None:
 
 
 def angles(rows: list[Row]) -> list[dict[str, float]]:
-    """What the mismatch of the angles does to the tip: eq. 18's angles against Table 2's, both with Table 2's lengths."""
+    """Effect on the tip of the angles that differ: eq. 18's against Table 2's, both with the lengths of Table 2."""
     table, given = printed_table(), vector("experiment", "identified")
     mixed = np.where(is_length(), table, given)
-    # Poses of the arm with eq. 18's angles on one point: Deltam there is 0, and with Table 2's angles what they are worth.
+    # Poses in which the arm with eq. 18's angles has its tip on one point: its Deltam is 0, that of Table 2's is not.
     q = np.asarray(aj.simulate(arm_of(mixed), {"A": (400, 200, 300)}, poses=2_000, seed=3).q)
     both = tips_of(np.stack([mixed, table]), np.stack([q, q]))
     moved = np.linalg.norm(both[1] - both[0], axis=-1)
@@ -113,7 +117,8 @@ def angles(rows: list[Row]) -> list[dict[str, float]]:
             "Table 2 angles against eq. 18's",
             "same arm",
             recomputed=f"tips {np.median(moved):.2f} mm apart (median), {moved.max():.2f} at most",
-            verdict=f"cannot both be right: with Table 2's angles, poses that eq. 18 brings together have Deltam {np.median(deltam):.2f} mm, not {printed}",
+            verdict="cannot both be right: with Table 2's angles, poses that eq. 18 brings together have "
+            f"Deltam {np.median(deltam):.2f} mm, not {printed}",
         )
     )
     return [{"pose": float(i), "moved_mm": float(x)} for i, x in enumerate(moved)]

@@ -12,7 +12,7 @@ KINDS = {"encoder noise alone": (0,), "seating alone": (1,), "eccentricity alone
 
 
 def noise_models(made: twin.Pool, rows: list[Row]) -> tuple[twin.Noise, list[dict[str, float | str]]]:
-    """Which noise explains the printed figures: each kind alone, made to match DE of Data1; and all three, made to match what they can."""
+    """Which noise explains the printed metrics: each kind fitted to DE of Data1, and all three fitted to more."""
     wanted, table, chosen = twin.printed_targets(), [], twin.Noise(0.0, 0.0, 0.0)
     for name, kinds in KINDS.items():
         noise = twin.fitted_noise(made, kinds=kinds, targets=1 if len(kinds) == 1 else 3)
@@ -28,8 +28,10 @@ def noise_models(made: twin.Pool, rows: list[Row]) -> tuple[twin.Noise, list[dic
             f"{printed:.2f}",
             toolkit="; ".join(f"{name} {ratio:.2f}" for name, ratio in ratios.items()),
             verdict=(
-                f"nearest: {nearest}; seating alone gives least ({min(ratios.values()):.2f}), since angle errors grow with the distance from the joints and the twins' Data2 and Data3 stand farther out. "
-                f"The twins have {chosen.encoder_arcsec:.1g} arcsec, {1e3 * chosen.seating_mm:.1g} um and {chosen.eccentricity_arcsec:.1g} arcsec, fitted to all three printed Deltam and to DE"
+                f"nearest: {nearest}; seating alone gives least ({min(ratios.values()):.2f}), since angle errors grow "
+                "with the distance from the joints and the twins' Data2 and Data3 stand farther out. "
+                f"The twins have {chosen.encoder_arcsec:.1g} arcsec, {1e3 * chosen.seating_mm:.1g} um and "
+                f"{chosen.eccentricity_arcsec:.1g} arcsec, fitted to all three printed Deltam and to DE"
             ),
         )
     )
@@ -37,7 +39,7 @@ def noise_models(made: twin.Pool, rows: list[Row]) -> tuple[twin.Noise, list[dic
 
 
 def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
-    """Every printed figure of sections 4.1 to 4.4 among the twins: as the paper identifies (all free), and with one length held."""
+    """Every printed metric of sections 4.1 to 4.4 among the twins: with all lengths free, and with one held."""
     experiment, table3, check = PUBLISHED["experiment"], PUBLISHED["table3"], PUBLISHED["verification"]
 
     def line(what: str, printed: float, of, note: str = "predicted; ", recomputed: str = "-") -> None:
@@ -53,7 +55,10 @@ def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
             )
         )
 
-    nominal, printed_k = check["nominal"], experiment["length_reference"]["mean"] / experiment["length_reference"]["nominal"]
+    nominal, printed_k = (
+        check["nominal"],
+        experiment["length_reference"]["mean"] / experiment["length_reference"]["nominal"],
+    )
     largest = max(check["maximum"] - nominal, nominal - check["minimum"])
     mean = np.mean([table3[name] for name in twin.SOCKETS])
     fitted, held_out = "fitted, with the others of Table 3; ", np.mean([table3["Data2"], table3["Data3"]])
@@ -72,11 +77,19 @@ def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
     note = f"averages in the set identified from: held out alone it is {held_out:.4f}; {fitted}"
     line("Table 3 mean [mm]", table3["mean"], lambda o: o.deltam.mean(axis=1), note, f"{mean:.4f}")
     note = f"matched by taking {twin.READINGS} readings an end; "
-    line("4.2 range of four lengths [mm]", experiment["length_reference"]["range"], lambda o: np.ptp(o.reference, axis=1), note)
+    line(
+        "4.2 range of four lengths [mm]",
+        experiment["length_reference"]["range"],
+        lambda o: np.ptp(o.reference, axis=1),
+        note,
+    )
     line("4.4 largest length [mm]", check["maximum"], lambda o: o.plate.max(axis=1) + twin.PLATE)
     line("4.4 smallest length [mm]", check["minimum"], lambda o: o.plate.min(axis=1) + twin.PLATE)
     line(
-        "4.4 largest deviation [mm]", check["max_deviation"], lambda o: np.abs(o.plate).max(axis=1), recomputed=f"{largest:.4f}"
+        "4.4 largest deviation [mm]",
+        check["max_deviation"],
+        lambda o: np.abs(o.plate).max(axis=1),
+        recomputed=f"{largest:.4f}",
     )
     line(
         "4.4 range [mm]",
@@ -96,10 +109,12 @@ def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
         row(
             "4.4 improvement [%]",
             printed,
-            recomputed=f"{100 * (1 - check['max_deviation'] / before):.1f}; length for length {100 * (1 - check['max_deviation'] / twin.PLATE / before * twin.REFERENCE):.1f}",
+            recomputed=f"{100 * (1 - check['max_deviation'] / before):.1f}; "
+            f"length for length {100 * (1 - check['max_deviation'] / twin.PLATE / before * twin.REFERENCE):.1f}",
             method=f"all lengths free: median {np.median(improvement(result)):.1f}",
             toolkit=f"median {np.median(improvement(own)):.1f}",
-            verdict="a figure of k, not of the method: it compares an error of 201.5 mm with errors of 300 mm, and the one before is as large as the search left k. "
+            verdict="a figure of k, not of the method: it compares an error of 201.5 mm with errors of 300 mm, "
+            "and the one before is as large as the search left k. "
             f"With the printed {before} mm before, {printed} is "
             + place(printed, 100 * (1 - np.abs(own.plate).max(axis=1) / before)),
         )
@@ -107,12 +122,12 @@ def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
 
 
 def improvement(result: twin.Outcome) -> np.ndarray:
-    """As the paper counts it: largest error of the reference length before, against that of the plate after; per cent."""
+    """As the paper defines it: largest error of the reference before against that of the plate after, per cent."""
     before = np.abs(result.reference - twin.REFERENCE).max(axis=1)
     return 100 * (1 - np.abs(result.plate).max(axis=1) / before)
 
 
-def scale_slides(rows: list[Row], twins: twin.Twins, free: twin.Outcome, own: twin.Outcome) -> None:
+def scale_of_experiment(rows: list[Row], twins: twin.Twins, free: twin.Outcome, own: twin.Outcome) -> None:
     """k of the experiment against what free lengths give with noise."""
     reference = PUBLISHED["experiment"]["length_reference"]
     printed = reference["mean"] / reference["nominal"]
@@ -123,27 +138,35 @@ def scale_slides(rows: list[Row], twins: twin.Twins, free: twin.Outcome, own: tw
     )
     k = twin.lengths_of(found, twins.reference[:METHODS]).mean(axis=1) / twin.REFERENCE
     width = upper - lower
-    edge = lambda values: np.any((values - lower < 1e-6 * width) | (upper - values < 1e-6 * width), axis=-1)  # noqa: E731
+
+    def edge(values: np.ndarray) -> np.ndarray:
+        return np.any((values - lower < 1e-6 * width) | (upper - values < 1e-6 * width), axis=-1)
+
     inside = "inside its box" if not edge(vector("experiment", "identified")) else "on a bound of its box"
     rows.append(
         row(
             "4.2 k of the identified arm",
             f"{printed:.5f}",
-            method=f"interior point from random starts, {METHODS} twins: {k.min():.4f} to {k.max():.4f}, {100 * np.mean(edge(found)):.0f} % on a bound",
-            toolkit=f"all free, squared distances: median {np.median(free.k):.4f}, {100 * np.mean(free.on_a_bound):.0f} % on a bound; d_3 held at its nominal value: {np.median(own.k):.5f}, standard deviation {np.std(own.k):.1e}",
-            verdict=f"eq. 18 lies {inside}; its k is {place(printed, k)} (interior point, which stops where its start and its {paper_method.ITERATIONS} iterations leave it)",
+            method=f"interior point from random starts, {METHODS} twins: {k.min():.4f} to {k.max():.4f}, "
+            f"{100 * np.mean(edge(found)):.0f} % on a bound",
+            toolkit=f"all free, squared distances: median {np.median(free.k):.4f}, "
+            f"{100 * np.mean(free.on_a_bound):.0f} % on a bound; "
+            f"d_3 held at its nominal value: {np.median(own.k):.5f}, standard deviation {np.std(own.k):.1e}",
+            verdict=f"eq. 18 lies {inside}; its k is {place(printed, k)} (interior point, which stops where its start "
+            f"and its {paper_method.ITERATIONS} iterations leave it)",
         )
     )
 
 
 def stages(rows: list[Row], twins: twin.Twins, free: twin.Outcome, own: twin.Outcome) -> list[dict[str, float]]:
-    """What two stages gain over one, and the joint solve over two, on the plate."""
+    """Improvement on the plate by two stages over one, and by the joint solve over two."""
     together = twin.joint(twins)
     joint = twin.lengths_of(together, twins.plate) - twin.PLATE
     noise_free = {"one stage, all free": free.plate_before, "one stage, d_3 held": own.plate_before}
     errors = noise_free | {"two stages, all free": free.plate, "two stages, d_3 held": own.plate, "joint": joint}
     rms = {name: np.sqrt((error**2).mean(axis=1)) for name, error in errors.items()}
     middle = {name: float(np.median(values)) for name, values in rms.items()}
+    all_free, d_3_held = middle["one stage, all free"], middle["one stage, d_3 held"]
     two = middle["two stages, d_3 held"]
     reference = PUBLISHED["experiment"]["length_reference"]
     at_printed = twin.PLATE * (1 - reference["mean"] / reference["nominal"])
@@ -151,11 +174,13 @@ def stages(rows: list[Row], twins: twin.Twins, free: twin.Outcome, own: twin.Out
         row(
             "Two stages over one, joint over two: RMS on the plate [mm]",
             "-",
-            method=f"all lengths free: one stage {middle['one stage, all free']:.3f}, two {middle['two stages, all free']:.4f}",
-            toolkit=f"d_3 held: one stage {middle['one stage, d_3 held']:.3f}, two {two:.4f}, joint {middle['joint']:.4f}",
+            method=f"all lengths free: one stage {all_free:.3f}, two {middle['two stages, all free']:.4f}",
+            toolkit=f"d_3 held: one stage {d_3_held:.3f}, two {two:.4f}, joint {middle['joint']:.4f}",
             verdict=(
-                f"the scale fix gains as much as k was wrong: {middle['one stage, all free'] / two:.0f} times where it slid to a bound, {middle['one stage, d_3 held'] / two:.0f} times with d_3 held at its nominal value, "
-                f"{at_printed / two:.0f} times at the printed k. With one length in one place the joint solve changes the median by {100 * (middle['joint'] / two - 1):+.1f} %"
+                f"the scale fix gains as much as k was wrong: {all_free / two:.0f} times where it slid to a bound, "
+                f"{d_3_held / two:.0f} times with d_3 held at its nominal value, "
+                f"{at_printed / two:.0f} times at the printed k. With one length in one place the joint solve changes "
+                f"the median by {100 * (middle['joint'] / two - 1):+.1f} %"
             ),
         )
     )
@@ -169,7 +194,7 @@ def run() -> tuple[list[Row], dict[str, list[dict]]]:
     twins = twin.draw(made, noise, TWINS, SEED)
     free, own = (twin.identified(twins, hold) for hold in (None, "d_3"))
     compared(rows, free, own)
-    scale_slides(rows, twins, free, own)
+    scale_of_experiment(rows, twins, free, own)
     by_stage = stages(rows, twins, free, own)
     figures = [
         {
@@ -184,7 +209,7 @@ def run() -> tuple[list[Row], dict[str, list[dict]]]:
         }
         for i in range(TWINS)
     ]
-    # The twin whose largest deviation is the median, shown measurement by measurement as the paper's figures 6 and 8 are.
+    # The twin whose largest deviation is the median, measurement by measurement, as in the paper's figures 6 and 8.
     typical = int(np.argsort([line["plate_largest_mm"] for line in figures])[TWINS // 2])
     plate = [{"placement": float(i + 1), "deviation_mm": float(x)} for i, x in enumerate(own.plate[typical])]
     stage1 = np.where(twin.is_length(), own.parameters[typical] * own.k[typical], own.parameters[typical])

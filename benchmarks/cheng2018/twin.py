@@ -1,9 +1,9 @@
-"""Twins of section 4's experiment: the recordings (figshare 6223811) could not be had, so the arm is made up again, a thousand times.
+"""Twins of the experiment of section 4: its recordings (figshare 6223811) were not available, so it is simulated.
 
-Truth is the arm of eq. 18 after its scale fix. Every twin records what the paper did: three sockets of 70 poses, one length of
-201.513 mm measured four times at one place, a plate of 300.0005 mm at 30 places. Readings err by encoder noise, the tip by
-seating, and, as a part that no D-H model holds, every encoder by its eccentricity: a first harmonic of its own reading with an
-amplitude and a phase drawn for each twin.
+The true arm is that of eq. 18 after its scale fix. Every twin records what the paper did: three sockets of 70 poses,
+one length of 201.513 mm measured four times in one position, a plate of 300.0005 mm in 30 positions. Readings err by
+encoder noise, the tip by seating, and every encoder by its eccentricity, which no D-H model contains: a first harmonic
+of its own reading, with an amplitude and a phase drawn for each twin.
 """
 
 from functools import cache
@@ -19,19 +19,19 @@ import aacmm_jax as aj
 from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.kinematics.inverse_kinematics import random_configurations
 
-# mm: three sockets well within the arm's reach of 1.4 m, since the paper does not print where its own stood.
+# mm: three sockets well within the reach of 1.4 m; the paper does not print the positions of its own.
 SOCKETS = {"Data1": (400.0, 200.0, 300.0), "Data2": (-350.0, 500.0, 150.0), "Data3": (600.0, -450.0, 550.0)}
 REFERENCE = PUBLISHED["experiment"]["length_reference"]["nominal"]
 REPEATS = len(PUBLISHED["experiment"]["length_reference"]["measured"])
 PLATE, PLACEMENTS = PUBLISHED["verification"]["nominal"], 30
-# Readings averaged at each end of the reference length. The paper does not say; single ones would make its four measurements range
-# over three times the printed 0.006 mm, with any noise that matches the sockets.
+# Readings averaged at each end of the reference length. The paper does not state it; with single readings the range of
+# the four measurements would be three times the printed 0.006 mm, for any noise that matches the sockets.
 READINGS = 10
 _POOL = 40  # times as many poses and placements as a twin takes
 
 
 class Noise(NamedTuple):
-    """Standard deviations: of a reading, of a coordinate of the seat, and of each of the two parts of the eccentricity."""
+    """Standard deviations: of a reading, of a coordinate of the seat, of each of the two parts of the eccentricity."""
 
     encoder_arcsec: float
     seating_mm: float
@@ -39,7 +39,7 @@ class Noise(NamedTuple):
 
 
 class Pool(NamedTuple):
-    """Exact poses of the true arm, from which every twin draws its own; and how each moves for a shifted tip."""
+    """Exact poses of the true arm, from which every twin draws its own."""
 
     sockets: np.ndarray  # (3, m, 6)
     reference: np.ndarray  # (m, 2, 6): the two ends
@@ -64,7 +64,9 @@ def pool() -> Pool:
     count = POSES * _POOL
     sockets = aj.simulate(arm, SOCKETS, poses=count, seed=11).sockets
     bars = {}
-    for seed, (name, length, wanted) in enumerate((("reference", REFERENCE, 400), ("plate", PLATE, PLACEMENTS * _POOL))):
+    for seed, (name, length, wanted) in enumerate(
+        (("reference", REFERENCE, 400), ("plate", PLATE, PLACEMENTS * _POOL))
+    ):
         bars[name] = placed(arm, length, wanted, seed)
     return Pool(np.stack([sockets[name] for name in SOCKETS]), bars["reference"], bars["plate"])
 
@@ -79,9 +81,9 @@ def placed(arm: aj.Arm, length: float, count: int, seed: int) -> np.ndarray:
     direction *= length / 2 / np.linalg.norm(direction, axis=1, keepdims=True)
     ends = np.stack([centre - direction, centre + direction], axis=1)
     limits = jnp.array([(-np.pi, np.pi)] * arm.joints)
-    return np.asarray(random_configurations(arm, jnp.asarray(ends.reshape(-1, 3)), jax.random.key(seed), limits)).reshape(
-        count, 2, -1
-    )
+    return np.asarray(
+        random_configurations(arm, jnp.asarray(ends.reshape(-1, 3)), jax.random.key(seed), limits)
+    ).reshape(count, 2, -1)
 
 
 def draw(made: Pool, noise: Noise, count: int, seed: int) -> Twins:
@@ -101,10 +103,12 @@ def recorded(q: np.ndarray, noise: Noise, harmonics: np.ndarray, generator: np.r
     """What the encoders read in exact poses ``(t, ..., 6)``."""
     shift = noise.seating_mm * generator.normal(size=(*q.shape[:-1], 3))
     sine, cosine = (part.reshape(part.shape[0], *(1,) * (q.ndim - 2), part.shape[1]) for part in harmonics)
-    seated = q + np.asarray(_least_move(jnp.asarray(q.reshape(-1, q.shape[-1])), jnp.asarray(shift.reshape(-1, 3)))).reshape(
-        q.shape
+    seated = q + np.asarray(
+        _least_move(jnp.asarray(q.reshape(-1, q.shape[-1])), jnp.asarray(shift.reshape(-1, 3)))
+    ).reshape(q.shape)
+    return (
+        seated + sine * np.sin(q) + cosine * np.cos(q) + noise.encoder_arcsec * ARCSEC * generator.normal(size=q.shape)
     )
-    return seated + sine * np.sin(q) + cosine * np.cos(q) + noise.encoder_arcsec * ARCSEC * generator.normal(size=q.shape)
 
 
 @jax.jit
@@ -195,7 +199,9 @@ def medians(result: Outcome) -> dict[str, float]:
     }
 
 
-def fitted_noise(made: Pool, kinds: tuple[int, ...] = (0, 1, 2), targets: int = 3, count: int = 100, seed: int = 5) -> Noise:
+def fitted_noise(
+    made: Pool, kinds: tuple[int, ...] = (0, 1, 2), targets: int = 3, count: int = 100, seed: int = 5
+) -> Noise:
     """The noise whose median twin comes closest, in ratios, to the printed figures (the first ``targets`` of them).
 
     ``kinds`` names the parts of `Noise` that are used; the others are zero.

@@ -412,9 +412,8 @@ def test_lengths_between_the_same_sockets_are_one_position():
     assert "(19 are there)" in titled(run(twice), "volumetric").missing[0]
 
 
+@pytest.mark.parametrize("recorded", ["iso"], indirect=True)
 def test_every_length_of_a_length_test_needs_its_three_readings(recorded):
-    if len(recorded.spheres) == 1:
-        pytest.skip("of ISO 10360-12 only")
     whole = measured_by(recorded.nominal.arm, recorded)
     assert titled(run(whole), "length error").missing == ()
     short = dict(whole.sockets) | {"bar1/01/a": whole.sockets["bar1/01/a"][:1]}

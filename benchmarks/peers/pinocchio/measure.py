@@ -1,8 +1,8 @@
 """Pinocchio's kinematics of the same arm, pose by pose, in its own environment: IN.npz OUT.npz.
 
-Three things are timed, each over all poses in a Python loop, as its Python users call it: the tip; the tip and its Jacobian by the
-joint angles; and the tip with its frame's kinematic regressor, Pinocchio's derivative by small displacements of every joint's
-placement (6 columns a joint), from which a calibration takes its D-H columns.
+Three things are timed, each over all poses in a Python loop, as its Python users call it: the tip; the tip and its
+Jacobian by the joint angles; and the tip with its frame's kinematic regressor, Pinocchio's derivative by small
+displacements of the placement of every joint (6 columns a joint), from which a calibration takes its D-H columns.
 """
 
 import sys
@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 
-def turned(axis: int, angle: float) -> pin.SE3:
+def rotation_about(axis: int, angle: float) -> pin.SE3:
     c, s = np.cos(angle), np.sin(angle)
     rotation = np.eye(3)
     one, two = [(1, 2), (2, 0), (0, 1)][axis]
@@ -25,8 +25,8 @@ def model_of(given) -> tuple[pin.Model, int]:
     model, parent, link = pin.Model(), 0, pin.SE3.Identity()
     for i in range(given["alpha"].size):
         joint = pin.JointModelRZ()
-        parent = model.addJoint(parent, joint, link * turned(2, given["theta"][i]), f"joint_{i + 1}")
-        link = pin.SE3(np.eye(3), np.array([given["a"][i], 0.0, given["d"][i]])) * turned(0, given["alpha"][i])
+        parent = model.addJoint(parent, joint, link * rotation_about(2, given["theta"][i]), f"joint_{i + 1}")
+        link = pin.SE3(np.eye(3), np.array([given["a"][i], 0.0, given["d"][i]])) * rotation_about(0, given["alpha"][i])
     tip = link * pin.SE3(np.eye(3), given["probe"])
     return model, model.addFrame(pin.Frame("tip", parent, 0, tip, pin.FrameType.OP_FRAME))
 

@@ -1,8 +1,8 @@
 """Stage 1 of the paper's problem with pybotics, in its own environment (it needs NumPy before 2): IN.npz OUT.npz.
 
-pybotics has no fixed-point residual with an unknown point and no bounds of its own, so it supplies what it has: the chain, the
-mask that says which parameters are free, and forward kinematics pose by pose; the residual is centred here, and SciPy's
-`least_squares`, which pybotics itself calls, gets the bounds.
+pybotics has no fixed-point residual with an unknown point and no bounds of its own. It supplies the chain, the mask of
+free parameters, and forward kinematics pose by pose; the residual is centred here, and SciPy's `least_squares`, which
+pybotics itself calls, gets the bounds.
 """
 
 import sys
@@ -26,8 +26,8 @@ def main(source: str, target: str) -> None:
     links[1:, 0], links[1:, 1] = given["alpha"][:-1], given["a"][:-1]
     links[:, 2], links[:, 3] = given["theta"], given["d"]
     robot = Robot(MDHKinematicChain.from_parameters(links))
-    # The last link of the standard form stands before the probe: the two together are pybotics' tool. The probe's free axis
-    # (z), turned by alpha_n, must be an axis of the tool for that.
+    # pybotics' tool is the last link of the standard form together with the probe. The free axis of the probe (z),
+    # rotated by alpha_n, must therefore be an axis of the tool.
     c, s = np.cos(given["alpha"][-1]), np.sin(given["alpha"][-1])
     x, y, z = given["probe"]
     robot.tool.position = [given["a"][-1] + x, c * y - s * z, s * y + c * z]
