@@ -16,7 +16,7 @@ def panda() -> aj.Arm:
 
 def test_replaced_parameters(panda):
     arm = panda.replace(d_3=317.0, probe=(1.0, 2.0, 3.0), probe_z=131.0, beta_2=0.01)
-    np.testing.assert_array_equal(arm.d, np.asarray(panda.d).copy() + [0, 0, 1.0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(arm.d, [333, 0, 317, 0, 384, 0, 107])
     np.testing.assert_array_equal(arm.probe, [1.0, 2.0, 131.0])
     np.testing.assert_array_equal(arm.beta, [0, 0.01, 0, 0, 0, 0, 0])
     assert arm.limits == panda.limits

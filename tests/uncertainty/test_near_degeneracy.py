@@ -18,7 +18,7 @@ def panda() -> aj.Arm:
 
 @pytest.fixture(scope="module")
 def capture(panda) -> aj.Capture:
-    return aj.simulate(panda, ENDS, poses=60, lengths=[("A", "B")], noise=aj.Noise(encoder_arcsec=1.0, seating=0.1))
+    return aj.simulate(panda, ENDS, poses=60, lengths=[("A", "B")], encoder_arcsec=1.0, seating=0.1)
 
 
 def described(trade_offs) -> set[tuple[str, str]]:
