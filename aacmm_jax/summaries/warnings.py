@@ -68,8 +68,8 @@ def _validation(record: CalibrationRecord) -> list[str]:
             f"Sockets left out one placement after the other have errors {validation.excess:.1f} times their predicted "
             f"uncertainty ({validation.rms:.3g} mm RMS instead of {validation.rms_predicted:.3g}, lengths "
             f"{validation.length_rms:.3g} mm instead of {validation.length_u:.3g}): errors of neighbouring poses are "
-            "alike, as of effects outside the D-H model (compliant joints, eccentric encoders). Use the cross-validated "
-            "values; every u below is too small."
+            "alike, as of effects outside the D-H model (compliant joints, eccentric encoders). Use the "
+            "cross-validated values; every u below is too small."
         )
     if record.reduced_chi is not None and not 1 / _EXCESS < record.reduced_chi < _EXCESS:
         word = "small" if record.reduced_chi > 1 else "large"
