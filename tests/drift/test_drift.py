@@ -485,7 +485,7 @@ def files(calibrated, tmp_path, monkeypatch):
 
 def test_command(run, files, calibrated):
     printed = run("a.h5", "c.h5")
-    assert printed.exit_code == 0
+    assert printed.exit_code == 0, printed.exception
     words = " ".join(printed.stdout.split())
     assert words.startswith(
         "Cheng 2018, simulated arm: c.h5 (2026-03-01) against a.h5 (2026-01-01) Together, the changes of 21"
