@@ -189,7 +189,7 @@ def _title_changes(axes: Any, title: str, drift: Drift) -> None:
 
 
 def _positions_in_time(trend: Trend, axes: Any) -> np.ndarray:
-    """Abscissas of the calibrations, by date unless they would overlap, in steps of one; sets the ticks of both axes."""
+    """Abscissas of the calibrations, by date unless they would overlap, in steps of one; sets the ticks of both."""
     seconds = np.array([date.timestamp() for date in trend.dates])
     span = seconds[-1] - seconds[0]
     even = span <= 0 or np.min(np.diff(seconds)) < _CROWDED * span

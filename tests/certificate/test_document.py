@@ -122,7 +122,7 @@ def full(tmp_path_factory) -> AdministrativeData:
 
 @pytest.fixture(scope="module")
 def certificates(record, full) -> dict[str, str]:
-    """Certificates of every kind that the published rules are held against."""
+    """Certificates of every kind, to be checked against the published rules."""
     uncertain = record.determined.copy()
     uncertain[0] = False
     active = record.active.copy()
@@ -207,7 +207,7 @@ def test_the_published_schematron_rules_hold(certificates, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_elements_stand_in_the_order_of_the_schema(certificates, kind):
+def test_elements_are_in_the_order_of_the_schema(certificates, kind):
     root = ElementTree.fromstring(certificates[kind].encode())
     children = lambda element: [child.tag.removeprefix(DCC) for child in element]  # noqa: E731
     assert root.tag == f"{DCC}digitalCalibrationCertificate"
@@ -328,7 +328,7 @@ def test_a_fixed_length_that_the_scale_fix_divided_says_so(record):
     assert parse_dcc(text)["As left", PARAMETERS, "probe_z"].expanded is None
 
 
-def test_what_is_stated_stands_there(certificates, full):
+def test_what_is_stated_is_in_the_certificate(certificates, full):
     text = certificates["all stated"]
     root = ElementTree.fromstring(text.encode())
     path = lambda *tags: "/".join(f"{DCC}{tag}" for tag in ("administrativeData", *tags))  # noqa: E731
@@ -392,13 +392,13 @@ def test_nothing_is_made_up(record):
     assert names[:2] == ["Scale", "Uncertainty"]
 
 
-def test_cautions_and_simulations_are_told(record):
+def test_warnings_and_simulations_are_stated(record):
     recording = record.recording
     simulated = record._replace(recording=recording._replace(true=recording.nominal), reduced_chi=3.0)
-    cautions = of_calibration(simulated)
-    assert any("3 times what the given noise predicts" in sentence for sentence in cautions)
+    warnings = of_calibration(simulated)
+    assert any("3 times what the given noise predicts" in sentence for sentence in warnings)
     said = contents(dcc_xml(simulated, AdministrativeData(), created=CREATED), "*/dcc:statements")
-    assert set(cautions) <= set(said)
+    assert set(warnings) <= set(said)
     assert "The readings are simulated, so this is no certificate of a real arm." in said
 
 

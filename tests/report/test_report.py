@@ -170,7 +170,7 @@ def tables_of(report):
     return found
 
 
-def test_numbers_of_a_report_stand_under_the_right_heading(written):
+def test_numbers_of_a_report_are_under_the_right_heading(written):
     from aacmm_jax.report.calibration import calibration_report
 
     record = written.record
