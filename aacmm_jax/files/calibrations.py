@@ -9,7 +9,7 @@ from ..calibration.results import CrossValidation, LeftOut
 from ..data.noise import Noise
 from ..kinematics.arm import is_length
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
-from .hdf5 import Stored, Table, Variable, need, read_tables, undamaged, write_tables
+from .hdf5 import Stored, Table, Variable, names_in, need, read_tables, undamaged, write_tables
 
 STAGES = ("nominal", "stage1", "calibrated")
 
@@ -33,7 +33,7 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
     attributes = recording_attributes(record.recording) | {
         "sampled_says": record.sampled_says,
         "method": record.method,
-        "held": ",".join(record.held),
+        "held": list(record.held) or "",
         "hold": record.hold,
         "scale_k": record.k,
         "scale_u": record.u_k,
@@ -66,7 +66,7 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
         stage1=specification_of(path, stored, "stage1_arm"),
         calibrated=specification_of(path, stored, "calibrated_arm"),
         names=tuple(str(name) for name in table["parameter"]),
-        held=tuple(attributes["held"].split(",")) if attributes.get("held") else (),
+        held=names_in(attributes.get("held")),
         hold=attributes.get("hold"),
         lower=table["lower"],
         upper=table["upper"],
@@ -113,7 +113,9 @@ def _parameter_table(record: CalibrationRecord) -> Table:
             ("parameter",), record.active_stage1, "1", "-1 on the lower bound, +1 on the upper, in stage 1"
         ),
         "active": Variable(("parameter",), record.active, "1", "-1 on the lower bound, +1 on the upper"),
-        "determined": Variable(("parameter",), record.determined.astype(np.int8), "1", "0: only a combination is determined"),
+        "determined": Variable(
+            ("parameter",), record.determined.astype(np.int8), "1", "0: only a combination is determined"
+        ),
         "stretch": Variable(
             ("parameter",), record.common_scale_error[:-1], both, "covariance with the relative error of held lengths"
         ),
@@ -130,17 +132,31 @@ def _parameter_table(record: CalibrationRecord) -> Table:
 def _validation_table(record: CalibrationRecord) -> Table:
     assert record.validation is not None
     groups = record.validation.groups
+    sockets = [(number, name) for number, group in enumerate(groups) for name in group.sockets]
     number = np.concatenate([np.full(len(group.length_error), i) for i, group in enumerate(groups)])
     variables = {
-        "group": Variable(("group",), [",".join(group.sockets) for group in groups], "", "sockets left out together"),
+        "group": Variable(
+            ("group",), [", ".join(group.sockets) for group in groups], "", "sockets left out together, as a label"
+        ),
+        "left_out_socket": Variable(
+            ("left_out_socket",), [name for _, name in sockets], "", "sockets left out, one after the other"
+        ),
+        "socket_number": Variable(
+            ("left_out_socket",), [i for i, _ in sockets], "1", "which group a socket is of, from 0"
+        ),
         "poses": Variable(("group",), [group.poses for group in groups], "1", "poses in sockets with more than one"),
         "rms": Variable(("group",), [group.rms for group in groups], "mm", "RMS distance from the centroid, found"),
         "rms_predicted": Variable(("group",), [group.rms_predicted for group in groups], "mm", "the same, predicted"),
         "converged": Variable(("group",), [int(group.converged) for group in groups], "1", "1: the others converged"),
-        "left_out_length": Variable(("left_out_length",), np.arange(len(number)), "1", "lengths left out, one after the other"),
+        "left_out_length": Variable(
+            ("left_out_length",), np.arange(len(number)), "1", "lengths left out, one after the other"
+        ),
         "number": Variable(("left_out_length",), number, "1", "which group a length is of, from 0"),
         "length_error": Variable(
-            ("left_out_length",), np.concatenate([group.length_error for group in groups]), "mm", "error of a length left out"
+            ("left_out_length",),
+            np.concatenate([group.length_error for group in groups]),
+            "mm",
+            "error of a length left out",
         ),
         "length_u": Variable(
             ("left_out_length",),
@@ -157,11 +173,13 @@ def _validation_of(stored: Stored) -> CrossValidation | None:
     if table is None:
         return None
     groups = []
-    for i, names in enumerate(table["group"]):
+    for i, label in enumerate(table["group"]):
         of = table["number"] == i
+        # Files of version 0.1 and before have the sockets in the label only.
+        names = table["left_out_socket"][table["socket_number"] == i] if "left_out_socket" in table else names_in(label)
         groups.append(
             LeftOut(
-                sockets=tuple(str(names).split(",")),
+                sockets=tuple(map(str, names)),
                 poses=int(table["poses"][i]),
                 rms=float(table["rms"][i]),
                 rms_predicted=float(table["rms_predicted"][i]),
@@ -188,7 +206,9 @@ def _sampled_table(record: CalibrationRecord) -> Table:
     for name, text in texts.items():
         variables[name] = Variable(("quantity",), record.sampled[name], "mm or rad; 1 for k", text)
     agrees = np.asarray(record.sampled["agrees"], dtype=np.int8)
-    variables["agrees"] = Variable(("quantity",), agrees, "1", "1: the linear interval is within the tolerance of JCGM 101")
+    variables["agrees"] = Variable(
+        ("quantity",), agrees, "1", "1: the linear interval is within the tolerance of JCGM 101"
+    )
     return Table(variables)
 
 

@@ -12,9 +12,15 @@ from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm
 from ..kinematics.specification import ArmSpecification, single
-from .hdf5 import Stored, Table, Variable, need, read_tables, undamaged, write_tables
+from .hdf5 import Stored, Table, Variable, names_in, need, read_tables, undamaged, write_tables
 
-_KINDS = {"alpha": "link twist", "a": "link length", "d": "link offset", "theta": "joint zero offset", "beta": "Hayati's angle"}
+_KINDS = {
+    "alpha": "link twist",
+    "a": "link length",
+    "d": "link offset",
+    "theta": "joint zero offset",
+    "beta": "Hayati's angle",
+}
 
 
 def save_capture(path: str | os.PathLike, recording: Recording) -> None:
@@ -79,7 +85,9 @@ def lengths_of(path: str | os.PathLike, stored: Stored) -> list[ReferenceLength]
 
 def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False) -> Table:
     """Touched spheres, by poses or points, one row a touch; what belongs to a sphere stands in every row of it."""
-    rows = [(sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group]
+    rows = [
+        (sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group
+    ]
     each = {
         "sphere": ([sphere.name for sphere, *_ in rows], "", "reference sphere"),
         "test": ([sphere.test for sphere, *_ in rows], "", "acceptance test that the sphere was touched for"),
@@ -163,7 +171,7 @@ def arm_table(specification: ArmSpecification) -> Table:
         "half_width_angle_rad": specification.angle,
         "override_names": list(specification.override) or None,
         "override_half_widths": [float(width) for width in specification.override.values()] or None,
-        "held": None if specification.held is None else ",".join(specification.held),
+        "held": None if specification.held is None else list(specification.held) or "",
     }
     return Table(variables, attributes)
 
@@ -193,7 +201,7 @@ def specification_of(path: str | os.PathLike, stored: Stored, table: str) -> Arm
     return ArmSpecification(
         arm=arm,
         name=attributes.get("name", ""),
-        held=None if held is None else tuple(name for name in held.split(",") if name),
+        held=None if held is None else names_in(held),
         length=attributes.get("half_width_length_mm", 10.0),
         angle=attributes.get("half_width_angle_rad", 0.0175),
         override=dict(override),

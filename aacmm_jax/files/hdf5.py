@@ -147,7 +147,13 @@ def provenance(kind: str) -> dict[str, Any]:
 def _write_attributes(item: Any, attributes: Mapping[str, Any]) -> None:
     for key, value in attributes.items():
         if value is not None:
-            item.attrs[key] = storable(value) if isinstance(value, str) else value
+            item.attrs[key] = _attribute(value)
+
+
+def _attribute(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_attribute(item) for item in value]
+    return storable(value) if isinstance(value, str) else value
 
 
 def _write_group(group: Any, table: Table) -> None:
@@ -192,7 +198,9 @@ def read_tables(path: str | os.PathLike, kinds: Sequence[str], without: Sequence
         _check_kind(path, attributes, kinds)
         groups = {name: group for name, group in file.items() if isinstance(group, h5py.Group) and name not in without}
         tables = {name: {key: _values(item) for key, item in group.items()} for name, group in groups.items()}
-        table_attributes = {name: {key: _plain(value) for key, value in group.attrs.items()} for name, group in groups.items()}
+        table_attributes = {
+            name: {key: _plain(value) for key, value in group.attrs.items()} for name, group in groups.items()
+        }
     return Stored(attributes, tables, table_attributes)
 
 
@@ -229,6 +237,13 @@ def need(path: str | os.PathLike, names: Mapping[str, Any], *needed: str, of: st
     for name in needed:
         if name not in names:
             raise InputError(f"{path} lacks the {of} '{name}'; it is damaged or was edited, make it again.")
+
+
+def names_in(attribute: str | Sequence[str] | None) -> tuple[str, ...]:
+    """The names that an attribute lists; files of version 0.1 and before have them in one string, with commas between."""
+    if isinstance(attribute, str):
+        return tuple(name for name in attribute.split(",") if name)
+    return tuple(attribute or ())
 
 
 def _values(dataset: Any) -> np.ndarray:

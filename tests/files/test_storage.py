@@ -16,6 +16,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 import aacmm_jax as aj
+from aacmm_jax.calibration.results import CrossValidation, LeftOut
 from aacmm_jax.files.arms import specification_toml
 from tests.refusals import assert_refused
 
@@ -402,6 +403,30 @@ def test_round_trip_of_a_calibration(tmp_path, good):
             assert plain(value) == plain(expected), name
         elif name != "recording":
             assert value == (str(expected) if name == "reason" else expected), name
+
+
+@pytest.mark.parametrize("earlier", [False, True], ids=["as written now", "as version 0.1 wrote it"])
+@pytest.mark.parametrize("held", [(), ("d_1", "theta_1")], ids=["nothing held", "two held"])
+def test_names_with_a_comma(tmp_path, good, held, earlier):
+    """Lists of names are lists in the file; those that were one string with commas between are still read."""
+    names = ("A", "B") if earlier else ("plate, left", "B")
+    lengths = [aj.ReferenceLength(*names, 230.0, 0.01)]
+    capture = aj.Capture(dict(zip(names, good.recording.capture.sockets.values(), strict=True)), lengths)
+    group = LeftOut(names, 15, 0.1, 0.1, np.array([0.2]), np.array([0.1]), True)
+    recording = good.recording._replace(capture=capture, nominal=good.recording.nominal._replace(held=held))
+    record = good.record._replace(recording=recording, held=held, validation=CrossValidation((group, group)))
+    path = tmp_path / "calibration.h5"
+    aj.files.save_calibration(path, record)
+    if earlier:
+        with h5py.File(path, "a") as file:
+            file.attrs["held"] = file["nominal_arm"].attrs["held"] = ",".join(held)
+            table = file["cross_validation"]
+            table["group"][...] = ",".join(names)
+            del table["socket_number"], table["left_out_socket"]
+    read = aj.files.load_calibration(path)
+    assert read.recording.capture.names == names
+    assert [found.sockets for found in read.validation.groups] == [names, names]
+    assert (read.held, read.recording.nominal.held) == (held, held)
 
 
 @pytest.mark.parametrize("name", ["a\0b", "h\udcf6le"], ids=["NUL", "not UTF-8"])
