@@ -6,10 +6,10 @@ import os
 import re
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
 from ..core.errors import InputError
-from .toml import read_toml
+from .toml import Strict, read_toml
 
 NOT_STATED = "not stated"
 NO_COUNTRY = "ZZ"  # ISO 3166-1 leaves it to users: the certificate must have a country code, and none was given
@@ -22,7 +22,9 @@ def held_by_xml(text: str, what: str) -> str:
     """The same text, or `InputError` where it has a character that XML 1.0 cannot hold. ``what`` names it in the sentence."""
     found = _UNHOLDABLE.search(text)
     if found:
-        raise InputError(f"{what} holds the character U+{ord(found.group()):04X}, which no XML file can hold; take it out.")
+        raise InputError(
+            f"{what} holds the character U+{ord(found.group()):04X}, which no XML file can hold; take it out."
+        )
     return text
 
 
@@ -46,11 +48,7 @@ def _country(code: str) -> str:
 Country = Annotated[str, AfterValidator(_country)]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Contact(_Strict):
+class Contact(Strict):
     """A laboratory's or a customer's name and address. ``country`` is a code of ISO 3166-1: two capital letters."""
 
     name: Text = NOT_STATED
@@ -68,7 +66,7 @@ class Laboratory(Contact):
     code: Text | None = None
 
 
-class Item(_Strict):
+class Item(Strict):
     """The arm that was calibrated; without a name, it is called as in its arm file."""
 
     name: Text | None = None
@@ -78,7 +76,7 @@ class Item(_Strict):
     customer_number: Text | None = None  # what the customer calls it by
 
 
-class Person(_Strict):
+class Person(Strict):
     """A person responsible for the certificate."""
 
     name: Text
@@ -86,7 +84,7 @@ class Person(_Strict):
     main_signer: bool = False
 
 
-class Reference(_Strict):
+class Reference(Strict):
     """A reference artefact that the lengths are between: gauge block, ball bar, plate."""
 
     name: Text
@@ -96,7 +94,7 @@ class Reference(_Strict):
     certificate_number: Text | None = None  # of its own calibration
 
 
-class Certificate(_Strict):
+class Certificate(Strict):
     """Number, dates and conditions. Without dates, the day on which the calibration was computed counts as begin and end."""
 
     number: Text | None = None
@@ -122,7 +120,7 @@ class Certificate(_Strict):
         return self
 
 
-class Conformity(_Strict):
+class Conformity(Strict):
     """A statement of conformity: the verdict, the specification it is about, and the rule by which it was decided."""
 
     verdict: Literal["pass", "fail", "conditionalPass", "conditionalFail", "noPass", "noFail"]
@@ -130,15 +128,15 @@ class Conformity(_Strict):
     decision_rule: Text
 
 
-class AdministrativeData(_Strict):
+class AdministrativeData(Strict):
     """What a certificate needs besides numbers. Everything is optional, and says that it is not stated where it is missing."""
 
     laboratory: Laboratory = Laboratory()
     customer: Contact = Contact()
     item: Item = Item()
-    person: list[Person] = []
+    person: list[Person] = Field(default_factory=list)
     certificate: Certificate = Certificate()
-    reference: list[Reference] = []
+    reference: list[Reference] = Field(default_factory=list)
     conformity: Conformity | None = None
 
     @property
@@ -153,7 +151,9 @@ def read_administrative_data(path: str | os.PathLike) -> AdministrativeData:
     return read_toml(path, AdministrativeData)
 
 
-def check_conformity(about: AdministrativeData, *, simulated: bool, decision: str | None = None, tested: bool = False) -> None:
+def check_conformity(
+    about: AdministrativeData, *, simulated: bool, decision: str | None = None, tested: bool = False
+) -> None:
     """Refuse a statement of conformity that the data contradict: of a simulated arm, or other than what an evaluation decided."""
     if about.conformity is None:
         return

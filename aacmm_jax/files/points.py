@@ -7,13 +7,14 @@ import numpy as np
 
 from ..acceptance.suite import Measured
 from ..core.errors import InputError, nearest
+from ..core.units import INCH, UM, M
 from ..kinematics.workspace import Reach
 from .manifest import PointsManifest, recorded
 from .text_table import read_numbers
 from .toml import read_toml
 from .whole_file import fingerprint
 
-_UNITS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "inch": 25.4}
+_UNITS = {"mm": 1.0, "m": M, "um": UM, "inch": INCH}
 
 
 def read_points(path: str | os.PathLike) -> Measured:
