@@ -138,7 +138,7 @@ def _procedure(
 ) -> dict[str, Any]:
     """Plan an acceptance test and write it."""
     from ..acceptance.procedure import plan_procedure
-    from ..files.procedures import procedure_csv, procedure_manifest
+    from ..files.plans import procedure_csv, procedure_manifest
     from ..files.whole_file import write_text
     from ..summaries.procedure import procedure_summary
 

@@ -96,8 +96,7 @@ def report(
 
 def show_evaluation(file: Path, of_points: bool, as_json: bool) -> None:
     """What an evaluation's file holds, printed."""
-    from ..files.evaluations import load_evaluation
-    from ..files.points_evaluations import load_points
+    from ..files.evaluations import load_evaluation, load_points
     from ..summaries.evaluation import evaluation_summary, points_summary
     from . import acceptance_display
 
@@ -136,8 +135,8 @@ def _evaluated(
 
 def _evaluated_points(manifest: Path, output: Path | None, limits: Any, u_test: float) -> dict[str, Any]:
     from ..acceptance.record import PointsRecord
+    from ..files.evaluations import save_points
     from ..files.points import read_points
-    from ..files.points_evaluations import save_points
     from ..summaries.evaluation import points_summary
 
     if manifest.suffix != ".toml":

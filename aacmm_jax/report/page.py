@@ -73,7 +73,7 @@ def _of_evaluation(source: Path, attributes: dict[str, Any]) -> tuple[Report, bo
     from .evaluation import evaluation_report, overall, points_report
 
     if attributes.get("of") == "points":
-        from ..files.points_evaluations import load_points
+        from ..files.evaluations import load_points
 
         report, summary = points_report(load_points(source))
         return report, False, overall(summary)
