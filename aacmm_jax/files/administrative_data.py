@@ -1,4 +1,4 @@
-"""What a calibration certificate says besides numbers: laboratory, customer, item, persons and dates, written by people in TOML."""
+"""Administrative data of a certificate (DCC's term), in TOML: laboratory, customer, item, persons and dates."""
 
 import datetime
 import itertools
@@ -12,15 +12,15 @@ from ..core.errors import InputError
 from .toml import Strict, read_toml
 
 NOT_STATED = "not stated"
-NO_COUNTRY = "ZZ"  # ISO 3166-1 leaves it to users: the certificate must have a country code, and none was given
+NO_COUNTRY = "ZZ"  # reserved for users by ISO 3166-1: a certificate must have a country code, and none was given
 
 # All but the characters of XML 1.0, production 2.
-_UNHOLDABLE = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_NOT_IN_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def held_by_xml(text: str, what: str) -> str:
-    """The same text, or `InputError` where it has a character that XML 1.0 cannot hold. ``what`` names it in the sentence."""
-    found = _UNHOLDABLE.search(text)
+    """The same text, or `InputError` where it has a character that XML 1.0 cannot hold; ``what`` names the text."""
+    found = _NOT_IN_XML.search(text)
     if found:
         raise InputError(
             f"{what} holds the character U+{ord(found.group()):04X}, which no XML file can hold; take it out."
@@ -29,7 +29,7 @@ def held_by_xml(text: str, what: str) -> str:
 
 
 def _text(text: str) -> str:
-    """Text without blanks around it, as the schema wants it."""
+    """Text without blanks around it, as the schema of the DCC requires."""
     text = held_by_xml(text, "the text").strip(" \t\n\r")
     if not text:
         raise ValueError("the text is empty; give some, or leave the key out.")
@@ -95,7 +95,7 @@ class Reference(Strict):
 
 
 class Certificate(Strict):
-    """Number, dates and conditions. Without dates, the day on which the calibration was computed counts as begin and end."""
+    """Number, dates and conditions; without dates, begin and end are the day on which the calibration was computed."""
 
     number: Text | None = None
     country: Country | None = None  # where it is issued; by default the laboratory's
@@ -114,7 +114,7 @@ class Certificate(Strict):
         given = [(name, date) for name, date in dates if date is not None]
         for (earlier, first), (later, second) in itertools.pairwise(given):
             if first > second:
-                raise ValueError(f"{earlier} is {first}, after {later} on {second}; mend one of them.")
+                raise ValueError(f"{earlier} is {first}, after {later} on {second}; correct one of them.")
         if self.temperature_u_celsius is not None and self.temperature_celsius is None:
             raise ValueError("temperature_u_celsius is given without temperature_celsius; give both.")
         return self
@@ -129,7 +129,7 @@ class Conformity(Strict):
 
 
 class AdministrativeData(Strict):
-    """What a certificate needs besides numbers. Everything is optional, and says that it is not stated where it is missing."""
+    """The administrative data of a certificate. All are optional; the certificate says what is not stated."""
 
     laboratory: Laboratory = Laboratory()
     customer: Contact = Contact()
@@ -146,23 +146,38 @@ class AdministrativeData(Strict):
 
 
 def read_administrative_data(path: str | os.PathLike) -> AdministrativeData:
-    """Read the TOML file about a certificate: ``[laboratory]``, ``[customer]``, ``[item]``, ``[[person]]``, ``[certificate]``,
-    ``[[reference]]``, ``[conformity]``. Raises `InputError` that names the file, the place in it and the mend."""
+    """Read the administrative data of a certificate.
+
+    Args:
+        path: a TOML file with the tables ``[laboratory]``, ``[customer]``, ``[item]``, ``[[person]]``,
+            ``[certificate]``, ``[[reference]]`` and ``[conformity]``, each of them optional.
+
+    Returns:
+        The data, checked.
+
+    Raises:
+        InputError: names the file, the key in it and what to do.
+    """
     return read_toml(path, AdministrativeData)
 
 
 def check_conformity(
     about: AdministrativeData, *, simulated: bool, decision: str | None = None, tested: bool = False
 ) -> None:
-    """Refuse a statement of conformity that the data contradict: of a simulated arm, or other than what an evaluation decided."""
+    """Refuse a statement of conformity that the data contradict: of a simulated arm, or against an evaluation."""
     if about.conformity is None:
         return
     verdict = about.conformity.verdict
     if simulated:
-        raise InputError("conformity is stated of a simulated arm, which conforms to nothing; leave [conformity] out.")
+        raise InputError("conformity is stated of a simulated arm, which cannot conform; leave [conformity] out.")
     passes = {"pass": ("conforms",), "fail": ("fails",)}.get(verdict)
     if tested and passes is not None and decision not in passes:
-        came = {"conforms": "every limit is kept", "fails": "a limit is not kept", "undecided": "a limit is undecided"}
+        results = {
+            "conforms": "every limit is kept",
+            "fails": "a limit is not kept",
+            "undecided": "a limit is undecided",
+        }
         raise InputError(
-            f"conformity.verdict is '{verdict}', but of this evaluation {came.get(decision or '', 'no limit was given')}; mend the statement."
+            f"conformity.verdict is '{verdict}', but of this evaluation "
+            f"{results.get(decision or '', 'no limit was given')}; correct the statement."
         )

@@ -1,4 +1,4 @@
-"""A finished calibration as plain tables: made from a `Calibration`, written to and read from HDF5."""
+"""Calibrations in HDF5: the capture, the arms of each stage, parameters with their covariance, and cross-validation."""
 
 import os
 
@@ -11,11 +11,17 @@ from ..kinematics.arm import is_length
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .hdf5 import Stored, Table, Variable, names_in, need, read_tables, undamaged, write_tables
 
-STAGES = ("nominal", "stage1", "calibrated")
-
 
 def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None:
-    """Write a calibration with its capture and arms to HDF5, whole or not at all."""
+    """Write a calibration with its capture and arms to HDF5, whole or not at all.
+
+    Args:
+        path: the file to write.
+        record: the calibration, from `calibration.record_of`.
+
+    Raises:
+        InputError: the file cannot be written, or a name holds a character that no file can hold.
+    """
     tables = recording_tables(record.recording)
     tables["stage1_arm"] = arm_table(record.stage1)
     tables["calibrated_arm"] = arm_table(record.calibrated)
@@ -51,7 +57,17 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
 
 
 def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
-    """Read a calibration. Raises `InputError` where the file is missing, damaged, foreign, newer or no calibration."""
+    """Read a calibration that `save_calibration` or ``aacmm calibrate`` wrote.
+
+    Args:
+        path: the file to read.
+
+    Returns:
+        The record, with arrays in mm and rad.
+
+    Raises:
+        InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+    """
     stored = read_tables(path, ("calibration",))
     need(path, stored.tables, "stage1_arm", "calibrated_arm", "parameters")
     with undamaged(path):
@@ -117,7 +133,7 @@ def _parameter_table(record: CalibrationRecord) -> Table:
             ("parameter",), record.determined.astype(np.int8), "1", "0: only a combination is determined"
         ),
         "stretch": Variable(
-            ("parameter",), record.common_scale_error[:-1], both, "covariance with the relative error of held lengths"
+            ("parameter",), record.common_scale_error[:-1], both, "covariance with the common scale error"
         ),
         "open": Variable(
             ("parameter", "parameter_2"), record.open, "1", "projector onto what is not determined, in mm and mrad"

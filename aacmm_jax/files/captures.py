@@ -1,4 +1,4 @@
-"""Captures in HDF5: the poses, the reference lengths, the nominal arm and, for a simulation, the true one."""
+"""Captures in HDF5: poses, reference lengths, touched spheres, the nominal arm and, for a simulation, the true arm."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -24,12 +24,30 @@ _KINDS = {
 
 
 def save_capture(path: str | os.PathLike, recording: Recording) -> None:
-    """Write a capture with its arms to HDF5, whole or not at all."""
+    """Write a capture with its arms to HDF5, whole or not at all.
+
+    Args:
+        path: the file to write.
+        recording: the capture, with its nominal arm.
+
+    Raises:
+        InputError: the file cannot be written, or a name holds a character that no file can hold.
+    """
     write_tables(path, "capture", recording_tables(recording), recording_attributes(recording))
 
 
 def load_capture(path: str | os.PathLike) -> Recording:
-    """Read a capture with its arms. Raises `InputError` where the file is missing, damaged, foreign or newer."""
+    """Read a capture with its arms, from a capture file or from a calibration file.
+
+    Args:
+        path: the file to read.
+
+    Returns:
+        The recording, in mm and rad.
+
+    Raises:
+        InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+    """
     stored = read_tables(path, ("capture", "calibration"))
     with undamaged(path):
         return recording_of(path, stored)
@@ -84,7 +102,7 @@ def lengths_of(path: str | os.PathLike, stored: Stored) -> list[ReferenceLength]
 
 
 def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False) -> Table:
-    """Touched spheres, by poses or points, one row a touch; what belongs to a sphere stands in every row of it."""
+    """Touched spheres, by poses or points, one row a touch; what belongs to a sphere is in every row of it."""
     rows = [
         (sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group
     ]

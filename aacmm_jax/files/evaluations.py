@@ -25,7 +25,15 @@ from .hdf5 import Stored, Table, Variable, need, read_tables, undamaged, write_t
 
 
 def save_evaluation(path: str | os.PathLike, record: EvaluationRecord) -> None:
-    """Write an evaluation to HDF5, whole or not at all."""
+    """Write an evaluation of a capture to HDF5, whole or not at all.
+
+    Args:
+        path: the file to write.
+        record: the evaluation, from `acceptance.evaluation_of`.
+
+    Raises:
+        InputError: the file cannot be written, or a name holds a character that no file can hold.
+    """
     tables = recording_tables(record.recording)
     tables["calibrated_arm"] = arm_table(record.calibrated)
     tables["used"] = Table(
@@ -42,7 +50,7 @@ def save_evaluation(path: str | os.PathLike, record: EvaluationRecord) -> None:
 
 
 def _limit_table(limits: Mapping[str, Limit | float]) -> Table:
-    """Limits by the name of a figure."""
+    """Limits by the name of a result."""
     checked = checked_limits(limits)
     columns = {
         "figure": (list(checked), "", "figure of an acceptance test"),
@@ -63,7 +71,7 @@ def _limits_in(stored: Stored) -> dict[str, Limit]:
 
 
 def _figure_table(record: EvaluationRecord) -> Table:
-    """The results, for other programs; this package computes them again."""
+    """The results, for other programs; this package computes them again on reading."""
     rows = [
         (stage, test, figure)
         for stage, tests in record.acceptance().items()
@@ -85,7 +93,17 @@ def _figure_table(record: EvaluationRecord) -> Table:
 
 
 def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
-    """Read an evaluation. Raises `InputError` where the file is missing, damaged, foreign, newer or no evaluation."""
+    """Read an evaluation of a capture.
+
+    Args:
+        path: the file to read.
+
+    Returns:
+        The record, from which the results are computed again.
+
+    Raises:
+        InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+    """
     stored = read_tables(path, ("evaluation",))
     need(path, stored.tables, "calibrated_arm", "used", "limits")
     with undamaged(path):
@@ -107,7 +125,15 @@ def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
 
 
 def save_points(path: str | os.PathLike, record: PointsRecord) -> None:
-    """Write an evaluation of points to HDF5, whole or not at all."""
+    """Write an evaluation of points to HDF5, whole or not at all.
+
+    Args:
+        path: the file to write.
+        record: the measured points, the limits and the uncertainty of the test.
+
+    Raises:
+        InputError: the file cannot be written, or a name holds a character that no file can hold.
+    """
     measured = record.measured
     owner = [name for name, points in measured.sockets.items() for _ in points]
     position = np.concatenate([np.zeros((0, 3)), *measured.sockets.values()])
@@ -138,7 +164,17 @@ def save_points(path: str | os.PathLike, record: PointsRecord) -> None:
 
 
 def load_points(path: str | os.PathLike) -> PointsRecord:
-    """Read an evaluation of points. Raises `InputError` where the file is missing, damaged, foreign, newer or none."""
+    """Read an evaluation of points.
+
+    Args:
+        path: the file to read.
+
+    Returns:
+        The record, from which the results are computed again.
+
+    Raises:
+        InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+    """
     stored = read_tables(path, ("evaluation",))
     need(path, stored.tables, "points", "reference", "limits")
     with undamaged(path):

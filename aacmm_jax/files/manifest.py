@@ -1,4 +1,4 @@
-"""The capture manifest: a short TOML file that says which text files hold which socket, in which unit, and the lengths."""
+"""The manifest of a capture (TOML): which text files hold which socket, in which unit, and the lengths."""
 
 import datetime
 import math
@@ -94,7 +94,7 @@ class _Points(Strict):
     def _both(self) -> "_Points":
         if (self.reach is None) != (self.shoulder is None):
             raise ValueError(
-                "give reach and shoulder together: the zones of a test are counted from the shoulder, in the points' frame."
+                "give reach and shoulder together: zones are distances from the shoulder, in the points' frame."
             )
         return self
 
@@ -130,7 +130,14 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     "-" only, so that ``hole_0_pose.csv`` is left alone. ``exclude = ["*_old.csv"]`` in ``[[socket]]`` leaves out the
     files that match such a shell pattern. Angles: reading -> sign * (reading - offset), in the stated unit.
 
-    Raises `InputError` that names the file, the place in it and the mend.
+    Args:
+        path: the manifest (TOML).
+
+    Returns:
+        The recording: capture and nominal arm, in mm and rad, with the SHA-256 of each file.
+
+    Raises:
+        InputError: names the file, the place in it and what to do.
     """
     path = Path(path)
     model = read_toml(path, _Manifest)
@@ -139,7 +146,8 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         joints = nominal.arm.joints
         if model.angles.columns is not None and len(model.angles.columns) != joints:
             raise InputError(
-                f"angles.columns picks {len(model.angles.columns)} columns, but the arm has {joints} joints; pick one a joint."
+                f"angles.columns picks {len(model.angles.columns)} columns, but the arm has {joints} joints; "
+                "pick one a joint."
             )
         files = [path]
 
@@ -185,8 +193,8 @@ def recorded(
 
 
 def _arm_source(manifest: Path, arm: str) -> str | Path:
-    beside = manifest.parent / arm
-    return beside if arm.endswith(".toml") or beside.is_file() else arm
+    file = manifest.parent / arm
+    return file if arm.endswith(".toml") or file.is_file() else arm
 
 
 def _radians(readings: np.ndarray, angles: _Angles) -> np.ndarray:
@@ -231,7 +239,7 @@ def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dic
 def _lengths(
     entries: list[_Length], fields: list[dict[str, str]], sockets: Mapping[str, np.ndarray]
 ) -> list[ReferenceLength]:
-    """Reference lengths; one with fields in braces stands for every combination of them that the sockets' files showed."""
+    """Reference lengths; one with fields in braces stands for every combination that the sockets' files have."""
     lengths = []
     for entry in entries:
         names = fields_of(entry.start + entry.end)
@@ -241,10 +249,11 @@ def _lengths(
         choices = {tuple((name, values[name]) for name in sorted(names)) for values in fields if names <= values.keys()}
         if not choices:
             raise InputError(
-                f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; name the fields alike."
+                f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; "
+                "name the fields alike."
             )
         pairs = [(fill(entry.start, dict(choice)), fill(entry.end, dict(choice))) for choice in sorted(choices)]
-        # A field may also stand in the names of sockets that have nothing to do with this length.
-        there = [pair for pair in pairs if pair[0] in sockets or pair[1] in sockets]
-        lengths += [ReferenceLength(*pair, entry.value, entry.u) for pair in there or pairs]
+        # The field may also be in the names of sockets that this length is not between.
+        known = [pair for pair in pairs if pair[0] in sockets or pair[1] in sockets]
+        lengths += [ReferenceLength(*pair, entry.value, entry.u) for pair in known or pairs]
     return lengths

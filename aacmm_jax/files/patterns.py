@@ -11,7 +11,7 @@ from pathlib import Path
 from ..core.errors import InputError
 
 _FIELD = re.compile(r"\{(\w+)\}")
-# A component of a path that is one field, perhaps with the extension of a file.
+# A folder's or file's name that is one field, perhaps with an extension.
 _WHOLE = re.compile(r"\{\w+\}(?:\.\w+)?")
 _ANYTHING = "[^/]+"
 _WORD = r"(?:[^\W_]|-)+"
@@ -55,8 +55,8 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
         near = [path.removeprefix(before) for path in kept if loose.fullmatch(path)]
         if near:
             raise InputError(
-                f"{where}, but nearly {_some(near)}: beside other text in a name, a field is letters, digits and '-' only; "
-                "write more of the name out."
+                f"{where}, but nearly {_some(near)}: beside other text in a name, a field is letters, digits and "
+                "'-' only; write more of the name out."
             )
         if left_out:
             raise InputError(f"{where} but {_some(left_out)}, which exclude leaves out; mend exclude.")

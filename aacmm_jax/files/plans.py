@@ -41,7 +41,7 @@ def plan_csv(plan: Plan) -> str:
 
 
 def procedure_csv(procedure: Procedure) -> str:
-    """A row for each pose of an acceptance test: what it is for, the file that its reading goes into, position, readings."""
+    """A row for each pose of an acceptance test: test, name, file for its reading, position, readings."""
     items = (*procedure.sockets, *procedure.touches)
     labels = ([item.test, item.name, file_of(procedure, item)] for item in items for _ in item.q)
     points, q = (np.concatenate([getattr(item, kind) for item in items]) for kind in ("points", "q"))
@@ -73,10 +73,11 @@ def file_of(procedure: Procedure, item: Item) -> str:
 
 
 def procedure_manifest(procedure: Procedure, arm: str) -> str:
-    """A manifest for the readings: one text file for each socket, end of a bar, and group of touches. Calibrated values are to be filled in."""
+    """A manifest for the readings of an acceptance test, in which the calibrated values are to be filled in."""
     lines = [
-        f"# {TITLES[procedure.standard]}, as planned. Put the calibrated values and standard uncertainties of your artefacts in, record a file for each",
-        "# socket and group of touches (one row a pose, in the order of the plan), then: aacmm import THIS.toml -o acceptance.h5",
+        f"# {TITLES[procedure.standard]}, as planned. Fill in the calibrated values and standard uncertainties of your",
+        "# artefacts, record a file for each socket and each group of touches (one row a pose, in the order of the",
+        "# plan), then: aacmm import THIS.toml -o acceptance.h5",
         f"arm = {_quoted(arm)}",
         "# date = 2026-01-31   # when it was recorded",
         "",

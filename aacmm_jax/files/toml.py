@@ -1,4 +1,4 @@
-"""What people write in TOML, or pass as tables from Python: read into pydantic models, and refused in one sentence."""
+"""TOML files, and tables passed from Python, read into pydantic models; errors in one sentence."""
 
 import os
 import tomllib
@@ -21,7 +21,7 @@ class Strict(BaseModel):
 
 
 def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
-    """Read a TOML file into a pydantic model. Raises `InputError` that names the file, the place and the mend."""
+    """Read a TOML file into a pydantic model. Raises `InputError` that names the file and the place in it."""
     path = Path(path)
     check_readable(path)
     try:
@@ -29,7 +29,7 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text in UTF-8, as TOML is; name a TOML file.") from error
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path} is not valid TOML: {error}; mend it there.") from error
+        raise InputError(f"{path} is not valid TOML: {error}; correct it there.") from error
     return validated(model, content, str(path))
 
 
@@ -44,7 +44,7 @@ def validated(model: type[Model], content: Mapping[str, Any], where: str) -> Mod
 
 
 def _written(steps: Sequence[Any], content: Any) -> list[Any]:
-    """The steps to a place that the writer wrote: others are pydantic's ("a number or a list"; one level of a list of levels)."""
+    """The part of the path to an error that is in the file: other steps are pydantic's ("a number or a list")."""
     kept = []
     for step in steps:
         inside = isinstance(content, list | tuple) if isinstance(step, int) else isinstance(content, Mapping)

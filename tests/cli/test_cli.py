@@ -27,7 +27,7 @@ def test_help_has_an_example(aacmm, command):
 def test_demo_recovers_the_truth_and_leaves_its_files(aacmm, tmp_path):
     result = json.loads(aacmm("demo", "out", "--json", "--seed", 3).stdout)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(result["files"])
-    # Stage 1 mends repeatability, stage 2 the lengths; 2 arcsec at about 1.2 m and 5 um leave about 0.02 mm in a length.
+    # Stage 1 corrects repeatability, stage 2 the lengths; 2 arcsec at 1.2 m and 5 um leave about 0.02 mm in a length.
     assert result["stage1"]["de_mm"] < 0.02 < result["nominal"]["de_mm"]
     assert result["calibrated"]["check_rms_mm"] < 0.03 < result["stage1"]["check_rms_mm"]
     assert (tmp_path / "out" / "calibration.png").stat().st_size > 10_000
@@ -77,7 +77,7 @@ def test_whole_path(aacmm, tmp_path):
 
 
 def test_not_converged_is_exit_code_1_and_still_written(aacmm, tmp_path, monkeypatch):
-    """A capture whose one socket was in truth two (half the poses elsewhere) still converges; a capped solve does not."""
+    """A solve that is stopped by its step limit has not converged."""
     aacmm(*SIMULATE)
     done = aacmm("calibrate", "capture.h5", "-o", "calibration.h5", "--max-steps", 2, "--json", expect=1)
     result = json.loads(done.stdout)
@@ -144,7 +144,7 @@ def test_plan(aacmm, tmp_path):
 
 @pytest.mark.slow
 def test_uncertainties_are_printed(aacmm):
-    """Known noise, what the data determine, uncertainty over the volume; cross-validated where a length stood in two places."""
+    """Known noise, what the data determine, uncertainty over the volume, cross-validation of two placements."""
     aacmm(
         *(
             "simulate",

@@ -437,11 +437,11 @@ def run(tmp_path, monkeypatch):
 
 
 def saved(record, path, created, monkeypatch):
-    from aacmm_jax.files import storage
+    from aacmm_jax.files import hdf5
 
     genuine = provenance
     with monkeypatch.context() as patch:
-        patch.setattr(storage, "provenance", lambda kind: genuine(kind) | {"created": created})
+        patch.setattr(hdf5, "provenance", lambda kind: genuine(kind) | {"created": created})
         aj.files.save_calibration(path, record)
 
 

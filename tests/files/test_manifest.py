@@ -297,9 +297,9 @@ def test_bad_manifest(tmp_path, motion, text, parts):
     [
         (b"1,2,3,4,5\n", ["has 5 columns", "the arm has 6 joints", "one column a joint", "columns = [...]"]),
         (b"1,2,3,4,5,6\n1,2,3,4,5\n", ["line 2 has 5 columns", "before it 6", "give all the same"]),
-        (b"q\n1,2,3,4,5,6\n\n1,2,x,4,5,6\n", ["line 4 column 3", "'x' is not a number", "mend it"]),
+        (b"q\n1,2,3,4,5,6\n\n1,2,x,4,5,6\n", ["line 4 column 3", "'x' is not a number", "correct it"]),
         (b"1,2,3,4,5,\n", ["line 1 column 6", "'' is not a number"]),
-        (b"1,2,3,4,5,6\n1,2,3,4,nan,6\n", ["line 2 column 5", "'nan' is not finite", "mend it"]),
+        (b"1,2,3,4,5,6\n1,2,3,4,nan,6\n", ["line 2 column 5", "'nan' is not finite", "correct it"]),
         (b"q1,q2,q3,q4,q5,q6\n", ["holds no numbers", "one line a pose"]),
         (b"", ["holds no numbers", "one line a pose"]),
         (b"0,5;1,5;2,5;0,5;1,5;2,5\n", ["holds no numbers", "with decimal points"]),
