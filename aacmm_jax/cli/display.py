@@ -36,7 +36,11 @@ def print_table(console: Console, table: Table, keys: int = 1) -> None:
     Cells wrap between words where the console is narrow. Where even that is not enough, the columns are printed in
     several blocks, each of which begins with the first ``keys`` columns.
     """
-    texts = [[Text.from_markup(str(cell), emoji=False).plain for cell in (column.header, *column.cells)] for column in table.columns]
+
+    def plain(cell: object) -> str:
+        return Text.from_markup(str(cell), emoji=False).plain
+
+    texts = [[plain(cell) for cell in (column.header, *column.cells)] for column in table.columns]
     natural = [max((cell_len(line) for cell in cells for line in cell.split("\n")), default=0) for cells in texts]
     words = [max((cell_len(word) for cell in cells for word in cell.split()), default=0) for cells in texts]
     least = [min(word, _LONGEST_WORD) for word in words]
