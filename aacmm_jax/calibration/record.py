@@ -123,20 +123,3 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         names=result.space.names,
         degrees_of_freedom=result.degrees_of_freedom,
     )
-
-
-# Of the arm's length. Calibrated measuring arms reach 5e-5 of it, robots 2e-4; their nominal models 1e-2.
-_LARGEST_RESIDUAL = 5e-3
-
-
-def implausible_residual(record: CalibrationRecord) -> str | None:
-    """A sentence where the residual after the fit is a hundred times that of an arm, and None otherwise."""
-    arm = record.calibrated.arm
-    length = float(np.abs(arm.a).sum() + np.abs(arm.d).sum() + np.linalg.norm(arm.probe))
-    rms = float(evaluate(arm, record.recording.capture).repeatability.rms)
-    if not rms > _LARGEST_RESIDUAL * length:
-        return None
-    return (
-        f"The fit leaves the tips {rms:.3g} mm RMS from their sockets, {100 * rms / length:.2g} % of the length of the arm, "
-        "a hundred times what an arm can be: check files, unit, order of columns, sockets and arm."
-    )

@@ -100,7 +100,7 @@ def calibrate(
     Stage 1 makes the tips of each socket coincide; the reference lengths then fix the scale.
     """
     from ..calibration.checks import plausible
-    from ..calibration.record import implausible_residual, record_of
+    from ..calibration.record import record_of
     from ..calibration.stages import calibrate as run
     from ..files.calibrations import save_calibration
     from ..files.captures import load_capture
@@ -149,7 +149,7 @@ def calibrate(
 
         calibration_figure(record, figure)
     show_summary(calibration_summary(record) | {"written": str(output)}, as_json, calibration_display.calibration)
-    if not record.converged or not plausible(record.k) or implausible_residual(record):
+    if not record.converged or not plausible(record.k) or record.implausible_residual:
         raise typer.Exit(1)
 
 

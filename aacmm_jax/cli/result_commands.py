@@ -201,7 +201,6 @@ def export(
     if about is not None and form != "dcc":
         raise InputError("--about is for certificates; give it with --format dcc.")
     check_outputs([output], [calibration, about])
-    from ..calibration.record import implausible_residual
     from ..files.arms import specification_toml
     from ..files.calibrations import load_calibration
     from ..summaries.calibration import calibration_summary, parameters_csv
@@ -211,9 +210,9 @@ def export(
     arm = arms[which]
     if arm is None:
         raise InputError(f"{calibration} is not of a simulation, so it has no true arm; choose another --arm.")
-    reason = implausible_residual(record) if record.converged else f"did not converge: {record.reason}"
-    if reason:
-        typer.echo(f"Warning: {calibration}: {reason}", err=True)
+    if not record.converged or record.implausible_residual:
+        reason = "the residual is that of no arm; see aacmm show." if record.converged else record.reason
+        typer.echo(f"Warning: {calibration} is not a calibration that can be used: {reason}", err=True)
     source = (
         f"calibrated from {sum(record.recording.capture.sizes)} poses, {record.method}, k = {record.k:.8f}"
         if which == "calibrated"

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..calibration.record import CalibrationRecord, implausible_residual, uncertainty_of
+from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import CrossValidation, active_names
 from ..data.capture import Capture
 from ..data.recording import Recording
@@ -145,7 +145,7 @@ def calibration_summary(
         "arm": record.recording.nominal.name,
         "method": record.method,
         "converged": record.converged,
-        "residual_plausible": implausible_residual(record) is None,
+        "residual_plausible": not record.implausible_residual,
         "reason": record.reason,
         "steps": record.steps,
         "poses": sum(record.recording.capture.sizes),

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ..calibration.checks import plausible
-from ..calibration.record import CalibrationRecord, implausible_residual
+from ..calibration.record import CalibrationRecord
 from ..calibration.results import active_names
 from ..core.units import INCH, M
 from ..data.recording import Recording
@@ -41,7 +41,6 @@ def of_capture(recording: Recording) -> list[str]:
 def of_calibration(record: CalibrationRecord, seen: Observability | None = None) -> list[str]:
     """Everything about a calibration that should be read before its numbers. ``seen`` saves looking again: see `observed`."""
     found = [] if record.converged else [record.reason]
-    found += [sentence] if (sentence := implausible_residual(record)) else []
     found += _validation(record)
     found += [*_scale(record), *of_capture(record.recording), *_bounds(record), *_data(record)]
     return found + _identifiability(record, observed(record) if seen is None else seen)
