@@ -188,9 +188,8 @@ def _parameters(results: Element, record: CalibrationRecord, stage: _Stage, fact
         "Denavit-Hartenberg parameters",
         "Standard convention; of one joint: Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta). The probe is the tip in the last frame.",
     )
-    nominal = _values(record.recording.nominal.arm)
     for name, value in _values(stage.arm).items():
-        words, u = ("", None) if stage.name == "As found" else _knowledge(record, name, value == nominal.get(name, 0.0))
+        words, u = ("", None) if stage.name == "As found" else _knowledge(record, name)
         quantity = put(data, "quantity")
         ours(quantity, "name", name)
         if words:
@@ -204,16 +203,14 @@ def _values(arm: Arm) -> dict[str, float]:
     return dict(zip(names, map(float, np.asarray(Parameters(arm, names).vector())), strict=True))
 
 
-def _knowledge(record: CalibrationRecord, name: str, unchanged: bool) -> tuple[str, float | None]:
+def _knowledge(record: CalibrationRecord, name: str) -> tuple[str, float | None]:
     """What is to be said of a calibrated parameter, and its standard uncertainty, where it has one of its own."""
     if name not in record.names:
-        return f"Not identified: held at its nominal value{'' if unchanged else ', and divided by k as all lengths are'}", None
+        return "Not identified: held at its nominal value", None
     i = record.names.index(name)
     u = float(np.sqrt(record.covariance[i, i]))
     if record.active[i]:
         bound = f"On its {'lower' if record.active[i] < 0 else 'upper'} bound"
-        if is_length(name) and record.method == "two-stage" and u > 0 and _is_known(u):  # such a length still follows k
-            return f"{bound} in stage 1; the uncertainty is that of k", u
         return f"{bound}, so it has no uncertainty of its own", None
     if not (record.determined[i] and _is_known(u)):
         return "Determined only together with other parameters, so it has no uncertainty of its own", None

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..calibration.record import CalibrationRecord
 from ..calibration.results import CrossValidation, LeftOut
+from ..core.errors import InputError
 from ..data.noise import Noise
 from ..kinematics.arm import is_length
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
@@ -47,7 +48,6 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
         "seating_mm": float(record.noise.seating),
         "form": record.noise_model,
         "freedom": record.degrees_of_freedom,
-        "stretch_variance": float(record.common_scale_error[-1]),
         "misfit": record.reduced_chi,
         "steps": record.steps,
         "converged": record.converged,
@@ -76,6 +76,10 @@ def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
 
 def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
     table, attributes = stored.tables["parameters"], stored.attributes
+    if attributes.get("stretch_variance", 0.0):
+        raise InputError(
+            f"{path} is from an earlier version, which divided fixed lengths by k; calibrate again from its capture."
+        )
     need(path, table, "parameter", "lower", "upper", "active_stage1", "active", "covariance", "determined", of="entry")
     return CalibrationRecord(
         recording=recording_of(path, stored),
@@ -92,9 +96,6 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
         determined=table["determined"].astype(bool),
         # Files of version 0.1 and before have none of the following.
         open=table.get("open", np.zeros_like(table["covariance"])),
-        common_scale_error=np.append(
-            table.get("stretch", np.zeros(len(table["covariance"]))), attributes.get("stretch_variance", 0.0)
-        ),
         noise=Noise(
             encoder_arcsec=np.squeeze(np.atleast_1d(attributes.get("encoder_arcsec", 0.0))),
             seating=attributes.get("seating_mm", 0.0),
@@ -131,9 +132,6 @@ def _parameter_table(record: CalibrationRecord) -> Table:
         "active": Variable(("parameter",), record.active, "1", "-1 on the lower bound, +1 on the upper"),
         "determined": Variable(
             ("parameter",), record.determined.astype(np.int8), "1", "0: only a combination is determined"
-        ),
-        "stretch": Variable(
-            ("parameter",), record.common_scale_error[:-1], both, "covariance with the common scale error"
         ),
         "open": Variable(
             ("parameter", "parameter_2"), record.open, "1", "projector onto what is not determined, in mm and mrad"

@@ -231,7 +231,7 @@ class Study:
 
     def _hold(self, hold: str) -> str | None:
         with _at("identification.hold"):
-            return scale_anchor(self.space, self.nominal.arm, None if hold == "none" else hold)
+            return scale_anchor(self.space, self.nominal.arm, None if hold == "none" else hold).hold
 
     def _numbers(self, cell: Mapping[str, Any]) -> tuple:
         space, nominal, table = self.space, self.nominal, self.specification.bounds
