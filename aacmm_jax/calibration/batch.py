@@ -20,14 +20,15 @@ from ..core.arrays import Numbers, as_array
 from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.noise import Noise
-from ..kinematics.arm import Arm, is_length
+from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
 from ..model.measurement import check_joints
 from ..solver.levenberg_marquardt import Reason, reasons
 from .batch_kernel import Problems, Shape, solve_chunk
-from .checks import check_enough
+from .checks import based_on, check_enough
 from .results import converged
-from .scale_anchor import scale_anchor
+from .scale_anchor import ScaleAnchor, scale_anchor
+from .second_stage import divided, rows_of, second_stage_many
 
 # Lanes per loop. On a CPU the columns of all lanes should fit the second-level cache (measured from 20 to 7,000 poses: five
 # times slower where they do not); a GPU wants thousands.
@@ -59,7 +60,7 @@ class ManyCalibrations(eqx.Module):
     """Results of both stages, or of the joint solve, problem by problem, as NumPy arrays; mm and rad."""
 
     parameters: Float[np.ndarray, "b p"]
-    k: Float[np.ndarray, " b"]  # of stage 1, by which its lengths were divided
+    k: Float[np.ndarray, " b"]  # of stage 1
     de: Float[np.ndarray, " b"]  # mm
     deltam: Float[np.ndarray, " b"]  # mm
     steps: Int[np.ndarray, " b"]  # evaluations of all solves
@@ -72,6 +73,11 @@ class ManyCalibrations(eqx.Module):
     def space(self) -> Parameters:
         """The free parameters."""
         return self.stage1.space
+
+    @property
+    def hold(self) -> str | None:
+        """The scale anchor of stage 1."""
+        return self.stage1.hold
 
     @property
     def converged(self) -> Bool[np.ndarray, " b"]:
@@ -139,14 +145,17 @@ def calibrate_many(
     stage1 = work.identified()
     k = stage1.k
     assert k is not None
-    # Every length but d_1, as in `divide_lengths`.
-    divided = np.array([is_length(name) and name != "d_1" for name in stage1.space.names])
-    scaled = np.where(divided, stage1.parameters / k[:, None], stage1.parameters)
+    base = based_on(work.space, arm)
     if method == "two-stage":
-        # Divided by k, the whole arm shrinks about the base, so do distances between its tips.
-        return ManyCalibrations(
-            scaled, k, stage1.de / k, stage1.deltam / k, stage1.steps, stage1.result, stage1.active, stage1, method
-        )
+
+        def identify_again(rows: np.ndarray, start: np.ndarray) -> ManyIdentifications:
+            some, recorded, low, high = rows_of(rows, arm, capture, work.problems.lower, work.problems.upper)
+            adjusted = work.anchor.adjusted
+            return _Work.of(some, recorded, low, high, start, work.space, adjusted, noise, effort).identified()
+
+        found = second_stage_many(work.anchor, base, work.problems.lower, work.problems.upper, stage1, identify_again)
+        return ManyCalibrations(k=k, stage1=stage1, method=method, **found)
+    scaled = np.asarray(divided(work.anchor, base, jnp.asarray(stage1.parameters), jnp.asarray(k)))
     fitted = sum(work.shape.kept)
     work = _Work.of(arm, capture, lower, upper, scaled, stage1.space, None, noise, effort, fitted)
     joint = work.identified()
@@ -176,6 +185,7 @@ class _Work(NamedTuple):
     space: Parameters
     hold: str | None
     noise: Noise | None
+    anchor: ScaleAnchor
 
     @classmethod
     def of(
@@ -195,7 +205,8 @@ class _Work(NamedTuple):
         if space is None:
             space = Parameters.free_of(arm)
         problems, batched, size = _problems(arm, capture, lower, upper, start, space)
-        hold = scale_anchor(space, arm, hold)
+        anchor = scale_anchor(space, arm, hold, noise)
+        hold = anchor.hold
         check_joints(capture, space)
         if noise is not None:
             noise.check(arm.joints)
@@ -220,7 +231,7 @@ class _Work(NamedTuple):
             fitted=fitted or 0,
         )
         room = _room(max(len(piece) for piece in pieces), lanes)
-        return cls(problems, shape, pieces, room, devices, workers, space, hold, noise)
+        return cls(problems, shape, pieces, room, devices, workers, space, hold, noise, anchor)
 
     def run(self, piece: range, device: Any) -> tuple[np.ndarray, ...]:
         """Solve one chunk. What room is left is filled with its first problem, which is never begun."""

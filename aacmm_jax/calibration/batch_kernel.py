@@ -23,7 +23,7 @@ from ..model.residuals import JointWeights, model_of
 from ..model.scale import scale_of
 from ..model.weights import Weights
 from ..solver.levenberg_marquardt import Box, Reason, advance, begin, choose, either, numbers_of, reasons
-from .stages import SOLVER
+from .task import SOLVER
 
 
 class Problems(NamedTuple):

@@ -96,7 +96,7 @@ def predicted_errors(uncertainty: Uncertainty, capture: Capture) -> tuple[Float[
     from the sockets' centroids, and the standard uncertainty of the error of every reference length."""
     arm, owner = uncertainty.arm, capture.owner
     sizes = np.asarray(capture.sizes, dtype=float)
-    slopes = np.asarray(uncertainty.slopes(capture.q))
+    slopes = np.asarray(uncertainty.derivatives(capture.q))
     averaging = averaging_matrix(capture.sizes)
     means = np.einsum("sN,Ncp->scp", averaging, slopes)
     centred = slopes - means[owner]
@@ -112,5 +112,9 @@ def predicted_errors(uncertainty: Uncertainty, capture: Capture) -> tuple[Float[
     of_means = np.einsum("sN,cdN->scd", averaging**2, reading)
     scatter = np.einsum("lc,lcd,ld->l", direction, of_means[ends[:, 0]] + of_means[ends[:, 1]], direction)
     own = np.array([float(length.u) for length in capture.lengths])
-    variance = np.asarray(uncertainty.covariance_of_functions(jnp.asarray(along[:, None, :])))[:, 0, 0] + scatter + own**2
-    return jnp.sqrt(jnp.asarray(squares[scattered].mean() if scattered.any() else np.nan)), jnp.asarray(np.sqrt(variance))
+    variance = (
+        np.asarray(uncertainty.covariance_of_functions(jnp.asarray(along[:, None, :])))[:, 0, 0] + scatter + own**2
+    )
+    return jnp.sqrt(jnp.asarray(squares[scattered].mean() if scattered.any() else np.nan)), jnp.asarray(
+        np.sqrt(variance)
+    )

@@ -15,7 +15,6 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
-from ..model.scale import divide_lengths
 from ..uncertainty.volume import default_length, sample_lengths
 from .batch import calibrate_many
 from .record import uncertainty_of
@@ -126,7 +125,9 @@ def monte_carlo(
             level_of = (
                 1.0
                 if known
-                else np.sqrt(result.degrees_of_freedom / random.chisquare(result.degrees_of_freedom, size=(count, 1, 1)))
+                else np.sqrt(
+                    result.degrees_of_freedom / random.chisquare(result.degrees_of_freedom, size=(count, 1, 1))
+                )
             )
             seats = float(noise.seating) * level_of * random.normal(size=(count, *exact.shape[:1], 3))
             readings = exact + np.einsum("Nic,tNc->tNi", moves, seats)
@@ -138,7 +139,9 @@ def monte_carlo(
         found = np.concatenate(pieces)
         drawn.append(found)
         if len(found) < 10:
-            raise InputError("hardly any Monte Carlo trial converges; widen the bounds, or look at the calibration first.")
+            raise InputError(
+                "hardly any Monte Carlo trial converges; widen the bounds, or look at the calibration first."
+            )
         low, high = np.quantile(found, [(1 - level) / 2, (1 + level) / 2], axis=0)
         blocks.append(np.stack([found.mean(axis=0), found.std(axis=0, ddof=1), low, high]))
         u = np.concatenate(drawn).std(axis=0, ddof=1)
@@ -146,7 +149,9 @@ def monte_carlo(
     return task.sampled(result, np.concatenate(drawn), stable, failed, level, digits)
 
 
-def bootstrap(result: Calibration, capture: Capture, *, trials: int = 2000, level: float = 0.95, seed: int = 0) -> Sampled:
+def bootstrap(
+    result: Calibration, capture: Capture, *, trials: int = 2000, level: float = 0.95, seed: int = 0
+) -> Sampled:
     """The calibration repeated on poses drawn with replacement from each socket, and lengths drawn with their u.
 
     It assumes nothing of the errors but that poses are independent. (A socket of m poses then scatters by (m - 1) / m too little.)
@@ -157,10 +162,13 @@ def bootstrap(result: Calibration, capture: Capture, *, trials: int = 2000, leve
     starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
     task = _Task.of(result, capture, None)
     rows = np.concatenate(
-        [start + random.integers(size, size=(trials, size)) for start, size in zip(starts, capture.sizes, strict=True)], axis=1
+        [start + random.integers(size, size=(trials, size)) for start, size in zip(starts, capture.sizes, strict=True)],
+        axis=1,
     )
     nominal = np.array([float(length.value) for length in capture.lengths])
-    found, failed = task.solved(np.asarray(capture.q)[rows], nominal + task.u * random.normal(size=(trials, len(nominal))))
+    found, failed = task.solved(
+        np.asarray(capture.q)[rows], nominal + task.u * random.normal(size=(trials, len(nominal)))
+    )
     if len(found) < 10:
         raise InputError("hardly any bootstrap trial converges: too few poses a socket for this; record more.")
     return task.sampled(result, found, True, failed, level, 1)
@@ -215,7 +223,9 @@ class _Task(NamedTuple):
         if lengths is not None and (
             len(lengths) != 2 or np.ndim(lengths[0]) != 2 or np.shape(lengths[0]) != np.shape(lengths[1])
         ):
-            raise InputError("lengths must be two arrays of poses, (v, n) each: where each length starts, and where it ends.")
+            raise InputError(
+                "lengths must be two arrays of poses, (v, n) each: where each length starts, and where it ends."
+            )
         start, end = lengths or sample_lengths(result.arm, _LENGTHS, length=default_length(result.arm))
         u = np.array([float(length.u) for length in capture.lengths])
         return cls(result, capture, np.asarray(start), np.asarray(end), u)
@@ -236,22 +246,14 @@ class _Task(NamedTuple):
             noise=given,
         )
         good = many.converged
-        lengths = self._measured(many.stage1.parameters if self.divided else many.parameters, many.k)
-        found = np.hstack([many.parameters, many.k[:, None], lengths])
+        ends = (jnp.asarray(self.start), jnp.asarray(self.end))
+        lengths = _lengths_of(Parameters(result.arm, result.space.names), jnp.asarray(many.parameters), ends)
+        found = np.hstack([many.parameters, many.k[:, None], np.asarray(lengths)])
         return found[good], int(np.sum(~good))
 
-    @property
-    def divided(self) -> bool:
-        """Whether the scale fix divided every length, held ones too."""
-        return self.result.method == "two-stage"
-
-    def _measured(self, parameters: Float[np.ndarray, "t p"], k: Float[np.ndarray, " t"]) -> Float[np.ndarray, "t v"]:
-        """The followed lengths by each trial's arm: of the joint solve, or of stage 1 and divided by k."""
-        base = Parameters(self.result.stage1.arm if self.divided else self.result.arm, self.result.space.names)
-        ends = (jnp.asarray(self.start), jnp.asarray(self.end))
-        return np.asarray(_lengths_of(base, jnp.asarray(parameters), jnp.asarray(k), ends, self.divided))
-
-    def sampled(self, result: Calibration, values: np.ndarray, stable: bool, failed: int, level: float, digits: int) -> Sampled:
+    def sampled(
+        self, result: Calibration, values: np.ndarray, stable: bool, failed: int, level: float, digits: int
+    ) -> Sampled:
         """The trials' distribution beside the linear result."""
         linear = uncertainty_of(result)
         u_length = np.asarray(linear.length(self.start, self.end))
@@ -278,13 +280,12 @@ class _Task(NamedTuple):
 
 
 @eqx.filter_jit
-def _lengths_of(space: Parameters, parameters: Array, k: Array, ends: tuple[Array, Array], divided: bool) -> Array:
-    def one(row: tuple[Array, Array]) -> Array:
-        arm = space.arm(row[0])
-        arm = divide_lengths(arm, row[1]) if divided else arm
+def _lengths_of(space: Parameters, parameters: Array, ends: tuple[Array, Array]) -> Array:
+    def one(vector: Array) -> Array:
+        arm = space.arm(vector)
         return jnp.linalg.norm(arm.position(ends[0]) - arm.position(ends[1]), axis=-1)
 
-    return jax.lax.map(one, (parameters, k), batch_size=256)
+    return jax.lax.map(one, parameters, batch_size=256)
 
 
 def batch_of(capture: Capture, q: Float[np.ndarray, "t N n"], values: Float[np.ndarray, "t l"]) -> Capture:

@@ -209,11 +209,10 @@ def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, 
         "Standard convention; of one joint: Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta). The probe is the tip in the "
         "last frame.",
     )
-    nominal = _values(record.recording.nominal.arm)
     for name, value in _values(stage.arm).items():
         note, u = "", None
         if stage.name == "As left":
-            note, u = _note_and_uncertainty(record, name, value == nominal.get(name, 0.0))
+            note, u = _note_and_uncertainty(record, name)
         quantity = add(data, "quantity")
         add_english(quantity, "name", name)
         if note:
@@ -227,17 +226,14 @@ def _values(arm: Arm) -> dict[str, float]:
     return dict(zip(names, map(float, np.asarray(Parameters(arm, names).vector())), strict=True))
 
 
-def _note_and_uncertainty(record: CalibrationRecord, name: str, unchanged: bool) -> tuple[str, float | None]:
+def _note_and_uncertainty(record: CalibrationRecord, name: str) -> tuple[str, float | None]:
     """A note on a calibrated parameter, and its standard uncertainty if it has one of its own."""
     if name not in record.names:
-        divided = "" if unchanged else ", and divided by k as all lengths are"
-        return f"Not identified: fixed at its nominal value{divided}", None
+        return "Not identified: fixed at its nominal value", None
     i = record.names.index(name)
     u = float(np.sqrt(record.covariance[i, i]))
     if record.active[i]:
         bound = f"On its {'lower' if record.active[i] < 0 else 'upper'} bound"
-        if is_length(name) and record.method == "two-stage" and _is_known(u):  # such a length still follows k
-            return f"{bound} in stage 1; the uncertainty is that of k", u
         return f"{bound}, so it has no uncertainty of its own", None
     if not (record.determined[i] and _is_known(u)):
         return "Determined only together with other parameters, so it has no uncertainty of its own", None

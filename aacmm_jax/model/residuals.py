@@ -50,7 +50,9 @@ def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Meas
     """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic columns."""
     space, measurement = args
     geometry = space.arm(vector).geometry
-    return model_of(geometry, measurement.sines_cosines, measurement.sizes, space.indices(), weights=measurement.weights)
+    return model_of(
+        geometry, measurement.sines_cosines, measurement.sizes, space.indices(), weights=measurement.weights
+    )
 
 
 def joint_model(
@@ -61,7 +63,9 @@ def joint_model(
     space, measurement, sigma, whitening = args
     joint_weights = JointWeights(measurement.ends, measurement.nominal, sigma, whitening)
     geometry = space.arm(vector).geometry
-    return model_of(geometry, measurement.sines_cosines, measurement.sizes, space.indices(), joint_weights, measurement.weights)
+    return model_of(
+        geometry, measurement.sines_cosines, measurement.sizes, space.indices(), joint_weights, measurement.weights
+    )
 
 
 def measured_lengths(

@@ -76,7 +76,7 @@ def _evaluation(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool,
     from .evaluation import evaluation_report, overall_decision, points_report
 
     if attributes.get("of") == "points":
-        from ..files.points_evaluations import load_points
+        from ..files.evaluations import load_points
 
         report, summary = points_report(load_points(source))
         return report, False, overall_decision(summary)

@@ -153,6 +153,7 @@ def calibration_summary(
         "arm": record.recording.nominal.name,
         "method": record.method,
         "converged": record.converged,
+        "residual_plausible": not record.implausible_residual,
         "reason": record.reason,
         "steps": record.steps,
         "poses": sum(record.recording.capture.sizes),

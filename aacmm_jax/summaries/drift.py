@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..drift.comparison import Drift, Trend
+from ..drift.results import Drift, Trend
 from ..drift.statistics import LengthChange
 from ..kinematics.arm import is_length
 

@@ -39,7 +39,9 @@ class VolumetricUncertainty(NamedTuple):
             values = getattr(self, name)
             found |= {
                 f"{name}_median_mm": float(np.median(values)),
-                f"{name}_95_mm": float(np.quantile(values, 0.95, method="higher")),  # no sum, so infinite ones are allowed
+                f"{name}_95_mm": float(
+                    np.quantile(values, 0.95, method="higher")
+                ),  # no sum, so infinite ones are allowed
                 f"{name}_largest_mm": float(np.max(values)),
             }
         return found

@@ -528,7 +528,7 @@ def test_command_refuses(run, files):
         (("a.h5",), "a.h5 alone cannot be compared"),
         (("a.h5", "none.h5"), "none.h5 does not exist"),
         (("a.h5", "b.h5", "--figure", "trend.gif"), "end its name in .png, .svg or .pdf"),
-        (("a.h5", "b.h5", "--csv", "b.h5"), "b.h5 is one of the calibrations"),
+        (("a.h5", "b.h5", "--csv", "b.h5"), "b.h5 is one of the files that this command reads"),
         (("a.h5", "b.h5", "--level", 0), "level is 0"),
     ):
         error = run(*arguments).exception

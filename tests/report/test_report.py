@@ -270,7 +270,7 @@ decision_rule = "a rule"
 
 def test_a_statement_that_the_file_contradicts_is_refused(written, tmp_path):
     from aacmm_jax.acceptance.record import PointsRecord
-    from aacmm_jax.files.points_evaluations import save_points
+    from aacmm_jax.files.evaluations import save_points
 
     (tmp_path / "pass.toml").write_text(CONFORMITY.format("pass"))
     stated = aj.files.read_administrative_data(tmp_path / "pass.toml")

@@ -287,7 +287,7 @@ def test_an_interrupt_finishes_the_blocks_in_work_and_says_how_to_go_on(home, ca
     assert process.returncode == 130, errors
     kept = len(list(parts_of(path).glob("*.h5")))
     assert kept >= 3
-    assert f"Stopped; {4 * kept:,} of 2,400 trials are kept. Go on with: aacmm study --resume -o {path}" in errors
+    assert f"Stopped; {4 * kept:,} of 2,400 trials are kept. Continue with: aacmm study --resume -o {path}" in errors
     assert "Traceback" not in errors
     process = subprocess.Popen(
         [sys.executable, "-m", "aacmm_jax", "study", "--resume", "-o", path, "--json"],
@@ -469,7 +469,7 @@ def test_an_interrupt_of_the_whole_terminal_reaches_no_dask_worker(home, cache, 
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 130, errors
-    assert "trials are kept. Go on with: aacmm study --resume" in errors
+    assert "trials are kept. Continue with: aacmm study --resume" in errors
     assert errors.count("\n") == 1, errors
 
 
