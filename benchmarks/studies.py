@@ -1,9 +1,9 @@
-"""Monte Carlo studies, measured: speed against bare identifications, memory, the same numbers however run, kills, full disks, Dask.
+"""Monte Carlo studies, measured: speed against bare identifications, memory, equal numbers, kills, full disks, Dask.
 
     python benchmarks/studies.py                 # all of it, about ten minutes on 2 quiet cores
     python benchmarks/studies.py speed memory    # some of it: speed, memory, same, kills, disk, dask
 
-writes results/studies-DATE.json and prints it. The study is `bound-sensitivity`, with more or fewer trials in its 20 cells.
+writes results/studies-DATE.json and prints it. The study is `bound-sensitivity`, with other numbers of trials a cell.
 """
 
 import json
@@ -42,7 +42,7 @@ def fresh(name: str, *arguments: object, cores: str | None = None) -> dict:
 
 
 def once(trials: int, repeats: int, bare: int) -> dict:
-    """Run the study of so many trials, compiled beforehand; with ``bare``, identify its own problems too, nothing else."""
+    """Run the study, compiled beforehand, with so many trials; with ``bare``, also only identify its problems."""
     import aacmm_jax as aj
 
     found = {"total": CELLS * trials, "seconds": [], "bare_seconds": []}
@@ -137,8 +137,8 @@ def run_into(path: str, trials: str, chunk: str, devices: str, dask: str) -> dic
 
 def same() -> dict:
     ways = {
-        "chunk 256": (256, 1, 0), "2 devices": (1000, 2, 0), "2 devices, chunk 256": (256, 2, 0), "2 Dask workers": (1000, 1, 2),
-        "2 Dask workers, chunk 256": (256, 1, 2),
+        "chunk 256": (256, 1, 0), "2 devices": (1000, 2, 0), "2 devices, chunk 256": (256, 2, 0),
+        "2 Dask workers": (1000, 1, 2), "2 Dask workers, chunk 256": (256, 1, 2),
     }  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         first = Path(folder) / "first.h5"
@@ -175,7 +175,8 @@ def kills() -> dict:
         last = command(folder, "-o", path, *arguments)
         last.communicate()
         left = sorted(item.name for item in Path(folder).iterdir())
-        return {"kills": 20, "blocks_kept": parts_at, "exit": last.returncode, "difference": differs(whole, path), "left": left}
+        found = {"kills": 20, "blocks_kept": parts_at, "exit": last.returncode}
+        return found | {"difference": differs(whole, path), "left": left}
 
 
 def disk() -> dict:
