@@ -9,6 +9,7 @@ from ..acceptance.decision import worst
 from ..acceptance.metrics import METRICS, AcceptanceTest, Metric
 from ..acceptance.record import EvaluationRecord, PointsRecord
 from ..acceptance.standards import EDITIONS
+from ..calibration.evaluation import Evaluation, evaluate
 from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
 from ..summaries.evaluation import evaluation_summary, points_summary
