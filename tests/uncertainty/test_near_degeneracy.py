@@ -77,7 +77,7 @@ def test_shipped_arms_are_what_independent_chooses():
         assert aj.Parameters.independent(specification.arm).names == specification.space().names, name
 
 
-@pytest.mark.parametrize("method", ["two-stage", "joint"])
+@pytest.mark.parametrize("method", ["two-stage", pytest.param("joint", marks=pytest.mark.slow)])
 def test_a_bound_that_ends_such_a_direction_is_part_of_u(panda, capture, method):
     """The arm is right but for 2 mm of a_6, so theta_6 goes to its bound; a_6 and theta_6 must not pass as exactly known."""
     nominal = panda.replace(a_6=90.0)
