@@ -139,7 +139,9 @@ def calibrate_many(
     if method not in ("two-stage", "joint"):
         raise InputError(f"method is '{method}'; it must be 'two-stage' or 'joint'.")
     if not capture.lengths:
-        raise InputError("the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many.")
+        raise InputError(
+            "the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many."
+        )
     effort = _Effort(max_steps, chunk, lanes, devices, workers)
     work = _Work.of(arm, capture, lower, upper, start, space, hold, noise, effort)
     stage1 = work.identified()
@@ -160,7 +162,9 @@ def calibrate_many(
     work = _Work.of(arm, capture, lower, upper, scaled, stage1.space, None, noise, effort, fitted)
     joint = work.identified()
     steps = stage1.steps + joint.steps
-    return ManyCalibrations(joint.parameters, k, joint.de, joint.deltam, steps, joint.result, joint.active, stage1, method)
+    return ManyCalibrations(
+        joint.parameters, k, joint.de, joint.deltam, steps, joint.result, joint.active, stage1, method
+    )
 
 
 class _Effort(NamedTuple):
@@ -246,7 +250,9 @@ class _Work(NamedTuple):
     def identified(self) -> ManyIdentifications:
         """All chunks solved."""
         found = _spread(self.run, self.pieces, self.devices, self.workers)
-        parameters, de, deltam, k, steps, reason, active = (np.concatenate(column) for column in zip(*found, strict=True))
+        parameters, de, deltam, k, steps, reason, active = (
+            np.concatenate(column) for column in zip(*found, strict=True)
+        )
         scale = k if self.shape.ends else None
         return ManyIdentifications(
             parameters, de, deltam, scale, steps, reasons(jnp.asarray(reason)), active, self.space, self.hold
@@ -313,7 +319,9 @@ def _problems(
     boxes = {what: np.asarray(as_array(value, what)) for what, value in given.items()}
     for what, value in boxes.items():
         if value.ndim not in (1, 2) or value.shape[-1] != p:
-            raise InputError(f"{what} has shape {value.shape}; give ({p},) or (batch, {p}), since {p} parameters are free.")
+            raise InputError(
+                f"{what} has shape {value.shape}; give ({p},) or (batch, {p}), since {p} parameters are free."
+            )
     if arm.beta is None and space.base.beta is not None:
         arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
     lengths = [[np.asarray(getattr(r, key)) for r in capture.lengths] for key in ("value", "u")]
@@ -322,7 +330,9 @@ def _problems(
     problems = Problems(boxes["start"], boxes["lower"], boxes["upper"], geometry, np.asarray(capture.q), nominal, u)
     ranks = Problems(1, 1, 1, jax.tree.map(lambda _: 1, geometry), 2, 1, 1)
     batched = jax.tree.map(lambda leaf, rank: leaf.ndim > rank, problems, ranks)
-    sizes = {leaf.shape[0] for leaf, many in zip(jax.tree.leaves(problems), jax.tree.leaves(batched), strict=True) if many}
+    sizes = {
+        leaf.shape[0] for leaf, many in zip(jax.tree.leaves(problems), jax.tree.leaves(batched), strict=True) if many
+    }
     if not sizes:
         raise InputError(
             "nothing is a batch: give start, lower or upper as (batch, p), a batch of arms or of captures; or use identify."

@@ -62,7 +62,9 @@ class _Ended(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("shape", "room"))
-def solve_chunk(problems: Problems, count: Int[Array, ""], noise: Noise | None, shape: Shape, room: int) -> tuple[Array, ...]:
+def solve_chunk(
+    problems: Problems, count: Int[Array, ""], noise: Noise | None, shape: Shape, room: int
+) -> tuple[Array, ...]:
     """Solve the first ``count`` of ``room`` problems: parameters, DE, Deltam, k, steps, reasons, active bounds."""
     batch = _Batch(problems, sines_cosines(problems.q), None, None)
     start = jnp.broadcast_to(problems.start, (room, len(shape.kept)))
@@ -86,7 +88,9 @@ class _Batch(NamedTuple):
     def taken(self, shape: Shape, index: Int[Array, " w"]) -> "_Batch":
         """The problems of an index, one a lane."""
         sines_cosines = (
-            (self.sines_cosines[0][:, index], self.sines_cosines[1][:, index]) if shape.batched.q else self.sines_cosines
+            (self.sines_cosines[0][:, index], self.sines_cosines[1][:, index])
+            if shape.batched.q
+            else self.sines_cosines
         )
         rest = jax.tree.map(lambda leaf: leaf[index], (self.weights, self.joint_weights))
         return _Batch(_taken(self.problems, shape, index), sines_cosines, *rest)
@@ -128,7 +132,9 @@ def _work_off(batch: _Batch, shape: Shape, count: Int[Array, ""], room: int) -> 
         part = batch.taken(shape, index)
         problems = part.problems
         geometry = _with_parameters(problems.geometry, problems.start.at[:, kept].set(trial), shape.entries)
-        joint_weights = None if part.joint_weights is None else JointWeights(shape.ends, problems.nominal, *part.joint_weights)
+        joint_weights = (
+            None if part.joint_weights is None else JointWeights(shape.ends, problems.nominal, *part.joint_weights)
+        )
         return model_of(geometry, part.sines_cosines, shape.sizes, entries, joint_weights, part.weights)
 
     def more(carry) -> Bool[Array, ""]:
@@ -172,7 +178,9 @@ def _tips(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> Float[
     return jnp.swapaxes(forward_pass(geometry, part.sines_cosines).tip, -1, -2)
 
 
-def _measurement(nominal: Float[Array, " l"], u: Float[Array, " l"], weights: Weights | None, shape: Shape) -> Measurement:
+def _measurement(
+    nominal: Float[Array, " l"], u: Float[Array, " l"], weights: Weights | None, shape: Shape
+) -> Measurement:
     """The lengths of one problem; its poses are known by their tips already."""
     empty = jnp.zeros((sum(shape.sizes), 1))
     return Measurement(empty, sines_cosines(empty), nominal, u, shape.sizes, shape.ends, weights)

@@ -27,7 +27,9 @@ def flat_box(y: PyTree[Array], lower: PyTree, upper: PyTree, scale: PyTree) -> B
             filled = fill if tree is None else float(tree)
             tree = jax.tree.map(lambda leaf: jnp.full(leaf.shape, filled), y)
         else:
-            tree = jax.tree.map(lambda leaf, b: jnp.broadcast_to(jnp.asarray(b, dtype=jnp.float64), leaf.shape), y, tree)
+            tree = jax.tree.map(
+                lambda leaf, b: jnp.broadcast_to(jnp.asarray(b, dtype=jnp.float64), leaf.shape), y, tree
+            )
         return ravel_pytree(tree)[0]
 
     return Box(flat(lower, -jnp.inf), flat(upper, jnp.inf), None if scale is None else flat(scale, 1.0))
@@ -71,7 +73,9 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return unravel(state.y), state, aux
 
     def terminate(self, fn, y, args, options, state, tags):
-        failed = optx.RESULTS.where(state.reason == Reason.stalled, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
+        failed = optx.RESULTS.where(
+            state.reason == Reason.stalled, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+        )
         failed = optx.RESULTS.where(state.reason == Reason.nonfinite, optx.RESULTS.nonfinite, failed)
         return state.reason != Reason.running, failed
 
@@ -177,7 +181,9 @@ def _stationarity(y: PyTree[Array], solved: PyTree, inputs: PyTree) -> Flat:
     nearer_lower = fixed_point - box.lower <= box.upper - fixed_point
     # An absent bound is infinite; it is never the nearer one of a pinned unknown, but must not make NaN in the other branch.
     bound = jnp.where(
-        nearer_lower, jnp.where(jnp.isfinite(box.lower), box.lower, 0.0), jnp.where(jnp.isfinite(box.upper), box.upper, 0.0)
+        nearer_lower,
+        jnp.where(jnp.isfinite(box.lower), box.lower, 0.0),
+        jnp.where(jnp.isfinite(box.upper), box.upper, 0.0),
     )
     return jnp.where(pinned, flat - bound, gradient)
 

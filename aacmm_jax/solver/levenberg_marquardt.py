@@ -29,7 +29,9 @@ class Reason(eqx.Enumeration):
     rounding = "Converged: no step can lower the cost by more than rounding error."
     max_steps = "Not converged: the step limit was reached; allow more steps or start closer."
     stalled = "Not converged: no step lowers the cost although the gradient is not zero; is the residual smooth?"
-    nonfinite = "Not converged: the residual or its derivative is not finite at the start; check the data and the start."
+    nonfinite = (
+        "Not converged: the residual or its derivative is not finite at the start; check the data and the start."
+    )
 
 
 def reasons(numbers: Int[Array, "*lanes"]) -> Reason:
@@ -137,7 +139,9 @@ def advance(progress: Progress, evaluated: Model, box: Box, rules: Rules) -> Pro
     finite = evaluated.finite()
     reached = optimality(progress.trial, evaluated, box)
     accept = finite & (first | _improves(progress, evaluated, reached))
-    y, model, found = choose(accept, (progress.trial, evaluated, reached), (progress.y, progress.model, progress.optimality))
+    y, model, found = choose(
+        accept, (progress.trial, evaluated, reached), (progress.y, progress.model, progress.optimality)
+    )
     curvature = jnp.maximum(progress.curvature, jnp.diagonal(model.gram, axis1=-2, axis2=-1))
     scale = _scale(box, curvature)
 

@@ -97,9 +97,7 @@ def _scale(record: CalibrationRecord) -> list[str]:
     k = record.k
     stage1 = _sides(record)
     if not plausible(k):
-        unit = next(
-            (u for u, factor in (("m", M), ("cm", 10), ("inch", 1 / INCH)) if abs(k / factor - 1) < 0.1), None
-        )
+        unit = next((u for u, factor in (("m", M), ("cm", 10), ("inch", 1 / INCH)) if abs(k / factor - 1) < 0.1), None)
         hint = f"are the lengths in {unit} by mistake?" if unit else "check units, sockets, lengths and arm."
         return [f"k = {k:.6g} cannot be the scale of this arm; {hint}"]
     fixed = record.scale_set_by

@@ -176,7 +176,9 @@ def test_refused(arm, bounds, capture, options, text):
 def test_files_keep_all_of_it(arm, bounds, capture, tmp_path):
     sampled = aj.bootstrap(aj.calibrate(arm, capture, bounds, method="joint", noise=NOISE), capture, trials=100)
     nominal = aj.kinematics.ArmSpecification(arm, "small")
-    result = aj.calibrate(arm, capture, bounds, noise=aj.Noise(encoder_arcsec=[1.0, 2.0, 3.0, 2.0, 1.0, 4.0], seating=0.004))
+    result = aj.calibrate(
+        arm, capture, bounds, noise=aj.Noise(encoder_arcsec=[1.0, 2.0, 3.0, 2.0, 1.0, 4.0], seating=0.004)
+    )
     record = aj.calibration.record_of(result, aj.Recording(capture, nominal))._replace(
         validation=aj.cross_validate(arm, capture, bounds), sampled=sampled.table(), sampled_says="It agrees."
     )
@@ -197,7 +199,9 @@ def test_files_keep_all_of_it(arm, bounds, capture, tmp_path):
     np.testing.assert_array_equal(loaded.sampled["high"], sampled.high)
     assert loaded.sampled_says == "It agrees."
     # A calibration that failed leaves residuals of any size; its file is read all the same.
-    aj.files.save_calibration(tmp_path / "failed.h5", record._replace(noise=aj.Noise(encoder_arcsec=1e6, seating=500.0)))
+    aj.files.save_calibration(
+        tmp_path / "failed.h5", record._replace(noise=aj.Noise(encoder_arcsec=1e6, seating=500.0))
+    )
     assert float(aj.files.load_calibration(tmp_path / "failed.h5").noise.seating) == 500.0
     again = aj.uncertainty_of(loaded)
     np.testing.assert_allclose(again.u, aj.uncertainty_of(result).u)

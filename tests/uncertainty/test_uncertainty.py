@@ -161,7 +161,9 @@ def test_coverage(paper_arm, space, bounds, noise, form, least, most):
     moves = np.linalg.pinv(np.asarray(paper_arm.jacobian(exact.q, [f"q_{i}" for i in range(1, 7)])))
     random = np.random.default_rng(4)
     seats = 0.005 * random.normal(size=(400, 80, 3))
-    readings = np.asarray(exact.q) + np.einsum("Nic,tNc->tNi", moves, seats) + 2 * ARCSEC * random.normal(size=(400, 80, 6))
+    readings = (
+        np.asarray(exact.q) + np.einsum("Nic,tNc->tNi", moves, seats) + 2 * ARCSEC * random.normal(size=(400, 80, 6))
+    )
     values = float(exact.lengths[0].value) + 0.002 * random.normal(size=400)
 
     def shares(noise, form):
@@ -173,7 +175,9 @@ def test_coverage(paper_arm, space, bounds, noise, form, least, most):
             )
             return found.parameters - space.vector(), jnp.sqrt(jnp.diagonal(found.covariance))
 
-        error, u = jax.jit(lambda rows: jax.lax.map(one, rows, batch_size=20))((jnp.asarray(readings), jnp.asarray(values)))
+        error, u = jax.jit(lambda rows: jax.lax.map(one, rows, batch_size=20))(
+            (jnp.asarray(readings), jnp.asarray(values))
+        )
         return np.mean(np.abs(error) <= 1.97 * np.asarray(u), axis=0)
 
     share = shares(noise, form)
@@ -192,7 +196,9 @@ def test_tips_and_lengths(paper_arm, space, result):
     reading = np.asarray(paper_arm.jacobian(q, [f"q_{i}" for i in range(1, 7)])) * 2 * ARCSEC
     more = np.asarray(uncertainty.tip(q, reading=True) - uncertainty.tip(q))
     np.testing.assert_allclose(more, reading @ np.swapaxes(reading, 1, 2) + 25e-6 * np.eye(3), rtol=2e-3, atol=1e-8)
-    along = jax.grad(lambda v: jnp.linalg.norm(space.arm(v).position(q[0]) - space.arm(v).position(q[1])))(result.parameters)
+    along = jax.grad(lambda v: jnp.linalg.norm(space.arm(v).position(q[0]) - space.arm(v).position(q[1])))(
+        result.parameters
+    )
     assert float(uncertainty.length(q[0], q[1])) == pytest.approx(float(jnp.sqrt(along @ result.covariance @ along)))
     assert float(uncertainty.length(q[0], q[1], reading=True)) > float(uncertainty.length(q[0], q[1]))
 
@@ -200,7 +206,9 @@ def test_tips_and_lengths(paper_arm, space, result):
 def test_over_the_volume(result):
     uncertainty = aj.uncertainty_of(result)
     volume = aj.volumetric_uncertainty(uncertainty, points=50, length=250.0)
-    np.testing.assert_allclose(np.linalg.norm(volume.start - volume.end, axis=1), 250, atol=0.5)  # by an arm beside the nominal
+    np.testing.assert_allclose(
+        np.linalg.norm(volume.start - volume.end, axis=1), 250, atol=0.5
+    )  # by an arm beside the nominal
     np.testing.assert_allclose(volume.u_length, uncertainty.length(volume.q, volume.q_end), rtol=1e-9)
     assert volume.summary["u_length_largest_mm"] == volume.u_length.max()
     for wrong in ({"length": 1e5}, {"length": -1.0}, {"points": 0}):
@@ -286,7 +294,10 @@ def test_settled_poses_rest_in_their_sockets(paper_arm, capture):
 REFUSED = {
     "negative": (lambda arm, capture, bounds: aj.Noise(encoder_arcsec=-1), "zero or positive"),
     "not finite": (lambda arm, capture, bounds: aj.Noise(seating=np.inf), "not finite"),
-    "nothing": (lambda arm, capture, bounds: aj.calibrate(arm, capture, bounds, noise=aj.Noise()), "noise is zero everywhere"),
+    "nothing": (
+        lambda arm, capture, bounds: aj.calibrate(arm, capture, bounds, noise=aj.Noise()),
+        "noise is zero everywhere",
+    ),
     "another unit": (
         lambda arm, capture, bounds: aj.identify(arm, capture, bounds, noise=aj.Noise(encoder_arcsec=1e5)),
         "in another unit",
@@ -295,7 +306,10 @@ REFUSED = {
         lambda arm, capture, bounds: aj.identify(arm, capture, bounds, noise=aj.Noise(encoder_arcsec=[1, 2])),
         "2 values, but the arm has 6 joints",
     ),
-    "given without": (lambda arm, capture, bounds: aj.identify(arm, capture, bounds, noise_model="given"), "needs the noise"),
+    "given without": (
+        lambda arm, capture, bounds: aj.identify(arm, capture, bounds, noise_model="given"),
+        "needs the noise",
+    ),
     "estimated with": (
         lambda arm, capture, bounds: aj.identify(arm, capture, bounds, noise=NOISE, noise_model="estimated"),
         "the noise is given",
