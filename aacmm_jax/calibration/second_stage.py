@@ -63,7 +63,7 @@ def must_adjust(
     scaled: Float[Array, "... p"],
 ) -> Bool[Array, "..."]:
     """Whether the division is not the result of stage 2, given what was active in stage 1; see the module."""
-    lengths = jnp.asarray(divisible(bounds.space))
+    lengths = jnp.broadcast_to(jnp.asarray(divisible(bounds.space)), scaled.shape)
     concerned = (scaled < bounds.lower - _OUTSIDE) | (scaled > bounds.upper + _OUTSIDE)
     if anchor.hold is not None:  # without an anchor it is the active bounds that set the scale of stage 1
         concerned = concerned | (active != 0)

@@ -304,16 +304,16 @@ def test_parameters_without_an_uncertainty_of_their_own_say_why(record, certific
     assert all(left[name] is None and values["As left", PARAMETERS, name].expanded for name in others)
 
 
-def test_a_held_length_that_the_scale_fix_divided_says_so(record):
+def test_a_fixed_length_says_so(record):
     i = record.names.index("probe_z")
-    parts = ("lower", "upper", "active_stage1", "active", "determined", "stretch")
+    parts = ("lower", "upper", "active_stage1", "active", "determined")
     fewer = {name: np.delete(getattr(record, name), i) for name in parts}
     square = {name: np.delete(np.delete(getattr(record, name), i, 0), i, 1) for name in ("covariance", "open")}
     names = tuple(name for name in record.names if name != "probe_z")
     text = dcc(
         record._replace(names=names, held=(*record.held, "probe_z"), **fewer, **square), AdministrativeData(), created=CREATED
     )
-    assert "Not identified: held at its nominal value, and divided by k as all lengths are" in text
+    assert "Not identified: held at its nominal value" in text
     assert parse_dcc(text)["As left", PARAMETERS, "probe_z"].expanded is None
 
 
