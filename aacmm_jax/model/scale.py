@@ -17,7 +17,7 @@ from ..kinematics.parameters import Parameters
 from .measurement import Measurement, length_covariance
 from .metrics import repeatability
 
-# Fixed lengths that free ones can replace: their names, and for each free parameter its weight in the place of each of them.
+# Names of fixed lengths that free ones can replace, and for each free parameter its weight in place of each of them.
 Partners = tuple[tuple[str, ...], tuple[tuple[float, ...], ...]]
 
 

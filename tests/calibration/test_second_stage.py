@@ -1,4 +1,8 @@
-"""Stage 2: fixed parameters are constants, the result lies inside the box, and what sets the scale is judged by how well."""
+"""Stage 2: fixed parameters are constants, the result lies inside the box, and what sets the scale is judged by how
+well."""
+
+import sys
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -82,7 +86,10 @@ def test_a_noisier_instrument_needs_a_longer_fixed_length(paper_arm):
 @pytest.mark.parametrize("method", ["two-stage", "joint"])
 def test_a_free_partner_moves_in_place_of_a_fixed_length(panda, method):
     """d_7 is fixed and lies along the last axis, like probe_z, which takes up its part of the division by k."""
-    bounds = aj.files.load_specification("panda").bounds()
+    names = aj.files.load_specification("panda").bounds().space.names
+    # alpha_6 and theta_6 are redundant with a probe that is nearly on the last axis.
+    space = aj.Parameters(panda, tuple(name for name in names if name not in ("alpha_6", "theta_6")))
+    bounds = aj.Bounds.around(panda, space)
     nominal = with_values(panda, d_5=float(panda.d[4]) + 2.0)
     capture = recorded(panda)
     result = aj.calibrate(nominal, capture, bounds, method=method)
@@ -179,7 +186,8 @@ def test_many_equal_single_ones_on_bounds_and_with_fixed_lengths(too_long, paper
 
 
 def test_covariance_on_a_bound_is_what_trials_show(too_long, paper_arm, capture, cut):
-    """300 recordings of the same poses; the bound is active in all of them, and the other parameters scatter as predicted."""
+    """300 recordings of the same poses; the bound is active in all of them, and the other parameters scatter as
+    predicted."""
     start = np.clip(cut.space.vector(too_long), cut.lower, cut.upper)
     noise = aj.Noise(encoder_arcsec=2.0, seating=0.0005)
     random = np.random.default_rng(1)
@@ -212,7 +220,11 @@ def stacked(tree):
 
 
 BATCHES = {
-    "bounds": lambda arm, capture, b: (arm, capture, aj.Bounds(b.space, np.stack([b.lower] * 2), np.stack([b.upper] * 2))),
+    "bounds": lambda arm, capture, b: (
+        arm,
+        capture,
+        aj.Bounds(b.space, np.stack([b.lower] * 2), np.stack([b.upper] * 2)),
+    ),
     "arm": lambda arm, capture, b: (stacked(arm), capture, b),
     "capture": lambda arm, capture, b: (arm, stacked(capture), b),
 }
@@ -264,3 +276,20 @@ def test_results_of_one_and_of_many_have_the_same_fields(paper_arm, capture, cut
             assert np.shape(getattr(batch, name)) == (1, *np.shape(getattr(single, name)))
     assert (many.hold, many.space.names) == (one.hold, one.space.names)
     assert value_of(one.arm, "d_1") == value_of(paper_arm, "d_1")
+
+
+def test_coverage_of_a_shipped_arm_with_a_fixed_length_along_the_probe():
+    """100 calibrations of the Panda, which fixes d_7: every 95 % interval holds the truth (probe_z did in 6 of 100
+    once).
+
+    `benchmarks/uncertainty.py shipped` is the sharp version: 400 trials, more arms, both methods.
+    """
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+    import uncertainty
+
+    panda = aj.files.load_specification("panda")
+    names = [name for name in panda.bounds().space.names if name not in ("alpha_6", "theta_6")]
+    found = uncertainty.shipped_coverage(aj.Parameters(panda.arm, tuple(names)), "two-stage", 100)
+    assert found["parameters"][0] >= 87, found["each"]  # 95 % of 100 scatters by 2.2 %: 3.6 of it for the worst of 23
+    assert 93 < found["mean"] < 97
+    assert found["active"] == 0
