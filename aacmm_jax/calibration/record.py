@@ -64,7 +64,7 @@ class CalibrationRecord(NamedTuple):
 
     @property
     def fixed_by_one_length(self) -> bool:
-        """Whether a single length fixed the scale, so that its own error as left is zero by construction: no measurement."""
+        """Whether a single length fixed the scale, so that its own error as left is zero by construction."""
         return self.method == "two-stage" and len(self.recording.capture.lengths) == 1 and not self.scale_set_by
 
     @property

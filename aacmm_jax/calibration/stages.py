@@ -47,8 +47,8 @@ def identify(
     """Stage 1: the parameters that make the poses of every socket agree, within bounds.
 
     Minimises the summed squared distance of the tips from their socket's centroid (Cheng et al. 2018, section 2.2).
-    Repeatability does not determine the scale of the arm, and noise makes it shrink, so one length, the scale anchor, is
-    kept at its start.
+    Repeatability does not determine the scale of the arm, and noise makes it shrink, so one length, the scale anchor,
+    is kept at its start.
 
     Differentiable with respect to angles, bounds and the arm, exactly, also where a bound is active (not in directions
     that the data leave open, such as the scale of noise-free data without an anchor). Failure to converge is data
@@ -61,8 +61,8 @@ def identify(
         hold: the scale anchor. A free length by name; "longest", the longest free link, or none where fixed lengths
             determine the scale well; None, no anchor, as in the paper (then expect active bounds).
         start: free parameters ``(p,)`` to start from instead of the arm's, mm and rad.
-        noise: standard deviations of readings and seat. Where given, every pose is weighted by the inverse covariance of
-            its tip, and the covariance of the result follows from it; else both are estimated from the residuals.
+        noise: standard deviations of readings and seat. Where given, every pose is weighted by the inverse covariance
+            of its tip, and the covariance of the result follows from it; else both are estimated from the residuals.
         noise_model: another model of the tips' errors, one of `uncertainty.covariance.NOISE_MODELS`.
         max_steps: most evaluations of the residual.
 
@@ -115,12 +115,12 @@ def calibrate(
     """Both stages: identify from repeatability, then fix the scale with the reference lengths.
 
     "two-stage" divides the arm of stage 1 by k = measured / nominal. Fixed parameters stay as they are, to the bit, and
-    the result is inside the box: where the division cannot give that, stage 1 is repeated with its anchor adjusted until
-    k = 1 (`calibration.second_stage`). Where fixed lengths set the scale, k changes nothing.
+    the result is inside the box: where the division cannot give that, stage 1 is repeated with its anchor adjusted
+    until k = 1 (`calibration.second_stage`). Where fixed lengths set the scale, k changes nothing.
 
-    "joint" goes on from there with one least squares of repeatability and lengths together, each weighted by its standard
-    deviation: that of a tip coordinate from stage 1's residuals; that of a length from its u and from the scatter of the
-    poses at its ends.
+    "joint" goes on from there with one least squares of repeatability and lengths together, each weighted by its
+    standard deviation: that of a tip coordinate from stage 1's residuals; that of a length from its u and from the
+    scatter of the poses at its ends.
 
     Args:
         arm: as for `identify`, like all arguments that are not named here.
@@ -144,8 +144,8 @@ def calibrate(
         raise InputError(f"method is '{method}'; it must be 'two-stage' or 'joint'.")
     if not capture.lengths:
         raise InputError(
-            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, from "
-            "Python, identify for stage 1 alone)."
+            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, "
+            "from Python, identify for stage 1 alone)."
         )
     task = _checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
     _check_identifiable(capture, task, strict)
@@ -159,7 +159,7 @@ def calibrate(
 
 
 def _check_identifiable(capture: Capture, task: Task, strict: bool) -> None:
-    """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine, unless values are traced."""
+    """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; not of traced values."""
     # Inside jit or vmap even what is constant becomes a tracer once JAX computes with it.
     if not is_concrete(jnp.negative(0.0), *jax.tree.leaves((capture, task.bounds))):
         return

@@ -1,4 +1,4 @@
-"""Measurement x arm -> residual: what the identifications minimise."""
+"""The residuals that the identifications minimise, of a measurement by an arm, and their quadratic models."""
 
 from typing import NamedTuple
 
@@ -15,17 +15,17 @@ from .weights import Weights
 
 
 class JointWeights(NamedTuple):
-    """What a joint solve needs besides the poses: the lengths, and how both are weighed. Leading axes may be lanes."""
+    """Reference lengths of a joint solve, and the weights of poses and lengths. Leading axes may be a batch."""
 
     ends: tuple[tuple[int, int], ...]
-    nominal: Float[Array, "*lanes l"]  # mm
-    sigma: Float[Array, "*lanes"]  # standard deviation of a tip coordinate, mm
-    whitening: Float[Array, "*lanes l l"]  # inverse Cholesky factor of the lengths' covariance, 1/mm
+    nominal: Float[Array, "*batch l"]  # mm
+    sigma: Float[Array, "*batch"]  # standard deviation of a tip coordinate, mm
+    whitening: Float[Array, "*batch l l"]  # inverse Cholesky factor of the lengths' covariance, 1/mm
 
 
 def repeatability_residual(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Float[Array, "N 3"]:
-    """Distance vectors of all tips from their socket's centroid, mm (Cheng et al. 2018, eq. 13-14, by component); whitened
-    where the measurement has weights."""
+    """Vectors of all tips from their socket's centroid, mm (Cheng et al. 2018, eq. 13-14, by component); whitened where
+    the measurement has weights."""
     space, measurement = args
     return measurement.whitened(measurement.centred(space.arm(vector).position(measurement.q)))
 
@@ -36,8 +36,8 @@ def joint_residual(
 ) -> tuple[Float[Array, "N 3"], Float[Array, " l"]]:
     """Repeatability and reference lengths together, each in units of its standard deviation.
 
-    args: free parameters, measurement, standard deviation of a tip coordinate (mm), and the whitening of the lengths: the
-    inverse Cholesky factor of their covariance (1/mm).
+    ``args`` are the free parameters, the measurement, the standard deviation of a tip coordinate (mm), and the
+    whitening of the lengths: the inverse Cholesky factor of their covariance (1/mm).
     """
     space, measurement, sigma, whitening = args
     tips = space.arm(vector).position(measurement.q)
@@ -47,7 +47,7 @@ def joint_residual(
 
 
 def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Model:
-    """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic columns."""
+    """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic Jacobian columns."""
     space, measurement = args
     geometry = space.arm(vector).geometry
     return model_of(
@@ -85,16 +85,16 @@ def model_of(
     joint_weights: JointWeights | None = None,
     weights: Weights | None = None,
 ) -> Model:
-    """Cost, gradient and Gram matrix of the repeatability residual, for any batch of arms and poses that broadcast; with
-    ``weighing``, of the joint residual of poses and lengths; with ``weights``, of whitened poses.
+    """Cost, gradient and Gram matrix of the repeatability residual, for any batch of arms and poses that broadcast;
+    with ``joint_weights``, of the joint residual of poses and lengths; with ``weights``, of whitened poses.
 
-    The mean over a socket is taken off the Gram matrix as a correction of rank 3 a socket, J^T J - m mu^T mu, which spares
-    a centred copy of the columns; the gradient needs none, because centred residuals sum to zero.
+    The mean over a socket is subtracted from the Gram matrix as a correction of rank 3 for each socket, J^T J - m mu^T
+    mu, so that no centred copy of the columns is needed; nor for the gradient, because centred residuals sum to zero.
     """
     forward = forward_pass(geometry, sines_cosines)
     columns = stacked_jacobian_columns(forward, entries)
-    # Centred twice: the rounding that one pass leaves in the mean (1e-13 mm) would otherwise be multiplied by the columns'
-    # means, and near a perfect fit outweigh the gradient.
+    # Centred twice: the rounding error that one pass leaves in the mean (1e-13 mm) would otherwise be multiplied by the
+    # columns' means, and exceed the gradient near a perfect fit.
     averaging = averaging_matrix(sizes)
     residual = _centred_rows(forward.tip, averaging)
     if weights is None:
@@ -125,12 +125,12 @@ def model_of(
 
 
 def _distances(
-    tip: Float[Array, "*lanes 3 N"],
-    columns: Float[Array, "*lanes p 3 N"],
+    tip: Float[Array, "*batch 3 N"],
+    columns: Float[Array, "*batch p 3 N"],
     sizes: tuple[int, ...],
     ends: tuple[tuple[int, int], ...],
     weights: Weights | None,
-) -> tuple[Float[Array, "*lanes l"], Float[Array, "*lanes l p"]]:
+) -> tuple[Float[Array, "*batch l"], Float[Array, "*batch l p"]]:
     """Distances between the centroids of sockets, mm, and their derivatives."""
     between = differences_matrix(ends, len(sizes)).T
     if weights is None:
