@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..core._compat import inside_trace
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..data.capture import Capture
@@ -20,7 +21,7 @@ from ..model.metrics import repeatability
 from ..model.residuals import joint_model, joint_residual, repeatability_model, repeatability_residual
 from ..model.scale import divide_lengths
 from ..solver.bounded import BoundedLevenbergMarquardt, least_squares
-from ..solver.levenberg_marquardt import Reason
+from ..solver.reason import Reason
 from ..uncertainty import propagation
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
 from ..uncertainty.identifiability import observability
@@ -118,8 +119,7 @@ def calibrate(
 
 def _check_identifiable(arm: Arm, capture: Capture, bounds: Bounds, strict: bool) -> None:
     """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; traced values are not looked at."""
-    # Inside jit or vmap even what is constant becomes a tracer once JAX computes with it.
-    if not is_single(arm) or not is_concrete(jnp.negative(0.0), *jax.tree.leaves((arm, capture, bounds))):
+    if not is_single(arm) or inside_trace() or not is_concrete(*jax.tree.leaves((arm, capture, bounds))):
         return
     sentences = observability(arm, capture, bounds.space).sentences()
     if sentences and strict:
@@ -241,8 +241,7 @@ def _joint(arm: Arm, stage1: Identification, task: _Task) -> tuple[Arm, Array, A
     """One weighted least squares of poses and lengths, from the two-stage result; held parameters stay as given."""
     assert stage1.scale is not None
     space, k = Parameters(arm, stage1.space.names), stage1.scale.value
-    # The joint solve waits for stage 1's covariance: see `covariance.inverted`.
-    scaled, _ = jax.lax.optimization_barrier((divide_lengths(stage1.arm, k), stage1.parameter_covariance.matrix))
+    scaled = divide_lengths(stage1.arm, k)
     measurement = task.measurement.weighted(scaled.geometry, task.noise)
     joint_weights = propagation.joint_weights(scaled, measurement, stage1.after.sigma / k)
     solution = least_squares(

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..core._compat import SymbolicZero
 from ..core.arrays import is_concrete
 
 SinesCosines = tuple[Float[Array, "n ... 1 N"], Float[Array, "n ... 1 N"]]
@@ -158,7 +159,7 @@ def _tip_position_jvp(primals, tangents):
     moved = jnp.zeros_like(forward.tip)
     for kind, tangent in pairs:
         # Unperturbed arguments arrive as symbolic zeros: a derivative by parameters then never touches q.
-        if not isinstance(tangent, jax.custom_derivatives.SymbolicZero):
+        if not isinstance(tangent, SymbolicZero):
             moved = moved + jnp.sum(columns[kind] * _rows(tangent, rank), axis=0)
     return _unrolled(forward.tip, geometry, q), _unrolled(moved, geometry, q)
 
