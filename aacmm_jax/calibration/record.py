@@ -10,7 +10,7 @@ from ..data.noise import Noise
 from ..data.recording import Recording
 from ..kinematics.parameters import Parameters
 from ..kinematics.specification import ArmSpecification
-from ..solver.levenberg_marquardt import Reason
+from ..solver.reason import Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .checks import largest_plausible_residual
 from .evaluation import Evaluation, evaluate

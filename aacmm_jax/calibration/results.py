@@ -8,17 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..core._compat import member_numbers
 from ..core.arrays import Numbers, is_concrete
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import Repeatability
 from ..model.scale import Scale
-from ..solver.levenberg_marquardt import Reason, numbers_of
+from ..solver.reason import Reason, numbers_of
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance
 from .checks import largest_plausible_residual
 
-_GOOD = [int(reason._value) for reason in (Reason.gradient, Reason.step, Reason.rounding)]  # pyright: ignore
+_GOOD = [int(member_numbers(reason)) for reason in (Reason.gradient, Reason.step, Reason.rounding)]
 
 
 class Identification(eqx.Module):

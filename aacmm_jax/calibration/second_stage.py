@@ -24,7 +24,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement
 from ..model.scale import divide_free_lengths, divisible, replaced_lengths, scale_of
-from ..solver.levenberg_marquardt import Reason, numbers_of, reasons
+from ..solver.reason import Reason, numbers_of, reasons
 from .scale_anchor import ScaleAnchor
 from .task import Task, fit_repeatability
 

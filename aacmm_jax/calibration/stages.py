@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..core._compat import inside_trace
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..data.capture import Capture
@@ -19,7 +20,7 @@ from ..model.measurement import Measurement, check_joints
 from ..model.metrics import repeatability
 from ..model.residuals import joint_model, joint_residual
 from ..solver.bounded import least_squares
-from ..solver.levenberg_marquardt import Reason
+from ..solver.reason import Reason
 from ..uncertainty import propagation
 from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
@@ -160,8 +161,7 @@ def calibrate(
 
 def _check_identifiable(capture: Capture, task: Task, strict: bool) -> None:
     """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; not of traced values."""
-    # Inside jit or vmap even what is constant becomes a tracer once JAX computes with it.
-    if not is_concrete(jnp.negative(0.0), *jax.tree.leaves((capture, task.bounds))):
+    if inside_trace() or not is_concrete(*jax.tree.leaves((capture, task.bounds))):
         return
     sentences = observability(task.space.base, capture, task.space).sentences()
     if sentences and strict:
@@ -318,10 +318,7 @@ def _joint(task: Task) -> Calibration:
     stage1, _ = _stage1(task)
     assert stage1.scale is not None
     space, k = task.space, stage1.scale.value
-    # The joint solve waits for stage 1's covariance: see `covariance.inverse_information`.
-    parameters, _ = jax.lax.optimization_barrier((
-        divided(task.anchor, space, stage1.parameters, k), stage1.parameter_covariance.matrix
-    ))  # fmt: skip
+    parameters = divided(task.anchor, space, stage1.parameters, k)
     scaled = space.arm(parameters)
     measurement = task.measurement.weighted(scaled.geometry, task.noise)
     sigma = stage1.after.sigma / k

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass
 from ..kinematics.jacobian import stacked_jacobian_columns
 from ..kinematics.parameters import Parameters
-from ..solver.levenberg_marquardt import Model
+from ..solver.active_set import QuadraticModel
 from .measurement import Measurement, averaging_matrix, differences_matrix
 from .weights import Weights
 
@@ -46,7 +46,7 @@ def joint_residual(
     )
 
 
-def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Model:
+def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> QuadraticModel:
     """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic Jacobian columns."""
     space, measurement = args
     geometry = space.arm(vector).geometry
@@ -58,7 +58,7 @@ def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Meas
 def joint_model(
     vector: Float[Array, " p"],
     args: tuple[Parameters, Measurement, Float[Array, ""], Float[Array, "l l"]],
-) -> Model:
+) -> QuadraticModel:
     """Cost, gradient and Gram matrix of `joint_residual`."""
     space, measurement, sigma, whitening = args
     joint_weights = JointWeights(measurement.ends, measurement.nominal, sigma, whitening)
@@ -84,7 +84,7 @@ def model_of(
     entries: tuple[tuple[str, int], ...],
     joint_weights: JointWeights | None = None,
     weights: Weights | None = None,
-) -> Model:
+) -> QuadraticModel:
     """Cost, gradient and Gram matrix of the repeatability residual, for any batch of arms and poses that broadcast;
     with ``joint_weights``, of the joint residual of poses and lengths; with ``weights``, of whitened poses.
 
@@ -106,7 +106,7 @@ def model_of(
     residual = residual.reshape(*residual.shape[:-2], -1)
     flat = counted.reshape(*counted.shape[:-2], -1)
     weighted = shifts.reshape(*shifts.shape[:-2], -1)
-    poses = Model(
+    poses = QuadraticModel(
         0.5 * jnp.sum(residual**2, axis=-1),
         (flat @ residual[..., None])[..., 0],
         flat @ jnp.swapaxes(flat, -1, -2) - weighted @ jnp.swapaxes(weighted, -1, -2),
@@ -117,7 +117,7 @@ def model_of(
     off = (joint_weights.whitening @ (distance - joint_weights.nominal)[..., None])[..., 0]
     rows = joint_weights.whitening @ rows
     weight = 1 / joint_weights.sigma**2
-    return Model(
+    return QuadraticModel(
         weight * poses.cost + 0.5 * jnp.sum(off**2, axis=-1),
         weight[..., None] * poses.gradient + (off[..., None, :] @ rows)[..., 0, :],
         weight[..., None, None] * poses.gram + jnp.swapaxes(rows, -1, -2) @ rows,

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..core.linear_algebra import inverse_positive_definite
 from ..kinematics.arm import Arm
 from ..kinematics.chain import sines_cosines
 from ..kinematics.inverse_kinematics import newton_projection, project_to_targets
@@ -64,7 +65,7 @@ def refined(
         fresh = eqx.tree_at(lambda m: (m.q, m.sines_cosines), design.measurement, (at, sines_cosines(at)))
         rows = whitened_equations(design.arm, design.space, fresh.weighted(design.arm.geometry, problem.noise))
         information = rows.T @ rows + 1e-4 * jnp.eye(rows.shape[1])
-        return problem.objective._replace(functions=design.functions).value(jnp.linalg.inv(information))
+        return problem.objective._replace(functions=design.functions).value(inverse_positive_definite(information))
 
     done = 0
 

@@ -8,11 +8,11 @@ parameters is the product of both.
 import math
 from typing import Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..core.linear_algebra import inverse_positive_definite, semidefinite_eigen
 from ..core.units import ARCSEC
 from ..data.noise import Noise, encoder_covariances, tip_covariances
 from ..kinematics.arm import Arm
@@ -133,15 +133,13 @@ def inverse_information(
     the others.
     """
     free = ~fixed
-    # One decomposition, and what follows from it one after the other: jaxlib's batched LAPACK calls wait for each
-    # other's threads, and on two cores two that may run at the same time can wait for ever.
     information = information + jnp.diag(jnp.where(fixed, 1.0 + jnp.max(jnp.abs(information)), 0.0))
     # Only masks and a basis come from the eigenvectors: their derivative is infinite where eigenvalues repeat.
-    values, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(information))
-    known = values > _NULL * values[-1]
+    values, vectors = semidefinite_eigen(information)
+    known = values > _NULL * values[0]
     seen, lost = jnp.where(known[None, :], vectors, 0.0), jnp.where(known[None, :], 0.0, vectors)
     inner = seen.T @ information @ seen + jnp.diag(jnp.where(known, 0.0, 1.0))
-    inverse = seen @ jnp.linalg.inv(inner) @ seen.T
+    inverse = seen @ inverse_positive_definite(inner) @ seen.T
     hardly = jnp.where((values > _LEAST_INFORMATION)[None, :] & known[None, :], 0.0, vectors)
     determined = fixed | (jnp.sum(hardly**2, axis=1) < 1e-6)
     return jnp.where(free[:, None] & free[None, :], inverse, 0.0), lost @ lost.T, determined

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..core.linear_algebra import inverse_cholesky
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
@@ -70,7 +71,7 @@ def joint_weights(arm: Arm, measurement: Measurement, sigma: Float[Array, ""]) -
     """Weights of poses and lengths in a joint solve, given the scatter of a tip coordinate by a nearly right arm."""
     safe = jnp.maximum(sigma, LEAST_SIGMA)
     centroids = measurement.centroids(arm.position(measurement.q))
-    whitening = jnp.linalg.inv(jnp.linalg.cholesky(length_covariance(centroids, measurement, safe)))
+    whitening = inverse_cholesky(length_covariance(centroids, measurement, safe))
     counted = safe if measurement.weights is None else jnp.ones_like(safe)  # weights are in standard deviations already
     return JointWeights(measurement.ends, measurement.nominal, counted, whitening)
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.errors import InputError
+from ..core.linear_algebra import semidefinite_eigen
 from ..kinematics.arm import Arm, joint_limits
 from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.workspace import total_link_length
@@ -82,7 +83,7 @@ def volumetric_uncertainty(
 def _volume(uncertainty: Uncertainty, start: Array, end: Array) -> tuple[Array, Array, Array, Array]:
     covariance = uncertainty.tip(start)
     finite = jnp.where(jnp.isfinite(covariance), covariance, 0.0)
-    largest = jnp.sqrt(jnp.linalg.eigvalsh(finite)[..., -1])
+    largest = jnp.sqrt(semidefinite_eigen(finite)[0][..., 0])
     largest = jnp.where(jnp.all(jnp.isfinite(covariance), axis=(-1, -2)), largest, jnp.inf)
     tips = jnp.stack([uncertainty.arm.position(q) for q in (start, end)])
     return tips, largest, uncertainty.length(start, end), uncertainty.length(start, end, reading=True)
