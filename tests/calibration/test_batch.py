@@ -61,7 +61,9 @@ def test_batches_of_arms_and_captures(paper_arm):
     space = aj.Parameters.free_of(paper_arm)
     true = [aj.perturbed_arm(space, length=1.0, angle=1e-3, seed=seed) for seed in range(4)]
     sockets = {"A": (400, 200, 300), "B": (600, 200, 300)}
-    captures = [aj.simulate(arm, sockets, poses={"A": 30, "B": 1}, lengths=[("A", "B")], seed=i) for i, arm in enumerate(true)]
+    captures = [
+        aj.simulate(arm, sockets, poses={"A": 30, "B": 1}, lengths=[("A", "B")], seed=i) for i, arm in enumerate(true)
+    ]
     nominal = jax.tree.map(lambda leaf: jnp.stack([leaf] * 4), paper_arm)
     bounds = aj.Bounds.around(paper_arm, space)
     many = aj.identify_many(nominal, aj.stack_captures(captures), bounds.lower, bounds.upper, hold="d_3")
