@@ -4,6 +4,8 @@ jaxlib's batched LAPACK calls split their batch over the thread pool whose threa
 one program can wait for each other forever (measured on two cores with four). Nothing here calls LAPACK.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,7 +38,7 @@ def solve_positive_definite(
 
 
 @solve_positive_definite.defjvp
-def _solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+def _solve_jvp(primals: tuple[Array, Array], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
     (matrix, right), (d_matrix, d_right) = primals, tangents
     solution = solve_positive_definite(matrix, right)
     change = d_right - (d_matrix @ solution[..., None])[..., 0]
@@ -52,7 +54,7 @@ def inverse_cholesky(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batch
 
 
 @inverse_cholesky.defjvp
-def _inverse_cholesky_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+def _inverse_cholesky_jvp(primals: tuple[Array], tangents: tuple[Any]) -> tuple[Array, Array]:
     # With L = W^-1: dL = L half(W dA W^T), hence dW = -half(W dA W^T) W.
     whitening = inverse_cholesky(primals[0])
     change = whitening @ tangents[0] @ jnp.swapaxes(whitening, -1, -2)
@@ -103,11 +105,12 @@ def singular_values(
         norm = jnp.where(norm > 0, norm, 1.0)
         # Divided by one norm after the other: the product of two squares may underflow.
         cosine = jnp.sum(columns * other[..., :height, :], axis=-2) / norm / norm[..., partner]
-        cosine = jnp.where(partner == order, 0.0, cosine)
+        alone, before = (jnp.broadcast_to(mask, norm.shape) for mask in (partner == order, order < partner))
+        cosine = jnp.where(alone, 0.0, cosine)
         rotated = jnp.abs(cosine) > 0.5 * _EPSILON
         ratio = norm[..., partner] / norm
         cotangent = (ratio - 1 / ratio) / (2 * jnp.where(rotated, cosine, 1.0))  # of twice the angle
-        sign = jnp.where((cotangent > 0) | ((cotangent == 0) & (order < partner)), 1.0, -1.0)
+        sign = jnp.where((cotangent > 0) | ((cotangent == 0) & before), 1.0, -1.0)
         tangent = jnp.where(rotated, sign / (jnp.abs(cotangent) + jnp.hypot(1.0, cotangent)), 0.0)
         stacked = lax.rsqrt(1 + tangent**2)[..., None, :] * (stacked - tangent[..., None, :] * other)
         return stacked, jnp.maximum(largest_cosine, jnp.max(jnp.abs(cosine), axis=-1))

@@ -15,6 +15,8 @@ from ..core.linear_algebra import solve_positive_definite
 Flat = Float[Array, "*slots p"]
 Number = Float[Array, "*slots"]
 
+_MAX_RAISES = 200  # of the damping, for one step
+
 
 class QuadraticModel(eqx.Module):
     """The quadratic model of the cost at one point: all that a step needs from one evaluation of f and its Jacobian J."""
@@ -69,32 +71,32 @@ class Step(eqx.Module):
     length: Number  # of the damped step before it was clipped to the box, scaled
 
 
-def propose(y: Flat, model: QuadraticModel, box: Box, scale: Flat, damping: Number) -> Step:
-    """The damped step on the unpinned unknowns, clipped to the box.
+def propose(
+    y: Flat, model: QuadraticModel, box: Box, scale: Flat, damping: Number, radius: Number | None
+) -> tuple[Step, Number]:
+    """The damped step on the unpinned unknowns, clipped to the box; and the damping, raised until the step before clipping is
+    no longer than ``radius`` (scaled), where there is one.
 
     Solves (S J^T J S + damping I) z = -S J^T f with S = diag(scale) and y + S z as the unclipped trial. Unknowns that the
     step would carry through a bound are put on it and the rest solved again, once: without that, strongly coupled
     unknowns zigzag along a bound.
     """
     pinned = box.pinned(y, model.gradient)
-    gram = scale[..., :, None] * model.gram * scale[..., None, :]
-    downhill = -scale * model.gradient
-    identity = jnp.eye(y.shape[-1], dtype=bool).reshape((1,) * (y.ndim - 1) + (y.shape[-1],) * 2)
-
-    def solve(fixed: Bool[Array, "*slots p"], right: Flat) -> Flat:
-        inside = ~fixed
-        matrix = jnp.where(inside[..., :, None] & inside[..., None, :], gram, 0.0)
-        matrix = matrix + jnp.where(identity, jnp.where(fixed, 1.0, damping[..., None])[..., None, :], 0.0)
-        return scale * solve_positive_definite(matrix, jnp.where(fixed, 0.0, right))
+    gram, downhill = scale[..., :, None] * model.gram * scale[..., None, :], -scale * model.gradient
+    if radius is None:
+        z = _damped(gram, downhill, pinned, damping)
+    else:
+        z, damping = _solve_within(gram, downhill, pinned, damping, radius)
+    step, length = scale * z, norm(z)
 
     def solve_again(step: Flat) -> Flat:
         landed = box.clip(y + step)
         through = landed != y + step
         shift = jnp.where(through, landed - y, 0.0)
-        return jnp.where(through, shift, solve(pinned | through, downhill - _times(gram, shift / scale)))
+        return jnp.where(
+            through, shift, scale * _damped(gram, downhill - _times(gram, shift / scale), pinned | through, damping)
+        )
 
-    step = solve(pinned, downhill)
-    length = norm(step / scale)
     # One test for all slots: solving again changes nothing in a slot whose step stays inside.
     step = jax.lax.cond(jnp.any(box.clip(y + step) != y + step), solve_again, lambda s: s, step)
     trial = box.clip(y + step)
@@ -102,9 +104,40 @@ def propose(y: Flat, model: QuadraticModel, box: Box, scale: Flat, damping: Numb
     predicted = -jnp.sum(step * (model.gradient + 0.5 * _times(model.gram, step)), axis=-1)
     # A failed factorisation shows as NaN: stay, predict nothing, and let the damping grow.
     usable = jnp.isfinite(predicted)
-    return choose(
-        usable, Step(trial, predicted, length), Step(y, jnp.zeros_like(predicted), jnp.full_like(length, jnp.inf))
-    )
+    nowhere = Step(y, jnp.zeros_like(predicted), jnp.full_like(length, jnp.inf))
+    return choose(usable, Step(trial, predicted, length), nowhere), damping
+
+
+def _solve_within(
+    gram: Float[Array, "*slots p p"], right: Flat, fixed: Bool[Array, "*slots p"], damping: Number, radius: Number
+) -> tuple[Flat, Number]:
+    """`_damped` with the damping raised as far as z needs it to be no longer than ``radius``; and that damping."""
+
+    def too_long(state: tuple[Array, Flat, Number]) -> Bool[Array, ""]:
+        count, z, _ = state
+        return (count < _MAX_RAISES) & jnp.any(~(norm(z) <= radius))
+
+    def raised(state: tuple[Array, Flat, Number]) -> tuple[Array, Flat, Number]:
+        count, z, damping = state
+        ratio = norm(z) / radius
+        # The length falls at most inversely to the damping, so the root does not go past the radius by much. A failed
+        # factorisation shows as NaN.
+        factor = jnp.where(jnp.isfinite(ratio), jnp.maximum(jnp.sqrt(ratio), 1.05), 10.0)
+        damping = jnp.where((count == 0) | (ratio <= 1), damping, factor * damping)
+        return count + 1, _damped(gram, right, fixed, damping), damping
+
+    nothing = jnp.full_like(right, jnp.nan)
+    return jax.lax.while_loop(too_long, raised, (jnp.zeros((), dtype=jnp.int32), nothing, damping))[1:]
+
+
+def _damped(gram: Float[Array, "*slots p p"], right: Flat, fixed: Bool[Array, "*slots p"], damping: Number) -> Flat:
+    """Solution of (gram + damping I) z = right on the unknowns that are not fixed; 0 for those that are."""
+    p = gram.shape[-1]
+    identity = jnp.eye(p, dtype=bool).reshape((1,) * (gram.ndim - 2) + (p, p))
+    inside = ~fixed
+    matrix = jnp.where(inside[..., :, None] & inside[..., None, :], gram, 0.0)
+    matrix = matrix + jnp.where(identity, jnp.where(fixed, 1.0, damping[..., None])[..., None, :], 0.0)
+    return solve_positive_definite(matrix, jnp.where(fixed, 0.0, right))
 
 
 def choose(predicate: Bool[Array, "*slots"], new: PyTree, old: PyTree) -> PyTree:

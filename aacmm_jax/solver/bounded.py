@@ -30,7 +30,9 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     rtol: float = 1e-14  # on the next step, relative to |y| (both scaled)
     atol: float = 0.0  # on the step, scaled
     gtol: float = 1e-10  # on the projected gradient: cosine between the residual and a column of J
-    initial_damping: float = 1e-3  # relative to the largest curvature
+    # Relative to the largest curvature; None: as little as keeps the steps within a trust region, whose first radius is the
+    # scaled length of the start. A value spares the search where a problem is known to need none.
+    initial_damping: float | None = None
     # Optimistix asks for a norm; every test here is written out, since it scales by unknowns.
     norm: Callable[[PyTree], Array] = optx.max_norm
 

@@ -23,7 +23,7 @@ class Rules(NamedTuple):
     rtol: float  # on the step, relative to |y| (both scaled)
     atol: float  # on the step, scaled
     gtol: float  # on the projected gradient: cosine between the residual and a column of J
-    initial_damping: float  # relative to the largest curvature
+    initial_damping: float | None  # relative to the largest curvature; None: steps are kept to a trust region instead
 
 
 class Progress(eqx.Module):
@@ -72,13 +72,20 @@ def advance(progress: Progress, evaluated: QuadraticModel, box: Box, rules: Rule
     curvature = jnp.maximum(progress.curvature, diagonal(model.gram))
     scale = _scale(box, curvature)
 
-    damping, growth = _next_damping(progress, evaluated, accept)
+    ratio = _ratio(progress, evaluated, accept)
+    damping, growth = _next_damping(progress, ratio, accept)
     largest = jnp.max(scale**2 * curvature, axis=-1)
-    damping = jnp.where(first, rules.initial_damping * largest, damping)
     # With less, rounding in the Gram matrix can make it indefinite.
-    damping = jnp.maximum(damping, 1e3 * _EPSILON * largest)
+    least = 1e3 * _EPSILON * largest
+    initial = 0.0 if rules.initial_damping is None else rules.initial_damping * largest
+    damping = jnp.maximum(jnp.where(first, initial, damping), least)
+    radius = None
+    if rules.initial_damping is None:
+        trusted = jnp.where(_within_rounding(progress, evaluated), 1.0, ratio)
+        radius = _next_radius(progress, y, model, scale, trusted, accept)
+        radius = jnp.where(model.finite(), radius, jnp.inf)
 
-    step = propose(y, model, box, scale, damping)
+    step, damping = propose(y, model, box, scale, damping, radius)
 
     # After an accepted trial the next step is tested: where it is too small to matter it is not taken, which saves the last
     # evaluation. After a refusal, the refused one. Both before clipping: a step that the box cuts to nothing says only that
@@ -108,25 +115,43 @@ def advance(progress: Progress, evaluated: QuadraticModel, box: Box, rules: Rule
 
 
 def _improves(progress: Progress, evaluated: QuadraticModel, trial_optimality: Number) -> Bool[Array, "*slots"]:
-    predicted, actual = progress.step.predicted, progress.model.cost - evaluated.cost
+    predicted = progress.step.predicted
+    decreases = progress.model.cost - evaluated.cost > 1e-4 * predicted
+    closer = trial_optimality < progress.optimality
+    return (predicted > 0) & jnp.where(_within_rounding(progress, evaluated), closer, decreases)
+
+
+def _within_rounding(progress: Progress, evaluated: QuadraticModel) -> Bool[Array, "*slots"]:
     # Close to the solution the decrease drowns in the rounding of the cost; the gradient still points downhill. (Tips at
     # 1 m that differ by 10 um lose five digits, hence the wide margin.)
     margin = 1e6 * _EPSILON * progress.model.cost
-    blurred = (predicted < margin) & (jnp.abs(actual) < margin)
-    decreases = actual > 1e-4 * predicted
-    return (predicted > 0) & jnp.where(blurred, trial_optimality < progress.optimality, decreases)
+    return (progress.step.predicted < margin) & (jnp.abs(progress.model.cost - evaluated.cost) < margin)
 
 
-def _next_damping(
-    progress: Progress, evaluated: QuadraticModel, accept: Bool[Array, "*slots"]
-) -> tuple[Number, Number]:
-    # Nielsen's rule: shrink smoothly with the ratio of actual to predicted decrease, grow ever faster with refusals.
+def _ratio(progress: Progress, evaluated: QuadraticModel, accept: Bool[Array, "*slots"]) -> Number:
+    """Actual to predicted decrease of an accepted step."""
     predicted = jnp.where(progress.step.predicted > 0, progress.step.predicted, 1.0)
     ratio = jnp.where(accept, (progress.model.cost - evaluated.cost) / predicted, 0.0)
-    ratio = jnp.where(jnp.isfinite(ratio), ratio, 0.0)
+    return jnp.where(jnp.isfinite(ratio), ratio, 0.0)
+
+
+def _next_damping(progress: Progress, ratio: Number, accept: Bool[Array, "*slots"]) -> tuple[Number, Number]:
+    # Nielsen's rule: shrink smoothly with the ratio, grow ever faster with refusals.
     shrink = jnp.clip(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1, 2.0)
     damping = progress.damping * jnp.where(accept, shrink, progress.growth)
     return damping, jnp.where(accept, 2.0, 2.0 * progress.growth)
+
+
+def _next_radius(
+    progress: Progress, y: Flat, model: QuadraticModel, scale: Flat, ratio: Number, accept: Array
+) -> Number:
+    # As in trust-region methods. At first the distance of the start from 0: from a bad start a step of Gauss and Newton can
+    # leave the region in which the residual depends on the unknowns at all (NIST's BoxBOD), and a step that is damped a
+    # given amount may follow the steepest descent into the wrong valley (MGH10).
+    start = norm(y / scale)
+    start = jnp.where(start > 0, start, jnp.sqrt(2 * model.cost))
+    factor = jnp.where(accept, jnp.where(ratio > 0.75, 2.0, jnp.where(ratio > 0.25, 1.0, 0.5)), 0.25)
+    return jnp.where(progress.steps == 0, start, factor * progress.step.length)
 
 
 def _scale(box: Box, curvature: Flat) -> Flat:
