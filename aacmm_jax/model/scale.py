@@ -1,7 +1,7 @@
 """Stage 2: the scale k, which repeatability cannot determine, from reference lengths (Cheng et al. 2018, section 2.3).
 
-The uncertainty of k is put together in two places: what the lengths and the scatter at their ends contribute is here
-(`scale_and_weights`); what the identified parameters contribute is in `uncertainty.propagation` (`propagated_scale`).
+The uncertainty of k comes from the lengths and the scatter at their ends (here, `scale_and_weights`), and from the
+identified parameters (`uncertainty.scale_uncertainty`).
 """
 
 import equinox as eqx
