@@ -196,7 +196,7 @@ def calibrate_many(
 
         found = second_stage_many(work.anchor, base, work.problems.lower, work.problems.upper, stage1, identify_again)
         return ManyCalibrations(k=k, stage1=stage1, method=method, **found)
-    scaled = np.asarray(divided(work.anchor, base, jnp.asarray(stage1.parameters), jnp.asarray(k)))
+    scaled = divided(work.anchor, base, stage1.parameters, k)
     fitted = sum(work.shape.solved)
     work = _Work.of(arm, capture, lower, upper, scaled, stage1.space, None, noise, effort, fitted)
     joint = work.identified()

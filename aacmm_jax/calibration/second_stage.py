@@ -42,9 +42,9 @@ def can_scale(anchor: ScaleAnchor) -> bool:
 def divided(
     anchor: ScaleAnchor,
     space: Parameters,
-    parameters: Float[Array, "... p"],
-    k: Float[Array, "..."],
-) -> Float[Array, "... p"]:
+    parameters: Any,
+    k: Any,
+) -> Any:
     """The parameters of stage 1 divided by k; the base of ``space`` is the arm, or a batch of arms."""
     if not can_scale(anchor):
         return parameters
@@ -120,7 +120,7 @@ def second_stage_many(
     ``identify_again(rows, start)`` repeats stage 1 for some of the problems and keeps the adjusted length.
     """
     lower, upper = (np.broadcast_to(side, stage1.parameters.shape) for side in (lower, upper))
-    scaled = np.array(divided(anchor, space, jnp.asarray(stage1.parameters), jnp.asarray(stage1.k)))
+    scaled = np.array(divided(anchor, space, stage1.parameters, stage1.k))
     bounds = Bounds(space, jnp.asarray(lower), jnp.asarray(upper))
     # Divided by k, the whole arm shrinks about the base, and so do the distances between its tips.
     factor = stage1.k if can_scale(anchor) else np.ones_like(stage1.k)

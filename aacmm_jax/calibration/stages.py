@@ -21,7 +21,7 @@ from ..model.metrics import repeatability
 from ..model.residuals import joint_model, joint_residual
 from ..solver.bounded import least_squares
 from ..solver.reason import Reason
-from ..uncertainty import propagation
+from ..uncertainty import propagation, scale_uncertainty
 from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
 from ..uncertainty.identifiability import observability
@@ -208,7 +208,9 @@ def _stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
         steps=solution.stats["num_steps"],
         result=solution.stats["reason"],
         optimality=solution.stats["optimality"],
-        scale=propagation.propagated_scale(tips, measurement, propagated, after.sigma) if measurement.ends else None,
+        scale=scale_uncertainty.propagated_scale(tips, measurement, propagated, after.sigma)
+        if measurement.ends
+        else None,
         parameter_covariance=propagated.parameter_covariance,
         before=repeatability(space.arm(start).position(measurement.q), measurement.sizes),
         after=after,
@@ -281,7 +283,7 @@ def _divided(task: Task) -> tuple[Calibration, Bool[Array, ""]]:
         scaled = jnp.where(jnp.asarray(space.lengths), jnp.clip(scaled, bounds.lower, bounds.upper), scaled)
         active = bounds.active(scaled)
         measurement = task.measurement.weighted(space.arm(task.start).geometry, task.noise)
-        parameter_covariance = propagation.propagate_division(
+        parameter_covariance = scale_uncertainty.propagate_division(
             propagated, stage1.arm, space, measurement, stage1.after.sigma, scaled, replaced(anchor, space)
         ).parameter_covariance
     result = _calibration(task, stage1, "two-stage", scaled, active, stage1.steps, stage1.result, parameter_covariance)
@@ -303,7 +305,7 @@ def _adjusted(task: Task, by_division: Calibration) -> Calibration:
     solved = propagation.propagate_solve(
         arm, space, measurement, (active != 0) | is_anchor, sigma, task.noise_model, task.noise
     )
-    parameter_covariance = propagation.propagate_adjustment(
+    parameter_covariance = scale_uncertainty.propagate_adjustment(
         solved, arm, space, measurement, sigma, name, jnp.any((active != 0) & is_anchor)
     ).parameter_covariance
     steps = stage1.steps + adjusted.steps

@@ -1,8 +1,10 @@
 """Stage 2: the scale k, which repeatability cannot determine, from reference lengths (Cheng et al. 2018, section 2.3).
 
-The uncertainty of k is put together in two places: what the lengths and the scatter at their ends contribute is here
-(`scale_and_weights`); what the identified parameters contribute is in `uncertainty.propagation` (`propagated_scale`).
+The uncertainty of k comes from the lengths and the scatter at their ends (here, `scale_and_weights`), and from the
+identified parameters (`uncertainty.scale_uncertainty`).
 """
+
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -49,15 +51,22 @@ def divide_lengths(arm: Arm, k: Float[Array, ""]) -> Arm:
 
 
 def divide_free_lengths(
-    space: Parameters, parameters: Float[Array, "... p"], k: Float[Array, "..."], replaced: Float[Array, "... p"]
-) -> Float[Array, "... p"]:
+    space: Parameters,
+    parameters: Float[Array | np.ndarray, "... p"],
+    k: Float[Array | np.ndarray, "..."],
+    replaced: Float[Array, "... p"],
+) -> Float[Array | np.ndarray, "... p"]:
     """Free parameters with which the arm, its fixed lengths as they are, equals the arm with every length divided by k.
 
     Tips are linear in the lengths, so a fixed length f that free lengths x can replace with weights w leaves
     x' = x / k + (1 / k - 1) w f. ``replaced`` is w f (see `replaced_lengths`), 0 where nothing is replaced.
     """
-    divided, replaced = (jnp.broadcast_to(row, parameters.shape) for row in (jnp.asarray(divisible(space)), replaced))
-    return jnp.where(divided, (parameters + replaced) / k[..., None] - replaced, parameters)
+    # NumPy for arrays of NumPy: XLA rounds a division by a broadcast k differently.
+    tools: Any = np if isinstance(parameters, np.ndarray) else jnp
+    divided, replaced = (
+        tools.broadcast_to(tools.asarray(row), parameters.shape) for row in (divisible(space), replaced)
+    )
+    return tools.where(divided, (parameters + replaced) / k[..., None] - replaced, parameters)
 
 
 def divisible(space: Parameters) -> np.ndarray:

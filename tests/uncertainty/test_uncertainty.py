@@ -15,7 +15,7 @@ from aacmm_jax.kinematics.inverse_kinematics import project_to_centroids
 from aacmm_jax.model.measurement import Measurement
 from aacmm_jax.model.scale import divide_lengths
 from aacmm_jax.model.weights import Weights, inverse_root
-from aacmm_jax.uncertainty import propagation
+from aacmm_jax.uncertainty import propagation, scale_uncertainty
 
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
 UNEVEN = aj.Noise(encoder_arcsec=[1.0, 2.0, 3.0, 4.0, 5.0, 6.0], seating=0.003)
@@ -119,7 +119,7 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
         measurement = Measurement.of(capture).weighted(paper_arm.geometry, noise)
         held, sigma = jnp.asarray([name == "d_3" for name in space.names]), stage1.after.sigma
         whole = propagation.propagate_solve(stage1.arm, space, measurement, held, sigma, noise_model, noise)
-        whole = propagation.propagate_division(
+        whole = scale_uncertainty.propagate_division(
             whole, stage1.arm, space, measurement, sigma, found.parameters, jnp.zeros(21)
         )
     by_joints = stage1.arm.jacobian(capture.q, [f"q_{i}" for i in range(1, 7)])

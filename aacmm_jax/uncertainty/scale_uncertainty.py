@@ -1,0 +1,114 @@
+"""The uncertainty of k, and of a calibration after stage 2, whose parameters follow k.
+
+k follows the certified lengths and the tips at their ends directly (`model.scale.scale_and_weights`), and the tips of
+all sockets once more through the parameters that stage 1 identified from them: `propagated_scale` has both.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..kinematics.arm import Arm
+from ..kinematics.parameters import Parameters
+from ..model.measurement import Measurement, length_covariance
+from ..model.scale import Scale, divisible, scale_and_weights
+from .covariance import Sensitivity, covariance_of
+from .propagation import Propagated, in_units
+
+
+def propagate_division(
+    before: Propagated,
+    arm: Arm,
+    space: Parameters,
+    measurement: Measurement,
+    sigma: Float[Array, ""],
+    divided: Float[Array, " p"],
+    replaced: Float[Array, " p"],
+) -> Propagated:
+    """After the lengths of stage 1's ``arm`` were divided by k, which itself follows the poses and the lengths.
+
+    x' = (x + r) / k - r for lengths, where r are the fixed lengths that x replaces (`model.scale.divide_free_lengths`),
+    so dx' = dx / k - (x' + r) / k dk; a parameter that stage 1 held or that was on a bound moves with k too.
+    """
+    scale = _scale_sensitivity(arm.position(measurement.q), measurement, before, sigma)
+    divides = jnp.asarray(divisible(space))
+    by_k = jnp.where(divides, (divided + replaced) / scale.k.value, 0.0)  # lengths only: their natural step is 1 mm
+    change = jnp.where(divides, 1 / scale.k.value, 1.0)
+    return _with_scale(before, space, measurement, scale, by_k, change)
+
+
+def propagate_adjustment(
+    solved: Propagated,
+    arm: Arm,
+    space: Parameters,
+    measurement: Measurement,
+    sigma: Float[Array, ""],
+    adjusted: str,
+    fixed: Bool[Array, ""],
+) -> Propagated:
+    """After a length was adjusted until k = 1, the others being identified with it at each of its values.
+
+    A step of the adjusted length h moves the tips by their column of h, which the other parameters follow as they
+    follow any error of the tips: S J_h. With t = S J_h + e_h, k(x(h), e) = 1 gives dx = S de - t (dk/dh)^-1 (dk/de) de.
+    ``fixed``: h is on a bound, so that nothing follows k.
+    """
+    scale = _scale_sensitivity(arm.position(measurement.q), measurement, solved, sigma)
+    column = arm.jacobian(measurement.q, (adjusted,))[..., 0].T
+    by_length = jnp.einsum("paN,aN->p", solved.sensitivity.tips, column)
+    by_length = by_length.at[space.index(adjusted)].set(1.0)
+    k_by_length = jnp.sum(scale.by_tips * column)
+    by_k = jnp.where(fixed, 0.0, by_length / jnp.where(k_by_length == 0, 1.0, k_by_length))
+    return _with_scale(solved, space, measurement, scale, by_k, jnp.ones_like(by_k))
+
+
+def propagated_scale(
+    tips: Float[Array, "N 3"], measurement: Measurement, propagated: Propagated, sigma: Float[Array, ""]
+) -> Scale:
+    """k of stage 1, with an uncertainty that includes that of the identified parameters."""
+    scale = _scale_sensitivity(tips, measurement, propagated, sigma)
+    by_tips = jnp.einsum("aN,abN,bN->", scale.by_tips, propagated.errors, scale.by_tips)
+    variance = by_tips + jnp.sum((scale.by_lengths * measurement.u) ** 2) + scale.surplus
+    return eqx.tree_at(lambda s: s.u, scale.k, jnp.sqrt(variance))
+
+
+class _ScaleSensitivity(NamedTuple):
+    """k and its derivatives by the errors of tips and of certified lengths, 1/mm."""
+
+    k: Scale
+    by_tips: Float[Array, "3 N"]
+    by_lengths: Float[Array, " l"]
+    surplus: Float[Array, ""]  # what the lengths' disagreement adds to its variance
+
+
+def _scale_sensitivity(
+    tips: Float[Array, "N 3"], measurement: Measurement, propagated: Propagated, sigma: Float[Array, ""]
+) -> _ScaleSensitivity:
+    k, by_lengths = scale_and_weights(tips, measurement, sigma)
+    linear = propagated.linear
+    measured = linear.lengths_by_tips + jnp.einsum("lp,paN->laN", linear.lengths, propagated.sensitivity.tips)
+    by_tips = jnp.einsum("l,laN->aN", by_lengths, measured)
+    centroids = measurement.centroids(tips)
+    predicted = by_lengths @ length_covariance(centroids, measurement, sigma, k.value) @ by_lengths
+    surplus = jnp.maximum(k.u**2 - predicted, 0.0)
+    return _ScaleSensitivity(k, by_tips, -by_lengths * k.measured / k.nominal, surplus)
+
+
+def _with_scale(
+    before: Propagated,
+    space: Parameters,
+    measurement: Measurement,
+    scale: _ScaleSensitivity,
+    by_k: Float[Array, " p"],
+    change: Float[Array, " p"],
+) -> Propagated:
+    """Sensitivities multiplied by ``change``, less what follows k: dx = change S de - by_k dk, in natural steps."""
+    sensitivity = Sensitivity(
+        change[:, None, None] * before.sensitivity.tips - by_k[:, None, None] * scale.by_tips[None],
+        -by_k[:, None] * scale.by_lengths[None],
+    )
+    matrix = covariance_of(sensitivity, before.linear, measurement, before.errors)
+    matrix = in_units(matrix + scale.surplus * by_k[:, None] * by_k[None, :], space)
+    parameter_covariance = before.parameter_covariance._replace(matrix=matrix)
+    return before._replace(sensitivity=sensitivity, parameter_covariance=parameter_covariance)
