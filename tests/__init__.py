@@ -1,6 +1,7 @@
-"""Before anything is imported: one cache of compiled programs for all worker processes, the command line and the notebooks' kernels.
+"""One cache of compiled programs for all worker processes, the command line and the kernels of the notebooks.
 
-Compiling is most of the suite's time. The cache is empty when the tests begin and gone when they end.
+Compiling is most of the suite's time. The cache is empty when the tests begin and is removed when they end. It must be
+set before anything is imported.
 """
 
 import atexit
