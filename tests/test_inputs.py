@@ -2,7 +2,6 @@
 
 import inspect
 import re
-import sys
 from types import SimpleNamespace
 
 import jax
@@ -21,7 +20,12 @@ def given(paper_arm):
     q = np.random.default_rng(0).uniform(-1, 1, (10, 6))
     capture = aj.Capture({"A": q, "B": q[:1]}, [aj.ReferenceLength("A", "B", 100.0)])
     return SimpleNamespace(
-        arm=paper_arm, space=space, bounds=aj.Bounds.around(paper_arm, space), start=space.vector(), q=q, capture=capture
+        arm=paper_arm,
+        space=space,
+        bounds=aj.Bounds.around(paper_arm, space),
+        start=space.vector(),
+        q=q,
+        capture=capture,
     )
 
 
@@ -48,7 +52,10 @@ def shifted(given: SimpleNamespace, **changes: float) -> np.ndarray:
     ("sockets", "parts"),
     [
         (lambda q: {"A": with_value(q, 3, 4, np.nan)}, ["socket 'A' pose 3 joint 4 is nan", "must be finite"]),
-        (lambda q: {"A": q, "B": with_value(q, 1, 6, -np.inf)}, ["socket 'B' pose 1 joint 6 is -inf", "must be finite"]),
+        (
+            lambda q: {"A": q, "B": with_value(q, 1, 6, -np.inf)},
+            ["socket 'B' pose 1 joint 6 is -inf", "must be finite"],
+        ),
         (lambda q: {"A": [[0.1, 0.2], [0.1]]}, ["socket 'A'", "rows of unequal length"]),
         (lambda q: {"A": [["left", "right"]]}, ["socket 'A'", "not a number"]),
         (lambda q: {"A": q, "B": q[:, :5]}, ["socket 'B' has 5 columns", "socket 'A' has 6", "one column a joint"]),
@@ -135,10 +142,16 @@ def test_arm(paper_arm, changes, parts):
             ["every parameter is held", "hold fewer"],
         ),
         (lambda x: aj.Bounds.around(x.arm, x.space, override={"prob_z": 60}), ["'prob_z'", "did you mean 'probe_z'?"]),
-        (lambda x: aj.Bounds.around(x.arm, x.space, override={"d_1": 60}), ["'d_1' is held, not free", "such as 'alpha_1'"]),
+        (
+            lambda x: aj.Bounds.around(x.arm, x.space, override={"d_1": 60}),
+            ["'d_1' is held, not free", "such as 'alpha_1'"],
+        ),
         (lambda x: aj.Bounds.around(x.arm, x.space, length=-1.0), ["half-width of a_1 is -1", "zero or a positive"]),
         (lambda x: aj.Bounds.around(x.arm, x.space, override={"d_3": np.nan}), ["half-width of d_3 is nan"]),
-        (lambda x: aj.Bounds(x.space, x.start, shifted(x, a_2=-1.5)), ["bounds of a_2 are 62 to 60.5", "not above the upper"]),
+        (
+            lambda x: aj.Bounds(x.space, x.start, shifted(x, a_2=-1.5)),
+            ["bounds of a_2 are 62 to 60.5", "not above the upper"],
+        ),
         (lambda x: aj.Bounds(x.space, shifted(x, d_4=np.nan), x.start), ["bounds of d_4 are nan to 0", "a number"]),
         (lambda x: aj.Bounds(x.space, x.start[:-1], x.start), ["lower has shape (20,)", "21 parameters are free"]),
         (lambda x: aj.Bounds(x.space, x.start, [[0.0], [0.0, 1.0]]), ["upper has rows of unequal length"]),
@@ -149,7 +162,17 @@ def test_arm(paper_arm, changes, parts):
     ],
     ids=[
         *("held", "free", "held and free", "held twice", "all held", "override", "override of held", "negative width"),
-        *("nan width", "reversed", "nan bound", "short bound", "ragged bound", "short vector", "jacobian", "columns", "text"),
+        *(
+            "nan width",
+            "reversed",
+            "nan bound",
+            "short bound",
+            "ragged bound",
+            "short vector",
+            "jacobian",
+            "columns",
+            "text",
+        ),
     ],
 )
 def test_parameters_and_bounds(given, call, parts):
@@ -215,7 +238,7 @@ class Reached(Exception):
     ids=str,
 )
 def test_too_few_poses(given, monkeypatch, sizes, held, hold):
-    """A socket of m poses gives 3 (m - 1) equations; the number of poses named as enough is enough, and one less is not."""
+    """A socket of m poses gives 3 (m - 1) equations; the number of poses named as enough is the least."""
     if held == "lengths":
         # Angles alone: nothing slides with the scale, so every free one is determined.
         held = [name for name in aj.kinematics.parameter_names(given.arm) if not name.startswith(("alpha", "theta"))]
@@ -238,7 +261,7 @@ def test_too_few_poses(given, monkeypatch, sizes, held, hold):
     assert unknowns == len(space.names) - any(space.lengths)
     assert equations < unknowns
     assert 3 * (needed - sockets) >= unknowns > 3 * (needed - 1 - sockets)
-    monkeypatch.setattr(sys.modules["aacmm_jax.calibrate"], "_identify", reached)
+    monkeypatch.setattr("aacmm_jax.calibration.stages._identify", reached)
     more = needed - sum(sizes)
     refusal(lambda: run((sizes[0] + more - 1, *sizes[1:])))
     with pytest.raises(Reached):
@@ -260,7 +283,10 @@ def test_too_few_poses(given, monkeypatch, sizes, held, hold):
         ({"limits": [(-1, 1)] * 5}, ["6 rows of (lowest, highest)"]),
         ({"limits": [(-1, 1)] * 5 + [(2, 1)]}, ["limits of joint 6 are 2 to 1 rad"]),
         ({"lengths": [("A", "B")], "poses": 1}, ["('A', 'B')", "of simulated sockets"]),
-        ({"sockets": {"far": (9000, 0, 0)}, "poses": 1}, ["socket 'far' at (9000, 0, 0) mm", "cannot be reached", "1864 mm"]),
+        (
+            {"sockets": {"far": (9000, 0, 0)}, "poses": 1},
+            ["socket 'far' at (9000, 0, 0) mm", "cannot be reached", "1864 mm"],
+        ),
     ],
     ids=[
         *("encoder", "resolution", "seating", "no poses", "no poses of one", "poses of unknown", "no socket"),
@@ -273,7 +299,9 @@ def test_simulation(paper_arm, arguments, parts):
 
 
 def test_deviation_and_batch(given):
-    assert_refused(lambda: aj.perturbed_arm(given.space, length=-1.0, angle=0.0), "free length is -1", "zero or positive")
+    assert_refused(
+        lambda: aj.perturbed_arm(given.space, length=-1.0, angle=0.0), "free length is -1", "zero or positive"
+    )
     batch = changed_arm(given.arm, a=np.zeros((2, 6)))
     assert_refused(lambda: aj.simulate(batch, {"A": (400, 200, 300)}), "one arm, not a batch")
 
@@ -283,4 +311,6 @@ def test_values_are_not_looked_at_inside_jit(given):
     capture = jax.jit(lambda q: aj.Capture({"A": q}))(with_value(given.q, 1, 1, np.nan))
     assert np.isnan(capture.q[0, 0])
     jax.jit(lambda x: aj.Bounds(given.space, [x] * 21, given.start).lower)(1e3)
-    assert_refused(lambda: jax.jit(lambda x: aj.Bounds(given.space, [x] * 20, given.start).lower)(1.0), "lower has shape (20,)")
+    assert_refused(
+        lambda: jax.jit(lambda x: aj.Bounds(given.space, [x] * 20, given.start).lower)(1.0), "lower has shape (20,)"
+    )

@@ -4,12 +4,14 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from ..calibration.checks import plausible
 from ..calibration.record import CalibrationRecord
 from ..data.recording import Recording
 from ..kinematics.arm import Arm
+from ..kinematics.chain import Geometry
 from ..kinematics.specification import ArmSpecification
 from .decision import Limit
 from .suite import AcceptanceTest, Measured, checked_limits, measured_by, run, without_stated_uncertainty
@@ -143,7 +145,9 @@ def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:
 
 
 def _same(one: Arm, other: Arm) -> bool:
-    return one.joints == other.joints and all(
-        np.array_equal(np.asarray(getattr(one, kind)), np.asarray(getattr(other, kind)))
-        for kind in ("alpha", "a", "d", "theta", "probe")
-    )
+    """Whether two arms have the same parameters; an arm without beta is one whose beta is zero."""
+
+    def parameters(arm: Arm) -> Geometry:
+        return arm.geometry._replace(beta=np.zeros(arm.joints) if arm.beta is None else arm.beta)
+
+    return jax.tree.all(jax.tree.map(np.array_equal, parameters(one), parameters(other)))

@@ -1,23 +1,45 @@
-"""What is checked before a solve, and which length is held during it."""
+"""Checks before a solve, and whether a result is plausible at all."""
 
+import math
+
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from ..core.arrays import is_concrete
 from ..core.errors import InputError
+from ..data.capture import Capture
 from ..data.noise import Noise
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, is_single
 from ..kinematics.parameters import Bounds, Parameters
+from ..kinematics.workspace import total_link_length
 from ..uncertainty.covariance import NOISE_MODELS, NoiseModel
 
 _PLAUSIBLE_SCALE = (0.5, 2.0)
+# Repeatability of an arm or robot relative to the sum of its links: the paper's arm reaches 1e-5 (0.026 mm on 2.5 m).
+_RELATIVE_REPEATABILITY = 1e-5
+_IMPLAUSIBLE = 100.0  # residuals larger than that by this factor come from wrong data, not from an arm
 
 
 def based_on(space: Parameters, arm: Arm) -> Parameters:
-    """The free parameters on the given arm: held values come from the arm that is calibrated, not from the space's base."""
+    """The free parameters with the fixed values of the arm that is calibrated, and not of the space's base."""
     if arm.beta is None and space.base.beta is not None:
-        return space
+        arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
     return Parameters(base=arm, names=space.names)
+
+
+def check_single(arm: Arm, capture: Capture, bounds: Bounds, many: str) -> None:
+    """Raise `InputError` where an arm, a capture or bounds are a batch; ``many`` is the function that takes batches."""
+    batched = {
+        "arm": not is_single(arm),
+        "capture": capture.q.ndim > 2,
+        "bounds": max(bounds.lower.ndim, bounds.upper.ndim) > 1,
+    }
+    found = [what for what, batch in batched.items() if batch]
+    if found:
+        raise InputError(
+            f"the {' and the '.join(found)} given are a batch, but one problem is solved here; use {many}."
+        )
 
 
 def check_start(bounds: Bounds, vector: Array, what: str) -> None:
@@ -33,25 +55,25 @@ def check_start(bounds: Bounds, vector: Array, what: str) -> None:
     if outside.any():
         i = int(np.flatnonzero(outside)[0])
         raise InputError(
-            f"{what} is outside the bounds: {bounds.space.names[i]} is {values[i]:g}, not within {lower[i]:g} to {upper[i]:g}; "
-            "move the start or widen the bounds."
+            f"{what} is outside the bounds: {bounds.space.names[i]} is {values[i]:g}, not within {lower[i]:g} to "
+            f"{upper[i]:g}; move the start or widen the bounds."
         )
 
 
 def check_enough(sizes: tuple[int, ...], unknowns: int) -> None:
-    """A socket of m poses gives 3 (m - 1) equations: its own position takes three."""
+    """Raise `InputError` where poses are too few: m poses in a socket give 3 (m - 1) equations."""
     equations = 3 * sum(size - 1 for size in sizes)
     if equations < unknowns:
         sockets, poses = len(sizes), sum(sizes)
         needed = -(-unknowns // 3) + sockets
         raise InputError(
-            f"{poses} poses in {sockets} socket{'s' if sockets > 1 else ''} give {equations} equations, but {unknowns} unknowns "
-            f"need at least {needed} poses; record more poses or hold more parameters."
+            f"{poses} poses in {sockets} socket{'s' if sockets > 1 else ''} give {equations} equations, but {unknowns} "
+            f"unknowns need at least {needed} poses; record more poses or hold more parameters."
         )
 
 
 def check_noise_model(noise_model: NoiseModel | None, noise: Noise | None, joints: int) -> NoiseModel:
-    """What errors of tips are taken for: by default the noise that is given, else one estimated from the residuals."""
+    """The model of the tips' errors: by default the noise that is given, else one estimated from the residuals."""
     if noise is not None:
         noise.check(joints)
     if noise_model is None:
@@ -68,3 +90,16 @@ def check_noise_model(noise_model: NoiseModel | None, noise: Noise | None, joint
 def plausible(k: float) -> bool:
     """Whether a scale can be a calibration's at all, and not a mistaken unit or socket."""
     return _PLAUSIBLE_SCALE[0] <= k <= _PLAUSIBLE_SCALE[1]
+
+
+def largest_plausible_residual(arm: Arm, noise: Noise | None = None) -> float:
+    """RMS distance from the sockets' centroids, mm, above which data and arm do not belong together.
+
+    A hundred times what an arm of this size can be, or what the given noise predicts at its full reach.
+    """
+    size = total_link_length(arm)
+    scatter = _RELATIVE_REPEATABILITY * size
+    if noise is not None:
+        encoder = float(np.sqrt(np.mean(np.asarray(noise.encoder) ** 2)))
+        scatter = max(scatter, math.sqrt(3) * math.hypot(encoder * size, float(noise.seating)))
+    return _IMPLAUSIBLE * scatter

@@ -1,7 +1,9 @@
-"""How good an arm is on a capture: repeatability of its sockets and errors of its reference lengths."""
+"""Repeatability of an arm's sockets and errors of its reference lengths on a capture."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.errors import InputError
@@ -12,32 +14,52 @@ from ..model.metrics import Repeatability, repeatability
 
 
 class Evaluation(eqx.Module):
-    """Figures of one arm on one capture; mm."""
+    """Metrics of one arm on one capture, mm; of a batch of arms with its axes first."""
 
     repeatability: Repeatability
-    measured: Float[Array, " l"]  # reference lengths as the arm measures them
-    error: Float[Array, " l"]  # measured - calibrated value
-    u: Float[Array, " l"]  # of error: the length's own u, and the scatter of the poses at its ends; NaN where unknown
-    distances: Float[Array, " N"]  # of every pose's tip from its socket's centroid
+    measured: Float[Array, "*batch l"]  # reference lengths as the arm measures them
+    error: Float[Array, "*batch l"]  # measured - calibrated value
+    u: Float[
+        Array, "*batch l"
+    ]  # of error: the length's own u, and the scatter of the poses at its ends; NaN where unknown
+    distances: Float[Array, "*batch N"]  # of every pose's tip from its socket's centroid
 
 
 def evaluate(arm: Arm, capture: Capture) -> Evaluation:
-    """Repeatability and length errors of an arm on a capture; nothing is fitted but the sockets' positions."""
+    """Repeatability and length errors of an arm on a capture; nothing is fitted but the sockets' positions.
+
+    Args:
+        arm: an arm, or a batch of arms (every parameter ``(..., n)``).
+        capture: joint readings by socket, rad, and reference lengths.
+
+    Returns:
+        Metrics in mm; every array has the batch axes of the arm first.
+
+    Raises:
+        InputError: capture and arm differ in their number of joints, or the capture is a batch.
+    """
     if capture.joints != arm.joints:
         raise InputError(
             f"the capture has {capture.joints} columns, but the arm has {arm.joints} joints; give one column a joint."
         )
-    return evaluate_measurement(arm, Measurement.of(capture))
+    if capture.q.ndim > 2:
+        raise InputError("the capture is a batch; evaluate its captures one by one, or map over them with jax.vmap.")
+    shape = np.broadcast_shapes(*(leaf.shape[:-1] for leaf in jax.tree.leaves(arm)))
+    work = evaluate_measurement
+    for _ in shape:
+        work = eqx.filter_vmap(work, in_axes=(0, None))
+    arm = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*shape, leaf.shape[-1])), arm) if shape else arm
+    return work(arm, Measurement.of(capture))
 
 
 @eqx.filter_jit
 def evaluate_measurement(arm: Arm, measurement: Measurement) -> Evaluation:
-    """`evaluate` for a capture already in the form that residuals take; nothing is checked."""
+    """`evaluate` for a capture that is a `Measurement` already; nothing is checked."""
     tips = arm.position(measurement.q)
-    figures = repeatability(tips, measurement.sizes)
+    metrics = repeatability(tips, measurement.sizes)
     measured = u = jnp.zeros(0)
     if measurement.ends:
         measured = measurement.distances(tips)
-        u = jnp.sqrt(jnp.diagonal(length_covariance(figures.centroids, measurement, figures.sigma)))
+        u = jnp.sqrt(jnp.diagonal(length_covariance(metrics.centroids, measurement, metrics.sigma)))
     distances = jnp.linalg.norm(measurement.centred(tips), axis=-1)
-    return Evaluation(figures, measured, measured - measurement.nominal, u, distances)
+    return Evaluation(metrics, measured, measured - measurement.nominal, u, distances)

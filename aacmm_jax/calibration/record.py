@@ -1,4 +1,4 @@
-"""The record of a calibration: everything that is kept of it, in plain arrays; and its uncertainty."""
+"""The record of a calibration: everything that a file keeps of it, in plain arrays; and its uncertainty."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -10,10 +10,12 @@ from ..data.noise import Noise
 from ..data.recording import Recording
 from ..kinematics.parameters import Parameters
 from ..kinematics.specification import ArmSpecification
-from ..solver.levenberg_marquardt import Reason
+from ..solver.reason import Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
+from .checks import largest_plausible_residual
 from .evaluation import Evaluation, evaluate
 from .results import Calibration, CrossValidation, Identification
+from .scale_anchor import scale_anchor
 
 
 class CalibrationRecord(NamedTuple):
@@ -23,8 +25,8 @@ class CalibrationRecord(NamedTuple):
     stage1: ArmSpecification
     calibrated: ArmSpecification
     names: tuple[str, ...]  # free parameters
-    held: tuple[str, ...]
-    hold: str | None  # held in stage 1 only
+    held: tuple[str, ...]  # fixed parameters
+    hold: str | None  # scale anchor of stage 1
     lower: np.ndarray
     upper: np.ndarray
     active_stage1: np.ndarray  # -1, 0, +1
@@ -32,10 +34,9 @@ class CalibrationRecord(NamedTuple):
     covariance: np.ndarray
     determined: np.ndarray  # False where only a combination with others is determined
     open: np.ndarray  # projector onto the directions that are not determined, in steps of 1 mm and 1 mrad
-    common_scale_error: np.ndarray  # of lengths that were held but divided by k: see covariance.Covariance
     noise: Noise  # given, or estimated from the residuals
-    noise_model: str  # what the covariance takes errors of tips for: covariance.FORMS
-    degrees_of_freedom: float  # degrees of freedom behind the covariance
+    noise_model: str  # model of the tips' errors: `uncertainty.covariance.NOISE_MODELS`
+    degrees_of_freedom: float  # of the covariance
     reduced_chi: float | None  # residuals in units of the given noise
     k: float
     u_k: float
@@ -44,14 +45,34 @@ class CalibrationRecord(NamedTuple):
     converged: bool
     reason: str
     validation: CrossValidation | None = None
-    # Monte Carlo after JCGM 101: quantity, estimate, u, low, high, linear_u, agrees; and what to say of it.
+    # Monte Carlo after JCGM 101: quantity, estimate, u, low, high, linear_u, agrees; and its summary in words.
     sampled: Mapping[str, np.ndarray] | None = None
     sampled_says: str | None = None
 
     @property
+    def given_noise(self) -> Noise | None:
+        """The noise, where it was given and not estimated."""
+        return None if self.reduced_chi is None else self.noise
+
+    @property
+    def scale_set_by(self) -> tuple[str, ...]:
+        """Fixed lengths that set the scale, so that k changes nothing in a two-stage calibration."""
+        arm = self.recording.nominal.arm
+        if self.hold is not None:
+            return ()
+        return scale_anchor(Parameters(arm, self.names), arm, None, self.given_noise).set_by
+
+    @property
     def fixed_by_one_length(self) -> bool:
-        """Whether a single length fixed the scale exactly, so that its own error as left is zero by construction: no measurement."""
-        return self.method == "two-stage" and len(self.recording.capture.lengths) == 1
+        """Whether a single length fixed the scale, so that its own error as left is zero by construction."""
+        return self.method == "two-stage" and len(self.recording.capture.lengths) == 1 and not self.scale_set_by
+
+    @property
+    def implausible_residual(self) -> bool:
+        """Whether the residual is a hundred times what an arm of this size can be, so that data and arm do not fit."""
+        arm, capture = self.calibrated.arm, self.recording.capture
+        rms = float(evaluate(arm, capture).repeatability.rms)
+        return rms > largest_plausible_residual(arm, self.given_noise)
 
     def vectors(self) -> dict[str, np.ndarray]:
         """Free parameters of the nominal arm, after stage 1, and calibrated; and of the true arm of a simulation."""
@@ -68,7 +89,15 @@ class CalibrationRecord(NamedTuple):
 
 
 def record_of(calibration: Calibration, recording: Recording) -> CalibrationRecord:
-    """The record of a calibration, given the recording that it was identified from."""
+    """The record of a calibration.
+
+    Args:
+        calibration: what `calibrate` returned.
+        recording: the capture that it was identified from, and the nominal arm.
+
+    Returns:
+        What a calibration file holds, as NumPy arrays.
+    """
     nominal, stage1 = recording.nominal, calibration.stage1
     result = calibration.result if bool(stage1.converged) else stage1.result
     return CalibrationRecord(
@@ -85,7 +114,6 @@ def record_of(calibration: Calibration, recording: Recording) -> CalibrationReco
         covariance=np.asarray(calibration.covariance),
         determined=np.asarray(calibration.determined),
         open=np.asarray(calibration.parameter_covariance.open),
-        common_scale_error=np.asarray(calibration.parameter_covariance.common_scale_error),
         noise=calibration.noise,
         noise_model=calibration.noise_model,
         degrees_of_freedom=calibration.degrees_of_freedom,
@@ -100,12 +128,18 @@ def record_of(calibration: Calibration, recording: Recording) -> CalibrationReco
 
 
 def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> Uncertainty:
-    """The uncertainty of a calibration, just made or loaded from a file; of an identification, with the scale as it was held."""
+    """The uncertainty of a calibration, just made or loaded from a file; of an identification, given its scale anchor.
+
+    Args:
+        result: what `calibrate` or `identify` returned, or the record of a calibration.
+
+    Returns:
+        Standard uncertainties of parameters, tips and lengths, mm and rad.
+    """
     if isinstance(result, CalibrationRecord):
         return Uncertainty(
             arm=result.calibrated.arm,
             covariance=jnp.asarray(result.covariance),
-            common_scale_error=jnp.asarray(result.common_scale_error),
             open=jnp.asarray(result.open),
             noise=result.noise,
             u_k=jnp.asarray(result.u_k),
@@ -116,7 +150,6 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
     return Uncertainty(
         arm=result.arm,
         covariance=result.covariance,
-        common_scale_error=result.parameter_covariance.common_scale_error,
         open=result.parameter_covariance.open,
         noise=result.noise,
         u_k=None if scale is None else scale.u,

@@ -8,20 +8,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..core._compat import member_numbers
 from ..core.arrays import Numbers, is_concrete
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import Repeatability
 from ..model.scale import Scale
-from ..solver.levenberg_marquardt import Reason, numbers_of
+from ..solver.reason import Reason, numbers_of
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance
+from .checks import largest_plausible_residual
 
-_GOOD = [int(reason._value) for reason in (Reason.gradient, Reason.step, Reason.rounding)]  # pyright: ignore
+_GOOD = [int(member_numbers(reason)) for reason in (Reason.gradient, Reason.step, Reason.rounding)]
 
 
 class Identification(eqx.Module):
-    """Result of stage 1. A PyTree: under ``eqx.filter_vmap`` every array gains the batch axis.
+    """Result of stage 1. A PyTree: under ``eqx.filter_vmap`` every array has the batch axis first.
 
     ``parameters``, ``active`` and ``covariance`` are in the order of ``space.names``; mm and rad.
     """
@@ -35,25 +37,26 @@ class Identification(eqx.Module):
     result: Reason  # why it ended
     optimality: Float[Array, ""]  # projected gradient as a cosine; 0 at a minimum
     scale: Scale | None  # k of this arm, where the capture holds reference lengths
-    parameter_covariance: ParameterCovariance  # with the scale as it was held; rows of active and held parameters are 0
+    parameter_covariance: (
+        ParameterCovariance  # given the scale anchor; rows of the anchor and of active parameters are 0
+    )
     before: Repeatability  # the start
     after: Repeatability
-    # Root mean square of the residuals in units of what the given noise predicts (1 where it is right); None without.
+    # Root mean square of the residuals in units of what the given noise predicts (1 where it is right), or None.
     reduced_chi: Float[Array, ""] | None
     bounds: Bounds
-    hold: str | None = eqx.field(static=True)
-    noise_model: NoiseModel = eqx.field(static=True)  # what the covariance takes errors of tips for
-    degrees_of_freedom: float = eqx.field(
-        static=True
-    )  # degrees of freedom behind the covariance; infinite where the noise was given
+    hold: str | None = eqx.field(static=True)  # the scale anchor
+    scale_set_by: tuple[str, ...] = eqx.field(static=True)  # fixed lengths that set the scale, where there is no anchor
+    noise_model: NoiseModel = eqx.field(static=True)  # model of the tips' errors
+    degrees_of_freedom: float = eqx.field(static=True)  # of the covariance; infinite where the noise was given
 
     @property
-    def covariance(self) -> Float[Array, "*lanes p p"]:
+    def covariance(self) -> Float[Array, "*batch p p"]:
         """Covariance of the parameters; that of what is determined, where not all is."""
         return self.parameter_covariance.matrix
 
     @property
-    def determined(self) -> Bool[Array, "*lanes p"]:
+    def determined(self) -> Bool[Array, "*batch p"]:
         """Which parameters are determined one by one, and not only in combination with others."""
         return self.parameter_covariance.determined
 
@@ -68,7 +71,18 @@ class Identification(eqx.Module):
         return self.bounds.space
 
     @property
-    def converged(self) -> Bool[Array | np.ndarray, "*lanes"]:
+    def k(self) -> Float[Array, "*batch"] | None:
+        """k = measured / nominal, where the capture holds reference lengths."""
+        return None if self.scale is None else self.scale.value
+
+    @property
+    def implausible_residual(self) -> bool:
+        """Whether the residual is a hundred times what an arm of this size can be, so that data and arm do not fit."""
+        given = None if self.reduced_chi is None else self.noise
+        return float(self.after.rms) > largest_plausible_residual(self.arm, given)
+
+    @property
+    def converged(self) -> Bool[Array | np.ndarray, "*batch"]:
         """Whether the solve ended at a minimum."""
         return converged(self.result)
 
@@ -82,12 +96,12 @@ class Calibration(eqx.Module):
 
     arm: Arm
     parameters: Float[Array, " p"]
-    scale: Scale  # k of stage 1, by which its lengths were divided
-    de: Float[Array, ""]
-    deltam: Float[Array, ""]
-    active: Int[Array, " p"]
-    steps: Int[Array, ""]
-    result: Reason
+    scale: Scale  # k of stage 1
+    de: Float[Array, ""]  # mean distance from the centroid, mm
+    deltam: Float[Array, ""]  # largest half range, mm
+    active: Int[Array, " p"]  # -1 on the lower bound, +1 on the upper, 0 inside
+    steps: Int[Array, ""]  # evaluations of all solves
+    result: Reason  # why the last solve ended
     parameter_covariance: ParameterCovariance
     before: Repeatability
     after: Repeatability
@@ -97,12 +111,12 @@ class Calibration(eqx.Module):
     method: str = eqx.field(static=True)
 
     @property
-    def covariance(self) -> Float[Array, "*lanes p p"]:
+    def covariance(self) -> Float[Array, "*batch p p"]:
         """Covariance of the parameters; that of what is determined, where not all is."""
         return self.parameter_covariance.matrix
 
     @property
-    def determined(self) -> Bool[Array, "*lanes p"]:
+    def determined(self) -> Bool[Array, "*batch p"]:
         """Which parameters are determined one by one, and not only in combination with others."""
         return self.parameter_covariance.determined
 
@@ -112,8 +126,29 @@ class Calibration(eqx.Module):
         return self.parameter_covariance.noise
 
     @property
+    def k(self) -> Float[Array, "*batch"]:
+        """k = measured / nominal of stage 1."""
+        return self.scale.value
+
+    @property
+    def hold(self) -> str | None:
+        """The scale anchor of stage 1."""
+        return self.stage1.hold
+
+    @property
+    def scale_set_by(self) -> tuple[str, ...]:
+        """Fixed lengths that set the scale, so that k changes nothing in a two-stage calibration."""
+        return self.stage1.scale_set_by
+
+    @property
+    def implausible_residual(self) -> bool:
+        """Whether the residual is a hundred times what an arm of this size can be, so that data and arm do not fit."""
+        given = None if self.stage1.reduced_chi is None else self.noise
+        return float(self.after.rms) > largest_plausible_residual(self.arm, given)
+
+    @property
     def noise_model(self) -> NoiseModel:
-        """What the covariance takes errors of tips for."""
+        """Model of the tips' errors behind the covariance."""
         return self.stage1.noise_model
 
     @property
@@ -132,7 +167,7 @@ class Calibration(eqx.Module):
         return self.stage1.bounds
 
     @property
-    def converged(self) -> Bool[Array | np.ndarray, "*lanes"]:
+    def converged(self) -> Bool[Array | np.ndarray, "*batch"]:
         """Whether every solve ended at a minimum."""
         both = self.stage1.converged & converged(self.result)
         return np.asarray(both) if is_concrete(both) else both
@@ -142,7 +177,7 @@ class Calibration(eqx.Module):
         return active_names(self.space, self.active)
 
 
-def converged(result: Reason) -> Bool[Array | np.ndarray, "*lanes"]:
+def converged(result: Reason) -> Bool[Array | np.ndarray, "*batch"]:
     """Whether a reason means that a minimum was reached."""
     number = numbers_of(result)
     good = np.array(_GOOD, dtype=number.dtype)
@@ -151,11 +186,16 @@ def converged(result: Reason) -> Bool[Array | np.ndarray, "*lanes"]:
 
 def active_names(space: Parameters, active: Numbers) -> dict[str, str]:
     """Parameters on a bound: name -> 'lower' or 'upper'."""
-    return {name: "lower" if side < 0 else "upper" for name, side in zip(space.names, np.asarray(active), strict=True) if side}
+    return {
+        name: "lower" if side < 0 else "upper"
+        for name, side in zip(space.names, np.asarray(active), strict=True)
+        if side
+    }
 
 
 class LeftOut(NamedTuple):
-    """One group of sockets that an arm was not identified from; mm. Infinite predictions: the others leave something open."""
+    """One group of sockets that an arm was not identified from; mm. Predictions are infinite where the other groups
+    leave a direction open that matters."""
 
     sockets: tuple[str, ...]
     poses: int  # in sockets with more than one
@@ -167,7 +207,7 @@ class LeftOut(NamedTuple):
 
 
 class CrossValidation(NamedTuple):
-    """Every group of sockets left out once. Figures are of what the remaining groups determine."""
+    """Every group of sockets left out once. The metrics pool the groups that the others can predict."""
 
     groups: tuple[LeftOut, ...]
 
@@ -191,7 +231,9 @@ class CrossValidation(NamedTuple):
         return float(np.sqrt(sum(poses * value**2 for poses, value in counted) / total)) if total else float("nan")
 
     def _lengths(self) -> tuple[np.ndarray, np.ndarray]:
-        errors, u = (np.concatenate([getattr(group, what) for group in self.groups]) for what in ("length_error", "length_u"))
+        errors, u = (
+            np.concatenate([getattr(group, what) for group in self.groups]) for what in ("length_error", "length_u")
+        )
         return errors[np.isfinite(u)], u[np.isfinite(u)]
 
     @property
@@ -212,7 +254,7 @@ class CrossValidation(NamedTuple):
         return sum(not np.all(np.isfinite(group.length_u)) or group.rms_predicted == np.inf for group in self.groups)
 
     def ratios(self) -> list[tuple[float, int]]:
-        """Found over predicted, of poses and of lengths, and from how many numbers each; those that are known."""
+        """Found over predicted, of poses and of lengths, and the number of values behind each, where they are known."""
         pairs = [
             (self.rms, self.rms_predicted, 3 * sum(group.poses for group in self.groups)),
             (self.length_rms, self.length_u, len(self._lengths()[0])),
@@ -221,12 +263,12 @@ class CrossValidation(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """By how much errors exceed what was predicted, the worse of both figures: about 1 where the uncertainty is honest."""
+        """Errors over their prediction, the larger of both ratios: about 1 where the uncertainty is right."""
         return max((ratio for ratio, _ in self.ratios()), default=float("nan"))
 
     @property
     def surprising(self) -> bool:
-        """Whether errors exceed their prediction by half, and by more than chance would allow in one case of a hundred."""
+        """Whether errors exceed their prediction by half, and by more than chance allows in one case of a hundred."""
         from scipy import stats
 
         return any(ratio > max(1.5, math.sqrt(stats.chi2.ppf(0.99, count) / count)) for ratio, count in self.ratios())

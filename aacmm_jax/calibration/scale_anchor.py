@@ -1,57 +1,146 @@
-"""Which length stage 1 holds as the anchor of the scale, and whether it needs one."""
+"""The scale anchor of stage 1: a free length kept at its start, or fixed lengths that determine the scale well."""
+
+import math
+from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from ..core.arrays import is_concrete
 from ..core.errors import InputError
-from ..kinematics.arm import Arm, is_length, parameter_names, value_of
+from ..data.noise import Noise
+from ..kinematics.arm import Arm, is_length, jacobian_at, natural_steps, neighbouring_arm, parameter_names, value_of
 from ..kinematics.parameters import Parameters
+from ..kinematics.workspace import total_link_length
+from ..model.scale import Partners
+from .checks import based_on
+
+# Fixed lengths set the scale where repeatability with them would determine it to this relative standard uncertainty ...
+_LARGEST_UNCERTAINTY = 1e-4
+# ... with 200 equations to spare (about 70 poses) and, where the noise is not given, tips that scatter by so many mm.
+_EQUATIONS = 200
+_SCATTER = 0.02
+_CONFIGURATIONS = 100
+_EXACT = 1e-9  # residual, relative to the column, below which free lengths replace a fixed one exactly
 
 
-def scale_anchor(space: Parameters, arm: Arm, hold: str | None) -> str | None:
-    """The length that stage 1 holds: the one named; or, for "longest", the longest free link if the scale is free at all.
+class ScaleAnchor(NamedTuple):
+    """What sets the scale in stage 1, and how stage 2 changes it; static, so that it may fix a compiled program."""
 
-    Raises `InputError` for an angle, a parameter that is not free, or an arm whose values cannot be looked at.
+    hold: str | None  # free length that stage 1 keeps at its start
+    adjusted: str | None  # length that stage 2 adjusts where it has to identify again
+    set_by: tuple[str, ...]  # fixed lengths that determine the scale well, so that stage 2 changes nothing
+    # Fixed lengths that free ones replace exactly in stage 2; None where some have no such partner, or are not known.
+    partners: Partners | None
+
+
+def scale_anchor(space: Parameters, arm: Arm, hold: str | None, noise: Noise | None = None) -> ScaleAnchor:
+    """What sets the scale of stage 1.
+
+    ``hold`` names a free length, or is None for no anchor. "longest" is the longest free link, but for one case: no
+    anchor where fixed lengths determine the scale well, to 1e-4 by repeatability alone (0.02 mm, 70 poses). It is
+    judged by how much a common change of these lengths moves the tips once the free parameters have adapted: d_3 = 750
+    mm, known from a drawing, sets the scale; probe_x = 0.6 mm does not, and d_7 with a free probe along the same axis
+    not at all.
+
+    Raises `InputError` for an angle, a parameter that is not free, or "longest" with an arm whose values are traced.
     """
+    space = based_on(space, arm)
+    arm = space.base
+    known = is_concrete(*jax.tree.leaves(arm))
     lengths = [name for name in space.names if is_length(name)]
-    if hold is None or (hold == "longest" and (not lengths or len(space.names) == 1)):
-        return None
-    if hold != "longest":
-        if hold not in lengths:
-            space.index(hold)
-            raise InputError(f"hold is '{hold}', which is an angle; hold a length, for example '{lengths[0]}'.")
-        return hold
-    if not is_concrete(*jax.tree.leaves(arm)):
+    if hold not in (None, "longest") and hold not in lengths:
+        space.index(hold)
+        raise InputError(f"hold is '{hold}', which is an angle; hold a length, for example '{lengths[0]}'.")
+    if hold == "longest" and (not lengths or len(space.names) == 1):
+        hold = None
+    if hold == "longest" and not known:
         raise InputError(
             "hold='longest' needs an arm with known values; where the arm itself is traced, name the length to hold."
         )
-    if not scale_is_free(arm, space):
-        return None
-    links = [name for name in lengths if not name.startswith("probe")] or lengths
+    fixed = fixed_lengths(arm, space)
+    one = _first(arm) if known and fixed else None
+    set_by = fixed if one is not None and hold in (None, "longest") and _sets_scale(one, space, fixed, noise) else ()
+    longest = _longest_link(lengths, arm if known else None)
+    if hold == "longest":
+        hold = None if set_by else longest
+    partners = _partners(arm, one, space, fixed) if one is not None else None if fixed else ((), ())
+    return ScaleAnchor(hold, longest if hold is None else hold, set_by, partners)
+
+
+def fixed_lengths(arm: Arm, space: Parameters) -> tuple[str, ...]:
+    """Fixed lengths that the scale concerns: all but ``d_1`` and, where values are known, those that are zero."""
+    names = [name for name in parameter_names(arm) if is_length(name) and name not in ("d_1", *space.names)]
+    if not is_concrete(*jax.tree.leaves(arm)):
+        return tuple(names)
+    return tuple(name for name in names if np.any(value_of(arm, name) != 0))
+
+
+def _longest_link(lengths: list[str], arm: Arm | None) -> str | None:
+    links = [name for name in lengths if not name.startswith("probe") and name != "d_1"] or lengths
+    if not links or arm is None:
+        return links[0] if links else None
     return max(links, key=lambda name: np.abs(value_of(arm, name)).max())
 
 
-def scale_is_free(arm: Arm, space: Parameters) -> bool:
-    """Whether repeatability leaves the scale open: stretching the *held* lengths too can be imitated by the free parameters.
-
-    It cannot where a held length matters (say d_3, known from a drawing): then the scale is known and nothing more may be
-    held. It can where the held ones are zero, or redundant with free ones (d_7 with a probe along the same axis).
-    """
-    held = [n for n in parameter_names(arm) if n not in space.names and is_length(n) and n != "d_1"]
-    held = [name for name in held if np.any(value_of(arm, name) != 0)]
-    if not held:
-        return True
-    if arm.alpha.ndim > 1:
-        arm = jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1])[0], arm)
-    poses = np.random.default_rng(0).uniform(-np.pi, np.pi, (2 * len(space.names) + 10, arm.joints))
+def _first(arm: Arm) -> Arm:
+    """One arm of a batch."""
+    if arm.alpha.ndim == 1:
+        return arm
     with jax.ensure_compile_time_eval():
-        columns = np.asarray(arm.jacobian(poses, [*space.names, *held]))
-        scale = np.asarray(space.scale)
-    columns = (columns - columns.mean(axis=0)).reshape(-1, columns.shape[-1])
-    free, scale_direction = (
-        columns[:, : -len(held)] * scale,
-        columns[:, -len(held) :] @ np.array([value_of(arm, n) for n in held]),
-    )
-    left = scale_direction - free @ np.linalg.lstsq(free, scale_direction, rcond=1e-10)[0]
-    return bool(np.linalg.norm(left) <= 1e-6 * np.linalg.norm(scale_direction))
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1])[0], arm)
+
+
+def _columns(arm: Arm, names: tuple[str, ...]) -> Float[np.ndarray, "rows k"]:
+    """Derivatives of the tips by named parameters at random configurations, less what they have in common."""
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_CONFIGURATIONS, arm.joints))
+    columns = jacobian_at(arm, q, names)
+    return (columns - columns.mean(axis=0)).reshape(-1, len(names))
+
+
+def _sets_scale(arm: Arm, space: Parameters, fixed: tuple[str, ...], noise: Noise | None) -> bool:
+    """Whether repeatability determines the scale well, given the fixed lengths.
+
+    A common relative change of the fixed lengths is imitated by the free parameters as well as they can; the residual,
+    in mm at the tip, is what repeatability sees of the scale. The nominal arm may be in a special position that the
+    real one does not share, so the smaller of two residuals counts: at the nominal arm, and at a neighbouring one.
+    """
+    sizes = []
+    with jax.ensure_compile_time_eval():
+        for one in (arm, neighbouring_arm(arm, space.names)):
+            columns = _columns(one, (*space.names, *fixed))
+            free = columns[:, : len(space.names)] * natural_steps(space.names)
+            scaling = columns[:, len(space.names) :] @ np.array([value_of(arm, name) for name in fixed])
+            residual = scaling - free @ np.linalg.lstsq(free, scaling, rcond=1e-10)[0]
+            sizes.append(float(np.sqrt(np.mean(residual**2))))
+    return _scatter(arm, noise) <= _LARGEST_UNCERTAINTY * math.sqrt(_EQUATIONS) * min(sizes)
+
+
+def _scatter(arm: Arm, noise: Noise | None) -> float:
+    """Standard deviation of a tip coordinate, mm, as the noise has it for a tip at half of the arm's reach."""
+    if noise is None or not is_concrete(noise.encoder, noise.seating):
+        return _SCATTER
+    encoder = float(np.sqrt(np.mean(np.asarray(noise.encoder) ** 2)))
+    return math.hypot(encoder * total_link_length(arm) / 2, float(noise.seating))
+
+
+def _partners(arm: Arm, one: Arm, space: Parameters, fixed: tuple[str, ...]) -> Partners | None:
+    """Free lengths that replace the fixed ones exactly, whatever the free angles are.
+
+    Tips are linear in the lengths, so the weights are a linear least squares; that they serve two arms with different
+    free angles shows that they follow from the fixed angles alone (alpha_n = 0 makes d_n and probe_z one).
+    """
+    angles = [name for name in parameter_names(arm) if not is_length(name) and name not in space.names]
+    if any(np.ptp(value_of(arm, name)) > 0 for name in angles):
+        return None  # the arms of this batch have different fixed angles
+    free = tuple(name for name in space.names if is_length(name) and name != "d_1")
+    with jax.ensure_compile_time_eval():
+        rows = np.concatenate([_columns(other, (*free, *fixed)) for other in (one, neighbouring_arm(one, space.names))])
+    replaceable, wanted = rows[:, : len(free)], rows[:, len(free) :]
+    weights = np.linalg.lstsq(replaceable, wanted, rcond=1e-10)[0] if free else np.zeros((0, len(fixed)))
+    if np.any(np.linalg.norm(wanted - replaceable @ weights, axis=0) > _EXACT * np.linalg.norm(wanted, axis=0) + 1e-12):
+        return None
+    weights = np.where(np.abs(weights) < _EXACT, 0.0, weights)
+    by_name = dict(zip(free, weights.tolist(), strict=True))
+    return fixed, tuple(tuple(by_name.get(name, [0.0] * len(fixed))) for name in space.names)

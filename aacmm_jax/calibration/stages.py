@@ -1,36 +1,36 @@
 """Stage 1 (`identify`), both stages (`calibrate`), and the joint solve."""
 
 import warnings
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from ..core._compat import inside_trace
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..data.capture import Capture
 from ..data.noise import Noise
-from ..kinematics.arm import Arm, is_single
-from ..kinematics.parameters import Bounds, Parameters
+from ..kinematics.arm import Arm
+from ..kinematics.parameters import Bounds
 from ..model.measurement import Measurement, check_joints
 from ..model.metrics import repeatability
-from ..model.residuals import joint_model, joint_residual, repeatability_model, repeatability_residual
-from ..model.scale import divide_lengths
-from ..solver.bounded import BoundedLevenbergMarquardt, least_squares
-from ..solver.levenberg_marquardt import Reason
+from ..model.residuals import joint_model, joint_residual
+from ..solver.bounded import least_squares
+from ..solver.reason import Reason
 from ..uncertainty import propagation
 from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
 from ..uncertainty.identifiability import observability
-from .checks import based_on, check_enough, check_noise_model, check_start
+from .checks import based_on, check_enough, check_noise_model, check_single, check_start
 from .results import Calibration, Identification
 from .scale_anchor import scale_anchor
+from .second_stage import adjust_anchor, can_scale, divided, must_adjust, replaced
+from .task import SOLVER, Task, fit_repeatability
 
-# The boxes of this problem are small against its curvature, so the first steps can be nearly Gauss-Newton's.
-SOLVER = BoundedLevenbergMarquardt(rtol=1e-13, initial_damping=1e-6)
 _MAX_STEPS = 300
 
 
@@ -47,20 +47,33 @@ def identify(
 ) -> Identification:
     """Stage 1: the parameters that make the poses of every socket agree, within bounds.
 
-    Minimises the summed squared distance of the tips from their socket's centroid. It starts from ``arm``, or from
-    ``start`` ``(p,)``. Repeatability cannot see the scale of the arm, and with noise it is lowered by shrinking it, so one
-    length is held meanwhile: ``hold`` names it, "longest" takes the longest free link (none, if a length that matters is held
-    anyway), None frees all, as the paper does (then expect active bounds).
+    Minimises the summed squared distance of the tips from their socket's centroid (Cheng et al. 2018, section 2.2).
+    Repeatability does not determine the scale of the arm, and noise makes it shrink, so one length, the scale anchor,
+    is kept at its start.
 
-    Where the ``noise`` of readings and seat is known, every pose is weighed by the inverse covariance of its tip, and the
-    covariance of the result follows from it; else both standard deviations are estimated from the residuals. ``form`` takes
-    another view of the errors (`covariance.FORMS`).
+    Differentiable with respect to angles, bounds and the arm, exactly, also where a bound is active (not in directions
+    that the data leave open, such as the scale of noise-free data without an anchor). Failure to converge is data
+    (``result``).
 
-    Differentiable with respect to angles and bounds, exactly, also where a bound is active (not in directions that the data
-    leave open, such as the scale of noise-free data with nothing held). Failure to converge is
-    data (``result``). Raises `InputError` for too few poses, a start outside the box, or names that do not fit.
+    Args:
+        arm: the arm to identify; its values are the start, and the fixed parameters stay as it has them.
+        capture: joint readings by socket, rad.
+        bounds: box of the free parameters ``(p,)``, mm and rad.
+        hold: the scale anchor. A free length by name; "longest", the longest free link, or none where fixed lengths
+            determine the scale well; None, no anchor, as in the paper (then expect active bounds).
+        start: free parameters ``(p,)`` to start from instead of the arm's, mm and rad.
+        noise: standard deviations of readings and seat. Where given, every pose is weighted by the inverse covariance
+            of its tip, and the covariance of the result follows from it; else both are estimated from the residuals.
+        noise_model: another model of the tips' errors, one of `uncertainty.covariance.NOISE_MODELS`.
+        max_steps: most evaluations of the residual.
+
+    Returns:
+        Parameters, repeatability, active bounds, covariance, and why the solve ended.
+
+    Raises:
+        InputError: too few poses, a start outside the box, names that do not fit, or a batch (see `identify_many`).
     """
-    return _identify(_checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps))
+    return _identify(_checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many"))
 
 
 def _checked(
@@ -72,16 +85,19 @@ def _checked(
     hold: str | None,
     noise_model: NoiseModel | None,
     max_steps: int,
-) -> "_Task":
-    space = bounds.space
-    vector = space.vector(arm) if start is None else as_array(start, "the start")
+    many: str,
+) -> Task:
+    check_single(arm, capture, bounds, many)
+    space = based_on(bounds.space, arm)
+    bounds = Bounds(space, bounds.lower, bounds.upper)
+    vector = space.vector() if start is None else as_array(start, "the start")
     check_joints(capture, space)
     check_start(bounds, vector, "the start" if start is not None else "the arm")
-    # Repeatability does not see the scale: where lengths are free, it determines one parameter less.
+    # Repeatability does not determine the scale: where lengths are free, it determines one parameter less.
     check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
     noise_model = check_noise_model(noise_model, noise, arm.joints)
-    hold = scale_anchor(space, arm, hold)
-    return _Task(based_on(space, arm), Measurement.of(capture), bounds, vector, noise, hold, noise_model, max_steps)
+    anchor = scale_anchor(space, space.base, hold, noise)
+    return Task(Measurement.of(capture), bounds, vector, noise, anchor, noise_model, max_steps)
 
 
 def calibrate(
@@ -99,51 +115,63 @@ def calibrate(
 ) -> Calibration:
     """Both stages: identify from repeatability, then fix the scale with the reference lengths.
 
-    ``method="joint"`` goes on from there with one least squares of repeatability and lengths together, each weighted by its
-    standard deviation: that of a tip coordinate from stage 1's residuals; that of a length from its u and from what the
-    scatter of the poses at its ends adds. ``noise`` and ``form`` are as in `identify`.
+    "two-stage" divides the arm of stage 1 by k = measured / nominal. Fixed parameters stay as they are, to the bit, and
+    the result is inside the box: where the division cannot give that, stage 1 is repeated with its anchor adjusted
+    until k = 1 (`calibration.second_stage`). Where fixed lengths set the scale, k changes nothing.
 
-    Raises `InputError` as `identify` does, and without a reference length. Free parameters that these data cannot determine
-    are an `IdentifiabilityWarning` that names them and says what would determine them; with ``strict`` an `InputError`.
+    "joint" goes on from there with one least squares of repeatability and lengths together, each weighted by its
+    standard deviation: that of a tip coordinate from stage 1's residuals; that of a length from its u and from the
+    scatter of the poses at its ends.
+
+    Args:
+        arm: as for `identify`, like all arguments that are not named here.
+        capture: sockets, and at least one reference length, mm.
+        bounds: box of the free parameters ``(p,)``, mm and rad.
+        method: "two-stage" or "joint".
+        hold: the scale anchor of stage 1.
+        start: free parameters ``(p,)`` to start from, mm and rad.
+        noise: standard deviations of readings and seat.
+        noise_model: another model of the tips' errors.
+        strict: raise instead of warn where free parameters are not determined by these data.
+        max_steps: most evaluations of each solve.
+
+    Returns:
+        The calibrated arm and its parameters, k, repeatability, lengths, covariance, and the result of stage 1.
+
+    Raises:
+        InputError: as `identify` does, and without a reference length.
     """
     if method not in ("two-stage", "joint"):
         raise InputError(f"method is '{method}'; it must be 'two-stage' or 'joint'.")
     if not capture.lengths:
         raise InputError(
-            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, from Python, identify for stage 1 alone)."
+            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, "
+            "from Python, identify for stage 1 alone)."
         )
-    task = _checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps)
-    _check_identifiable(arm, capture, bounds, strict)
-    return _calibrate(task, method)
+    task = _checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
+    _check_identifiable(capture, task, strict)
+    if method == "joint":
+        return _joint(task)
+    result, adjust = _divided(task)
+    if not can_scale(task.anchor) or (is_concrete(adjust) and not bool(adjust)):
+        return result
+    again = _adjusted(task, result)
+    return again if is_concrete(adjust) else jax.tree.map(lambda new, old: jnp.where(adjust, new, old), again, result)
 
 
-def _check_identifiable(arm: Arm, capture: Capture, bounds: Bounds, strict: bool) -> None:
-    """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; traced values are not looked at."""
-    # Inside jit or vmap even what is constant becomes a tracer once JAX computes with it.
-    if not is_single(arm) or not is_concrete(jnp.negative(0.0), *jax.tree.leaves((arm, capture, bounds))):
+def _check_identifiable(capture: Capture, task: Task, strict: bool) -> None:
+    """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; not of traced values."""
+    if inside_trace() or not is_concrete(*jax.tree.leaves((capture, task.bounds))):
         return
-    sentences = observability(arm, capture, bounds.space).sentences()
+    sentences = observability(task.space.base, capture, task.space).sentences()
     if sentences and strict:
         raise InputError(" ".join(sentences))
     for sentence in sentences:
         warnings.warn(sentence, IdentifiabilityWarning, stacklevel=3)
 
 
-class _Task(NamedTuple):
-    """An identification, checked."""
-
-    space: Parameters
-    measurement: Measurement
-    bounds: Bounds
-    start: Float[Array, " p"]
-    noise: Noise | None
-    hold: str | None
-    noise_model: NoiseModel
-    max_steps: int
-
-
 @eqx.filter_jit
-def _identify(task: _Task) -> Identification:
+def _identify(task: Task) -> Identification:
     found, _ = _stage1(task)
     parameter_covariance = with_active_bounds(
         found.parameter_covariance,
@@ -153,36 +181,24 @@ def _identify(task: _Task) -> Identification:
         found.active,
         task.bounds,
         found.after.sigma,
-        task.hold,
+        task.anchor.hold,
     )
     return eqx.tree_at(lambda result: result.parameter_covariance, found, parameter_covariance)
 
 
-def _stage1(task: _Task) -> tuple[Identification, propagation.Propagated]:
-    space, bounds, start, hold = task.space, task.bounds, task.start, task.hold
+def _stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
+    space, start, hold = task.space, task.start, task.anchor.hold
     measurement = task.measurement.weighted(space.arm(start).geometry, task.noise)
-    kept = np.array([name != hold for name in space.names])
-    index = jnp.asarray(np.flatnonzero(kept))
-    reduced = Parameters(base=space.arm(start), names=tuple(name for name in space.names if name != hold))
-    solution = least_squares(
-        repeatability_residual,
-        start[index],
-        (reduced, measurement),
-        lower=bounds.lower[index],
-        upper=bounds.upper[index],
-        scale=reduced.scale,
-        normal=repeatability_model,
-        solver=SOLVER,
-        max_steps=task.max_steps,
-        throw=False,
-    )
-    parameters = start.at[index].set(solution.value)
+    parameters, solution = fit_repeatability(task, measurement, start, hold)
+    kept = np.array([name == hold for name in space.names])
+    fitted = int((~kept).sum())
     identified = space.arm(parameters)
     tips = identified.position(measurement.q)
-    after = repeatability(tips, measurement.sizes, fitted=int(kept.sum()))
-    active = jnp.where(jnp.asarray(kept), bounds.active(parameters), 0)
-    fixed = (active != 0) | ~jnp.asarray(kept)
-    propagated = propagation.propagate_solve(identified, space, measurement, fixed, after.sigma, task.noise_model, task.noise)
+    after = repeatability(tips, measurement.sizes, fitted=fitted)
+    active = jnp.where(jnp.asarray(kept), 0, task.bounds.active(parameters))
+    propagated = propagation.propagate_solve(
+        identified, space, measurement, (active != 0) | jnp.asarray(kept), after.sigma, task.noise_model, task.noise
+    )
     identification = Identification(
         arm=identified,
         parameters=parameters,
@@ -196,11 +212,12 @@ def _stage1(task: _Task) -> tuple[Identification, propagation.Propagated]:
         parameter_covariance=propagated.parameter_covariance,
         before=repeatability(space.arm(start).position(measurement.q), measurement.sizes),
         after=after,
-        reduced_chi=_reduced_chi(measurement, tips, int(kept.sum())),
-        bounds=bounds,
+        reduced_chi=_reduced_chi(measurement, tips, fitted),
+        bounds=task.bounds,
         hold=hold,
+        scale_set_by=task.anchor.set_by,
         noise_model=task.noise_model,
-        degrees_of_freedom=residual_degrees_of_freedom(task.noise_model, measurement.sizes, int(kept.sum())),
+        degrees_of_freedom=residual_degrees_of_freedom(task.noise_model, measurement.sizes, fitted),
     )
     return identification, propagated
 
@@ -212,22 +229,21 @@ def _reduced_chi(measurement: Measurement, tips: Float[Array, "N 3"], fitted: in
     return jnp.sqrt(jnp.sum(measurement.whitened(measurement.centred(tips)) ** 2) / degrees_of_freedom)
 
 
-@eqx.filter_jit
-def _calibrate(task: _Task, method: str) -> Calibration:
-    stage1, propagated = _stage1(task)
+def _calibration(
+    task: Task,
+    stage1: Identification,
+    method: str,
+    parameters: Float[Array, " p"],
+    active: Int[Array, " p"],
+    steps: Int[Array, ""],
+    result: Reason,
+    parameter_covariance: ParameterCovariance,
+) -> Calibration:
+    """The result of a calibration that ended with these parameters."""
     assert stage1.scale is not None
-    space, k = task.space, stage1.scale.value
-    arm = space.arm(task.start)
-    measurement = task.measurement.weighted(arm.geometry, task.noise)
-    if method == "joint":
-        calibrated, parameters, active, steps, result, parameter_covariance = _joint(arm, stage1, task)
-    else:
-        calibrated = divide_lengths(stage1.arm, k)
-        parameters, active, steps, result = space.vector(calibrated), stage1.active, stage1.steps, stage1.result
-        sigma = stage1.after.sigma
-        parameter_covariance = propagation.propagate_division(
-            propagated, stage1.arm, space, measurement, sigma, parameters
-        ).parameter_covariance
+    space = task.space
+    start, calibrated = space.arm(task.start), space.arm(parameters)
+    measurement = task.measurement.weighted(start.geometry, task.noise)
     tips = calibrated.position(measurement.q)
     after = repeatability(tips, measurement.sizes, fitted=len(space.names))
     parameter_covariance = with_active_bounds(
@@ -245,24 +261,71 @@ def _calibrate(task: _Task, method: str) -> Calibration:
         parameter_covariance=parameter_covariance,
         before=stage1.before,
         after=after,
-        length_before=measurement.distances(arm.position(measurement.q)),
+        length_before=measurement.distances(start.position(measurement.q)),
         length_after=measurement.distances(tips),
         stage1=stage1,
         method=method,
     )
 
 
-def _joint(arm: Arm, stage1: Identification, task: _Task) -> tuple[Arm, Array, Array, Array, Reason, ParameterCovariance]:
-    """One weighted least squares of poses and lengths, from the two-stage result; held parameters stay as given."""
+@eqx.filter_jit
+def _divided(task: Task) -> tuple[Calibration, Bool[Array, ""]]:
+    """Stage 1 and the division by k; and whether the anchor must be adjusted instead."""
+    stage1, propagated = _stage1(task)
     assert stage1.scale is not None
-    space, k = Parameters(arm, stage1.space.names), stage1.scale.value
-    # The joint solve waits for stage 1's covariance: see `covariance.inverted`.
-    scaled, _ = jax.lax.optimization_barrier((divide_lengths(stage1.arm, k), stage1.parameter_covariance.matrix))
+    space, bounds, anchor = task.space, task.bounds, task.anchor
+    scaled = divided(anchor, space, stage1.parameters, stage1.scale.value)
+    adjust = must_adjust(anchor, bounds, stage1.active, scaled)
+    active, parameter_covariance = stage1.active, stage1.parameter_covariance
+    if can_scale(anchor):
+        scaled = jnp.where(jnp.asarray(space.lengths), jnp.clip(scaled, bounds.lower, bounds.upper), scaled)
+        active = bounds.active(scaled)
+        measurement = task.measurement.weighted(space.arm(task.start).geometry, task.noise)
+        parameter_covariance = propagation.propagate_division(
+            propagated, stage1.arm, space, measurement, stage1.after.sigma, scaled, replaced(anchor, space)
+        ).parameter_covariance
+    result = _calibration(task, stage1, "two-stage", scaled, active, stage1.steps, stage1.result, parameter_covariance)
+    return result, adjust
+
+
+@eqx.filter_jit
+def _adjusted(task: Task, by_division: Calibration) -> Calibration:
+    """Stage 2 where the division leaves the box, or would need a fixed length to move."""
+    stage1, space, name = by_division.stage1, task.space, task.anchor.adjusted
+    assert stage1.scale is not None
+    assert name is not None
+    scaled = space.arm(by_division.parameters)
+    sigma = stage1.after.sigma / stage1.scale.value
     measurement = task.measurement.weighted(scaled.geometry, task.noise)
-    joint_weights = propagation.joint_weights(scaled, measurement, stage1.after.sigma / k)
+    adjusted = adjust_anchor(task, measurement, by_division.parameters, sigma)
+    arm, active = space.arm(adjusted.parameters), task.bounds.active(adjusted.parameters)
+    is_anchor = jnp.asarray([other == name for other in space.names])
+    solved = propagation.propagate_solve(
+        arm, space, measurement, (active != 0) | is_anchor, sigma, task.noise_model, task.noise
+    )
+    parameter_covariance = propagation.propagate_adjustment(
+        solved, arm, space, measurement, sigma, name, jnp.any((active != 0) & is_anchor)
+    ).parameter_covariance
+    steps = stage1.steps + adjusted.steps
+    return _calibration(
+        task, stage1, "two-stage", adjusted.parameters, active, steps, adjusted.result, parameter_covariance
+    )
+
+
+@eqx.filter_jit
+def _joint(task: Task) -> Calibration:
+    """One weighted least squares of poses and lengths, from the arm of stage 1 divided by k."""
+    stage1, _ = _stage1(task)
+    assert stage1.scale is not None
+    space, k = task.space, stage1.scale.value
+    parameters = divided(task.anchor, space, stage1.parameters, k)
+    scaled = space.arm(parameters)
+    measurement = task.measurement.weighted(scaled.geometry, task.noise)
+    sigma = stage1.after.sigma / k
+    joint_weights = propagation.joint_weights(scaled, measurement, sigma)
     solution = least_squares(
         joint_residual,
-        space.vector(scaled),
+        parameters,
         (space, measurement, joint_weights.sigma, joint_weights.whitening),
         lower=stage1.bounds.lower,
         upper=stage1.bounds.upper,
@@ -273,9 +336,8 @@ def _joint(arm: Arm, stage1: Identification, task: _Task) -> tuple[Arm, Array, A
         throw=False,
     )
     stats, active = solution.stats, stage1.bounds.active(solution.value)
-    found = space.arm(solution.value)
-    sigma = stage1.after.sigma / k
     parameter_covariance = propagation.propagate_solve(
-        found, space, measurement, active != 0, sigma, task.noise_model, task.noise, joint_weights
+        space.arm(solution.value), space, measurement, active != 0, sigma, task.noise_model, task.noise, joint_weights
     ).parameter_covariance
-    return found, solution.value, active, stage1.steps + stats["num_steps"], stats["reason"], parameter_covariance
+    steps = stage1.steps + stats["num_steps"]
+    return _calibration(task, stage1, "joint", solution.value, active, steps, stats["reason"], parameter_covariance)

@@ -1,2 +1,3 @@
-from .document import dcc as dcc
-from .document import parse_dcc as parse_dcc
+from .document import dcc_xml as dcc_xml
+from .parsing import CertifiedValue as CertifiedValue
+from .parsing import parse_dcc as parse_dcc

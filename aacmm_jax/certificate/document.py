@@ -1,51 +1,68 @@
-"""The Digital Calibration Certificate (DCC) of a calibration: XML after PTB's schema, version 3.3.0; and a reader of its values."""
+"""The Digital Calibration Certificate (DCC) of a calibration: XML after PTB's schema, version 3.3.0."""
 
 import datetime
 import uuid
 from collections.abc import Sequence
-from typing import NamedTuple
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity, held_by_xml
 from ..summaries.warnings import of_calibration, plausible
-from .results import add_results, uncertainty_says
-from .xml import DCC, SI, XSI, contact, identifications, ours, put, software, theirs, written
+from .measurement_results import add_results, uncertainty_statement
+from .xml_elements import (
+    DCC,
+    SI,
+    XSI,
+    add,
+    add_contact,
+    add_english,
+    add_identifications,
+    add_software,
+    add_text,
+    xml_text,
+)
 
 VERSION = "3.3.0"
-_PREFIXES = {"dcc": DCC, "si": SI}
 
 
-class Certified(NamedTuple):
-    """A value of a certificate, its unit in D-SI syntax, and its expanded uncertainty, where it has one."""
-
-    value: float
-    unit: str
-    expanded: float | None
-
-
-def dcc(
-    record: CalibrationRecord, about: AdministrativeData, *, created: str, sources: Sequence[str] = (), command: str = ""
+def dcc_xml(
+    record: CalibrationRecord,
+    administrative_data: AdministrativeData,
+    *,
+    created: str,
+    sources: Sequence[str] = (),
+    command: str = "",
 ) -> str:
-    """The certificate of a calibration: the text of an XML file in UTF-8.
+    """Make the Digital Calibration Certificate of a calibration.
 
-    ``created``: when the calibration was computed (ISO 8601, as calibration files say); ``sources``: names of the files that it
-    was made of; ``command``: what computed it. The same input gives the same text: without a number in ``about`` the unique
-    identifier is a UUID of the content.
+    The same input gives the same text: without a stated number, the unique identifier is a UUID of the content.
 
-    Raises `InputError` for a calibration that did not converge or whose scale is impossible, for names that XML cannot hold, and
-    for dates that are out of order.
+    Args:
+        record: The calibration.
+        administrative_data: Laboratory, customer, item, persons, dates and artefacts.
+        created: When the calibration was computed, ISO 8601, as calibration files say.
+        sources: Names of the files that the calibration was made of.
+        command: The command that computed it.
+
+    Returns:
+        The text of an XML file in UTF-8.
+
+    Raises:
+        InputError: If the calibration did not converge, its scale is impossible, a name has characters that XML
+            does not allow, or the dates are out of order.
     """
     if not record.converged:
         reason = record.reason.partition(";")[0].rstrip(".")
-        raise InputError(f"a calibration that failed has no certificate ({reason}); calibrate again until it converges.")
+        raise InputError(
+            f"a calibration that failed has no certificate ({reason}); calibrate again until it converges."
+        )
     if not plausible(record.k):
         raise InputError(
-            f"k = {record.k:.6g} is the scale of no arm, so there is no certificate; mend the lengths and calibrate."
+            f"k = {record.k:.6g} cannot be the scale of an arm, so there is no certificate; correct the lengths and "
+            "calibrate again."
         )
-    check_conformity(about, simulated=record.recording.true is not None)
+    check_conformity(administrative_data, simulated=record.recording.true is not None)
     _check_texts(record, sources, command)
     root = Element("dcc:digitalCalibrationCertificate")
     for name, value in (("xmlns:dcc", DCC), ("xmlns:si", SI), ("xmlns:xsi", XSI)):
@@ -53,10 +70,10 @@ def dcc(
     root.set("xsi:schemaLocation", f"{DCC} {DCC}/v{VERSION}/dcc.xsd")
     root.set("schemaVersion", VERSION)
     day = _day(record.recording.measured or created)
-    identifier = _administrative(put(root, "administrativeData"), record, about, day, sources)
-    add_results(put(root, "measurementResults"), record, about, command)
-    identifier.text = about.certificate.number or str(uuid.uuid5(uuid.NAMESPACE_URL, written(root)))
-    return written(root)
+    identifier = _add_administrative(add(root, "administrativeData"), record, administrative_data, day, sources)
+    add_results(add(root, "measurementResults"), record, administrative_data, command)
+    identifier.text = administrative_data.certificate.number or str(uuid.uuid5(uuid.NAMESPACE_URL, xml_text(root)))
+    return xml_text(root)
 
 
 def _check_texts(record: CalibrationRecord, sources: Sequence[str], command: str) -> None:
@@ -77,136 +94,101 @@ def _day(created: str) -> datetime.date:
         ) from error
 
 
-def _administrative(
-    data: Element, record: CalibrationRecord, about: AdministrativeData, day: datetime.date, sources: Sequence[str]
+def _add_administrative(
+    parent: Element, record: CalibrationRecord, given: AdministrativeData, day: datetime.date, sources: Sequence[str]
 ) -> Element:
     """Fill in the administrative data; returns the element for the unique identifier, still empty."""
-    software(data, "dccSoftware")
-    identifier = _core(put(data, "coreData"), about, day)
-    given, item = about.item, put(put(data, "items"), "item")
-    theirs(item, "name", given.name or record.recording.nominal.name or "articulated-arm coordinate measuring machine")
-    if given.manufacturer is not None:
-        theirs(put(item, "manufacturer"), "name", given.manufacturer)
-    if given.model is not None:
-        put(item, "model", given.model)
-    serial = ("manufacturer", given.serial_number or NOT_STATED, "Serial number")
-    identifications(item, [serial, ("customer", given.customer_number, "Customer's number")])
-    laboratory = put(data, "calibrationLaboratory")
-    if about.laboratory.code is not None:
-        put(laboratory, "calibrationLaboratoryCode", about.laboratory.code)
-    contact(laboratory, "contact", about.laboratory)
-    _persons(put(data, "respPersons"), about)
-    contact(data, "customer", about.customer)
-    _statements(put(data, "statements"), record, about, sources)
+    add_software(parent, "dccSoftware")
+    identifier = _add_core(add(parent, "coreData"), given, day)
+    item = add(add(parent, "items"), "item")
+    name = given.item.name or record.recording.nominal.name or "articulated-arm coordinate measuring machine"
+    add_text(item, "name", name)
+    if given.item.manufacturer is not None:
+        add_text(add(item, "manufacturer"), "name", given.item.manufacturer)
+    if given.item.model is not None:
+        add(item, "model", given.item.model)
+    serial = ("manufacturer", given.item.serial_number or NOT_STATED, "Serial number")
+    add_identifications(item, [serial, ("customer", given.item.customer_number, "Customer's number")])
+    laboratory = add(parent, "calibrationLaboratory")
+    if given.laboratory.code is not None:
+        add(laboratory, "calibrationLaboratoryCode", given.laboratory.code)
+    add_contact(laboratory, "contact", given.laboratory)
+    _add_persons(add(parent, "respPersons"), given)
+    add_contact(parent, "customer", given.customer)
+    _add_statements(add(parent, "statements"), record, given, sources)
     return identifier
 
 
-def _core(core: Element, about: AdministrativeData, day: datetime.date) -> Element:
-    given = about.certificate
+def _add_core(core: Element, administrative_data: AdministrativeData, day: datetime.date) -> Element:
+    given = administrative_data.certificate
     begin = given.begin or given.end or day
     end = given.end or max(day, begin)
     if given.received is not None and given.received > begin:
         raise InputError(
-            f"certificate.received is {given.received}, after the calibration began on {begin}; mend it, or state begin."
+            f"certificate.received is {given.received}, after the calibration began on {begin}; "
+            "correct it, or state begin."
         )
     if given.issued is not None and given.issued < end:
-        raise InputError(f"certificate.issued is {given.issued}, before the calibration ended on {end}; mend it, or state end.")
-    put(core, "countryCodeISO3166_1", about.country)
-    put(core, "usedLangCodeISO639_1", "en")
-    put(core, "mandatoryLangCodeISO639_1", "en")
-    identifier = put(core, "uniqueIdentifier")
+        raise InputError(
+            f"certificate.issued is {given.issued}, before the calibration ended on {end}; correct it, or state end."
+        )
+    add(core, "countryCodeISO3166_1", administrative_data.country)
+    add(core, "usedLangCodeISO639_1", "en")
+    add(core, "mandatoryLangCodeISO639_1", "en")
+    identifier = add(core, "uniqueIdentifier")
     if given.received is not None:
-        put(core, "receiptDate", given.received.isoformat())
-    put(core, "beginPerformanceDate", begin.isoformat())
-    put(core, "endPerformanceDate", end.isoformat())
-    put(core, "performanceLocation", given.place)
+        add(core, "receiptDate", given.received.isoformat())
+    add(core, "beginPerformanceDate", begin.isoformat())
+    add(core, "endPerformanceDate", end.isoformat())
+    add(core, "performanceLocation", given.place)
     if given.issued is not None:
-        put(core, "issueDate", given.issued.isoformat())
+        add(core, "issueDate", given.issued.isoformat())
     return identifier
 
 
-def _persons(persons: Element, about: AdministrativeData) -> None:
-    for person in about.person:
-        element = put(persons, "respPerson")
-        theirs(put(element, "person"), "name", person.name)
+def _add_persons(parent: Element, given: AdministrativeData) -> None:
+    for person in given.person:
+        element = add(parent, "respPerson")
+        add_text(add(element, "person"), "name", person.name)
         if person.role is not None:
-            put(element, "role", person.role)
-        put(element, "mainSigner", "true" if person.main_signer else "false")
-    if not about.person:
-        ours(put(put(persons, "respPerson"), "person"), "name", NOT_STATED)
+            add(element, "role", person.role)
+        add(element, "mainSigner", "true" if person.main_signer else "false")
+    if not given.person:
+        add_english(add(add(parent, "respPerson"), "person"), "name", NOT_STATED)
 
 
-def _statements(statements: Element, record: CalibrationRecord, about: AdministrativeData, sources: Sequence[str]) -> None:
+def _add_statements(
+    parent: Element, record: CalibrationRecord, given: AdministrativeData, sources: Sequence[str]
+) -> None:
     if record.recording.true is not None:
-        _state(statements, "Simulation", "The readings are simulated, so this is no certificate of a real arm.")
-    _state(
-        statements,
+        _add_statement(parent, "Simulation", "The readings are simulated, so this is no certificate of a real arm.")
+    _add_statement(
+        parent,
         "Scale",
-        "The scale of the arm comes from the reference lengths alone: what it measures is traceable as far as they are, and has no "
-        "other tie to the metre.",
+        "The scale of the arm comes from the reference lengths alone: its measurements are traceable as far as these "
+        "lengths are, and have no other connection to the metre.",
     )
-    _state(statements, "Uncertainty", uncertainty_says(record), norm="JCGM 100:2008")
+    _add_statement(parent, "Uncertainty", uncertainty_statement(record), norm="JCGM 100:2008")
     if record.sampled_says:
-        _state(statements, "Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
+        _add_statement(parent, "Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
     for sentence in of_calibration(record):
-        _state(statements, "Caution", sentence)
+        _add_statement(parent, "Warning", sentence)
     if sources:
-        _state(statements, "Files", ", ".join(sources))
-    if about.conformity is not None:
-        statement = _state(statements, "Conformity", about.conformity.decision_rule, norm=about.conformity.specification)
-        put(statement, "conformity", about.conformity.verdict)
-    if about.certificate.remarks is not None:
-        statement = put(statements, "statement")
-        ours(statement, "name", "Remarks")
-        theirs(statement, "declaration", about.certificate.remarks)
+        _add_statement(parent, "Files", ", ".join(sources))
+    if given.conformity is not None:
+        conformity = given.conformity
+        statement = _add_statement(parent, "Conformity", conformity.decision_rule, norm=conformity.specification)
+        add(statement, "conformity", conformity.verdict)
+    if given.certificate.remarks is not None:
+        statement = add(parent, "statement")
+        add_english(statement, "name", "Remarks")
+        add_text(statement, "declaration", given.certificate.remarks)
 
 
-def _state(statements: Element, name: str, text: str, *, norm: str | None = None) -> Element:
-    statement = put(statements, "statement")
-    ours(statement, "name", name)
+def _add_statement(parent: Element, name: str, text: str, *, norm: str | None = None) -> Element:
+    statement = add(parent, "statement")
+    add_english(statement, "name", name)
     if norm is not None:
-        put(statement, "norm", norm)
-    ours(statement, "declaration", text)
+        add(statement, "norm", norm)
+    add_english(statement, "declaration", text)
     return statement
-
-
-def parse_dcc(text: str) -> dict[tuple[str, ...], Certified]:
-    """The single values (``si:real``) among the results of a DCC, by the names of measurement result, result, list and quantity.
-
-    Such as ``("As left", "Denavit-Hartenberg parameters", "a_2")``. Where several stand under one path, the last is returned.
-
-    Raises `InputError` where the text is no XML, no DCC, or has a document type: its entities could name files elsewhere.
-    """
-    try:
-        root = ElementTree.fromstring(text, ElementTree.XMLParser(target=_NoDocumentType()))
-    except (ElementTree.ParseError, UnicodeError) as error:
-        raise InputError(f"the certificate is not valid XML: {error}; export it again.") from error
-    if root.tag != f"{{{DCC}}}digitalCalibrationCertificate":
-        raise InputError(f"the XML is a '{root.tag}', not a digital calibration certificate; give a DCC.")
-    found: dict[tuple[str, ...], Certified] = {}
-    for result in root.iterfind("dcc:measurementResults/dcc:measurementResult", _PREFIXES):
-        _collect(result, (), found)
-    return found
-
-
-class _NoDocumentType(ElementTree.TreeBuilder):
-    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
-        raise InputError(f"the XML has a document type, '{name}', as no certificate has; leave it out.")
-
-
-def _collect(element: Element, path: tuple[str, ...], found: dict[tuple[str, ...], Certified]) -> None:
-    name = element.find("dcc:name/dcc:content", _PREFIXES)
-    path = path if name is None else (*path, name.text or "")
-    real = element.find("si:real", _PREFIXES)
-    if real is not None:
-        expanded = real.findtext("si:measurementUncertaintyUnivariate/si:expandedMU/si:valueExpandedMU", None, _PREFIXES)
-        try:
-            value = float(real.findtext("si:value", "", _PREFIXES))
-            found[path] = Certified(
-                value, real.findtext("si:unit", "", _PREFIXES), None if expanded is None else float(expanded)
-            )
-        except ValueError as error:
-            raise InputError(f"the value of {' / '.join(path)!r} is no number; export the certificate again.") from error
-    for tag in ("results", "result", "data", "list", "quantity"):
-        for child in element.iterfind(f"dcc:{tag}", _PREFIXES):
-            _collect(child, path, found)

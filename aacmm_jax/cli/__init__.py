@@ -14,7 +14,6 @@ _FAMILIES = (
     "study_commands",
     "plan_commands",
     "compare_commands",
-    "show_command",
 )
 
 
@@ -23,8 +22,8 @@ def main() -> None:
     debug = "--debug" in sys.argv
     if debug:
         sys.argv.remove("--debug")
-    # Tracing makes hundreds of thousands of objects that live to the end. Looking for garbage among them, now and when the
-    # interpreter ends, would take a sixth of a short command.
+    # Tracing makes hundreds of thousands of objects that live until the process ends. Looking for garbage among them
+    # would take a sixth of the time of a short command.
     gc.set_threshold(200_000, 20, 20)
     try:
         from ..core.errors import InputError
@@ -39,7 +38,7 @@ def main() -> None:
     except KeyboardInterrupt:
         _interrupted()
     try:
-        app()
+        app(prog_name="aacmm")
     except SystemExit as done:
         if done.code == _INTERRUPTED:
             _interrupted()
@@ -57,7 +56,8 @@ def main() -> None:
         if debug:
             raise
         _fail(
-            f"aacmm failed unexpectedly ({type(error).__name__}: {error}); run again with --debug and report what it shows.", 1
+            f"aacmm failed unexpectedly ({type(error).__name__}: {error}); report what it says with --debug.",
+            1,
         )
     finally:
         gc.freeze()

@@ -1,8 +1,9 @@
-"""What all commands share: the application, common options, and how results are shown."""
+"""What all commands share: the application, common arguments and options, checks, and how results are printed."""
 
+import csv
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -14,38 +15,53 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
-    rich_markup_mode="rich",
+    # Plain help: the panels of rich cut the names of options, and with them their units, in a narrow terminal.
+    rich_markup_mode=None,
+    context_settings={"max_content_width": 120},
     help="Calibrate articulated-arm coordinate measuring machines and other serial arms.",
-    epilog="Every command takes --help and, for a traceback when something fails, --debug. Start with: aacmm demo",
+    epilog="Every command has --help, and --debug for the traceback of a failure. Start with: aacmm demo",
 )
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else there.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else.")]
 
 Only = Annotated[
     list[str] | None,
-    typer.Option("--only", metavar="PATTERN", help="Use only the sockets that match (shell pattern); repeatable."),
+    typer.Option("--only", metavar="PATTERN", help="Use only the sockets that match this shell pattern; repeatable."),
 ]
 
 Without = Annotated[
-    list[str] | None, typer.Option("--without", metavar="PATTERN", help="Leave out the sockets that match; repeatable.")
+    list[str] | None,
+    typer.Option(
+        "--without", metavar="PATTERN", help="Leave out the sockets that match this shell pattern; repeatable."
+    ),
 ]
 
-CaptureFile = Annotated[Path, typer.Argument(metavar="CAPTURE.h5", help="Capture written by import or simulate.")]
+CaptureFile = Annotated[Path, typer.Argument(metavar="CAPTURE.h5", help="Capture, written by import or simulate.")]
 
-CalibrationFile = Annotated[Path, typer.Argument(metavar="CALIBRATION.h5", help="Calibration written by calibrate.")]
+CalibrationFile = Annotated[Path, typer.Argument(metavar="CALIBRATION.h5", help="Calibration, written by calibrate.")]
 
 
-def _version(wanted: bool) -> None:
+def examples(*commands: str) -> str:
+    """The end of a command's help: examples as they are typed, one a line, not wrapped."""
+    word = "Examples" if len(commands) > 1 else "Example"
+    lines = [line for command in commands for line in command.splitlines()]
+    return "\n".join(["\b", f"{word}:", *(f"  {line}" for line in lines)])
+
+
+def _version(wanted: bool) -> bool:
     if wanted:
         from importlib import metadata
 
         typer.echo(metadata.version("aacmm_jax"))
         raise typer.Exit()
+    return wanted
 
 
 @app.callback()
 def prepare(
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
 ) -> None:
     """Calibrate articulated-arm coordinate measuring machines and other serial arms."""
     # Compiled kernels are kept between runs; it more than halves the time of a short command.
@@ -58,7 +74,7 @@ def prepare(
 
 
 def with_spinner(what: str, work: Callable[[], Any]) -> Any:
-    """Do work behind a spinner on standard error, where that is a terminal."""
+    """Do work, with a spinner on standard error where that is a terminal."""
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -68,37 +84,56 @@ def with_spinner(what: str, work: Callable[[], Any]) -> Any:
         return work()
 
 
-def show_summary(summary: dict[str, Any], as_json: bool, printed: Callable[[dict[str, Any]], None]) -> None:
+def show_summary(summary: dict[str, Any], as_json: bool, display: Callable[[dict[str, Any]], None]) -> None:
+    """Print a summary as JSON, or with the function that prints it for people."""
     if as_json:
         typer.echo(json.dumps(summary, indent=2))
     else:
-        printed(summary)
+        display(summary)
 
 
-def socket_option(text: str) -> tuple[str, tuple[float, ...]]:
-    name, _, point = text.partition("=")
-    try:
-        x, y, z = (float(part) for part in point.split(","))
-    except ValueError:
-        bad_option("--socket", text, "NAME=X,Y,Z in mm, for example A=400,200,300")
-    return name, (x, y, z)
+def check_outputs(outputs: Sequence[Path | None], inputs: Iterable[str | Path | None]) -> None:
+    """Refuse an output that is one of the files to read, or that is named twice. Inputs need not exist."""
+    given = [Path(path) for path in inputs if path is not None]
+    written = [path for path in outputs if path is not None]
+    for number, output in enumerate(written):
+        if output.exists() and any(path.exists() and output.samefile(path) for path in given):
+            raise InputError(f"{output} is one of the files that this command reads; choose another output.")
+        if any(output.resolve() == other.resolve() for other in written[:number]):
+            raise InputError(f"{output} is named for two outputs; choose another for one of them.")
+
+
+def sockets_option(texts: Sequence[str] | None) -> dict[str, tuple[float, ...]]:
+    """Sockets from ``NAME=X,Y,Z``, mm."""
+    points: dict[str, tuple[float, ...]] = {}
+    for text in texts or ():
+        name, _, point = text.rpartition("=")
+        try:
+            x, y, z = (float(part) for part in point.split(","))
+        except ValueError:
+            bad_option("--socket", text, "NAME=X,Y,Z in mm, for example A=400,200,300")
+        if name in points:
+            raise InputError(f"socket '{name}' is given twice in --socket; give each its own name.")
+        points[name] = (x, y, z)
+    return points
 
 
 def length_option(text: str) -> tuple:
-    parts = text.split(",")
+    """A reference length from ``A,B`` or ``A,B,U``, mm; a name with a comma in it is put in double quotes."""
+    start, end, *rest = [*next(csv.reader([text]), []), "", ""]
+    u = rest[:-2]
     try:
-        return (
-            (*parts[:2], *(float(u) for u in parts[2:]))
-            if len(parts) in (2, 3)
-            else bad_option("--length", text, "A,B or A,B,U")
-        )
+        if not start or not end or len(u) > 1:
+            raise ValueError
+        return (start, end, *map(float, u))
     except ValueError:
         bad_option("--length", text, "A,B or A,B,U with u in mm")
 
 
 def bad_option(option: str, text: str, form: str) -> NoReturn:
+    """Refuse the value of an option."""
     raise InputError(f"{option} '{text}' is not of the form {form}.")
 
 
 class Stopped(Exception):
-    """Work was interrupted and what is done is kept; the message says how to go on."""
+    """Work was interrupted, and what is done is kept; the message says how to continue."""

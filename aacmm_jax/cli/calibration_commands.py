@@ -1,84 +1,125 @@
 """The command ``calibrate``."""
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
 from ..core.errors import IdentifiabilityWarning, InputError
-from .app import CaptureFile, Json, Only, Without, app, show_summary, with_spinner
+from ..core.units import DEG
+from .app import CaptureFile, Json, Only, Without, app, check_outputs, examples, show_summary, with_spinner
 
 
-@app.command(epilog="Example: aacmm calibrate capture.h5 -o calibration.h5 --without 'test*' --method joint")
+@app.command(
+    epilog=examples(
+        "aacmm calibrate capture.h5 -o calibration.h5",
+        "aacmm calibrate capture.h5 -o calibration.h5 --without 'test*' --method joint",
+    )
+)
 def calibrate(
     capture: CaptureFile,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Calibration to write (HDF5).")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Calibration to write (HDF5).")],
     method: Annotated[
-        Literal["two-stage", "joint"], typer.Option(help="Scale fix after stage 1, or one least squares of poses and lengths.")
+        Literal["two-stage", "joint"],
+        typer.Option(
+            help="two-stage: repeatability, then the scale by the reference lengths; joint: one least squares of both."
+        ),
     ] = "two-stage",
     hold: Annotated[
-        str, typer.Option(help="Length held in stage 1: a name, 'longest', or 'none' to free all as the paper does.")
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="Length that anchors the scale in stage 1: a parameter, 'longest', or 'none' as in the paper.",
+        ),
     ] = "longest",
     only: Only = None,
     without: Without = None,
     held: Annotated[
         str | None,
-        typer.Option(metavar="NAMES", help="Parameters that are not identified, with commas; replaces the arm's own list."),
+        typer.Option(
+            metavar="NAMES", help="Parameters that are fixed, separated by commas; replaces the list in the arm's file."
+        ),
     ] = None,
     free: Annotated[
-        str | None, typer.Option(metavar="NAMES", help="Parameters to free besides, with commas (beta_2 for Hayati's angle).")
+        str | None,
+        typer.Option(
+            metavar="NAMES", help="Further parameters to identify, separated by commas (beta_2: Hayati's angle)."
+        ),
     ] = None,
-    length_bound_mm: Annotated[float | None, typer.Option(min=0, help="Half-width of the bounds of lengths.")] = None,
-    angle_bound_deg: Annotated[float | None, typer.Option(min=0, help="Half-width of the bounds of angles.")] = None,
+    length_bound_mm: Annotated[
+        float | None, typer.Option(min=0, metavar="MM", help="Half-width of the bounds of length parameters.")
+    ] = None,
+    angle_bound_deg: Annotated[
+        float | None, typer.Option(min=0, metavar="DEG", help="Half-width of the bounds of angle parameters.")
+    ] = None,
     bound: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=WIDTH", help="Half-width of one parameter's bounds, mm or deg; repeatable."),
+        typer.Option(metavar="NAME=WIDTH", help="Half-width of the bounds of one parameter, in mm or deg; repeatable."),
     ] = None,
     encoder_arcsec: Annotated[
-        float | None, typer.Option(min=0, help="Known standard deviation of a reading: weighs poses. Default: estimated.")
+        float | None,
+        typer.Option(
+            min=0,
+            metavar="ARCSEC",
+            help="Known standard deviation of a joint reading, for the weights. Default: estimated.",
+        ),
     ] = None,
     seating_mm: Annotated[
-        float | None, typer.Option(min=0, help="Known standard deviation, a coordinate, of the seat. Default: estimated.")
+        float | None,
+        typer.Option(
+            min=0,
+            metavar="MM",
+            help="Known standard deviation of the tip in its socket, for each coordinate. Default: estimated.",
+        ),
     ] = None,
     cross_validate: Annotated[
         bool | None,
         typer.Option(
-            help="Leave out placements of the reference length one after the other. Default: yes, for a recorded capture of several."
+            help="Calibrate once without each placement of the reference length, and test the result there. "
+            "Default: yes, for a recorded capture with several placements."
         ),
     ] = None,
     monte_carlo: Annotated[
-        bool, typer.Option("--monte-carlo", help="Check the uncertainties by Monte Carlo (JCGM 101); a minute or two.")
+        bool,
+        typer.Option("--monte-carlo", help="Check the uncertainties by Monte Carlo (JCGM 101); takes a minute or two."),
     ] = False,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Refuse parameters that such data could not determine even without noise.")
+        bool,
+        typer.Option("--strict", help="Refuse free parameters that such data could not determine even without noise."),
     ] = False,
-    figure: Annotated[Path | None, typer.Option(help="Draw the residuals pose by pose as PNG.")] = None,
-    max_steps: Annotated[int, typer.Option(min=1, help="Step limit of each solve.")] = 300,
+    figure: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Plot the residual of every pose (PNG).")
+    ] = None,
+    max_steps: Annotated[int, typer.Option(min=1, metavar="N", help="Largest number of steps of each solve.")] = 300,
     as_json: Json = False,
 ) -> None:
-    """Identify the arm from repeatability, and fix its scale with the reference lengths."""
+    """Identify the parameters of an arm from a capture.
+
+    Stage 1 makes the tips of each socket coincide; the reference lengths then fix the scale.
+    """
+    from ..calibration.checks import plausible
     from ..calibration.record import record_of
     from ..calibration.stages import calibrate as run
     from ..files.calibrations import save_calibration
     from ..files.captures import load_capture
     from ..files.whole_file import fingerprint
     from ..summaries.calibration import calibration_summary
-    from ..summaries.warnings import plausible
-    from . import display, options
+    from . import calibration_display
 
-    if output.exists() and output.samefile(capture):
-        raise InputError(f"{output} is the capture itself; choose another output, so that held-out sockets are not lost.")
+    check_outputs([output, figure], [capture])
     recording = load_capture(capture)
     recording = recording._replace(
-        capture=recording.capture.select(only or None, without or ()), sources=(fingerprint(capture), *recording.sources)
+        capture=recording.capture.select(only or None, without or ()),
+        sources=(fingerprint(capture), *recording.sources),
     )
-    bounds = options.bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])
+    bounds = _bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])
     recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
     solving = {
         "method": method,
         "hold": None if hold == "none" else hold,
-        "noise": options.noise(encoder_arcsec, seating_mm),
+        "noise": _noise(encoder_arcsec, seating_mm),
     }
     capture_used = recording.capture
     with warnings.catch_warnings():
@@ -93,7 +134,9 @@ def calibrate(
         ):
             from ..calibration.cross_validation import cross_validate as validated
 
-            found = with_spinner("Cross-validating", lambda: validated(bounds.space.base, capture_used, bounds, **solving))
+            found = with_spinner(
+                "Cross-validating", lambda: validated(bounds.space.base, capture_used, bounds, **solving)
+            )
             record = record._replace(validation=found)
     if monte_carlo:
         from ..calibration.sampling import monte_carlo as sample
@@ -102,16 +145,63 @@ def calibrate(
         record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
     save_calibration(output, record)
     if figure is not None:
-        from ..plot.axes import calibration_figure
+        from ..plot import save_calibration_figure
 
-        calibration_figure(record, figure)
-    show_summary(calibration_summary(record) | {"written": str(output)}, as_json, display.calibration)
-    if not record.converged or not plausible(record.k):
+        save_calibration_figure(record, figure)
+    show_summary(calibration_summary(record) | {"written": str(output)}, as_json, calibration_display.calibration)
+    if not record.converged or not plausible(record.k) or record.implausible_residual:
         raise typer.Exit(1)
 
 
+def _bounds(
+    nominal: Any,
+    held: str | None,
+    free: str | None,
+    length_mm: float | None,
+    angle_deg: float | None,
+    single: Sequence[str],
+) -> Any:
+    """The bounds that the arm's file proposes, changed by what the command line says."""
+    from ..kinematics.arm import is_length
+    from ..kinematics.parameters import Bounds, Parameters
+
+    names = _names(held) if held is not None else nominal.held
+    space = Parameters.free_of(nominal.arm, held=names, free=_names(free or ""))
+    override = {name: width for name, width in nominal.override.items() if name in space.names}
+    for text in single:
+        name, _, width = text.partition("=")
+        try:
+            value = float(width)
+        except ValueError as error:
+            raise InputError(f"--bound '{text}' is not of the form NAME=WIDTH, in mm or deg.") from error
+        override[name] = value if is_length(name) else value * DEG
+    return Bounds.around(
+        space.base,
+        space,
+        length=nominal.length if length_mm is None else length_mm,
+        angle=nominal.angle if angle_deg is None else angle_deg * DEG,
+        override=override,
+    )
+
+
+def _noise(encoder_arcsec: float | None, seating_mm: float | None) -> Any:
+    """The noise that is known: both of its parts, or None."""
+    from ..data.noise import Noise
+
+    if encoder_arcsec is None and seating_mm is None:
+        return None
+    if encoder_arcsec is None or seating_mm is None:
+        missing = "--seating-mm" if seating_mm is None else "--encoder-arcsec"
+        raise InputError(f"{missing} is missing: give both standard deviations, or neither to have both estimated.")
+    return Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
 def _several(capture: Any, parameters: int) -> bool:
-    """Whether the reference length stood in several placements, so that each can be left out."""
+    """Whether the reference length was measured in several placements, so that each can be left out."""
     if len(capture.lengths) < 2:
         return False
     from ..calibration.cross_validation import can_cross_validate

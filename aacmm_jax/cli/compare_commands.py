@@ -8,36 +8,55 @@ import typer
 from ..core.errors import InputError
 from ..files.hdf5 import need, read_tables
 from ..files.whole_file import write_text
-from .app import Json, app, show_summary, with_spinner
+from .app import Json, app, check_outputs, examples, show_summary, with_spinner
 
 
-@app.command(epilog="Examples: aacmm compare march.h5 september.h5; "
-             "aacmm compare 2023.h5 2024.h5 2025.h5 --figure trend.png --max-length-change-mm 0.05")  # fmt: skip
+@app.command(
+    epilog=examples(
+        "aacmm compare march.h5 september.h5",
+        "aacmm compare 2023.h5 2024.h5 2025.h5 --figure trend.png --max-length-change-mm 0.05",
+    )
+)
 def compare(
     files: Annotated[
         list[Path],
         typer.Argument(
             metavar="OLD.h5 NEW.h5 [MORE.h5 ...]",
-            help="Calibrations of one arm, written by calibrate: two in this order; more are put in the order in which they were made.",
+            help="Calibrations of one arm, written by calibrate: two in this order; more than two are ordered by date.",
         ),
     ],
-    level: Annotated[float, typer.Option(help="Coverage of the expanded uncertainties.")] = 0.95,
+    level: Annotated[
+        float, typer.Option(metavar="P", help="Coverage probability of the expanded uncertainties.")
+    ] = 0.95,
     length_mm: Annotated[
         float | None,
-        typer.Option(help="Lengths that are followed over the volume. Default 300, or half of a small arm's reach."),
+        typer.Option(
+            metavar="MM",
+            help="Length whose change is computed all over the volume. Default 300, or half a small arm's reach.",
+        ),
     ] = None,
     figure: Annotated[
         Path | None,
-        typer.Option(help="Draw the changes, of three calibrations or more over time: PNG, SVG or PDF by the name."),
+        typer.Option(
+            metavar="FILE",
+            help="Plot the changes, over time for three calibrations or more: PNG, SVG or PDF by the name.",
+        ),
     ] = None,
-    csv: Annotated[Path | None, typer.Option("--csv", help="Write every parameter of every calibration as CSV.")] = None,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", metavar="FILE", help="Write every parameter of every calibration.")
+    ] = None,
     max_length_change_mm: Annotated[
         float | None,
-        typer.Option(min=0, help="Exit with code 1 where the largest change of a length from first to last is larger."),
+        typer.Option(
+            min=0, metavar="MM", help="Exit code 1 where a length changes by more than this from the first to the last."
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Say what moved between calibrations, beyond its uncertainty, and what that does to lengths."""
+    """Compare calibrations of one arm.
+
+    Reports which parameters changed beyond their uncertainty, and what that does to lengths.
+    """
     from ..files.calibrations import load_calibration
     from ..summaries.drift import change_exceeded, compared_summary, drift_csv
     from . import compare_display
@@ -53,9 +72,9 @@ def compare(
     summary["kept"], summary["failed"] = change_exceeded(found.drifts[-1].lengths, max_length_change_mm)
     written = []
     if figure is not None:
-        from ..plot.drift import save_trend
+        from ..plot import save_drift_trend
 
-        save_trend(found, figure)
+        save_drift_trend(found, figure)
         written.append(str(figure))
     if csv is not None:
         write_text(csv, drift_csv(found, labels))
@@ -74,8 +93,8 @@ def _compared(records: list, created: list[str], labels: list[str], level: float
         found = trend(records, created, level=level, length=length, labels=labels)
         if list(found.order) != sorted(found.order):
             caution = (
-                f"Ordered by their dates, not as they were named: {', '.join(labels[i] for i in found.order)}. The date is when poses were "
-                "measured, where the manifest states it, and else when the file was made."
+                f"Ordered by date, not as named: {', '.join(labels[i] for i in found.order)}. The date is when the "
+                "poses were measured, where the manifest states it, and otherwise when the file was made."
             )
             first = found.drifts[0]
             found = found._replace(drifts=(first._replace(warnings=(caution, *first.warnings)), *found.drifts[1:]))
@@ -83,7 +102,10 @@ def _compared(records: list, created: list[str], labels: list[str], level: float
     drift = compare(*records, level=level, length=length, labels=labels)
     dates = tuple(moment(date) for date in created)
     if dates[1] < dates[0]:
-        caution = f"{labels[1]} was made before {labels[0]} ({dates[1]:%Y-%m-%d %H:%M} and {dates[0]:%Y-%m-%d %H:%M}): is the order right?"
+        caution = (
+            f"{labels[1]} was made before {labels[0]} ({dates[1]:%Y-%m-%d %H:%M} and {dates[0]:%Y-%m-%d %H:%M}): "
+            "is the order right?"
+        )
         drift = drift._replace(warnings=(*drift.warnings, caution))
     return Trend(dates, (0, 1), (drift,))
 
@@ -97,12 +119,8 @@ def _created(file: Path) -> str:
 
 
 def _check_outputs(files: list[Path], figure: Path | None, csv: Path | None) -> None:
-    from ..plot.drift import check_format
-
     if figure is not None:
+        from ..plot.drift import check_format
+
         check_format(figure)
-    for output in (figure, csv):
-        if output is not None and output.exists() and any(file.exists() and output.samefile(file) for file in files):
-            raise InputError(f"{output} is one of the calibrations; choose another output.")
-    if figure is not None and csv is not None and figure.resolve() == csv.resolve():
-        raise InputError(f"{figure} is given for the figure and for the table; choose another for one of them.")
+    check_outputs([figure, csv], files)

@@ -6,19 +6,28 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from .display import _ARCSEC, _console, _number, _table, _verdicts, _warnings, _written
+from ..core.units import ARCSEC, DEG
+from .display import (
+    formatted,
+    new_console,
+    new_table,
+    print_table,
+    print_verdicts,
+    print_warnings,
+    print_written,
+)
 
-_COLUMNS = 9  # calibrations beside each other
+_COLUMNS = 9  # calibrations side by side
 
 
 def comparison(summary: dict[str, Any]) -> None:
-    """What came out in sentences, then the numbers: first against last in full, and of three or more all of them in brief."""
-    console = _console()
+    """Findings in sentences, then the numbers: the last against the first; of three or more, all against the first."""
+    console = new_console()
     console.print(
         f"[bold]{escape(summary['arm'])}[/bold]: {escape(summary['new'])} ({_day(summary['new_created'])}) against "
         f"{escape(summary['old'])} ({_day(summary['old_created'])})"
     )
-    _warnings(console, summary)
+    print_warnings(console, summary)
     for sentence in summary["findings"]:
         console.print(escape(sentence))
     _parameters(console, summary)
@@ -26,19 +35,19 @@ def comparison(summary: dict[str, Any]) -> None:
     if len(summary["trend"]) > 2:
         _trend(console, summary["trend"])
         _changes(console, summary["trend"])
-    _verdicts(console, summary)
-    _written(console, summary)
+    print_verdicts(console, summary)
+    print_written(console, summary)
 
 
 def _parameters(console: Console, summary: dict[str, Any]) -> None:
     """Values to the digits that the uncertainty of their change allows, changes in um and arcsec."""
-    table = _table(
+    table = new_table(
         f"\nParameters: change with its expanded uncertainty U ({100 * summary['level']:g} %)",
         "parameter", "unit", "old", "new", "unit", "change", "U", "",
     )  # fmt: skip
     for row in summary["parameters"]:
         length = row["unit"] == "mm"
-        factor, fine = (1.0, 1e3) if length else (180 / math.pi, _ARCSEC)
+        factor, fine = (1.0, 1e3) if length else (1 / DEG, 1 / ARCSEC)
         expanded = row["expanded"]
         decimals = _decimals(None if expanded is None else factor * expanded, 5)
         small = _decimals(None if expanded is None else fine * expanded, 2)
@@ -51,53 +60,57 @@ def _parameters(console: Console, summary: dict[str, Any]) -> None:
             "-" if expanded is None else f"{fine * expanded:.{small}f}",
             row["without"] or ("[bold]* beyond U[/bold]" if row["moved"] else ""),
         )
-    console.print(table)
+    print_table(console, table)
 
 
 def _lengths(console: Console, summary: dict[str, Any]) -> None:
     found = summary["lengths"]
-    title = f"\nThe same lengths of {found['length_mm']:g} mm, new less old, at {found['places']} places of the volume [mm]"
-    table = _table(title, "RMS", "RMS by the uncertainties alone", "95th percentile", "largest", "mean")
+    title = f"\nLengths of {found['length_mm']:g} mm, new minus old, at {found['places']} positions in the volume [mm]"
+    table = new_table(title, "RMS", "RMS by the uncertainties alone", "95th percentile", "largest", "mean")
     keys = ("rms_mm", "rms_by_chance_mm", "percentile_95_mm", "largest_mm", "mean_mm")
-    table.add_row(*(_number(found[key]) if found[key] is not None else "not determined" for key in keys))
-    console.print(table)
+    table.add_row(*(formatted(found[key]) if found[key] is not None else "not determined" for key in keys))
+    print_table(console, table)
 
 
 def _trend(console: Console, rows: list[dict[str, Any]]) -> None:
-    table = _table(
+    table = new_table(
         "\nEach calibration against the first (whose own error all of them share)",
-        "", "calibration", "date", "beyond U", "p together", "RMS [mm]", "by chance [mm]", "largest [mm]", "mean [um/m]",
-    )  # fmt: skip
+        *("", "calibration", "date", "beyond U", "p together"),
+        *("RMS [mm]", "by chance [mm]", "largest [mm]", "mean [um/m]"),
+    )
     table.columns[1].justify = "left"
     for number, row in enumerate(rows, start=1):
         cells = ["-"] * 6
         if number > 1:
             lengths = row["lengths"]
-            cells = [str(row["moved"]), "-" if row["p"] is None else "< 0.0001" if row["p"] < 1e-4 else f"{row['p']:.2g}"]
-            cells += [_number(lengths[key]) for key in ("rms_mm", "rms_by_chance_mm", "largest_mm")]
+            cells = [
+                str(row["moved"]),
+                "-" if row["p"] is None else "< 0.0001" if row["p"] < 1e-4 else f"{row['p']:.2g}",
+            ]
+            cells += [formatted(lengths[key]) for key in ("rms_mm", "rms_by_chance_mm", "largest_mm")]
             cells.append(f"{lengths['mean_um_per_m']:+.1f}")
         table.add_row(str(number), escape(row["calibration"]), _day(row["created"]), *cells)
-    console.print(table)
+    print_table(console, table)
 
 
 def _changes(console: Console, rows: list[dict[str, Any]]) -> None:
-    """Change of every parameter from the first calibration, the latest calibrations where they are too many for a line."""
+    """Change of every parameter from the first calibration, of many calibrations, the last ones."""
     shown = list(enumerate(rows, start=1))[1:][-_COLUMNS:]
     left_out = len(rows) - 1 - len(shown)
     title = "\nChange from the first calibration (*: beyond its uncertainty)"
     title += f", the last {_COLUMNS}; --csv and --json have all" if left_out else ""
-    table = _table(title, "parameter", "unit", *(str(number) for number, _ in shown))
+    table = new_table(title, "parameter", "unit", *(str(number) for number, _ in shown))
     for i, first in enumerate(shown[0][1]["parameters"]):
         length = first["unit"] == "mm"
         cells = []
         for _, row in shown:
             found = row["parameters"][i]
-            change = (1e3 if length else _ARCSEC) * found["change"]
+            change = (1e3 if length else 1 / ARCSEC) * found["change"]
             cells.append(f"{change:+.1f}" + ("*" if found["moved"] else "?" if found["moved"] is None else " "))
         table.add_row(first["parameter"], "um" if length else "arcsec", *cells)
-    console.print(table)
+    print_table(console, table)
     if any(row["moved"] is None for _, entry in shown for row in entry["parameters"]):
-        console.print("?: without an uncertainty, since it was fixed, on a bound or left open in one of the two.")
+        console.print("?: without an uncertainty, since it is fixed, on a bound or not determined in one of the two.")
 
 
 def _decimals(expanded: float | None, default: int) -> int:

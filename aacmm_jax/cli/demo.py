@@ -58,9 +58,9 @@ def run(folder: Path, seed: int) -> dict[str, Any]:
     save_arm(true.arm, folder / "true.toml", name=true.name)
     save_arm(record.calibrated.arm, folder / "calibrated.toml", name=record.calibrated.name)
     summary = _summary(record, _checks(record, seed))
-    from ..plot.axes import calibration_figure
+    from ..plot import save_calibration_figure
 
-    calibration_figure(record, folder / "calibration.png")
+    save_calibration_figure(record, folder / "calibration.png")
     files = ["capture.h5", "calibration.h5", "nominal.toml", "true.toml", "calibrated.toml", "calibration.png"]
     return summary | {"folder": str(folder), "files": files}
 

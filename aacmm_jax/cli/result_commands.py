@@ -1,4 +1,4 @@
-"""What is done with a calibration: ``evaluate``, ``report``, ``export``."""
+"""What is done with results: ``evaluate``, ``report``, ``export``, ``show``."""
 
 import json
 from pathlib import Path
@@ -9,46 +9,67 @@ import typer
 from ..core.errors import InputError
 from ..files.hdf5 import read_tables
 from ..files.whole_file import fingerprint, write_text
-from .app import CalibrationFile, Json, Only, Without, app, show_summary, with_spinner
+from .app import CalibrationFile, Json, Only, Without, app, check_outputs, examples, show_summary, with_spinner
 
 About = Annotated[
     Path | None,
-    typer.Option(metavar="FILE.toml", help="Laboratory, customer, item, persons, dates, as a certificate states them."),
+    typer.Option(
+        metavar="FILE.toml", help="Administrative data of a certificate: laboratory, customer, item, persons, dates."
+    ),
 ]
 
 
 @app.command(
-    epilog="Examples: aacmm evaluate calibration.h5 capture.h5 --mpe Deltam=0.05 --mpe E_Uni=0.025+L/40000; aacmm evaluate points.toml"
+    epilog=examples(
+        "aacmm evaluate calibration.h5 capture.h5 --mpe Deltam=0.05 --mpe E_Uni=0.025+L/40000",
+        "aacmm evaluate points.toml",
+    )
 )
 def evaluate(
     calibration: Annotated[
         Path,
         typer.Argument(
-            metavar="CALIBRATION.h5", help="Calibration written by calibrate; or alone a manifest (TOML) of points."
+            metavar="CALIBRATION.h5", help="Calibration, written by calibrate; or, alone, a manifest of points (TOML)."
         ),
     ],
-    capture: Annotated[Path | None, typer.Argument(metavar="CAPTURE.h5", help="Capture written by import or simulate.")] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Evaluation to write (HDF5), for aacmm report.")] = None,
+    capture: Annotated[
+        Path | None, typer.Argument(metavar="CAPTURE.h5", help="Capture, written by import or simulate.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE.h5", help="Evaluation to write (HDF5), for aacmm report."),
+    ] = None,
     only: Only = None,
     without: Without = None,
     mpe: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="FIGURE=A[+L/K]",
-            help="Limit of an acceptance figure in mm, decided by ISO 14253-1; repeatable. Exit code 1 where one is not met.",
+            metavar="NAME=A[+L/K]",
+            help="Maximum permissible error of an acceptance test, mm (L: the length); repeatable. Exit code 1 where "
+            "one is not met by the decision rule of ISO 14253-1.",
         ),
     ] = None,
     test_u_mm: Annotated[
-        float, typer.Option(min=0, help="Standard uncertainty that seat, fixture and temperature add to every test value.")
+        float,
+        typer.Option(
+            min=0, metavar="MM", help="Standard uncertainty that seat, fixture and temperature add to every test value."
+        ),
     ] = 0.0,
-    max_rms_mm: Annotated[float | None, typer.Option(min=0, help="Exit with code 1 where the RMS distance is larger.")] = None,
-    max_deltam_mm: Annotated[float | None, typer.Option(min=0, help="Exit with code 1 where Deltam is larger.")] = None,
+    max_rms_mm: Annotated[
+        float | None, typer.Option(min=0, metavar="MM", help="Exit code 1 where the RMS distance is larger.")
+    ] = None,
+    max_deltam_mm: Annotated[
+        float | None, typer.Option(min=0, metavar="MM", help="Exit code 1 where Deltam is larger.")
+    ] = None,
     max_length_error_mm: Annotated[
-        float | None, typer.Option(min=0, help="Exit with code 1 where any length's error is larger.")
+        float | None, typer.Option(min=0, metavar="MM", help="Exit code 1 where the error of any length is larger.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Try a calibration on a capture, with sockets it has never seen, and run every acceptance test that the capture holds."""
+    """Test a calibration on a capture that it has not seen.
+
+    Runs every acceptance test that the capture allows. A manifest of points is tested without a calibration.
+    """
     from ..acceptance.decision import read_limits
     from ..acceptance.metrics import METRICS
     from . import acceptance_display
@@ -59,7 +80,8 @@ def evaluate(
     if capture is None:
         if maxima or only or without:
             raise InputError(
-                "with a manifest of points there are only --mpe, --test-u-mm, --output and --json; name a calibration and a capture for more."
+                "a manifest of points takes only --mpe, --test-u-mm, --output and --json; name a calibration and a "
+                "capture for the other options."
             )
         summary = _evaluated_points(calibration, output, limits, test_u_mm)
         show_summary(summary, as_json, acceptance_display.points)
@@ -71,44 +93,45 @@ def evaluate(
         raise typer.Exit(1)
 
 
-@app.command(epilog="Example: aacmm report calibration.h5 -o report.html")
+@app.command(epilog=examples("aacmm report calibration.h5 -o report.html"))
 def report(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE.h5", help="A calibration, an evaluation (aacmm evaluate -o) or a study.")
+        Path, typer.Argument(metavar="FILE.h5", help="Calibration, evaluation (aacmm evaluate -o) or study.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Report to write: one HTML file that needs no network.")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE.html",
+            help="Report to write: one HTML file that needs no network connection.",
+        ),
+    ],
     about: About = None,
     as_json: Json = False,
 ) -> None:
-    """Write a report that can be handed on: warnings, results, uncertainty, charts and tables in one HTML file, which prints well."""
+    """Write a report of a result as one HTML file.
+
+    It holds warnings, results, uncertainties, charts and tables, and can be printed.
+    """
     from ..files.administrative_data import read_administrative_data
     from ..report import write_report
     from . import acceptance_display
 
-    show_summary(
-        with_spinner(
-            "Writing the report", lambda: write_report(file, output, None if about is None else read_administrative_data(about))
-        ),
-        as_json,
-        acceptance_display.report,
-    )
-
-
-def show_evaluation(file: Path, of_points: bool, as_json: bool) -> None:
-    """What an evaluation's file holds, printed."""
-    from ..files.evaluations import load_evaluation
-    from ..files.points_evaluations import load_points
-    from ..summaries.evaluation import evaluation_summary, points_summary
-    from . import acceptance_display
-
-    if of_points:
-        show_summary(points_summary(load_points(file)), as_json, acceptance_display.points)
-    else:
-        show_summary(evaluation_summary(load_evaluation(file)), as_json, acceptance_display.evaluation)
+    check_outputs([output], [file, about])
+    stated = None if about is None else read_administrative_data(about)
+    summary = with_spinner("Writing the report", lambda: write_report(file, output, stated))
+    show_summary(summary, as_json, acceptance_display.report)
 
 
 def _evaluated(
-    calibration: Path, capture: Path, output: Path | None, choice: tuple, limits: Any, u_test: float, maxima: dict[str, float]
+    calibration: Path,
+    capture: Path,
+    output: Path | None,
+    choice: tuple,
+    limits: Any,
+    u_test: float,
+    maxima: dict[str, float],
 ) -> dict[str, Any]:
     from ..acceptance.record import evaluation_of
     from ..files.calibrations import load_calibration
@@ -117,10 +140,7 @@ def _evaluated(
     from ..files.whole_file import fingerprint
     from ..summaries.evaluation import evaluation_summary
 
-    if output is not None:
-        for given in (calibration, capture):
-            if output.exists() and given.exists() and output.samefile(given):
-                raise InputError(f"{output} is one of the files to evaluate; choose another output.")
+    check_outputs([output], [calibration, capture])
     record, recording = load_calibration(calibration), load_capture(capture)
     recording = recording._replace(
         capture=recording.capture.select(choice[0] or None, choice[1] or ()),
@@ -136,14 +156,15 @@ def _evaluated(
 
 def _evaluated_points(manifest: Path, output: Path | None, limits: Any, u_test: float) -> dict[str, Any]:
     from ..acceptance.record import PointsRecord
+    from ..files.evaluations import save_points
     from ..files.points import read_points
-    from ..files.points_evaluations import save_points
     from ..summaries.evaluation import points_summary
 
     if manifest.suffix != ".toml":
-        raise InputError(f"{manifest} alone cannot be evaluated; name a capture too, or a manifest (TOML) of points.")
-    if output is not None and output.exists() and manifest.exists() and output.samefile(manifest):
-        raise InputError(f"{output} is the manifest itself; choose another output.")
+        raise InputError(
+            f"{manifest} alone cannot be evaluated; name a capture as well, or a manifest of points (TOML)."
+        )
+    check_outputs([output], [manifest])
     record = PointsRecord(read_points(manifest), limits, u_test)
     summary = points_summary(record)
     if output is not None:
@@ -153,7 +174,10 @@ def _evaluated_points(manifest: Path, output: Path | None, limits: Any, u_test: 
 
 
 @app.command(
-    epilog="Examples: aacmm export calibration.h5 --format toml -o arm.toml; aacmm export calibration.h5 --format dcc --about laboratory.toml -o certificate.xml"
+    epilog=examples(
+        "aacmm export calibration.h5 --format toml -o arm.toml",
+        "aacmm export calibration.h5 --format dcc --about laboratory.toml -o certificate.xml",
+    )
 )
 def export(
     calibration: CalibrationFile,
@@ -161,21 +185,22 @@ def export(
         Literal["toml", "json", "csv", "dcc"],
         typer.Option(
             "--format",
-            help="toml: an arm file; json: everything; csv: the parameters; dcc: a Digital Calibration Certificate (XML).",
+            help="toml: the arm; json: the whole summary; csv: parameters; dcc: Digital Calibration Certificate (XML).",
         ),
     ] = "toml",
     which: Annotated[
-        Literal["calibrated", "nominal", "true"], typer.Option("--arm", help="Which arm, for toml; true: of a simulation.")
+        Literal["calibrated", "nominal", "true"],
+        typer.Option("--arm", help="Which arm to write with --format toml; a simulation has a true one."),
     ] = "calibrated",
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="File to write; standard output without it.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write. Default: standard output.")
+    ] = None,
     about: About = None,
 ) -> None:
-    """Write a calibrated arm for other programs."""
+    """Write a calibration for other programs."""
     if about is not None and form != "dcc":
         raise InputError("--about is for certificates; give it with --format dcc.")
-    for given in (calibration, about):
-        if output is not None and given is not None and output.exists() and given.exists() and output.samefile(given):
-            raise InputError(f"{output} is what the export is made from; choose another output.")
+    check_outputs([output], [calibration, about])
     from ..files.arms import specification_toml
     from ..files.calibrations import load_calibration
     from ..summaries.calibration import calibration_summary, parameters_csv
@@ -184,9 +209,10 @@ def export(
     arms = {"calibrated": record.calibrated, "nominal": record.recording.nominal, "true": record.recording.true}
     arm = arms[which]
     if arm is None:
-        raise InputError(f"{calibration} is not of a simulation, so it holds no true arm.")
-    if not record.converged:
-        typer.echo(f"Warning: {calibration} did not converge: {record.reason}", err=True)
+        raise InputError(f"{calibration} is not of a simulation, so it has no true arm; choose another --arm.")
+    if not record.converged or record.implausible_residual:
+        reason = "the residual is that of no arm; see aacmm show." if record.converged else record.reason
+        typer.echo(f"Warning: {calibration} is not a calibration that can be used: {reason}", err=True)
     source = (
         f"calibrated from {sum(record.recording.capture.sizes)} poses, {record.method}, k = {record.k:.8f}"
         if which == "calibrated"
@@ -205,16 +231,71 @@ def export(
 
 
 def _certificate(calibration: Path, record: Any, about: Path | None) -> str:
-    from ..certificate.document import dcc
+    from ..certificate import dcc_xml
     from ..files.administrative_data import AdministrativeData as Stated
     from ..files.administrative_data import read_administrative_data
 
     made = read_tables(calibration, ("calibration",)).attributes
     sources = [fingerprint(calibration), *record.recording.sources]
-    return dcc(
+    return dcc_xml(
         record,
         Stated() if about is None else read_administrative_data(about),
         created=made["created"],
         sources=sources,
         command=made["command"],
     )
+
+
+@app.command(epilog=examples("aacmm show calibration.h5", "aacmm show panda"))
+def show(
+    file: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE",
+            help="Capture, calibration, evaluation or study (HDF5), or an arm: a TOML file or a shipped name.",
+        ),
+    ],
+    cell: Annotated[int | None, typer.Option(min=1, metavar="N", help="Of a study: show this cell in full.")] = None,
+    figures: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Of a study: write its figures (PNG) to this folder.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Print the content of a file."""
+    from ..files.arms import load_specification
+    from ..files.calibrations import load_calibration
+    from ..files.captures import load_capture
+    from ..summaries.calibration import arm_summary, calibration_summary, capture_summary
+    from . import calibration_display
+
+    path = Path(file)
+    if path.suffix in ("", ".toml") and not (path.is_file() and path.suffix == ""):
+        show_summary(arm_summary(load_specification(file)), as_json, calibration_display.arm)
+        return
+    stored = read_tables(path, ("capture", "calibration", "evaluation", "study"), without=("trials",))
+    kind = stored.attributes["kind"]
+    if kind == "study":
+        from .study_commands import show_study
+
+        show_study(path, cell, figures, as_json)
+        return
+    if cell is not None or figures is not None:
+        raise InputError(f"{file} holds a {kind}; --cell and --figures are for studies.")
+    if kind == "evaluation":
+        _show_evaluation(path, stored.attributes.get("of") == "points", as_json)
+    elif kind == "capture":
+        show_summary(capture_summary(load_capture(path)), as_json, calibration_display.capture)
+    else:
+        show_summary(calibration_summary(load_calibration(path)), as_json, calibration_display.calibration)
+
+
+def _show_evaluation(file: Path, of_points: bool, as_json: bool) -> None:
+    """Print the content of an evaluation's file."""
+    from ..files.evaluations import load_evaluation, load_points
+    from ..summaries.evaluation import evaluation_summary, points_summary
+    from . import acceptance_display
+
+    if of_points:
+        show_summary(points_summary(load_points(file)), as_json, acceptance_display.points)
+    else:
+        show_summary(evaluation_summary(load_evaluation(file)), as_json, acceptance_display.evaluation)

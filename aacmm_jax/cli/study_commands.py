@@ -8,50 +8,75 @@ from typing import Annotated, Any
 import typer
 
 from ..core.errors import InputError
-from .app import Json, Stopped, app, show_summary, with_spinner
+from .app import Json, Stopped, app, examples, show_summary, with_spinner
 
 
 @app.command(
-    epilog="Examples: aacmm study bound-sensitivity -o study.h5; "
-    "aacmm study my-study.toml -o study.h5 --dask tcp://scheduler:8786; aacmm study --resume -o study.h5"
+    epilog=examples(
+        "aacmm study bound-sensitivity -o study.h5",
+        "aacmm study my-study.toml -o study.h5 --dask tcp://scheduler:8786",
+        "aacmm study --resume -o study.h5",
+    )
 )
 def study(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Study to write, or to go on with (HDF5).")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Study to write, or to continue (HDF5).")
+    ],
     specification: Annotated[
         str | None,
-        typer.Argument(metavar="SPEC.toml", help="What to study: a TOML file, or a name that ships with the package."),
+        typer.Argument(
+            metavar="SPEC.toml", help="Specification: a TOML file, or the name of a study that ships with aacmm."
+        ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the study that the output holds.")] = False,
-    trials: Annotated[int | None, typer.Option(min=1, help="Trials in each cell, instead of the file's.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed, instead of the file's.")] = None,
-    chunk: Annotated[int | None, typer.Option(min=1, help="Trials in a block; changes no number. Default 1,000.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the study in the output file.")] = False,
+    trials: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Trials in each cell, instead of the specification's.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, metavar="N", help="Seed, instead of the specification's.")] = None,
+    chunk: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="N", help="Trials computed at a time; no result depends on it. Default 1000."),
+    ] = None,
     dask: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Run on a Dask cluster: address of its scheduler, or 'local' for processes here."),
+        typer.Option(
+            metavar="ADDRESS",
+            help="Run on a Dask cluster: the address of its scheduler, or 'local' for processes on this machine.",
+        ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Threads, or processes of --dask local. Default: one a core.")
+        int | None, typer.Option(min=1, metavar="N", help="Threads, or processes of --dask local. Default: one a core.")
     ] = None,
     shards: Annotated[
         bool,
-        typer.Option("--shards", help="Dask workers write their blocks themselves, to the output's folder, which they share."),
+        typer.Option(
+            "--shards", help="Dask workers write their trials themselves, to the output's folder, which they share."
+        ),
     ] = False,
     keep_parts: Annotated[
-        bool, typer.Option("--keep-parts", help="Leave the blocks in their folder at the end: for results too large to copy.")
+        bool,
+        typer.Option(
+            "--keep-parts", help="Leave the workers' files in their folder at the end: for results too large to copy."
+        ),
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Run thousands of simulated calibrations; run again, it goes on where it was."""
+    """Run a Monte Carlo study of simulated calibrations.
+
+    The same command continues a study that was interrupted.
+    """
     from ..study.runner import StudyProgress, run_study
     from ..study.store import read
 
     if resume and not output.exists():
-        raise InputError(f"{output} does not exist, so there is nothing to resume; leave --resume out to begin.")
+        raise InputError(
+            f"{output} does not exist, so there is nothing to resume; leave --resume out to start a study."
+        )
     if specification is None:
         if not resume:
-            raise InputError("name a specification, or use --resume to go on with the study that the output holds.")
+            raise InputError("name a specification, or use --resume to continue the study in the output file.")
         if trials is not None or seed is not None:
-            raise InputError("--trials and --seed are those that the study was begun with; leave them out with --resume.")
+            raise InputError("--trials and --seed stay those of the study; leave them out with --resume.")
         asked = read(output).study
     else:
         asked = _asked(specification, trials, seed)
@@ -76,7 +101,8 @@ def study(
     show_summary(summary, as_json, lambda _: _ended(outcome, output))
     if not outcome.finished:
         raise Stopped(
-            f"Stopped; {outcome.done:,} of {outcome.total:,} trials are kept. Go on with: aacmm study --resume -o {shlex.quote(str(output))}"
+            f"Stopped; {outcome.done:,} of {outcome.total:,} trials are kept. "
+            f"Continue with: aacmm study --resume -o {shlex.quote(str(output))}"
         )
 
 
@@ -89,7 +115,9 @@ def _asked(specification: str, trials: int | None, seed: int | None) -> Any:
     changes = {name: value for name, value in (("trials", trials), ("seed", seed)) if value is not None}
     if not changes:
         return asked
-    changed = validated(type(asked.specification), asked.specification.model_dump(exclude_unset=True) | changes, specification)
+    changed = validated(
+        type(asked.specification), asked.specification.model_dump(exclude_unset=True) | changes, specification
+    )
     return Study(changed, asked.nominal, asked.recording)
 
 
@@ -108,7 +136,14 @@ def _on(dask: str | None, workers: int | None) -> Any:
 def _bar(asked: Any) -> Any:
     """A progress bar with rate and time left, on standard error, where that is a terminal."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     console = Console(stderr=True)
     total = asked.trials * len(asked.cells)
@@ -117,16 +152,18 @@ def _bar(asked: Any) -> Any:
             yield lambda _: None
         return
     columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("trials"), TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
-    )  # fmt: skip
+        *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("trials")),
+        *(TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()),
+    )
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("Compiling", total=total, rate="")
 
         def show(state: Any) -> None:
             running = progress.tasks[0]
             speed = running.speed
-            progress.update(task, description="Calibrating", completed=state.done, rate=f"{speed:,.0f}/s" if speed else "")
+            progress.update(
+                task, description="Calibrating", completed=state.done, rate=f"{speed:,.0f}/s" if speed else ""
+            )
 
         yield show
 
@@ -139,7 +176,7 @@ def _ended(outcome: Any, output: Path) -> None:
 
 def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool) -> None:
     """Print a study's results, and draw its figures."""
-    from ..plot.study import write_figures
+    from ..plot import save_study_figures
     from ..study.results import Results
     from ..study.statistics import study_summary
     from . import study_display
@@ -149,6 +186,6 @@ def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool
         raise InputError(f"{file} has {len(results.study.cells)} cells, so there is no cell {cell}; name another.")
     summary = with_spinner("Reading", lambda: study_summary(results, cell))
     if figures is not None:
-        paths = with_spinner("Drawing", lambda: write_figures(results, figures))
+        paths = with_spinner("Drawing", lambda: save_study_figures(results, figures))
         summary["figures_written"] = [str(path) for path in paths]
     show_summary(summary, as_json, study_display.study if cell is None else study_display.one_cell)

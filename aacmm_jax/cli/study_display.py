@@ -6,9 +6,9 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from .display import _console, _table
+from ..core.units import ARCSEC
+from .display import new_console, new_table, print_table
 
-_ARCSEC = 3600 * 180 / math.pi
 _MOST = 40  # cells in a table
 # Figure, heading, factor to the shown unit.
 _OVERVIEW = (
@@ -17,14 +17,14 @@ _OVERVIEW = (
     ("deltam", "Deltam [mm]", 1.0),
     ("length_error_stage1", "length error before [mm]", 1.0),
     ("length_error", "and after [mm]", 1.0),
-    ("angle_error", "angle error [arcsec]", _ARCSEC),
+    ("angle_error", "angle error [arcsec]", 1 / ARCSEC),
 )
 _STAGE1 = (
     ("scale", "scale", 1.0),
     ("de_stage1", "DE [mm]", 1.0),
     ("deltam_stage1", "Deltam [mm]", 1.0),
     ("length_error_stage1", "length error [mm]", 1.0),
-    ("angle_error_stage1", "angle error [arcsec]", _ARCSEC),
+    ("angle_error_stage1", "angle error [arcsec]", 1 / ARCSEC),
 )
 _NAMES = {
     "k": ("k = measured / nominal", 1.0),
@@ -33,11 +33,11 @@ _NAMES = {
     "de_stage1": ("DE before the scale fix [mm]", 1.0),
     "deltam_stage1": ("Deltam before the scale fix [mm]", 1.0),
     "length_error_stage1": ("largest length error before the scale fix [mm]", 1.0),
-    "angle_error_stage1": ("largest angle error before the scale fix [arcsec]", _ARCSEC),
+    "angle_error_stage1": ("largest angle error before the scale fix [arcsec]", 1 / ARCSEC),
     "de": ("DE after the scale fix [mm]", 1.0),
     "deltam": ("Deltam after the scale fix [mm]", 1.0),
     "length_error": ("largest length error after the scale fix [mm]", 1.0),
-    "angle_error": ("largest angle error after the scale fix [arcsec]", _ARCSEC),
+    "angle_error": ("largest angle error after the scale fix [arcsec]", 1 / ARCSEC),
 }
 
 
@@ -84,7 +84,7 @@ def _column(factor: str) -> str:
 
 def study(summary: dict[str, Any]) -> None:
     """All cells: what converged, then every figure's mean; then spread and percentiles."""
-    console = _console()
+    console = new_console()
     _heading(console, summary)
     cells = [cell for cell in summary["results"] if cell["trials_run"]]
     if not cells:
@@ -95,17 +95,20 @@ def study(summary: dict[str, Any]) -> None:
     _identified(console, shown, names)
     fixed = any("de" in cell["figures"] for cell in cells)
     figures = _OVERVIEW if fixed else _STAGE1
-    table = _table("\nMeans over converged trials", "cell", *names, *(heading for _, heading, _ in figures))
+    table = new_table("\nMeans over converged trials", "cell", *names, *(heading for _, heading, _ in figures))
     for cell in shown:
         values = (_both(_mean(cell, name), factor) for name, _, factor in figures)
         table.add_row(str(cell["cell"]), *map(_text, cell["factors"].values()), *values)
-    console.print(table)
+    print_table(console, table)
     if len(cells) > 1:
-        _spreads(console, shown, ("length_error", "angle_error") if fixed else ("length_error_stage1", "angle_error_stage1"))
+        _spreads(
+            console, shown, ("length_error", "angle_error") if fixed else ("length_error_stage1", "angle_error_stage1")
+        )
     if len(cells) > len(shown):
         console.print(f"\n{len(cells) - len(shown)} more cells: see them with --json, or aacmm_jax.study.open_study.")
     console.print(
-        "\nDigits in parentheses: Monte Carlo standard error of the last digits. Length and angle error: the largest of all parameters'."
+        "\nDigits in parentheses: Monte Carlo standard error of the last digits. Length and angle error: the largest "
+        "of all parameters."
     )
     if len(cells) == 1:
         _full(console, cells[0])
@@ -116,7 +119,7 @@ def study(summary: dict[str, Any]) -> None:
 
 def one_cell(summary: dict[str, Any]) -> None:
     """One cell in full."""
-    console = _console()
+    console = new_console()
     _heading(console, summary)
     for cell in summary["results"]:
         levels = ", ".join(f"{name} {_text(level)}" for name, level in cell["factors"].items())
@@ -139,15 +142,20 @@ def _heading(console: Console, summary: dict[str, Any]) -> None:
 
 
 def _identified(console: Console, cells: list[dict[str, Any]], names: list[str]) -> None:
-    table = _table(
-        "\nIdentifications", "cell", *names, "trials", "converged [%]", "truth in the box [%]", "on a bound [%]", "most often",
-    )  # fmt: skip
+    table = new_table(
+        "\nIdentifications",
+        *("cell", *names, "trials", "converged [%]", "truth within bounds [%]", "on a bound [%]", "most often"),
+    )
     for cell in cells:
         worst = max(cell["parameters"], key=lambda row: row["on_a_bound"]["value"], default=None)
-        often = f"{worst['parameter']} {_percent(worst['on_a_bound'])} %" if worst and worst["on_a_bound"]["value"] else ""
-        shares = (_percent(cell[key]) for key in ("converged", "truth_inside", "on_a_bound"))
-        table.add_row(str(cell["cell"]), *map(_text, cell["factors"].values()), f"{cell['trials_run']:,}", *shares, often)
-    console.print(table)
+        often = (
+            f"{worst['parameter']} {_percent(worst['on_a_bound'])} %" if worst and worst["on_a_bound"]["value"] else ""
+        )
+        rates = (_percent(cell[key]) for key in ("converged", "truth_inside", "on_a_bound"))
+        table.add_row(
+            str(cell["cell"]), *map(_text, cell["factors"].values()), f"{cell['trials_run']:,}", *rates, often
+        )
+    print_table(console, table)
     failed = {}
     for cell in cells:
         for reason in ("max_steps", "stalled", "nonfinite"):
@@ -155,11 +163,13 @@ def _identified(console: Console, cells: list[dict[str, Any]], names: list[str])
     words = {
         "max_steps": "reached the step limit",
         "stalled": "stalled",
-        "nonfinite": "had a pose that the true arm could not take up",
+        "nonfinite": "had a pose that the true arm cannot take",
     }
     for reason, count in failed.items():
         if count:
-            console.print(f"[yellow]{count:,} trial{'s' if count > 1 else ''} {words[reason]};[/yellow] left out of the means.")
+            console.print(
+                f"[yellow]{count:,} trial{'s' if count > 1 else ''} {words[reason]};[/yellow] left out of the means."
+            )
 
 
 def _mean(cell: dict[str, Any], name: str) -> dict[str, Any] | None:
@@ -169,12 +179,12 @@ def _mean(cell: dict[str, Any], name: str) -> dict[str, Any] | None:
 def _spreads(console: Console, cells: list[dict[str, Any]], names: tuple[str, ...]) -> None:
     for name in names:
         text, factor = _NAMES[name]
-        table = _table(f"\n{text[0].upper()}{text[1:]}", "cell", "mean", "spread", "5 %", "50 %", "95 %")
+        table = new_table(f"\n{text[0].upper()}{text[1:]}", "cell", "mean", "spread", "5 %", "50 %", "95 %")
         for cell in cells:
             if name in cell["figures"]:
                 table.add_row(str(cell["cell"]), *_row(cell["figures"][name], factor))
         if table.row_count:
-            console.print(table)
+            print_table(console, table)
 
 
 def _row(figure: dict[str, Any], factor: float) -> list[str]:
@@ -182,19 +192,19 @@ def _row(figure: dict[str, Any], factor: float) -> list[str]:
 
 
 def _full(console: Console, cell: dict[str, Any]) -> None:
-    table = _table("\nFigures over converged trials", "", "mean", "spread", "5 %", "50 %", "95 %")
+    table = new_table("\nFigures over converged trials", "", "mean", "spread", "5 %", "50 %", "95 %")
     for name, (text, factor) in _NAMES.items():
         if name in cell["figures"]:
             table.add_row(escape(text), *_row(cell["figures"][name], factor))
-    console.print(table)
-    table = _table(
+    print_table(console, table)
+    table = new_table(
         "\nParameters: estimate less truth", "parameter", "unit", "bias", "spread", "on a bound [%]",
     )  # fmt: skip
     for row in cell["parameters"]:
-        factor, unit = (1.0, "mm") if row["unit"] == "mm" else (_ARCSEC, "arcsec")
+        factor, unit = (1.0, "mm") if row["unit"] == "mm" else (1 / ARCSEC, "arcsec")
         numbers = (_both(row["bias"], factor), _both(row["spread"], factor), _percent(row["on_a_bound"]))
         table.add_row(row["parameter"], unit, *numbers)
-    console.print(table)
+    print_table(console, table)
 
 
 def _written(console: Console, summary: dict[str, Any]) -> None:

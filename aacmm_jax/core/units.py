@@ -1,4 +1,4 @@
-"""Units at the edges: everything inside is in mm and rad. A value times its unit is in mm or rad; divided by it, in the unit."""
+"""Units in mm and rad, which everything inside is in: a value times its unit is in mm or rad; divided by it, in the unit."""
 
 import math
 
@@ -6,5 +6,5 @@ M = 1000.0  # mm
 INCH = 25.4  # mm
 UM = 1e-3  # mm
 DEG = math.pi / 180  # rad
-ARCMIN = DEG / 60  # rad
-ARCSEC = DEG / 3600  # rad
+ARCMIN = math.pi / (180 * 60)  # rad
+ARCSEC = math.pi / (180 * 3600)  # rad

@@ -161,8 +161,8 @@ def _checked_angles(name: str, angles: Numbers) -> Array | np.ndarray:
             array = np.asarray(angles, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise InputError(
-                f"socket '{name}' has something that is not a number, or rows of unequal length; give one row of numbers "
-                "a pose."
+                f"socket '{name}' has something that is not a number, or rows of unequal length; give one row of "
+                "numbers a pose."
             ) from error
     if array.ndim != 2 or 0 in array.shape:
         raise InputError(

@@ -2,6 +2,7 @@
 
 import datetime
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -32,8 +33,8 @@ def compare(
 
     The two are taken as independent, so variances add (JCGM 100, 5.1.2) and effective degrees of freedom follow Welch
     and Satterthwaite (annex G.4). A common error, such as that of one artefact's certified length, cancels in the
-    change, so the uncertainty is then too large rather than too small. k is not compared: it is a correction of stage 1,
-    not a parameter of the arm.
+    change, so the uncertainty is then too large rather than too small. k is not compared: it is a correction of
+    stage 1, not a parameter of the arm.
 
     Args:
         old: The earlier calibration.
@@ -175,7 +176,7 @@ def _standard_uncertainties(record: CalibrationRecord, names: tuple[str, ...]) -
     return np.array([known.get(name, 0.0) for name in names])
 
 
-def _check(records: Sequence[CalibrationRecord], level: float, labels: Sequence[str]) -> None:
+def _check(records: Sequence[Any], level: float, labels: Sequence[str]) -> None:
     """Raise `InputError` for what cannot be compared."""
     if not 0 < level < 1:
         raise InputError(f"level is {level:g}; give a number between 0 and 1, for example 0.95.")
@@ -214,7 +215,7 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[s
     found += [sentence for sentence in (_common_poses(old, new, labels), _other_arm(old, new, labels)) if sentence]
     if old.method != new.method:
         found.append(
-            f"Different methods: {labels[0]} is {old.method}, {labels[1]} {new.method}; that explains part of the change."
+            f"Different methods: {labels[0]} is {old.method}, {labels[1]} {new.method}; this is part of the change."
         )
     for one, other, label in ((old, new, labels[0]), (new, old, labels[1])):
         alone = [name for name in one.names if name not in other.names]

@@ -144,8 +144,8 @@ def _of_lengths(drift: Drift) -> str:
     percent = 100 * float(np.mean(lengths.moved))
     return (
         f"{start} over the volume changed by {lengths.rms:.4f} mm RMS, where the uncertainties alone would give "
-        f"{lengths.rms_by_chance:.4f} mm, and at most by {lengths.largest:+.4f} mm; {percent:.0f} % of them moved beyond "
-        f"their uncertainty ({100 * (1 - drift.level):.2g} % would by chance)."
+        f"{lengths.rms_by_chance:.4f} mm, and at most by {lengths.largest:+.4f} mm; {percent:.0f} % of them moved "
+        f"beyond their uncertainty ({100 * (1 - drift.level):.2g} % would by chance)."
     )
 
 

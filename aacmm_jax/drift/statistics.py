@@ -224,7 +224,7 @@ def _measured(
     """Lengths by an arm, their standard uncertainties, and that of their mean; mm."""
     between = uncertainty.arm.position(end) - uncertainty.arm.position(start)
     measured = jnp.linalg.norm(between, axis=-1)
-    slopes = uncertainty.slopes(end) - uncertainty.slopes(start)
+    slopes = uncertainty.derivatives(end) - uncertainty.derivatives(start)
     along = jnp.einsum("vc,vcw->vw", between / measured[:, None], slopes)
     each = uncertainty.covariance_of_functions(along[:, None, :])[:, 0, 0]
     mean = uncertainty.covariance_of_functions(jnp.mean(along, axis=0)[None, :])[0, 0]

@@ -9,9 +9,9 @@ from .calibrations import save_calibration as save_calibration
 from .captures import load_capture as load_capture
 from .captures import save_capture as save_capture
 from .evaluations import load_evaluation as load_evaluation
+from .evaluations import load_points as load_points
 from .evaluations import save_evaluation as save_evaluation
+from .evaluations import save_points as save_points
 from .manifest import read_manifest as read_manifest
 from .plans import save_plan as save_plan
 from .points import read_points as read_points
-from .points_evaluations import load_points as load_points
-from .points_evaluations import save_points as save_points

@@ -1,4 +1,4 @@
-"""What a calibration certificate says besides numbers: laboratory, customer, item, persons and dates, written by people in TOML."""
+"""Administrative data of a certificate (DCC's term), in TOML: laboratory, customer, item, persons and dates."""
 
 import datetime
 import itertools
@@ -6,28 +6,30 @@ import os
 import re
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
 from ..core.errors import InputError
-from .toml import read_toml
+from .toml import Strict, read_toml
 
 NOT_STATED = "not stated"
-NO_COUNTRY = "ZZ"  # ISO 3166-1 leaves it to users: the certificate must have a country code, and none was given
+NO_COUNTRY = "ZZ"  # reserved for users by ISO 3166-1: a certificate must have a country code, and none was given
 
 # All but the characters of XML 1.0, production 2.
-_UNHOLDABLE = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_NOT_IN_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def held_by_xml(text: str, what: str) -> str:
-    """The same text, or `InputError` where it has a character that XML 1.0 cannot hold. ``what`` names it in the sentence."""
-    found = _UNHOLDABLE.search(text)
+    """The same text, or `InputError` where it has a character that XML 1.0 cannot hold; ``what`` names the text."""
+    found = _NOT_IN_XML.search(text)
     if found:
-        raise InputError(f"{what} holds the character U+{ord(found.group()):04X}, which no XML file can hold; take it out.")
+        raise InputError(
+            f"{what} holds the character U+{ord(found.group()):04X}, which no XML file can hold; take it out."
+        )
     return text
 
 
 def _text(text: str) -> str:
-    """Text without blanks around it, as the schema wants it."""
+    """Text without blanks around it, as the schema of the DCC requires."""
     text = held_by_xml(text, "the text").strip(" \t\n\r")
     if not text:
         raise ValueError("the text is empty; give some, or leave the key out.")
@@ -46,11 +48,7 @@ def _country(code: str) -> str:
 Country = Annotated[str, AfterValidator(_country)]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Contact(_Strict):
+class Contact(Strict):
     """A laboratory's or a customer's name and address. ``country`` is a code of ISO 3166-1: two capital letters."""
 
     name: Text = NOT_STATED
@@ -68,7 +66,7 @@ class Laboratory(Contact):
     code: Text | None = None
 
 
-class Item(_Strict):
+class Item(Strict):
     """The arm that was calibrated; without a name, it is called as in its arm file."""
 
     name: Text | None = None
@@ -78,7 +76,7 @@ class Item(_Strict):
     customer_number: Text | None = None  # what the customer calls it by
 
 
-class Person(_Strict):
+class Person(Strict):
     """A person responsible for the certificate."""
 
     name: Text
@@ -86,7 +84,7 @@ class Person(_Strict):
     main_signer: bool = False
 
 
-class Reference(_Strict):
+class Reference(Strict):
     """A reference artefact that the lengths are between: gauge block, ball bar, plate."""
 
     name: Text
@@ -96,8 +94,8 @@ class Reference(_Strict):
     certificate_number: Text | None = None  # of its own calibration
 
 
-class Certificate(_Strict):
-    """Number, dates and conditions. Without dates, the day on which the calibration was computed counts as begin and end."""
+class Certificate(Strict):
+    """Number, dates and conditions; without dates, begin and end are the day on which the calibration was computed."""
 
     number: Text | None = None
     country: Country | None = None  # where it is issued; by default the laboratory's
@@ -116,13 +114,13 @@ class Certificate(_Strict):
         given = [(name, date) for name, date in dates if date is not None]
         for (earlier, first), (later, second) in itertools.pairwise(given):
             if first > second:
-                raise ValueError(f"{earlier} is {first}, after {later} on {second}; mend one of them.")
+                raise ValueError(f"{earlier} is {first}, after {later} on {second}; correct one of them.")
         if self.temperature_u_celsius is not None and self.temperature_celsius is None:
             raise ValueError("temperature_u_celsius is given without temperature_celsius; give both.")
         return self
 
 
-class Conformity(_Strict):
+class Conformity(Strict):
     """A statement of conformity: the verdict, the specification it is about, and the rule by which it was decided."""
 
     verdict: Literal["pass", "fail", "conditionalPass", "conditionalFail", "noPass", "noFail"]
@@ -130,15 +128,15 @@ class Conformity(_Strict):
     decision_rule: Text
 
 
-class AdministrativeData(_Strict):
-    """What a certificate needs besides numbers. Everything is optional, and says that it is not stated where it is missing."""
+class AdministrativeData(Strict):
+    """The administrative data of a certificate. All are optional; the certificate says what is not stated."""
 
     laboratory: Laboratory = Laboratory()
     customer: Contact = Contact()
     item: Item = Item()
-    person: list[Person] = []
+    person: list[Person] = Field(default_factory=list)
     certificate: Certificate = Certificate()
-    reference: list[Reference] = []
+    reference: list[Reference] = Field(default_factory=list)
     conformity: Conformity | None = None
 
     @property
@@ -148,21 +146,38 @@ class AdministrativeData(_Strict):
 
 
 def read_administrative_data(path: str | os.PathLike) -> AdministrativeData:
-    """Read the TOML file about a certificate: ``[laboratory]``, ``[customer]``, ``[item]``, ``[[person]]``, ``[certificate]``,
-    ``[[reference]]``, ``[conformity]``. Raises `InputError` that names the file, the place in it and the mend."""
+    """Read the administrative data of a certificate.
+
+    Args:
+        path: a TOML file with the tables ``[laboratory]``, ``[customer]``, ``[item]``, ``[[person]]``,
+            ``[certificate]``, ``[[reference]]`` and ``[conformity]``, each of them optional.
+
+    Returns:
+        The data, checked.
+
+    Raises:
+        InputError: names the file, the key in it and what to do.
+    """
     return read_toml(path, AdministrativeData)
 
 
-def check_conformity(about: AdministrativeData, *, simulated: bool, decision: str | None = None, tested: bool = False) -> None:
-    """Refuse a statement of conformity that the data contradict: of a simulated arm, or other than what an evaluation decided."""
+def check_conformity(
+    about: AdministrativeData, *, simulated: bool, decision: str | None = None, tested: bool = False
+) -> None:
+    """Refuse a statement of conformity that the data contradict: of a simulated arm, or against an evaluation."""
     if about.conformity is None:
         return
     verdict = about.conformity.verdict
     if simulated:
-        raise InputError("conformity is stated of a simulated arm, which conforms to nothing; leave [conformity] out.")
+        raise InputError("conformity is stated of a simulated arm, which cannot conform; leave [conformity] out.")
     passes = {"pass": ("conforms",), "fail": ("fails",)}.get(verdict)
     if tested and passes is not None and decision not in passes:
-        came = {"conforms": "every limit is kept", "fails": "a limit is not kept", "undecided": "a limit is undecided"}
+        results = {
+            "conforms": "every limit is kept",
+            "fails": "a limit is not kept",
+            "undecided": "a limit is undecided",
+        }
         raise InputError(
-            f"conformity.verdict is '{verdict}', but of this evaluation {came.get(decision or '', 'no limit was given')}; mend the statement."
+            f"conformity.verdict is '{verdict}', but of this evaluation "
+            f"{results.get(decision or '', 'no limit was given')}; correct the statement."
         )

@@ -1,4 +1,4 @@
-"""A finished calibration as plain tables: made from a `Calibration`, written to and read from HDF5."""
+"""Calibrations in HDF5: the capture, the arms of each stage, parameters with their covariance, and cross-validation."""
 
 import os
 
@@ -6,16 +6,23 @@ import numpy as np
 
 from ..calibration.record import CalibrationRecord
 from ..calibration.results import CrossValidation, LeftOut
+from ..core.errors import InputError
 from ..data.noise import Noise
 from ..kinematics.arm import is_length
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
-from .hdf5 import Stored, Table, Variable, need, read_tables, undamaged, write_tables
-
-STAGES = ("nominal", "stage1", "calibrated")
+from .hdf5 import Stored, Table, Variable, names_in, need, read_tables, undamaged, write_tables
 
 
 def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None:
-    """Write a calibration with its capture and arms to HDF5, whole or not at all."""
+    """Write a calibration with its capture and arms to HDF5, whole or not at all.
+
+    Args:
+        path: the file to write.
+        record: the calibration, from `calibration.record_of`.
+
+    Raises:
+        InputError: the file cannot be written, or a name holds a character that no file can hold.
+    """
     tables = recording_tables(record.recording)
     tables["stage1_arm"] = arm_table(record.stage1)
     tables["calibrated_arm"] = arm_table(record.calibrated)
@@ -33,7 +40,7 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
     attributes = recording_attributes(record.recording) | {
         "sampled_says": record.sampled_says,
         "method": record.method,
-        "held": ",".join(record.held),
+        "held": list(record.held) or "",
         "hold": record.hold,
         "scale_k": record.k,
         "scale_u": record.u_k,
@@ -41,7 +48,6 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
         "seating_mm": float(record.noise.seating),
         "form": record.noise_model,
         "freedom": record.degrees_of_freedom,
-        "stretch_variance": float(record.common_scale_error[-1]),
         "misfit": record.reduced_chi,
         "steps": record.steps,
         "converged": record.converged,
@@ -51,7 +57,17 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
 
 
 def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
-    """Read a calibration. Raises `InputError` where the file is missing, damaged, foreign, newer or no calibration."""
+    """Read a calibration that `save_calibration` or ``aacmm calibrate`` wrote.
+
+    Args:
+        path: the file to read.
+
+    Returns:
+        The record, with arrays in mm and rad.
+
+    Raises:
+        InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+    """
     stored = read_tables(path, ("calibration",))
     need(path, stored.tables, "stage1_arm", "calibrated_arm", "parameters")
     with undamaged(path):
@@ -60,13 +76,17 @@ def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
 
 def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
     table, attributes = stored.tables["parameters"], stored.attributes
+    if attributes.get("stretch_variance", 0.0):
+        raise InputError(
+            f"{path} is from an earlier version, which divided fixed lengths by k; calibrate again from its capture."
+        )
     need(path, table, "parameter", "lower", "upper", "active_stage1", "active", "covariance", "determined", of="entry")
     return CalibrationRecord(
         recording=recording_of(path, stored),
         stage1=specification_of(path, stored, "stage1_arm"),
         calibrated=specification_of(path, stored, "calibrated_arm"),
         names=tuple(str(name) for name in table["parameter"]),
-        held=tuple(attributes["held"].split(",")) if attributes.get("held") else (),
+        held=names_in(attributes.get("held")),
         hold=attributes.get("hold"),
         lower=table["lower"],
         upper=table["upper"],
@@ -76,9 +96,6 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
         determined=table["determined"].astype(bool),
         # Files of version 0.1 and before have none of the following.
         open=table.get("open", np.zeros_like(table["covariance"])),
-        common_scale_error=np.append(
-            table.get("stretch", np.zeros(len(table["covariance"]))), attributes.get("stretch_variance", 0.0)
-        ),
         noise=Noise(
             encoder_arcsec=np.squeeze(np.atleast_1d(attributes.get("encoder_arcsec", 0.0))),
             seating=attributes.get("seating_mm", 0.0),
@@ -113,9 +130,8 @@ def _parameter_table(record: CalibrationRecord) -> Table:
             ("parameter",), record.active_stage1, "1", "-1 on the lower bound, +1 on the upper, in stage 1"
         ),
         "active": Variable(("parameter",), record.active, "1", "-1 on the lower bound, +1 on the upper"),
-        "determined": Variable(("parameter",), record.determined.astype(np.int8), "1", "0: only a combination is determined"),
-        "stretch": Variable(
-            ("parameter",), record.common_scale_error[:-1], both, "covariance with the relative error of held lengths"
+        "determined": Variable(
+            ("parameter",), record.determined.astype(np.int8), "1", "0: only a combination is determined"
         ),
         "open": Variable(
             ("parameter", "parameter_2"), record.open, "1", "projector onto what is not determined, in mm and mrad"
@@ -130,17 +146,31 @@ def _parameter_table(record: CalibrationRecord) -> Table:
 def _validation_table(record: CalibrationRecord) -> Table:
     assert record.validation is not None
     groups = record.validation.groups
+    sockets = [(number, name) for number, group in enumerate(groups) for name in group.sockets]
     number = np.concatenate([np.full(len(group.length_error), i) for i, group in enumerate(groups)])
     variables = {
-        "group": Variable(("group",), [",".join(group.sockets) for group in groups], "", "sockets left out together"),
+        "group": Variable(
+            ("group",), [", ".join(group.sockets) for group in groups], "", "sockets left out together, as a label"
+        ),
+        "left_out_socket": Variable(
+            ("left_out_socket",), [name for _, name in sockets], "", "sockets left out, one after the other"
+        ),
+        "socket_number": Variable(
+            ("left_out_socket",), [i for i, _ in sockets], "1", "which group a socket is of, from 0"
+        ),
         "poses": Variable(("group",), [group.poses for group in groups], "1", "poses in sockets with more than one"),
         "rms": Variable(("group",), [group.rms for group in groups], "mm", "RMS distance from the centroid, found"),
         "rms_predicted": Variable(("group",), [group.rms_predicted for group in groups], "mm", "the same, predicted"),
         "converged": Variable(("group",), [int(group.converged) for group in groups], "1", "1: the others converged"),
-        "left_out_length": Variable(("left_out_length",), np.arange(len(number)), "1", "lengths left out, one after the other"),
+        "left_out_length": Variable(
+            ("left_out_length",), np.arange(len(number)), "1", "lengths left out, one after the other"
+        ),
         "number": Variable(("left_out_length",), number, "1", "which group a length is of, from 0"),
         "length_error": Variable(
-            ("left_out_length",), np.concatenate([group.length_error for group in groups]), "mm", "error of a length left out"
+            ("left_out_length",),
+            np.concatenate([group.length_error for group in groups]),
+            "mm",
+            "error of a length left out",
         ),
         "length_u": Variable(
             ("left_out_length",),
@@ -157,11 +187,13 @@ def _validation_of(stored: Stored) -> CrossValidation | None:
     if table is None:
         return None
     groups = []
-    for i, names in enumerate(table["group"]):
+    for i, label in enumerate(table["group"]):
         of = table["number"] == i
+        # Files of version 0.1 and before have the sockets in the label only.
+        names = table["left_out_socket"][table["socket_number"] == i] if "left_out_socket" in table else names_in(label)
         groups.append(
             LeftOut(
-                sockets=tuple(str(names).split(",")),
+                sockets=tuple(map(str, names)),
                 poses=int(table["poses"][i]),
                 rms=float(table["rms"][i]),
                 rms_predicted=float(table["rms_predicted"][i]),
@@ -188,7 +220,9 @@ def _sampled_table(record: CalibrationRecord) -> Table:
     for name, text in texts.items():
         variables[name] = Variable(("quantity",), record.sampled[name], "mm or rad; 1 for k", text)
     agrees = np.asarray(record.sampled["agrees"], dtype=np.int8)
-    variables["agrees"] = Variable(("quantity",), agrees, "1", "1: the linear interval is within the tolerance of JCGM 101")
+    variables["agrees"] = Variable(
+        ("quantity",), agrees, "1", "1: the linear interval is within the tolerance of JCGM 101"
+    )
     return Table(variables)
 
 

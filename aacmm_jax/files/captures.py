@@ -1,4 +1,4 @@
-"""Captures in HDF5: the poses, the reference lengths, the nominal arm and, for a simulation, the true one."""
+"""Captures in HDF5: poses, reference lengths, touched spheres, the nominal arm and, for a simulation, the true arm."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -12,18 +12,42 @@ from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm
 from ..kinematics.specification import ArmSpecification, single
-from .hdf5 import Stored, Table, Variable, need, read_tables, undamaged, write_tables
+from .hdf5 import Stored, Table, Variable, names_in, need, read_tables, undamaged, write_tables
 
-_KINDS = {"alpha": "link twist", "a": "link length", "d": "link offset", "theta": "joint zero offset", "beta": "Hayati's angle"}
+_KINDS = {
+    "alpha": "link twist",
+    "a": "link length",
+    "d": "link offset",
+    "theta": "joint zero offset",
+    "beta": "Hayati's angle",
+}
 
 
 def save_capture(path: str | os.PathLike, recording: Recording) -> None:
-    """Write a capture with its arms to HDF5, whole or not at all."""
+    """Write a capture with its arms to HDF5, whole or not at all.
+
+    Args:
+        path: the file to write.
+        recording: the capture, with its nominal arm.
+
+    Raises:
+        InputError: the file cannot be written, or a name holds a character that no file can hold.
+    """
     write_tables(path, "capture", recording_tables(recording), recording_attributes(recording))
 
 
 def load_capture(path: str | os.PathLike) -> Recording:
-    """Read a capture with its arms. Raises `InputError` where the file is missing, damaged, foreign or newer."""
+    """Read a capture with its arms, from a capture file or from a calibration file.
+
+    Args:
+        path: the file to read.
+
+    Returns:
+        The recording, in mm and rad.
+
+    Raises:
+        InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+    """
     stored = read_tables(path, ("capture", "calibration"))
     with undamaged(path):
         return recording_of(path, stored)
@@ -78,8 +102,10 @@ def lengths_of(path: str | os.PathLike, stored: Stored) -> list[ReferenceLength]
 
 
 def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False) -> Table:
-    """Touched spheres, by poses or points, one row a touch; what belongs to a sphere stands in every row of it."""
-    rows = [(sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group]
+    """Touched spheres, by poses or points, one row a touch; what belongs to a sphere is in every row of it."""
+    rows = [
+        (sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group
+    ]
     each = {
         "sphere": ([sphere.name for sphere, *_ in rows], "", "reference sphere"),
         "test": ([sphere.test for sphere, *_ in rows], "", "acceptance test that the sphere was touched for"),
@@ -163,8 +189,8 @@ def arm_table(specification: ArmSpecification) -> Table:
         "half_width_angle_rad": specification.angle,
         "override_names": list(specification.override) or None,
         "override_half_widths": [float(width) for width in specification.override.values()] or None,
-        "held": None if specification.held is None else ",".join(specification.held),
-        "free": ",".join(specification.free) or None,
+        "held": None if specification.held is None else list(specification.held) or "",
+        "free": list(specification.free) or None,
     }
     return Table(variables, attributes)
 
@@ -194,9 +220,9 @@ def specification_of(path: str | os.PathLike, stored: Stored, table: str) -> Arm
     return ArmSpecification(
         arm=arm,
         name=attributes.get("name", ""),
-        held=None if held is None else tuple(name for name in held.split(",") if name),
+        held=None if held is None else names_in(held),
         length=attributes.get("half_width_length_mm", 10.0),
         angle=attributes.get("half_width_angle_rad", 0.0175),
         override=dict(override),
-        free=tuple(name for name in attributes.get("free", "").split(",") if name),
+        free=names_in(attributes.get("free")),
     )

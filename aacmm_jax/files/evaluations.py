@@ -1,4 +1,4 @@
-"""An evaluation: a calibrated arm tried on a capture, within what limits; in HDF5."""
+"""Evaluations in HDF5: a calibrated arm tried on a capture, or the points that an arm's own program reported."""
 
 import math
 import os
@@ -7,19 +7,40 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..acceptance.decision import Limit
-from ..acceptance.metrics import METRICS
-from ..acceptance.record import MAXIMA, EvaluationRecord
+from ..acceptance.metrics import METRICS, Measured
+from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord
 from ..acceptance.suite import checked_limits
-from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
+from ..kinematics.workspace import Reach
+from .captures import (
+    arm_table,
+    lengths_of,
+    recording_attributes,
+    recording_of,
+    recording_tables,
+    reference_table,
+    specification_of,
+    sphere_table,
+    spheres_of,
+)
 from .hdf5 import Stored, Table, Variable, need, read_tables, undamaged, write_tables
 
 
 def save_evaluation(path: str | os.PathLike, record: EvaluationRecord) -> None:
-    """Write an evaluation to HDF5, whole or not at all."""
+    """Write an evaluation of a capture to HDF5, whole or not at all.
+
+    Args:
+        path: the file to write.
+        record: the evaluation, from `acceptance.evaluation_of`.
+
+    Raises:
+        InputError: the file cannot be written, or a name holds a character that no file can hold.
+    """
     tables = recording_tables(record.recording)
     tables["calibrated_arm"] = arm_table(record.calibrated)
-    tables["used"] = Table({"used": Variable(("used",), sorted(record.used), "", "socket that the arm was identified from")})
-    tables["limits"] = limit_table(record.limits)
+    tables["used"] = Table(
+        {"used": Variable(("used",), sorted(record.used), "", "socket that the arm was identified from")}
+    )
+    tables["limits"] = _limit_table(record.limits)
     tables["figures"] = _figure_table(record)
     attributes = recording_attributes(record.recording) | {
         "warnings": list(record.warnings) or None,
@@ -29,8 +50,8 @@ def save_evaluation(path: str | os.PathLike, record: EvaluationRecord) -> None:
     write_tables(path, "evaluation", tables, attributes)
 
 
-def limit_table(limits: Mapping[str, Limit | float]) -> Table:
-    """Limits by the name of a figure."""
+def _limit_table(limits: Mapping[str, Limit | float]) -> Table:
+    """Limits by the name of a result."""
     checked = checked_limits(limits)
     columns = {
         "figure": (list(checked), "", "figure of an acceptance test"),
@@ -40,19 +61,24 @@ def limit_table(limits: Mapping[str, Limit | float]) -> Table:
     return Table({name: Variable(("figure",), *column) for name, column in columns.items()})
 
 
-def limits_in(stored: Stored) -> dict[str, Limit]:
+def _limits_in(stored: Stored) -> dict[str, Limit]:
     """The limits that a file holds."""
     table = stored.tables["limits"]
     rows = zip(table["figure"], table["fixed"], table["divisor"], strict=True)
     found = {str(name): Limit(float(fixed), float(divisor)) for name, fixed, divisor in rows}
     if not all(name in METRICS and 0 <= limit.fixed < math.inf and limit.divisor > 0 for name, limit in found.items()):
-        raise ValueError("a limit that this package would not have written")  # `storage.undamaged` says what that means
+        raise ValueError("a limit that this package would not have written")  # `hdf5.undamaged` says what that means
     return found
 
 
 def _figure_table(record: EvaluationRecord) -> Table:
-    """The results, for other programs; this package computes them again."""
-    rows = [(stage, test, figure) for stage, tests in record.acceptance().items() for test in tests for figure in test.metrics]
+    """The results, for other programs; this package computes them again on reading."""
+    rows = [
+        (stage, test, figure)
+        for stage, tests in record.acceptance().items()
+        for test in tests
+        for figure in test.metrics
+    ]
     columns = {
         "arm": ([stage for stage, *_ in rows], "", "arm that measured"),
         "standard": ([test.standard for _, test, _ in rows], "", "standard of the test"),
@@ -68,12 +94,24 @@ def _figure_table(record: EvaluationRecord) -> Table:
 
 
 def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
-    """Read an evaluation. Raises `InputError` where the file is missing, damaged, foreign, newer or no evaluation."""
+    """Read an evaluation of a capture.
+
+    Args:
+        path: the file to read.
+
+    Returns:
+        The record, from which the results are computed again.
+
+    Raises:
+        InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+    """
     stored = read_tables(path, ("evaluation",))
     need(path, stored.tables, "calibrated_arm", "used", "limits")
     with undamaged(path):
         attributes = stored.attributes
-        maxima = {name.removeprefix("most_"): float(value) for name, value in attributes.items() if name.startswith("most_")}
+        maxima = {
+            name.removeprefix("most_"): float(value) for name, value in attributes.items() if name.startswith("most_")
+        }
         if not set(maxima) <= set(MAXIMA) or not all(0 <= value < math.inf for value in maxima.values()):
             raise ValueError("a limit that this package would not have written")
         return EvaluationRecord(
@@ -81,7 +119,78 @@ def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
             specification_of(path, stored, "calibrated_arm"),
             frozenset(str(name) for name in stored.tables["used"]["used"]),
             tuple(map(str, np.atleast_1d(attributes.get("warnings") or []))),
-            limits_in(stored),
+            _limits_in(stored),
             float(attributes["u_test_mm"]),
             maxima,
         )
+
+
+def save_points(path: str | os.PathLike, record: PointsRecord) -> None:
+    """Write an evaluation of points to HDF5, whole or not at all.
+
+    Args:
+        path: the file to write.
+        record: the measured points, the limits and the uncertainty of the test.
+
+    Raises:
+        InputError: the file cannot be written, or a name holds a character that no file can hold.
+    """
+    measured = record.measured
+    owner = [name for name, points in measured.sockets.items() for _ in points]
+    position = np.concatenate([np.zeros((0, 3)), *measured.sockets.values()])
+    tables = {
+        "points": Table(
+            {
+                "point": Variable(("point",), np.arange(1, len(owner) + 1), "1", "point number"),
+                "axis": Variable(("axis",), ["x", "y", "z"], "", "axis"),
+                "position": Variable(("point", "axis"), position, "mm", "centre of the probe"),
+                "socket": Variable(("point",), owner, "", "socket that held it"),
+            }
+        ),
+        "reference": reference_table(measured.lengths),
+        "limits": _limit_table(record.limits),
+    }
+    if measured.spheres:
+        tables["sphere"] = sphere_table(measured.spheres, points=True)
+    reach = measured.reach
+    attributes = {
+        "of": "points",
+        "u_test_mm": record.u_test,
+        "sources": list(measured.sources) or None,
+        "measured": measured.measured or None,
+        "reach_mm": None if reach is None else reach.radius,
+        "shoulder_mm": None if reach is None else reach.shoulder,
+    }
+    write_tables(path, "evaluation", tables, attributes)
+
+
+def load_points(path: str | os.PathLike) -> PointsRecord:
+    """Read an evaluation of points.
+
+    Args:
+        path: the file to read.
+
+    Returns:
+        The record, from which the results are computed again.
+
+    Raises:
+        InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+    """
+    stored = read_tables(path, ("evaluation",))
+    need(path, stored.tables, "points", "reference", "limits")
+    with undamaged(path):
+        table, attributes = stored.tables["points"], stored.attributes
+        owner = np.asarray(table["socket"]).astype(str)
+        sockets = {name: table["position"][owner == name] for name in dict.fromkeys(owner.tolist())}
+        reach = None
+        if attributes.get("reach_mm") is not None:
+            reach = Reach(np.array(attributes["shoulder_mm"]), float(attributes["reach_mm"]))
+        measured = Measured(
+            sockets,
+            tuple(lengths_of(path, stored)),
+            spheres_of(path, stored, "position"),
+            reach,
+            sources=tuple(attributes.get("sources") or ()),
+            measured=attributes.get("measured", ""),
+        )
+        return PointsRecord(measured, _limits_in(stored), float(attributes["u_test_mm"]))

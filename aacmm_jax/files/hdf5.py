@@ -1,4 +1,4 @@
-"""HDF5 tables after netCDF-4's conventions, without any idea of arms."""
+"""Tables in HDF5 by the conventions of netCDF-4; nothing here depends on what they hold."""
 
 import contextlib
 import datetime
@@ -31,7 +31,7 @@ class Variable(NamedTuple):
 
 
 class Table(NamedTuple):
-    """One HDF5 group: variables by name (a variable named like its only dimension is its coordinate), and attributes."""
+    """One HDF5 group: variables by name (one named like its only dimension is its coordinate), and attributes."""
 
     variables: dict[str, Variable]
     attributes: Mapping[str, Any] = MappingProxyType({})
@@ -43,7 +43,7 @@ def write_tables(
     tables: Mapping[str, Table],
     attributes: Mapping[str, Any],
     extend: Callable[[Any], None] | None = None,
-    mend: str = ELSEWHERE,
+    advice: str = ELSEWHERE,
     streamed: bool = False,
 ) -> None:
     """Write an HDF5 file of tables that netCDF-4 readers (xarray) understand. ``kind`` says what the file is.
@@ -59,9 +59,9 @@ def write_tables(
         if extend is not None:
             extend(file)
 
-    with whole_file(path, mend) as temporary:
+    with whole_file(path, advice) as temporary:
         if streamed:
-            with _Unbroken(temporary) as stream:
+            with _FailureKeepingFile(temporary) as stream:
                 with h5py.File(stream, "w", track_order=True) as file:
                     fill(file)
                 stream.check()
@@ -74,9 +74,9 @@ def write_tables(
         temporary.write_bytes(image)
 
 
-class _Unbroken:
-    """A file that HDF5 writes through. Where a write fails (a full disk), the HDF5 library would crash the process: so the failure
-    is kept, HDF5 is left to believe in success, and `check` raises it. Interrupts must be kept away meanwhile."""
+class _FailureKeepingFile:
+    """A file that HDF5 writes to. Where a write fails (a full disk), the HDF5 library would crash the process: so the
+    failure is kept, HDF5 is told of success, and `check` raises the failure. Interrupts must be blocked meanwhile."""
 
     def __init__(self, path: Path):
         self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 - closed on exit
@@ -85,7 +85,7 @@ class _Unbroken:
             getattr(self._file, name) for name in ("seek", "tell", "read", "readinto")
         )
 
-    def __enter__(self) -> "_Unbroken":
+    def __enter__(self) -> "_FailureKeepingFile":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -147,7 +147,13 @@ def provenance(kind: str) -> dict[str, Any]:
 def _write_attributes(item: Any, attributes: Mapping[str, Any]) -> None:
     for key, value in attributes.items():
         if value is not None:
-            item.attrs[key] = storable(value) if isinstance(value, str) else value
+            item.attrs[key] = _attribute(value)
+
+
+def _attribute(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_attribute(item) for item in value]
+    return storable(value) if isinstance(value, str) else value
 
 
 def _write_group(group: Any, table: Table) -> None:
@@ -180,7 +186,10 @@ class Stored(NamedTuple):
 
 
 def read_tables(path: str | os.PathLike, kinds: Sequence[str], without: Sequence[str] = ()) -> Stored:
-    """Read a file of tables whole, but for those named. Raises `InputError` where it is missing, damaged, foreign, newer or of another kind."""
+    """Read all tables of a file but those in ``without``.
+
+    Raises `InputError` where the file is missing, damaged, of another program or kind, or of a newer version.
+    """
     import h5py
 
     path = Path(path)
@@ -192,13 +201,15 @@ def read_tables(path: str | os.PathLike, kinds: Sequence[str], without: Sequence
         _check_kind(path, attributes, kinds)
         groups = {name: group for name, group in file.items() if isinstance(group, h5py.Group) and name not in without}
         tables = {name: {key: _values(item) for key, item in group.items()} for name, group in groups.items()}
-        table_attributes = {name: {key: _plain(value) for key, value in group.attrs.items()} for name, group in groups.items()}
+        table_attributes = {
+            name: {key: _plain(value) for key, value in group.attrs.items()} for name, group in groups.items()
+        }
     return Stored(attributes, tables, table_attributes)
 
 
 @contextlib.contextmanager
 def undamaged(path: str | os.PathLike) -> Iterator[None]:
-    """While the content of a file is taken apart: whatever fails there fails because the file is not as it was written."""
+    """While the content of a file is interpreted: what fails there fails because the file was not written so."""
     try:
         yield
     except InputError:
@@ -213,7 +224,7 @@ def _check_kind(path: Path, attributes: Mapping[str, Any], kinds: Sequence[str])
         raise InputError(f"{path} is HDF5, but was not written by aacmm; name a {wanted} file.")
     for name in ("created", "command", "package_version", "kind"):
         if not isinstance(attributes.get(name), str):
-            raise InputError(f"{path} lacks the attribute '{name}'; it is damaged or was edited, make it again.")
+            raise InputError(f"{path} lacks the attribute '{name}'; it is damaged or was edited; make it again.")
     version = attributes["format_version"]
     if version > FORMAT_VERSION:
         raise InputError(
@@ -228,7 +239,14 @@ def need(path: str | os.PathLike, names: Mapping[str, Any], *needed: str, of: st
     """Raise `InputError` where a file lacks a table, or a table an entry."""
     for name in needed:
         if name not in names:
-            raise InputError(f"{path} lacks the {of} '{name}'; it is damaged or was edited, make it again.")
+            raise InputError(f"{path} lacks the {of} '{name}'; it is damaged or was edited; make it again.")
+
+
+def names_in(attribute: str | Sequence[str] | None) -> tuple[str, ...]:
+    """The names that an attribute lists; files of version 0.1 have them in one string, with commas between."""
+    if isinstance(attribute, str):
+        return tuple(name for name in attribute.split(",") if name)
+    return tuple(attribute or ())
 
 
 def _values(dataset: Any) -> np.ndarray:

@@ -1,35 +1,30 @@
-"""The capture manifest: a short TOML file that says which text files hold which socket, in which unit, and the lengths."""
+"""The manifest of a capture (TOML): which text files hold which socket, in which unit, and the lengths."""
 
 import datetime
-import glob
 import math
 import os
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, FiniteFloat, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from ..core.errors import InputError
+from ..core.units import ARCSEC, DEG
 from ..data.capture import Capture, ReferenceLength
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
 from .arms import load_specification
+from .patterns import fields_of, fill, in_braces, matches
 from .text_table import read_numbers
-from .toml import read_toml
+from .toml import Strict, read_toml
 from .whole_file import fingerprint
 
-_UNITS = {"rad": 1.0, "deg": math.pi / 180, "arcsec": math.pi / (180 * 3600)}
-_FIELD = re.compile(r"\{(\w+)\}")
+_UNITS = {"rad": 1.0, "deg": DEG, "arcsec": ARCSEC}
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", populate_by_name=True)
-
-
-class _Angles(_Strict):
+class _Angles(Strict):
     unit: Literal["rad", "deg", "arcsec", "counts"]
     counts_per_turn: PositiveFloat | list[PositiveFloat] | None = None
     sign: Literal[1, -1] | list[Literal[1, -1]] = 1
@@ -43,7 +38,7 @@ class _Angles(_Strict):
         return self
 
 
-class _Files(_Strict):
+class _Files(Strict):
     """What is recorded in one file, or in several."""
 
     file: str | None = None
@@ -56,6 +51,7 @@ class _Files(_Strict):
 
 class _Socket(_Files):
     name: str | None = None
+    exclude: list[str] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _one(self) -> "_Socket":
@@ -66,7 +62,7 @@ class _Socket(_Files):
         return self
 
 
-class _Length(_Strict):
+class _Length(Strict):
     start: str = Field(alias="from")
     end: str = Field(alias="to")
     value: float
@@ -88,7 +84,7 @@ class _Sphere(_Files):
         return self
 
 
-class _Points(_Strict):
+class _Points(Strict):
     unit: Literal["mm", "m", "um", "inch"]
     columns: Annotated[list[PositiveInt], Field(min_length=3, max_length=3)] | None = None
     reach: PositiveFloat | None = None  # mm
@@ -98,18 +94,18 @@ class _Points(_Strict):
     def _both(self) -> "_Points":
         if (self.reach is None) != (self.shoulder is None):
             raise ValueError(
-                "give reach and shoulder together: the zones of a test are counted from the shoulder, in the points' frame."
+                "give reach and shoulder together: zones are distances from the shoulder, in the points' frame."
             )
         return self
 
 
-class _Recorded(_Strict):
+class _Recorded(Strict):
     """What manifests of poses and of points have in common."""
 
     date: datetime.date | None = None  # when it was recorded
-    socket: list[_Socket] = []
-    length: list[_Length] = []
-    sphere: list[_Sphere] = []
+    socket: list[_Socket] = Field(default_factory=list)
+    length: list[_Length] = Field(default_factory=list)
+    sphere: list[_Sphere] = Field(default_factory=list)
 
 
 class _Manifest(_Recorded):
@@ -129,9 +125,19 @@ def read_manifest(path: str | os.PathLike) -> Recording:
 
     A field in braces stands for part of a path and makes one socket for each value found: with
     ``file = "run_1/{place}/hole_{hole}.csv"`` and ``name = "{place}/{hole}"``, the length ``from = "{place}/0"``,
-    ``to = "{place}/1"`` holds at every place. Angles: reading -> sign * (reading - offset), in the stated unit.
+    ``to = "{place}/1"`` is measured at every place. A field that makes up a whole folder or file name, such as
+    ``{place}``, matches anything but "/"; beside other text in a name, as ``{hole}``, it matches letters, digits and
+    "-" only, so that ``hole_0_pose.csv`` is left alone. ``exclude = ["*_old.csv"]`` in ``[[socket]]`` leaves out the
+    files that match such a shell pattern. Angles: reading -> sign * (reading - offset), in the stated unit.
 
-    Raises `InputError` that names the file, the place in it and the mend.
+    Args:
+        path: the manifest (TOML).
+
+    Returns:
+        The recording: capture and nominal arm, in mm and rad, with the SHA-256 of each file.
+
+    Raises:
+        InputError: names the file, the place in it and what to do.
     """
     path = Path(path)
     model = read_toml(path, _Manifest)
@@ -140,7 +146,8 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         joints = nominal.arm.joints
         if model.angles.columns is not None and len(model.angles.columns) != joints:
             raise InputError(
-                f"angles.columns picks {len(model.angles.columns)} columns, but the arm has {joints} joints; pick one a joint."
+                f"angles.columns picks {len(model.angles.columns)} columns, but the arm has {joints} joints; "
+                "pick one a joint."
             )
         files = [path]
 
@@ -156,7 +163,9 @@ def read_manifest(path: str | os.PathLike) -> Recording:
 
         sockets, lengths, spheres = recorded(path.parent, model, angles)
         sources = tuple(fingerprint(file, path.parent) for file in files)
-        return Recording(Capture(sockets, lengths), nominal, spheres=spheres, sources=sources, measured=str(model.date or ""))
+        return Recording(
+            Capture(sockets, lengths), nominal, spheres=spheres, sources=sources, measured=str(model.date or "")
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -184,8 +193,8 @@ def recorded(
 
 
 def _arm_source(manifest: Path, arm: str) -> str | Path:
-    beside = manifest.parent / arm
-    return beside if arm.endswith(".toml") or beside.is_file() else arm
+    file = manifest.parent / arm
+    return file if arm.endswith(".toml") or file.is_file() else arm
 
 
 def _radians(readings: np.ndarray, angles: _Angles) -> np.ndarray:
@@ -194,75 +203,57 @@ def _radians(readings: np.ndarray, angles: _Angles) -> np.ndarray:
     def a_joint(value: float | list, what: str) -> np.ndarray:
         array = np.asarray(value, dtype=float)
         if array.ndim and array.shape != (joints,):
-            raise InputError(f"angles.{what} has {array.size} values, but there are {joints} joints; give one, or one a joint.")
+            raise InputError(
+                f"angles.{what} has {array.size} values, but there are {joints} joints; give one, or one a joint."
+            )
         return array
 
-    unit = 2 * math.pi / a_joint(angles.counts_per_turn, "counts_per_turn") if angles.counts_per_turn else _UNITS[angles.unit]
+    unit = (
+        2 * math.pi / a_joint(angles.counts_per_turn, "counts_per_turn")
+        if angles.counts_per_turn
+        else _UNITS[angles.unit]
+    )
     return a_joint(angles.sign, "sign") * (readings - a_joint(angles.offset, "offset")) * unit
 
 
 def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dict[str, str]]]:
     """Sockets of one entry: name, files and the values of its fields in braces."""
     first = entry.paths[0]
-    fields = set(_FIELD.findall(first))
+    fields = fields_of(first)
     for what, text in (("name", entry.name or ""), *(("file", file) for file in entry.paths[1:])):
-        if set(_FIELD.findall(text)) != fields:
+        if fields_of(text) != fields:
             raise InputError(
-                f"socket {what} '{text}' has {_braces(_FIELD.findall(text))}, but file '{first}' has {_braces(fields)}; "
+                f"socket {what} '{text}' has {in_braces(fields_of(text))}, but file '{first}' has {in_braces(fields)}; "
                 "use the same fields in the name and in every file."
             )
     if not fields:
+        if entry.exclude:
+            raise InputError(f"exclude is for files with a field in braces, but '{first}' has none; leave it out.")
         yield entry.name or Path(first).stem, [folder / file for file in entry.paths], {}
         return
     assert entry.name is not None  # its fields are those of the file
-    before = "" if Path(first).is_absolute() else f"{folder.as_posix()}/"
-    literals = _FIELD.sub("\0", first).split("\0")
-    # Separators only: to resolve "./" or "//" would keep the pattern from matching.
-    found = sorted(item.replace(os.sep, "/") for item in glob.glob(glob.escape(before) + "*".join(map(glob.escape, literals))))
-    pattern = re.compile(re.escape(before) + _matcher(first))
-    matches = [match for item in found if (match := pattern.fullmatch(item))]
-    if not matches:
-        raise InputError(f"no file matches '{first}' in {folder}; check the path.")
-    for match in matches:
-        values = match.groupdict()
-        yield _fill(entry.name, values), [folder / _fill(file, values) for file in entry.paths], values
+    for values in matches(folder, first, entry.exclude):
+        yield fill(entry.name, values), [folder / fill(file, values) for file in entry.paths], values
 
 
-def _braces(fields: Iterable[str]) -> str:
-    return ", ".join(f"{{{name}}}" for name in sorted(set(fields))) or "no field"
-
-
-def _matcher(pattern: str) -> str:
-    """Regular expression of a path with fields; a field that returns must match the same text."""
-    parts, last, seen = "", 0, set()
-    for field in _FIELD.finditer(pattern):
-        parts += re.escape(pattern[last : field.start()])
-        name = field.group(1)
-        parts += f"(?P={name})" if name in seen else f"(?P<{name}>[^/]+)"
-        seen.add(name)
-        last = field.end()
-    return parts + re.escape(pattern[last:])
-
-
-def _fill(text: str, values: Mapping[str, str]) -> str:
-    return _FIELD.sub(lambda field: values[field.group(1)], text)
-
-
-def _lengths(entries: list[_Length], fields: list[dict[str, str]], sockets: Mapping[str, np.ndarray]) -> list[ReferenceLength]:
-    """Reference lengths; one with fields in braces stands for every combination of them that the sockets' files showed."""
+def _lengths(
+    entries: list[_Length], fields: list[dict[str, str]], sockets: Mapping[str, np.ndarray]
+) -> list[ReferenceLength]:
+    """Reference lengths; one with fields in braces stands for every combination that the sockets' files have."""
     lengths = []
     for entry in entries:
-        names = set(_FIELD.findall(entry.start + entry.end))
+        names = fields_of(entry.start + entry.end)
         if not names:
             lengths.append(ReferenceLength(entry.start, entry.end, entry.value, entry.u))
             continue
         choices = {tuple((name, values[name]) for name in sorted(names)) for values in fields if names <= values.keys()}
         if not choices:
             raise InputError(
-                f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; name the fields alike."
+                f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; "
+                "name the fields alike."
             )
-        pairs = [(_fill(entry.start, dict(choice)), _fill(entry.end, dict(choice))) for choice in sorted(choices)]
-        # A field may also stand in the names of sockets that have nothing to do with this length.
-        there = [pair for pair in pairs if pair[0] in sockets or pair[1] in sockets]
-        lengths += [ReferenceLength(*pair, entry.value, entry.u) for pair in there or pairs]
+        pairs = [(fill(entry.start, dict(choice)), fill(entry.end, dict(choice))) for choice in sorted(choices)]
+        # The field may also be in the names of sockets that this length is not between.
+        known = [pair for pair in pairs if pair[0] in sockets or pair[1] in sockets]
+        lengths += [ReferenceLength(*pair, entry.value, entry.u) for pair in known or pairs]
     return lengths

@@ -1,35 +1,125 @@
-"""A plan as CSV, for people and spreadsheets, and as a plain dictionary."""
+"""Plans on paper: the poses of a calibration or of an acceptance test as CSV, and the manifest for what is recorded."""
 
+import csv
+import io
+import json
 import os
+from collections.abc import Iterable
 
 import numpy as np
 
+from ..acceptance.procedure import TOUCHED, Item, Procedure
+from ..acceptance.standards import PLANNED
+from ..core.units import DEG
+from ..kinematics.arm import Arm
 from ..planning.design import Plan
 from .whole_file import write_text
 
-_DIRECTION = ("probe_direction_x", "probe_direction_y", "probe_direction_z")  # the last frame's z axis
-
 
 def save_plan(path: str | os.PathLike, plan: Plan) -> None:
-    """Write a plan as CSV: a row a pose, with its socket, where that stands (mm), the joints' readings (deg), and the direction in which
-    the probe points."""
+    """Write the poses of a plan as CSV, in the order in which to take them.
+
+    Columns: ``pose``, ``socket``, ``x_mm``, ``y_mm``, ``z_mm`` (the socket), ``q_1_deg`` and so on (joint readings),
+    ``probe_direction_x``, ``_y``, ``_z`` (the last frame's z axis).
+
+    Args:
+        path: the file to write.
+        plan: what `planning.plan` returned.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     write_text(path, plan_csv(plan))
 
 
 def plan_csv(plan: Plan) -> str:
-    """The poses of a plan in the order in which to take them."""
-    joints = plan.arm.joints
-    lines = [",".join(["pose", "socket", "x_mm", "y_mm", "z_mm", *(f"q_{i}_deg" for i in range(1, joints + 1)), *_DIRECTION])]
+    """The text of `save_plan`."""
     names = list(plan.sockets)
-    directions = np.asarray(plan.arm.pose(plan.q))[:, :3, 2]
-    rows = zip(np.degrees(plan.q), plan.owner, directions, strict=True)
-    for number, (q, owner, direction) in enumerate(rows, start=1):
-        point = plan.sockets[names[owner]]
-        label = names[owner]
-        label = '"' + label.replace('"', '""') + '"' if any(c in label for c in ',"\n') else label
-        lines.append(
-            ",".join(
-                [str(number), label, *(f"{x:.3f}" for x in point), *(f"{x:.3f}" for x in q), *(f"{x:.2f}" for x in direction)]
-            )
-        )
+    owners = [names[owner] for owner in plan.owner]
+    return _poses_csv(
+        plan.arm, ["socket"], ([owner] for owner in owners), [plan.sockets[name] for name in owners], plan.q
+    )
+
+
+def procedure_csv(procedure: Procedure) -> str:
+    """A row for each pose of an acceptance test: test, name, file for its reading, position, readings."""
+    items = (*procedure.sockets, *procedure.touches)
+    labels = ([item.test, item.name, file_of(procedure, item)] for item in items for _ in item.q)
+    points, q = (np.concatenate([getattr(item, kind) for item in items]) for kind in ("points", "q"))
+    return _poses_csv(procedure.arm, ["test", "name", "file"], labels, points, q)
+
+
+def _poses_csv(arm: Arm, headings: list[str], labels: Iterable[list[str]], points: Iterable, q: np.ndarray) -> str:
+    """A row for each pose: number, labels, where the tip is (mm), joint readings (deg), direction of the probe."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    readings = [f"q_{i}_deg" for i in range(1, arm.joints + 1)]
+    direction = [f"probe_direction_{axis}" for axis in "xyz"]
+    writer.writerow(["pose", *headings, "x_mm", "y_mm", "z_mm", *readings, *direction])
+    directions = np.asarray(arm.pose(q))[:, :3, 2]
+    for number, (label, point, reading, axis) in enumerate(
+        zip(labels, points, q / DEG, directions, strict=True), start=1
+    ):
+        numbers = [*(f"{x:.3f}" for x in (*point, *reading)), *(f"{x:.2f}" for x in axis)]
+        writer.writerow([number, *label, *numbers])
+    return text.getvalue()
+
+
+def file_of(procedure: Procedure, item: Item) -> str:
+    """The file that a manifest of `procedure_manifest` expects an item's readings in."""
+    if item.test not in TOUCHED:
+        return f"{item.name}.csv"
+    several = sum(other.test == item.test for other in procedure.touches) > 1
+    return f"{item.name}/{item.test.replace(' ', '-')}" + (f"-{item.group}" if several else "") + ".csv"
+
+
+def procedure_manifest(procedure: Procedure, arm: str) -> str:
+    """A manifest for the readings of an acceptance test, in which the calibrated values are to be filled in."""
+    lines = [
+        f"# {PLANNED[procedure.standard]}, as planned. Fill in the calibrated values and standard uncertainties of your",
+        "# artefacts, record a file for each socket and each group of touches (one row a pose, in the order of the",
+        "# plan), then: aacmm import THIS.toml -o acceptance.h5",
+        f"arm = {_quoted(arm)}",
+        "# date = 2026-01-31   # when it was recorded",
+        "",
+        "[angles]",
+        'unit = "deg"',
+    ]
+    kinds = dict.fromkeys(item.name.split("/")[0] for item in procedure.sockets)
+    for kind in kinds:
+        pattern = f"{kind}/{{zone}}" if kind == "spat" else f"{kind}/{{position}}/{{side}}"
+        lines += ["", "[[socket]]", f"name = {_quoted(pattern)}", f"file = {_quoted(pattern + '.csv')}"]
+    for kind in kinds:
+        value = next((value for start, _, value in procedure.lengths if start.startswith(f"{kind}/")), None)
+        if value is not None:
+            ends = [f"{key} = {_quoted(f'{kind}/{{position}}/{side}')}" for key, side in (("from", "a"), ("to", "b"))]
+            lines += [
+                "",
+                "[[length]]",
+                *ends,
+                f"value = {value!r}   # mm: the calibrated length",
+                "u = 0.002   # mm: its standard uncertainty",
+            ]
+    for sphere in procedure.spheres:
+        of = [item for item in procedure.touches if item.name == sphere.name and TOUCHED[item.test] == sphere.test]
+        files = ", ".join(_quoted(file_of(procedure, item)) for item in of)
+        lines += [
+            "",
+            "[[sphere]]",
+            f"name = {_quoted(sphere.name)}",
+            f"test = {_quoted(sphere.test)}",
+            f"files = [{files}]",
+        ]
+        lines += [
+            f"diameter = {sphere.diameter!r}   # mm: the calibrated diameter",
+            "u = 0.0005   # mm: its standard uncertainty",
+        ]
+        lines += [
+            f"stylus = {sphere.stylus!r}   # mm: diameter of the probe's ball",
+            "form = 0.0   # mm: its calibrated form error",
+        ]
     return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)  # a TOML basic string

@@ -1,4 +1,4 @@
-"""Points instead of poses, for acceptance tests of arms that report coordinates: read by the same kind of manifest."""
+"""The manifest of points instead of poses, for acceptance tests of arms that report coordinates."""
 
 import os
 from pathlib import Path
@@ -7,20 +7,31 @@ import numpy as np
 
 from ..acceptance.metrics import Measured
 from ..core.errors import InputError, nearest
+from ..core.units import INCH, UM, M
 from ..kinematics.workspace import Reach
 from .manifest import PointsManifest, recorded
 from .text_table import read_numbers
 from .toml import read_toml
 from .whole_file import fingerprint
 
-_UNITS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "inch": 25.4}
+_UNITS = {"mm": 1.0, "m": M, "um": UM, "inch": INCH}
 
 
 def read_points(path: str | os.PathLike) -> Measured:
-    """Read a manifest of points: ``[points]`` with ``unit`` (mm, m, um, inch), perhaps ``columns``, and the arm's ``reach`` and ``shoulder`` (x, y, z) in mm
-    (for the zones of ASME B89.4.22); ``[[socket]]``, ``[[length]]`` and ``[[sphere]]`` as in a manifest of poses, with files of x, y, z.
+    """Read a manifest of points and every file that it names; paths are relative to the manifest.
 
-    Raises `InputError` that names the file, the place in it and the mend.
+    ``[points]`` has ``unit`` (mm, m, um, inch), optionally ``columns``, and, for the zones of ASME B89.4.22, the arm's
+    ``reach`` and ``shoulder`` (x, y, z) in mm. ``[[socket]]``, ``[[length]]`` and ``[[sphere]]`` are those of
+    `read_manifest`, with files of x, y, z.
+
+    Args:
+        path: the manifest (TOML).
+
+    Returns:
+        The measured points, mm.
+
+    Raises:
+        InputError: names the file, the place in it and what to do.
     """
     path = Path(path)
     model = read_toml(path, PointsManifest)
@@ -32,7 +43,8 @@ def read_points(path: str | os.PathLike) -> Measured:
             table = read_numbers(file, model.points.columns)
             if table.shape[1] != 3:
                 raise InputError(
-                    f"{file} has {table.shape[1]} columns; give x, y and z, or pick three with columns = [...] in [points]."
+                    f"{file} has {table.shape[1]} columns; give x, y and z, or pick three with columns = [...] in "
+                    "[points]."
                 )
             return table * _UNITS[model.points.unit]
 
@@ -41,7 +53,8 @@ def read_points(path: str | os.PathLike) -> Measured:
             for end in (length.start, length.end):
                 if end not in sockets:
                     raise InputError(
-                        f"length '{length.start}' to '{length.end}' names the unknown socket '{end}'{nearest(end, sockets)}"
+                        f"length '{length.start}' to '{length.end}' names the unknown socket '{end}'"
+                        f"{nearest(end, sockets)}"
                     )
         if not sockets and not spheres:
             raise InputError("there is neither a [[socket]] nor a [[sphere]], so nothing can be tested; add one.")

@@ -13,7 +13,7 @@ from .whole_file import check_readable
 
 
 def read_numbers(path: str | os.PathLike, columns: Sequence[int] | None = None) -> np.ndarray:
-    """Read a text table of numbers, ``(rows, columns)``: comma, semicolon, tab or blank between them, header lines allowed.
+    """Read a text table of numbers, ``(rows, columns)``; separated by comma, semicolon, tab or blank, headers ignored.
 
     ``columns`` picks columns, counted from 1. Raises `InputError` that names the file, the line and the column.
     """
@@ -35,15 +35,18 @@ def read_numbers(path: str | os.PathLike, columns: Sequence[int] | None = None) 
                 continue  # a header
             column = next(i for i, cell in enumerate(cells, start=1) if not _is_number(cell))
             raise InputError(
-                f"{path} line {number} column {column}: '{cells[column - 1]}' is not a number; mend it."
+                f"{path} line {number} column {column}: '{cells[column - 1]}' is not a number; correct it."
             ) from error
         if len(rows[-1]) != len(rows[0]):
             raise InputError(
-                f"{path} line {number} has {len(rows[-1])} columns, the lines before it {len(rows[0])}; give all the same."
+                f"{path} line {number} has {len(rows[-1])} columns, the lines before it {len(rows[0])}; "
+                "give all the same."
             )
         for column, value in enumerate(rows[-1], start=1):
             if not math.isfinite(value):
-                raise InputError(f"{path} line {number} column {column}: '{cells[column - 1]}' is not finite; mend it.")
+                raise InputError(
+                    f"{path} line {number} column {column}: '{cells[column - 1]}' is not finite; correct it."
+                )
     if not rows:
         raise InputError(f"{path} holds no numbers; give one line a pose, with decimal points.")
     table = np.array(rows)

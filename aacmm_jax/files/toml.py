@@ -1,4 +1,4 @@
-"""What people write in TOML, or pass as tables from Python: read into pydantic models, and refused in one sentence."""
+"""TOML files, and tables passed from Python, read into pydantic models; errors in one sentence."""
 
 import os
 import tomllib
@@ -6,14 +6,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pydantic import BaseModel, ConfigDict, ValidationError
+
 from ..core.errors import InputError, nearest
 from .whole_file import check_readable
 
-Model = TypeVar("Model")
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class Strict(BaseModel):
+    """A table whose keys are all known: any other key is refused. Values cannot be assigned to."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
 
 def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
-    """Read a TOML file into a pydantic model. Raises `InputError` that names the file, the place and the mend."""
+    """Read a TOML file into a pydantic model. Raises `InputError` that names the file and the place in it."""
     path = Path(path)
     check_readable(path)
     try:
@@ -21,24 +29,22 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text in UTF-8, as TOML is; name a TOML file.") from error
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path} is not valid TOML: {error}; mend it there.") from error
+        raise InputError(f"{path} is not valid TOML: {error}; correct it there.") from error
     return validated(model, content, str(path))
 
 
 def validated(model: type[Model], content: Mapping[str, Any], where: str) -> Model:
     """A pydantic model of tables. Raises `InputError`, one sentence that begins with ``where``."""
-    import pydantic
-
     try:
-        return model.model_validate(content)  # type: ignore[attr-defined]
-    except pydantic.ValidationError as error:
+        return model.model_validate(content)
+    except ValidationError as error:
         # A misspelt key is also a missing one, and says more; an error inside a list says more than "not a number".
         worst = max(error.errors(), key=lambda found: (found["type"] == "extra_forbidden", len(found["loc"])))
         raise InputError(f"{where}: {_explain(worst, model, content)}") from error
 
 
 def _written(steps: Sequence[Any], content: Any) -> list[Any]:
-    """The steps to a place that the writer wrote: others are pydantic's ("a number or a list"; one level of a list of levels)."""
+    """The part of the path to an error that is in the file: other steps are pydantic's ("a number or a list")."""
     kept = []
     for step in steps:
         inside = isinstance(content, list | tuple) if isinstance(step, int) else isinstance(content, Mapping)
@@ -69,9 +75,11 @@ def _explain(error: Any, model: Any, content: Any) -> str:
         return f"'{place}' has {len(given) or 'no'} entries; give {limit}."
     shown = "a table" if isinstance(given, dict) else "a list" if isinstance(given, list) else repr(given)
     mend = f"; write [[{place}]]" if kind == "list_type" and isinstance(given, dict) else ""
-    wanted = {"tuple_type": "must be a list of numbers", "dict_type": "must be a table", "model_type": "must be a table"}.get(
-        kind
-    )
+    wanted = {
+        "tuple_type": "must be a list of numbers",
+        "dict_type": "must be a table",
+        "model_type": "must be a table",
+    }.get(kind)
     if context.get("class_name") == "Distribution":
         wanted = "must be a number, { uniform = ... } or { normal = ... }"
     wanted = wanted or error["msg"].replace("Input should", "must").partition(", unable")[0]

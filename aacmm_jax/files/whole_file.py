@@ -12,7 +12,7 @@ ELSEWHERE = "choose another output path"
 
 
 @contextlib.contextmanager
-def whole_file(path: str | os.PathLike, mend: str = ELSEWHERE) -> Iterator[Path]:
+def whole_file(path: str | os.PathLike, advice: str = ELSEWHERE) -> Iterator[Path]:
     """Write a file whole or not at all: yields a temporary path beside the target, renamed onto it at the end.
 
     Whatever goes wrong (Ctrl-C included), the temporary file is removed and an existing target stays as it was.
@@ -31,7 +31,7 @@ def whole_file(path: str | os.PathLike, mend: str = ELSEWHERE) -> Iterator[Path]
         os.replace(temporary, target)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
-        raise InputError(f"{target} cannot be written: {reason}; {mend}.") from error
+        raise InputError(f"{target} cannot be written: {reason}; {advice}.") from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
@@ -57,7 +57,7 @@ def check_readable(path: Path) -> None:
 
 
 def fingerprint(path: str | os.PathLike, beside: str | os.PathLike | None = None) -> str:
-    """A file's name and SHA-256, by which it can be told from every other; with its folders below ``beside``, where it lies there."""
+    """A file's name and SHA-256, which identify it; the name is relative to ``beside`` where the file is below it."""
     import hashlib
 
     path = Path(path)
@@ -68,12 +68,12 @@ def fingerprint(path: str | os.PathLike, beside: str | os.PathLike | None = None
 
 
 def storable(text: str) -> str:
-    """The same text, or `InputError` where neither HDF5 nor TOML can hold it (NUL, or a file name that is not UTF-8)."""
+    """The same text, or `InputError` where HDF5 and TOML cannot hold it (NUL, or a file name that is not UTF-8)."""
     if "\0" in text or text.encode(errors="ignore").decode() != text:
         raise InputError(f"the name {text!r} holds a character that no file can hold; rename it.")
     return text
 
 
 def storable_name(text: str) -> str:
-    """A name from the file system or the command line in a form that HDF5 can hold: bytes that are not UTF-8 are written out."""
+    """A name in a form that HDF5 can hold: bytes that are not UTF-8 are written as escapes."""
     return text.encode(errors="backslashreplace").decode()

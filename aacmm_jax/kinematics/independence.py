@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
@@ -83,10 +83,11 @@ def tip_movements(poses: Float[np.ndarray, "N 3 p"], lengths: Float[np.ndarray, 
     )
 
 
-class _GenericPoses(NamedTuple):
-    """Poses all over the workspace; has what `SocketPoses` asks for."""
+@dataclass
+class _GenericPoses:
+    """`SocketPoses` all over the workspace; the reference length joins the first two sockets."""
 
-    q: Float[np.ndarray, "N n"]
+    q: Float[Array, "N n"]
     sizes: tuple[int, ...]
 
     @property
@@ -113,7 +114,7 @@ def generic_poses(arm: Arm) -> SocketPoses:
     starts = random.uniform(limits[:, 0], limits[:, 1], (len(owner), arm.joints))
     q, arrived = project_to_targets(arm, starts, np.asarray(arm.position(first))[owner], limits)
     sockets = [np.concatenate([first[i : i + 1], q[arrived & (owner == i)]]) for i in range(_SOCKETS)]
-    return _GenericPoses(np.concatenate(sockets), tuple(len(socket) for socket in sockets))
+    return _GenericPoses(jnp.asarray(np.concatenate(sockets)), tuple(len(socket) for socket in sockets))
 
 
 def _independent(arm: Arm, order: list[str], rows: Float[np.ndarray, "r p"]) -> tuple[str, ...]:
@@ -144,7 +145,7 @@ def _order(arm: Arm, parallel: list[int]) -> list[str]:
     angles = [f"{kind}_{i}" for i in range(1, n) for kind in ("alpha", "theta")]
     # Of what lies beyond the last joint, the probe comes before the link, since probes are changed.
     tip = {"probe_z": float(arm.probe[2]), f"d_{n}": values["d"][-1]}
-    # theta of the last joint is seen by a tip that stands off its axis; near the axis x and y of the probe are.
+    # theta of the last joint is determined by a tip off its axis; near the axis x and y of the probe are.
     x, y, z = np.asarray(arm.probe)
     off = math.hypot(float(arm.a[-1]) + x, y * math.cos(float(arm.alpha[-1])) - z * math.sin(float(arm.alpha[-1])))
     wrist = [f"theta_{n}", "probe_x", "probe_y"] if off > _OFF_AXIS else ["probe_x", "probe_y", f"theta_{n}"]

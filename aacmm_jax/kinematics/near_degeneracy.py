@@ -107,9 +107,8 @@ def _trade_off(
     direction = np.zeros(len(names))
     direction[~fixed], direction[i] = -amounts, 1.0
     largest = np.abs(amounts).max(initial=0.0)
-    order = [
-        j for j in np.argsort(-np.abs(direction), kind="stable") if j != i and abs(direction[j]) > _PARTNER * largest
-    ]
+    by_size = [int(j) for j in np.argsort(-np.abs(direction), kind="stable")]
+    order = [j for j in by_size if j != i and abs(direction[j]) > _PARTNER * largest]
     return TradeOff(
         names=tuple(names[j] for j in (i, *order)),
         amounts=(1.0, *(float(-direction[j]) for j in order)),

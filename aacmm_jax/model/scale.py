@@ -1,4 +1,8 @@
-"""Stage 2: the one number that repeatability cannot see, from reference lengths (Cheng et al. 2018, section 2.3)."""
+"""Stage 2: the scale k, which repeatability cannot determine, from reference lengths (Cheng et al. 2018, section 2.3).
+
+The uncertainty of k is put together in two places: what the lengths and the scatter at their ends contribute is here
+(`scale_and_weights`); what the identified parameters contribute is in `uncertainty.propagation` (`propagated_scale`).
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,8 +13,12 @@ from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
 from ..data.capture import Capture
 from ..kinematics.arm import Arm
+from ..kinematics.parameters import Parameters
 from .measurement import Measurement, length_covariance
 from .metrics import repeatability
+
+# Names of fixed lengths that free ones can replace, and for each free parameter its weight in place of each of them.
+Partners = tuple[tuple[str, ...], tuple[tuple[float, ...], ...]]
 
 
 class Scale(eqx.Module):
@@ -23,7 +31,7 @@ class Scale(eqx.Module):
 
 
 class ScaleFix(eqx.Module):
-    """Result of stage 2: the arm divided by k, and k."""
+    """Result of stage 2 on its own: the arm divided by k, and k."""
 
     arm: Arm
     scale: Scale
@@ -40,16 +48,51 @@ def divide_lengths(arm: Arm, k: Float[Array, ""]) -> Arm:
     return arm.replace(a=arm.a / k, d=d, probe=arm.probe / k)
 
 
+def divide_free_lengths(
+    space: Parameters, parameters: Float[Array, "... p"], k: Float[Array, "..."], replaced: Float[Array, "... p"]
+) -> Float[Array, "... p"]:
+    """Free parameters with which the arm, its fixed lengths as they are, equals the arm with every length divided by k.
+
+    Tips are linear in the lengths, so a fixed length f that free lengths x can replace with weights w leaves
+    x' = x / k + (1 / k - 1) w f. ``replaced`` is w f (see `replaced_lengths`), 0 where nothing is replaced.
+    """
+    divided, replaced = (jnp.broadcast_to(row, parameters.shape) for row in (jnp.asarray(divisible(space)), replaced))
+    return jnp.where(divided, (parameters + replaced) / k[..., None] - replaced, parameters)
+
+
+def divisible(space: Parameters) -> np.ndarray:
+    """Boolean mask ``(p,)``: free lengths that the division by k changes, all but ``d_1`` (see `divide_lengths`)."""
+    return space.lengths & np.array([name != "d_1" for name in space.names])
+
+
+def replaced_lengths(space: Parameters, arm: Arm, partners: Partners) -> Float[Array, "... p"]:
+    """w f of `divide_free_lengths`, mm: the fixed lengths of the arm by the weights of their partners."""
+    names, weights = partners
+    if not names:
+        return jnp.zeros(len(space.names))
+    fixed = Parameters(arm, names).vector(arm)
+    return fixed @ jnp.asarray(np.array(weights).T)
+
+
 def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> ScaleFix:
     """Stage 2: k from every reference length of a capture, and the arm divided by it.
 
     k is the mean of measured / nominal weighted by uncertainty: the length's own u, and the scatter of the poses over
     the number of them at each end. Its standard uncertainty is the larger of what those predict and what the lengths'
-    disagreement shows (the Birge ratio). It takes the arm's angles as exact; `calibrate` adds their uncertainty.
+    disagreement shows (the Birge ratio). It takes the arm's angles as exact; `calibrate` adds their uncertainty, and
+    leaves fixed parameters as they are, where this function divides every length but ``d_1``.
 
-    ``sigma`` is the standard deviation of a tip coordinate, mm (stage 1's ``after.sigma``); by default it comes from the
-    capture's own scatter. With one pose in every socket there is none, and u of k is then NaN: unknown.
-    Raises `InputError` without a reference length.
+    Args:
+        arm: the arm as stage 1 left it.
+        capture: sockets and at least one reference length.
+        sigma: standard deviation of a tip coordinate, mm (stage 1's ``after.sigma``); by default the capture's own
+            scatter. With one pose in every socket there is none, and u of k is NaN.
+
+    Returns:
+        The arm divided by k, and k with its standard uncertainty.
+
+    Raises:
+        InputError: the capture has no reference length.
     """
     if not capture.lengths:
         raise InputError(
@@ -90,11 +133,21 @@ def scale_and_weights(
 
 
 def scale_from_lengths(measured: Numbers, nominal: Numbers, u: float = 0.0) -> Scale:
-    """k from lengths measured by the arm and their nominal value (one, or one each), mm.
+    """k from repeated measurements of a length, measured / nominal (Cheng et al. 2018, section 2.3).
 
-    ``u`` is the standard uncertainty of the nominal value (of all alike). The uncertainty of k combines it with the
-    standard deviation of the mean of the measurements (JCGM 100, type A). Raises `InputError` for lengths that are not
-    positive and finite.
+    The uncertainty of k combines that of the nominal value with the standard deviation of the mean of the measurements
+    (JCGM 100, type A).
+
+    Args:
+        measured: lengths measured by the arm ``(l,)``, mm.
+        nominal: their certified values, mm; one, or one each.
+        u: standard uncertainty of the nominal value, mm, the same for all.
+
+    Returns:
+        k, its standard uncertainty, and the lengths.
+
+    Raises:
+        InputError: a length is not positive and finite, or the shapes do not fit.
     """
     measured, nominal = jnp.atleast_1d(as_array(measured, "measured")), as_array(nominal, "nominal")
     if nominal.shape not in ((), measured.shape):

@@ -1,4 +1,4 @@
-"""Charts of drift (matplotlib, without its global state), readable in grey: changes over any number of calibrations."""
+"""Figures of drift: changes of parameters and of lengths between two calibrations, or over the dates of several."""
 
 from pathlib import Path
 from typing import Any
@@ -7,97 +7,121 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..drift.results import Drift, Trend, in_words
-from ..files.whole_file import whole_file
+from .style import ACCENT, DARK, save_figure
 
 FORMATS = ("png", "svg", "pdf")
-_DARK, _LIGHT, _ACCENT = "#1b3a6b", "0.72", "#d95f02"
+_LIGHT = "0.72"
 _LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (2, 1)), (0, (4, 1, 1, 1)))
 _MARKERS = "os^Dv<>p"
-_MOST = len(_MARKERS)  # lines that are told apart and named
-_CROWDED = 0.03  # of the span of time: calibrations nearer than this are drawn one after the other, evenly
-_FAR = 8.0  # changes beyond so many expanded uncertainties are drawn on a logarithmic axis
+_COLORS = ("#1b3a6b", "#d95f02", "#111111", "#1b7a5a", "#7a3b8f", "#555555", "#a33b3b", "#3a6fb0")
+_NAMED = len(_MARKERS)  # lines that remain distinct, each with its name
+_CROWDED = 0.03  # calibrations nearer in time than this fraction of the whole are spaced evenly
+_FAR = 8.0  # changes beyond so many expanded uncertainties need a logarithmic axis
 
 
 def check_format(path: Path) -> str:
-    """The format that a figure's file name asks for, or `InputError` for another than PNG, SVG and PDF."""
+    """The format of a figure by its file name; `InputError` for any but PNG, SVG and PDF."""
     suffix = path.suffix.lower().removeprefix(".")
     if suffix not in FORMATS:
         raise InputError(f"{path} is no figure that can be drawn; end its name in .png, .svg or .pdf.")
     return suffix
 
 
-def save_trend(table: Trend, path: Path) -> None:
-    """Draw `trend` into a file, PNG, SVG or PDF by its name, whole or not at all."""
-    suffix = check_format(path)
-    panels = trend(table)
-    with whole_file(path) as temporary:
-        panels[0].figure.savefig(temporary, format=suffix, dpi=150)
+def save_drift_trend(trend: Trend, path: Path) -> None:
+    """Write the figure of `drift_trend` into a file.
+
+    Args:
+        trend: The comparison of two calibrations or more (`drift.trend`).
+        path: The file to write, whole or not at all; its name ends in ``.png``, ``.svg`` or ``.pdf``.
+
+    Raises:
+        InputError: For another format, or if the file cannot be written.
+    """
+    file_format = check_format(path)
+    save_figure(drift_trend(trend)[0].figure, path, file_format)
 
 
-def trend(table: Trend, axes: Any = None) -> Any:
-    """Changes of the parameters over their expanded uncertainty and, below, the effect on lengths; returns both axes.
+def drift_trend(trend: Trend, axes: Any = None) -> Any:
+    """Plot changes of the parameters over their expanded uncertainty and, below, the effect on lengths.
 
-    Over time where there are three calibrations or more; of two, parameter by parameter, with the lengths as a histogram.
+    Three calibrations or more are plotted over time; two parameter by parameter, with the lengths as a histogram.
+
+    Args:
+        trend: The comparison of two calibrations or more (`drift.trend`).
+        axes: Two axes to plot into; new ones if None.
+
+    Returns:
+        Both axes.
     """
     if axes is None:
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(8.2, 6.8), layout="constrained")
-        axes = figure.subplots(2, 1, height_ratios=(1.9, 1))
-    if len(table.drifts) == 1:
-        plot_parameters(table.drifts[0], axes[0])
-        plot_length_changes(table.drifts[0], axes[1])
+        axes = Figure(figsize=(8.2, 6.8), layout="constrained").subplots(2, 1, height_ratios=(1.9, 1))
+    if len(trend.drifts) == 1:
+        parameter_drift(trend.drifts[0], axes[0])
+        length_drift(trend.drifts[0], axes[1])
     else:
-        places = _places(table, axes)
-        plot_changes(table, axes[0], places)
-        plot_lengths(table, axes[1], places)
+        positions = _positions_in_time(trend, axes)
+        parameter_trend(trend, axes[0], positions)
+        length_trend(trend, axes[1], positions)
     return axes
 
 
-def plot_changes(table: Trend, axes: Any, places: np.ndarray | None = None) -> Any:
-    """Every parameter's change from the first calibration over its expanded uncertainty; those beyond it at the end by name."""
-    places = np.arange(len(table.dates)) if places is None else places
-    ratio = np.where(table.expanded > 0, table.change / np.where(table.expanded > 0, table.expanded, 1.0), np.nan)
+def parameter_trend(trend: Trend, axes: Any, positions: np.ndarray | None = None) -> Any:
+    """Plot each parameter's change from the first calibration over its expanded uncertainty.
+
+    The parameters that are beyond it in the last calibration are named.
+
+    Args:
+        trend: The comparison of three calibrations or more (`drift.trend`).
+        axes: Axes to plot into.
+        positions: Abscissa of each calibration; evenly spaced if None.
+
+    Returns:
+        The axes.
+    """
+    positions = np.arange(len(trend.dates)) if positions is None else positions
+    ratio = _ratio(trend.change, trend.expanded)
     ratio[0] = 0.0
     last = np.abs(np.where(np.isnan(ratio[-1]), 0.0, ratio[-1]))
-    named = [i for i in np.argsort(-last) if last[i] > 1][:_MOST]
+    named = [i for i in np.argsort(-last) if last[i] > 1][:_NAMED]
     _band(axes, np.nanmax(np.abs(ratio), initial=1.0))
-    for i in range(len(table.names)):
+    for i in range(len(trend.names)):
         if i not in named:
-            axes.plot(places, ratio[:, i], color=_LIGHT, linewidth=0.8, zorder=1)
+            axes.plot(positions, ratio[:, i], color=_LIGHT, linewidth=0.8, zorder=1)
             beyond = np.abs(ratio[:, i]) > 1
-            axes.plot(places[beyond], ratio[beyond, i], "o", color="white", markeredgecolor="0.45", markersize=4, zorder=2)
-    for rank, i in enumerate(named):
-        axes.plot(
-            places, ratio[:, i], color=_shade(rank), linestyle=_LINES[rank], marker=_MARKERS[rank], markersize=5, linewidth=1.5, zorder=3
-        )  # fmt: skip
-    texts = [f"{table.names[i]} {in_words(table.names[i], float(table.drifts[-1].change[i]))}" for i in named]
-    _label_ends(
-        axes, [(ratio[-1, i], text, _shade(rank)) for rank, (i, text) in enumerate(zip(named, texts, strict=True))], places
+            open_circles = {"color": "white", "markeredgecolor": "0.45", "markersize": 4, "zorder": 2}
+            axes.plot(positions[beyond], ratio[beyond, i], "o", **open_circles)
+    drift, labels = trend.drifts[-1], []
+    for i, color, line, marker in zip(named, _COLORS, _LINES, _MARKERS, strict=False):
+        style = {"color": color, "linestyle": line, "marker": marker, "markersize": 5, "linewidth": 1.5, "zorder": 3}
+        axes.plot(positions, ratio[:, i], **style)
+        labels.append((ratio[-1, i], f"{trend.names[i]} {in_words(trend.names[i], float(drift.change[i]))}", color))
+    _label_ends(axes, labels, positions)
+    _title_changes(
+        axes,
+        f"Change of {len(trend.names)} parameters from the first calibration; band: expanded uncertainty "
+        f"({100 * drift.level:g} %)\nnamed: beyond the band at the end (at most {_NAMED}); "
+        "open circles: other values beyond it",
+        drift,
     )
-    axes.set_ylabel("change / expanded uncertainty")
-    drift = table.drifts[-1]
-    axes.set_title(
-        f"Change of {len(table.names)} parameters from the first calibration; band: expanded uncertainty ({100 * drift.level:g} %)\n"
-        f"named: beyond the band at the end (at most {_MOST}); open circles: other values beyond it{_left_out(drift)}",
-        fontsize=9.5, loc="left",
-    )  # fmt: skip
     return axes
 
 
-def plot_lengths(table: Trend, axes: Any, places: np.ndarray | None = None) -> Any:
-    """Change of lengths over the volume from the first calibration, beside what the uncertainties alone would give; um."""
-    places = np.arange(len(table.dates)) if places is None else places
-    lengths = [drift.lengths for drift in table.drifts]
+def length_trend(trend: Trend, axes: Any, positions: np.ndarray | None = None) -> Any:
+    """Change of lengths over the volume from the first calibration, and what the uncertainties alone predict; um."""
+    positions = np.arange(len(trend.dates)) if positions is None else positions
+    lengths = [drift.lengths for drift in trend.drifts]
+    by_chance = "RMS by the uncertainties alone"
     rows = (
         ([abs(length.largest) for length in lengths], "largest", {"color": "0.5", "marker": "^", "linestyle": ":"}),
-        ([length.rms for length in lengths], "RMS", {"color": _DARK, "marker": "s", "linestyle": "-"}),
-        ([length.rms_by_chance for length in lengths], "RMS by the uncertainties alone", {"color": _ACCENT, "linestyle": "--"}),
+        ([length.rms for length in lengths], "RMS", {"color": DARK, "marker": "s", "linestyle": "-"}),
+        ([length.rms_by_chance for length in lengths], by_chance, {"color": ACCENT, "linestyle": "--"}),
     )
     for values, label, style in rows:
-        shown = np.where(np.isfinite(values), 1e3 * np.asarray(values), np.nan)
-        axes.plot(places[1:], shown, label=label, markersize=5, **style)
-    axes.set_xlim(*_limits(places))
+        finite = np.where(np.isfinite(values), 1e3 * np.asarray(values), np.nan)
+        axes.plot(positions[1:], finite, label=label, markersize=5, **style)
+    axes.set_xlim(*_limits(positions))
     axes.set_ylim(bottom=0)
     axes.set_ylabel(f"change of {lengths[0].length:g} mm\nlengths [um]")
     axes.grid(True, axis="y", alpha=0.3)
@@ -105,85 +129,91 @@ def plot_lengths(table: Trend, axes: Any, places: np.ndarray | None = None) -> A
     return axes
 
 
-def plot_parameters(drift: Drift, axes: Any) -> Any:
-    """Of two calibrations: every parameter's change over its expanded uncertainty, those beyond it filled and by name."""
+def parameter_drift(drift: Drift, axes: Any) -> Any:
+    """Changes between two calibrations over their expanded uncertainty; those beyond it are filled and named."""
     chosen = [i for i, reason in enumerate(drift.reasons) if not reason]
-    safe = np.where(drift.expanded > 0, drift.expanded, 1.0)
-    ratio = np.where(drift.expanded > 0, drift.change / safe, np.nan)[chosen]
-    places = np.arange(len(chosen))
+    ratio, moved = _ratio(drift.change, drift.expanded)[chosen], drift.moved[chosen]
+    positions = np.arange(len(chosen))
     _band(axes, np.nanmax(np.abs(ratio), initial=1.0))
-    moved = drift.moved[chosen]
-    axes.vlines(places, 0, ratio, color=np.where(moved, _DARK, _LIGHT), linewidth=1.2)
-    axes.plot(places[~moved], ratio[~moved], "o", color="white", markeredgecolor="0.35", markersize=6)
-    axes.plot(places[moved], ratio[moved], "s", color=_DARK, markersize=6)
-    crowded = np.any(np.diff(places[moved]) < 3)
-    for place in places[moved]:
-        text = in_words(drift.names[chosen[place]], float(drift.change[chosen[place]]))
-        axes.annotate(
-            text, (place, ratio[place]), xytext=(0, 7 if ratio[place] > 0 else -7), textcoords="offset points", fontsize=8, color=_DARK,
-            ha="center", rotation=90 if crowded else 0, va="bottom" if ratio[place] > 0 else "top",
-        )  # fmt: skip
-    axes.set_xticks(places, [drift.names[i] for i in chosen], rotation=60, ha="right", rotation_mode="anchor", fontsize=8)
+    axes.vlines(positions, 0, ratio, color=np.where(moved, DARK, _LIGHT), linewidth=1.2)
+    axes.plot(positions[~moved], ratio[~moved], "o", color="white", markeredgecolor="0.35", markersize=6)
+    axes.plot(positions[moved], ratio[moved], "s", color=DARK, markersize=6)
+    crowded = np.any(np.diff(positions[moved]) < 3)
+    for i in positions[moved]:
+        up = ratio[i] > 0
+        style = {"va": "bottom" if up else "top", "ha": "center", "rotation": 90 if crowded else 0, "fontsize": 8}
+        text = in_words(drift.names[chosen[i]], float(drift.change[chosen[i]]))
+        offset = {"xytext": (0, 7 if up else -7), "textcoords": "offset points"}
+        axes.annotate(text, (i, ratio[i]), color=DARK, **offset, **style)
+    style = {"rotation": 60, "ha": "right", "rotation_mode": "anchor", "fontsize": 8}
+    axes.set_xticks(positions, [drift.names[i] for i in chosen], **style)
     axes.set_xlim(-0.8, max(len(chosen), 1) - 0.2)
     axes.margins(y=0.3 if crowded else 0.15)
-    axes.set_ylabel("change / expanded uncertainty")
-    axes.set_title(
-        f"New less old calibration: {int(moved.sum())} of {len(chosen)} parameters beyond the band, their expanded uncertainty "
-        f"({100 * drift.level:g} %){_left_out(drift)}",
-        fontsize=9.5, loc="left",
-    )  # fmt: skip
+    _title_changes(
+        axes,
+        f"New less old calibration: {int(moved.sum())} of {len(chosen)} parameters beyond the band, "
+        f"their expanded uncertainty ({100 * drift.level:g} %)",
+        drift,
+    )
     return axes
 
 
-def plot_length_changes(drift: Drift, axes: Any) -> Any:
-    """Of two calibrations: how the changes of lengths over the volume are distributed, beside what the uncertainties alone would give."""
+def length_drift(drift: Drift, axes: Any) -> Any:
+    """Histogram of the changes of lengths between two calibrations, and what the uncertainties alone predict."""
     lengths = drift.lengths
     axes.hist(1e3 * lengths.change, bins=40, color="0.8", edgecolor="0.45", linewidth=0.6)
     axes.axvline(0, color="0.3", linewidth=0.8)
-    if np.isfinite(lengths.rms_by_chance):
-        for side in (-1, 1):
-            label = "RMS by the uncertainties alone" if side > 0 else None
-            axes.axvline(1e3 * side * lengths.rms_by_chance, color=_ACCENT, linestyle="--", linewidth=1.5, label=label)
-    for side in (-1, 1):
-        axes.axvline(
-            1e3 * side * lengths.rms, color=_DARK, linestyle="-", linewidth=1.5, label="RMS found" if side > 0 else None
-        )
+    for rms, color, line, label in (
+        (lengths.rms_by_chance, ACCENT, "--", "RMS by the uncertainties alone"),
+        (lengths.rms, DARK, "-", "RMS found"),
+    ):
+        for side in (-1, 1) if np.isfinite(rms) else ():
+            style = {"color": color, "linestyle": line, "linewidth": 1.5, "label": label if side > 0 else None}
+            axes.axvline(1e3 * side * rms, **style)
     axes.set_xlabel(f"change of {lengths.length:g} mm lengths over the volume [um]")
     axes.set_ylabel("lengths")
     axes.legend(frameon=False, fontsize=8, loc="upper right")
     return axes
 
 
-def _left_out(drift: Drift) -> str:
-    count = len(drift.names) - drift.compared
-    return f"\nnot shown: {count} without an uncertainty of change" if count else ""
+def _ratio(change: np.ndarray, expanded: np.ndarray) -> np.ndarray:
+    """Changes over their expanded uncertainty; NaN without one."""
+    return np.where(expanded > 0, change / np.where(expanded > 0, expanded, 1.0), np.nan)
 
 
-def _places(table: Trend, axes: Any) -> np.ndarray:
-    """Where calibrations stand on both axes: at their dates, or evenly where some would lie on one another; and the ticks."""
-    seconds = np.array([date.timestamp() for date in table.dates])
+def _title_changes(axes: Any, title: str, drift: Drift) -> None:
+    without = len(drift.names) - drift.reasons.count("")
+    note = f"\nnot shown: {without} without an uncertainty of change" if without else ""
+    axes.set_ylabel("change / expanded uncertainty")
+    axes.set_title(title + note, fontsize=9.5, loc="left")
+
+
+def _positions_in_time(trend: Trend, axes: Any) -> np.ndarray:
+    """Abscissas of the calibrations, by date unless they would overlap, in steps of one; sets the ticks of both."""
+    seconds = np.array([date.timestamp() for date in trend.dates])
     span = seconds[-1] - seconds[0]
     even = span <= 0 or np.min(np.diff(seconds)) < _CROWDED * span
-    places = np.arange(len(seconds), dtype=float) if even else (seconds - seconds[0]) / span * (len(seconds) - 1)
-    form = "%Y-%m-%d" if span > 86400 else "%m-%d %H:%M"
-    texts = [f"{date:{form}}" for date in table.dates]
-    axes[0].set_xticks(places, [])
-    axes[1].set_xticks(places, texts, rotation=45, ha="right", rotation_mode="anchor", fontsize=8)
+    count = len(seconds)
+    positions = np.arange(count, dtype=float) if even else (seconds - seconds[0]) / span * (count - 1)
+    date_format = "%Y-%m-%d" if span > 86400 else "%m-%d %H:%M"
+    dates = [f"{date:{date_format}}" for date in trend.dates]
+    axes[0].set_xticks(positions, [])
+    axes[1].set_xticks(positions, dates, rotation=45, ha="right", rotation_mode="anchor", fontsize=8)
     axes[1].set_xlabel("calibration" + (", evenly spaced" if even else ""))
-    return places
+    return positions
 
 
-def _limits(places: np.ndarray) -> tuple[float, float]:
-    span = places[-1] - places[0]
-    return float(places[0] - 0.03 * span), float(places[-1] + 0.03 * span)
+def _limits(positions: np.ndarray) -> tuple[float, float]:
+    margin = 0.03 * (positions[-1] - positions[0])
+    return float(positions[0] - margin), float(positions[-1] + margin)
 
 
-def _band(axes: Any, most: float) -> None:
-    """The band within which a change is no more than its expanded uncertainty; logarithmic beyond, where changes are far out."""
-    if most > _FAR:
+def _band(axes: Any, largest: float) -> None:
+    """The band of changes within their expanded uncertainty; the axis is logarithmic beyond it if any is far out."""
+    if largest > _FAR:
         axes.set_yscale("symlog", linthresh=2, linscale=1.2)
-        steps = (2, 5, 10, 20) if most < 40 else (10, 100, 1000, 10_000, 100_000)
-        ticks = [value for value in steps if value < 2 * most]
+        steps = (2, 5, 10, 20) if largest < 40 else (10, 100, 1000, 10_000, 100_000)
+        ticks = [value for value in steps if value < 2 * largest]
         values = [-value for value in reversed(ticks)] + [-1, 0, 1] + ticks
         axes.set_yticks(values, [f"{value:g}" for value in values])
         axes.minorticks_off()
@@ -193,29 +223,23 @@ def _band(axes: Any, most: float) -> None:
         axes.axhline(side, color="0.5", linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
 
 
-def _shade(rank: int) -> str:
-    return ("#1b3a6b", "#d95f02", "#111111", "#1b7a5a", "#7a3b8f", "#555555", "#a33b3b", "#3a6fb0")[rank]
-
-
-def _label_ends(axes: Any, labels: list[tuple[float, str, str]], places: np.ndarray) -> None:
-    """Names at the right of the lines' ends, moved apart where they would lie on one another."""
-    axes.set_xlim(*_limits(places))
+def _label_ends(axes: Any, labels: list[tuple[float, str, str]], positions: np.ndarray) -> None:
+    """Label the ends of lines at the right (value, text, color), moved apart where the labels would overlap."""
+    axes.set_xlim(*_limits(positions))
     low, high = axes.get_ylim()
     transform = axes.transData + axes.transAxes.inverted()
-    wanted = sorted((float(transform.transform((places[-1], value))[1]), value, text, color) for value, text, color in labels)
+    wanted = sorted((float(transform.transform((positions[-1], label[0]))[1]), *label) for label in labels)
     heights = np.array([height for height, *_ in wanted])
     least = 0.055
     for _ in range(200):
-        gaps = np.diff(heights)
-        tight = np.flatnonzero(gaps < least - 1e-6)
+        tight = np.flatnonzero(np.diff(heights) < least - 1e-6)
         if not len(tight):
             break
         for i in tight:
             push = (least - (heights[i + 1] - heights[i])) / 2
             heights[i], heights[i + 1] = heights[i] - push, heights[i + 1] + push
+    arrow = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.7, "shrinkA": 1, "shrinkB": 4}
+    style = {"textcoords": "axes fraction", "fontsize": 8.5, "va": "center", "annotation_clip": False}
     for height, (_, value, text, color) in zip(heights, wanted, strict=True):
-        axes.annotate(
-            text, (places[-1], value), xytext=(1.03, height), textcoords="axes fraction", fontsize=8.5, color=color, va="center",
-            arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.7, "shrinkA": 1, "shrinkB": 4}, annotation_clip=False,
-        )  # fmt: skip
+        axes.annotate(text, (positions[-1], value), xytext=(1.03, height), color=color, arrowprops=arrow, **style)
     axes.set_ylim(low, high)

@@ -1,4 +1,4 @@
-"""Figures of a study (matplotlib), readable in grey; each takes the results and returns a matplotlib figure."""
+"""Figures of a Monte Carlo study; each takes its results."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,182 +7,273 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..files.whole_file import whole_file
+from ..core.units import ARCSEC
 from ..study.results import Results
 from ..study.specification import unit
 from ..study.statistics import METRICS, correlation
+from .style import ACCENT, DARK, axes_or_new, label_axes, save_figure
 
-_BEFORE, _AFTER = "#d95f02", "#1b3a6b"
 _UNITS = {"de": "mm", "deltam": "mm", "length_error": "mm", "angle_error": "arcsec"}
-_ARCSEC = 3600 * 180 / np.pi
 _WIDTHS = ("bounds.length_mm", "bounds.angle_deg")
 _SHIFTS = ("bounds.length_shift_mm", "bounds.angle_shift_deg")
+_AXES = {
+    "bounds.length_mm": "half-width of lengths [mm]",
+    "bounds.angle_deg": "half-width of angles [deg]",
+    "bounds.length_shift_mm": "shift of the centre, lengths [mm]",
+    "bounds.angle_shift_deg": "shift of the centre, angles [deg]",
+    "identification.hold": "scale anchor",
+    "identification.method": "method",
+    "capture.poses": "poses in a socket",
+    "capture.sockets": "sockets",
+    "reference.positions": "positions of the reference length",
+}
 
 
-def write_figures(results: Results, folder: Path) -> list[Path]:
-    """Every figure that the study's factors give sense to, as PNG in a folder; the paths written."""
-    import matplotlib
+def study_metric(results: Results, metric: str = "length_error", axes: Any = None) -> Any:
+    """Plot one metric in every cell of a study: median, 5th and 95th percentile of the converged trials.
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    Args:
+        results: The study.
+        metric: Name of the metric, a key of `study.statistics.METRICS`.
+        axes: Axes to plot into; new ones if None.
 
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: If there is no such metric.
+    """
+    if metric not in METRICS:
+        raise InputError(f"a study has no metric '{metric}'; choose one of {', '.join(METRICS)}.")
+    axes = axes_or_new(axes)
+    cells = range(len(results.study.cells))
+    for cell in cells:
+        values = _values(results, metric, [cell])
+        if len(values):
+            low, middle, high = np.percentile(values, (5, 50, 95))
+            bars = [[middle - low], [high - middle]]
+            axes.errorbar(cell + 1, middle, yerr=bars, fmt="s", color=DARK, capsize=4)
+    axes.set_xticks([cell + 1 for cell in cells] if len(cells) <= 30 else axes.get_xticks())
+    measure = _UNITS.get(metric.removesuffix("_stage1"))
+    label_axes(axes, "cell", METRICS[metric] + (f" [{measure}]" if measure else ""))
+    return axes
+
+
+def save_study_figures(results: Results, folder: Path) -> list[Path]:
+    """Write every figure that the study's factors allow into a folder, as PNG.
+
+    Args:
+        results: The study.
+        folder: The folder, made if there is none.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: If the folder or a file cannot be written.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(
-            f"{folder} cannot be made: {(error.strerror or str(error)).lower()}; choose another folder."
-        ) from error
-    factors, made = results.study.factors, {}
-    converged = any(np.any(results.column("converged", cell) == 1) for cell in range(len(results.study.cells)))
-    made["convergence"] = lambda: convergence_map(results)
-    if not converged:
-        factors = {}
-    for factor in factors:
-        made[f"distributions_{factor.replace('.', '_')}"] = lambda factor=factor: distributions(results, factor)
-    for factor in _WIDTHS:
-        if factor in factors:
-            made[f"error_against_{factor.replace('.', '_')}"] = lambda factor=factor: errors_against(results, factor)
-    for factor in _SHIFTS:
-        if factor in factors:
-            made[f"k_against_{factor.replace('.', '_')}"] = lambda factor=factor: scale_against(results, factor)
-    if converged:
-        made["correlation"] = lambda: correlations(results, 1)
+        reason = (error.strerror or str(error)).lower()
+        raise InputError(f"{folder} cannot be made: {reason}; choose another folder.") from error
     written = []
-    for name, draw in made.items():
-        figure = draw()
-        with whole_file(folder / f"{name}.png") as temporary:
-            figure.savefig(temporary, format="png", dpi=150)
-        pyplot.close(figure)
+    for name, figure in _possible_figures(results).items():
         written.append(folder / f"{name}.png")
+        save_figure(figure(), written[-1])
     return written
 
 
-def distributions(results: Results, factor: str, figures: Sequence[str] = ("de", "length_error", "angle_error")) -> Any:
-    """How figures are distributed at each level of a factor, over all other factors: median, quartiles, 5 and 95 %."""
-    from matplotlib import pyplot
+def _possible_figures(results: Results) -> dict[str, Any]:
+    """Functions that make the figures, by file name."""
+    figures: dict[str, Any] = {"convergence": lambda: study_convergence(results)}
+    if not any(np.any(results.column("converged", cell) == 1) for cell in range(len(results.study.cells))):
+        return figures
+    for names, prefix, plot in (
+        (tuple(results.study.factors), "distributions", study_distributions),
+        (_WIDTHS, "error_against", study_errors),
+        (_SHIFTS, "k_against", study_scale),
+    ):
+        for factor in names:
+            if factor in results.study.factors:
+                name = f"{prefix}_{factor.replace('.', '_')}"
+                figures[name] = lambda factor=factor, plot=plot: plot(results, factor)
+    figures["correlation"] = lambda: study_correlation(results, 1)
+    return figures
 
-    levels = _levels(results, factor)
-    shown = [name for name in map(lambda name: _there(results, name), figures) if name]
-    drawing, axes = pyplot.subplots(1, len(shown), figsize=(4.3 * len(shown), 3.8), layout="constrained", squeeze=False)
-    for panel, name in zip(axes[0], shown, strict=True):
-        values = [_values(results, name, cells) for cells in _cells_by(results, factor)]
+
+def study_distributions(
+    results: Results, factor: str, metrics: Sequence[str] = ("de", "length_error", "angle_error")
+) -> Any:
+    """Plot how metrics are distributed at each level of a factor, over all other factors, as box plots.
+
+    Args:
+        results: The study.
+        factor: Name of a varied factor.
+        metrics: Names of the metrics, one panel each; those of stage 1 if the study has no scale fix.
+
+    Returns:
+        The figure.
+    """
+    names = [name for name in (_available(results, metric) for metric in metrics) if name]
+    figure, axes = _panels(1, len(names), (4.3 * len(names), 3.8))
+    for panel, name in zip(axes[0], names, strict=True):
+        values = [_values(results, name, cells) for cells in _cells_by_level(results, factor)]
         panel.boxplot(
-            [v if len(v) else [np.nan] for v in values], whis=(5, 95), showfliers=False, tick_labels=levels,
-            medianprops={"color": _AFTER, "linewidth": 1.8},
+            [v if len(v) else [np.nan] for v in values], whis=(5, 95), showfliers=False,
+            tick_labels=_levels(results, factor), medianprops={"color": DARK, "linewidth": 1.8},
         )  # fmt: skip
         _finish(panel, _axis(factor), _title(name))
-        if all(np.nanmin(v, initial=np.inf) > 0 for v in values) and _spans(values):
+        if all(np.nanmin(v, initial=np.inf) > 0 for v in values) and _spans_decades(values):
             panel.set_yscale("log")
-    drawing.suptitle("boxes: quartiles and median; whiskers: 5 % and 95 %", fontsize=9)
-    return drawing
+    figure.suptitle("boxes: quartiles and median; whiskers: 5 % and 95 %", fontsize=9)
+    return figure
 
 
-def errors_against(results: Results, factor: str) -> Any:
-    """Largest length error (or angle error) before and after the scale fix against a half-width of the box: median, 5 to 95 %."""
-    from matplotlib import pyplot
+def study_errors(results: Results, factor: str) -> Any:
+    """Plot the largest length or angle error before and after the scale fix against a half-width of the bounds.
 
+    Args:
+        results: The study.
+        factor: ``"bounds.length_mm"`` or ``"bounds.angle_deg"``, varied in the study.
+
+    Returns:
+        The figure, with medians and bands from the 5th to the 95th percentile.
+    """
     kind = "length_error" if "length" in factor else "angle_error"
-    others = _others(results, factor, most=4)
-    drawing, axes = pyplot.subplots(
-        1, len(others), figsize=(5 * len(others), 3.9), layout="constrained", squeeze=False, sharey=True
-    )
-    for panel, (words, cells) in zip(axes[0], others.items(), strict=True):
+    runs = _runs(results, factor, most=4)
+    figure, axes = _panels(1, len(runs), (5 * len(runs), 3.9), sharey=True)
+    for panel, (words, cells) in zip(axes[0], runs.items(), strict=True):
         x = [float(results.study.factors[factor][_index(results, cell)[factor]]) for cell in cells]
-        for name, color, text, marker in (
-            (f"{kind}_stage1", _BEFORE, "before the scale fix", "^"),
-            (kind, _AFTER, "after", "s"),
+        for name, color, label, marker in (
+            (f"{kind}_stage1", ACCENT, "before the scale fix", "^"),
+            (kind, DARK, "after", "s"),
         ):
-            rows = [_values(results, name, [cell]) for cell in cells]
-            if any(len(row) for row in rows):
-                low, middle, high = np.array([np.percentile(row, (5, 50, 95)) if len(row) else [np.nan] * 3 for row in rows]).T
+            low, middle, high = _percentiles(results, name, cells)
+            if np.any(np.isfinite(middle)):
                 panel.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
-                panel.plot(x, middle, color=color, marker=marker, label=text)
+                panel.plot(x, middle, color=color, marker=marker, label=label)
         panel.set_xscale("log")
         panel.set_yscale("log")
         panel.set_xticks(x, [f"{value:g}" for value in x])
         panel.minorticks_off()
         _finish(panel, _axis(factor), _title(kind) if panel is axes[0, 0] else "", words)
     axes[0, 0].legend(frameon=False)
-    return drawing
+    return figure
 
 
-def scale_against(results: Results, factor: str) -> Any:
-    """The scale that stage 1 leaves (found / true) against a shift of the box's centre: median, 5 to 95 %."""
-    from matplotlib import pyplot
+def study_scale(results: Results, factor: str) -> Any:
+    """Plot the scale that stage 1 leaves (found / true) against a shift of the bounds' centre.
 
-    drawing, panel = pyplot.subplots(figsize=(6, 4.2), layout="constrained")
-    others = _others(results, factor, most=10)
-    for i, (words, cells) in enumerate(others.items()):
+    Args:
+        results: The study.
+        factor: ``"bounds.length_shift_mm"`` or ``"bounds.angle_shift_deg"``, varied in the study.
+
+    Returns:
+        The figure, with medians and bands from the 5th to the 95th percentile.
+    """
+    figure, axes = _panels(1, 1, (6, 4.2))
+    panel = axes[0, 0]
+    runs = _runs(results, factor, most=10)
+    for i, (words, cells) in enumerate(runs.items()):
         x = [float(results.study.factors[factor][_index(results, cell)[factor]]) for cell in cells]
-        rows = [_values(results, "scale", [cell]) for cell in cells]
-        low, middle, high = np.array([np.percentile(row, (5, 50, 95)) if len(row) else [np.nan] * 3 for row in rows]).T
-        shade = str(0.65 * i / max(len(others) - 1, 1))
-        if len(others) <= 4:
-            panel.fill_between(x, low, high, color=shade, alpha=0.12, linewidth=0)
-        panel.plot(x, middle, color=shade, marker="os^Dv<>p*h"[i % 10], label=words or None)
-    panel.axhline(1.0, color=_BEFORE, linewidth=0.9, linestyle="--")
+        low, middle, high = _percentiles(results, "scale", cells)
+        grey = str(0.65 * i / max(len(runs) - 1, 1))
+        if len(runs) <= 4:
+            panel.fill_between(x, low, high, color=grey, alpha=0.12, linewidth=0)
+        panel.plot(x, middle, color=grey, marker="os^Dv<>p*h"[i % 10], label=words or None)
+    panel.axhline(1.0, color=ACCENT, linewidth=0.9, linestyle="--")
     _finish(panel, _axis(factor), "scale of stage 1, found / true")
-    if len(others) > 1:
+    if len(runs) > 1:
         panel.legend(frameon=False, fontsize=8)
-    return drawing
+    return figure
 
 
-def correlations(results: Results, cell: int) -> Any:
-    """Correlation of the errors of all parameters in one cell (counted from 1)."""
-    from matplotlib import pyplot
+def study_correlation(results: Results, cell: int) -> Any:
+    """Plot the correlations of the parameters' errors in one cell.
 
+    Args:
+        results: The study.
+        cell: The cell, counted from 1.
+
+    Returns:
+        The figure.
+    """
     names = results.study.space.names
-    drawing, panel = pyplot.subplots(figsize=(6.8, 5.8), layout="constrained")
+    figure, axes = _panels(1, 1, (6.8, 5.8))
+    panel = axes[0, 0]
     image = panel.imshow(correlation(results, cell - 1), vmin=-1, vmax=1, cmap="RdBu_r")
     panel.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
     panel.set_yticks(range(len(names)), names, fontsize=8)
-    panel.set_title(f"correlation of parameter errors, cell {cell}{_words_of(results, cell - 1)}", fontsize=10)
-    drawing.colorbar(image, ax=panel, shrink=0.85)
-    return drawing
+    words = _cell_label(results, cell - 1)
+    panel.set_title(f"correlation of parameter errors, cell {cell}{': ' if words else ''}{words}", fontsize=10)
+    figure.colorbar(image, ax=panel, shrink=0.85)
+    return figure
 
 
-def convergence_map(results: Results) -> Any:
-    """Share of trials that converged: over the two factors with the most levels, or along the only one."""
-    from matplotlib import pyplot
+def study_convergence(results: Results) -> Any:
+    """Plot the percentage of trials that converged over the two factors with the most levels, or along the only one.
 
+    Args:
+        results: The study.
+
+    Returns:
+        The figure.
+    """
     factors = sorted(results.study.factors, key=lambda name: -len(results.study.factors[name]))[:2]
     levels = [_levels(results, name) for name in factors] + [["all"]] * (2 - len(factors))
     total, good = np.zeros((2, len(levels[1]), len(levels[0])))
     for cell in range(len(results.study.cells)):
         index = _index(results, cell)
-        place = (index[factors[1]] if len(factors) > 1 else 0, index[factors[0]] if factors else 0)
+        at = (index[factors[1]] if len(factors) > 1 else 0, index[factors[0]] if factors else 0)
         converged = results.column("converged", cell)
-        total[place] += np.sum(converged >= 0)
-        good[place] += np.sum(converged == 1)
-    share = np.divide(100 * good, total, out=np.full_like(good, np.nan), where=total > 0)
-    size = (1.6 + 0.75 * max(len(levels[0]), 4), 1.7 + 0.45 * len(levels[1]))
-    drawing, panel = pyplot.subplots(figsize=size, layout="constrained")
-    panel.imshow(share, vmin=0, vmax=100, cmap="Greys_r", aspect="auto")
-    for (row, column), value in np.ndenumerate(share):
+        total[at] += np.sum(converged >= 0)
+        good[at] += np.sum(converged == 1)
+    percentage = np.divide(100 * good, total, out=np.full_like(good, np.nan), where=total > 0)
+    figure, axes = _panels(1, 1, (1.6 + 0.75 * max(len(levels[0]), 4), 1.7 + 0.45 * len(levels[1])))
+    panel = axes[0, 0]
+    panel.imshow(percentage, vmin=0, vmax=100, cmap="Greys_r", aspect="auto")
+    for (row, column), value in np.ndenumerate(percentage):
         text = "-" if np.isnan(value) else f"{value:.0f}" if value in (0, 100) else f"{value:.1f}"
-        panel.text(column, row, text, ha="center", va="center", fontsize=8, color="white" if value < 50 else "black")
+        color = "white" if value < 50 else "black"
+        panel.text(column, row, text, ha="center", va="center", fontsize=8, color=color)
     panel.set_xticks(range(len(levels[0])), levels[0])
     panel.set_yticks(range(len(levels[1])), levels[1])
     panel.set_xlabel(_axis(factors[0]) if factors else "")
     panel.set_ylabel(_axis(factors[1]) if len(factors) > 1 else "")
     panel.set_title("trials that converged [%]", fontsize=10)
-    return drawing
+    return figure
 
 
-def _there(results: Results, name: str) -> str | None:
-    """The figure, or what stands for it where the study has no scale fix."""
-    for candidate in (name, f"{name}_stage1"):
-        if candidate in METRICS and any(len(_values(results, candidate, [cell])) for cell in range(len(results.study.cells))):
-            return candidate
+def _panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Any, Any]:
+    """A figure outside matplotlib's global state, and its axes as an array."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, **options)
+
+
+def _available(results: Results, metric: str) -> str | None:
+    """The metric, or that of stage 1 where the study has no scale fix."""
+    cells = range(len(results.study.cells))
+    for name in (metric, f"{metric}_stage1"):
+        if name in METRICS and any(len(_values(results, name, [cell])) for cell in cells):
+            return name
     return None
 
 
-def _values(results: Results, name: str, cells: Sequence[int]) -> np.ndarray:
-    """A figure of the converged trials of some cells; angles in arcseconds."""
-    factor = _ARCSEC if name.startswith("angle") else 1.0
-    rows = [results.column(name, cell)[results.column("converged", cell) == 1] for cell in cells]
+def _values(results: Results, metric: str, cells: Sequence[int]) -> np.ndarray:
+    """A metric of the converged trials of some cells; angles in arcseconds."""
+    factor = 1 / ARCSEC if metric.startswith("angle") else 1.0
+    rows = [results.column(metric, cell)[results.column("converged", cell) == 1] for cell in cells]
     values = factor * np.concatenate(rows)
     return values[np.isfinite(values)]
+
+
+def _percentiles(results: Results, metric: str, cells: Sequence[int]) -> np.ndarray:
+    """5th, 50th and 95th percentile in each cell; NaN where no trial converged."""
+    rows = [_values(results, metric, [cell]) for cell in cells]
+    return np.array([np.percentile(row, (5, 50, 95)) if len(row) else [np.nan] * 3 for row in rows]).T
 
 
 def _index(results: Results, cell: int) -> dict[str, int]:
@@ -192,17 +283,17 @@ def _index(results: Results, cell: int) -> dict[str, int]:
     return {name: int(i) for name, i in zip(results.study.factors, chosen, strict=True)}
 
 
-def _cells_by(results: Results, factor: str) -> list[list[int]]:
+def _cells_by_level(results: Results, factor: str) -> list[list[int]]:
     cells = range(len(results.study.cells))
     index = [_index(results, cell)[factor] for cell in cells]
     return [[cell for cell in cells if index[cell] == i] for i in range(len(results.study.factors[factor]))]
 
 
-def _others(results: Results, factor: str, most: int) -> dict[str, list[int]]:
-    """Runs of cells that differ in one factor only, by the levels of the others in words; in order of the factor."""
+def _runs(results: Results, factor: str, most: int) -> dict[str, list[int]]:
+    """Runs of cells that differ in one factor only and in its order, by the levels of the other factors in words."""
     runs: dict[str, list[int]] = {}
     for cell in range(len(results.study.cells)):
-        runs.setdefault(_words_of(results, cell, without=factor), []).append(cell)
+        runs.setdefault(_cell_label(results, cell, without=factor), []).append(cell)
     for cells in runs.values():
         cells.sort(key=lambda cell: results.study.factors[factor][_index(results, cell)[factor]])
     if len(runs) > most:
@@ -211,15 +302,14 @@ def _others(results: Results, factor: str, most: int) -> dict[str, list[int]]:
     return runs
 
 
-def _words_of(results: Results, cell: int, without: str = "") -> str:
-    factors, index = results.study.factors, _index(results, cell)
-    words = [_with_unit(_axis(name), _text(factors[name][i])) for name, i in index.items() if name != without]
-    return (": " if not without and words else "") + ", ".join(words)
-
-
-def _with_unit(axis: str, level: str) -> str:
-    name, _, measure = axis.partition(" [")
-    return f"{name} {level}" + (f" {measure[:-1]}" if measure else "")
+def _cell_label(results: Results, cell: int, without: str = "") -> str:
+    """The levels of a cell's factors in words."""
+    factors, words = results.study.factors, []
+    for factor, i in _index(results, cell).items():
+        if factor != without:
+            name, _, measure = _axis(factor).partition(" [")
+            words.append(f"{name} {_text(factors[factor][i])}" + (f" {measure[:-1]}" if measure else ""))
+    return ", ".join(words)
 
 
 def _levels(results: Results, factor: str) -> list[str]:
@@ -231,38 +321,27 @@ def _text(level: float | str) -> str:
 
 
 def _axis(factor: str) -> str:
-    known = {
-        "bounds.length_mm": "half-width of lengths [mm]",
-        "bounds.angle_deg": "half-width of angles [deg]",
-        "bounds.length_shift_mm": "shift of the centre, lengths [mm]",
-        "bounds.angle_shift_deg": "shift of the centre, angles [deg]",
-        "identification.hold": "held length",
-        "identification.method": "method",
-        "capture.poses": "poses in a socket",
-        "capture.sockets": "sockets",
-        "reference.positions": "positions of the reference length",
-    }
-    if factor in known:
-        return known[factor]
+    """Label of a factor's axis."""
+    if factor in _AXES:
+        return _AXES[factor]
     table, _, name = factor.partition(".")
     words = name.removesuffix(f"_{unit(factor)}").replace("_", " ")
     prefix = {"reference": "reference ", "deviation": "deviation of "}.get(table, "")
     return prefix + words + (f" [{unit(factor)}]" if unit(factor) != "1" else "")
 
 
-def _title(name: str) -> str:
-    measure = _UNITS.get(name.removesuffix("_stage1"), "1")
-    return f"{METRICS[name].removesuffix(' after the scale fix')} [{measure}]"
+def _title(metric: str) -> str:
+    measure = _UNITS.get(metric.removesuffix("_stage1"), "1")
+    return f"{METRICS[metric].removesuffix(' after the scale fix')} [{measure}]"
 
 
-def _spans(values: list[np.ndarray]) -> bool:
+def _spans_decades(values: list[np.ndarray]) -> bool:
     """Whether medians differ more than tenfold."""
     medians = [np.median(v) for v in values if len(v)]
     return bool(medians) and max(medians) > 10 * min(medians)
 
 
 def _finish(panel: Any, x: str, y: str, title: str = "") -> None:
-    panel.set_xlabel(x)
-    panel.set_ylabel(y)
+    panel.set(xlabel=x, ylabel=y)
     panel.set_title(title, fontsize=9)
     panel.grid(True, which="major", axis="y", alpha=0.3)

@@ -1,4 +1,4 @@
-"""Reports that a laboratory would hand on: one HTML file for a calibration, an evaluation or a study."""
+"""Reports for laboratories and their customers: one HTML file for a calibration, an evaluation or a study."""
 
 import lazy_loader as _lazy_loader
 

@@ -1,42 +1,61 @@
-"""Who calibrated what for whom, as people stated it; and what they left out."""
+"""The section of administrative data: laboratory, customer, item, persons and dates, and what is not stated of them."""
 
-from typing import Any
+from ..files.administrative_data import NOT_STATED, AdministrativeData
+from .elements import Section, Table, text_cell
 
-from .about import _ADDRESS, _ALWAYS, _NOT, _WHERE_STATED, _stated, _temperature
-from .parts import Section, Table, text
+# Part, key and title: shown always, and shown if stated.
+_ALWAYS = (
+    ("laboratory", "name", "Laboratory"),
+    ("customer", "name", "Customer"),
+    ("item", "manufacturer", "Manufacturer of the arm"),
+    ("item", "model", "Model"),
+    ("item", "serial_number", "Serial number"),
+    ("certificate", "number", "Certificate number"),
+    ("certificate", "begin", "Begun on"),
+    ("certificate", "end", "Ended on"),
+)
+_IF_STATED = (
+    ("laboratory", "code", "Accreditation of the laboratory"),
+    ("item", "name", "Arm"),
+    ("item", "customer_number", "Customer's number of the arm"),
+    ("certificate", "received", "Received on"),
+    ("certificate", "issued", "Issued on"),
+    ("certificate", "place", "Place"),
+    ("certificate", "remarks", "Remarks"),
+)
+_ADDRESS = ("street", "postal_code", "city", "country", "email", "phone")
 
 
-def administrative_section(about: Any, tested: bool) -> Section:
-    """What an `about.About` states, and which of the usual entries it leaves out. ``tested``: acceptance tests stand in the report."""
-    rows = [[text(title), text(_stated(about, part, key) or _NOT)] for part, key, title in _ALWAYS]
-    for part, title in (("laboratory", "Address of the laboratory"), ("customer", "Address of the customer")):
-        address = ", ".join(filter(None, (_stated(about, part, key) for key in _ADDRESS)))
-        rows += [[text(title), text(address)]] if address else []
-    rows += [
-        [text(title), text(value)]
-        for part, key, title in _WHERE_STATED
-        if (value := _stated(about, part, key)) and value != "other"
-    ]
-    rows.append([text("Temperature"), text(_temperature(about.certificate))])
-    for person in about.person:
-        words = ", ".join(filter(None, (person.name, person.role, "signs the certificate" if person.main_signer else "")))
-        rows.append([text("Responsible"), text(words)])
-    if not about.person:
-        rows.append([text("Responsible"), text(_NOT)])
-    for reference in about.reference:
-        number = reference.certificate_number
-        parts = (
-            reference.name,
-            reference.manufacturer,
-            reference.model,
-            reference.serial_number,
-            number and f"certificate {number}",
-        )
-        rows.append([text("Reference artefact"), text(", ".join(filter(None, parts)))])
-    if not about.reference:
-        rows.append([text("Reference artefacts"), text(_NOT)])
-    if about.conformity is not None:
-        source = "" if tested else " (stated by the laboratory; this file holds no acceptance test)"
-        words = f"{about.conformity.verdict}: {about.conformity.specification}; {about.conformity.decision_rule}{source}"
-        rows.append([text("Statement of conformity"), text(words)])
-    return Section("about", "Laboratory, customer and item", [Table("As stated", ("", ""), rows)])
+def administrative_section(given: AdministrativeData, tested: bool) -> Section:
+    """The administrative data of a report; ``tested``: whether the report contains acceptance tests."""
+
+    def stated(part: str, key: str) -> str:
+        value = getattr(getattr(given, part), key)
+        return "" if value is None else str(value)
+
+    rows = [(title, stated(part, key) or NOT_STATED) for part, key, title in _ALWAYS]
+    for part in ("laboratory", "customer"):
+        address = ", ".join(filter(None, (stated(part, key) for key in _ADDRESS)))
+        rows += [(f"Address of the {part}", address)] if address else []
+    rows += [(title, value) for part, key, title in _IF_STATED if (value := stated(part, key)) and value != "other"]
+    temperature, u = given.certificate.temperature_celsius, given.certificate.temperature_u_celsius
+    words = NOT_STATED if temperature is None else f"{temperature:g} °C" + ("" if u is None else f", u = {u:g} °C")
+    rows.append(("Temperature", words))
+    for person in given.person:
+        parts = (person.name, person.role, "signs the certificate" if person.main_signer else "")
+        rows.append(("Responsible", ", ".join(filter(None, parts))))
+    if not given.person:
+        rows.append(("Responsible", NOT_STATED))
+    for artefact in given.reference:
+        number = artefact.certificate_number and f"certificate {artefact.certificate_number}"
+        parts = (artefact.name, artefact.manufacturer, artefact.model, artefact.serial_number, number)
+        rows.append(("Reference artefact", ", ".join(filter(None, parts))))
+    if not given.reference:
+        rows.append(("Reference artefacts", NOT_STATED))
+    if given.conformity is not None:
+        source = "" if tested else " (stated by the laboratory; this file contains no acceptance test)"
+        conformity = given.conformity
+        words = f"{conformity.verdict}: {conformity.specification}; {conformity.decision_rule}{source}"
+        rows.append(("Statement of conformity", words))
+    table = Table("As stated", ("", ""), [[text_cell(title), text_cell(value)] for title, value in rows])
+    return Section("about", "Laboratory, customer and item", [table])

@@ -1,18 +1,18 @@
-"""Charts of a report, as plain dictionaries for Plotly; shapes and shades differ, so that grey is enough to read them."""
+"""Charts of a report, as plain dictionaries for Plotly; shapes and shades remain distinct in grey."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from .parts import plain
+from .elements import escaped
 
 DARK, WARM, LIGHT = "#1b3a6b", "#c8560a", "#9aa3ad"
 _FONT = {"family": "system-ui, sans-serif", "size": 13, "color": "#1a1a1a"}
 
 
 def layout(x: str, y: str, **more: Any) -> dict[str, Any]:
-    """Layout with titled axes; tight, so that it also fits a narrow screen."""
+    """Layout with titled axes and narrow margins, so that it fits a narrow screen."""
     axis = {
         "showgrid": True,
         "gridcolor": "#dde2e8",
@@ -36,7 +36,7 @@ def layout(x: str, y: str, **more: Any) -> dict[str, Any]:
     return found
 
 
-def dots(
+def markers(
     name: str,
     x: Any,
     y: Any,
@@ -58,17 +58,17 @@ def dots(
         "marker": {"color": color, "symbol": symbol, "size": size, "line": {"width": 1, "color": color}},
     }
     if len(hover):
-        trace |= {"text": [plain(line) for line in hover], "hoverinfo": "text"}
+        trace |= {"text": [escaped(line) for line in hover], "hoverinfo": "text"}
     if bars is not None:
         trace["error_y"] = {"type": "data", "array": _numbers(bars), "color": color, "thickness": 1.2, "width": 4}
     return trace | more
 
 
 def logarithmic(*values: Any) -> dict[str, Any]:
-    """A logarithmic axis with plain numbers at every decade, and at 2 and 5 where there are few decades."""
-    every = np.concatenate([np.asarray(part, dtype=float).ravel() for part in values])
-    every = every[np.isfinite(every) & (every > 0)]
-    low, high = (float(every.min()), float(every.max())) if len(every) else (0.1, 1.0)
+    """A logarithmic axis with plain numbers at every decade, and at 2 and 5 if there are few decades."""
+    shown = np.concatenate([np.asarray(part, dtype=float).ravel() for part in values])
+    shown = shown[np.isfinite(shown) & (shown > 0)]
+    low, high = (float(shown.min()), float(shown.max())) if len(shown) else (0.1, 1.0)
     first, last = int(np.floor(np.log10(low))), int(np.ceil(np.log10(high)))
     steps = (1, 2, 5) if last - first <= 3 else (1,)
     marks = [step * 10.0**power for power in range(first, last + 1) for step in steps]
@@ -84,7 +84,8 @@ def vertical(positions: Sequence[float]) -> list[dict[str, Any]]:
     """Thin vertical lines over the whole height."""
     line = {"color": "#777", "width": 1, "dash": "dot"}
     return [
-        {"type": "line", "xref": "x", "yref": "paper", "x0": at, "x1": at, "y0": 0, "y1": 1, "line": line} for at in positions
+        {"type": "line", "xref": "x", "yref": "paper", "x0": x, "x1": x, "y0": 0, "y1": 1, "line": line}
+        for x in positions
     ]
 
 
@@ -92,22 +93,23 @@ def horizontal(positions: Sequence[float], dash: str = "dash") -> list[dict[str,
     """Thin horizontal lines over the whole width."""
     line = {"color": "#444", "width": 1, "dash": dash}
     return [
-        {"type": "line", "xref": "paper", "yref": "y", "x0": 0, "x1": 1, "y0": at, "y1": at, "line": line} for at in positions
+        {"type": "line", "xref": "paper", "yref": "y", "x0": 0, "x1": 1, "y0": y, "y1": y, "line": line}
+        for y in positions
     ]
 
 
-def heatmap(names: Sequence[str], table: np.ndarray) -> list[dict[str, Any]]:
-    """Correlations: darker is stronger, and the sign is written in where it matters."""
+def correlation_heatmap(names: Sequence[str], table: np.ndarray) -> list[dict[str, Any]]:
+    """Correlations: darker is stronger, with the sign written where it is at least 0.5."""
     strength = np.abs(table)
     written = [
         ["" if i == j or strength[i, j] < 0.5 else ("+" if table[i, j] > 0 else "−") for j in range(len(names))]
         for i in range(len(names))
     ]
     hover = [
-        [f"{plain(one)} with {plain(other)}: {table[i, j]:+.3f}" for j, other in enumerate(names)]
+        [f"{escaped(one)} with {escaped(other)}: {table[i, j]:+.3f}" for j, other in enumerate(names)]
         for i, one in enumerate(names)
     ]
-    labels = [plain(name) for name in names]
+    labels = [escaped(name) for name in names]
     return [
         {
             "type": "heatmap",

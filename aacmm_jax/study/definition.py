@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from ..calibration.checks import check_enough
 from ..calibration.scale_anchor import scale_anchor
 from ..core.errors import InputError
-from ..core.units import ARCSEC
+from ..core.units import ARCSEC, DEG
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..files.arms import specification_toml
@@ -241,14 +241,14 @@ class Study:
 
     def _scale_anchor(self, hold: str) -> str | None:
         with _naming("identification.hold"):
-            return scale_anchor(self.space, self.nominal.arm, None if hold == "none" else hold)
+            return scale_anchor(self.space, self.nominal.arm, None if hold == "none" else hold).hold
 
     def _values_of(self, cell: Mapping[str, Any]) -> tuple:
         """The fields of `CellValues` for one cell."""
         space, nominal, override = self.space, self.nominal, self.specification.bounds.override
         is_length_of = space.lengths
         deviations = [_deviation(cell, name) for name in space.names]
-        unit = np.where(is_length_of, 1.0, math.pi / 180)
+        unit = np.where(is_length_of, 1.0, DEG)
         width = unit * [one.uniform if one.normal is None else one.normal for one in deviations]
         length, angle = cell.get("bounds.length_mm"), cell.get("bounds.angle_deg")
         length = nominal.length if length is None else length

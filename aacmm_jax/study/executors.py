@@ -67,8 +67,10 @@ def _client(distributed: Any, address: str, workers: int | None) -> Iterator[Any
         cluster = distributed.LocalCluster(
             n_workers=count, threads_per_worker=1, dashboard_address=":0", env=environment
         )
+    from .dask_affinity import Affinity
+
     with cluster, distributed.Client(cluster) as client:
-        client.register_plugin(_affinity_plugin(distributed)(cores, count))
+        client.register_plugin(Affinity(cores, count))
         yield client
 
 
@@ -83,21 +85,3 @@ def _interrupts_ignored() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, former)
-
-
-def _affinity_plugin(distributed: Any) -> Any:
-    """Restricts every worker to its part of the cores; otherwise each would use all, and wait for the others."""
-
-    class Affinity(distributed.WorkerPlugin):
-        name = "aacmm-affinity"
-
-        def __init__(self, cores: list[int], count: int):
-            self.cores, self.count = cores, count
-
-        def setup(self, worker: Any) -> None:
-            if hasattr(os, "sched_setaffinity"):
-                number = int(worker.name) % self.count
-                part = self.cores[number * len(self.cores) // self.count : (number + 1) * len(self.cores) // self.count]
-                os.sched_setaffinity(0, part or self.cores)
-
-    return Affinity

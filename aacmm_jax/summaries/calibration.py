@@ -1,5 +1,6 @@
-"""What files hold, as plain dictionaries with the unit in every key: printed by the command line, and its ``--json``."""
+"""Arms, captures and calibrations as plain dictionaries with the unit in every key; ``--json`` prints them."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import CrossValidation, active_names
-from ..data.capture import Capture
+from ..data.capture import Capture, ReferenceLength
 from ..data.recording import Recording
 from ..kinematics.arm import is_length
 from ..kinematics.parameters import Parameters
@@ -20,7 +21,7 @@ _CORRELATED = 0.95
 
 
 def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
-    """An arm, joint by joint, and what is not identified of it by default."""
+    """An arm, joint by joint, and the parameters that are fixed by default."""
     arm = specification.arm
     joints = [
         {
@@ -62,10 +63,7 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
         "joints": capture.joints,
         "poses": sum(capture.sizes),
         "sockets": [{"socket": name, "poses": size} for name, size in zip(capture.names, capture.sizes, strict=True)],
-        "lengths": [
-            {"from": length.start, "to": length.end, "value_mm": float(length.value), "u_mm": float(length.u)}
-            for length in capture.lengths
-        ],
+        "lengths": reference_length_rows(capture.lengths),
         "ranges": [
             {"joint": i + 1, "lowest_rad": float(low), "highest_rad": float(high)}
             for i, (low, high) in enumerate(zip(np.min(capture.q, axis=0), np.max(capture.q, axis=0), strict=True))
@@ -75,16 +73,24 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
     }
 
 
-def figures(evaluation: Evaluation) -> dict[str, Any]:
+def reference_length_rows(lengths: Iterable[ReferenceLength]) -> list[dict[str, Any]]:
+    """Reference lengths with their calibrated value and its standard uncertainty, mm."""
+    return [
+        {"from": length.start, "to": length.end, "value_mm": float(length.value), "u_mm": float(length.u)}
+        for length in lengths
+    ]
+
+
+def metrics(evaluation: Evaluation) -> dict[str, Any]:
     """Repeatability over all sockets, and the errors of the lengths; mm."""
-    spread, error = evaluation.repeatability, np.asarray(evaluation.error)
-    numbers = {"de_mm": spread.de, "deltam_mm": spread.deltam, "rms_mm": spread.rms}
-    # With one pose in every socket there is no repeatability to speak of.
-    found: dict[str, Any] = {key: float(value) for key, value in numbers.items() if np.isfinite(value)}
-    return found | (length_figures(error) if len(error) else {})
+    repeatability, error = evaluation.repeatability, np.asarray(evaluation.error)
+    values = {"de_mm": repeatability.de, "deltam_mm": repeatability.deltam, "rms_mm": repeatability.rms}
+    # With one pose in every socket none of them is finite: there is no scatter.
+    found: dict[str, Any] = {key: float(value) for key, value in values.items() if np.isfinite(value)}
+    return found | (length_metrics(error) if len(error) else {})
 
 
-def length_figures(error: np.ndarray) -> dict[str, float]:
+def length_metrics(error: np.ndarray) -> dict[str, float]:
     """Mean absolute and largest error of lengths, mm."""
     return {
         "length_error_mean_absolute_mm": float(np.mean(np.abs(error))),
@@ -92,19 +98,19 @@ def length_figures(error: np.ndarray) -> dict[str, float]:
     }
 
 
-def tables(capture: Capture, evaluation: Evaluation) -> dict[str, Any]:
-    """Figures socket by socket and length by length."""
-    spread = evaluation.repeatability
-    figures = (np.asarray(column) for column in (spread.socket_de, spread.socket_deltam, spread.socket_rms))
-    sockets = zip(capture.names, capture.sizes, *figures, strict=True)
+def metrics_by_socket_and_length(capture: Capture, evaluation: Evaluation) -> dict[str, Any]:
+    """Repeatability socket by socket and errors length by length; mm."""
+    found = evaluation.repeatability
+    columns = (np.asarray(column) for column in (found.socket_de, found.socket_deltam, found.socket_rms))
+    sockets = zip(capture.names, capture.sizes, *columns, strict=True)
     columns = (np.asarray(column) for column in (evaluation.measured, evaluation.error, evaluation.u))
     lengths = zip(capture.lengths, *columns, strict=True)
     return {
         "sockets": [
             {"socket": name, "poses": size}
             # One pose shows no scatter.
-            | dict(zip(("de_mm", "deltam_mm", "rms_mm"), map(float, spread) if size > 1 else (None,) * 3, strict=True))
-            for name, size, *spread in sockets
+            | dict(zip(("de_mm", "deltam_mm", "rms_mm"), map(float, values) if size > 1 else (None,) * 3, strict=True))
+            for name, size, *values in sockets
         ],
         "lengths": [
             {
@@ -121,13 +127,15 @@ def tables(capture: Capture, evaluation: Evaluation) -> dict[str, Any]:
 
 
 def calibration_summary(
-    record: CalibrationRecord, seen: Observability | None = None, volume: VolumetricUncertainty | None = None
+    record: CalibrationRecord,
+    observability: Observability | None = None,
+    volume: VolumetricUncertainty | None = None,
 ) -> dict[str, Any]:
-    """A calibration: what was done, before and after, the scale, the parameters, and what to be wary of.
+    """A calibration: method, metrics as found and as left, scale, parameters, uncertainty and warnings.
 
-    ``seen`` (`cautions.observed`) and ``volume`` (`volumetric_uncertainty`) are worked out where they are not given.
+    ``observability`` (`warnings.observed`) and ``volume`` (`volumetric_uncertainty`) are computed if not given.
     """
-    seen = observed(record) if seen is None else seen
+    observability = observed(record) if observability is None else observability
     evaluations, vectors = record.evaluations(), record.vectors()
     u = np.sqrt(np.diag(record.covariance))
     parameters = [
@@ -145,6 +153,7 @@ def calibration_summary(
         "arm": record.recording.nominal.name,
         "method": record.method,
         "converged": record.converged,
+        "residual_plausible": not record.implausible_residual,
         "reason": record.reason,
         "steps": record.steps,
         "poses": sum(record.recording.capture.sizes),
@@ -156,40 +165,40 @@ def calibration_summary(
         "hold": record.hold,
         "active_stage1": active_names_of(record, record.active_stage1),
         "active": active_names_of(record, record.active),
-        **{stage: figures(evaluation) for stage, evaluation in evaluations.items()},
-        **tables(record.recording.capture, evaluations["calibrated"]),
+        **{stage: metrics(evaluation) for stage, evaluation in evaluations.items()},
+        **metrics_by_socket_and_length(record.recording.capture, evaluations["calibrated"]),
         "parameters": parameters,
-        "uncertainty": uncertainty_summary(record, seen, volume),
+        "uncertainty": uncertainty_summary(record, observability, volume),
         "cross_validation": None if record.validation is None else _validation_summary(record.validation),
         "monte_carlo": record.sampled_says,
-        "warnings": of_calibration(record, seen),
+        "warnings": of_calibration(record, observability),
     }
     if "true" in vectors:
-        summary["truth"] = {stage: truth_errors(record, vectors, stage) for stage in ("nominal", "stage1", "calibrated")}
+        summary["truth"] = {
+            stage: truth_errors(record, vectors, stage) for stage in ("nominal", "stage1", "calibrated")
+        }
     return summary
 
 
 def uncertainty_summary(
-    record: CalibrationRecord, seen: Observability, volume: VolumetricUncertainty | None = None
+    record: CalibrationRecord, observability: Observability, volume: VolumetricUncertainty | None = None
 ) -> dict[str, Any]:
-    """What the uncertainty comes from and what it means for lengths all over the volume; standard uncertainties (k = 1)."""
+    """Noise behind the uncertainty, standard uncertainties (k = 1) over the working volume, and observability."""
     uncertainty = uncertainty_of(record)
-    noise = record.noise
-    encoder = np.asarray(noise.encoder_arcsec)
     found = {
         "form": record.noise_model,
-        "encoder_arcsec": encoder.tolist(),
-        "seating_mm": float(noise.seating),
+        "encoder_arcsec": np.asarray(record.noise.encoder_arcsec).tolist(),
+        "seating_mm": float(record.noise.seating),
         "misfit": record.reduced_chi,
         "coverage_factor_95": uncertainty.factor(0.95),
         "volume": (volumetric_uncertainty(uncertainty) if volume is None else volume).summary,
         "correlated": [{"one": one, "other": other, "r": r} for one, other, r in uncertainty.correlated(_CORRELATED)],
-        "rank": seen.rank,
-        "parameters": len(seen.names),
-        "condition": seen.condition,
-        "indices": seen.indices,
+        "rank": observability.rank,
+        "parameters": len(observability.names),
+        "condition": observability.condition,
+        "indices": observability.indices,
     }
-    # JSON has no infinity; what is not determined has no number.
+    # JSON has no infinity: None for what is not determined.
     found["volume"] = {key: value if np.isfinite(value) else None for key, value in found["volume"].items()}
     found["condition"] = found["condition"] if np.isfinite(found["condition"]) else None
     return found

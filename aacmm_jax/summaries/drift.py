@@ -1,4 +1,4 @@
-"""What a comparison of calibrations found, as plain dictionaries with the unit in every key, and as CSV."""
+"""Comparisons of calibrations as plain dictionaries with the unit in every key, and as CSV."""
 
 import csv
 import io
@@ -12,7 +12,7 @@ from ..kinematics.arm import is_length
 
 
 def drift_summary(drift: Drift) -> dict[str, Any]:
-    """Two calibrations compared; None where something is not known or has no end."""
+    """Two calibrations compared; None for what is unknown or infinite."""
     joint = drift.joint_test
     return {
         "kind": "comparison",
@@ -39,7 +39,7 @@ def drift_summary(drift: Drift) -> dict[str, Any]:
 
 
 def compared_summary(trend: Trend, labels: list[str], arm: str) -> dict[str, Any]:
-    """The first calibration against the last in full, and all of them; ``labels`` in the order in which they were given."""
+    """The first calibration against the last in full, and the trend of all; ``labels`` in the order given."""
     summary = {"kind": "comparison", "arm": arm, "old": labels[trend.order[0]], "new": labels[trend.order[-1]]}
     summary |= {"old_created": trend.dates[0].isoformat(), "new_created": trend.dates[-1].isoformat()}
     summary |= drift_summary(trend.drifts[-1])
@@ -52,14 +52,14 @@ def change_exceeded(lengths: LengthChange, limit: float | None) -> tuple[list[st
         return [], []
     kept = abs(lengths.largest) <= limit
     verdict = (
-        f"the largest change of a length of {lengths.length:g} mm is {abs(lengths.largest):.4f} mm, {'within' if kept else 'over'} the "
-        f"limit of {limit:g} mm."
+        f"the largest change of a length of {lengths.length:g} mm is {abs(lengths.largest):.4f} mm, "
+        f"{'within' if kept else 'over'} the limit of {limit:g} mm."
     )
     return ([verdict], []) if kept else ([], [verdict])
 
 
 def lengths_summary(lengths: LengthChange) -> dict[str, Any]:
-    """What a change does to lengths over the volume."""
+    """Changes of lengths over the working volume."""
     return {
         "length_mm": lengths.length,
         "places": len(lengths.change),
@@ -75,11 +75,11 @@ def lengths_summary(lengths: LengthChange) -> dict[str, Any]:
 
 
 def trend_summary(trend: Trend, labels: list[str]) -> list[dict[str, Any]]:
-    """Every calibration of a trend in the order of their dates; ``labels`` in the order in which they were given."""
+    """Every calibration of a trend in the order of their dates; ``labels`` in the order given."""
     rows: list[dict[str, Any]] = [{"calibration": labels[trend.order[0]], "created": trend.dates[0].isoformat()}]
-    for date, place, drift in zip(trend.dates[1:], trend.order[1:], trend.drifts, strict=True):
+    for date, position, drift in zip(trend.dates[1:], trend.order[1:], trend.drifts, strict=True):
         rows.append({
-            "calibration": labels[place],
+            "calibration": labels[position],
             "created": date.isoformat(),
             "moved": int(drift.moved.sum()),
             "moved_by_chance": drift.by_chance,
@@ -91,15 +91,15 @@ def trend_summary(trend: Trend, labels: list[str]) -> list[dict[str, Any]]:
 
 
 def drift_csv(trend: Trend, labels: list[str]) -> str:
-    """Every parameter of every calibration but the first, compared with the first: mm and rad, empty where not known."""
+    """Every parameter of every calibration but the first, compared with the first: mm and rad, empty if unknown."""
     text = io.StringIO()
     columns = ("parameter", "unit", "old", "new", "change", "u", "expanded", "moved", "without")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["old_calibration", "new_calibration", "new_created", *columns])
-    for date, place, drift in zip(trend.dates[1:], trend.order[1:], trend.drifts, strict=True):
+    for date, position, drift in zip(trend.dates[1:], trend.order[1:], trend.drifts, strict=True):
         for row in _rows(drift):
             cells = ["" if row[name] is None else row[name] for name in columns]
-            writer.writerow([labels[trend.order[0]], labels[place], date.isoformat(), *cells])
+            writer.writerow([labels[trend.order[0]], labels[position], date.isoformat(), *cells])
     return text.getvalue()
 
 

@@ -1,4 +1,4 @@
-"""An evaluation as a plain dictionary with the unit in every key: printed by the command line, and its ``--json``."""
+"""Evaluations and acceptance tests as plain dictionaries with the unit in every key; ``--json`` prints them."""
 
 from typing import Any
 
@@ -8,16 +8,18 @@ from ..acceptance.metrics import METRICS, AcceptanceTest, Metric, MetricValue
 from ..acceptance.record import EvaluationRecord, PointsRecord, unstated_uncertainty_warning
 from ..calibration.evaluation import Evaluation, evaluate
 from ..data.capture import Capture
-from .calibration import figures, length_figures, tables
+from .calibration import length_metrics, metrics, metrics_by_socket_and_length
 
 _LIMITED = {"rms_mm": "RMS distance", "deltam_mm": "Deltam", "length_error_largest_mm": "largest length error"}
 
 
-def evaluation_summary(record: EvaluationRecord, tests: dict[str, list[AcceptanceTest]] | None = None) -> dict[str, Any]:
-    """The nominal and the calibrated arm on a capture, apart for what was identified from and what was held out; acceptance tests.
+def evaluation_summary(
+    record: EvaluationRecord, tests: dict[str, list[AcceptanceTest]] | None = None
+) -> dict[str, Any]:
+    """The nominal and the calibrated arm on a capture, on held-out data and on those identified from; acceptance tests.
 
-    A length counts as held out where at least one of its ends was never identified from. ``tests`` (`EvaluationRecord.acceptance`)
-    are run where they are not given.
+    A length counts as held out if at least one of its ends was not identified from. ``tests``
+    (`EvaluationRecord.acceptance`) are run if not given.
     """
     capture, unseen = record.recording.capture, record.held_out_lengths()
     summary: dict[str, Any] = {
@@ -26,7 +28,7 @@ def evaluation_summary(record: EvaluationRecord, tests: dict[str, list[Acceptanc
         "warnings": list(record.warnings),
     }
     whole = {stage: evaluate(specification.arm, capture) for stage, specification in record.arms().items()}
-    rows = tables(capture, whole["calibrated"])
+    rows = metrics_by_socket_and_length(capture, whole["calibrated"])
     for group in ("held_out", "identified_from"):
         wanted = group == "identified_from"
         names = [name for name in capture.names if (name in record.used) == wanted]
@@ -49,7 +51,7 @@ def evaluation_summary(record: EvaluationRecord, tests: dict[str, list[Acceptanc
 
 
 def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = None) -> dict[str, Any]:
-    """Acceptance tests of points; ``tests`` (`PointsRecord.acceptance`) are run where they are not given."""
+    """Acceptance tests of points; ``tests`` (`PointsRecord.acceptance`) are run if not given."""
     tests = record.acceptance() if tests is None else tests
     sockets = record.measured.sockets
     return {
@@ -68,30 +70,30 @@ def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = No
 
 
 def acceptance_summary(tests: list[AcceptanceTest], before: list[AcceptanceTest] | None = None) -> list[dict[str, Any]]:
-    """Acceptance tests, with the figures of the arm as found beside those as left where both are given."""
-    earlier = {(test.title, figure.name): figure for test in before or () for figure in test.metrics}
+    """Acceptance tests; ``before``: those of the arm as found, whose metrics are added."""
+    earlier = {(test.title, metric.name): metric for test in before or () for metric in test.metrics}
     return [
         {
             "standard": test.standard,
             "title": test.title,
             "decision": test.decision,
             "missing": list(test.missing),
-            "figures": [_figure(figure, earlier.get((test.title, figure.name))) for figure in test.metrics],
+            "figures": [_metric(metric, earlier.get((test.title, metric.name))) for metric in test.metrics],
         }
         for test in tests
     ]
 
 
-def _figure(figure: Metric, earlier: Metric | None) -> dict[str, Any]:
+def _metric(metric: Metric, earlier: Metric | None) -> dict[str, Any]:
     return {
-        "name": figure.name,
-        "what": METRICS[figure.name],
-        "decision": figure.decision,
-        **_part(figure.worst),
+        "name": metric.name,
+        "what": METRICS[metric.name],
+        "decision": metric.decision,
+        **_part(metric.worst),
         "as_found_mm": None if earlier is None else earlier.value,
         "as_found_decision": None if earlier is None else earlier.decision,
-        "failing": figure.failing,
-        "parts": [_part(part) | {"decision": part.decision} for part in figure.values],
+        "failing": metric.failing,
+        "parts": [_part(part) | {"decision": part.decision} for part in metric.values],
     }
 
 
@@ -101,17 +103,20 @@ def _part(part: MetricValue) -> dict[str, Any]:
 
 def _grouped(part: Evaluation | None, whole: Evaluation, lengths: list[int]) -> dict[str, Any]:
     """Repeatability of a group's own sockets, and errors of the lengths that count for it."""
-    found = {} if part is None else figures(part)
-    return found | (length_figures(np.asarray(whole.error)[lengths]) if lengths else {})
+    found = {} if part is None else metrics(part)
+    return found | (length_metrics(np.asarray(whole.error)[lengths]) if lengths else {})
 
 
 def _exceeded(summary: dict[str, Any], record: EvaluationRecord) -> tuple[list[str], list[str]]:
-    """Sentences on limits kept and limits exceeded by the calibrated arm, over held-out data where there are any."""
+    """Sentences on limits kept and limits exceeded by the calibrated arm, on held-out data if there are any."""
     kept, failed = [], []
     for key, limit in record.maxima.items():
-        groups = [group for group in ("held_out", "identified_from") if summary[group] and key in summary[group]["calibrated"]]
+        groups = ("held_out", "identified_from")
+        groups = [group for group in groups if summary[group] and key in summary[group]["calibrated"]]
         if not groups:
-            failed.append(f"{_LIMITED[key]} has a limit of {limit:g} mm, but there is nothing to measure it on.")
+            failed.append(
+                f"{_LIMITED[key]} has a limit of {limit:g} mm, but the data contain nothing to measure it on."
+            )
             continue
         value = summary[groups[0]]["calibrated"][key]
         where = "held-out data" if groups[0] == "held_out" else "the data identified from"

@@ -1,14 +1,17 @@
-"""A plan as a plain dictionary with the unit in every key."""
+"""Plans of poses and of acceptance tests as plain dictionaries with the unit in every key."""
 
 from typing import Any
 
 import numpy as np
 
+from ..acceptance.procedure import Procedure
+from ..acceptance.standards import PLANNED
 from ..planning.design import MORE, Plan, Prediction
+from .calibration import reference_length_rows
 
 
 def plan_summary(plan: Plan, arm: str) -> dict[str, Any]:
-    """Where sockets stand, how many poses each gets, and the predictions; the unit in every key."""
+    """Positions of the sockets, how many poses each gets, and the predicted uncertainties."""
     counts = np.bincount(plan.owner, minlength=len(plan.sockets))
     return {
         "kind": "plan",
@@ -19,10 +22,7 @@ def plan_summary(plan: Plan, arm: str) -> dict[str, Any]:
             {"socket": name, "position_mm": list(point), "poses": int(count)}
             for (name, point), count in zip(plan.sockets.items(), counts, strict=True)
         ],
-        "lengths": [
-            {"from": length.start, "to": length.end, "value_mm": float(length.value), "u_mm": float(length.u)}
-            for length in plan.lengths
-        ],
+        "lengths": reference_length_rows(plan.lengths),
         "check_length_mm": plan.check_length,
         "encoder_arcsec": np.asarray(plan.noise.encoder_arcsec).tolist(),
         "seating_mm": float(plan.noise.seating),
@@ -36,3 +36,39 @@ def plan_summary(plan: Plan, arm: str) -> dict[str, Any]:
 
 def _prediction(prediction: Prediction) -> dict[str, float]:
     return {"median_mm": prediction.median, "largest_mm": prediction.largest}
+
+
+def procedure_summary(procedure: Procedure, arm: str) -> dict[str, Any]:
+    """A planned acceptance test: what to set up, and how many poses to take."""
+    lengths: dict[float, int] = {}
+    for *_, value in procedure.lengths:
+        lengths[value] = lengths.get(value, 0) + 1
+    return {
+        "kind": "acceptance plan",
+        "arm": arm,
+        "standard": PLANNED[procedure.standard],
+        "poses": procedure.poses,
+        "reach_mm": procedure.reach.radius,
+        "shoulder_mm": procedure.reach.shoulder.tolist(),
+        "bars": [{"length_mm": value, "positions": count} for value, count in lengths.items()],
+        "spheres": [
+            {
+                "name": sphere.name,
+                "test": sphere.test,
+                "diameter_mm": sphere.diameter,
+                "centre_mm": sphere.centre.tolist(),
+            }
+            for sphere in procedure.spheres
+        ],
+        "items": [
+            {
+                "test": item.test,
+                "name": item.name,
+                "group": item.group,
+                "position_mm": item.points.mean(axis=0).tolist(),
+                "poses": len(item.q),
+            }
+            for item in (*procedure.sockets, *procedure.touches)
+        ],
+        "warnings": list(procedure.left_out),
+    }

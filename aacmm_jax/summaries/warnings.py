@@ -8,9 +8,9 @@ import numpy as np
 from ..calibration.checks import plausible
 from ..calibration.record import CalibrationRecord
 from ..calibration.results import active_names
+from ..core.units import INCH, M
 from ..data.noise import tip_covariances
 from ..data.recording import Recording
-from ..kinematics.arm import is_length, value_of
 from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Bounds, Parameters
 from ..uncertainty.identifiability import Observability, observability
@@ -44,6 +44,7 @@ def of_calibration(record: CalibrationRecord, seen: Observability | None = None)
     """What should be read about a calibration before its numbers; ``seen`` is the result of `observed`, if known."""
     seen = observed(record) if seen is None else seen
     found = [] if record.converged else [record.reason]
+    found += _implausible(record)
     found += _validation(record)
     found += [*_scale(record), *of_capture(record.recording), *_bounds(record, seen), *_data(record)]
     return found + _identifiability(record, seen)
@@ -58,6 +59,17 @@ def observed(record: CalibrationRecord) -> Observability:
     return observability(arm, capture, space, sigma=sigma, bounds=Bounds(space, record.lower, record.upper))
 
 
+def _implausible(record: CalibrationRecord) -> list[str]:
+    """A residual that no arm has: the solve ended at a minimum, but of data that do not belong to this arm."""
+    if not record.implausible_residual:
+        return []
+    rms = float(record.evaluations()["calibrated"].repeatability.rms)
+    return [
+        f"The poses of a socket disagree by {rms:.3g} mm RMS, over a hundred times what an arm of this size can be, so data and arm "
+        "do not belong together: check the files, their columns and unit, the sockets and the arm."
+    ]
+
+
 def _validation(record: CalibrationRecord) -> list[str]:
     """Results of cross-validation that contradict the uncertainty, and residuals that contradict the given noise."""
     found = []
@@ -67,8 +79,8 @@ def _validation(record: CalibrationRecord) -> list[str]:
             f"Sockets left out one placement after the other have errors {validation.excess:.1f} times their predicted "
             f"uncertainty ({validation.rms:.3g} mm RMS instead of {validation.rms_predicted:.3g}, lengths "
             f"{validation.length_rms:.3g} mm instead of {validation.length_u:.3g}): errors of neighbouring poses are "
-            "alike, as of effects outside the D-H model (compliant joints, eccentric encoders). Use the cross-validated "
-            "values; every u below is too small."
+            "alike, as of effects outside the D-H model (compliant joints, eccentric encoders). Use the "
+            "cross-validated values; every u below is too small."
         )
     if record.reduced_chi is not None and not 1 / _EXCESS < record.reduced_chi < _EXCESS:
         word = "small" if record.reduced_chi > 1 else "large"
@@ -85,12 +97,17 @@ def _scale(record: CalibrationRecord) -> list[str]:
     k = record.k
     stage1 = _sides(record)
     if not plausible(k):
-        unit = next(
-            (u for u, factor in (("m", 1000), ("cm", 10), ("inch", 1 / 25.4)) if abs(k / factor - 1) < 0.1), None
-        )
+        unit = next((u for u, factor in (("m", M), ("cm", 10), ("inch", 1 / INCH)) if abs(k / factor - 1) < 0.1), None)
         hint = f"are the lengths in {unit} by mistake?" if unit else "check units, sockets, lengths and arm."
         return [f"k = {k:.6g} cannot be the scale of this arm; {hint}"]
-    if record.hold is None and stage1:
+    fixed = record.scale_set_by
+    if fixed and record.method == "two-stage":
+        which = f"{_some(list(fixed))} {'is' if len(fixed) == 1 else 'are'} fixed and already set{'s' * (len(fixed) == 1)} the scale"
+        return [
+            f"{which}, so the reference lengths changed nothing: by them the arm is {k:.6f} times too large (u = {record.u_k:.2g}). "
+            "Free one of these lengths, or use both with the joint solve (--method joint)."
+        ]
+    if record.hold is None and stage1 and not fixed:
         word = "shrank" if k < 1 else "stretched"
         return [
             f"Stage 1 ran with every length free and {word} the arm to k = {k:.5f} until a bound stopped it: "
@@ -195,13 +212,6 @@ def _identifiability(record: CalibrationRecord, seen: Observability) -> list[str
             f"Hardly determined, with a standard uncertainty over half of what the bounds allow: {_some(loose)}; "
             "fix some (--held), or record poses that separate them."
         )
-    scaled = [
-        name
-        for name in record.held
-        if is_length(name) and name != "d_1" and value_of(record.recording.nominal.arm, name) != 0
-    ]
-    if scaled:
-        found.append(f"The scale fix divides every length by k, fixed ones too: {_some(scaled)}.")
     return found
 
 

@@ -1,4 +1,4 @@
-"""The uncertainty of a calibrated arm where it is used: of its parameters, of a tip, of a length."""
+"""The uncertainty of a calibrated arm: of its parameters, of a tip, of a length."""
 
 import math
 
@@ -10,22 +10,21 @@ from jaxtyping import Array, Float
 from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError
 from ..data.noise import Noise, tip_covariances
-from ..kinematics.arm import Arm, is_length, parameter_names
+from ..kinematics.arm import Arm
 from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Parameters
 
 
 class Uncertainty(eqx.Module):
-    """Uncertainty of a calibrated arm: standard uncertainties, in mm and rad, of whatever it is asked for.
+    """Standard uncertainties of a calibrated arm, in mm and rad.
 
-    What the calibration adds; with ``reading=True`` the noise of the readings themselves too, as given to the calibration or as
-    estimated by it. Where something follows a direction that the data leave open, it is infinite. The base frame counts as
-    exact: ``d_1`` and ``theta_1`` only say where it is.
+    They are the calibration's contribution; with ``reading=True`` the noise of the readings is added, as given to the
+    calibration or as estimated by it. What depends on a direction that the data do not determine is infinitely
+    uncertain. Fixed parameters count as exact, and so does the base frame (``d_1`` and ``theta_1`` only define it).
     """
 
     arm: Arm
     covariance: Float[Array, "p p"]
-    common_scale_error: Float[Array, " w"]  # of lengths that were held but divided by k (see `covariance.Covariance`)
     open: Float[Array, "p p"]  # projector onto undetermined directions, natural steps
     noise: Noise
     u_k: Float[Array, ""] | None
@@ -41,7 +40,7 @@ class Uncertainty(eqx.Module):
     def u(self) -> Float[Array, " p"]:
         """Standard uncertainty of each free parameter; infinite where only a combination is determined.
 
-        0 on a bound; but after two stages lengths there follow k, and have its uncertainty.
+        0 on a bound.
         """
         alone = jnp.sqrt(jnp.diagonal(self.covariance))
         return jnp.where(jnp.diagonal(self.open) > 1e-6, jnp.inf, alone)
@@ -54,7 +53,7 @@ class Uncertainty(eqx.Module):
         return self.covariance / (safe[:, None] * safe[None, :])
 
     def correlated(self, least: float = 0.9) -> list[tuple[str, str, float]]:
-        """Pairs of parameters whose correlation is at least so strong, the strongest first: (name, name, correlation)."""
+        """Pairs of parameters with at least this correlation, the strongest first: (name, name, correlation)."""
         if not 0 <= least <= 1:
             raise InputError(f"least is {least:g}; give a correlation between 0 and 1.")
         table = np.asarray(self.correlation)
@@ -65,7 +64,7 @@ class Uncertainty(eqx.Module):
     def factor(self, level: float = 0.95) -> float:
         """Coverage factor of a level: Student's t for the degrees of freedom (JCGM 100, annex G)."""
         if not 0 < level < 1:
-            raise InputError(f"level is {level:g}; give a share between 0 and 1, for example 0.95.")
+            raise InputError(f"level is {level:g}; give a probability between 0 and 1, for example 0.95.")
         from scipy import stats
 
         tail = 0.5 + level / 2
@@ -75,61 +74,57 @@ class Uncertainty(eqx.Module):
 
     def tip(self, q: Numbers, *, reading: bool = False) -> Float[Array, "... 3 3"]:
         """Covariance of the tip's position in the base frame at joint angles ``(..., n)``, mm^2."""
-        q = self._poses(q)
-        covariance = self.covariance_of_functions(self.slopes(q))
-        return covariance + self._read(q) if reading else covariance
+        q = self._checked(q)
+        covariance = self.covariance_of_functions(self.derivatives(q))
+        return covariance + self._reading(q) if reading else covariance
 
     def length(self, start: Numbers, end: Numbers, *, reading: bool = False) -> Float[Array, "..."]:
         """Standard uncertainty of the distance between the tips at two poses, ``(..., n)`` each, mm."""
-        start, end = self._poses(start), self._poses(end)
+        start, end = self._checked(start), self._checked(end)
         try:
             np.broadcast_shapes(start.shape, end.shape)
         except ValueError as error:
-            raise InputError(f"the poses have shapes {start.shape} and {end.shape}; give as many ends as starts.") from error
+            raise InputError(
+                f"the poses have shapes {start.shape} and {end.shape}; give as many ends as starts."
+            ) from error
         between = self.arm.position(end) - self.arm.position(start)
         if is_concrete(between) and np.any(np.linalg.norm(between, axis=-1) < 1e-6):
-            raise InputError("both poses put the tip in the same place, so there is no length between them; give others.")
+            raise InputError(
+                "both poses put the tip in the same place, so there is no length between them; give others."
+            )
         direction = between / jnp.linalg.norm(between, axis=-1, keepdims=True)
-        along = jnp.einsum("...c,...cp->...p", direction, self.slopes(end) - self.slopes(start))
+        along = jnp.einsum("...c,...cp->...p", direction, self.derivatives(end) - self.derivatives(start))
         variance = self.covariance_of_functions(along[..., None, :])[..., 0, 0]
         if reading:
-            both = self._read(start) + self._read(end)
+            both = self._reading(start) + self._reading(end)
             variance = variance + jnp.einsum("...c,...cd,...d->...", direction, both, direction)
         return jnp.sqrt(variance)
 
-    def slopes(self, q: Float[Array, "... n"]) -> Float[Array, "... 3 w"]:
-        """Derivatives of the tip by the free parameters and, last, by a stretch of the lengths that were held."""
-        free = self.arm.jacobian(q, self.names)
-        held = [n for n in parameter_names(self.arm) if is_length(n) and n not in ("d_1", *self.names)]
-        if not held:
-            return jnp.concatenate([free, jnp.zeros((*free.shape[:-1], 1))], axis=-1)
-        values = Parameters(self.arm, tuple(held)).vector()
-        return jnp.concatenate([free, (self.arm.jacobian(q, held) @ values)[..., None]], axis=-1)
+    def derivatives(self, q: Float[Array, "... n"]) -> Float[Array, "... 3 p"]:
+        """Derivatives of the tip by the free parameters."""
+        return self.arm.jacobian(q, self.names)
 
-    def covariance_of_functions(self, slopes: Float[Array, "... k w"]) -> Float[Array, "... k k"]:
-        """Covariance of functions with these derivatives (as `slopes` gives them); infinite where they follow what is open."""
-        p = len(self.names)
-        upper = jnp.concatenate([self.covariance, self.common_scale_error[:-1, None]], axis=1)
-        whole = jnp.concatenate([upper, self.common_scale_error[None]])
-        covariance = slopes @ whole @ jnp.swapaxes(slopes, -1, -2)
-        return jnp.where(self._lost(slopes[..., :p])[..., None], jnp.inf, covariance)
+    def covariance_of_functions(self, derivatives: Float[Array, "... k p"]) -> Float[Array, "... k k"]:
+        """Covariance of functions of the parameters with these derivatives; infinite where they follow what is open."""
+        covariance = derivatives @ self.covariance @ jnp.swapaxes(derivatives, -1, -2)
+        return jnp.where(self._is_open(derivatives)[..., None], jnp.inf, covariance)
 
-    def _poses(self, q: Numbers) -> Float[Array, "... n"]:
+    def _checked(self, q: Numbers) -> Float[Array, "... n"]:
         q = self.arm._checked(q)
         if is_concrete(q) and not np.all(np.isfinite(np.asarray(q))):
             raise InputError("a joint angle is not finite; give angles in rad.")
         return q
 
-    def _read(self, q: Float[Array, "... n"]) -> Float[Array, "... 3 3"]:
+    def _reading(self, q: Float[Array, "... n"]) -> Float[Array, "... 3 3"]:
         flat = q.reshape(-1, q.shape[-1])
         covariance = jnp.moveaxis(tip_covariances(self.arm.geometry, sines_cosines(flat), self.noise), -1, 0)
         return covariance.reshape(*q.shape[:-1], 3, 3)
 
-    def _lost(self, slope: Float[Array, "... k p"]) -> Array:
-        """Which rows follow a direction that is open."""
-        inside = slope @ (self.space.scale[:, None] * self.open)
-        return jnp.sqrt(jnp.sum(inside**2, axis=-1)) > _REACHED
+    def _is_open(self, derivatives: Float[Array, "... k p"]) -> Array:
+        """Which rows follow an undetermined direction."""
+        inside = derivatives @ (self.space.scale[:, None] * self.open)
+        return jnp.sqrt(jnp.sum(inside**2, axis=-1)) > _LEAST_COMPONENT
 
 
-# A direction that is open is uncertain by 10 mm or 10 mrad at least: through this much of it, 0.1 um.
-_REACHED = 1e-5
+# An undetermined direction is uncertain by 10 mm or 10 mrad at least: this component of it by 0.1 um.
+_LEAST_COMPONENT = 1e-5

@@ -1,17 +1,18 @@
-"""How uncertain an identification is: the law of propagation (JCGM 100) from every reading and length to every parameter.
+"""Covariance of an identification: the law of propagation (JCGM 100) from readings and lengths to parameters.
 
-An identification is linearised at its result. `Sensitivity` says how its parameters follow the error of each tip and of each
-certified length; a form (`NOISE_MODELS`) says what those errors are; their product is the covariance.
+An identification is linearised at its result. `Sensitivity` is how its parameters follow the error of each tip and of
+each certified length; a noise model (`NOISE_MODELS`) is the covariance of those errors; the covariance of the
+parameters is the product of both.
 """
 
 import math
 from typing import Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..core.linear_algebra import inverse_positive_definite, semidefinite_eigen
 from ..core.units import ARCSEC
 from ..data.noise import Noise, encoder_covariances, tip_covariances
 from ..kinematics.arm import Arm
@@ -20,16 +21,18 @@ from ..model.measurement import Measurement, differences_matrix, length_directio
 from ..model.residuals import measured_lengths
 from ..model.weights import membership
 
-# What errors of tips are taken for. "given": encoders and seat as stated. "estimated": encoders and seat, both standard
-# deviations estimated from the residuals. "common": one variance for every coordinate of every tip. "robust": each pose's own
-# residual, corrected for its leverage (a jackknife), whatever the errors are, as long as poses are independent.
+# Models of the tips' errors. "given": encoders and seat as stated. "estimated": encoders and seat, both standard
+# deviations estimated from the residuals. "common": one variance for every coordinate of every tip. "robust": each
+# pose's own residual, corrected for its leverage (a jackknife), whatever the errors are, as long as poses are
+# independent.
 NoiseModel = Literal["given", "estimated", "common", "robust"]
 NOISE_MODELS = ("given", "estimated", "common", "robust")
 
 # A direction whose standard uncertainty exceeds 10 mm or 10 mrad is not determined, whatever its eigenvalue.
 _LEAST_INFORMATION = 1e-2
 _NULL = 1e-12  # eigenvalues of the information below this, of the largest, are zero
-# Of a pose that fixes its own socket nearly alone, the residual says nothing: the robust form takes the common variance there.
+# Where a pose determines its own socket nearly alone, its residual carries no information: "robust" takes the common
+# variance there.
 _LEAST_REDUNDANCY = 0.05
 
 
@@ -47,13 +50,10 @@ class ParameterCovariance(NamedTuple):
     determined: Bool[Array, " p"]  # one by one, and not only in combination with others
     open: Float[Array, "p p"]  # projector onto the directions that are not determined, in natural steps
     noise: Noise  # given, or as estimated: one encoder for all
-    # Where the scale fix divided lengths that were held, they err by one common factor: its covariance with the parameters,
-    # and, last, its variance (relative); else 0.
-    common_scale_error: Float[Array, " w"]
 
 
 class Linearisation(NamedTuple):
-    """An identification at its result: derivatives in natural steps of the parameters (1 mm, 1 mrad), 0 where they are fixed."""
+    """Derivatives of an identification at its result, in natural steps (1 mm, 1 mrad), 0 for fixed parameters."""
 
     scale: Float[Array, " p"]  # natural steps, 0 where fixed
     columns: Float[Array, "p 3 N"]  # of tips less their socket's mean
@@ -65,7 +65,7 @@ class Linearisation(NamedTuple):
 
 
 def linearised(arm: Arm, space: Parameters, measurement: Measurement, fixed: Bool[Array, " p"]) -> Linearisation:
-    """The identification at an arm; ``fixed`` parameters are held, or on a bound."""
+    """The identification at an arm; ``fixed`` parameters are the scale anchor, or on a bound."""
     scale = jnp.where(fixed, 0.0, space.scale)
     tips = arm.position(measurement.q)
     jacobian = jnp.moveaxis(arm.jacobian(measurement.q, space.names), 0, -1)  # (3, p, N)
@@ -81,7 +81,9 @@ def linearised(arm: Arm, space: Parameters, measurement: Measurement, fixed: Boo
         centroid_weights = jnp.einsum("abN,cbN,cdN->adN", covariance, weights.basis, weights.root)
     columns = columns - means @ jnp.asarray(members)
     if measurement.ends:
-        by_parameters = measured_lengths(space.vector(arm), Parameters(arm, space.names), measurement)[1] * scale[None, :]
+        by_parameters = (
+            measured_lengths(space.vector(arm), Parameters(arm, space.names), measurement)[1] * scale[None, :]
+        )
         ends = differences_matrix(measurement.ends, len(sizes)) @ members
         by_tips = jnp.einsum(
             "lN,lc,cdN->ldN", ends, length_directions(measurement.centroids(tips), measurement), centroid_weights
@@ -111,7 +113,7 @@ def sensitivity_of(
     sigma: Float[Array, ""],
     whitening: Float[Array, "l l"] | None = None,
 ) -> Sensitivity:
-    """Gains of one least squares, given the inverse of its information; in natural steps."""
+    """Sensitivity coefficients of one least squares, given the inverse of its information; in natural steps."""
     weighted = linear.counted
     if measurement.weights is not None:
         # Columns are centred under the weights, so a tip's own shift of the mean meets sums that are zero.
@@ -126,19 +128,18 @@ def sensitivity_of(
 def inverse_information(
     information: Float[Array, "p p"], fixed: Bool[Array, " p"]
 ) -> tuple[Float[Array, "p p"], Float[Array, "p p"], Bool[Array, " p"]]:
-    """Inverse on the identifiable subspace, the projector onto what the data leave open, and which parameters are determined one
-    by one; natural steps. A direction that is hardly seen keeps its large variance: what does not follow it is not spoilt.
+    """Inverse on the identifiable subspace, the projector onto the undetermined directions, and which parameters are
+    determined one by one; natural steps. A poorly determined direction keeps its large variance, which does not affect
+    the others.
     """
     free = ~fixed
-    # One decomposition, and what follows from it one after the other: jaxlib's batched LAPACK calls wait for each other's threads,
-    # and on two cores two that may run at the same time can wait for ever.
     information = information + jnp.diag(jnp.where(fixed, 1.0 + jnp.max(jnp.abs(information)), 0.0))
     # Only masks and a basis come from the eigenvectors: their derivative is infinite where eigenvalues repeat.
-    values, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(information))
-    known = values > _NULL * values[-1]
+    values, vectors = semidefinite_eigen(information)
+    known = values > _NULL * values[0]
     seen, lost = jnp.where(known[None, :], vectors, 0.0), jnp.where(known[None, :], 0.0, vectors)
     inner = seen.T @ information @ seen + jnp.diag(jnp.where(known, 0.0, 1.0))
-    inverse = seen @ jnp.linalg.inv(inner) @ seen.T
+    inverse = seen @ inverse_positive_definite(inner) @ seen.T
     hardly = jnp.where((values > _LEAST_INFORMATION)[None, :] & known[None, :], 0.0, vectors)
     determined = fixed | (jnp.sum(hardly**2, axis=1) < 1e-6)
     return jnp.where(free[:, None] & free[None, :], inverse, 0.0), lost @ lost.T, determined
@@ -158,7 +159,7 @@ def covariance_of(
 
 
 def residual_degrees_of_freedom(noise_model: NoiseModel, sizes: tuple[int, ...], fitted: int) -> float:
-    """Degrees of freedom of what a form takes from the residuals: of equations, or of poses where each speaks for itself."""
+    """Degrees of freedom of a noise model: of all equations, or of poses where each has a variance of its own."""
     if noise_model == "given":
         return math.inf
     spare = sum(sizes) - len(sizes) - fitted / 3
@@ -175,7 +176,7 @@ def tip_errors(
     sigma: Float[Array, ""],
     noise: Noise | None,
 ) -> tuple[Float[Array, "3 3 N"], Noise]:
-    """Covariance of every tip's error under a form, mm^2, and the noise that is behind it (see `NOISE_MODELS`)."""
+    """Covariance of every tip's error by a noise model, mm^2, and the noise it stands for (see `NOISE_MODELS`)."""
     common = sigma**2 * jnp.asarray(np.broadcast_to(np.eye(3)[:, :, None], (3, 3, measurement.q.shape[0])))
     geometry = arm.geometry
     if noise_model == "given":
@@ -193,8 +194,10 @@ def tip_errors(
         return sigma**2 * tip_covariances(geometry, measurement.sines_cosines, noise), Noise(
             encoder_arcsec=sigma * noise.encoder_arcsec, seating=sigma * noise.seating
         )
-    redundancy = jnp.eye(3)[:, :, None] - linear.centroid_weights + jnp.einsum("paN,pbN->abN", linear.columns, sensitivity.tips)
-    # What the residual would be had the pose not taken part: redundancy^-1 r, by Cramer's rule.
+    redundancy = (
+        jnp.eye(3)[:, :, None] - linear.centroid_weights + jnp.einsum("paN,pbN->abN", linear.columns, sensitivity.tips)
+    )
+    # The residual of the pose if it had been left out: redundancy^-1 r, by Cramer's rule.
     cofactors = jnp.stack([jnp.cross(redundancy[(i + 1) % 3], redundancy[(i + 2) % 3], axis=0) for i in range(3)])
     determinant = jnp.sum(redundancy[0] * cofactors[0], axis=0)
     enough = determinant > _LEAST_REDUNDANCY
@@ -211,9 +214,9 @@ def _components(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Variances of the encoders (arcsec^2) and of the seat (mm^2), from two moments of the residuals.
 
-    Residuals are r = M e, M a projector: the identity less the sockets' means less the fit. With D the encoders' part for
-    1 arcsec, E[r.r] = v tr(MD) + s tr(M) and E[r.Dr] = v tr(MDMD) + s tr(MD); a negative one is set to 0 and the other
-    taken from the first (variance components by the method of moments, Henderson 1953).
+    Residuals are r = M e, M a projector: the identity less the sockets' means less the fit. With D the encoders' part
+    for 1 arcsec, E[r.r] = v tr(MD) + s tr(M) and E[r.Dr] = v tr(MDMD) + s tr(MD); a negative one is set to 0 and the
+    other taken from the first (variance components by the method of moments, Henderson 1953).
     """
     sizes = np.asarray(measurement.sizes, dtype=float)
     members = jnp.asarray(membership(measurement.sizes))
@@ -250,7 +253,7 @@ def _components(
 
 
 def _root(value: Float[Array, ""]) -> Float[Array, ""]:
-    # The square root has no derivative at 0, where a variance that would be negative is put.
+    # The square root has no derivative at 0, the value of a variance whose estimate is negative.
     return jnp.where(value > 0, jnp.sqrt(jnp.where(value > 0, value, 1.0)), 0.0)
 
 

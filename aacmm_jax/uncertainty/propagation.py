@@ -1,4 +1,9 @@
-"""The uncertainty of each kind of identification: stage 1, the division by k after it, and the joint solve."""
+"""The uncertainty of each kind of identification: of stage 1, of stage 2, of the joint solve; and that of k.
+
+k follows the tips and the certified lengths directly, and the tips once more through the identified parameters:
+`propagated_scale` is its uncertainty, `propagate_division` and `propagate_adjustment` what it contributes to the
+parameters of a two-stage calibration.
+"""
 
 from typing import NamedTuple
 
@@ -6,12 +11,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..core.linear_algebra import inverse_cholesky
 from ..data.noise import Noise
-from ..kinematics.arm import Arm, is_length, parameter_names
+from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
 from ..model.measurement import LEAST_SIGMA, Measurement, length_covariance
 from ..model.residuals import JointWeights
-from ..model.scale import Scale, scale_and_weights
+from ..model.scale import Scale, divisible, scale_and_weights
 from .covariance import (
     Linearisation,
     NoiseModel,
@@ -27,7 +33,7 @@ from .covariance import (
 
 
 class Propagated(NamedTuple):
-    """How the errors of the data reach the parameters, and what that makes of their uncertainty."""
+    """How the errors of the data reach the parameters, and the uncertainty of these that follows."""
 
     linear: Linearisation
     sensitivity: Sensitivity  # natural steps
@@ -45,8 +51,8 @@ def propagate_solve(
     noise: Noise | None,
     joint_weights: JointWeights | None = None,
 ) -> Propagated:
-    """Of one least squares: of the poses alone (stage 1), or with ``joint_weights`` of poses and lengths (the joint solve); ``fixed``
-    parameters were held, or are on a bound."""
+    """Of one least squares: of the poses alone (stage 1), or with ``joint_weights`` of poses and lengths (the joint
+    solve); ``fixed`` parameters are the scale anchor, or on a bound."""
     whitening = None if joint_weights is None else joint_weights.whitening
     sigma = jnp.maximum(sigma, LEAST_SIGMA)
     counted = sigma if measurement.weights is None else jnp.ones_like(sigma)
@@ -58,16 +64,14 @@ def propagate_solve(
         noise_model, arm, measurement, linear, sensitivity, inverse, _typical(linear, measurement, sigma), noise
     )
     matrix = _in_units(covariance_of(sensitivity, linear, measurement, errors), space)
-    return Propagated(
-        linear, sensitivity, errors, ParameterCovariance(matrix, determined, lost, behind, jnp.zeros(len(space.names) + 1))
-    )
+    return Propagated(linear, sensitivity, errors, ParameterCovariance(matrix, determined, lost, behind))
 
 
 def joint_weights(arm: Arm, measurement: Measurement, sigma: Float[Array, ""]) -> JointWeights:
-    """How a joint solve weighs poses and lengths, given the scatter of a tip coordinate by a nearly right arm."""
+    """Weights of poses and lengths in a joint solve, given the scatter of a tip coordinate by a nearly right arm."""
     safe = jnp.maximum(sigma, LEAST_SIGMA)
     centroids = measurement.centroids(arm.position(measurement.q))
-    whitening = jnp.linalg.inv(jnp.linalg.cholesky(length_covariance(centroids, measurement, safe)))
+    whitening = inverse_cholesky(length_covariance(centroids, measurement, safe))
     counted = safe if measurement.weights is None else jnp.ones_like(safe)  # weights are in standard deviations already
     return JointWeights(measurement.ends, measurement.nominal, counted, whitening)
 
@@ -79,52 +83,66 @@ def propagate_division(
     measurement: Measurement,
     sigma: Float[Array, ""],
     divided: Float[Array, " p"],
+    replaced: Float[Array, " p"],
 ) -> Propagated:
-    """After every length of stage 1's ``arm`` was divided by k, which itself follows the poses and the lengths.
+    """After the lengths of stage 1's ``arm`` were divided by k, which itself follows the poses and the lengths.
 
-    x = y / k for lengths, so dx = dy / k - (x / k) dk; parameters that stage 1 held or that sat on a bound move with k.
+    x' = (x + r) / k - r for lengths, where r are the fixed lengths that x replaces (`model.scale.divide_free_lengths`),
+    so dx' = dx / k - (x' + r) / k dk; a parameter that stage 1 held or that was on a bound moves with k too.
     """
-    k, by_k, surplus = _scale_gains(arm.position(measurement.q), measurement, before, sigma)
-    divides = jnp.asarray([name != "d_1" and bool(length) for name, length in zip(space.names, space.lengths, strict=True)])
-    shift = jnp.where(divides, divided / k.value, 0.0)  # lengths only: their natural step is 1 mm
-    change = jnp.where(divides, 1 / k.value, 1.0)
-    sensitivity = Sensitivity(
-        change[:, None, None] * before.sensitivity.tips - shift[:, None, None] * by_k.tips[None],
-        -shift[:, None] * by_k.lengths[None],
-    )
-    matrix = covariance_of(sensitivity, before.linear, measurement, before.errors) + surplus * shift[:, None] * shift[None, :]
-    parameter_covariance = before.parameter_covariance._replace(matrix=_in_units(matrix, space))
-    if any(is_length(name) and name not in ("d_1", *space.names) for name in parameter_names(arm)):
-        # Held lengths are divided too: they err by -dk / k, all alike.
-        both = Sensitivity(
-            jnp.concatenate([sensitivity.tips, -by_k.tips[None] / k.value]),
-            jnp.concatenate([sensitivity.lengths, -by_k.lengths[None] / k.value]),
-        )
-        row = covariance_of(both, before.linear, measurement, before.errors)[-1]
-        row = row + surplus * jnp.append(shift, 1 / k.value) / k.value
-        parameter_covariance = parameter_covariance._replace(common_scale_error=row * jnp.append(space.scale, 1.0))
-    return before._replace(sensitivity=sensitivity, parameter_covariance=parameter_covariance)
+    scale = _scale_sensitivity(arm.position(measurement.q), measurement, before, sigma)
+    divides = jnp.asarray(divisible(space))
+    by_k = jnp.where(divides, (divided + replaced) / scale.k.value, 0.0)  # lengths only: their natural step is 1 mm
+    change = jnp.where(divides, 1 / scale.k.value, 1.0)
+    return _with_scale(before, space, measurement, scale, by_k, change)
+
+
+def propagate_adjustment(
+    solved: Propagated,
+    arm: Arm,
+    space: Parameters,
+    measurement: Measurement,
+    sigma: Float[Array, ""],
+    adjusted: str,
+    fixed: Bool[Array, ""],
+) -> Propagated:
+    """After a length was adjusted until k = 1, the others being identified with it at each of its values.
+
+    A step of the adjusted length h moves the tips by their column of h, which the other parameters follow as they
+    follow any error of the tips: S J_h. With t = S J_h + e_h, k(x(h), e) = 1 gives dx = S de - t (dk/dh)^-1 (dk/de) de.
+    ``fixed``: h is on a bound, so that nothing follows k.
+    """
+    scale = _scale_sensitivity(arm.position(measurement.q), measurement, solved, sigma)
+    column = arm.jacobian(measurement.q, (adjusted,))[..., 0].T
+    by_length = jnp.einsum("paN,aN->p", solved.sensitivity.tips, column)
+    by_length = by_length.at[space.index(adjusted)].set(1.0)
+    k_by_length = jnp.sum(scale.by_tips * column)
+    by_k = jnp.where(fixed, 0.0, by_length / jnp.where(k_by_length == 0, 1.0, k_by_length))
+    return _with_scale(solved, space, measurement, scale, by_k, jnp.ones_like(by_k))
 
 
 def propagated_scale(
     tips: Float[Array, "N 3"], measurement: Measurement, propagated: Propagated, sigma: Float[Array, ""]
 ) -> Scale:
-    """k of stage 1, with an uncertainty that holds that of the identified parameters too."""
-    k, by_k, surplus = _scale_gains(tips, measurement, propagated, sigma)
-    flat = jnp.einsum("aN,abN,bN->", by_k.tips, propagated.errors, by_k.tips)
-    variance = flat + jnp.sum((by_k.lengths * measurement.u) ** 2) + surplus
-    return eqx.tree_at(lambda s: s.u, k, jnp.sqrt(variance))
+    """k of stage 1, with an uncertainty that includes that of the identified parameters."""
+    scale = _scale_sensitivity(tips, measurement, propagated, sigma)
+    by_tips = jnp.einsum("aN,abN,bN->", scale.by_tips, propagated.errors, scale.by_tips)
+    variance = by_tips + jnp.sum((scale.by_lengths * measurement.u) ** 2) + scale.surplus
+    return eqx.tree_at(lambda s: s.u, scale.k, jnp.sqrt(variance))
 
 
-class _ScaleGains(NamedTuple):
-    tips: Float[Array, "3 N"]
-    lengths: Float[Array, " l"]
+class _ScaleSensitivity(NamedTuple):
+    """k and its derivatives by the errors of tips and of certified lengths, 1/mm."""
+
+    k: Scale
+    by_tips: Float[Array, "3 N"]
+    by_lengths: Float[Array, " l"]
+    surplus: Float[Array, ""]  # what the lengths' disagreement adds to its variance
 
 
-def _scale_gains(
+def _scale_sensitivity(
     tips: Float[Array, "N 3"], measurement: Measurement, propagated: Propagated, sigma: Float[Array, ""]
-) -> tuple[Scale, _ScaleGains, Float[Array, ""]]:
-    """k, its derivatives by the errors of tips and certified lengths, and what the lengths' disagreement adds to its variance."""
+) -> _ScaleSensitivity:
     k, by_lengths = scale_and_weights(tips, measurement, sigma)
     linear = propagated.linear
     measured = linear.lengths_by_tips + jnp.einsum("lp,paN->laN", linear.lengths, propagated.sensitivity.tips)
@@ -132,11 +150,30 @@ def _scale_gains(
     centroids = measurement.centroids(tips)
     predicted = by_lengths @ length_covariance(centroids, measurement, sigma, k.value) @ by_lengths
     surplus = jnp.maximum(k.u**2 - predicted, 0.0)
-    return k, _ScaleGains(by_tips, -by_lengths * k.measured / k.nominal), surplus
+    return _ScaleSensitivity(k, by_tips, -by_lengths * k.measured / k.nominal, surplus)
+
+
+def _with_scale(
+    before: Propagated,
+    space: Parameters,
+    measurement: Measurement,
+    scale: _ScaleSensitivity,
+    by_k: Float[Array, " p"],
+    change: Float[Array, " p"],
+) -> Propagated:
+    """Sensitivities multiplied by ``change``, less what follows k: dx = change S de - by_k dk, in natural steps."""
+    sensitivity = Sensitivity(
+        change[:, None, None] * before.sensitivity.tips - by_k[:, None, None] * scale.by_tips[None],
+        -by_k[:, None] * scale.by_lengths[None],
+    )
+    matrix = covariance_of(sensitivity, before.linear, measurement, before.errors)
+    matrix = _in_units(matrix + scale.surplus * by_k[:, None] * by_k[None, :], space)
+    parameter_covariance = before.parameter_covariance._replace(matrix=matrix)
+    return before._replace(sensitivity=sensitivity, parameter_covariance=parameter_covariance)
 
 
 def _typical(linear: Linearisation, measurement: Measurement, sigma: Float[Array, ""]) -> Float[Array, ""]:
-    """Scatter that the common form takes: of a coordinate, mm; with weights, in units of what these say."""
+    """Scatter of the noise model "common": of a coordinate, mm; with weights, in units of what these predict."""
     if measurement.weights is None:
         return sigma
     degrees_of_freedom = 3 * sum(size - 1 for size in measurement.sizes) - linear.columns.shape[0]

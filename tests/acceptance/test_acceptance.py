@@ -18,7 +18,7 @@ from aacmm_jax.acceptance.decision import read_limits
 from aacmm_jax.acceptance.procedure import plan_procedure, simulate_procedure
 from aacmm_jax.acceptance.standards import EDITIONS
 from aacmm_jax.acceptance.suite import checked_limits
-from aacmm_jax.files.procedures import procedure_csv, procedure_manifest
+from aacmm_jax.files.plans import procedure_csv, procedure_manifest
 from aacmm_jax.kinematics.workspace import Reach
 from tests.refusals import assert_refused
 
@@ -585,7 +585,7 @@ def test_what_makes_an_evaluation_doubtful_is_said_first(calibrated):
 
 
 def test_an_evaluation_of_points_is_stored_whole(tmp_path):
-    from aacmm_jax.files.points_evaluations import load_points, save_points
+    from aacmm_jax.files.evaluations import load_points, save_points
 
     spheres = (aj.data.ProbedSphere("S", "probing", (PLACE + 15.5 * AXES,), 31.0, 0.001, 0.0, 0.0002),)
     measured = lengths_of((0.01, 0.001, 100.0))._replace(

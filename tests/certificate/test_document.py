@@ -1,4 +1,4 @@
-"""The Digital Calibration Certificate: valid after the published schema, numbers that read back exactly, texts that stay texts."""
+"""The Digital Calibration Certificate: valid by the published schema; numbers and texts read back exactly."""
 
 import datetime
 import math
@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 import aacmm_jax as aj
-from aacmm_jax.certificate import xml as dcc_xml
-from aacmm_jax.certificate.document import dcc, parse_dcc
+from aacmm_jax.certificate import dcc_xml, parse_dcc, xml_elements
 from aacmm_jax.files.administrative_data import (
     AdministrativeData,
     Certificate,
@@ -123,17 +122,21 @@ def full(tmp_path_factory) -> AdministrativeData:
 
 @pytest.fixture(scope="module")
 def certificates(record, full) -> dict[str, str]:
-    """Certificates of every kind that the published rules are held against."""
+    """Certificates of every kind, to be checked against the published rules."""
     uncertain = record.determined.copy()
     uncertain[0] = False
     active = record.active.copy()
     active[1:3] = (-1, 1)
     return {
-        "nothing stated": dcc(record, AdministrativeData(), created=CREATED),
-        "all stated": dcc(record, full, created=CREATED, sources=("a.h5", "<b>.toml"), command="aacmm calibrate a.h5"),
-        "hostile names": dcc(renamed(record, *HOSTILE[:3]), full, created=CREATED),
-        "on bounds": dcc(record._replace(determined=uncertain, active=active), AdministrativeData(), created=CREATED),
-        "joint": dcc(
+        "nothing stated": dcc_xml(record, AdministrativeData(), created=CREATED),
+        "all stated": dcc_xml(
+            record, full, created=CREATED, sources=("a.h5", "<b>.toml"), command="aacmm calibrate a.h5"
+        ),
+        "hostile names": dcc_xml(renamed(record, *HOSTILE[:3]), full, created=CREATED),
+        "on bounds": dcc_xml(
+            record._replace(determined=uncertain, active=active), AdministrativeData(), created=CREATED
+        ),
+        "joint": dcc_xml(
             record._replace(method="joint", degrees_of_freedom=math.inf, noise_model="given"),
             AdministrativeData(),
             created=CREATED,
@@ -191,7 +194,9 @@ def test_the_published_schematron_rules_hold(certificates, kind):
 
     rules = Path(validation.__file__).parent / "schema" / "dcc.sch"
     found = validation.SchematronValidator.from_file(str(rules)).validate_str(certificates[kind])
-    wrong = [report.text for report in [*found.failed_assertions, *found.successful_reports] if report.role != "information"]
+    wrong = [
+        report.text for report in [*found.failed_assertions, *found.successful_reports] if report.role != "information"
+    ]
     # Where no country is stated, ZZ is: one that ISO 3166-1 leaves free, so that nobody takes it for a country.
     stated = kind in ("all stated", "hostile names")
     assert len(wrong) == (0 if stated else 1), wrong
@@ -202,7 +207,7 @@ def test_the_published_schematron_rules_hold(certificates, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_elements_stand_in_the_order_of_the_schema(certificates, kind):
+def test_elements_are_in_the_order_of_the_schema(certificates, kind):
     root = ElementTree.fromstring(certificates[kind].encode())
     children = lambda element: [child.tag.removeprefix(DCC) for child in element]  # noqa: E731
     assert root.tag == f"{DCC}digitalCalibrationCertificate"
@@ -224,7 +229,7 @@ def test_elements_stand_in_the_order_of_the_schema(certificates, kind):
 
 
 def test_numbers_read_back_exactly(record):
-    text = dcc(record, AdministrativeData(), created=CREATED)
+    text = dcc_xml(record, AdministrativeData(), created=CREATED)
     values = parse_dcc(text)
     factor = stats.t.ppf(0.975, record.degrees_of_freedom)
     coverage = {name: {x.text for x in ElementTree.fromstring(text).iter(f"{SI}coverage{name}")} for name in COVERAGE}
@@ -244,7 +249,9 @@ def test_numbers_read_back_exactly(record):
         figures = aj.evaluate(arm, record.recording.capture)
         for name, number in (("DE", "de"), ("Deltam", "deltam"), ("RMS", "rms")):
             assert values[stage, "Repeatability", name] == (float(getattr(figures.repeatability, number)), MM, None)
-        for i, (length, name) in enumerate(zip(record.recording.capture.lengths, ("1: A - B", "2: B - C"), strict=True)):
+        for i, (length, name) in enumerate(
+            zip(record.recording.capture.lengths, ("1: A - B", "2: B - C"), strict=True)
+        ):
             row = {key[3]: value for key, value in values.items() if key[:3] == (stage, "Reference lengths", name)}
             assert row["calibrated value"][:2] == (float(length.value), MM)
             assert row["measured value"] == (float(figures.measured[i]), MM, None)
@@ -253,7 +260,9 @@ def test_numbers_read_back_exactly(record):
     for i, name in enumerate(record.names):
         expected = factor * math.sqrt(record.covariance[i, i])
         np.testing.assert_allclose(values["As left", PARAMETERS, name].expanded, expected, rtol=1e-12)
-    exact, measured = (values["As left", "Reference lengths", name, "calibrated value"] for name in ("2: B - C", "1: A - B"))
+    exact, measured = (
+        values["As left", "Reference lengths", name, "calibrated value"] for name in ("2: B - C", "1: A - B")
+    )
     assert exact.expanded is None
     np.testing.assert_allclose(measured.expanded, factor * 0.01, rtol=1e-12)
     k = values["As left", "Scale", "k"]
@@ -265,12 +274,12 @@ def test_numbers_read_back_exactly(record):
 
 @pytest.mark.parametrize("value", [5e-324, -0.0, 1e-5, 0.1, 1 / 3, -123456789.125, 1.7976931348623157e308])
 def test_any_number_reads_back(record, value):
-    text = dcc(record, AdministrativeData(), created=CREATED)
+    text = dcc_xml(record, AdministrativeData(), created=CREATED)
     k = f"<si:value>{record.k!r}</si:value>"
     assert text.count(k) == 1
     parent = ElementTree.Element("x")
-    dcc_xml.real(parent, value, MM)
-    again = ElementTree.fromstring(dcc_xml.written(parent).replace("si:", ""))[0]
+    xml_elements.add_real(parent, value, MM)
+    again = ElementTree.fromstring(xml_elements.xml_text(parent).replace("si:", ""))[0]
     read = parse_dcc(text.replace(k, f"<si:value>{again.findtext('value')}</si:value>"))["As left", "Scale", "k"].value
     assert (read, math.copysign(1, read)) == (value, math.copysign(1, value))
 
@@ -289,33 +298,37 @@ def test_parameters_without_an_uncertainty_of_their_own_say_why(record, certific
         record.names[0]: "Determined only together with other",
         record.names[1]: "On its lower bound",
         record.names[2]: "On its upper bound",
-        "theta_1": "held at its nominal value",
-        "d_1": "held at its nominal value",
+        "theta_1": "fixed at its nominal value",
+        "d_1": "fixed at its nominal value",
     }
     for name, word in words.items():
         assert word in left[name]
         assert values["As left", PARAMETERS, name].expanded is None
         assert found[name] is None
-    assert all("divided" not in text for text in left.values() if text)  # d_1 only says where the base is, the others are 0
+    assert all(
+        "divided" not in text for text in left.values() if text
+    )  # d_1 only says where the base is, the others are 0
     others = set(record.names) - set(words)
     assert others
     assert all(left[name] is None and values["As left", PARAMETERS, name].expanded for name in others)
 
 
-def test_a_held_length_that_the_scale_fix_divided_says_so(record):
+def test_a_fixed_length_says_so(record):
     i = record.names.index("probe_z")
-    parts = ("lower", "upper", "active_stage1", "active", "determined", "stretch")
+    parts = ("lower", "upper", "active_stage1", "active", "determined")
     fewer = {name: np.delete(getattr(record, name), i) for name in parts}
     square = {name: np.delete(np.delete(getattr(record, name), i, 0), i, 1) for name in ("covariance", "open")}
     names = tuple(name for name in record.names if name != "probe_z")
-    text = dcc(
-        record._replace(names=names, held=(*record.held, "probe_z"), **fewer, **square), AdministrativeData(), created=CREATED
+    text = dcc_xml(
+        record._replace(names=names, held=(*record.held, "probe_z"), **fewer, **square),
+        AdministrativeData(),
+        created=CREATED,
     )
-    assert "Not identified: held at its nominal value, and divided by k as all lengths are" in text
+    assert "Not identified: fixed at its nominal value" in text
     assert parse_dcc(text)["As left", PARAMETERS, "probe_z"].expanded is None
 
 
-def test_what_is_stated_stands_there(certificates, full):
+def test_what_is_stated_is_in_the_certificate(certificates, full):
     text = certificates["all stated"]
     root = ElementTree.fromstring(text.encode())
     path = lambda *tags: "/".join(f"{DCC}{tag}" for tag in ("administrativeData", *tags))  # noqa: E731
@@ -352,11 +365,15 @@ def test_what_is_stated_stands_there(certificates, full):
     assert parse_dcc(text)["As left", "Scale", "k"].expanded
     temperature = root.find(f"*/{DCC}measurementResult/{DCC}influenceConditions//{SI}real")
     assert temperature is not None
-    assert [item.text for item in temperature.iter() if item.text and item.text.strip()] == ["20.25", r"\degreecelsius", "0.1"]
+    assert [item.text for item in temperature.iter() if item.text and item.text.strip()] == [
+        "20.25",
+        r"\degreecelsius",
+        "0.1",
+    ]
 
 
 def test_nothing_is_made_up(record):
-    text = dcc(record, AdministrativeData(), created=CREATED)
+    text = dcc_xml(record, AdministrativeData(), created=CREATED)
     root = ElementTree.fromstring(text)
     core = [(child.tag.removeprefix(DCC), child.text) for child in root[0][1]]
     assert ("countryCodeISO3166_1", "ZZ") in core
@@ -375,13 +392,13 @@ def test_nothing_is_made_up(record):
     assert names[:2] == ["Scale", "Uncertainty"]
 
 
-def test_cautions_and_simulations_are_told(record):
+def test_warnings_and_simulations_are_stated(record):
     recording = record.recording
     simulated = record._replace(recording=recording._replace(true=recording.nominal), reduced_chi=3.0)
-    cautions = of_calibration(simulated)
-    assert any("3 times what the given noise predicts" in sentence for sentence in cautions)
-    said = contents(dcc(simulated, AdministrativeData(), created=CREATED), "*/dcc:statements")
-    assert set(cautions) <= set(said)
+    warnings = of_calibration(simulated)
+    assert any("3 times what the given noise predicts" in sentence for sentence in warnings)
+    said = contents(dcc_xml(simulated, AdministrativeData(), created=CREATED), "*/dcc:statements")
+    assert set(warnings) <= set(said)
     assert "The readings are simulated, so this is no certificate of a real arm." in said
 
 
@@ -397,15 +414,15 @@ def test_cautions_and_simulations_are_told(record):
 )
 def test_the_day_of_the_calibration_stands_in_for_missing_dates(record, stated, begin, end):
     dates = {name: datetime.date.fromisoformat(text) for name, text in stated.items()}
-    text = dcc(record, AdministrativeData(certificate=Certificate(**dates)), created=CREATED)
+    text = dcc_xml(record, AdministrativeData(certificate=Certificate(**dates)), created=CREATED)
     assert f"<dcc:beginPerformanceDate>{begin}<" in text
     assert f"<dcc:endPerformanceDate>{end}<" in text
 
 
 def test_the_same_calibration_has_the_same_certificate(record):
-    one, again = (dcc(record, AdministrativeData(), created=CREATED) for _ in range(2))
+    one, again = (dcc_xml(record, AdministrativeData(), created=CREATED) for _ in range(2))
     assert one == again
-    other = dcc(record, AdministrativeData(item=Item(name="other")), created=CREATED)
+    other = dcc_xml(record, AdministrativeData(item=Item(name="other")), created=CREATED)
     identifier = lambda text: ElementTree.fromstring(text).findtext(f"*/{DCC}coreData/{DCC}uniqueIdentifier")  # noqa: E731
     assert identifier(one) != identifier(other)
 
@@ -414,7 +431,7 @@ def test_the_same_calibration_has_the_same_certificate(record):
 def test_hostile_names_stay_text(record, name):
     record = renamed(record, name, "B", "C")
     record = record._replace(recording=record.recording._replace(nominal=record.recording.nominal._replace(name=name)))
-    text = dcc(record, AdministrativeData(), created=CREATED, command=name)
+    text = dcc_xml(record, AdministrativeData(), created=CREATED, command=name)
     assert ("As left", "Reference lengths", f"1: {name} - B", "error") in parse_dcc(text)
     assert contents(text, "*/dcc:items/dcc:item/dcc:name")[0] == name
     assert name in contents(text, "*/dcc:measurementResult/dcc:usedSoftware")
@@ -422,8 +439,10 @@ def test_hostile_names_stay_text(record, name):
 
 
 def is_held_by_xml(text: str) -> bool:
-    """XML 1.0, section 2.2, by exclusion: no C0 controls but tab, line feed and return, no surrogates, not U+FFFE or U+FFFF."""
-    return not any((ord(c) < 32 and c not in "\t\n\r") or 0xD800 <= ord(c) <= 0xDFFF or c in "\ufffe\uffff" for c in text)
+    """XML 1.0, section 2.2: all but C0 controls (except tab, line feed, return), surrogates, U+FFFE and U+FFFF."""
+    return not any(
+        (ord(c) < 32 and c not in "\t\n\r") or 0xD800 <= ord(c) <= 0xDFFF or c in "\ufffe\uffff" for c in text
+    )
 
 
 @given(st.text(st.characters()) | st.text(st.sampled_from("\x00\x1f\x7f\x85\u2028\ufffe\uffff\ud800\t\n\r <>&]\"'a")))
@@ -432,8 +451,10 @@ def test_any_text_survives_or_is_refused(text):
         from aacmm_jax.files.administrative_data import held_by_xml
 
         parent = ElementTree.Element("x")
-        dcc_xml.theirs(parent, "name", held_by_xml(text, "a name"))
-        return ElementTree.fromstring(dcc_xml.written(parent).replace("dcc:", "").encode()).findtext("name/content")
+        xml_elements.add_text(parent, "name", held_by_xml(text, "a name"))
+        return ElementTree.fromstring(xml_elements.xml_text(parent).replace("dcc:", "").encode()).findtext(
+            "name/content"
+        )
 
     if is_held_by_xml(text):
         assert there_and_back() == text
@@ -447,25 +468,33 @@ def test_any_text_survives_or_is_refused(text):
 @pytest.mark.parametrize(
     ("changes", "keywords", "parts"),
     [
-        ({"converged": False, "reason": "Not converged: too few steps; allow more."}, {}, ["too few steps", "calibrate again"]),
-        ({"k": 25.4}, {}, ["25.4", "mend the lengths"]),
-        ({"k": math.nan}, {}, ["nan", "mend the lengths"]),
+        (
+            {"converged": False, "reason": "Not converged: too few steps; allow more."},
+            {},
+            ["too few steps", "calibrate again"],
+        ),
+        ({"k": 25.4}, {}, ["25.4", "correct the lengths"]),
+        ({"k": math.nan}, {}, ["nan", "correct the lengths"]),
         ({}, {"created": "yesterday"}, ["yesterday", "ISO 8601"]),
         ({}, {"sources": ["a\x07.h5"]}, ["file", "U+0007", "take it out"]),
         ({}, {"command": "aacmm \x00"}, ["command", "U+0000"]),
     ],
 )
 def test_what_cannot_be_certified_is_refused(record, changes, keywords, parts):
-    assert_refused(lambda: dcc(record._replace(**changes), AdministrativeData(), **{"created": CREATED} | keywords), *parts)
+    assert_refused(
+        lambda: dcc_xml(record._replace(**changes), AdministrativeData(), **{"created": CREATED} | keywords), *parts
+    )
 
 
 def test_names_that_xml_cannot_hold_are_refused(record):
     assert_refused(
-        lambda: dcc(renamed(record, "A\x1b", "B", "C"), AdministrativeData(), created=CREATED), r"socket 'A\x1b'", "U+001B"
+        lambda: dcc_xml(renamed(record, "A\x1b", "B", "C"), AdministrativeData(), created=CREATED),
+        r"socket 'A\x1b'",
+        "U+001B",
     )
     nominal = record.recording.nominal._replace(name="\ud800")
     broken = record._replace(recording=record.recording._replace(nominal=nominal))
-    assert_refused(lambda: dcc(broken, AdministrativeData(), created=CREATED), "arm", "U+D800")
+    assert_refused(lambda: dcc_xml(broken, AdministrativeData(), created=CREATED), "arm", "U+D800")
 
 
 @pytest.mark.parametrize(
@@ -475,7 +504,9 @@ def test_names_that_xml_cannot_hold_are_refused(record):
 def test_dates_that_contradict_the_calibration_are_refused(record, stated, part):
     dates = {name: datetime.date.fromisoformat(text) for name, text in stated.items()}
     assert_refused(
-        lambda: dcc(record, AdministrativeData(certificate=Certificate(**dates)), created=CREATED), part, "2026-03-05"
+        lambda: dcc_xml(record, AdministrativeData(certificate=Certificate(**dates)), created=CREATED),
+        part,
+        "2026-03-05",
     )
 
 
@@ -538,7 +569,7 @@ def test_what_is_no_certificate_is_refused(text, parts):
 
 
 def test_a_certificate_whose_number_was_edited_is_refused(record):
-    text = dcc(record, AdministrativeData(), created=CREATED)
+    text = dcc_xml(record, AdministrativeData(), created=CREATED)
     k = f"<si:value>{record.k!r}</si:value>"
     for edited in (k.replace(".", ","), ""):
         assert_refused(lambda edited=edited: parse_dcc(text.replace(k, edited)), "'As left / Scale / k'", "no number")

@@ -27,7 +27,7 @@ def test_help_has_an_example(aacmm, command):
 def test_demo_recovers_the_truth_and_leaves_its_files(aacmm, tmp_path):
     result = json.loads(aacmm("demo", "out", "--json", "--seed", 3).stdout)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(result["files"])
-    # Stage 1 mends repeatability, stage 2 the lengths; 2 arcsec at about 1.2 m and 5 um leave about 0.02 mm in a length.
+    # Stage 1 corrects repeatability, stage 2 the lengths; 2 arcsec at 1.2 m and 5 um leave about 0.02 mm in a length.
     assert result["stage1"]["de_mm"] < 0.02 < result["nominal"]["de_mm"]
     assert result["calibrated"]["check_rms_mm"] < 0.03 < result["stage1"]["check_rms_mm"]
     assert (tmp_path / "out" / "calibration.png").stat().st_size > 10_000
@@ -45,7 +45,11 @@ def test_whole_path(aacmm, tmp_path):
     result = json.loads(done.stdout)
     assert result["converged"]
     assert result["sockets_used"] == ["A", "B"]
-    assert result["truth"]["calibrated"]["length_error_largest_mm"] < 0.1 < result["truth"]["stage1"]["length_error_largest_mm"]
+    assert (
+        result["truth"]["calibrated"]["length_error_largest_mm"]
+        < 0.1
+        < result["truth"]["stage1"]["length_error_largest_mm"]
+    )
     # Python reads the same calibration.
     record = aj.files.load_calibration(tmp_path / "calibration.h5")
     assert record.k == result["scale_k"]
@@ -73,7 +77,7 @@ def test_whole_path(aacmm, tmp_path):
 
 
 def test_not_converged_is_exit_code_1_and_still_written(aacmm, tmp_path, monkeypatch):
-    """A capture whose one socket was in truth two (half the poses elsewhere) still converges; a capped solve does not."""
+    """A solve that is stopped by its step limit has not converged."""
     aacmm(*SIMULATE)
     done = aacmm("calibrate", "capture.h5", "-o", "calibration.h5", "--max-steps", 2, "--json", expect=1)
     result = json.loads(done.stdout)
@@ -88,7 +92,10 @@ def test_not_converged_is_exit_code_1_and_still_written(aacmm, tmp_path, monkeyp
         (("calibrate", "none.h5", "-o", "x.h5"), "none.h5 does not exist"),
         (("show", "pandda"), "did you mean 'panda'?"),
         (("simulate", "panda", "-o", "x.h5", "--socket", "A=1,2"), "--socket 'A=1,2' is not of the form NAME=X,Y,Z"),
-        (("simulate", "panda", "-o", "x.h5", "--socket", "A=5000,0,0"), "socket 'A' at (5000, 0, 0) mm cannot be reached"),
+        (
+            ("simulate", "panda", "-o", "x.h5", "--socket", "A=5000,0,0"),
+            "socket 'A' at (5000, 0, 0) mm cannot be reached",
+        ),
         (("simulate", "panda", "-o", "x.h5", "--socket", "A=400,0,300", "--poses", "B=2"), "unknown socket 'B'"),
         (
             ("simulate", "panda", "-o", "no/where.h5", "--socket", "A=400,0,300", "--poses", "2"),
@@ -132,15 +139,35 @@ def test_plan(aacmm, tmp_path):
     assert len(rows) == 13
     printed = aacmm(*PLAN).stdout
     assert "random poses in the same sockets" in printed
-    assert "Not looked at: obstacles" in " ".join(printed.split())
+    assert "Not checked: obstacles" in " ".join(printed.split())
 
 
 @pytest.mark.slow
 def test_uncertainties_are_printed(aacmm):
-    """Known noise, what the data determine, uncertainty over the volume; cross-validated where a length stood in two places."""
+    """Known noise, what the data determine, uncertainty over the volume, cross-validation of two placements."""
     aacmm(
-        *("simulate", "cheng2018-simulation", "-o", "two.h5", "--poses", 16, "--encoder-arcsec", 2, "--seating-mm", 0.005),
-        *("--socket", "A=400,200,300", "--socket", "B=600,200,300", "--socket", "C=500,400,400", "--socket", "D=300,400,600"),
+        *(
+            "simulate",
+            "cheng2018-simulation",
+            "-o",
+            "two.h5",
+            "--poses",
+            16,
+            "--encoder-arcsec",
+            2,
+            "--seating-mm",
+            0.005,
+        ),
+        *(
+            "--socket",
+            "A=400,200,300",
+            "--socket",
+            "B=600,200,300",
+            "--socket",
+            "C=500,400,400",
+            "--socket",
+            "D=300,400,600",
+        ),
         *("--length", "A,B,0.002", "--length", "C,D,0.002"),
     )
     known = ("--encoder-arcsec", 2, "--seating-mm", 0.005, "--method", "joint")
@@ -174,7 +201,7 @@ def test_what_cannot_be_determined_is_a_warning_or_with_strict_an_error(aacmm):
         (("--sockets", 2, "--socket", "A=1,2,3"), "give one of the two"),
         (("--region", "z=1"), "not of the form AXIS=LOW:HIGH"),
         (("--length-mm", "long"), "not of the form L or L:M"),
-        (("--length", "A,B"), "--length is between sockets that stand"),
+        (("--length", "A,B"), "--length is between sockets of --socket"),
         (("-o", "missing/plan.csv"), "cannot be written"),
         (("--region", "z=0:1", "--region", "z=0:2"), "named twice in --region"),
     ],

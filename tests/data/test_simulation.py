@@ -50,7 +50,10 @@ def test_every_encoder_has_its_own_noise(paper_arm):
 @pytest.mark.parametrize(
     ("noise", "parts"),
     [
-        ({"noise": aj.Noise(seating=0.1), "seating": 0.1}, ["simulate is given noise and seating", "put all of it into"]),
+        (
+            {"noise": aj.Noise(seating=0.1), "seating": 0.1},
+            ["simulate is given noise and seating", "put all of it into"],
+        ),
         ({"noise": aj.Noise(), "encoder_arcsec": 0.0, "seating": 0.0}, ["noise and encoder_arcsec and seating"]),
         ({"noise": {"seating": 0.1}}, ["noise is a dict", "aj.Noise("]),
         ({"noise": aj.Noise(encoder_arcsec=[1.0, 2.0])}, ["encoder_arcsec has 2 values", "6 joints"]),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.files.arms import specification_toml
 from tests import published
 from tests.refusals import assert_refused
 
@@ -65,7 +66,7 @@ def assert_same_arm(arm: aj.Arm, other: aj.Arm, rtol: float = 0.0) -> None:
 
 
 def test_simulated_arm_is_the_papers():
-    """The arm of the paper's section 3 stands in the middle of its first box; d_1 is that of the experiment."""
+    """The arm of the paper's section 3 is in the middle of its first box; d_1 is that of the experiment."""
     arm = aj.load_arm("cheng2018-simulation")
     space = aj.Parameters.free_of(arm)
     lower, upper = (np.array(side) for side in published.BOXES[1])
@@ -210,3 +211,39 @@ def test_what_is_not_an_arm_file(tmp_path):
 def test_a_batch_of_arms_has_no_file(tmp_path):
     batch = aj.Arm(alpha=np.zeros((2, 3)), a=np.zeros(3), d=np.zeros(3))
     assert_refused(lambda: aj.files.save_arm(batch, tmp_path / "arm.toml"), "one arm", "take one of it first")
+
+
+ROBOT = """
+length_unit = "mm"
+angle_unit = "deg"
+probe = [30.0, 10.0, 100.0]
+joint = [
+  { alpha = 90.0, a = 0.0, d = 89.0 },
+  { alpha = 0.0, a = -425.0, d = 0.0 },
+  { alpha = 0.0, a = -392.0, d = 0.0 },
+  { alpha = 90.0, a = 0.0, d = 109.0 },
+  { alpha = -90.0, a = 0.0, d = 95.0 },
+  { alpha = 0.0, a = 0.0, d = 82.0 },
+]
+"""
+
+
+def test_a_file_without_identification_gets_independent_parameters(tmp_path):
+    """Three parallel axes: two of their offsets are fixed, and Hayati's angles are free instead; also after a round trip."""
+    path = written(tmp_path, ROBOT)
+    specification = aj.files.load_specification(path)
+    chosen = aj.Parameters.independent(specification.arm)
+    assert specification.space().names == chosen.names
+    assert specification.free == ("beta_2", "beta_3")
+    assert {"d_2", "d_3"} <= set(specification.held)
+    assert specification.arm.beta is None  # the file states none
+    path.write_text(specification_toml(specification))
+    again = aj.files.load_specification(path)
+    assert (again.held, again.free, again.bounds().space.names) == (
+        specification.held,
+        specification.free,
+        chosen.names,
+    )
+    aj.files.save_arm(specification.arm, path)  # a file of the arm alone proposes nothing
+    assert "identification" not in path.read_text()
+    assert aj.files.load_specification(path).space().names == chosen.names

@@ -43,7 +43,7 @@ SIGNS = np.array([1, -1, 1, 1, -1, -1])
     [
         ('unit = "rad"', lambda q: q),
         ('unit = "deg"', np.rad2deg),
-        ('unit = "arcsec"', lambda q: np.rad2deg(q) * 3600),
+        ('unit = "arcsec"', lambda q: q / aj.units.ARCSEC),
         ('unit = "counts"\ncounts_per_turn = 4096', lambda q: q / TURN * 4096),
         (f'unit = "counts"\ncounts_per_turn = {(1000 * JOINTS).tolist()}', lambda q: q / TURN * 1000 * JOINTS),
         ('unit = "deg"\nsign = -1\noffset = 90', lambda q: 90 - np.rad2deg(q)),
@@ -117,9 +117,60 @@ def test_braces_make_a_socket_a_file(tmp_path, monkeypatch, motion, prefix, insi
     capture = recording.capture
     assert capture.names == ("left/0", "left/1", "mid-high/0", "mid-high/1")
     np.testing.assert_array_equal(capture.sockets["mid-high/0"], motion + 2)
-    assert [(length.start, length.end) for length in capture.lengths] == [("left/0", "left/1"), ("mid-high/0", "mid-high/1")]
+    assert [(length.start, length.end) for length in capture.lengths] == [
+        ("left/0", "left/1"),
+        ("mid-high/0", "mid-high/1"),
+    ]
     assert {(float(length.value), float(length.u)) for length in capture.lengths} == {(50.0, 0.01)}
     assert recording.nominal.name == "Cheng 2018, simulated arm"
+
+
+FILES = (
+    "front_left/hole_0.csv",
+    "front_left/hole_0_pose.csv",
+    "front_left/hole_1.csv",
+    "mid-high/hole_0.csv",
+    "old/hole_0.csv",
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "exclude", "expected"),
+    [
+        # A field beside other text is one word: what lies beside a recording under a longer name is another file.
+        ("{place}/{hole}", "{place}/hole_{hole}.csv", [], {"front_left/0", "front_left/1", "mid-high/0", "old/0"}),
+        ("{place}/{hole}", "{place}/hole_{hole}.csv", ["old/*"], {"front_left/0", "front_left/1", "mid-high/0"}),
+        ("{place}/{hole}", "{place}/hole_{hole}.csv", ["hole_1.csv", "old/*"], {"front_left/0", "mid-high/0"}),
+        # One that is a whole name, but for the extension, may hold anything.
+        ("{file}", "front_left/{file}.csv", [], {"hole_0", "hole_0_pose", "hole_1"}),
+        ("{file}", "front_left/{file}.csv", ["*_pose.csv"], {"hole_0", "hole_1"}),
+        ("{file}", "front_left/{file}", ["*_pose.csv"], {"hole_0.csv", "hole_1.csv"}),
+        ("{side}/{h}", "{side}-high/hole_{h}.csv", [], {"mid/0"}),
+        ("{h}", "front_left/hole_{h}_pose.csv", [], {"0"}),
+    ],
+)
+def test_what_a_field_matches(tmp_path, motion, name, file, exclude, expected):
+    for number, path in enumerate(FILES):
+        record(tmp_path / path, motion + 0.1 * number)
+    text = f'{HEAD}{ANGLES}[[socket]]\nname = "{name}"\nfile = "{file}"\nexclude = {exclude}\n'
+    assert set(read(tmp_path, text).names) == expected
+
+
+@pytest.mark.parametrize(
+    ("file", "exclude", "parts"),
+    [
+        ("hole_{hole}.csv", [], ["but nearly 'hole_0_pose.csv', 'hole_1_pose.csv'", "letters, digits and '-' only"]),
+        ("{hole}_pose.csv", ["*_pose.csv"], ["but 'hole_0_pose.csv'", "which exclude leaves out; mend exclude"]),
+        ("hole_{hole}_poze.csv", [], ["there is 'hole_1_pose.csv', 'hole_0_pose.csv'", "check the path"]),
+        ("plate/{hole}.csv", [], ["no file matches 'plate/{hole}.csv'", "check the path"]),
+    ],
+    ids=["longer name", "excluded", "misspelt", "no such folder"],
+)
+def test_what_nearly_matches_is_named(tmp_path, motion, file, exclude, parts):
+    for number in range(2):
+        record(tmp_path / f"hole_{number}_pose.csv", motion + number)
+    text = f'{HEAD}{ANGLES}[[socket]]\nname = "{{hole}}"\nfile = "{file}"\nexclude = {exclude}\n'
+    assert_refused(lambda: read(tmp_path, text), tmp_path / "capture.toml", *parts)
 
 
 def test_a_field_that_returns_is_the_same_text(tmp_path, motion):
@@ -153,6 +204,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL + LENGTH.replace("from", "form"), ["unknown key 'length 1.form'", "did you mean 'from'?"]),
         (SMALL.replace("[[socket]]", "[socket]"), ["'socket' must be a valid list, not a table", "write [[socket]]"]),
         (SMALL + 'name = "{place}"', ["name '{place}'", "file 'a.csv' has no field", "use the same fields"]),
+        (SMALL + 'exclude = ["b*"]', ["exclude is for files with a field in braces", "'a.csv' has none; leave it out"]),
         (SMALL + 'files = ["a.csv"]', ["socket 1", "either file or files"]),
         (HEAD + ANGLES + '[[socket]]\nfiles = ["a.csv"]', ["socket 1", "needs a name"]),
         (HEAD + ANGLES + '[[socket]]\nname = "a"\nfiles = []', ["'socket 1.files' has no entries", "give at least 1"]),
@@ -164,13 +216,25 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL + LENGTH.replace('"b"', '"{x}"'), ["from 'a' to '{x}'", "field that no [[socket]] has"]),
         (SMALL.replace("rad", "counts"), ["angles", "give counts_per_turn with unit = 'counts'"]),
         (SMALL.replace(SOCKET, "counts_per_turn = 9\n" + SOCKET), ["angles", "only with it"]),
-        (SMALL.replace('"rad"', '"counts"\ncounts_per_turn = [9, 9]'), ["angles.counts_per_turn has 2 values", "6 joints"]),
-        (SMALL.replace('"rad"', '"counts"\ncounts_per_turn = "many"'), ["'angles.counts_per_turn' must be", "not 'many'"]),
+        (
+            SMALL.replace('"rad"', '"counts"\ncounts_per_turn = [9, 9]'),
+            ["angles.counts_per_turn has 2 values", "6 joints"],
+        ),
+        (
+            SMALL.replace('"rad"', '"counts"\ncounts_per_turn = "many"'),
+            ["'angles.counts_per_turn' must be", "not 'many'"],
+        ),
         (SMALL.replace('"rad"', '"rad"\nsign = 2'), ["'angles.sign' must be 1 or -1, not 2"]),
         (SMALL.replace('"rad"', '"rad"\nsign = [1, 1, 0, 1, 1, 1]'), ["'angles.sign 3' must be 1 or -1, not 0"]),
         (SMALL.replace('"rad"', '"rad"\noffset = [1, 2]'), ["angles.offset has 2 values", "give one, or one a joint"]),
-        (SMALL.replace('"rad"', '"rad"\ncolumns = [1, 2, 3]'), ["angles.columns picks 3", "6 joints", "pick one a joint"]),
-        (SMALL.replace('"rad"', '"rad"\ncolumns = [1, 2, 3, 4, 5, 9]'), ["a.csv has 6 columns", "no column 9", "pick others"]),
+        (
+            SMALL.replace('"rad"', '"rad"\ncolumns = [1, 2, 3]'),
+            ["angles.columns picks 3", "6 joints", "pick one a joint"],
+        ),
+        (
+            SMALL.replace('"rad"', '"rad"\ncolumns = [1, 2, 3, 4, 5, 9]'),
+            ["a.csv has 6 columns", "no column 9", "pick others"],
+        ),
         (SMALL.replace('"rad"', '"rad"\ncolumns = [0, 2, 3, 4, 5, 6]'), ["'angles.columns 1' must be greater than 0"]),
         (HEAD + ANGLES + PATTERN.replace(".csv", ".txt"), ["no file matches '{place}.txt'", "check the path"]),
         (HEAD + ANGLES + PATTERN.replace('name = "{place}"\n', ""), ["has {place}", "use the same fields in the name"]),
@@ -187,10 +251,39 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
     ],
     ids=[
         *("missing file", "folder", "unit", "no angles", "no socket", "misspelt in socket", "misspelt in angles"),
-        *("misspelt in length", "socket as a table", "field in the name only", "file and files", "files without name"),
-        *("no files", "socket twice", "length to unknown", "length negative", "length text", "u negative", "length field"),
-        *("counts without per turn", "per turn without counts", "per turn of two", "per turn text", "sign", "sign of one"),
-        *("offset of two", "columns of three", "column beyond", "column 0", "pattern without match", "pattern without name"),
+        *(
+            "misspelt in length",
+            "socket as a table",
+            "field in the name only",
+            "exclude without field",
+            "file and files",
+            "files without name",
+        ),
+        *(
+            "no files",
+            "socket twice",
+            "length to unknown",
+            "length negative",
+            "length text",
+            "u negative",
+            "length field",
+        ),
+        *(
+            "counts without per turn",
+            "per turn without counts",
+            "per turn of two",
+            "per turn text",
+            "sign",
+            "sign of one",
+        ),
+        *(
+            "offset of two",
+            "columns of three",
+            "column beyond",
+            "column 0",
+            "pattern without match",
+            "pattern without name",
+        ),
         *("pattern of two", "arm", "arm file", "not TOML"),
     ],
 )
@@ -204,9 +297,9 @@ def test_bad_manifest(tmp_path, motion, text, parts):
     [
         (b"1,2,3,4,5\n", ["has 5 columns", "the arm has 6 joints", "one column a joint", "columns = [...]"]),
         (b"1,2,3,4,5,6\n1,2,3,4,5\n", ["line 2 has 5 columns", "before it 6", "give all the same"]),
-        (b"q\n1,2,3,4,5,6\n\n1,2,x,4,5,6\n", ["line 4 column 3", "'x' is not a number", "mend it"]),
+        (b"q\n1,2,3,4,5,6\n\n1,2,x,4,5,6\n", ["line 4 column 3", "'x' is not a number", "correct it"]),
         (b"1,2,3,4,5,\n", ["line 1 column 6", "'' is not a number"]),
-        (b"1,2,3,4,5,6\n1,2,3,4,nan,6\n", ["line 2 column 5", "'nan' is not finite", "mend it"]),
+        (b"1,2,3,4,5,6\n1,2,3,4,nan,6\n", ["line 2 column 5", "'nan' is not finite", "correct it"]),
         (b"q1,q2,q3,q4,q5,q6\n", ["holds no numbers", "one line a pose"]),
         (b"", ["holds no numbers", "one line a pose"]),
         (b"0,5;1,5;2,5;0,5;1,5;2,5\n", ["holds no numbers", "with decimal points"]),
@@ -222,7 +315,9 @@ def test_bad_table(tmp_path, content, parts):
 
 def test_degrees_taken_for_radians(tmp_path, motion):
     record(tmp_path / "a.csv", np.rad2deg(motion))
-    assert_refused(lambda: read(tmp_path, SMALL), tmp_path / "capture.toml", "socket 'a' pose", "degrees", "state the unit")
+    assert_refused(
+        lambda: read(tmp_path, SMALL), tmp_path / "capture.toml", "socket 'a' pose", "degrees", "state the unit"
+    )
 
 
 def test_what_is_not_a_manifest(tmp_path):

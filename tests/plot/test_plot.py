@@ -1,4 +1,4 @@
-"""Figures alone: each returns the axes that it drew into, and what it drew are the numbers."""
+"""Figures: each returns the axes that it was plotted into, and shows the numbers of its record."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,8 @@ def record():
     space = aj.Parameters.free_of(nominal.arm)
     true = aj.perturbed_arm(space, length=1.0, angle=0.002, seed=2)
     capture = aj.simulate(
-        true, {"A": (400, 200, 300), "B": (700, 500, 500)}, poses={"A": 40, "B": 12}, lengths=[("A", "B", 0.002)], encoder_arcsec=2, seed=2
+        true, {"A": (400, 200, 300), "B": (700, 500, 500)}, poses={"A": 40, "B": 12}, lengths=[("A", "B", 0.002)],
+        encoder_arcsec=2, seed=2,
     )  # fmt: skip
     result = aj.calibrate(nominal.arm, capture, aj.Bounds.around(nominal.arm, space, length=10.0, angle=0.0175))
     return aj.calibration.record_of(result, aj.Recording(capture, nominal, nominal._replace(arm=true), 2))
@@ -23,7 +24,10 @@ def record():
 @pytest.fixture(scope="module")
 def made(record, tmp_path_factory):
     uncertainty = aj.uncertainty_of(record)
-    study = aj.study.make_study(arm="cheng2018-simulation", trials=4, capture={"positions_mm": [[400, 200, 300]], "poses": [20, 30]}, noise={"encoder_arcsec": 2}, identification={"method": "stage1"})  # fmt: skip
+    study = aj.study.make_study(
+        arm="cheng2018-simulation", trials=4, capture={"positions_mm": [[400, 200, 300]], "poses": [20, 30]},
+        noise={"encoder_arcsec": 2}, identification={"method": "stage1"},
+    )  # fmt: skip
     path = tmp_path_factory.mktemp("plot") / "study.h5"
     aj.study.run_study(study, path)
     arm, capture = record.calibrated.arm, record.recording.capture
@@ -31,19 +35,24 @@ def made(record, tmp_path_factory):
     from aacmm_jax.study.results import Results
 
     return {
-        "distances": (record,),
+        "pose_distances": (record,),
         "length_parameter_errors": (record,),
         "parameter_changes": (record,),
-        "length_errors": (record,),
-        "volume": (aj.volumetric_uncertainty(uncertainty, points=30),),
-        "correlation": (uncertainty,),
+        "reference_length_errors": (record,),
+        "volumetric_uncertainty_map": (aj.volumetric_uncertainty(uncertainty, points=30),),
+        "correlation_matrix": (uncertainty,),
         "singular_values": (aj.observability(arm, capture, aj.Parameters(arm, record.names)),),
-        "acceptance": (aj.acceptance.run(aj.acceptance.Measured(sockets), {"Deltam": aj.acceptance.Limit(0.05)}),),
-        "study": (Results.of(path), "de_stage1"),
+        "acceptance_metrics": (
+            aj.acceptance.run(aj.acceptance.Measured(sockets), {"Deltam": aj.acceptance.Limit(0.05)}),
+        ),
+        "study_metric": (Results.of(path), "de_stage1"),
     }
 
 
-FIGURES = ["distances", "length_parameter_errors", "parameter_changes", "length_errors", "volume", "correlation", "singular_values", "acceptance", "study"]  # fmt: skip
+FIGURES = [
+    "pose_distances", "length_parameter_errors", "parameter_changes", "reference_length_errors",
+    "volumetric_uncertainty_map", "correlation_matrix", "singular_values", "acceptance_metrics", "study_metric",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -54,17 +63,17 @@ def test_a_figure_draws_into_the_axes_it_is_given_or_into_new_ones(made, name, t
     alone.figure.savefig(tmp_path / "figure.pdf")
     drawn = [*alone.lines, *alone.collections, *alone.images, *alone.containers]
     assert drawn
-    assert alone.get_ylabel() or name == "correlation"
+    assert alone.get_ylabel() or name == "correlation_matrix"
 
 
 def test_figures_hold_the_numbers(record, made):
-    lines = aj.plot.distances(record).lines
+    lines = aj.plot.pose_distances(record).lines
     left = np.asarray(record.evaluations()["calibrated"].distances)
     np.testing.assert_allclose(np.sort(lines[1].get_ydata()), np.sort(left))
     changes = aj.plot.parameter_changes(record, "angle").containers[0].lines[0].get_ydata()
     vectors = record.vectors()
     angles = [i for i, name in enumerate(record.names) if name.startswith(("alpha", "theta"))]
-    expected = np.degrees((vectors["calibrated"] - vectors["nominal"])[angles]) * 3600
+    expected = (vectors["calibrated"] - vectors["nominal"])[angles] / aj.units.ARCSEC
     np.testing.assert_allclose(changes, expected)
     values = aj.plot.singular_values(*made["singular_values"]).lines[0].get_ydata()
     np.testing.assert_allclose(values, made["singular_values"][0].singular)
@@ -72,10 +81,10 @@ def test_figures_hold_the_numbers(record, made):
 
 def test_an_arm_is_drawn_in_space(record):
     arm, q = record.calibrated.arm, record.recording.capture.q[:3]
-    axes = aj.plot.arm(arm, q)
+    axes = aj.plot.arm_poses(arm, q)
     x, y, z = axes.lines[-1].get_data_3d()  # the tips, drawn last
     np.testing.assert_allclose(np.column_stack([x, y, z]), arm.position(q))
-    assert_refused(lambda: aj.plot.arm(arm, q, Figure().subplots()), "projection='3d'")
+    assert_refused(lambda: aj.plot.arm_poses(arm, q, Figure().subplots()), "projection='3d'")
 
 
 @pytest.mark.parametrize(
@@ -83,11 +92,13 @@ def test_an_arm_is_drawn_in_space(record):
     [
         (lambda record: aj.plot.parameter_changes(record, "lengths"), "length or angle"),
         (
-            lambda record: aj.plot.acceptance(aj.acceptance.run(aj.acceptance.Measured({"A": np.eye(3)}))),
-            "no figure has a limit",
+            lambda record: aj.plot.acceptance_metrics(aj.acceptance.run(aj.acceptance.Measured({"A": np.eye(3)}))),
+            "no metric has a limit",
         ),
         (
-            lambda record: aj.plot.length_parameter_errors(record._replace(recording=record.recording._replace(true=None))),
+            lambda record: aj.plot.length_parameter_errors(
+                record._replace(recording=record.recording._replace(true=None))
+            ),
             "simulation",
         ),
     ],

@@ -1,4 +1,4 @@
-"""Reports: what they hold, that nobody's text becomes markup, and that a real browser shows, sines_cosines, sorts and prints them."""
+"""Reports: their contents, that no given text becomes markup, and that a browser shows, sorts and prints them."""
 
 import json
 import math
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.report import charts, parts, write_report
+from aacmm_jax.report import charts, elements, write_report
 from aacmm_jax.report.residuals import outliers
 from tests.refusals import assert_refused
 
@@ -134,9 +134,11 @@ def test_a_calibration_report_says_what_the_calibration_found(written):
     found = Page(written.pages["calibration"].read_text(encoding="utf-8"))
     record = written.record
     assert f"{record.k:.8f}" in found.text
-    for name, value, u in zip(record.names, record.vectors()["calibrated"], np.sqrt(np.diag(record.covariance)), strict=True):
+    for name, value, u in zip(
+        record.names, record.vectors()["calibrated"], np.sqrt(np.diag(record.covariance)), strict=True
+    ):
         if name.startswith("a_") and u > 0:
-            decimals = parts.decimals_of(1.99 * u)
+            decimals = elements.decimals_for(1.99 * u)
             assert f"{value:.{decimals}f}".replace("-", "−") in found.text, name
     assert "on the upper bound" in found.text or "on the lower bound" in found.text
     assert "Read this first" in found.text
@@ -146,7 +148,9 @@ def test_a_calibration_report_says_what_the_calibration_found(written):
         assert needed in found.text
     scene = json.loads(found.held["scenes"])["scene"]
     q = np.asarray(record.recording.capture.q)
-    np.testing.assert_allclose([pose["points"][-1] for pose in scene["poses"]], record.calibrated.arm.position(q), atol=0.06)
+    np.testing.assert_allclose(
+        [pose["points"][-1] for pose in scene["poses"]], record.calibrated.arm.position(q), atol=0.06
+    )
     assert all(pose["points"][0] == [0, 0, 0] for pose in scene["poses"])
 
 
@@ -154,13 +158,19 @@ def tables_of(report):
     found = {}
     for section in report.sections:
         for block in section.blocks:
-            table = block.table if isinstance(block, parts.Chart) else block if isinstance(block, parts.Table) else None
+            table = (
+                block.table
+                if isinstance(block, elements.Chart)
+                else block
+                if isinstance(block, elements.Table)
+                else None
+            )
             if table is not None:
                 found[table.caption] = table
     return found
 
 
-def test_numbers_of_a_report_stand_under_the_right_heading(written):
+def test_numbers_of_a_report_are_under_the_right_heading(written):
     from aacmm_jax.report.calibration import calibration_report
 
     record = written.record
@@ -168,27 +178,31 @@ def test_numbers_of_a_report_stand_under_the_right_heading(written):
     tables = tables_of(report)
     evaluations, factor = record.evaluations(), aj.uncertainty_of(record).factor(0.95)
     stages = {"as found": "nominal", "after stage 1": "stage1", "as left": "calibrated"}
-    figures = tables["Figures as found and as left [mm]"]
+    metrics = tables["Metrics as found and as left [mm]"]
     for heading, stage in stages.items():
-        cell = figures.rows[0][figures.columns.index(heading)]
+        cell = metrics.rows[0][metrics.columns.index(heading)]
         assert cell.value == pytest.approx(float(evaluations[stage].repeatability.de))
     parameters = tables["Parameters"]
     u = np.sqrt(np.diag(record.covariance))
     for row in parameters.rows:
         i = record.names.index(row[0].text)
-        scale = 180 / math.pi if row[1].text == "deg" else 1.0
-        assert row[parameters.columns.index("as left")].value == pytest.approx(scale * record.vectors()["calibrated"][i])
+        scale = 1 / aj.units.DEG if row[1].text == "deg" else 1.0
+        assert row[parameters.columns.index("as left")].value == pytest.approx(
+            scale * record.vectors()["calibrated"][i]
+        )
         if row[parameters.columns.index("U (95 %)")].value is not None:
             assert row[parameters.columns.index("U (95 %)")].value == pytest.approx(scale * factor * u[i])
     volume = aj.volumetric_uncertainty(aj.uncertainty_of(record))
     rows = tables["Expanded uncertainty over the working volume [mm]"].rows
     assert rows[1][3].value == pytest.approx(factor * volume.u_length.max())
-    places = tables["All places"]
-    np.testing.assert_allclose([row[4].value for row in places.rows], factor * volume.u_length)
+    positions = tables["All positions"]
+    np.testing.assert_allclose([row[4].value for row in positions.rows], factor * volume.u_length)
     charts_by_id = {
-        block.id: block for section in report.sections for block in section.blocks if isinstance(block, parts.Chart)
+        block.id: block for section in report.sections for block in section.blocks if isinstance(block, elements.Chart)
     }
-    np.testing.assert_allclose(charts_by_id["volume"].figure["data"][0]["marker"]["color"], factor * volume.u_length, rtol=1e-3)
+    np.testing.assert_allclose(
+        charts_by_id["volume"].figure["data"][0]["marker"]["color"], factor * volume.u_length, rtol=1e-3
+    )
     change = charts_by_id["change-mm"].figure["data"][0]
     i = record.names.index(change["x"][0])
     vectors = record.vectors()
@@ -231,21 +245,19 @@ def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
 
 
 def test_poses_alone_in_their_socket_show_no_scatter(written):
+    from aacmm_jax.report.arm_view import view_of_arm
     from aacmm_jax.report.residuals import residual_chart, socket_table
-    from aacmm_jax.report.scene import arms_of
 
     arm, q = written.record.calibrated.arm, written.record.recording.capture.q
     capture = aj.Capture({"A": q[:10], "B": q[10:11]})
     evaluation = aj.evaluate(arm, capture)
-    distances = [pose["distance"] for pose in arms_of(arm, capture, evaluation).data["poses"]]
+    distances = [pose["distance"] for pose in view_of_arm(arm, capture, evaluation).data["poses"]]
     assert distances[10] is None
     assert None not in distances[:10]
     assert [cell.text for cell in socket_table(capture, evaluation).rows[1]][2:5] == ["–"] * 3
     assert len(residual_chart("r", "R", capture, {"as left": evaluation}).figure["data"][0]["x"]) == 10
-    assert (
-        "no scatter"
-        in residual_chart("r", "R", aj.Capture({"B": q[:1]}), {"as left": aj.evaluate(arm, aj.Capture({"B": q[:1]}))}).words
-    )
+    single = aj.Capture({"B": q[:1]})
+    assert "no scatter" in residual_chart("r", "R", single, {"as left": aj.evaluate(arm, single)}).description
 
 
 CONFORMITY = """
@@ -258,25 +270,27 @@ decision_rule = "a rule"
 
 def test_a_statement_that_the_file_contradicts_is_refused(written, tmp_path):
     from aacmm_jax.acceptance.record import PointsRecord
-    from aacmm_jax.files.points_evaluations import save_points
+    from aacmm_jax.files.evaluations import save_points
 
     (tmp_path / "pass.toml").write_text(CONFORMITY.format("pass"))
     stated = aj.files.read_administrative_data(tmp_path / "pass.toml")
     for kind in ("calibration", "evaluation"):
-        assert_refused(lambda kind=kind: write_report(written.folder / f"{kind}.h5", tmp_path / "r.html", stated), "simulated")
+        assert_refused(
+            lambda kind=kind: write_report(written.folder / f"{kind}.h5", tmp_path / "r.html", stated), "simulated"
+        )
     measured = aj.acceptance.Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])})
     save_points(tmp_path / "fails.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.04)}, 0.001))
     assert_refused(lambda: write_report(tmp_path / "fails.h5", tmp_path / "r.html", stated), "a limit is not kept")
     save_points(tmp_path / "passes.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.06)}, 0.001))
     write_report(tmp_path / "passes.h5", tmp_path / "r.html", stated)
     assert "pass: a specification; a rule" in (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert_refused(lambda: aj.certificate.dcc(written.record, stated, created="2026-01-31T00:00:00"), "simulated")
+    assert_refused(lambda: aj.certificate.dcc_xml(written.record, stated, created="2026-01-31T00:00:00"), "simulated")
 
 
 def test_corners_of_an_arm_by_hand():
     from aacmm_jax.kinematics.workspace import skeleton
 
-    # One joint turned by 90 degrees: up 100, then out 200 along y, then the probe 50 along the last z, tilted by alpha = -90 deg.
+    # One joint at 90 degrees: 100 up, 200 out along y, then the probe 50 along the last z, tilted by alpha = -90 deg.
     arm = aj.Arm(alpha=[-math.pi / 2], a=[200], d=[100], theta=[0], probe=[0, 0, 50])
     np.testing.assert_allclose(
         skeleton(arm, np.array([[math.pi / 2]]))[0], [[0, 0, 0], [0, 0, 100], [0, 200, 100], [-50, 200, 100]], atol=1e-9
@@ -310,11 +324,11 @@ def test_outliers_by_hand():
     ],
 )
 def test_numbers_are_shown(value, decimals, signed, expected):
-    assert parts.shown(value, decimals, signed=signed) == expected
+    assert elements.format_number(value, decimals, signed=signed) == expected
 
 
 def test_missing_numbers_are_told_from_infinite_ones():
-    assert [parts.number(value).text for value in (None, math.nan, math.inf)] == ["–", "–", "not determined"]
+    assert [elements.number_cell(value).text for value in (None, math.nan, math.inf)] == ["–", "–", "not determined"]
 
 
 def test_a_logarithmic_axis_marks_what_is_there():
@@ -355,10 +369,12 @@ def test_the_command_states_the_laboratory_and_prints_for_machines(written, aacm
     dcc = aacmm("export", written.folder / "calibration.h5", "--format", "dcc", "--about", "about.toml").stdout
     values = aj.certificate.parse_dcc(dcc)
     assert any(value.value == float(written.record.calibrated.arm.a[1]) for value in values.values())
-    assert "--format dcc" in aacmm("export", written.folder / "calibration.h5", "--about", "about.toml", expect=2).stderr
+    assert (
+        "--format dcc" in aacmm("export", written.folder / "calibration.h5", "--about", "about.toml", expect=2).stderr
+    )
 
 
-# --- A real browser -----------------------------------------------------------------------------------------------------------
+# --- A real browser ---
 
 
 @pytest.fixture(scope="module")
@@ -367,7 +383,13 @@ def browser():
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if chromium is None:
         pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
-    quiet = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
+    quiet = [
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+    ]
     with api.sync_playwright() as playwright:
         running = playwright.chromium.launch(executable_path=chromium, args=quiet)
         yield running
@@ -406,7 +428,8 @@ def test_a_browser_draws_everything_and_asks_for_nothing(shown, written, kind, w
     # Every chart has drawn marks of some size, and the page is no wider than the screen.
     drawn = opened.evaluate(
         """() => [...document.querySelectorAll("[data-chart]")].map((place) => ({
-            marks: place.querySelectorAll(".main-svg .point, .main-svg .hm image, .main-svg .heatmaplayer image").length,
+            marks: place.querySelectorAll(
+                ".main-svg .point, .main-svg .hm image, .main-svg .heatmaplayer image").length,
             width: place.getBoundingClientRect().width, paper: place.querySelector("img.paper").naturalWidth }))"""
     )
     assert drawn
@@ -474,6 +497,7 @@ def test_it_prints_to_pdf(shown, tmp_path, kind):
     opened.emulate_media(media="print")
     seen = opened.evaluate(
         """() => [...document.querySelectorAll("[data-chart]")].map((place) =>
-            [...place.children].filter((child) => getComputedStyle(child).display !== "none").map((child) => child.className))"""
+            [...place.children].filter((child) => getComputedStyle(child).display !== "none")
+                .map((child) => child.className))"""
     )
     assert seen == [["paper"]] * len(seen)

@@ -1,4 +1,4 @@
-"""What a study's results say: standard errors that are true, tables, figures, labelled data."""
+"""Results of a study: standard errors that are true, tables, plots, labelled data."""
 
 import json
 
@@ -132,7 +132,7 @@ def test_summary_says_what_the_arrays_say(path, summary):
 
 
 def test_the_method_is_right(summary):
-    """In a wide box the scale fix leaves no bias in the scale, and every parameter's bias is within its standard error."""
+    """Within wide bounds the scale fix leaves no bias, and every parameter's bias is within its standard error."""
     cell = summary["results"][2]
     scale = cell["figures"]["scale_error"]["mean"]
     assert abs(scale["value"]) < 4 * scale["se"]

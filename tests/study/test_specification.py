@@ -1,4 +1,4 @@
-"""What a study asks: what is read, and what is refused before any work."""
+"""The specification of a study: what is read, and what is refused before any work."""
 
 import inspect
 
@@ -66,7 +66,7 @@ def _text(name: str) -> str:
     return (resources.files("aacmm_jax.study") / "shipped_studies" / f"{name}.toml").read_text()
 
 
-def test_what_a_toml_file_names_lies_beside_it(tmp_path, noisy_capture, paper_arm):
+def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_arm):
     aj.files.save_arm(paper_arm, tmp_path / "my-arm.toml", name="mine")
     specification = aj.files.load_specification("cheng2018-simulation")
     aj.files.save_capture(tmp_path / "rec.h5", aj.Recording(noisy_capture, specification))

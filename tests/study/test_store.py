@@ -1,4 +1,4 @@
-"""A study's file: whole at every moment, continued whatever happened, the same however it was run."""
+"""A study's file: complete at every moment, continued after any stop, the same however it was run."""
 
 import inspect
 import multiprocessing
@@ -95,7 +95,7 @@ def until_parts(path: Path, count: int, process: subprocess.Popen) -> None:
 
 
 def interrupted_at(count: int):
-    """Something to watch a study with that interrupts it, once."""
+    """A callback for a study that interrupts it, once."""
     sent = []
 
     def watch(progress):
@@ -130,7 +130,7 @@ def test_blocks_cover_every_trial_once(study):
 
 
 def test_cells_of_different_settings_share_no_block():
-    """Pose counts compile to different programs; hold does too."""
+    """Numbers of poses compile to different programs; so do scale anchors."""
     capture = {"positions_mm": [[400, 200, 300]], "poses": [10, 20], "pool": 4096}
     study = aj.study.make_study(
         arm="cheng2018-simulation", trials=10, capture=capture, identification={"hold": ["none", "longest"]}
@@ -147,7 +147,7 @@ def test_cells_of_different_settings_share_no_block():
 
 
 def test_stopped_is_resumed(home, study, tmp_path):
-    """Stopped by what watches it: everything that had ended is kept, read while unfinished, and continued."""
+    """Stopped by its callback: all finished blocks are kept, read while unfinished, and continued."""
     path = tmp_path / "s.h5"
 
     outcome = aj.study.run_study(study, path, chunk=16, watch=interrupted_at(48))
@@ -243,7 +243,7 @@ def test_blocks_of_a_study_whose_file_is_gone_are_not_taken_for_anothers(home, s
 
 
 def test_a_moved_and_oddly_named_study_still_reads(home, study, tmp_path):
-    """The folder is found beside the file, wherever both stand and whoever looks; percent signs are no patterns."""
+    """The folder is found next to the file wherever both are moved; percent signs are no patterns."""
     path = tmp_path / "50% of it.h5"
     aj.study.run_study(study, path, chunk=16, watch=interrupted_at(1))
     moved = tmp_path / "elsewhere"
@@ -287,7 +287,7 @@ def test_an_interrupt_finishes_the_blocks_in_work_and_says_how_to_go_on(home, ca
     assert process.returncode == 130, errors
     kept = len(list(parts_of(path).glob("*.h5")))
     assert kept >= 3
-    assert f"Stopped; {4 * kept:,} of 2,400 trials are kept. Go on with: aacmm study --resume -o {path}" in errors
+    assert f"Stopped; {4 * kept:,} of 2,400 trials are kept. Continue with: aacmm study --resume -o {path}" in errors
     assert "Traceback" not in errors
     process = subprocess.Popen(
         [sys.executable, "-m", "aacmm_jax", "study", "--resume", "-o", path, "--json"],
@@ -315,7 +315,8 @@ def test_a_full_disk_is_one_sentence_and_loses_nothing(home, cache, tmp_path):
     ):
         done = subprocess.run(
             [sys.executable, "-c", limited, str(limit), "study", "spec.toml", "-o", str(path), "--workers", "1"],
-            cwd=home, env=os.environ | {"PYTHONPATH": str(ROOT), "JAX_ENABLE_COMPILATION_CACHE": "0"}, capture_output=True, text=True, timeout=300,
+            cwd=home, env=os.environ | {"PYTHONPATH": str(ROOT), "JAX_ENABLE_COMPILATION_CACHE": "0"},
+            capture_output=True, text=True, timeout=300,
         )  # fmt: skip
         assert done.returncode == 2, done.stderr
         assert done.stderr.count("\n") == 1
@@ -380,7 +381,8 @@ def test_a_spoilt_block_runs_again(home, study, tmp_path):
     whole = parts[0].read_bytes()
     dataset = h5py.File(parts[0])["estimate"].id.get_chunk_info(0).byte_offset
     spoilt = (
-        whole[: dataset + 9] + bytes([whole[dataset + 9] ^ 1]) + whole[dataset + 10 :], whole[:2000], whole[:500] + bytes(4000) + whole[4500:], b"",
+        whole[: dataset + 9] + bytes([whole[dataset + 9] ^ 1]) + whole[dataset + 10 :],
+        whole[:2000], whole[:500] + bytes(4000) + whole[4500:], b"",
     )  # fmt: skip
     for part, content in zip(parts, spoilt, strict=False):
         part.write_bytes(content)
@@ -389,7 +391,7 @@ def test_a_spoilt_block_runs_again(home, study, tmp_path):
 
 
 def test_reading_needs_no_more_files_than_one(home, study, tmp_path):
-    """Where a process may open few files, HDF5 would show what it may not open as not run."""
+    """Where a process may open few files, HDF5 would show the others as not run."""
     path = tmp_path / "s.h5"
     specification = study.specification.model_copy(update={"trials": 40})
     aj.study.run_study(aj.study.Study(specification, study.nominal), path, chunk=1, keep_parts=True)
@@ -422,7 +424,7 @@ def test_any_executor(home, study, tmp_path):
 
 
 def test_dask_workers_that_die_lose_nothing_and_shards_are_the_same(home, study, tmp_path):
-    """Two Dask processes; one is killed in the middle. Once the blocks come back, once workers write them themselves."""
+    """Two Dask processes, one killed in the middle; blocks come back, or workers write them themselves."""
     with aj.study.dask_executor("local", 2) as (executor, count):
         assert count == 2
         client = executor._client
@@ -469,7 +471,7 @@ def test_an_interrupt_of_the_whole_terminal_reaches_no_dask_worker(home, cache, 
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 130, errors
-    assert "trials are kept. Go on with: aacmm study --resume" in errors
+    assert "trials are kept. Continue with: aacmm study --resume" in errors
     assert errors.count("\n") == 1, errors
 
 

@@ -46,7 +46,7 @@ def hayati() -> "aj.Arm":
     ],
     ids=["paper", "far off", "panda", "beta"],
 )
-def test_without_noise_every_true_tip_stands_on_its_point(arm, deviation):
+def test_without_noise_every_true_tip_is_at_its_point(arm, deviation):
     capture = {"positions_mm": [[400, 200, 300], [300, -300, 400]], "poses": 20, "pool": 4096}
     study = made(arm=arm, deviation=deviation, reference=REFERENCE | {"u_mm": 0.0, "length_mm": 200}, capture=capture)
     trials = drawn(study)
@@ -146,7 +146,7 @@ def test_starts_at_random_fill_the_box():
     assert np.delete(np.ptp(held.start, axis=0), d_3).min() > 0
 
 
-def test_a_recording_lends_its_poses(noisy_capture):
+def test_a_recording_gives_its_poses(noisy_capture):
     study = made(arm=aj.load_arm("cheng2018-simulation"), capture=noisy_capture, deviation=OFF)
     trials = drawn(study, 20)
     assert np.abs(trials.q - np.asarray(noisy_capture.q)).max() < 0.03
@@ -203,7 +203,7 @@ def test_equals_one_by_one(whole):
 
 
 def test_a_trial_depends_on_its_key_alone(whole):
-    """Whatever block a trial stands in, to the bit."""
+    """To the bit, whatever block a trial is in."""
     study, results = whole
     for block in (Block(1, 2, 0, 40), Block(0, 1, 13, 29), Block(1, 2, 39, 40)):
         part = run_block(study, block, workers=1)

@@ -1,0 +1,183 @@
+"""Stage 2 of a calibration: the arm's scale from reference lengths, with fixed parameters as they are, within bounds.
+
+Stage 1 leaves the scale to its anchor, a length kept at its start, and k = measured / nominal is its error. The result
+of stage 2 is what stage 1 finds with the anchor at the value for which k = 1. Nearly always that is the arm divided by
+k: if no bound acts on a length, repeatability does not change with the scale, and fixed lengths that free ones replace
+exactly (d_n by a probe along the same axis) can stay. Otherwise (a length on a bound, or carried over it by the
+division; a fixed length that has no such partner) stage 1 is repeated with the anchor adjusted until k = 1.
+
+Where fixed lengths set the scale by themselves, nothing is changed and k only compares them with the reference lengths.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..data.capture import Capture
+from ..kinematics.arm import Arm
+from ..kinematics.parameters import Bounds, Parameters
+from ..model.measurement import Measurement
+from ..model.scale import divide_free_lengths, divisible, replaced_lengths, scale_of
+from ..solver.reason import Reason, numbers_of, reasons
+from .scale_anchor import ScaleAnchor
+from .task import Task, fit_repeatability
+
+# Identifications with an adjusted anchor; the secant method ends at k = 1 to rounding after three or four.
+_ROUNDS = 4
+_SLOPES = (0.1, 2.0)  # of log k by the log of the anchor: 1 unless bounds or fixed lengths set part of the scale
+_OUTSIDE = 1e-9  # mm: what the division may leave of the box by rounding
+
+
+def can_scale(anchor: ScaleAnchor) -> bool:
+    """Whether stage 2 changes the arm: not where fixed lengths set the scale, or no length is free."""
+    return not anchor.set_by and anchor.adjusted is not None
+
+
+def divided(
+    anchor: ScaleAnchor,
+    space: Parameters,
+    parameters: Float[Array, "... p"],
+    k: Float[Array, "..."],
+) -> Float[Array, "... p"]:
+    """The parameters of stage 1 divided by k; the base of ``space`` is the arm, or a batch of arms."""
+    if not can_scale(anchor):
+        return parameters
+    return divide_free_lengths(space, parameters, k, replaced(anchor, space))
+
+
+def replaced(anchor: ScaleAnchor, space: Parameters) -> Float[Array, "... p"]:
+    """Fixed lengths that the free ones replace in the division, mm."""
+    return replaced_lengths(space, space.base, ((), ()) if anchor.partners is None else anchor.partners)
+
+
+def must_adjust(
+    anchor: ScaleAnchor,
+    bounds: Bounds,
+    active: Int[Array, "... p"],
+    scaled: Float[Array, "... p"],
+) -> Bool[Array, "..."]:
+    """Whether the division is not the result of stage 2, given what was active in stage 1; see the module."""
+    lengths = jnp.broadcast_to(jnp.asarray(divisible(bounds.space)), scaled.shape)
+    concerned = (scaled < bounds.lower - _OUTSIDE) | (scaled > bounds.upper + _OUTSIDE)
+    if anchor.hold is not None:  # without an anchor it is the active bounds that set the scale of stage 1
+        concerned = concerned | (active != 0)
+    if anchor.partners is None:
+        concerned = jnp.ones_like(concerned)
+    needed = jnp.any(concerned & lengths, axis=-1) & jnp.all(jnp.isfinite(scaled), axis=-1)
+    return needed if can_scale(anchor) else jnp.zeros_like(needed)
+
+
+class Adjusted(NamedTuple):
+    """The parameters for which k = 1."""
+
+    parameters: Float[Array, " p"]
+    steps: Int[Array, ""]
+    result: Reason
+
+
+def adjust_anchor(
+    task: Task, measurement: Measurement, scaled: Float[Array, " p"], sigma: Float[Array, ""]
+) -> Adjusted:
+    """Stage 1 repeated with its anchor adjusted by the secant method until k = 1, from the divided parameters.
+
+    Derivatives pass through every round, with the slope of the secant as a constant: exact where k = 1 is reached.
+    """
+    space, bounds, name = task.space, task.bounds, task.anchor.adjusted
+    assert name is not None
+    i = space.index(name)
+
+    def identify_again(carry, _):
+        x, length, last_length, last_log_k = carry
+        x, solution = fit_repeatability(
+            task, measurement, jnp.clip(x.at[i].set(length), bounds.lower, bounds.upper), name
+        )
+        log_k = jnp.log(scale_of(space.arm(x).position(measurement.q), measurement, sigma).value)
+        following = _secant(length, last_length, log_k, last_log_k, bounds.lower[i], bounds.upper[i])
+        return (x, following, length, log_k), (solution.stats["num_steps"], numbers_of(solution.stats["reason"]))
+
+    length = jnp.clip(scaled[i], bounds.lower[i], bounds.upper[i])
+    first = (scaled, length, length, jnp.zeros(()))
+    (x, *_), (steps, numbers) = jax.lax.scan(identify_again, first, length=_ROUNDS)
+    return Adjusted(x, jnp.sum(steps), reasons(numbers[-1]))
+
+
+def second_stage_many(
+    anchor: ScaleAnchor,
+    space: Parameters,
+    lower: Float[np.ndarray, "... p"],
+    upper: Float[np.ndarray, "... p"],
+    stage1: Any,
+    identify_again: Callable[[np.ndarray, np.ndarray], Any],
+) -> dict[str, Any]:
+    """Stage 2 of a batch: the fields of `ManyCalibrations` that it decides, from stage 1's `ManyIdentifications`.
+
+    ``identify_again(rows, start)`` repeats stage 1 for some of the problems and keeps the adjusted length.
+    """
+    lower, upper = (np.broadcast_to(side, stage1.parameters.shape) for side in (lower, upper))
+    scaled = np.array(divided(anchor, space, jnp.asarray(stage1.parameters), jnp.asarray(stage1.k)))
+    bounds = Bounds(space, jnp.asarray(lower), jnp.asarray(upper))
+    # Divided by k, the whole arm shrinks about the base, and so do the distances between its tips.
+    factor = stage1.k if can_scale(anchor) else np.ones_like(stage1.k)
+    de, deltam, steps, reason = stage1.de / factor, stage1.deltam / factor, stage1.steps, numbers_of(stage1.result)
+    rows = np.flatnonzero(must_adjust(anchor, bounds, jnp.asarray(stage1.active), jnp.asarray(scaled)))
+    active = stage1.active
+    if can_scale(anchor):
+        scaled = np.where(space.lengths, np.clip(scaled, lower, upper), scaled)
+        active = np.asarray(bounds.active(jnp.asarray(scaled)))
+    if len(rows):
+        found, more = _adjust_many(anchor, space, scaled[rows], lower[rows], upper[rows], partial(identify_again, rows))
+        de, deltam, steps, reason, active = (np.array(column) for column in (de, deltam, steps, reason, active))
+        scaled[rows], de[rows], deltam[rows], steps[rows] = found.parameters, found.de, found.deltam, steps[rows] + more
+        reason[rows] = numbers_of(found.result)
+        active[rows] = np.where(scaled[rows] <= lower[rows], -1, np.where(scaled[rows] >= upper[rows], 1, 0))
+    result = reasons(jnp.asarray(reason))
+    return {"parameters": scaled, "de": de, "deltam": deltam, "steps": steps, "result": result, "active": active}
+
+
+def _adjust_many(
+    anchor: ScaleAnchor,
+    space: Parameters,
+    scaled: Float[np.ndarray, "b p"],
+    lower: Float[np.ndarray, "b p"],
+    upper: Float[np.ndarray, "b p"],
+    identify_again: Callable[[np.ndarray], Any],
+) -> tuple[Any, Int[np.ndarray, " b"]]:
+    """`adjust_anchor` for a batch: the last identifications, and the evaluations of all."""
+    assert anchor.adjusted is not None
+    i = space.index(anchor.adjusted)
+    length = last_length = scaled[:, i]
+    x, last_log_k, steps, found = scaled, np.zeros(len(scaled)), np.zeros(len(scaled), dtype=int), None
+    for _ in range(_ROUNDS):
+        start = np.array(x)
+        start[:, i] = length
+        found = identify_again(start)
+        log_k, steps = np.log(found.k), steps + found.steps
+        following = _secant(length, last_length, log_k, last_log_k, lower[:, i], upper[:, i])
+        x, length, last_length, last_log_k = found.parameters, np.asarray(following), length, log_k
+    return found, steps
+
+
+def rows_of(rows: np.ndarray, arm: Arm, capture: Capture, *boxes: np.ndarray) -> tuple[Any, ...]:
+    """Some problems of a batch: of the arm, the capture and each side of the box, where these are a batch."""
+
+    def chosen(single: int, leaf: Any) -> Any:
+        return leaf[rows] if leaf.ndim > single else leaf
+
+    arm = jax.tree.map(partial(chosen, 1), arm)
+    lengths = jax.tree.map(partial(chosen, 0), capture.lengths)
+    capture = eqx.tree_at(lambda c: (c.q, c.lengths), capture, (chosen(2, capture.q), lengths))
+    return (arm, capture, *(chosen(1, box) for box in boxes))
+
+
+def _secant(length: Any, last_length: Any, log_k: Any, last_log_k: Any, lower: Any, upper: Any) -> Array:
+    """The next value of the adjusted length, within bounds: a secant step of log k towards 0, the first of slope 1."""
+    moved = length != last_length
+    ratio = jnp.log(jnp.where(moved, length / jnp.where(moved, last_length, 1.0), 2.0))
+    slope = jnp.where(moved, jnp.clip((log_k - last_log_k) / ratio, *_SLOPES), 1.0)
+    return jnp.clip(length * jnp.exp(-log_k / jax.lax.stop_gradient(slope)), lower, upper)

@@ -1,0 +1,251 @@
+"""The measurement results of a certificate: the same readings as found (nominal arm) and as left (calibrated arm)."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from ..calibration.evaluation import Evaluation
+from ..calibration.record import CalibrationRecord, uncertainty_of
+from ..data.capture import ReferenceLength
+from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
+from ..kinematics.arm import Arm, is_length, parameter_names
+from ..kinematics.parameters import Parameters
+from .xml_elements import (
+    CELSIUS,
+    LEVEL,
+    MILLIMETRE,
+    ONE,
+    RADIAN,
+    add,
+    add_english,
+    add_identifications,
+    add_real,
+    add_software,
+    add_text,
+)
+
+_METHODS = {"two-stage": "from repeatability first, and then the scale from the lengths", "joint": "from both jointly"}
+_METRICS = {
+    "DE": "Mean distance of the tip from its mean position in the socket",
+    "Deltam": "Largest half range of a coordinate of the tip in a socket",
+    "RMS": "Root mean square distance of the tip from its mean position in the socket",
+}
+
+
+class _Stage(NamedTuple):
+    name: str
+    status: str
+    description: str
+    arm: Arm
+    evaluation: Evaluation
+
+
+def add_results(
+    parent: Element, record: CalibrationRecord, administrative_data: AdministrativeData, command: str
+) -> None:
+    """Add both measurement results of a calibration."""
+    evaluations = record.evaluations()
+    found = "The readings, evaluated with the nominal parameters, those before the calibration."
+    left = "The same readings, evaluated with the calibrated parameters, which were identified from them."
+    for stage in (
+        _Stage("As found", "beforeAdjustment", found, record.recording.nominal.arm, evaluations["nominal"]),
+        _Stage("As left", "afterAdjustment", left, record.calibrated.arm, evaluations["calibrated"]),
+    ):
+        _add_measurement(add(parent, "measurementResult"), record, administrative_data, stage, command)
+
+
+def uncertainty_statement(record: CalibrationRecord) -> str:
+    """How the uncertainties were evaluated, and what they do not include."""
+    noise = "as it was given" if record.noise_model == "given" else "as estimated from the residuals"
+    count = "infinitely many" if math.isinf(record.degrees_of_freedom) else f"{record.degrees_of_freedom:.4g}"
+    return (
+        f"Expanded uncertainties are standard uncertainties times {uncertainty_of(record).factor(LEVEL):.4g}, the "
+        f"coverage factor of Student's t for {count} degrees of freedom and a coverage probability of {LEVEL:.0%}. "
+        f"They follow, by the law of propagation of uncertainty, from the noise of the readings, {noise}, and from the "
+        "uncertainty of the reference lengths. They apply to each parameter alone; the parameters are correlated. "
+        "Errors that the Denavit-Hartenberg model does not describe are not included."
+    )
+
+
+def _add_measurement(
+    measurement: Element, record: CalibrationRecord, given: AdministrativeData, stage: _Stage, command: str
+) -> None:
+    add_english(measurement, "name", stage.name)
+    add_english(measurement, "description", stage.description)
+    lengths = record.recording.capture.lengths
+    _add_methods(add(measurement, "usedMethods"), record)
+    add_software(measurement, "usedSoftware", command)
+    _add_equipment(add(measurement, "measuringEquipments"), lengths, given.reference)
+    _add_conditions(add(measurement, "influenceConditions"), given, stage)
+    results = add(measurement, "results")
+    factor = uncertainty_of(record).factor(LEVEL)
+    _add_repeatability(results, stage)
+    left = stage.name == "As left"
+    _add_lengths(results, lengths, stage, factor, fixed_scale=left and record.fixed_by_one_length)
+    _add_parameters(results, record, stage, factor)
+    if left:
+        _add_scale(results, record, factor)
+
+
+def _add_methods(parent: Element, record: CalibrationRecord) -> None:
+    capture = record.recording.capture
+    method = add(parent, "usedMethod")
+    add_english(method, "name", "Identification of Denavit-Hartenberg parameters")
+    add_english(
+        method,
+        "description",
+        f"Number of sockets in which the tip was seated: {len(capture.sizes)}; of poses: {sum(capture.sizes)}; of "
+        f"reference lengths between sockets: {len(capture.lengths)}. Parameters were identified by bounded least "
+        f"squares, {_METHODS.get(record.method, record.method)}: those with which the positions of the tip in each "
+        "socket agree best, and the distances between the sockets with the reference lengths.",
+    )
+    method = add(parent, "usedMethod", ref_type="basic_methodMeasurementUncertainty")
+    add_english(method, "name", "Evaluation of measurement uncertainty")
+    add_english(method, "description", uncertainty_statement(record))
+    add(method, "norm", "JCGM 100:2008")
+
+
+def _add_equipment(parent: Element, lengths: Sequence[ReferenceLength], references: Sequence[Reference]) -> None:
+    for reference in references:
+        equipment = add(parent, "measuringEquipment")
+        add_text(equipment, "name", reference.name)
+        if reference.manufacturer is not None:
+            add_text(add(equipment, "manufacturer"), "name", reference.manufacturer)
+        if reference.model is not None:
+            add(equipment, "model", reference.model)
+        serial = ("manufacturer", reference.serial_number, "Serial number")
+        certificate = ("other", reference.certificate_number, "Number of its calibration certificate")
+        add_identifications(equipment, [serial, certificate])
+    equipment = add(parent, "measuringEquipment")
+    add_english(equipment, "name", "Reference lengths")
+    if not references:
+        add_english(equipment, "description", f"Artefact: {NOT_STATED}")
+    quantities = add(equipment, "measuringEquipmentQuantities")
+    for number, length in enumerate(lengths, start=1):
+        quantity = add(quantities, "measuringEquipmentQuantity")
+        add_text(quantity, "name", _length_name(number, length))
+        add_real(quantity, float(length.value), MILLIMETRE, float(length.u))
+
+
+def _add_conditions(parent: Element, given: AdministrativeData, stage: _Stage) -> None:
+    condition = add(parent, "influenceCondition")
+    add_english(condition, "name", "Ambient temperature")
+    add(condition, "status", stage.status)
+    data = add(condition, "data")
+    if given.certificate.temperature_celsius is None:
+        add_english(data, "text", NOT_STATED)
+        return
+    quantity = add(data, "quantity")
+    add_english(quantity, "name", "Ambient temperature")
+    add_real(quantity, given.certificate.temperature_celsius, CELSIUS, given.certificate.temperature_u_celsius)
+
+
+def _add_result(parent: Element, name: str, description: str) -> Element:
+    result = add(parent, "result")
+    add_english(result, "name", name)
+    add_english(result, "description", description)
+    return add(result, "data")
+
+
+def _add_repeatability(results: Element, stage: _Stage) -> None:
+    found = stage.evaluation.repeatability
+    metrics = {"DE": float(found.de), "Deltam": float(found.deltam), "RMS": float(found.rms)}
+    if not all(map(math.isfinite, metrics.values())):  # one pose in every socket
+        return
+    data = _add_result(results, "Repeatability", "Over all sockets with more than one pose.")
+    for name, value in metrics.items():
+        quantity = add(data, "quantity")
+        add_english(quantity, "name", name)
+        add_english(quantity, "description", _METRICS[name])
+        add_real(quantity, value, MILLIMETRE)
+
+
+def _length_name(number: int, length: ReferenceLength) -> str:
+    """Numbered, since different pairs of sockets can read alike: their names may contain anything."""
+    return f"{number}: {length.start} - {length.end}"
+
+
+def _add_lengths(
+    results: Element, lengths: Sequence[ReferenceLength], stage: _Stage, factor: float, fixed_scale: bool
+) -> None:
+    data = _add_result(
+        results,
+        "Reference lengths",
+        "An error is the measured value minus the calibrated one; its uncertainty is that of the calibrated value and "
+        "of the scatter of the poses at both ends.",
+    )
+    columns = (np.asarray(column) for column in (stage.evaluation.measured, stage.evaluation.error, stage.evaluation.u))
+    for number, (length, measured, error, error_u) in enumerate(zip(lengths, *columns, strict=True), start=1):
+        row = add(data, "list")
+        add_text(row, "name", _length_name(number, length))
+        values = [
+            ("calibrated value", "basic_referenceValue", length.value, float(length.u)),
+            ("measured value", "basic_measuredValue", measured, math.nan),
+            ("error", "basic_measurementError", error, float(error_u)),
+        ]
+        if fixed_scale:
+            add_english(
+                row,
+                "description",
+                "This length fixed the scale, so that the arm measures it as calibrated by construction; no error was "
+                "measured.",
+            )
+            values = values[:1]
+        for name, ref_type, value, u in values:
+            quantity = add(row, "quantity", ref_type=ref_type)
+            add_english(quantity, "name", name)
+            if name == "calibrated value" and u == 0:
+                add_english(quantity, "description", "Taken as exact")
+            add_real(quantity, float(value), MILLIMETRE, u if _is_known(u) else None, factor)
+
+
+def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, factor: float) -> None:
+    data = _add_result(
+        results,
+        "Denavit-Hartenberg parameters",
+        "Standard convention; of one joint: Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta). The probe is the tip in the "
+        "last frame.",
+    )
+    for name, value in _values(stage.arm).items():
+        note, u = "", None
+        if stage.name == "As left":
+            note, u = _note_and_uncertainty(record, name)
+        quantity = add(data, "quantity")
+        add_english(quantity, "name", name)
+        if note:
+            add_english(quantity, "description", note)
+        add_real(quantity, value, MILLIMETRE if is_length(name) else RADIAN, u, factor)
+
+
+def _values(arm: Arm) -> dict[str, float]:
+    """All parameters of an arm by name, mm and rad."""
+    names = parameter_names(arm)
+    return dict(zip(names, map(float, np.asarray(Parameters(arm, names).vector())), strict=True))
+
+
+def _note_and_uncertainty(record: CalibrationRecord, name: str) -> tuple[str, float | None]:
+    """A note on a calibrated parameter, and its standard uncertainty if it has one of its own."""
+    if name not in record.names:
+        return "Not identified: fixed at its nominal value", None
+    i = record.names.index(name)
+    u = float(np.sqrt(record.covariance[i, i]))
+    if record.active[i]:
+        bound = f"On its {'lower' if record.active[i] < 0 else 'upper'} bound"
+        return f"{bound}, so it has no uncertainty of its own", None
+    if not (record.determined[i] and _is_known(u)):
+        return "Determined only together with other parameters, so it has no uncertainty of its own", None
+    return "", u
+
+
+def _add_scale(results: Element, record: CalibrationRecord, factor: float) -> None:
+    description = "Reference lengths as the arm measured them before its scale was set, over their calibrated values."
+    quantity = add(_add_result(results, "Scale", description), "quantity")
+    add_english(quantity, "name", "k")
+    add_real(quantity, record.k, ONE, record.u_k if _is_known(record.u_k) else None, factor)
+
+
+def _is_known(u: float) -> bool:
+    return math.isfinite(u) and u > 0

@@ -1,0 +1,69 @@
+"""A reader of the values in a Digital Calibration Certificate."""
+
+from typing import NamedTuple
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from ..core.errors import InputError
+from .xml_elements import DCC, SI
+
+_PREFIXES = {"dcc": DCC, "si": SI}
+
+
+class CertifiedValue(NamedTuple):
+    """A value of a certificate."""
+
+    value: float
+    unit: str  # in D-SI syntax
+    expanded: float | None  # expanded uncertainty; None if there is none
+
+
+def parse_dcc(text: str) -> dict[tuple[str, ...], CertifiedValue]:
+    """Read the single values (``si:real``) among the results of a Digital Calibration Certificate.
+
+    Args:
+        text: The XML of the certificate.
+
+    Returns:
+        The values by the names of measurement result, result, list and quantity, such as
+        ``("As left", "Denavit-Hartenberg parameters", "a_2")``; of several with the same names, the last.
+
+    Raises:
+        InputError: If the text is no XML, no DCC, or has a document type, whose entities could name other files.
+    """
+    try:
+        root = ElementTree.fromstring(text, ElementTree.XMLParser(target=_NoDocumentType()))
+    except (ElementTree.ParseError, UnicodeError) as error:
+        raise InputError(f"the certificate is not valid XML: {error}; export it again.") from error
+    if root.tag != f"{{{DCC}}}digitalCalibrationCertificate":
+        raise InputError(f"the XML is a '{root.tag}', not a digital calibration certificate; give a DCC.")
+    values: dict[tuple[str, ...], CertifiedValue] = {}
+    for result in root.iterfind("dcc:measurementResults/dcc:measurementResult", _PREFIXES):
+        _collect(result, (), values)
+    return values
+
+
+class _NoDocumentType(ElementTree.TreeBuilder):
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
+        raise InputError(f"the XML has a document type, '{name}', as no certificate has; leave it out.")
+
+
+def _collect(element: Element, path: tuple[str, ...], values: dict[tuple[str, ...], CertifiedValue]) -> None:
+    name = element.find("dcc:name/dcc:content", _PREFIXES)
+    path = path if name is None else (*path, name.text or "")
+    real = element.find("si:real", _PREFIXES)
+    if real is not None:
+        expanded = real.findtext(
+            "si:measurementUncertaintyUnivariate/si:expandedMU/si:valueExpandedMU", None, _PREFIXES
+        )
+        try:
+            value = float(real.findtext("si:value", "", _PREFIXES))
+            u = None if expanded is None else float(expanded)
+        except ValueError as error:
+            raise InputError(
+                f"the value of {' / '.join(path)!r} is no number; export the certificate again."
+            ) from error
+        values[path] = CertifiedValue(value, real.findtext("si:unit", "", _PREFIXES), u)
+    for tag in ("results", "result", "data", "list", "quantity"):
+        for child in element.iterfind(f"dcc:{tag}", _PREFIXES):
+            _collect(child, path, values)

@@ -1,0 +1,240 @@
+"""Arms, captures, calibrations and the demonstration on a terminal; every heading names its unit."""
+
+import math
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+
+from ..core.units import ARCSEC, DEG
+from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
+
+_FIGURES = (
+    ("de_mm", "DE, mean distance of poses from their socket's centroid"),
+    ("deltam_mm", "Deltam, largest half range of a coordinate in a socket"),
+    ("rms_mm", "RMS distance of poses from their socket's centroid"),
+    ("length_error_mean_absolute_mm", "length error, mean absolute"),
+    ("length_error_largest_mm", "length error, largest"),
+)
+_TRUTH = (
+    ("length_error_largest_mm", "largest error of a length parameter [mm]", 1.0),
+    ("angle_error_largest_rad", "largest error of an angle parameter [arcsec]", 1 / ARCSEC),
+)
+
+
+def arm(summary: dict[str, Any]) -> None:
+    """One arm: its table and what its file proposes."""
+    console = new_console()
+    beta = any(row["beta_rad"] is not None for row in summary["joints"])
+    table = new_table(
+        f"{summary['name']} (standard D-H)",
+        "joint", "alpha [deg]", "a [mm]", "d [mm]", "theta [deg]", *(["beta [deg]"] if beta else []), "limits [deg]",
+    )  # fmt: skip
+    for row in summary["joints"]:
+        limits = row["limits_rad"]
+        angles = [row["alpha_rad"] / DEG, row["a_mm"], row["d_mm"], row["theta_rad"] / DEG]
+        cells = [formatted(value) for value in angles] + ([formatted((row["beta_rad"] or 0.0) / DEG)] if beta else [])
+        cells.append("-" if limits is None else f"{limits[0] / DEG:.0f} to {limits[1] / DEG:.0f}")
+        table.add_row(str(row["joint"]), *cells)
+    print_table(console, table)
+    console.print(
+        f"Probe {', '.join(formatted(x) for x in summary['probe_mm'])} mm. Fixed: {', '.join(summary['held'])}."
+    )
+
+
+def capture(summary: dict[str, Any]) -> None:
+    """One capture."""
+    console = new_console()
+    console.print(
+        f"[bold]{escape(summary['arm'])}[/bold]: {summary['poses']} poses of {summary['joints']} joints in "
+        f"{len(summary['sockets'])} sockets, {len(summary['lengths'])} reference lengths"
+        + (", simulated" if summary["simulated"] else "")
+    )
+    print_warnings(console, summary)
+    table = new_table("", "socket", "poses")
+    for row in summary["sockets"]:
+        table.add_row(escape(row["socket"]), str(row["poses"]))
+    print_table(console, table)
+    table = new_table("\nReadings", "joint", "lowest [deg]", "highest [deg]")
+    for row in summary["ranges"]:
+        table.add_row(str(row["joint"]), *(f"{row[key] / DEG:.3f}" for key in ("lowest_rad", "highest_rad")))
+    print_table(console, table)
+    if summary["lengths"]:
+        table = new_table("\nReference lengths", "from", "to", "value [mm]", "u [mm]")
+        for row in summary["lengths"]:
+            table.add_row(escape(row["from"]), escape(row["to"]), formatted(row["value_mm"]), formatted(row["u_mm"]))
+        print_table(console, table)
+    print_written(console, summary)
+
+
+def calibration(summary: dict[str, Any]) -> None:
+    """One calibration: warnings first."""
+    console = new_console()
+    print_verdict(console, summary)
+    held = f"{summary['hold']} fixed meanwhile" if summary["hold"] else "no length fixed"
+    console.print(f"Scale of stage 1: k = {summary['scale_k']:.8f}, u(k) = {summary['scale_u']:.1e} ({held})")
+    print_warnings(console, summary)
+    _validated(console, summary["cross_validation"])
+    stages = ("nominal", "stage1", "calibrated")
+    print_stages(
+        console, "\nOn the poses it was identified from [mm]", summary, stages, fitted=summary["fixed_by_one_length"]
+    )
+    if "truth" in summary:
+        _truth(console, summary["truth"])
+    _parameters(console, summary["parameters"])
+    if summary["lengths"]:
+        print_lengths(console, summary["lengths"], fitted=summary["fixed_by_one_length"])
+    _uncertainty(console, summary)
+    print_written(console, summary)
+
+
+def print_verdict(console: Console, summary: dict[str, Any]) -> None:
+    """How the solve ended; a residual that no arm has is not called converged, whatever the solver says."""
+    verdict = "[green]converged[/green]" if summary["converged"] else "[red]did not converge[/red]"
+    if summary["converged"] and not summary["residual_plausible"]:
+        verdict = "[red]ended with a residual that no arm has[/red],"
+    console.print(
+        f"[bold]{escape(summary['arm'])}[/bold], {summary['method']}: {verdict} in {summary['steps']} steps on "
+        f"{summary['poses']} poses in {len(summary['sockets_used'])} sockets"
+    )
+
+
+def _validated(console: Console, found: dict[str, Any] | None) -> None:
+    """Cross-validation."""
+    if found is None:
+        return
+    title = f"\nCross-validated: each of {found['groups']} placements left out once [mm]"
+    table = new_table(title, "", "found", "predicted by u")
+    table.add_row(
+        "RMS distance of poses from their socket's centroid",
+        formatted(found["rms_mm"]),
+        formatted(found["rms_predicted_mm"]),
+    )
+    table.add_row(
+        "RMS error of reference lengths", formatted(found["length_error_rms_mm"]), formatted(found["length_u_mm"])
+    )
+    print_table(console, table)
+
+
+def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
+    """The expanded uncertainty (95 %) over the volume, the noise that it follows from, and what the data determine."""
+    found = summary["uncertainty"]
+    volume, factor = found["volume"], found["coverage_factor_95"]
+    title = f"\nExpanded uncertainty U over the working volume (95 %, coverage factor {factor:.2f}) [mm]"
+    table = new_table(title, "", "median", "95th percentile", "largest")
+    length = f"{volume['length_mm']:g} mm length"
+    for key, text in (
+        ("u_tip", "tip position, along its worst direction: from the calibration"),
+        ("u_length", f"{length}: from the calibration"),
+        ("u_length_reading", f"{length}: with the noise of both readings"),
+    ):
+        values = [volume[f"{key}_{which}_mm"] for which in ("median", "95", "largest")]
+        table.add_row(text, *("not determined" if value is None else formatted(factor * value) for value in values))
+    print_table(console, table)
+    console.print(
+        "Propagated from u of the parameters to 400 positions that random poses within the joint limits reach."
+    )
+    encoder = found["encoder_arcsec"]
+    readings = ", ".join(f"{x:.3g}" for x in encoder) if isinstance(encoder, list) else f"{encoder:.3g}"
+    noise = f"encoders {readings} arcsec, seat {1e3 * found['seating_mm']:.3g} um"
+    source = {
+        "given": f"Noise as given: {noise}; residuals are {found['misfit'] or 0:.2f} times what it predicts.",
+        "estimated": f"Noise estimated from the residuals: {noise} (their sum is better known than each).",
+        "common": f"One variance for all poses: {1e3 * found['seating_mm']:.3g} um a coordinate.",
+        "robust": "The variance of each pose is taken from its own residual (robust noise model).",
+    }[found["form"]]
+    pairs = [f"{row['one']} with {row['other']} ({row['r']:+.3f})" for row in found["correlated"][:6]]
+    console.print(source + (f" Strongly correlated: {', '.join(pairs)}." if pairs else ""), soft_wrap=False)
+    indices = found["indices"]
+    console.print(
+        f"Observability: rank {found['rank']} of {found['parameters']}, "
+        f"condition {found['condition'] or math.inf:.3g}, "
+        + ", ".join(f"{name} = {value:.3g}" for name, value in indices.items())
+    )
+    if summary["monte_carlo"]:
+        console.print(f"Monte Carlo (JCGM 101): {summary['monte_carlo']}")
+
+
+def demo(summary: dict[str, Any]) -> None:
+    """The demonstration: before, stage 1 and stage 2 against the truth."""
+    console = new_console()
+    console.print(
+        f"The simulated arm of Cheng et al. 2018, off by up to {summary['deviation_mm']:g} mm and "
+        f"{summary['deviation_deg']:g} deg, measured with {summary['encoder_arcsec']:g} arcsec and "
+        f"{summary['seating_um']:g} um of noise:\n{summary['poses']} poses in one socket, {summary['more_poses']} in "
+        f"another (stage 1), between them one length of {summary['length_mm']:.4f} mm with u = "
+        f"{summary['length_u_um']:g} um (stage 2)."
+    )
+    table = new_table("", "against the truth", "before", "stage 1", "stage 2")
+    for key, text, factor in (
+        ("de_mm", "DE, mean distance from centroid [mm]", 1.0),
+        ("deltam_mm", "Deltam, largest half range [mm]", 1.0),
+        *_TRUTH,
+        ("check_rms_mm", f"RMS error of {summary['checks']} lengths of {summary['check_length_mm']:g} mm [mm]", 1.0),
+    ):
+        table.add_row(
+            escape(text), *(formatted(factor * summary[stage][key]) for stage in ("nominal", "stage1", "calibrated"))
+        )
+    print_table(console, table)
+    console.print(
+        f"k = {summary['scale_k']:.7f}, u(k) = {summary['scale_u']:.1e}: stage 1 sees repeatability only and leaves "
+        "every length off by this one factor; stage 2 divides it out."
+    )
+    console.print(f"Files in {escape(summary['folder'])}: {', '.join(escape(name) for name in summary['files'])}")
+
+
+def print_stages(
+    console: Console, title: str, figures: dict[str, Any], stages: tuple[str, ...], *, fitted: bool = False
+) -> None:
+    """Repeatability and length errors by stage; ``fitted``: the scale makes the last length error zero."""
+    names = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
+    table = new_table(title, "", *(names[stage] for stage in stages))
+    for key, text in _FIGURES:
+        if key in figures[stages[0]]:
+            cells = [formatted(figures[stage][key]) for stage in stages]
+            table.add_row(escape(text), *cells[:-1], "by fit" if fitted and key.startswith("length") else cells[-1])
+    print_table(console, table)
+
+
+def _truth(console: Console, truth: dict[str, Any]) -> None:
+    stages = ("nominal", "stage1", "calibrated")
+    table = new_table("\nAgainst the true arm of the simulation", "", "nominal", "stage 1", "calibrated")
+    for key, text, factor in _TRUTH:
+        table.add_row(escape(text), *(formatted(factor * truth[stage][key]) for stage in stages))
+    print_table(console, table)
+
+
+def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
+    """Every parameter in its own unit, to two digits of its standard uncertainty."""
+    table = new_table(
+        "\nParameters, with standard uncertainty u",
+        *("parameter", "unit", "nominal", "calibrated", "change", "u", "bound"),
+    )
+    for row in rows:
+        factor, unit = (1.0, "mm") if row["unit"] == "mm" else (1 / DEG, "deg")
+        nominal, value = factor * row["nominal"], factor * row["calibrated"]
+        u = None if row["u"] is None else factor * row["u"]
+        decimals = 4 if u is None else min(max(1 - math.floor(math.log10(u)), 0), 9) if u > 0 else 9
+        numbers = (
+            f"{nominal:.4f}",
+            f"{value:.{decimals}f}",
+            f"{value - nominal:+.{decimals}f}",
+            "-" if u is None else f"{u:.{decimals}f}",
+        )
+        table.add_row(row["parameter"], unit, *numbers, row["bound"] or "")
+    print_table(console, table)
+
+
+def print_lengths(console: Console, rows: list[dict[str, Any]], *, fitted: bool = False) -> None:
+    """Reference lengths; ``fitted``: a single one fixed the scale, so that its error is zero by construction."""
+    table = new_table("\nReference lengths", "between", "value [mm]", "measured [mm]", "error [mm]", "u of error [mm]")
+    for row in rows:
+        error = "fixed the scale" if fitted else formatted(row["error_mm"])
+        table.add_row(
+            escape(f"{row['from']} - {row['to']}"),
+            formatted(row["value_mm"]),
+            formatted(row["measured_mm"]),
+            error,
+            formatted(row["error_u_mm"]),
+        )
+    print_table(console, table)

@@ -1,0 +1,102 @@
+"""Fields in braces: one entry of a manifest stands for every file that its pattern matches."""
+
+import difflib
+import fnmatch
+import glob
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from ..core.errors import InputError
+
+_FIELD = re.compile(r"\{(\w+)\}")
+# A folder's or file's name that is one field, perhaps with an extension.
+_WHOLE = re.compile(r"\{\w+\}(?:\.\w+)?")
+_ANYTHING = "[^/]+"
+_WORD = r"(?:[^\W_]|-)+"
+_NAMED = 3  # near misses that a message names
+
+
+def fields_of(text: str) -> set[str]:
+    """Names of the fields in braces."""
+    return set(_FIELD.findall(text))
+
+
+def in_braces(fields: Iterable[str]) -> str:
+    """Names of fields as people write them."""
+    return ", ".join(f"{{{name}}}" for name in sorted(fields)) or "no field"
+
+
+def fill(text: str, values: Mapping[str, str]) -> str:
+    """The text with its fields replaced by their values."""
+    return _FIELD.sub(lambda field: values[field.group(1)], text)
+
+
+def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dict[str, str]]:
+    """The values of the fields for each file below ``folder`` that the pattern matches, in the order of the paths.
+
+    A field that makes up a whole folder or file name (but for its extension) matches anything but "/"; one that
+    shares the name with other text matches letters, digits and "-" only: ``hole_{hole}.csv`` matches ``hole_0.csv``
+    and not ``hole_0_pose.csv``. ``exclude``: shell patterns of file names, or of paths relative to ``folder``.
+    Raises `InputError` where no file matches, naming those that nearly do.
+    """
+    before = "" if Path(pattern).is_absolute() else f"{folder.as_posix()}/"
+    literals = (glob.escape(text) for text in _FIELD.sub("\0", pattern).split("\0"))
+    # Separators only: to resolve "./" or "//" would keep the pattern from matching.
+    found = sorted(path.replace(os.sep, "/") for path in glob.glob(glob.escape(before) + "*".join(literals)))
+    strict = re.compile(re.escape(before) + _expression(pattern, _WORD))
+    kept = [path for path in found if not _excluded(path.removeprefix(before), exclude)]
+    values = [match.groupdict() for path in kept if (match := strict.fullmatch(path))]
+    if not values:
+        where = f"no file matches '{pattern}' in {folder}"
+        left_out = [path.removeprefix(before) for path in found if path not in kept]
+        loose = re.compile(re.escape(before) + _expression(pattern, _ANYTHING))
+        near = [path.removeprefix(before) for path in kept if loose.fullmatch(path)]
+        if near:
+            raise InputError(
+                f"{where}, but nearly {_some(near)}: beside other text in a name, a field is letters, digits and "
+                "'-' only; write more of the name out."
+            )
+        if left_out:
+            raise InputError(f"{where} but {_some(left_out)}, which exclude leaves out; mend exclude.")
+        alike = _alike(folder, before, pattern)
+        raise InputError(f"{where}" + (f"; there is {_some(alike)}" if alike else "") + "; check the path.")
+    return values
+
+
+def _expression(pattern: str, partial: str) -> str:
+    """Regular expression of a path with fields; ``partial`` is what a field may be beside other text in a name.
+
+    A field that is repeated must match the same text each time.
+    """
+    components = [text for text in pattern.split("/") if _FIELD.search(text)]
+    shared = {name for text in components if not _WHOLE.fullmatch(text) for name in _FIELD.findall(text)}
+    parts, last, seen = "", 0, set()
+    for field in _FIELD.finditer(pattern):
+        name = field.group(1)
+        value = partial if name in shared else _ANYTHING
+        parts += re.escape(pattern[last : field.start()])
+        parts += f"(?P={name})" if name in seen else f"(?P<{name}>{value})"
+        seen.add(name)
+        last = field.end()
+    return parts + re.escape(pattern[last:])
+
+
+def _excluded(path: str, exclude: Sequence[str]) -> bool:
+    names = (path, path.rpartition("/")[2])
+    return any(fnmatch.fnmatchcase(name, pattern) for pattern in exclude for name in names)
+
+
+def _alike(folder: Path, before: str, pattern: str) -> list[str]:
+    """Files as deep in the folders as the pattern, with names like it."""
+    fixed = pattern[: _FIELD.search(pattern).start()].rpartition("/")[0]  # type: ignore[union-attr]
+    below = glob.escape(before + fixed) + ("/" if fixed else "")
+    deeper = "/".join("*" for _ in pattern.removeprefix(fixed).strip("/").split("/"))
+    found = sorted(path.replace(os.sep, "/") for path in glob.glob(below + deeper) if os.path.isfile(path))
+    return difflib.get_close_matches(pattern, [path.removeprefix(before) for path in found], n=_NAMED, cutoff=0.3)
+
+
+def _some(paths: Sequence[str]) -> str:
+    more = f" and {len(paths) - _NAMED} more" if len(paths) > _NAMED else ""
+    return ", ".join(f"'{path}'" for path in paths[:_NAMED]) + more

@@ -1,0 +1,34 @@
+"""What all figures share: colours that stay distinct in grey, new axes, labels, and files written whole."""
+
+from pathlib import Path
+from typing import Any
+
+from ..files.whole_file import whole_file
+
+DARK, ACCENT, LIGHT = "#1b3a6b", "#d95f02", "0.65"
+
+
+def axes_or_new(axes: Any) -> Any:
+    """The given axes, or those of a new figure outside matplotlib's global state."""
+    if axes is not None:
+        return axes
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(6.4, 4.2), layout="constrained").subplots()
+
+
+def label_axes(axes: Any, x: str, y: str) -> None:
+    """Label both axes and add a grid."""
+    axes.set(xlabel=x, ylabel=y)
+    axes.grid(True, which="major", alpha=0.3)
+
+
+def label_parameters(axes: Any, names: list[str]) -> None:
+    """Mark the x axis with the names of parameters or lengths."""
+    axes.set_xticks(range(len(names)), names, rotation=60, ha="right")
+
+
+def save_figure(figure: Any, path: Path, file_format: str = "png") -> None:
+    """Write a figure into a file, whole or not at all."""
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, format=file_format, dpi=150)

@@ -1,0 +1,86 @@
+"""Figures of uncertainty and observability: over the working volume, correlations, singular values."""
+
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import InputError
+from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.identifiability import Observability
+from ..uncertainty.volume import VolumetricUncertainty
+from .style import ACCENT, DARK, axes_or_new, label_axes
+
+
+def volumetric_uncertainty_map(volume: VolumetricUncertainty, factor: float = 2.0, axes: Any = None) -> Any:
+    """Plot the expanded uncertainty of lengths over the working volume: larger and darker marks are more uncertain.
+
+    Each length is marked at the height and the distance from the first axis where it starts.
+
+    Args:
+        volume: The result of `volumetric_uncertainty`.
+        factor: Coverage factor.
+        axes: Axes to plot into; new ones if None.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: If no length has a finite uncertainty.
+    """
+    axes = axes_or_new(axes)
+    expanded = factor * volume.u_length
+    known = np.isfinite(expanded)
+    if not np.any(known):
+        raise InputError("no length over the volume is determined, so there is no uncertainty to draw.")
+    start, expanded = volume.start[known], expanded[known]
+    size = 8 + 60 * (expanded / expanded.max()) ** 2
+    style = {"cmap": "Blues", "vmin": 0, "edgecolors": "0.4", "linewidths": 0.4}
+    marks = axes.scatter(np.hypot(start[:, 0], start[:, 1]), start[:, 2], s=size, c=expanded, **style)
+    axes.figure.colorbar(marks, ax=axes, label=f"U of a {volume.length:g} mm length [mm]")
+    label_axes(axes, "distance from the first axis [mm]", "height [mm]")
+    return axes
+
+
+def correlation_matrix(uncertainty: Uncertainty, axes: Any = None) -> Any:
+    """Plot the correlations of the parameters: darker is stronger, with the sign written where it is at least 0.5.
+
+    Args:
+        uncertainty: Uncertainty of a calibrated arm (`uncertainty_of`).
+        axes: Axes to plot into; new ones if None.
+
+    Returns:
+        The axes.
+    """
+    axes = axes_or_new(axes)
+    table, names = np.asarray(uncertainty.correlation), uncertainty.names
+    image = axes.imshow(np.abs(table), cmap="Blues", vmin=0, vmax=1)
+    axes.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=7)
+    axes.set_yticks(np.arange(len(names)), names, fontsize=7)
+    for i, j in np.argwhere(np.abs(table) >= 0.5):
+        if i != j:
+            color = "w" if abs(table[i, j]) > 0.7 else "k"
+            axes.text(j, i, "+" if table[i, j] > 0 else "-", ha="center", va="center", color=color)
+    axes.figure.colorbar(image, ax=axes, label="|r|", shrink=0.8)
+    return axes
+
+
+def singular_values(observed: Observability, axes: Any = None) -> Any:
+    """Plot the singular values of the identification Jacobian, in steps of 1 mm and 1 mrad; zero ones are crosses.
+
+    Args:
+        observed: The result of `observability`.
+        axes: Axes to plot into; new ones if None.
+
+    Returns:
+        The axes.
+    """
+    axes = axes_or_new(axes)
+    values = np.maximum(observed.singular, 1e-12 * observed.singular.max())
+    numbers, rank = np.arange(1, len(values) + 1), observed.rank
+    axes.plot(numbers[:rank], values[:rank], "o", color=DARK, label="determined")
+    if rank < len(values):
+        axes.plot(numbers[rank:], values[rank:], "x", color=ACCENT, label="not determined")
+        axes.legend(frameon=False)
+    axes.set_yscale("log")
+    label_axes(axes, "number", "singular value")
+    return axes

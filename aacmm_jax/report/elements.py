@@ -1,0 +1,103 @@
+"""The elements of a report, independent of how they are shown: sections of text, tables, charts and views."""
+
+import html
+import math
+from typing import Any, NamedTuple
+
+_ZERO = 1e-9  # mm: smaller numbers are rounding errors
+
+
+class Cell(NamedTuple):
+    """One cell of a table."""
+
+    text: str
+    value: float | None = None  # what the column is sorted by; None: the text
+    mark: str = ""  # "good", "bad", "unsure", "outlier"
+
+
+class Table(NamedTuple):
+    """A table with headings; columns whose cells have values are right-aligned."""
+
+    caption: str
+    columns: tuple[str, ...]
+    rows: list[list[Cell]]
+
+    @property
+    def numeric(self) -> list[bool]:
+        """Which columns contain numbers."""
+        return [any(row[i].value is not None for row in self.rows) for i in range(len(self.columns))]
+
+
+class Chart(NamedTuple):
+    """A figure for Plotly (traces and layout as plain dictionaries), a description, and the table of its numbers."""
+
+    id: str
+    title: str
+    description: str
+    figure: dict[str, Any]
+    table: Table | None = None
+    height: int = 380
+    printed: bool = False  # whether the table is printed on paper as well
+
+
+class ArmView(NamedTuple):
+    """An interactive view of the arm in its poses: see `arm_view`."""
+
+    id: str
+    title: str
+    description: str
+    data: dict[str, Any]
+
+
+class Section(NamedTuple):
+    """A part of a report with a heading."""
+
+    id: str
+    title: str
+    blocks: list["str | Table | Chart | ArmView"]
+
+
+class Report(NamedTuple):
+    """A whole report, in reading order."""
+
+    title: str
+    subtitle: str
+    verdict: str
+    verdict_mark: str  # "good", "bad", "unsure"
+    warnings: list[str]
+    facts: list[tuple[str, str]]
+    sections: list[Section]
+
+
+def text_cell(value: object, mark: str = "") -> Cell:
+    """A cell of text."""
+    return Cell(str(value), None, mark)
+
+
+def number_cell(value: float | None, decimals: int = 4, *, signed: bool = False, mark: str = "") -> Cell:
+    """A cell with a number; a dash for None and NaN."""
+    if value is None or not math.isfinite(value):
+        return Cell("–" if value is None or math.isnan(value) else "not determined", None, mark)
+    return Cell(format_number(value, decimals, signed=signed), float(value), mark)
+
+
+def format_number(value: float, decimals: int = 4, *, signed: bool = False) -> str:
+    """A number with a fixed number of decimals, or in powers of ten if these would not show it."""
+    sign = "+" if signed else ""
+    if abs(value) < _ZERO:
+        value = 0.0
+    if value != 0 and abs(value) < 0.5 * 10**-decimals:
+        return f"{value:{sign}.1e}".replace("-", "−")
+    return f"{value:{sign}.{decimals}f}".replace("-", "−")
+
+
+def decimals_for(u: float | None, default: int = 4) -> int:
+    """Decimals that show two digits of an uncertainty."""
+    if u is None or not math.isfinite(u) or u <= 0:
+        return default
+    return min(max(1 - math.floor(math.log10(u)), 0), 9)
+
+
+def escaped(value: object) -> str:
+    """Text for Plotly, which interprets some tags: names appear as they are."""
+    return html.escape(str(value), quote=False)

@@ -1,0 +1,149 @@
+"""One self-contained HTML page: text, charts, the view of the arm, style and scripts."""
+
+import base64
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ..acceptance.record import SIMULATED
+from ..core.errors import InputError
+from ..files.administrative_data import AdministrativeData, check_conformity
+from ..files.hdf5 import read_tables
+from ..files.whole_file import fingerprint, write_text
+from .administrative_data import administrative_section
+from .elements import ArmView, Chart, Report, Table
+
+KINDS = ("calibration", "evaluation", "study")
+_FOLDER = Path(__file__).parent
+
+
+def write_report(
+    source: str | os.PathLike, target: str | os.PathLike, administrative_data: AdministrativeData | None = None
+) -> dict[str, Any]:
+    """Write the report of a calibration, an evaluation or a study as one HTML file.
+
+    Args:
+        source: The HDF5 file of the calibration, the evaluation or the study.
+        target: The HTML file to write, whole or not at all.
+        administrative_data: Laboratory, customer, item, persons, dates and artefacts, shown in a section of their own.
+
+    Returns:
+        Title, verdict, warnings and size of the report.
+
+    Raises:
+        InputError: If the source cannot be read or the target not written, or the administrative data state a
+            conformity that the source contradicts.
+    """
+    source, target = Path(source), Path(target)
+    if target.exists() and source.exists() and target.samefile(source):
+        raise InputError(f"{target} is the file that the report is of; choose another output.")
+    stored = read_tables(source, KINDS, without=("trials",))
+    kind = stored.attributes["kind"]
+    report, simulated, decision = _REPORTS[kind](source, stored.attributes)
+    if simulated:
+        warnings = list(dict.fromkeys([SIMULATED, *report.warnings]))
+        mark = "bad" if report.verdict_mark == "bad" else "unsure"
+        report = report._replace(warnings=warnings, verdict_mark=mark)
+    if administrative_data is not None:
+        tested = kind == "evaluation"
+        check_conformity(administrative_data, simulated=simulated, decision=decision, tested=tested)
+        section = administrative_section(administrative_data, tested)
+        report = report._replace(sections=[section, *report.sections])
+    page = _render(report, _origin(source, stored.attributes))
+    write_text(target, page)
+    return {
+        "kind": "report",
+        "of": str(source),
+        "title": report.title,
+        "verdict": report.verdict,
+        "warnings": report.warnings,
+        "bytes": len(page.encode()),
+        "written": str(target),
+    }
+
+
+def _calibration(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+    from ..files.calibrations import load_calibration
+    from .calibration import calibration_report
+
+    record = load_calibration(source)
+    return calibration_report(record)[0], record.recording.true is not None, None
+
+
+def _evaluation(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+    from .evaluation import evaluation_report, overall_decision, points_report
+
+    if attributes.get("of") == "points":
+        from ..files.evaluations import load_points
+
+        report, summary = points_report(load_points(source))
+        return report, False, overall_decision(summary)
+    from ..files.evaluations import load_evaluation
+
+    record = load_evaluation(source)
+    report, summary = evaluation_report(record)
+    return report, record.recording.true is not None, overall_decision(summary)
+
+
+def _study(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+    from ..study.results import Results
+    from .study import study_report
+
+    return study_report(Results.of(source))[0], False, None
+
+
+# By the kind of file: the report, whether it is of a simulation, and the overall decision of its acceptance tests.
+_REPORTS: dict[str, Callable[[Path, dict[str, Any]], tuple[Report, bool, str | None]]] = {
+    "calibration": _calibration,
+    "evaluation": _evaluation,
+    "study": _study,
+}
+
+
+def _origin(source: Path, attributes: dict[str, Any]) -> list[tuple[str, list[str]]]:
+    """How the file was made, and how to reproduce it."""
+    return [
+        ("File", [fingerprint(source)]),
+        ("Measured on", [str(attributes.get("measured") or "not stated")]),
+        ("Created on", [str(attributes["created"])]),
+        ("Command", [str(attributes["command"])]),
+        ("aacmm_jax", [str(attributes["package_version"])]),
+        ("Versions", [attributes.get("versions") or "not recorded"]),
+        ("Seed", ["none" if attributes.get("seed") is None else str(attributes["seed"])]),
+        ("Sources", [str(line) for line in attributes.get("sources") or ["not recorded"]]),
+    ]
+
+
+def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
+    """The HTML of a report. Jinja escapes texts given by people, and only the page's own scripts run."""
+    import jinja2
+    from plotly.offline import get_plotlyjs
+
+    def read(name: str) -> str:
+        return (_FOLDER / name).read_text(encoding="utf-8")
+
+    template = jinja2.Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    ).from_string(read("page_template.html"))
+    scripts = [get_plotlyjs(), read("page_script.js")]
+    blocks = [block for section in report.sections for block in section.blocks]
+    return template.render(
+        report=report,
+        origin=origin,
+        is_chart=lambda block: isinstance(block, Chart),
+        is_table=lambda block: isinstance(block, Table),
+        is_arm_view=lambda block: isinstance(block, ArmView),
+        charts={block.id: block.figure for block in blocks if isinstance(block, Chart)},
+        scenes={block.id: block.data for block in blocks if isinstance(block, ArmView)},
+        style=read("page_style.css"),
+        scripts=scripts,
+        mark=hashlib.sha256(repr(origin).encode()).hexdigest()[:12],
+        hashes=[_script_hash(script) for script in scripts],
+    )
+
+
+def _script_hash(script: str) -> str:
+    """The source expression by which the page's content security policy allows one of its own scripts."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()

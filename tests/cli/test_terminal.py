@@ -1,0 +1,218 @@
+"""What a terminal of any width shows, and what is refused before any work: in this process, which starts no other."""
+
+import io
+from importlib import import_module
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+from typer.main import get_command
+from typer.testing import CliRunner
+
+import aacmm_jax as aj
+from aacmm_jax.cli import _FAMILIES, acceptance_display, calibration_display
+from aacmm_jax.cli.app import app, examples, length_option
+from aacmm_jax.cli.display import new_console, new_table, print_table
+from aacmm_jax.summaries.calibration import calibration_summary
+from tests.refusals import assert_refused
+
+for family in _FAMILIES:
+    import_module(f"aacmm_jax.cli.{family}")
+COMMANDS = get_command(app).commands
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """A command in this process, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))  # so that the command leaves JAX's own setting alone
+    return lambda *arguments: CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.mark.parametrize("columns", [60, 80, 120])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_every_option_whole(monkeypatch, capsys, command, columns):
+    """The names of options carry their units, so none may be cut; only examples are not wrapped, so as to be copied."""
+    monkeypatch.setenv("COLUMNS", str(columns))
+    get_command(app).main([command, "--help"], "aacmm", standalone_mode=False)
+    shown = capsys.readouterr().out
+    head, _, tail = shown.partition("\n  Example")
+    assert f"aacmm {command} " in tail
+    words = head.replace(",", " ").split()
+    for parameter in COMMANDS[command].params:
+        for name in (*parameter.opts, *parameter.secondary_opts) if parameter.param_type_name == "option" else ():
+            assert any(name in word.split("/") for word in words), name
+    assert max(map(len, head.splitlines())) <= columns
+
+
+def test_help_lists_every_command_whole(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    get_command(app).main(["--help"], "aacmm", standalone_mode=False)
+    shown = capsys.readouterr().out
+    assert all(f"\n  {command} " in shown for command in COMMANDS)
+    assert "..." not in shown.partition("Commands:")[2]
+
+
+def test_examples_are_printed_a_line_each():
+    assert examples("aacmm a \\\n  --b", "aacmm c") == "\b\nExamples:\n  aacmm a \\\n    --b\n  aacmm c"
+
+
+cells = st.text("abcxyz0189.-", min_size=1, max_size=8)
+texts = st.lists(cells, min_size=1, max_size=6).map(" ".join)
+
+
+@given(st.integers(30, 200), st.integers(1, 2), st.data())
+@settings(max_examples=60, deadline=None)
+def test_nothing_in_a_table_is_cut(columns, keys, data):
+    """Each word of each cell is printed whole, in lines that are not wider than the console."""
+    count = data.draw(st.integers(keys + 1, 8))
+    rows = data.draw(st.lists(st.lists(texts, min_size=count, max_size=count), min_size=1, max_size=4))
+    stream = io.StringIO()
+    table = new_table("", *rows[0])
+    for row in rows[1:]:
+        table.add_row(*row)
+    print_table(Console(file=stream, width=columns, highlight=False), table, keys)
+    lines = stream.getvalue().splitlines()
+    printed = [word for line in lines for word in line.split()]
+    assert all(word in printed for row in rows for cell in row for word in cell.split())
+    assert max(map(len, lines)) <= columns
+
+
+@pytest.mark.parametrize(("given_columns", "width"), [("72", 72), ("200", 200), (None, 110)])
+def test_what_is_piped_is_as_wide_as_asked(monkeypatch, given_columns, width):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    if given_columns:
+        monkeypatch.setenv("COLUMNS", given_columns)
+    monkeypatch.setattr("sys.stdout", io.StringIO())
+    assert new_console().width == width
+
+
+NAMES = ("Volumetric performance, 2 RMS", "Volumetric performance, largest", "E_Uni", "L_Dia.5x5:Art:Tact.AArm")
+
+
+def test_acceptance_at_80_columns(monkeypatch, capsys):
+    """Every result by its whole name, with every number."""
+    monkeypatch.setenv("COLUMNS", "80")
+    numbers = {"value_mm": 0.0312, "as_found_mm": 12.3456, "expanded_mm": 0.0021, "limit_mm": 0.0415}
+    parts = {"failing": 2, "parts": [None] * 7, "decision": "undecided", "where": "500 mm bar at position 3, repeat 2"}
+    tests = [
+        {"standard": "ISO 10360-12:2016", "title": "articulated arms", "missing": ["5 lengths"]}
+        | {"figures": [{"name": name} | numbers | parts for name in NAMES]}
+    ]
+    summary = {"points": 9, "sockets": 2, "lengths": 1, "spheres": 0, "warnings": [], "u_test_mm": 0.0}
+    acceptance_display.points(summary | {"acceptance": tests})
+    shown = capsys.readouterr().out
+    assert max(map(len, shown.splitlines())) <= 80
+    words = shown.split()
+    for text in (*NAMES, "12.3456 0.0312 0.0021 0.0415 undecided (2 of 7) position 3, repeat"):
+        assert all(word in words for word in text.split()), text
+    assert "..." not in shown
+    assert "…" not in shown
+
+
+def test_a_residual_that_no_arm_has_is_not_called_converged(paper_arm):
+    """Positions and quaternions read as joint readings: every solve ends, and nothing was calibrated."""
+    rng = np.random.default_rng(0)
+    nominal = aj.files.load_specification("cheng2018-simulation")
+    q = [rng.uniform(-1, 1, (40, 6)) for _ in range(2)]
+    capture = aj.Capture({"A": q[0], "B": q[1]}, [aj.ReferenceLength("A", "B", 200.0, 0.01)])
+    result = aj.calibrate(nominal.arm, capture, nominal.bounds())
+    record = aj.calibration.record_of(result, aj.Recording(capture, nominal))
+    assert record.implausible_residual
+    summary = calibration_summary(record)
+    assert any("a hundred times what an arm of this size can be" in warning for warning in summary["warnings"])
+    assert not summary["residual_plausible"]
+
+
+@pytest.mark.parametrize(
+    ("converged", "plausible", "said", "unsaid"),
+    [
+        (True, True, ": converged in 3 steps", "no arm has"),
+        (True, False, "ended with a residual that no arm has, in 3 steps", "converged"),
+        (False, False, "did not converge in 3 steps", "no arm has"),
+    ],
+)
+def test_verdict(capsys, converged, plausible, said, unsaid):
+    calibration_display.print_verdict(
+        new_console(),
+        {"arm": "arm", "method": "joint", "steps": 3, "poses": 9, "sockets_used": ["A"]}
+        | {"converged": converged, "residual_plausible": plausible},
+    )
+    shown = " ".join(capsys.readouterr().out.split())
+    assert said in shown
+    assert unsaid not in shown
+
+
+EXISTING = ("there.h5", "there.toml", "there.csv", "there.html")
+MISSING = [
+    ("import", "no.toml", "-o", "there.h5"),
+    ("simulate", "no.toml", "-o", "there.h5", "--socket", "A=1,2,3"),
+    ("simulate", "panda", "--true-arm", "no.toml", "-o", "there.h5", "--socket", "A=1,2,3"),
+    ("calibrate", "no.h5", "-o", "there.h5"),
+    ("evaluate", "no.h5", "there.h5", "-o", "new.h5"),
+    ("evaluate", "no.h5", "no.h5", "-o", "there.h5"),
+    ("evaluate", "no.toml", "-o", "there.h5"),
+    ("report", "no.h5", "-o", "there.html"),
+    ("report", "there.h5", "--about", "no.toml", "-o", "there.html"),
+    ("export", "no.h5", "-o", "there.toml"),
+    ("export", "no.h5", "--format", "dcc", "--about", "there.toml", "-o", "new.xml"),
+    ("study", "no.toml", "-o", "new.h5"),
+    ("study", "no.toml", "-o", "there.h5"),
+    ("study", "--resume", "-o", "no.h5"),
+    ("plan", "no.toml", "-o", "there.csv"),
+    ("plan", "no.toml", "--acceptance", "iso", "-o", "there.csv", "--manifest", "there.toml"),
+    ("compare", "no.h5", "there.h5", "--csv", "there.csv"),
+    ("compare", "no.h5", "no2.h5", "--figure", "there.png"),
+    ("show", "no.h5"),
+    ("show", "no.toml"),
+]
+
+
+@pytest.mark.parametrize("arguments", MISSING, ids=" ".join)
+def test_a_missing_input_is_named_whether_or_not_the_output_exists(run, tmp_path, arguments):
+    for name in EXISTING:
+        (tmp_path / name).touch()
+    error = run(*arguments).exception
+    assert isinstance(error, aj.InputError), error  # exit code 2 and one sentence, by `aacmm_jax.cli.main`
+    assert "does not exist" in str(error)
+    assert "no" in str(error).split(" ")[0]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(EXISTING)
+    assert all((tmp_path / name).stat().st_size == 0 for name in EXISTING)
+
+
+SAME = [
+    ("import", "there.toml", "-o", "there.toml"),
+    ("simulate", "there.toml", "-o", "there.toml", "--socket", "A=1,2,3"),
+    ("calibrate", "there.h5", "-o", "there.h5"),
+    ("calibrate", "there.h5", "-o", "new.h5", "--figure", "there.h5"),
+    ("evaluate", "there.h5", "no.h5", "-o", "there.h5"),
+    ("evaluate", "there.toml", "-o", "there.toml"),
+    ("report", "there.h5", "-o", "there.h5"),
+    ("export", "there.h5", "-o", "there.h5"),
+    ("plan", "there.toml", "-o", "there.toml"),
+    ("compare", "there.h5", "no.h5", "--csv", "there.h5"),
+]
+
+
+@pytest.mark.parametrize("arguments", SAME, ids=" ".join)
+def test_an_input_is_never_overwritten(run, tmp_path, arguments):
+    for name in EXISTING:
+        (tmp_path / name).touch()
+    error = run(*arguments).exception
+    assert isinstance(error, aj.InputError), error
+    assert "choose another output" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("A,B", ("A", "B")), ("A,B,0.002", ("A", "B", 0.002)), ('"plate, left",B,0.1', ("plate, left", "B", 0.1))],
+)
+def test_a_length_between_any_two_names(text, expected):
+    assert length_option(text) == expected
+
+
+@pytest.mark.parametrize("text", ["A", "", "A,B,u", "A,B,1,2", ",B"])
+def test_what_is_no_length(text):
+    assert_refused(lambda: length_option(text), f"--length '{text}' is not of the form")
