@@ -236,7 +236,7 @@ def shipped(trials: int = 400) -> dict:
 
 
 def shipped_coverage(space: aj.Parameters, method: str, trials: int, seed: int = 4) -> dict:
-    """Coverage (%) of the 95 % interval of each free parameter, over recordings of one arm that is not the nominal one."""
+    """Coverage (%) of the 95 % interval of each free parameter, over recordings of one arm other than the nominal."""
     true = aj.perturbed_arm(space, length=0.5, angle=1e-3, seed=seed)
     reach = 0.6 * float(np.abs(np.asarray(space.base.a)).sum() + np.abs(np.asarray(space.base.d[1:])).sum())
     directions = np.array([[0.6, 0.2, 0.1], [0.3, -0.5, 0.2], [-0.4, 0.4, 0.3], [0.2, 0.5, -0.1]])
