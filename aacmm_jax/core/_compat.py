@@ -42,3 +42,8 @@ def member_numbers(member: Any) -> Int[Array | np.ndarray, "*batch"]:
 def members(like: Any, numbers: Int[Array, "*batch"]) -> Any:
     """An array of members of the enumeration of ``like``, from their numbers. (Equinox's own constructors take one.)"""
     return eqx.tree_at(lambda item: item._value, like, numbers)
+
+
+def named_members(enumeration: Any) -> list[tuple[str, Any]]:
+    """Every member of an enumeration with its name."""
+    return [(name, getattr(enumeration, name)) for name in enumeration._name_to_item]

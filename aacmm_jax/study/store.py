@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..core._compat import named_members
 from ..core.errors import InputError
 from ..data.recording import Recording
 from ..files.captures import arm_table, recording_of, recording_tables, specification_of
@@ -174,8 +175,8 @@ def _write(
                 dataset.dims[axis].attach_scale(group[dimension])
         if fill is not None:
             fill(group)
-        members = [(name, getattr(Reason, name)) for name in Reason._name_to_item if name]  # pyright: ignore
-        group["reason"].attrs["reasons"] = ", ".join(f"{int(numbers_of(item))}: {name}" for name, item in members)
+        numbered = (f"{int(numbers_of(reason))}: {name}" for name, reason in named_members(Reason))
+        group["reason"].attrs["reasons"] = ", ".join(numbered)
 
     write_tables(path, "study", _tables(study), attributes, extend, advice, streamed=fill is not None)
 

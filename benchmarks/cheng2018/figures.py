@@ -237,7 +237,7 @@ def stages(table: Table) -> Any:
     return figure
 
 
-def sliding(table: Table) -> Any:
+def noise_and_box(table: Table) -> Any:
     """k by noise, every length free, for several boxes; and with one length held."""
     figure, axes = plt.subplots(figsize=(4.6, 3.2))
     widths = sorted({line["half_width_mm"] for line in table})
@@ -258,7 +258,7 @@ def sliding(table: Table) -> Any:
     return figure
 
 
-def buying(table: Table) -> Any:
+def sockets_poses_lengths(table: Table) -> Any:
     """RMS of 300 mm lengths by poses, sockets and reference lengths."""
     lengths = sorted({line["lengths"] for line in table})
     figure, grid = plt.subplots(1, len(lengths), figsize=(7.0, 2.7), sharey=True)
@@ -278,7 +278,7 @@ def buying(table: Table) -> Any:
     return figure
 
 
-def references(table: Table) -> Any:
+def reference_lengths(table: Table) -> Any:
     """u of k by how long the reference is, where it lies, and how well it is known."""
     figure, grid = plt.subplots(1, 2, figsize=(7.0, 2.9), sharey=True)
     exact = [line for line in table if line["u_mm"] == 0]
@@ -310,15 +310,15 @@ def draw(tables: dict[str, Table], folder: Path) -> dict[str, str]:
         "figure8": lambda: plate(tables["figure8"]),
         "twins": lambda: twins(tables["twins"]),
         "stages": lambda: stages(tables["stages"]),
-        "noise_and_box": lambda: sliding(tables["noise_and_box"]),
-        "sockets_poses_lengths": lambda: buying(tables["sockets_poses_lengths"]),
-        "reference_lengths": lambda: references(tables["reference_lengths"]),
+        "noise_and_box": lambda: noise_and_box(tables["noise_and_box"]),
+        "sockets_poses_lengths": lambda: sockets_poses_lengths(tables["sockets_poses_lengths"]),
+        "reference_lengths": lambda: reference_lengths(tables["reference_lengths"]),
     }
     about = {
         "figure2": simulation, "figure3": simulation, "scale_law": scale_law, "distributions": distributions,
         "k_against_box": box_and_scale,
-        "figure6": repeatability, "figure8": plate, "twins": twins, "stages": stages, "noise_and_box": sliding,
-        "sockets_poses_lengths": buying, "reference_lengths": references,
+        "figure6": repeatability, "figure8": plate, "twins": twins, "stages": stages, "noise_and_box": noise_and_box,
+        "sockets_poses_lengths": sockets_poses_lengths, "reference_lengths": reference_lengths,
     }  # fmt: skip
     for name, make in figures.items():
         with plt.rc_context(STYLE):

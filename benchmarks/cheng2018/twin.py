@@ -116,7 +116,9 @@ def _least_move(q: jax.Array, shift: jax.Array) -> jax.Array:
     """Least change of the joints that moves the tip by a few micrometres (to first order: picometres are left)."""
     jacobian = true_arm().jacobian(q, [f"q_{i + 1}" for i in range(q.shape[-1])])
     square = jacobian @ jnp.swapaxes(jacobian, -1, -2)
-    return jnp.einsum("bci,bc->bi", jacobian, jnp.linalg.solve(square, shift[..., None])[..., 0])
+    # One batched LAPACK call at a time cannot deadlock, and another factorisation would change the last digits.
+    solved = jnp.linalg.solve(square, shift[..., None])[..., 0]
+    return jnp.einsum("bci,bc->bi", jacobian, solved)
 
 
 def joint(twins: Twins, u: float = 0.001) -> np.ndarray:
