@@ -40,6 +40,6 @@ from .kinematics.parameters import perturbed_arm as perturbed_arm
 from .model.scale import fix_scale as fix_scale
 from .model.scale import scale_from_lengths as scale_from_lengths
 from .solver.bounded import least_squares as least_squares
-from .solver.levenberg_marquardt import Reason as Reason
+from .solver.reason import Reason as Reason
 from .uncertainty.identifiability import observability as observability
 from .uncertainty.volume import volumetric_uncertainty as volumetric_uncertainty

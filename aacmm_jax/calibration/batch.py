@@ -1,6 +1,6 @@
-"""Thousands of calibrations at once (`identify_many`, `calibrate_many`): the engine under every Monte Carlo study.
+"""Thousands of calibrations at once (`identify_many`, `calibrate_many`), which every Monte Carlo study uses.
 
-The batch is cut into chunks, which are spread over devices and cores; `lanes` solves a chunk.
+The batch is cut into chunks, which are distributed over devices and cores; `batch_kernel` solves a chunk.
 """
 
 import math
@@ -8,6 +8,7 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from queue import Empty, SimpleQueue
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -21,20 +22,20 @@ from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
-from ..kinematics.parameters import Parameters
+from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import check_joints
-from ..solver.levenberg_marquardt import Reason, reasons
+from ..solver.reason import Reason, reasons
 from .batch_kernel import Problems, Shape, solve_chunk
 from .checks import based_on, check_enough
 from .results import converged
 from .scale_anchor import ScaleAnchor, scale_anchor
 from .second_stage import divided, rows_of, second_stage_many
 
-# Lanes per loop. On a CPU the columns of all lanes should fit the second-level cache (measured from 20 to 7,000 poses: five
-# times slower where they do not); a GPU wants thousands.
-_LANES_CPU, _POSES_IN_CACHE = 16, 2000
-_LANES_ELSEWHERE = 4096
-_ROUNDS = 64  # problems a lane of one chunk takes at most, one after the other
+# Slots per loop. On a CPU the Jacobian columns of all slots should fit the second-level cache (measured from 20 to 7,000
+# poses: five times slower where they do not); a GPU needs thousands.
+_SLOTS_CPU, _POSES_IN_CACHE = 16, 2000
+_SLOTS_ELSEWHERE = 4096
+_ROUNDS = 64  # problems that a slot of one chunk takes at most, one after the other
 
 
 class ManyIdentifications(eqx.Module):
@@ -46,7 +47,7 @@ class ManyIdentifications(eqx.Module):
     k: Float[np.ndarray, " b"] | None  # measured / nominal, where the capture holds reference lengths
     steps: Int[np.ndarray, " b"]  # evaluations
     result: Reason  # why each ended
-    active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, 0 inside or held
+    active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, 0 inside or fixed
     space: Parameters
     hold: str | None = eqx.field(static=True)
 
@@ -88,8 +89,8 @@ class ManyCalibrations(eqx.Module):
 def identify_many(
     arm: Arm,
     capture: Capture,
-    lower: Numbers,
-    upper: Numbers,
+    lower: Bounds | Numbers,
+    upper: Numbers | None = None,
     start: Numbers | None = None,
     *,
     space: Parameters | None = None,
@@ -97,29 +98,46 @@ def identify_many(
     noise: Noise | None = None,
     max_steps: int = 300,
     chunk: int | None = None,
-    lanes: int | None = None,
+    slots: int | None = None,
     devices: Sequence[Any] | None = None,
     workers: int | None = None,
 ) -> ManyIdentifications:
     """Stage 1 for a batch: what `identify` does, problem by problem, fast.
 
-    ``lower``, ``upper`` and ``start`` are ``(batch, p)`` or ``(p,)``, in the order of ``space.names`` (default: the paper's
-    parameters of ``arm``); ``start`` defaults to the arm. ``arm`` may be a batch (every parameter ``(batch, n)``), and so
-    may the capture (see `stack_captures`).
+    Memory is bounded by ``chunk``. Failure is data (``result``).
 
-    With ``noise`` poses are weighed by it, as in `identify`. Work is spread over all devices and, on a CPU, all cores (or ``workers`` threads); memory is bounded by the ``chunk``
-    (problems per call of the compiled program). Failure is data (``result``); a start outside its box is clipped to it. Raises `InputError` for
-    shapes that do not fit, a lower bound above its upper one, and too few poses.
+    Args:
+        arm: The nominal arm, or a batch of arms (every parameter ``(batch, n)``).
+        capture: The readings, or a batch of them (see `stack_captures`).
+        lower: `Bounds`, whose space is then used; or lower bounds, ``(batch, p)`` or ``(p,)``, mm and rad, in the order of
+            ``space.names``.
+        upper: Upper bounds, likewise; left out where ``lower`` is `Bounds`.
+        start: Starts, likewise, clipped to the bounds; by default the arm.
+        space: The free parameters where bounds are arrays; by default the paper's of ``arm``.
+        hold: The scale anchor, as in `identify`.
+        noise: Weights poses, as in `identify`.
+        max_steps: The largest number of evaluations of one problem.
+        chunk: Problems in one call of the compiled program.
+        slots: Problems in work at the same time in one call.
+        devices: The devices to use; by default all.
+        workers: Threads; by default one for each device or, on a CPU, for each core.
+
+    Returns:
+        Parameters, metrics and reasons, problem by problem.
+
+    Raises:
+        InputError: For shapes that do not fit, a lower bound above its upper one, and too few poses.
     """
-    effort = _Effort(max_steps, chunk, lanes, devices, workers)
+    lower, upper, space = _bounds_and_space(arm, lower, upper, space)
+    effort = _Effort(max_steps, chunk, slots, devices, workers)
     return _Work.of(arm, capture, lower, upper, start, space, hold, noise, effort).identified()
 
 
 def calibrate_many(
     arm: Arm,
     capture: Capture,
-    lower: Numbers,
-    upper: Numbers,
+    lower: Bounds | Numbers,
+    upper: Numbers | None = None,
     start: Numbers | None = None,
     *,
     method: Literal["two-stage", "joint"] = "two-stage",
@@ -128,13 +146,33 @@ def calibrate_many(
     noise: Noise | None = None,
     max_steps: int = 300,
     chunk: int | None = None,
-    lanes: int | None = None,
+    slots: int | None = None,
     devices: Sequence[Any] | None = None,
     workers: int | None = None,
 ) -> ManyCalibrations:
-    """Both stages for a batch: what `calibrate` does, problem by problem, fast; arguments as for `identify_many`.
+    """Both stages for a batch: what `calibrate` does, problem by problem, fast.
 
-    Raises `InputError` as `identify_many` does, and where the capture holds no reference length.
+    Args:
+        arm: As for `identify_many`, like all arguments but ``method``.
+        capture: Readings and at least one reference length.
+        lower: `Bounds` or lower bounds.
+        upper: Upper bounds.
+        start: Starts.
+        method: As in `calibrate`.
+        space: The free parameters.
+        hold: The scale anchor of stage 1.
+        noise: Weights poses.
+        max_steps: The largest number of evaluations of one solve.
+        chunk: Problems in one call of the compiled program.
+        slots: Problems in work at the same time in one call.
+        devices: The devices to use.
+        workers: Threads.
+
+    Returns:
+        Parameters, scale, metrics and reasons, problem by problem.
+
+    Raises:
+        InputError: As `identify_many`, and where the capture holds no reference length.
     """
     if method not in ("two-stage", "joint"):
         raise InputError(f"method is '{method}'; it must be 'two-stage' or 'joint'.")
@@ -142,7 +180,8 @@ def calibrate_many(
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many."
         )
-    effort = _Effort(max_steps, chunk, lanes, devices, workers)
+    lower, upper, space = _bounds_and_space(arm, lower, upper, space)
+    effort = _Effort(max_steps, chunk, slots, devices, workers)
     work = _Work.of(arm, capture, lower, upper, start, space, hold, noise, effort)
     stage1 = work.identified()
     k = stage1.k
@@ -158,7 +197,7 @@ def calibrate_many(
         found = second_stage_many(work.anchor, base, work.problems.lower, work.problems.upper, stage1, identify_again)
         return ManyCalibrations(k=k, stage1=stage1, method=method, **found)
     scaled = np.asarray(divided(work.anchor, base, jnp.asarray(stage1.parameters), jnp.asarray(k)))
-    fitted = sum(work.shape.kept)
+    fitted = sum(work.shape.solved)
     work = _Work.of(arm, capture, lower, upper, scaled, stage1.space, None, noise, effort, fitted)
     joint = work.identified()
     steps = stage1.steps + joint.steps
@@ -167,12 +206,29 @@ def calibrate_many(
     )
 
 
+def _bounds_and_space(
+    arm: Arm, lower: Bounds | Numbers, upper: Numbers | None, space: Parameters | None
+) -> tuple[Numbers, Numbers, Parameters]:
+    """Bounds as arrays and the free parameters, from `Bounds` or from arrays."""
+    if isinstance(lower, Bounds):
+        for what, given in (("upper bounds", upper), ("a space", space)):
+            if given is not None:
+                raise InputError(
+                    f"Bounds are given, and {what} as well, which they hold already; leave one out (a start goes by its "
+                    "name: start=...)."
+                )
+        return lower.lower, lower.upper, lower.space
+    if upper is None:
+        raise InputError("lower bounds are given without upper ones; give both, or Bounds, which hold both.")
+    return lower, upper, Parameters.free_of(arm) if space is None else space
+
+
 class _Effort(NamedTuple):
     """How much is computed at a time, and where."""
 
     max_steps: int
     chunk: int | None
-    lanes: int | None
+    slots: int | None
     devices: Sequence[Any] | None
     workers: int | None
 
@@ -182,8 +238,8 @@ class _Work(NamedTuple):
 
     problems: Problems
     shape: Shape
-    pieces: list[range]
-    room: int  # problems that the compiled program has room for
+    chunks: list[range]
+    capacity: int  # problems of one call of the compiled program
     devices: list[Any]
     workers: int
     space: Parameters
@@ -199,15 +255,13 @@ class _Work(NamedTuple):
         lower: Numbers,
         upper: Numbers,
         start: Numbers | None,
-        space: Parameters | None,
+        space: Parameters,
         hold: str | None,
         noise: Noise | None,
         effort: _Effort,
         fitted: int | None = None,
     ) -> "_Work":
         """Everything checked and laid out. ``fitted``: the joint solve, after a stage 1 of so many parameters."""
-        if space is None:
-            space = Parameters.free_of(arm)
         problems, batched, size = _problems(arm, capture, lower, upper, start, space)
         anchor = scale_anchor(space, arm, hold, noise)
         hold = anchor.hold
@@ -215,41 +269,41 @@ class _Work(NamedTuple):
         if noise is not None:
             noise.check(arm.joints)
         check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
-        for what, number in (("chunk", effort.chunk), ("lanes", effort.lanes), ("workers", effort.workers)):
+        for what, number in (("chunk", effort.chunk), ("slots", effort.slots), ("workers", effort.workers)):
             if number is not None and number < 1:
                 raise InputError(f"{what} is {number}; give at least 1, or leave it out.")
         devices = jax.local_devices() if effort.devices is None else list(effort.devices)
-        lanes = effort.lanes or _lanes(devices, sum(capture.sizes))
+        slots = effort.slots or _slots(devices, sum(capture.sizes))
         workers = effort.workers or _workers(devices)
-        pieces = _pieces(size, lanes, workers, effort.chunk)
+        chunks = _chunks(size, slots, workers, effort.chunk)
         shape = Shape(
             sizes=capture.sizes,
             ends=tuple((int(a), int(b)) for a, b in capture.ends()),
-            entries=space.indices(),
-            kept=tuple(name != hold for name in space.names),
+            indices=space.indices(),
+            solved=tuple(name != hold for name in space.names),
             scale=tuple(np.asarray(space.scale).tolist()),
             batched=batched,
-            lanes=lanes,
+            slots=slots,
             max_steps=effort.max_steps,
             joint=fitted is not None,
             fitted=fitted or 0,
         )
-        room = _room(max(len(piece) for piece in pieces), lanes)
-        return cls(problems, shape, pieces, room, devices, workers, space, hold, noise, anchor)
+        capacity = _capacity(max(map(len, chunks)), slots)
+        return cls(problems, shape, chunks, capacity, devices, workers, space, hold, noise, anchor)
 
-    def run(self, piece: range, device: Any) -> tuple[np.ndarray, ...]:
-        """Solve one chunk. What room is left is filled with its first problem, which is never begun."""
-        rows = np.full(self.room, piece.start)
-        rows[: len(piece)] = piece
+    def run(self, chunk: range, device: Any) -> tuple[np.ndarray, ...]:
+        """Solve one chunk, filled up to the capacity with copies of its first problem, which are never begun."""
+        rows = np.full(self.capacity, chunk.start)
+        rows[: len(chunk)] = chunk
         part = jax.tree.map(lambda leaf, many: leaf[rows] if many else leaf, self.problems, self.shape.batched)
         with jax.default_device(device):
-            given = jax.device_put((part, np.asarray(len(piece)), self.noise), device)
-            solved = solve_chunk(*given, self.shape, self.room)
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(piece)], solved)
+            given = jax.device_put((part, np.asarray(len(chunk)), self.noise), device)
+            solved = solve_chunk(*given, self.shape, self.capacity)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(chunk)], solved)
 
     def identified(self) -> ManyIdentifications:
         """All chunks solved."""
-        found = _spread(self.run, self.pieces, self.devices, self.workers)
+        found = _run_chunks(self.run, self.chunks, self.devices, self.workers)
         parameters, de, deltam, k, steps, reason, active = (
             np.concatenate(column) for column in zip(*found, strict=True)
         )
@@ -259,55 +313,62 @@ class _Work(NamedTuple):
         )
 
 
-def _lanes(devices: Sequence[Any], poses: int) -> int:
+def _slots(devices: Sequence[Any], poses: int) -> int:
     if devices[0].platform != "cpu":
-        return _LANES_ELSEWHERE
-    return min(_LANES_CPU, 2 ** max(round(math.log2(_POSES_IN_CACHE / poses)), 0))
+        return _SLOTS_ELSEWHERE
+    return min(_SLOTS_CPU, 2 ** max(round(math.log2(_POSES_IN_CACHE / poses)), 0))
 
 
 def _workers(devices: Sequence[Any]) -> int:
-    """Chunks in work at a time: one a device; on a CPU, one a core."""
+    """Chunks in work at the same time: one for each device; on a CPU, one for each core."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return len(devices) if devices[0].platform != "cpu" else max(len(devices), cores)
 
 
-def _pieces(size: int, lanes: int, workers: int, chunk: int | None) -> list[range]:
-    """The batch in chunks: of the given size; or as few as fill the workers evenly, since at the end of each some lanes idle."""
+def _chunks(size: int, slots: int, workers: int, chunk: int | None) -> list[range]:
+    """The batch in chunks: of the given size, or as few as keep all workers busy, since slots idle at the end of each."""
     if chunk is None:
-        rounds = -(-size // (lanes * _ROUNDS))
-        calls = min(-(-rounds // workers) * workers, -(-size // lanes))
+        rounds = -(-size // (slots * _ROUNDS))
+        calls = min(-(-rounds // workers) * workers, -(-size // slots))
         chunk = -(-size // calls)
     return [range(first, min(first + chunk, size)) for first in range(0, size, chunk)]
 
 
-def _room(count: int, lanes: int) -> int:
-    """Whole rounds of the lanes, their number a power of two: each size is compiled once, so there should be few."""
-    return lanes * 2 ** math.ceil(math.log2(-(-count // lanes)))
+def _capacity(count: int, slots: int) -> int:
+    """Whole rounds of the slots, their number a power of two: each size is compiled once, so there should be few."""
+    return slots * 2 ** math.ceil(math.log2(-(-count // slots)))
 
 
-def _spread(run: Callable, pieces: Sequence[range], devices: Sequence[Any], workers: int) -> list:
-    """Chunks over devices and cores, in their order. XLA leaves the interpreter's lock while it computes, so threads are enough.
+def _run_chunks(run: Callable, chunks: Sequence[range], devices: Sequence[Any], workers: int) -> list:
+    """Results of all chunks in their order, computed by threads: XLA releases the interpreter's lock while it computes.
 
     The calling thread is one of the workers, since a new one takes a millisecond to start. A worker keeps its device.
     """
-    following, failed, found = iter(range(len(pieces))), threading.Event(), {}
+    # A queue and not a shared iterator, which two threads may advance at once where Python runs without its lock.
+    numbers: SimpleQueue[int] = SimpleQueue()
+    for i in range(len(chunks)):
+        numbers.put(i)
+    failed = threading.Event()
+    results: list[Any] = [None] * len(chunks)
 
     def work(worker: int) -> None:
-        try:
-            for i in following:
-                if failed.is_set():
-                    return
-                found[i] = run(pieces[i], devices[worker % len(devices)])
-        except BaseException:
-            failed.set()
-            raise
+        while not failed.is_set():
+            try:
+                i = numbers.get_nowait()
+            except Empty:
+                return
+            try:
+                results[i] = run(chunks[i], devices[worker % len(devices)])
+            except BaseException:
+                failed.set()
+                raise
 
     with ThreadPoolExecutor(workers) as pool:
-        others = [pool.submit(work, worker) for worker in range(1, min(workers, len(pieces)))]
+        others = [pool.submit(work, worker) for worker in range(1, min(workers, len(chunks)))]
         work(0)
         for other in others:
             other.result()
-    return [found[i] for i in range(len(pieces))]
+    return results
 
 
 def _problems(

@@ -1,7 +1,7 @@
-"""The compiled part of a batch: a fixed number of lanes works off a chunk of problems.
+"""The compiled part of a batch: a fixed number of batch slots solves a chunk of problems.
 
-Every pass of the loop evaluates and advances all lanes; a lane whose problem has ended writes its result and takes the next
-problem of the chunk, so no problem waits for another. The number of lanes, not the chunk, fixes the arithmetic: results are
+Every pass of the loop evaluates and advances all slots; a slot whose problem has ended writes its result and takes the next
+problem of the chunk, so no problem waits for another. The number of slots, not the chunk, fixes the arithmetic: results are
 the same to the bit whatever the chunk.
 """
 
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..core.linear_algebra import inverse_cholesky
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import with_values
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass, sines_cosines
@@ -22,7 +23,9 @@ from ..model.metrics import repeatability
 from ..model.residuals import JointWeights, model_of
 from ..model.scale import scale_of
 from ..model.weights import Weights
-from ..solver.levenberg_marquardt import Box, Reason, advance, begin, choose, either, numbers_of, reasons
+from ..solver.active_set import Box, choose
+from ..solver.levenberg_marquardt import advance, begin
+from ..solver.reason import Reason, either, numbers_of, reasons
 from .task import SOLVER
 
 
@@ -43,138 +46,138 @@ class Shape(NamedTuple):
 
     sizes: tuple[int, ...]
     ends: tuple[tuple[int, int], ...]
-    entries: tuple[tuple[str, int], ...]
-    kept: tuple[bool, ...]  # False for the length held in stage 1
+    indices: tuple[tuple[str, int], ...]  # kind and joint of each parameter
+    solved: tuple[bool, ...]  # False for the scale anchor of stage 1
     scale: tuple[float, ...]
     batched: Problems  # booleans
-    lanes: int
+    slots: int
     max_steps: int
     joint: bool = False  # poses and lengths in one least squares
     fitted: int = 0  # parameters that stage 1 took from the poses (joint)
 
 
-class _Ended(NamedTuple):
-    """What one ended problem leaves."""
+class _Solutions(NamedTuple):
+    """Results of the solves of a chunk."""
 
     parameters: Float[Array, "b p"]
     steps: Int[Array, " b"]
     reason: Reason
 
 
-@partial(jax.jit, static_argnames=("shape", "room"))
+@partial(jax.jit, static_argnames=("shape", "capacity"))
 def solve_chunk(
-    problems: Problems, count: Int[Array, ""], noise: Noise | None, shape: Shape, room: int
+    problems: Problems, count: Int[Array, ""], noise: Noise | None, shape: Shape, capacity: int
 ) -> tuple[Array, ...]:
-    """Solve the first ``count`` of ``room`` problems: parameters, DE, Deltam, k, steps, reasons, active bounds."""
+    """Solve the first ``count`` of ``capacity`` problems: parameters, DE, Deltam, k, steps, reasons, active bounds."""
     batch = _Batch(problems, sines_cosines(problems.q), None, None)
-    start = jnp.broadcast_to(problems.start, (room, len(shape.kept)))
+    start = jnp.broadcast_to(problems.start, (capacity, len(shape.solved)))
     if noise is not None:
-        batch = batch._replace(weights=_by_groups(partial(_weights, noise), batch, start, shape))
+        batch = batch._replace(weights=_in_groups(partial(_weights, noise), batch, start, shape))
     if shape.joint:
-        batch = batch._replace(joint_weights=_by_groups(_joint_weights, batch, start, shape))
-    ended = _work_off(batch, shape, count, room)
-    de, deltam, k, active = _by_groups(_figures, batch, ended.parameters, shape)
-    return ended.parameters, de, deltam, k, ended.steps, numbers_of(ended.reason), active
+        batch = batch._replace(joint_weights=_in_groups(_joint_weights, batch, start, shape))
+    solutions = _solve_all(batch, shape, count, capacity)
+    de, deltam, k, active = _in_groups(_metrics, batch, solutions.parameters, shape)
+    return solutions.parameters, de, deltam, k, solutions.steps, numbers_of(solutions.reason), active
 
 
 class _Batch(NamedTuple):
-    """A chunk, or a group of lanes taken from it."""
+    """A chunk, or a group of problems selected from it."""
 
     problems: Problems
     sines_cosines: SinesCosines
     weights: Weights | None  # of poses, where the noise is given
     joint_weights: tuple[Array, Array] | None  # of a joint solve: sigma and whitening
 
-    def taken(self, shape: Shape, index: Int[Array, " w"]) -> "_Batch":
-        """The problems of an index, one a lane."""
-        sines_cosines = (
-            (self.sines_cosines[0][:, index], self.sines_cosines[1][:, index])
-            if shape.batched.q
-            else self.sines_cosines
-        )
+    def selected(self, shape: Shape, index: Int[Array, " w"]) -> "_Batch":
+        """The problems of an index, one a slot."""
+        sines_cosines = self.sines_cosines
+        if shape.batched.q:
+            sines_cosines = (sines_cosines[0][:, index], sines_cosines[1][:, index])
         rest = jax.tree.map(lambda leaf: leaf[index], (self.weights, self.joint_weights))
-        return _Batch(_taken(self.problems, shape, index), sines_cosines, *rest)
+        return _Batch(_selected(self.problems, shape, index), sines_cosines, *rest)
 
 
-def _taken(problems: Problems, shape: Shape, index: Int[Array, " w"]) -> Problems:
-    """The problems of an index, one a lane; what is shared is repeated, but for q."""
+def _selected(problems: Problems, shape: Shape, index: Int[Array, " w"]) -> Problems:
+    """The problems of an index, one a slot; what is shared is repeated, but for q."""
 
-    def lanes_of(leaf: Array, many: bool) -> Array:
-        return leaf[index] if many else jnp.broadcast_to(leaf, (shape.lanes, *leaf.shape))
+    def slots_of(leaf: Array, many: bool) -> Array:
+        return leaf[index] if many else jnp.broadcast_to(leaf, (shape.slots, *leaf.shape))
 
     q = problems.q[index] if shape.batched.q else problems.q
-    return jax.tree.map(lanes_of, problems, shape.batched)._replace(q=q)
+    return jax.tree.map(slots_of, problems, shape.batched)._replace(q=q)
 
 
-def _by_groups(work: Callable, batch: _Batch, parameters: Float[Array, "room p"], shape: Shape) -> Any:
-    """``work(batch, parameters, shape)`` for all, as many at a time as there are lanes."""
+def _in_groups(work: Callable, batch: _Batch, parameters: Float[Array, "capacity p"], shape: Shape) -> Any:
+    """``work(batch, parameters, shape)`` for all, as many at a time as there are slots."""
 
     def group(row: Int[Array, ""]) -> Any:
-        index = row * shape.lanes + jnp.arange(shape.lanes)
-        return work(batch.taken(shape, index), parameters[index], shape)
+        index = row * shape.slots + jnp.arange(shape.slots)
+        return work(batch.selected(shape, index), parameters[index], shape)
 
-    found = jax.lax.map(group, jnp.arange(parameters.shape[0] // shape.lanes))
+    found = jax.lax.map(group, jnp.arange(parameters.shape[0] // shape.slots))
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
 
 
-def _work_off(batch: _Batch, shape: Shape, count: Int[Array, ""], room: int) -> _Ended:
-    """The loop over lanes; every lane takes the next problem of the chunk when its own has ended."""
-    kept = np.flatnonzero(shape.kept)
-    entries = tuple(shape.entries[i] for i in kept)
-    scale = jnp.asarray(np.asarray(shape.scale)[kept])
+def _solve_all(batch: _Batch, shape: Shape, count: Int[Array, ""], capacity: int) -> _Solutions:
+    """The loop over slots; every slot takes the next problem of the chunk when its own has ended."""
+    solved = np.flatnonzero(shape.solved)
+    indices = tuple(shape.indices[i] for i in solved)
+    scale = jnp.asarray(np.asarray(shape.scale)[solved])
 
     def starts(index: Array) -> tuple[Array, Box]:
-        part = _taken(batch.problems, shape, index)
-        start = part.start[:, kept]
-        return start, Box(part.lower[:, kept], part.upper[:, kept], jnp.broadcast_to(scale, start.shape))
+        part = _selected(batch.problems, shape, index)
+        start = part.start[:, solved]
+        return start, Box(part.lower[:, solved], part.upper[:, solved], jnp.broadcast_to(scale, start.shape))
 
     def evaluate(trial: Array, index: Array):
-        part = batch.taken(shape, index)
+        part = batch.selected(shape, index)
         problems = part.problems
-        geometry = _with_parameters(problems.geometry, problems.start.at[:, kept].set(trial), shape.entries)
+        geometry = _with_parameters(problems.geometry, problems.start.at[:, solved].set(trial), shape.indices)
         joint_weights = (
             None if part.joint_weights is None else JointWeights(shape.ends, problems.nominal, *part.joint_weights)
         )
-        return model_of(geometry, part.sines_cosines, shape.sizes, entries, joint_weights, part.weights)
+        return model_of(geometry, part.sines_cosines, shape.sizes, indices, joint_weights, part.weights)
 
     def more(carry) -> Bool[Array, ""]:
         _, index, _, _ = carry
         return jnp.any(index < count)
 
     def once(carry):
-        progress, index, following, ended = carry
-        now = jnp.minimum(index, count - 1)  # a lane without work repeats the last problem; its result is dropped
+        progress, index, upcoming, solutions = carry
+        now = jnp.minimum(index, count - 1)  # a slot without a problem repeats the last problem; its result is dropped
         _, box = starts(now)
-        progress = advance(progress, evaluate(progress.trial, now), box, SOLVER.rules)
+        progress = advance(progress, evaluate(progress.step.trial, now), box, SOLVER.rules)
         late = progress.steps >= shape.max_steps
         done = (progress.reason != Reason.running) | late
         reason = either(late & (progress.reason == Reason.running), Reason.max_steps, progress.reason)
-        slot = jnp.where(done & (index < count), index, room)
-        whole = _taken(batch.problems, shape, now).start.at[:, kept].set(progress.y)
-        ended = _Ended(
-            ended.parameters.at[slot].set(whole, mode="drop"),
-            ended.steps.at[slot].set(progress.steps, mode="drop"),
-            reasons(numbers_of(ended.reason).at[slot].set(numbers_of(reason), mode="drop")),
+        slot = jnp.where(done & (index < count), index, capacity)
+        whole = _selected(batch.problems, shape, now).start.at[:, solved].set(progress.y)
+        solutions = _Solutions(
+            solutions.parameters.at[slot].set(whole, mode="drop"),
+            solutions.steps.at[slot].set(progress.steps, mode="drop"),
+            reasons(numbers_of(solutions.reason).at[slot].set(numbers_of(reason), mode="drop")),
         )
-        index = jnp.where(done, following + jnp.cumsum(done) - 1, index)
-        following = following + jnp.sum(done)
+        index = jnp.where(done, upcoming + jnp.cumsum(done) - 1, index)
+        upcoming = upcoming + jnp.sum(done)
         fresh = begin(*starts(jnp.minimum(index, count - 1)))
-        return choose(done, fresh, progress), index, following, ended
+        return choose(done, fresh, progress), index, upcoming, solutions
 
-    first = jnp.arange(shape.lanes)
-    p = len(shape.kept)
-    nothing = _Ended(jnp.zeros((room, p)), jnp.zeros(room, dtype=jnp.int64), reasons(jnp.zeros(room, dtype=jnp.int32)))
-    carry = (begin(*starts(jnp.minimum(first, count - 1))), first, jnp.asarray(shape.lanes), nothing)
+    first = jnp.arange(shape.slots)
+    p = len(shape.solved)
+    empty = _Solutions(
+        jnp.zeros((capacity, p)), jnp.zeros(capacity, dtype=jnp.int64), reasons(jnp.zeros(capacity, dtype=jnp.int32))
+    )
+    carry = (begin(*starts(jnp.minimum(first, count - 1))), first, jnp.asarray(shape.slots), empty)
     return jax.lax.while_loop(more, once, carry)[3]
 
 
-def _with_parameters(rows: Geometry, vector: Float[Array, "w p"], entries: tuple[tuple[str, int], ...]) -> Geometry:
-    """Geometry of every lane ``(w, 1, n)`` with its free parameters from ``vector``; the axis of ones is for the poses."""
-    return jax.tree.map(lambda leaf: leaf[:, None, :], rows._replace(**with_values(rows, vector, entries)))
+def _with_parameters(rows: Geometry, vector: Float[Array, "w p"], indices: tuple[tuple[str, int], ...]) -> Geometry:
+    """Geometry of every slot ``(w, 1, n)`` with its free parameters from ``vector``; the axis of ones is for the poses."""
+    return jax.tree.map(lambda leaf: leaf[:, None, :], rows._replace(**with_values(rows, vector, indices)))
 
 
 def _tips(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> Float[Array, "w N 3"]:
-    geometry = _with_parameters(part.problems.geometry, parameters, shape.entries)
+    geometry = _with_parameters(part.problems.geometry, parameters, shape.indices)
     return jnp.swapaxes(forward_pass(geometry, part.sines_cosines).tip, -1, -2)
 
 
@@ -186,36 +189,36 @@ def _measurement(
     return Measurement(empty, sines_cosines(empty), nominal, u, shape.sizes, shape.ends, weights)
 
 
-def _figures(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> tuple[Array, ...]:
-    """DE, Deltam, k and active bounds of one group of lanes."""
+def _metrics(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> tuple[Array, ...]:
+    """DE, Deltam, k and active bounds of one group."""
     problems, tips = part.problems, _tips(part, parameters, shape)
-    figures = jax.vmap(lambda t: repeatability(t, shape.sizes, fitted=sum(shape.kept)))(tips)
-    k = jnp.ones(shape.lanes)
+    metrics = jax.vmap(lambda t: repeatability(t, shape.sizes, fitted=sum(shape.solved)))(tips)
+    k = jnp.ones(shape.slots)
     if shape.ends:
 
         def scale(t: Array, value: Array, uncertainty: Array, sigma: Array, weights: Weights | None) -> Array:
             return scale_of(t, _measurement(value, uncertainty, weights, shape), sigma).value
 
-        k = jax.vmap(scale)(tips, problems.nominal, problems.u, figures.sigma, part.weights)
+        k = jax.vmap(scale)(tips, problems.nominal, problems.u, metrics.sigma, part.weights)
     side = jnp.where(parameters <= problems.lower, -1, jnp.where(parameters >= problems.upper, 1, 0))
-    return figures.de, figures.deltam, k, jnp.where(jnp.asarray(shape.kept)[None], side, 0)
+    return metrics.de, metrics.deltam, k, jnp.where(jnp.asarray(shape.solved)[None], side, 0)
 
 
 def _weights(noise: Noise, part: _Batch, start: Float[Array, "w p"], shape: Shape) -> Weights:
-    """Weights of poses by the noise, in the arm at the start of one group of lanes."""
-    geometry = _with_parameters(part.problems.geometry, start, shape.entries)
+    """Weights of poses by the noise, in the arm at the start of one group."""
+    geometry = _with_parameters(part.problems.geometry, start, shape.indices)
     return Weights.of(tip_covariances(geometry, part.sines_cosines, noise), shape.sizes)
 
 
 def _joint_weights(part: _Batch, start: Float[Array, "w p"], shape: Shape) -> tuple[Array, Array]:
-    """What weighs poses and lengths in a joint solve, from the scatter at its start: sigma and whitening of every lane."""
+    """Sigma and whitening of every slot for a joint solve, from the scatter at its start."""
 
     def joint_weights(t: Array, value: Array, uncertainty: Array, weights: Weights | None) -> tuple[Array, Array]:
-        figures = repeatability(t, shape.sizes, fitted=shape.fitted)
-        sigma = jnp.maximum(figures.sigma, LEAST_SIGMA)
+        metrics = repeatability(t, shape.sizes, fitted=shape.fitted)
+        sigma = jnp.maximum(metrics.sigma, LEAST_SIGMA)
         measurement = _measurement(value, uncertainty, weights, shape)
         covariance = length_covariance(measurement.centroids(t), measurement, sigma)
         counted = sigma if weights is None else jnp.ones_like(sigma)
-        return counted, jnp.linalg.inv(jnp.linalg.cholesky(covariance))
+        return counted, inverse_cholesky(covariance)
 
     return jax.vmap(joint_weights)(_tips(part, start, shape), part.problems.nominal, part.problems.u, part.weights)

@@ -22,7 +22,7 @@ _IMPLAUSIBLE = 100.0  # residuals larger than that by this factor come from wron
 
 
 def based_on(space: Parameters, arm: Arm) -> Parameters:
-    """The free parameters on the given arm: fixed values come from the arm that is calibrated, not from the space's base."""
+    """The free parameters with the fixed values of the arm that is calibrated, and not of the space's base."""
     if arm.beta is None and space.base.beta is not None:
         arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
     return Parameters(base=arm, names=space.names)
@@ -61,7 +61,7 @@ def check_start(bounds: Bounds, vector: Array, what: str) -> None:
 
 
 def check_enough(sizes: tuple[int, ...], unknowns: int) -> None:
-    """Raise `InputError` where poses are too few: m poses in a socket give 3 (m - 1) equations, its own position takes three."""
+    """Raise `InputError` where poses are too few: m poses in a socket give 3 (m - 1) equations."""
     equations = 3 * sum(size - 1 for size in sizes)
     if equations < unknowns:
         sockets, poses = len(sizes), sum(sizes)

@@ -1,4 +1,4 @@
-"""Cross-validation: the arm identified without some of the sockets, and tried on them. The figure that a user should trust."""
+"""Cross-validation: the arm identified without some of the sockets, and evaluated on those left out."""
 
 from typing import Literal
 
@@ -21,7 +21,7 @@ from .stages import calibrate
 
 
 def groups_of(capture: Capture) -> tuple[tuple[str, ...], ...]:
-    """Sockets that reference lengths join: they stand or fall together."""
+    """Groups of sockets that reference lengths join, which are left out together."""
     group = list(range(len(capture.names)))
     for start, end in capture.ends():
         old, new = group[end], group[start]
@@ -33,7 +33,7 @@ def groups_of(capture: Capture) -> tuple[tuple[str, ...], ...]:
 
 
 def can_cross_validate(capture: Capture, parameters: int) -> bool:
-    """Whether each group can be left out, and what remains holds a reference length and enough poses for so many parameters."""
+    """Whether without any one group a reference length is left, and enough poses for so many parameters."""
     groups = groups_of(capture)
     with_lengths = {group for group in groups if any(length.start in group for length in capture.lengths)}
     if len(with_lengths) < 2:
@@ -51,23 +51,37 @@ def cross_validate(
     hold: str | None = "longest",
     noise: Noise | None = None,
 ) -> CrossValidation:
-    """Calibrate once without each group of sockets that reference lengths join, and try the result on that group.
+    """Calibrate once without each group of sockets that reference lengths join, and evaluate the result on that group.
 
-    Where errors exceed what the uncertainty predicts, the model misses something (joints that give, eccentric encoders) that
-    poses alike to those identified from do not show. Raises `InputError` where fewer than two groups hold a reference length.
+    Where errors exceed what the uncertainty predicts, the model misses an effect (elastic joints, eccentric encoders)
+    that poses similar to those identified from do not show.
+
+    Args:
+        arm: the nominal arm.
+        capture: sockets and reference lengths.
+        bounds: box of the free parameters ``(p,)``, mm and rad.
+        method: as for `calibrate`.
+        hold: the scale anchor of stage 1, as for `calibrate`.
+        noise: standard deviations of readings and seat, as for `calibrate`.
+
+    Returns:
+        Errors of each group, found and predicted, mm.
+
+    Raises:
+        InputError: fewer than two groups hold a reference length, or too few poses are left without one of them.
     """
     if not can_cross_validate(capture, len(bounds.space.names)):
         raise InputError(
-            "cross-validation leaves sockets out with their reference lengths, so it needs two groups of sockets that each hold a "
-            "length, and without the largest of them poses enough for the parameters; place the reference length somewhere else too, "
-            "or do without (--no-cross-validate)."
+            "cross-validation leaves sockets out with their reference lengths, so it needs two groups of sockets that "
+            "each hold a length, and without the largest of them poses enough for the parameters; place the reference "
+            "length somewhere else too, or leave cross-validation out (--no-cross-validate)."
         )
     found = []
     for group in groups_of(capture):
         rest = _part(capture, tuple(name for name in capture.names if name not in group))
         result = calibrate(arm, rest, bounds, method=method, hold=hold, noise=noise)
         left = _part(capture, group)
-        found.append(_tried(uncertainty_of(result), left, group, bool(result.converged)))
+        found.append(_evaluated(uncertainty_of(result), left, group, bool(result.converged)))
     return CrossValidation(tuple(found))
 
 
@@ -77,7 +91,7 @@ def _part(capture: Capture, names: tuple[str, ...]) -> Capture:
     return Capture({name: q for name, q in capture.sockets.items() if name in names}, lengths)
 
 
-def _tried(uncertainty: Uncertainty, left: Capture, group: tuple[str, ...], converged: bool) -> LeftOut:
+def _evaluated(uncertainty: Uncertainty, left: Capture, group: tuple[str, ...], converged: bool) -> LeftOut:
     evaluation = evaluate(uncertainty.arm, left)
     predicted, length_u = predicted_errors(uncertainty, left)
     return LeftOut(
@@ -92,8 +106,9 @@ def _tried(uncertainty: Uncertainty, left: Capture, group: tuple[str, ...], conv
 
 
 def predicted_errors(uncertainty: Uncertainty, capture: Capture) -> tuple[Float[Array, ""], Float[Array, " l"]]:
-    """What an arm's uncertainty and the readings' noise predict on a capture it was not identified from, mm: the RMS distance
-    from the sockets' centroids, and the standard uncertainty of the error of every reference length."""
+    """Predictions of an arm's uncertainty and the readings' noise for a capture that it was not identified from, mm:
+    the RMS distance from the sockets' centroids, and the standard uncertainty of the error of every reference
+    length."""
     arm, owner = uncertainty.arm, capture.owner
     sizes = np.asarray(capture.sizes, dtype=float)
     slopes = np.asarray(uncertainty.derivatives(capture.q))

@@ -54,7 +54,7 @@ def evaluate(arm: Arm, capture: Capture) -> Evaluation:
 
 @eqx.filter_jit
 def evaluate_measurement(arm: Arm, measurement: Measurement) -> Evaluation:
-    """`evaluate` for a capture already in the form that residuals take; nothing is checked."""
+    """`evaluate` for a capture that is a `Measurement` already; nothing is checked."""
     tips = arm.position(measurement.q)
     metrics = repeatability(tips, measurement.sizes)
     measured = u = jnp.zeros(0)

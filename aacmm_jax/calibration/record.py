@@ -10,7 +10,7 @@ from ..data.noise import Noise
 from ..data.recording import Recording
 from ..kinematics.parameters import Parameters
 from ..kinematics.specification import ArmSpecification
-from ..solver.levenberg_marquardt import Reason
+from ..solver.reason import Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .checks import largest_plausible_residual
 from .evaluation import Evaluation, evaluate
@@ -64,7 +64,7 @@ class CalibrationRecord(NamedTuple):
 
     @property
     def fixed_by_one_length(self) -> bool:
-        """Whether a single length fixed the scale, so that its own error as left is zero by construction: no measurement."""
+        """Whether a single length fixed the scale, so that its own error as left is zero by construction."""
         return self.method == "two-stage" and len(self.recording.capture.lengths) == 1 and not self.scale_set_by
 
     @property

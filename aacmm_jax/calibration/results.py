@@ -8,21 +8,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..core._compat import member_numbers
 from ..core.arrays import Numbers, is_concrete
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import Repeatability
 from ..model.scale import Scale
-from ..solver.levenberg_marquardt import Reason, numbers_of
+from ..solver.reason import Reason, numbers_of
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance
 from .checks import largest_plausible_residual
 
-_GOOD = [int(reason._value) for reason in (Reason.gradient, Reason.step, Reason.rounding)]  # pyright: ignore
+_GOOD = [int(member_numbers(reason)) for reason in (Reason.gradient, Reason.step, Reason.rounding)]
 
 
 class Identification(eqx.Module):
-    """Result of stage 1. A PyTree: under ``eqx.filter_vmap`` every array gains the batch axis.
+    """Result of stage 1. A PyTree: under ``eqx.filter_vmap`` every array has the batch axis first.
 
     ``parameters``, ``active`` and ``covariance`` are in the order of ``space.names``; mm and rad.
     """
@@ -193,8 +194,8 @@ def active_names(space: Parameters, active: Numbers) -> dict[str, str]:
 
 
 class LeftOut(NamedTuple):
-    """One group of sockets that an arm was not identified from; mm. Predictions are infinite where the other groups leave a
-    direction open that matters."""
+    """One group of sockets that an arm was not identified from; mm. Predictions are infinite where the other groups
+    leave a direction open that matters."""
 
     sockets: tuple[str, ...]
     poses: int  # in sockets with more than one
@@ -253,7 +254,7 @@ class CrossValidation(NamedTuple):
         return sum(not np.all(np.isfinite(group.length_u)) or group.rms_predicted == np.inf for group in self.groups)
 
     def ratios(self) -> list[tuple[float, int]]:
-        """Found over predicted, of poses and of lengths, and the number of values behind each; only those that are known."""
+        """Found over predicted, of poses and of lengths, and the number of values behind each, where they are known."""
         pairs = [
             (self.rms, self.rms_predicted, 3 * sum(group.poses for group in self.groups)),
             (self.length_rms, self.length_u, len(self._lengths()[0])),
@@ -262,7 +263,7 @@ class CrossValidation(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """By how much errors exceed what was predicted, the larger of both ratios: about 1 where the uncertainty is right."""
+        """Errors over their prediction, the larger of both ratios: about 1 where the uncertainty is right."""
         return max((ratio for ratio, _ in self.ratios()), default=float("nan"))
 
     @property

@@ -1,4 +1,4 @@
-"""Uncertainty without linearisation: Monte Carlo after JCGM 101, and the bootstrap over poses; both through the batch engine."""
+"""Uncertainty without linearisation: Monte Carlo after JCGM 101, and the bootstrap over poses."""
 
 import math
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from .batch import calibrate_many
 from .record import uncertainty_of
 from .results import Calibration
 
-_LENGTHS = 24  # lengths over the volume that are followed besides the parameters and k
+_LENGTHS = 24  # lengths over the working volume whose distribution is found with those of the parameters and k
 _REFINED = 5  # the standard's own tolerance is divided by this where a linear result is validated (JCGM 101, 8.2)
 
 
@@ -33,7 +33,7 @@ class Sampled(NamedTuple):
     quantities: tuple[str, ...]
     estimate: Float[np.ndarray, " q"]  # of the calibration itself
     u: Float[np.ndarray, " q"]
-    low: Float[np.ndarray, " q"]  # equal shares beyond both ends
+    low: Float[np.ndarray, " q"]  # as probable to be below it as above the other end
     high: Float[np.ndarray, " q"]
     linear_u: Float[np.ndarray, " q"]  # what the law of propagation says
     factor: float  # of the linear interval
@@ -46,10 +46,13 @@ class Sampled(NamedTuple):
 
     @property
     def agrees(self) -> Bool[np.ndarray, " q"]:
-        """Where the linear interval's ends differ from the sampled ones by no more than the tolerance (JCGM 101, 8.2)."""
-        off = np.stack([
-            self.estimate - self.factor * self.linear_u - self.low, self.estimate + self.factor * self.linear_u - self.high
-        ])  # fmt: skip
+        """Where both ends of the linear interval agree with the sampled ones to the tolerance (JCGM 101, 8.2)."""
+        off = np.stack(
+            [
+                self.estimate - self.factor * self.linear_u - self.low,
+                self.estimate + self.factor * self.linear_u - self.high,
+            ]
+        )
         return np.all(np.abs(off) <= self.tolerance, axis=0)
 
     def table(self) -> dict[str, np.ndarray]:
@@ -66,14 +69,14 @@ class Sampled(NamedTuple):
         percent = f"{100 * self.level:g} %"
         if apart:
             found.append(
-                f"The linear {percent} intervals differ from the Monte Carlo ones by more than the tolerance of JCGM 101 for "
-                f"{len(apart)} of {len(self.quantities)} quantities: {', '.join(apart[:8])}{' ...' if len(apart) > 8 else ''}; "
-                "use the Monte Carlo ones."
+                f"The linear {percent} intervals differ from the Monte Carlo ones by more than the tolerance of JCGM "
+                f"101 for {len(apart)} of {len(self.quantities)} quantities: {', '.join(apart[:8])}"
+                f"{' ...' if len(apart) > 8 else ''}; use the Monte Carlo ones."
             )
         else:
             found.append(
-                f"The linear {percent} intervals agree with those of {self.trials} Monte Carlo trials within the tolerance of JCGM 101, for "
-                "every parameter, k, and lengths over the volume."
+                f"The linear {percent} intervals agree with those of {self.trials} Monte Carlo trials within the "
+                "tolerance of JCGM 101, for every parameter, k, and lengths over the volume."
             )
         return found
 
@@ -91,17 +94,32 @@ def monte_carlo(
 ) -> Sampled:
     """Propagation of distributions (JCGM 101:2008): the whole calibration is repeated on readings drawn anew.
 
-    Readings are drawn about poses that the calibrated arm holds exactly in their sockets, with the calibration's noise (given
-    or estimated; or ``noise``), certified lengths with their u. Blocks of max(100 / (1 - level), 10,000) trials are added until
-    mean, u and both ends of the interval of every quantity are stable to a fifth of the tolerance for ``digits`` significant
-    digits of u, or ``most`` trials are done. ``lengths`` are poses at both ends, ``(v, n)`` each (default: 24 over the volume).
+    Readings are drawn about poses in which the calibrated arm meets its sockets exactly, certified lengths with their
+    u. Blocks of max(100 / (1 - level), 10,000) trials are added until mean, u and both ends of the interval of every
+    quantity are stable to a fifth of the tolerance (section 7.9). Bounds act in every trial as they did in the
+    calibration, so the distribution ends where one is active.
 
-    Bounds act in every trial as they did in the calibration, so where one is active the distribution ends there.
+    Args:
+        result: what `calibrate` returned.
+        capture: the capture that it was identified from.
+        level: coverage probability of the intervals.
+        digits: significant digits of u that must be stable, 1 or 2.
+        most: most trials.
+        lengths: poses at both ends of the lengths to follow ``(v, n)`` each, rad; by default 24 over the working
+            volume.
+        noise: standard deviations of readings and seat, instead of the calibration's own.
+        seed: of the random numbers.
+
+    Returns:
+        Distribution of every parameter, k and the lengths, with the linear result to compare it with.
+
+    Raises:
+        InputError: a number is out of range, or hardly any trial converges.
     """
     if digits not in (1, 2):
         raise InputError(f"digits is {digits}; give 1 or 2 significant digits of the uncertainty.")
     if not 0 < level <= 0.9999:
-        raise InputError(f"level is {level:g}; give a share between 0 and 0.9999, for example 0.95.")
+        raise InputError(f"level is {level:g}; give a probability between 0 and 0.9999, for example 0.95.")
     if not isinstance(result, Calibration):
         raise InputError("monte_carlo repeats a whole calibration; give the result of aj.calibrate.")
     if noise is not None:
@@ -117,10 +135,10 @@ def monte_carlo(
     stable = False
     while sum(map(len, drawn)) + failed < most and not stable:
         random = np.random.default_rng([seed, len(drawn)])
-        pieces = []
+        parts = []
         for count in _slices(block, exact.size):
-            # Noise estimated with few degrees of freedom is itself uncertain: its scale is drawn too, which gives Student's t
-            # (JCGM 101, 6.4.9).
+            # Noise estimated with few degrees of freedom is itself uncertain: its scale is drawn too, which gives
+            # Student's t (JCGM 101, 6.4.9).
             known = math.isinf(result.degrees_of_freedom)
             level_of = (
                 1.0
@@ -134,9 +152,9 @@ def monte_carlo(
             readings += np.asarray(noise.encoder) * level_of * random.normal(size=readings.shape)
             values = true_lengths + task.u * random.normal(size=(count, len(task.u)))
             solved, lost = task.solved(readings, values)
-            pieces.append(solved)
+            parts.append(solved)
             failed += lost
-        found = np.concatenate(pieces)
+        found = np.concatenate(parts)
         drawn.append(found)
         if len(found) < 10:
             raise InputError(
@@ -145,7 +163,7 @@ def monte_carlo(
         low, high = np.quantile(found, [(1 - level) / 2, (1 + level) / 2], axis=0)
         blocks.append(np.stack([found.mean(axis=0), found.std(axis=0, ddof=1), low, high]))
         u = np.concatenate(drawn).std(axis=0, ddof=1)
-        stable = len(blocks) > 1 and bool(np.all(_unsettled(blocks) <= numerical_tolerance(u, digits) / _REFINED))
+        stable = len(blocks) > 1 and bool(np.all(_instability(blocks) <= numerical_tolerance(u, digits) / _REFINED))
     return task.sampled(result, np.concatenate(drawn), stable, failed, level, digits)
 
 
@@ -154,7 +172,21 @@ def bootstrap(
 ) -> Sampled:
     """The calibration repeated on poses drawn with replacement from each socket, and lengths drawn with their u.
 
-    It assumes nothing of the errors but that poses are independent. (A socket of m poses then scatters by (m - 1) / m too little.)
+    It only assumes that the errors of poses are independent. (The variance of a socket of m poses is (m - 1) / m too
+    small.)
+
+    Args:
+        result: what `calibrate` returned.
+        capture: the capture that it was identified from.
+        trials: how many repetitions, at least 100.
+        level: coverage probability of the intervals.
+        seed: of the random numbers.
+
+    Returns:
+        Distribution of every parameter, k and lengths over the working volume.
+
+    Raises:
+        InputError: too few trials, or hardly any of them converges.
     """
     if trials < 100:
         raise InputError(f"{trials} trials show no distribution; ask for at least 100.")
@@ -183,14 +215,14 @@ def numerical_tolerance(u: Float[np.ndarray, " q"], digits: int) -> Float[np.nda
     return np.where(u > 0, 0.5 * 10**exponent, 0.0)
 
 
-def _unsettled(blocks: list[np.ndarray]) -> Float[np.ndarray, " q"]:
+def _instability(blocks: list[np.ndarray]) -> Float[np.ndarray, " q"]:
     """Twice the standard deviation of the averages over blocks, of the worst of mean, u and both ends."""
     count = len(blocks)
     return 2 * np.std(blocks, axis=0, ddof=1).max(axis=0) / math.sqrt(count)
 
 
 def _slices(block: int, numbers: int) -> list[int]:
-    """A block of trials in pieces whose readings take 200 MB at most."""
+    """Sizes of the parts of a block of trials, so that the readings of each take 200 MB at most."""
     most = max(int(2.5e7 / numbers), 1)
     return [min(most, block - first) for first in range(0, block, most)]
 
@@ -233,7 +265,7 @@ class _Task(NamedTuple):
     def solved(self, q: Float[np.ndarray, "t N n"], values: Float[np.ndarray, "t l"]) -> tuple[np.ndarray, int]:
         """Outputs of the trials that converged ``(t, q)``, and how many did not."""
         result = self.result
-        given = None if result.stage1.reduced_chi is None else result.noise  # weighed as the calibration was
+        given = None if result.stage1.reduced_chi is None else result.noise  # weighted as the calibration was
         many = calibrate_many(
             result.stage1.arm,
             batch_of(self.capture, q, values),
@@ -254,7 +286,7 @@ class _Task(NamedTuple):
     def sampled(
         self, result: Calibration, values: np.ndarray, stable: bool, failed: int, level: float, digits: int
     ) -> Sampled:
-        """The trials' distribution beside the linear result."""
+        """The trials' distribution, with the linear result to compare it with."""
         linear = uncertainty_of(result)
         u_length = np.asarray(linear.length(self.start, self.end))
         u = values.std(axis=0, ddof=1)

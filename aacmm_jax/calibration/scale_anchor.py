@@ -1,4 +1,4 @@
-"""What sets the scale in stage 1, which repeatability alone leaves open: a free length kept at its start, or fixed lengths."""
+"""The scale anchor of stage 1: a free length kept at its start, or fixed lengths that determine the scale well."""
 
 import math
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from .checks import based_on
 
 # Fixed lengths set the scale where repeatability with them would determine it to this relative standard uncertainty ...
 _LARGEST_UNCERTAINTY = 1e-4
-# ... with about 70 poses (equations less unknowns) and, where the noise is not given, tips that scatter by this much, mm.
+# ... with 200 equations to spare (about 70 poses) and, where the noise is not given, tips that scatter by so many mm.
 _EQUATIONS = 200
 _SCATTER = 0.02
 _CONFIGURATIONS = 100
@@ -70,7 +70,7 @@ def scale_anchor(space: Parameters, arm: Arm, hold: str | None, noise: Noise | N
 
 
 def fixed_lengths(arm: Arm, space: Parameters) -> tuple[str, ...]:
-    """Fixed lengths that a change of scale concerns: all that are not zero, but for ``d_1``; all, where values are traced."""
+    """Fixed lengths that the scale concerns: all but ``d_1`` and, where values are known, those that are zero."""
     names = [name for name in parameter_names(arm) if is_length(name) and name not in ("d_1", *space.names)]
     if not is_concrete(*jax.tree.leaves(arm)):
         return tuple(names)
@@ -102,14 +102,14 @@ def _columns(arm: Arm, names: tuple[str, ...]) -> Float[np.ndarray, "rows k"]:
 def _sets_scale(arm: Arm, space: Parameters, fixed: tuple[str, ...], noise: Noise | None) -> bool:
     """Whether repeatability determines the scale well, given the fixed lengths.
 
-    A common relative change of the fixed lengths is imitated by the free parameters as well as they can; the residual, in
-    mm at the tip, is what repeatability sees of the scale. The nominal arm may be in a special position that the real
-    one does not share, so the smaller of two residuals counts: there, and next to it.
+    A common relative change of the fixed lengths is imitated by the free parameters as well as they can; the residual,
+    in mm at the tip, is what repeatability sees of the scale. The nominal arm may be in a special position that the
+    real one does not share, so the smaller of two residuals counts: at the nominal arm, and at a neighbouring one.
     """
     sizes = []
     with jax.ensure_compile_time_eval():
-        for place in (arm, neighbouring_arm(arm, space.names)):
-            columns = _columns(place, (*space.names, *fixed))
+        for one in (arm, neighbouring_arm(arm, space.names)):
+            columns = _columns(one, (*space.names, *fixed))
             free = columns[:, : len(space.names)] * natural_steps(space.names)
             scaling = columns[:, len(space.names) :] @ np.array([value_of(arm, name) for name in fixed])
             residual = scaling - free @ np.linalg.lstsq(free, scaling, rcond=1e-10)[0]
@@ -128,15 +128,15 @@ def _scatter(arm: Arm, noise: Noise | None) -> float:
 def _partners(arm: Arm, one: Arm, space: Parameters, fixed: tuple[str, ...]) -> Partners | None:
     """Free lengths that replace the fixed ones exactly, whatever the free angles are.
 
-    Tips are linear in the lengths, so the weights are a linear least squares; that they serve two arms with different free
-    angles shows that they follow from the fixed angles alone (alpha_n = 0 makes d_n and probe_z one).
+    Tips are linear in the lengths, so the weights are a linear least squares; that they serve two arms with different
+    free angles shows that they follow from the fixed angles alone (alpha_n = 0 makes d_n and probe_z one).
     """
     angles = [name for name in parameter_names(arm) if not is_length(name) and name not in space.names]
     if any(np.ptp(value_of(arm, name)) > 0 for name in angles):
         return None  # the arms of this batch have different fixed angles
     free = tuple(name for name in space.names if is_length(name) and name != "d_1")
     with jax.ensure_compile_time_eval():
-        rows = np.concatenate([_columns(place, (*free, *fixed)) for place in (one, neighbouring_arm(one, space.names))])
+        rows = np.concatenate([_columns(other, (*free, *fixed)) for other in (one, neighbouring_arm(one, space.names))])
     replaceable, wanted = rows[:, : len(free)], rows[:, len(free) :]
     weights = np.linalg.lstsq(replaceable, wanted, rcond=1e-10)[0] if free else np.zeros((0, len(fixed)))
     if np.any(np.linalg.norm(wanted - replaceable @ weights, axis=0) > _EXACT * np.linalg.norm(wanted, axis=0) + 1e-12):

@@ -1,10 +1,10 @@
-"""Stage 2 of a calibration: the scale of the arm from reference lengths, with fixed parameters as they are, within bounds.
+"""Stage 2 of a calibration: the arm's scale from reference lengths, with fixed parameters as they are, within bounds.
 
-Stage 1 leaves the scale to its anchor, a length kept at its start, and k = measured / nominal says how wrong that was. The
-result is what stage 1 gives with the anchor at the value for which k = 1. Nearly always that is the arm divided by k: if no
-bound acts on a length, the scale changes nothing that repeatability sees, and fixed lengths that free ones replace
+Stage 1 leaves the scale to its anchor, a length kept at its start, and k = measured / nominal is its error. The result
+of stage 2 is what stage 1 finds with the anchor at the value for which k = 1. Nearly always that is the arm divided by
+k: if no bound acts on a length, repeatability does not change with the scale, and fixed lengths that free ones replace
 exactly (d_n by a probe along the same axis) can stay. Otherwise (a length on a bound, or carried over it by the
-division; a fixed length that has no partner) stage 1 is repeated with the anchor adjusted until k = 1: `adjust_anchor`.
+division; a fixed length that has no such partner) stage 1 is repeated with the anchor adjusted until k = 1.
 
 Where fixed lengths set the scale by themselves, nothing is changed and k only compares them with the reference lengths.
 """
@@ -24,7 +24,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement
 from ..model.scale import divide_free_lengths, divisible, replaced_lengths, scale_of
-from ..solver.levenberg_marquardt import Reason, numbers_of, reasons
+from ..solver.reason import Reason, numbers_of, reasons
 from .scale_anchor import ScaleAnchor
 from .task import Task, fit_repeatability
 
@@ -63,7 +63,7 @@ def must_adjust(
     scaled: Float[Array, "... p"],
 ) -> Bool[Array, "..."]:
     """Whether the division is not the result of stage 2, given what was active in stage 1; see the module."""
-    lengths = jnp.asarray(divisible(bounds.space))
+    lengths = jnp.broadcast_to(jnp.asarray(divisible(bounds.space)), scaled.shape)
     concerned = (scaled < bounds.lower - _OUTSIDE) | (scaled > bounds.upper + _OUTSIDE)
     if anchor.hold is not None:  # without an anchor it is the active bounds that set the scale of stage 1
         concerned = concerned | (active != 0)
@@ -86,7 +86,7 @@ def adjust_anchor(
 ) -> Adjusted:
     """Stage 1 repeated with its anchor adjusted by the secant method until k = 1, from the divided parameters.
 
-    Derivatives pass through every round; the secant's slope is constant for them, so they are exact where k = 1 is reached.
+    Derivatives pass through every round, with the slope of the secant as a constant: exact where k = 1 is reached.
     """
     space, bounds, name = task.space, task.bounds, task.anchor.adjusted
     assert name is not None
@@ -117,7 +117,7 @@ def second_stage_many(
 ) -> dict[str, Any]:
     """Stage 2 of a batch: the fields of `ManyCalibrations` that it decides, from stage 1's `ManyIdentifications`.
 
-    ``identify_again(rows, start)`` repeats stage 1 for some of the problems, with the adjusted length kept at its start.
+    ``identify_again(rows, start)`` repeats stage 1 for some of the problems and keeps the adjusted length.
     """
     lower, upper = (np.broadcast_to(side, stage1.parameters.shape) for side in (lower, upper))
     scaled = np.array(divided(anchor, space, jnp.asarray(stage1.parameters), jnp.asarray(stage1.k)))
@@ -176,7 +176,7 @@ def rows_of(rows: np.ndarray, arm: Arm, capture: Capture, *boxes: np.ndarray) ->
 
 
 def _secant(length: Any, last_length: Any, log_k: Any, last_log_k: Any, lower: Any, upper: Any) -> Array:
-    """The next value of an adjusted length, within its bounds: a secant step of log k towards 0, the first of slope 1."""
+    """The next value of the adjusted length, within bounds: a secant step of log k towards 0, the first of slope 1."""
     moved = length != last_length
     ratio = jnp.log(jnp.where(moved, length / jnp.where(moved, last_length, 1.0), 2.0))
     slope = jnp.where(moved, jnp.clip((log_k - last_log_k) / ratio, *_SLOPES), 1.0)

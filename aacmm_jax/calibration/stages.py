@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..core._compat import inside_trace
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..data.capture import Capture
@@ -19,7 +20,7 @@ from ..model.measurement import Measurement, check_joints
 from ..model.metrics import repeatability
 from ..model.residuals import joint_model, joint_residual
 from ..solver.bounded import least_squares
-from ..solver.levenberg_marquardt import Reason
+from ..solver.reason import Reason
 from ..uncertainty import propagation
 from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
@@ -47,8 +48,8 @@ def identify(
     """Stage 1: the parameters that make the poses of every socket agree, within bounds.
 
     Minimises the summed squared distance of the tips from their socket's centroid (Cheng et al. 2018, section 2.2).
-    Repeatability does not determine the scale of the arm, and noise makes it shrink, so one length, the scale anchor, is
-    kept at its start.
+    Repeatability does not determine the scale of the arm, and noise makes it shrink, so one length, the scale anchor,
+    is kept at its start.
 
     Differentiable with respect to angles, bounds and the arm, exactly, also where a bound is active (not in directions
     that the data leave open, such as the scale of noise-free data without an anchor). Failure to converge is data
@@ -61,8 +62,8 @@ def identify(
         hold: the scale anchor. A free length by name; "longest", the longest free link, or none where fixed lengths
             determine the scale well; None, no anchor, as in the paper (then expect active bounds).
         start: free parameters ``(p,)`` to start from instead of the arm's, mm and rad.
-        noise: standard deviations of readings and seat. Where given, every pose is weighted by the inverse covariance of
-            its tip, and the covariance of the result follows from it; else both are estimated from the residuals.
+        noise: standard deviations of readings and seat. Where given, every pose is weighted by the inverse covariance
+            of its tip, and the covariance of the result follows from it; else both are estimated from the residuals.
         noise_model: another model of the tips' errors, one of `uncertainty.covariance.NOISE_MODELS`.
         max_steps: most evaluations of the residual.
 
@@ -115,12 +116,12 @@ def calibrate(
     """Both stages: identify from repeatability, then fix the scale with the reference lengths.
 
     "two-stage" divides the arm of stage 1 by k = measured / nominal. Fixed parameters stay as they are, to the bit, and
-    the result is inside the box: where the division cannot give that, stage 1 is repeated with its anchor adjusted until
-    k = 1 (`calibration.second_stage`). Where fixed lengths set the scale, k changes nothing.
+    the result is inside the box: where the division cannot give that, stage 1 is repeated with its anchor adjusted
+    until k = 1 (`calibration.second_stage`). Where fixed lengths set the scale, k changes nothing.
 
-    "joint" goes on from there with one least squares of repeatability and lengths together, each weighted by its standard
-    deviation: that of a tip coordinate from stage 1's residuals; that of a length from its u and from the scatter of the
-    poses at its ends.
+    "joint" goes on from there with one least squares of repeatability and lengths together, each weighted by its
+    standard deviation: that of a tip coordinate from stage 1's residuals; that of a length from its u and from the
+    scatter of the poses at its ends.
 
     Args:
         arm: as for `identify`, like all arguments that are not named here.
@@ -144,8 +145,8 @@ def calibrate(
         raise InputError(f"method is '{method}'; it must be 'two-stage' or 'joint'.")
     if not capture.lengths:
         raise InputError(
-            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, from "
-            "Python, identify for stage 1 alone)."
+            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, "
+            "from Python, identify for stage 1 alone)."
         )
     task = _checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
     _check_identifiable(capture, task, strict)
@@ -159,9 +160,8 @@ def calibrate(
 
 
 def _check_identifiable(capture: Capture, task: Task, strict: bool) -> None:
-    """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine, unless values are traced."""
-    # Inside jit or vmap even what is constant becomes a tracer once JAX computes with it.
-    if not is_concrete(jnp.negative(0.0), *jax.tree.leaves((capture, task.bounds))):
+    """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; not of traced values."""
+    if inside_trace() or not is_concrete(*jax.tree.leaves((capture, task.bounds))):
         return
     sentences = observability(task.space.base, capture, task.space).sentences()
     if sentences and strict:
@@ -318,10 +318,7 @@ def _joint(task: Task) -> Calibration:
     stage1, _ = _stage1(task)
     assert stage1.scale is not None
     space, k = task.space, stage1.scale.value
-    # The joint solve waits for stage 1's covariance: see `covariance.inverse_information`.
-    parameters, _ = jax.lax.optimization_barrier((
-        divided(task.anchor, space, stage1.parameters, k), stage1.parameter_covariance.matrix
-    ))  # fmt: skip
+    parameters = divided(task.anchor, space, stage1.parameters, k)
     scaled = space.arm(parameters)
     measurement = task.measurement.weighted(scaled.geometry, task.noise)
     sigma = stage1.after.sigma / k

@@ -39,7 +39,7 @@ class Task(NamedTuple):
 def fit_repeatability(
     task: Task, measurement: Measurement, start: Float[Array, " p"], hold: str | None
 ) -> tuple[Float[Array, " p"], optx.Solution]:
-    """The parameters of least squared distance of the tips from their sockets' centroids, within bounds, with one kept."""
+    """Stage 1's least squares within bounds, with one parameter kept at its start; the parameters and how it ended."""
     space = task.space
     index = jnp.asarray(np.flatnonzero([name != hold for name in space.names]))
     reduced = Parameters(base=space.arm(start), names=tuple(name for name in space.names if name != hold))

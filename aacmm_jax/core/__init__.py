@@ -1,1 +1,1 @@
-"""Arrays, errors, units and 64-bit floats: what every other folder stands on."""
+"""Arrays, errors, units, 64-bit floats and small linear algebra: what every other folder imports."""

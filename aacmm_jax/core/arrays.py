@@ -1,29 +1,32 @@
-"""Numbers at the door: what people pass for arrays, made into float64 arrays or refused."""
+"""What people pass for arrays of numbers, converted to float64 arrays or refused."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from . import _compat
 from .errors import InputError
+from .x64 import check_x64
 
 # What people pass for an array of numbers; lists are converted and checked.
 Numbers = ArrayLike | Sequence[Any]
 
+_CHUNK = 256  # rows of a block
 _KINDS = {"U": "text", "S": "text", "b": "true or false", "c": "complex numbers"}
 
 
 def is_concrete(*arrays: object) -> bool:
-    """Whether values can be looked at now; inside jit, vmap or grad they cannot, and checks of values are left out."""
-    return not any(isinstance(array, jax.core.Tracer) for array in arrays)
+    """Whether values are known now; inside jit, vmap or grad they are not, and checks of values are left out."""
+    return not any(_compat.is_traced(array) for array in arrays)
 
 
 def as_array(value: Numbers, what: str) -> Array:
     """A float64 array, or `InputError` that names ``what``."""
+    check_x64()
     try:
         array = value if isinstance(value, jax.Array) else np.asarray(value)
     except jax.errors.TracerArrayConversionError:
@@ -38,8 +41,9 @@ def as_array(value: Numbers, what: str) -> Array:
 def joined(rows: Sequence[Array | np.ndarray], axis: int = 0, new: bool = False) -> Array:
     """Arrays concatenated along an axis, or stacked along a new one; by NumPy where values are known.
 
-    At the edges a call of NumPy costs microseconds, and one of JAX outside jit a compiled kernel: 5 to 30 ms in every process.
+    Outside jit a call of NumPy costs microseconds, and one of JAX a compiled kernel: 5 to 30 ms in every process.
     """
+    check_x64()
     known = is_concrete(*rows)
     tools: Any = np if known else jnp
     whole = (tools.stack if new else tools.concatenate)(rows, axis=axis)
@@ -55,13 +59,10 @@ def as_floats(value: Numbers, what: str) -> Array:
 
 
 def in_chunks(work: Callable[[np.ndarray], np.ndarray], rows: np.ndarray) -> np.ndarray:
-    """``work`` on whole blocks of rows; the last is filled up with its first row."""
-    pieces = []
+    """``work`` on blocks of equal size, so that it is compiled once; the last is filled up with its first row."""
+    results = []
     for first in range(0, len(rows), _CHUNK):
         block = rows[first : first + _CHUNK]
         filled = np.concatenate([block, np.repeat(block[:1], _CHUNK - len(block), axis=0)])
-        pieces.append(work(filled)[: len(block)])
-    return np.concatenate(pieces)
-
-
-_CHUNK = 256  # poses at a time: one compiled program for captures of every size
+        results.append(work(filled)[: len(block)])
+    return np.concatenate(results)

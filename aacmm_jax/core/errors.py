@@ -1,4 +1,4 @@
-"""The one exception and the one warning that people see, and the wording helpers they need."""
+"""The exception and the warning of the package, and a helper for their wording."""
 
 import difflib
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""Units at the edges: everything inside is in mm and rad. A value times its unit is in mm or rad; divided by it, in the unit."""
+"""Units in mm and rad, which everything inside is in: a value times its unit is in mm or rad; divided by it, in the unit."""
 
 import math
 

@@ -1,11 +1,13 @@
-"""Turns on JAX's 64-bit floats; imported before anything else of the package.
+"""Turns on JAX's 64-bit floats, and refuses to go on without them; imported before anything else of the package.
 
-A calibration in float32 is silently wrong by tens of micrometres, so an explicit request for it is refused.
+A calibration in float32 is wrong by tens of micrometres without any sign of it.
 """
 
 import os
 
 import jax
+
+from .errors import InputError
 
 _setting = os.environ.get("JAX_ENABLE_X64")
 if _setting is not None and _setting.strip().lower() in {"0", "false", "off", "no"}:
@@ -14,3 +16,12 @@ if _setting is not None and _setting.strip().lower() in {"0", "false", "off", "n
         "wrong by tens of micrometres; unset JAX_ENABLE_X64 or set it to 1."
     )
 jax.config.update("jax_enable_x64", True)
+
+
+def check_x64() -> None:
+    """Raise `InputError` where 64-bit floats were turned off after the import."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise InputError(
+            "64-bit floats were turned off after aacmm_jax was imported, and in float32 a calibration is wrong by tens of "
+            "micrometres; leave jax.enable_x64(False), or call jax.config.update('jax_enable_x64', True)."
+        )

@@ -145,7 +145,7 @@ def _order(arm: Arm, parallel: list[int]) -> list[str]:
     angles = [f"{kind}_{i}" for i in range(1, n) for kind in ("alpha", "theta")]
     # Of what lies beyond the last joint, the probe comes before the link, since probes are changed.
     tip = {"probe_z": float(arm.probe[2]), f"d_{n}": values["d"][-1]}
-    # theta of the last joint is seen by a tip that stands off its axis; near the axis x and y of the probe are.
+    # theta of the last joint is determined by a tip off its axis; near the axis x and y of the probe are.
     x, y, z = np.asarray(arm.probe)
     off = math.hypot(float(arm.a[-1]) + x, y * math.cos(float(arm.alpha[-1])) - z * math.sin(float(arm.alpha[-1])))
     wrist = [f"theta_{n}", "probe_x", "probe_y"] if off > _OFF_AXIS else ["probe_x", "probe_y", f"theta_{n}"]

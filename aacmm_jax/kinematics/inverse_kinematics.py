@@ -176,19 +176,6 @@ def project_to_targets(
     return found[:, :-1], found[:, -1] <= _ARRIVED
 
 
-def newton_steps_to_targets(
-    arm: Arm, q: Float[Array, "N n"], targets: Float[Array, "N 3"], steps: int
-) -> Float[Array, "N n"]:
-    """Configurations near their targets, projected by a few least-norm Newton steps; differentiable, without limits."""
-
-    def step(q: Array, _: None) -> tuple[Array, None]:
-        forward = forward_pass(arm.geometry, sines_cosines(q))
-        moves = damped_inverse(jacobian_columns(forward)["theta"], jnp.full(q.shape[0], 1e-6))
-        return q + jnp.sum(moves * (targets.T - forward.tip)[None], axis=1).T, None
-
-    return jax.lax.scan(step, q, None, length=steps)[0]
-
-
 def project_to_centroids(arm: Arm, capture: SocketPoses, targets_of: Arm | None = None) -> Float[np.ndarray, "N n"]:
     """The configurations of a capture moved by least-norm steps until each tip is at its socket's centroid.
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..core._compat import SymbolicZero
 from .chain import ForwardPass, Geometry, components_last, forward_pass, joints_first, sines_cosines
 
 
@@ -59,7 +60,7 @@ def _tip_position_jvp(primals, tangents):
     moved = jnp.zeros_like(forward.tip)
     for kind, tangent in pairs:
         # Unperturbed arguments arrive as symbolic zeros: a derivative by parameters then never touches q.
-        if not isinstance(tangent, jax.custom_derivatives.SymbolicZero):
+        if not isinstance(tangent, SymbolicZero):
             moved = moved + jnp.sum(columns[kind] * joints_first(tangent, rank), axis=0)
     return components_last(forward.tip, geometry, q), components_last(moved, geometry, q)
 

@@ -1,4 +1,4 @@
-"""A capture in the form that residuals take: poses, sockets and lengths, and the means over sockets."""
+"""A capture as arrays for the residuals: poses, sockets and lengths, and the means over sockets."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,10 +18,10 @@ LEAST_SIGMA = 1e-9
 
 
 class Measurement(eqx.Module):
-    """A capture in the form that residuals take: all poses, which socket each belongs to, and the lengths.
+    """A capture as arrays: all poses, socket after socket, and the reference lengths.
 
-    ``sizes`` and ``ends`` are static: they fix the shape of the problem, as the number of poses does. ``turns`` are the
-    cosines and sines of q, which every evaluation needs and none changes. With ``weights``, centroids are weighted means.
+    ``sizes`` and ``ends`` are static: they fix the shape of the problem, as the number of poses does. ``sines_cosines``
+    are those of q, which every evaluation needs and none changes. With ``weights``, centroids are weighted means.
     """
 
     q: Float[Array, "N n"]
@@ -47,7 +47,7 @@ class Measurement(eqx.Module):
         )
 
     def weighted(self, geometry: Geometry, noise: Noise | None) -> "Measurement":
-        """The same with poses weighed by the inverse covariance that ``noise`` gives their tips in an arm about this one."""
+        """The same with weights: the inverse covariances of the tips by ``noise``, for an arm close to this one."""
         if noise is None:
             return self
         weights = Weights.of(tip_covariances(geometry, self.sines_cosines, noise), self.sizes)
@@ -70,11 +70,11 @@ class Measurement(eqx.Module):
         return tips - jnp.asarray(membership(self.sizes).T) @ self.centroids(tips)
 
     def whitened(self, centred: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
-        """Centred tips as a least squares counts them: in standard deviations where there are weights, else in mm."""
+        """Centred tips in the units of the least squares: standard deviations where there are weights, else mm."""
         return centred if self.weights is None else self.weights.whiten(centred.T).T
 
     def centroid_covariances(self, sigma: Float[Array, ""]) -> Float[Array, "s 3 3"]:
-        """Covariance of each socket's mean, mm^2: what the weights say, or ``sigma``^2 of a tip coordinate over the poses."""
+        """Covariance of each socket's mean, mm^2: by the weights, else ``sigma``^2 of a coordinate over the poses."""
         if self.weights is not None:
             return jnp.einsum("abs,cbs->sac", self.weights.centroid_factor, self.weights.centroid_factor)
         return sigma**2 * jnp.asarray(np.eye(3)[None] / np.asarray(self.sizes, dtype=float)[:, None, None])
@@ -104,7 +104,8 @@ def check_joints(capture: Capture, space: Parameters) -> None:
     """Raise `InputError` where capture and arm differ in their number of joints."""
     if capture.joints != space.base.joints:
         raise InputError(
-            f"the capture has {capture.joints} columns, but the arm has {space.base.joints} joints; give one column a joint."
+            f"the capture has {capture.joints} columns, but the arm has {space.base.joints} joints; give one column a "
+            "joint."
         )
 
 
@@ -114,14 +115,14 @@ def length_covariance(
     sigma: Float[Array, ""],
     scale_factor: Float[Array, "..."] | float = 1.0,
 ) -> Float[Array, "l l"]:
-    """Covariance of measured minus nominal lengths, mm^2, by an arm that is ``stretch`` times too large.
+    """Covariance of measured minus nominal lengths, mm^2, by an arm that is ``scale_factor`` times too large.
 
-    Each length's own u, and the scatter of the poses over their number at each end. Lengths that share a socket share its
-    scatter, so they are correlated.
+    Each length's own u, and the scatter of the poses over their number at each end. Lengths that share a socket share
+    its scatter, so they are correlated.
     """
     pull = measurement.differences[:, :, None] * length_directions(centroids, measurement)[:, None, :]
     scatter = jnp.einsum("lsc,scd,ksd->lk", pull, measurement.centroid_covariances(sigma), pull)
-    # The floor (1e-12 mm) only keeps a noise-free simulation's weights finite.
+    # The least variance, (1e-12 mm)^2, only keeps a noise-free simulation's weights finite.
     return jnp.diag((scale_factor * measurement.u) ** 2 + 1e-24) + scatter
 
 

@@ -1,4 +1,4 @@
-"""Repeatability figures of tip positions: how far the poses of one socket disagree."""
+"""Repeatability of tip positions: how far the poses of one socket disagree (DE, Deltam, RMS)."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -28,10 +28,17 @@ class Repeatability(eqx.Module):
 
 
 def repeatability(tips: Float[Array, "N 3"], sizes: Sequence[int], *, fitted: int = 0) -> Repeatability:
-    """Figures of tips that lie socket after socket, ``sizes[i]`` of them in socket i.
+    """Repeatability of tips, socket after socket.
 
-    DE of several sockets is the mean over all poses of sockets with at least two (a single pose has no spread to show);
-    Deltam is the worst socket's. ``fitted`` parameters are taken off the degrees of freedom of ``sigma``.
+    DE of several sockets is the mean over all poses of sockets with at least two; Deltam is the largest of all sockets.
+
+    Args:
+        tips: positions ``(N, 3)``, mm.
+        sizes: number of tips of each socket, in their order.
+        fitted: number of parameters fitted to them, subtracted from the degrees of freedom of ``sigma``.
+
+    Returns:
+        Metrics over all sockets and socket by socket, mm; NaN where no socket has two poses.
     """
     counts = np.asarray(sizes)
     owner = jnp.asarray(np.repeat(np.arange(len(counts)), counts))
@@ -41,7 +48,7 @@ def repeatability(tips: Float[Array, "N 3"], sizes: Sequence[int], *, fitted: in
     squared = jnp.sum((tips - centroids[owner]) ** 2, axis=-1)
     distances = _root(squared)
     half_range = jnp.max(highest(tips) + highest(-tips), axis=-1) / 2
-    # With one pose in every socket nothing is known of the scatter: 0 / 0, which is NaN and not a perfect 0.
+    # One pose in every socket shows no scatter: 0 / 0, which is NaN and not a perfect 0.
     scattering = int(counts[counts > 1].sum())
     degrees_of_freedom = max(3 * int((counts - 1).sum()) - fitted, min(scattering, 1))
     return Repeatability(
@@ -61,6 +68,6 @@ def _over(total: Float[Array, ""], count: int) -> Float[Array, ""]:
 
 
 def _root(value: Float[Array, "..."]) -> Float[Array, "..."]:
-    # sqrt has no derivative at 0, which a socket of one pose meets exactly; its distance there is 0 and so is the slope.
+    # sqrt has no derivative at 0, the distance of a single pose from its centroid; there the derivative is set to 0.
     zero = value == 0
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, value)))

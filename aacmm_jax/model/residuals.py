@@ -1,4 +1,4 @@
-"""Measurement x arm -> residual: what the identifications minimise."""
+"""The residuals that the identifications minimise, of a measurement by an arm, and their quadratic models."""
 
 from typing import NamedTuple
 
@@ -9,23 +9,23 @@ from jaxtyping import Array, Float
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass
 from ..kinematics.jacobian import stacked_jacobian_columns
 from ..kinematics.parameters import Parameters
-from ..solver.levenberg_marquardt import Model
+from ..solver.active_set import QuadraticModel
 from .measurement import Measurement, averaging_matrix, differences_matrix
 from .weights import Weights
 
 
 class JointWeights(NamedTuple):
-    """What a joint solve needs besides the poses: the lengths, and how both are weighed. Leading axes may be lanes."""
+    """Reference lengths of a joint solve, and the weights of poses and lengths. Leading axes may be a batch."""
 
     ends: tuple[tuple[int, int], ...]
-    nominal: Float[Array, "*lanes l"]  # mm
-    sigma: Float[Array, "*lanes"]  # standard deviation of a tip coordinate, mm
-    whitening: Float[Array, "*lanes l l"]  # inverse Cholesky factor of the lengths' covariance, 1/mm
+    nominal: Float[Array, "*batch l"]  # mm
+    sigma: Float[Array, "*batch"]  # standard deviation of a tip coordinate, mm
+    whitening: Float[Array, "*batch l l"]  # inverse Cholesky factor of the lengths' covariance, 1/mm
 
 
 def repeatability_residual(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Float[Array, "N 3"]:
-    """Distance vectors of all tips from their socket's centroid, mm (Cheng et al. 2018, eq. 13-14, by component); whitened
-    where the measurement has weights."""
+    """Vectors of all tips from their socket's centroid, mm (Cheng et al. 2018, eq. 13-14, by component); whitened where
+    the measurement has weights."""
     space, measurement = args
     return measurement.whitened(measurement.centred(space.arm(vector).position(measurement.q)))
 
@@ -36,8 +36,8 @@ def joint_residual(
 ) -> tuple[Float[Array, "N 3"], Float[Array, " l"]]:
     """Repeatability and reference lengths together, each in units of its standard deviation.
 
-    args: free parameters, measurement, standard deviation of a tip coordinate (mm), and the whitening of the lengths: the
-    inverse Cholesky factor of their covariance (1/mm).
+    ``args`` are the free parameters, the measurement, the standard deviation of a tip coordinate (mm), and the
+    whitening of the lengths: the inverse Cholesky factor of their covariance (1/mm).
     """
     space, measurement, sigma, whitening = args
     tips = space.arm(vector).position(measurement.q)
@@ -46,8 +46,8 @@ def joint_residual(
     )
 
 
-def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Model:
-    """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic columns."""
+def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> QuadraticModel:
+    """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic Jacobian columns."""
     space, measurement = args
     geometry = space.arm(vector).geometry
     return model_of(
@@ -58,7 +58,7 @@ def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Meas
 def joint_model(
     vector: Float[Array, " p"],
     args: tuple[Parameters, Measurement, Float[Array, ""], Float[Array, "l l"]],
-) -> Model:
+) -> QuadraticModel:
     """Cost, gradient and Gram matrix of `joint_residual`."""
     space, measurement, sigma, whitening = args
     joint_weights = JointWeights(measurement.ends, measurement.nominal, sigma, whitening)
@@ -84,17 +84,17 @@ def model_of(
     entries: tuple[tuple[str, int], ...],
     joint_weights: JointWeights | None = None,
     weights: Weights | None = None,
-) -> Model:
-    """Cost, gradient and Gram matrix of the repeatability residual, for any batch of arms and poses that broadcast; with
-    ``weighing``, of the joint residual of poses and lengths; with ``weights``, of whitened poses.
+) -> QuadraticModel:
+    """Cost, gradient and Gram matrix of the repeatability residual, for any batch of arms and poses that broadcast;
+    with ``joint_weights``, of the joint residual of poses and lengths; with ``weights``, of whitened poses.
 
-    The mean over a socket is taken off the Gram matrix as a correction of rank 3 a socket, J^T J - m mu^T mu, which spares
-    a centred copy of the columns; the gradient needs none, because centred residuals sum to zero.
+    The mean over a socket is subtracted from the Gram matrix as a correction of rank 3 for each socket, J^T J - m mu^T
+    mu, so that no centred copy of the columns is needed; nor for the gradient, because centred residuals sum to zero.
     """
     forward = forward_pass(geometry, sines_cosines)
     columns = stacked_jacobian_columns(forward, entries)
-    # Centred twice: the rounding that one pass leaves in the mean (1e-13 mm) would otherwise be multiplied by the columns'
-    # means, and near a perfect fit outweigh the gradient.
+    # Centred twice: the rounding error that one pass leaves in the mean (1e-13 mm) would otherwise be multiplied by the
+    # columns' means, and exceed the gradient near a perfect fit.
     averaging = averaging_matrix(sizes)
     residual = _centred_rows(forward.tip, averaging)
     if weights is None:
@@ -106,7 +106,7 @@ def model_of(
     residual = residual.reshape(*residual.shape[:-2], -1)
     flat = counted.reshape(*counted.shape[:-2], -1)
     weighted = shifts.reshape(*shifts.shape[:-2], -1)
-    poses = Model(
+    poses = QuadraticModel(
         0.5 * jnp.sum(residual**2, axis=-1),
         (flat @ residual[..., None])[..., 0],
         flat @ jnp.swapaxes(flat, -1, -2) - weighted @ jnp.swapaxes(weighted, -1, -2),
@@ -117,7 +117,7 @@ def model_of(
     off = (joint_weights.whitening @ (distance - joint_weights.nominal)[..., None])[..., 0]
     rows = joint_weights.whitening @ rows
     weight = 1 / joint_weights.sigma**2
-    return Model(
+    return QuadraticModel(
         weight * poses.cost + 0.5 * jnp.sum(off**2, axis=-1),
         weight[..., None] * poses.gradient + (off[..., None, :] @ rows)[..., 0, :],
         weight[..., None, None] * poses.gram + jnp.swapaxes(rows, -1, -2) @ rows,
@@ -125,12 +125,12 @@ def model_of(
 
 
 def _distances(
-    tip: Float[Array, "*lanes 3 N"],
-    columns: Float[Array, "*lanes p 3 N"],
+    tip: Float[Array, "*batch 3 N"],
+    columns: Float[Array, "*batch p 3 N"],
     sizes: tuple[int, ...],
     ends: tuple[tuple[int, int], ...],
     weights: Weights | None,
-) -> tuple[Float[Array, "*lanes l"], Float[Array, "*lanes l p"]]:
+) -> tuple[Float[Array, "*batch l"], Float[Array, "*batch l p"]]:
     """Distances between the centroids of sockets, mm, and their derivatives."""
     between = differences_matrix(ends, len(sizes)).T
     if weights is None:

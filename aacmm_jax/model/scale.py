@@ -17,7 +17,7 @@ from ..kinematics.parameters import Parameters
 from .measurement import Measurement, length_covariance
 from .metrics import repeatability
 
-# Fixed lengths that free ones can replace: their names, and for each free parameter its weight in the place of each of them.
+# Names of fixed lengths that free ones can replace, and for each free parameter its weight in place of each of them.
 Partners = tuple[tuple[str, ...], tuple[tuple[float, ...], ...]]
 
 
@@ -56,7 +56,7 @@ def divide_free_lengths(
     Tips are linear in the lengths, so a fixed length f that free lengths x can replace with weights w leaves
     x' = x / k + (1 / k - 1) w f. ``replaced`` is w f (see `replaced_lengths`), 0 where nothing is replaced.
     """
-    divided = jnp.asarray(divisible(space))
+    divided, replaced = (jnp.broadcast_to(row, parameters.shape) for row in (jnp.asarray(divisible(space)), replaced))
     return jnp.where(divided, (parameters + replaced) / k[..., None] - replaced, parameters)
 
 

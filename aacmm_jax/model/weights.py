@@ -1,4 +1,4 @@
-"""Poses weighed by the inverse covariance of their tips, and the sockets' unknown positions eliminated under these weights."""
+"""Weights of poses, the inverse covariances of their tips, and the elimination of the sockets' positions under them."""
 
 from typing import NamedTuple
 
@@ -8,19 +8,20 @@ from jaxtyping import Array, Float
 
 
 class Weights(NamedTuple):
-    """Weights of poses. Layout as in `chain`: components before poses, which are last; leading axes may be lanes.
+    """Weights of poses. Layout as in `chain`: components before poses, which are last; leading axes may be a batch.
 
-    With W_j the inverse covariance of tip j: ``root`` R_j has R_j^T R_j = W_j, so it whitens the tip's error. A socket shifted
-    by c moves its whitened tips by R_j c; ``basis`` B_j = R_j T spans the same shifts orthonormally (the sum of B_j^T B_j over
-    a socket is I), where ``centroid_factor`` T of the socket has T T^T = (sum of W_j)^-1, the covariance of its weighted centroid.
+    With W_j the inverse covariance of tip j: ``root`` R_j has R_j^T R_j = W_j, so it whitens the tip's error. A socket
+    shifted by c moves its whitened tips by R_j c; ``basis`` B_j = R_j T spans the same shifts orthonormally (the sum of
+    B_j^T B_j over a socket is I), where ``centroid_factor`` T of the socket has T T^T = (sum of W_j)^-1, the covariance
+    of its weighted centroid.
     """
 
-    root: Float[Array, "*lanes 3 3 N"]  # 1/mm
-    basis: Float[Array, "*lanes 3 3 N"]
-    centroid_factor: Float[Array, "*lanes 3 3 s"]  # mm
+    root: Float[Array, "*batch 3 3 N"]  # 1/mm
+    basis: Float[Array, "*batch 3 3 N"]
+    centroid_factor: Float[Array, "*batch 3 3 s"]  # mm
 
     @classmethod
-    def of(cls, covariances: Float[Array, "*lanes 3 3 N"], sizes: tuple[int, ...]) -> "Weights":
+    def of(cls, covariances: Float[Array, "*batch 3 3 N"], sizes: tuple[int, ...]) -> "Weights":
         """Weights of tips with these covariances (mm^2)."""
         root = inverse_root(covariances)
         members = jnp.asarray(membership(sizes))
@@ -29,15 +30,15 @@ class Weights(NamedTuple):
         return cls(root, _product(root, centroid_factor @ members), centroid_factor)
 
     def whiten(self, rows: Float[Array, "... 3 N"]) -> Float[Array, "... 3 N"]:
-        """R_j times every pose's vector; more axes than the weights' (parameters) come after the lanes."""
+        """R_j times every pose's vector; more axes than the weights' (parameters) come after the batch."""
         return _applied(self.root, rows)
 
     def sums(self, whitened: Float[Array, "... 3 N"], sizes: tuple[int, ...]) -> Float[Array, "... 3 s"]:
-        """Coordinates, socket by socket, of the part that a shift of the socket can make up for."""
+        """Coordinates, socket by socket, of the part that a shift of the socket accounts for."""
         return _applied(_transposed(self.basis), whitened) @ jnp.asarray(membership(sizes).T)
 
     def centred(self, whitened: Float[Array, "... 3 N"], sizes: tuple[int, ...]) -> Float[Array, "... 3 N"]:
-        """Whitened rows less what a shift of their socket can make up for."""
+        """Whitened rows less what a shift of their socket accounts for."""
         return whitened - _applied(self.basis, self.sums(whitened, sizes) @ jnp.asarray(membership(sizes)))
 
     def centroids(self, rows: Float[Array, "... 3 N"], sizes: tuple[int, ...]) -> Float[Array, "... 3 s"]:
@@ -52,7 +53,7 @@ def membership(sizes: tuple[int, ...]) -> Float[np.ndarray, "s N"]:
 
 
 def inverse_root(matrix: Float[Array, "... 3 3 N"]) -> Float[Array, "... 3 3 N"]:
-    """Inverse of the Cholesky factor of many positive definite 3 x 3 matrices, written out: LAPACK's costs 1 us for each."""
+    """Inverse Cholesky factors of many 3 x 3 matrices, written out, since LAPACK takes 1 us for each."""
     a, b, c = (matrix[..., i, i, :] for i in range(3))
     ba, ca, cb = matrix[..., 1, 0, :], matrix[..., 2, 0, :], matrix[..., 2, 1, :]
     p = 1 / jnp.sqrt(a)

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..core.linear_algebra import inverse_positive_definite
 from ..kinematics.arm import Arm
 from ..kinematics.chain import sines_cosines
-from ..kinematics.inverse_kinematics import newton_steps_to_targets, project_to_targets
+from ..kinematics.inverse_kinematics import newton_projection, project_to_targets
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import lowest_point
 from ..model.measurement import Measurement
@@ -60,11 +61,11 @@ def refined(
     @eqx.filter_jit
     @eqx.filter_value_and_grad
     def objective(moved: Array, design: _Design) -> Array:
-        at = newton_steps_to_targets(design.arm, moved, design.targets, _NEWTON_STEPS)
+        at = newton_projection(design.arm.geometry, moved, design.targets, _NEWTON_STEPS)
         fresh = eqx.tree_at(lambda m: (m.q, m.sines_cosines), design.measurement, (at, sines_cosines(at)))
         rows = whitened_equations(design.arm, design.space, fresh.weighted(design.arm.geometry, problem.noise))
         information = rows.T @ rows + 1e-4 * jnp.eye(rows.shape[1])
-        return problem.objective._replace(functions=design.functions).value(jnp.linalg.inv(information))
+        return problem.objective._replace(functions=design.functions).value(inverse_positive_definite(information))
 
     done = 0
 

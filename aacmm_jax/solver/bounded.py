@@ -1,55 +1,38 @@
-"""Box-bounded nonlinear least squares on Optimistix's extension points: the solver, its adjoint, and one entry function."""
+"""Box-bounded nonlinear least squares on Optimistix's extension points: the solver, and `least_squares`, which adds the adjoint."""
 
-import inspect
 from collections.abc import Callable
-from typing import Any
 
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
-from optimistix.internal import implicit_jvp
 
 from ..core.arrays import is_concrete
 from ..core.errors import InputError
-from .levenberg_marquardt import Box, Flat, Model, Progress, Reason, Rules, advance, begin, either
-
-
-def flat_box(y: PyTree[Array], lower: PyTree, upper: PyTree, scale: PyTree) -> Box:
-    """Bounds and scale as flat vectors; None, scalars and leaves that broadcast against y's are spread over it."""
-
-    def flat(tree: PyTree, fill: float) -> Flat:
-        if tree is None or isinstance(tree, (int, float)):
-            filled = fill if tree is None else float(tree)
-            tree = jax.tree.map(lambda leaf: jnp.full(leaf.shape, filled), y)
-        else:
-            tree = jax.tree.map(
-                lambda leaf, b: jnp.broadcast_to(jnp.asarray(b, dtype=jnp.float64), leaf.shape), y, tree
-            )
-        return ravel_pytree(tree)[0]
-
-    return Box(flat(lower, -jnp.inf), flat(upper, jnp.inf), None if scale is None else flat(scale, 1.0))
+from ..core.x64 import check_x64
+from .active_set import Box, Flat, QuadraticModel, expand
+from .adjoint import BoundedAdjoint, box_of
+from .levenberg_marquardt import Progress, Rules, advance, begin
+from .reason import Reason, either
 
 
 class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Levenberg-Marquardt within a box, as an Optimistix least-squares solver.
 
-    The box comes in ``options``: ``lower``, ``upper`` (PyTrees like y, scalars, or None) and ``scale``, the natural step of
-    each unknown (None: chosen from the columns of the Jacobian). ``normal``, a function of (y, args), may supply the `Model`
-    where it can be had cheaper than from the Jacobian of the residual. ``stats`` of the solution holds ``reason``,
-    ``num_accepted_steps``, ``cost``, ``gradient`` and ``optimality``.
+    The box is in ``options``: ``lower``, ``upper`` and ``scale`` as in `least_squares`, and ``normal``. ``stats`` of the
+    solution holds ``reason``, ``num_accepted_steps``, ``cost``, ``gradient`` and ``optimality``.
 
-    Use it through `least_squares`, which also brings the adjoint that knows the bounds.
+    Use it through `least_squares`, which also brings the adjoint that takes the bounds into account.
     """
 
-    rtol: float = 1e-14  # on the step to come, relative to |y| (both scaled)
+    rtol: float = 1e-14  # on the next step, relative to |y| (both scaled)
     atol: float = 0.0  # on the step, scaled
     gtol: float = 1e-10  # on the projected gradient: cosine between the residual and a column of J
-    initial_damping: float = 1e-3  # relative to the largest curvature
+    # Relative to the largest curvature; None: as little as keeps the steps within a trust region, whose first radius is the
+    # scaled length of the start. A value spares the search where a problem is known to need none.
+    initial_damping: float | None = None
     # Optimistix asks for a norm; every test here is written out, since it scales by unknowns.
     norm: Callable[[PyTree], Array] = optx.max_norm
 
@@ -60,24 +43,24 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Progress:
         flat, _ = ravel_pytree(y)
-        return begin(flat, _box(y, options))
+        return begin(flat, box_of(y, options))
 
     def step(self, fn, y, args, options, state, tags):
         _, unravel = ravel_pytree(y)
         normal = options.get("normal")
         if normal is None:
-            evaluated, aux = _evaluate(fn, unravel, state.trial, args)
+            evaluated, aux = _evaluate(fn, unravel, state.step.trial, args)
         else:
-            evaluated, aux = normal(unravel(state.trial), args), None
-        state = advance(state, evaluated, _box(y, options), self.rules)
+            evaluated, aux = normal(unravel(state.step.trial), args), None
+        state = advance(state, evaluated, box_of(y, options), self.rules)
         return unravel(state.y), state, aux
 
     def terminate(self, fn, y, args, options, state, tags):
-        failed = optx.RESULTS.where(
+        result = optx.RESULTS.where(
             state.reason == Reason.stalled, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
         )
-        failed = optx.RESULTS.where(state.reason == Reason.nonfinite, optx.RESULTS.nonfinite, failed)
-        return state.reason != Reason.running, failed
+        result = optx.RESULTS.where(state.reason == Reason.nonfinite, optx.RESULTS.nonfinite, result)
+        return state.reason != Reason.running, result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         # Optimistix itself stops, before any step, where y is not finite.
@@ -92,100 +75,14 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return y, aux, stats
 
 
-def _box(y: PyTree[Array], options: dict[str, Any]) -> Box:
-    return flat_box(y, options.get("lower"), options.get("upper"), options.get("scale"))
-
-
-def _evaluate(fn: Callable, unravel: Callable, flat: Flat, args: PyTree) -> tuple[Model, PyTree]:
+def _evaluate(fn: Callable, unravel: Callable, flat: Flat, args: PyTree) -> tuple[QuadraticModel, PyTree]:
     def residual(point: Flat) -> tuple[Array, tuple[Array, PyTree]]:
         out, aux = fn(unravel(point), args)
         value = ravel_pytree(out)[0]
         return value, (value, aux)
 
     jacobian, (value, aux) = jax.jacfwd(residual, has_aux=True)(flat)
-    return Model(0.5 * jnp.dot(value, value), jacobian.T @ value, jacobian.T @ jacobian), aux
-
-
-class _EquilibratedSVD(lx.AbstractLinearSolver):
-    """Pseudo-inverse after rows and columns are brought to size 1, so that no unit makes a direction look undetermined."""
-
-    rcond: float = 1e-14
-
-    def init(self, operator, options):
-        matrix = operator.as_matrix()
-        row = _inverse(jnp.max(jnp.abs(matrix), axis=1))
-        column = _inverse(jnp.max(jnp.abs(row[:, None] * matrix), axis=0))
-        row = row * _inverse(jnp.max(jnp.abs(row[:, None] * matrix * column[None, :]), axis=1))
-        u, s, vt = jnp.linalg.svd(row[:, None] * matrix * column[None, :], full_matrices=False)
-        structures = eqxi.Static((operator.in_structure(), operator.out_structure()))
-        return (u, s, vt), row, column, structures
-
-    def compute(self, state, vector, options):
-        (u, s, vt), row, column, structures = state
-        known = s > self.rcond * s[0]
-        inverse = jnp.where(known, 1 / jnp.where(known, s, 1.0), 0.0)
-        solution = column * (vt.T @ (inverse * (u.T @ (row * ravel_pytree(vector)[0]))))
-        like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), structures.value[0])
-        return ravel_pytree(like)[1](solution), lx.RESULTS.successful, {}
-
-    def assume_full_rank(self):
-        return False
-
-    def transpose(self, state, options):
-        (u, s, vt), row, column, structures = state
-        inside, outside = structures.value
-        return ((vt.T, s, u.T), column, row, eqxi.Static((outside, inside))), options
-
-    def conj(self, state, options):
-        return state, options
-
-
-def _inverse(size: Array) -> Array:
-    return jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1.0), 1.0)
-
-
-class BoundedAdjoint(optx.AbstractAdjoint):
-    """Implicit differentiation of the stationarity of a box-bounded minimum: y = clip(y - gradient).
-
-    Optimistix's own implicit adjoint takes the gradient to vanish, which is false on an active bound: there the solution
-    follows the bound. Exact (full Hessian, not Gauss-Newton's), forward and reverse.
-    """
-
-    linear_solver: lx.AbstractLinearSolver = _EquilibratedSVD()
-
-    def apply(self, primal_fn, rewrite_fn, inputs, tags):
-        del rewrite_fn
-        inputs = (*inputs, _while_loop)
-        # Optimistix wants a plain global function, not one that a run-time type checker has wrapped.
-        return implicit_jvp(primal_fn, inspect.unwrap(_stationarity), inputs, tags, self.linear_solver)
-
-
-def _while_loop(cond_fun, body_fun, init_val, *, max_steps):
-    return eqxi.while_loop(cond_fun, body_fun, init_val, max_steps=max_steps, kind="lax")
-
-
-def _stationarity(y: PyTree[Array], solved: PyTree, inputs: PyTree) -> Flat:
-    """Zero at a bounded minimum: the gradient where an unknown is free, its distance from the bound where pinned."""
-    del solved
-    fn, _, _, args, options, *_ = inputs
-    flat, unravel = ravel_pytree(y)
-    box = _box(y, options)
-
-    def cost(point: Flat) -> Array:
-        value = ravel_pytree(fn(unravel(point), args)[0])[0]
-        return 0.5 * jnp.dot(value, value)
-
-    gradient = jax.grad(cost)(flat)
-    fixed_point, fixed_gradient = jax.lax.stop_gradient((flat, gradient))
-    pinned = box.pinned(fixed_point, fixed_gradient)
-    nearer_lower = fixed_point - box.lower <= box.upper - fixed_point
-    # An absent bound is infinite; it is never the nearer one of a pinned unknown, but must not make NaN in the other branch.
-    bound = jnp.where(
-        nearer_lower,
-        jnp.where(jnp.isfinite(box.lower), box.lower, 0.0),
-        jnp.where(jnp.isfinite(box.upper), box.upper, 0.0),
-    )
-    return jnp.where(pinned, flat - bound, gradient)
+    return QuadraticModel(0.5 * jnp.dot(value, value), jacobian.T @ value, jacobian.T @ jacobian), aux
 
 
 def least_squares(
@@ -196,33 +93,60 @@ def least_squares(
     lower: PyTree = None,
     upper: PyTree = None,
     scale: PyTree = None,
-    normal: Callable[[PyTree, PyTree], Model] | None = None,
+    normal: Callable[[PyTree, PyTree], QuadraticModel] | None = None,
     solver: BoundedLevenbergMarquardt = BoundedLevenbergMarquardt(),
     max_steps: int = 1000,
     throw: bool = True,
 ) -> optx.Solution:
     """Minimise 1/2 |fn(y, args)|^2 within lower <= y <= upper.
 
-    ``y0`` is any PyTree of floats; ``lower``, ``upper`` and ``scale`` are PyTrees like it, scalars, or None (no bound;
-    scaling by the Jacobian's columns). ``y0`` is clipped to the box. Returns an `optimistix.Solution`; its
-    ``stats["reason"]`` says which test ended the solve. Differentiable with respect to args and both bounds. ``normal``, a
-    global function of (y, args), may supply cost, gradient and Gram matrix of fn as a `Model`.
+    Differentiable with respect to ``args`` and both bounds, forward and reverse.
 
-    With ``throw=False`` a failure is only data (``result``), as a batch needs it.
+    Args:
+        fn: The residual, a PyTree of arrays.
+        y0: The start, any PyTree of floats; it is clipped to the box.
+        args: Passed to ``fn``.
+        lower: Lower bounds: a PyTree like ``y0`` or a number for all unknowns; None, also as a leaf, is no bound.
+        upper: Upper bounds, likewise.
+        scale: The natural step of each unknown, likewise; None takes it from the columns of the Jacobian.
+        normal: A global function of (y, args) that supplies cost, gradient and Gram matrix of ``fn`` where they can be had
+            more cheaply than from its Jacobian.
+        solver: Tolerances and initial damping.
+        max_steps: The largest number of evaluations.
+        throw: Whether a failure is an exception; otherwise it is only data (``result``), as a batch needs it.
+
+    Returns:
+        An `optimistix.Solution`; its ``stats["reason"]`` is the `Reason` why the solve ended.
+
+    Raises:
+        InputError: Where a lower bound is above its upper one, or bounds do not fit the start.
     """
-    options = {"lower": lower, "upper": upper, "scale": scale, "normal": normal}
-    _check_box(y0, lower, upper)
+    check_x64()
     y0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.float64), y0)
+    given = {"lower": (lower, -jnp.inf), "upper": (upper, jnp.inf), "scale": (scale, 1.0)}
+    options = {
+        what: tree if tree is None else _expanded(y0, tree, absent, what) for what, (tree, absent) in given.items()
+    }
+    _check_box(y0, options["lower"], options["upper"])
     return optx.least_squares(
         fn,
         solver,
         y0,
         args,
-        options,
+        options | {"normal": normal},
         max_steps=max_steps,
         adjoint=BoundedAdjoint(),
         throw=throw,
     )
+
+
+def _expanded(y0: PyTree[Array], tree: PyTree, absent: float, what: str) -> PyTree[Array]:
+    try:
+        return expand(y0, tree, absent)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{what} does not fit the start; give a number, or a PyTree like the start ({error})."
+        ) from error
 
 
 def _check_box(y0: PyTree, lower: PyTree, upper: PyTree) -> None:
@@ -230,7 +154,7 @@ def _check_box(y0: PyTree, lower: PyTree, upper: PyTree) -> None:
     if not is_concrete(*jax.tree.leaves((y0, lower, upper))):
         return
     with jax.ensure_compile_time_eval():
-        box = flat_box(jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.float64), y0), lower, upper, None)
+        box = Box.of(y0, lower, upper, None)
         wrong = np.flatnonzero(~(np.asarray(box.lower) <= np.asarray(box.upper)))
     if len(wrong):
         i = wrong[0]

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from ..core.errors import InputError
 from ..kinematics import chain
 from ..kinematics.arm import Arm
-from ..kinematics.inverse_kinematics import damped_inverse, solve_to_targets
+from ..kinematics.inverse_kinematics import damped_inverse, least_norm_inverse, solve_to_targets
 from ..kinematics.jacobian import jacobian_columns
 from .definition import POOL_PARTS, Fixture, Setting, Study, pool_capacity
 from .specification import Region
@@ -200,8 +200,7 @@ def _rows(arm: Arm, q: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 @jax.jit
 def _inverse(geometry: chain.Geometry, q: Array) -> Array:
-    columns = jacobian_columns(chain.forward_pass(geometry, chain.sines_cosines(q)))["theta"]
-    return jnp.moveaxis(damped_inverse(columns, jnp.zeros(q.shape[0])), -1, 0).reshape(q.shape[0], -1)
+    return jnp.moveaxis(least_norm_inverse(geometry, q), -1, 0).reshape(q.shape[0], -1)
 
 
 def _placements(arm: Arm, fixture: Fixture, limits: Array, key: Array, count: int) -> np.ndarray:

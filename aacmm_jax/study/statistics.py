@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..solver.levenberg_marquardt import Reason, numbers_of
+from ..solver.reason import Reason, numbers_of
 from .results import Results
 from .specification import label
 

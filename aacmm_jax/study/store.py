@@ -164,7 +164,7 @@ def _write(
     }
 
     def extend(file: Any) -> None:
-        from ..solver.levenberg_marquardt import Reason, numbers_of
+        from ..solver.reason import Reason, numbers_of
 
         group = file["trials"]
         for name, kind in VARIABLES.items():

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..calibration.batch import calibrate_many, identify_many
 from ..data.capture import Capture, ReferenceLength
-from ..solver.levenberg_marquardt import numbers_of
+from ..solver.reason import numbers_of
 from .definition import Setting, Study
 from .drawing import Drawn, draw, ends_of
 from .layout import Block

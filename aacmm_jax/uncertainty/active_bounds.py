@@ -15,7 +15,6 @@ of an arm that stage 1 shrank to its bounds is not meant: the lengths determine 
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -54,8 +53,6 @@ def with_active_bounds(
         return known  # nothing determines the scale: it cannot be distinguished from a near-degenerate direction
     fixed = jnp.asarray(np.array([name == anchor for name in space.names]))
     sigma = jnp.maximum(sigma, LEAST_SIGMA)
-    # One factorisation after the other: see `covariance.inverse_information`.
-    matrix, sigma = jax.lax.optimization_barrier((known.matrix, sigma))
     plain = dataclasses.replace(measurement, weights=None)
     linear = linearised(arm, space, plain, fixed)
     whitening = joint_weights(arm, plain, sigma).whitening if measurement.ends else None
@@ -77,4 +74,4 @@ def with_active_bounds(
     weak = on_bound & (weak | (movement < LEAST_MOVEMENT**2 * size))
     variance = jnp.where(weak, (2 * half_widths) ** 2 / 3, 0.0)
     added = space.scale[:, None] * ((directions * variance[None, :]) @ directions.T) * space.scale[None, :]
-    return known._replace(matrix=matrix + added)
+    return known._replace(matrix=known.matrix + added)

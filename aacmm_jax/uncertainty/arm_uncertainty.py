@@ -19,8 +19,8 @@ class Uncertainty(eqx.Module):
     """Standard uncertainties of a calibrated arm, in mm and rad.
 
     They are the calibration's contribution; with ``reading=True`` the noise of the readings is added, as given to the
-    calibration or as estimated by it. What depends on a direction that the data do not determine is infinitely uncertain.
-    Fixed parameters count as exact, and so does the base frame (``d_1`` and ``theta_1`` only define it).
+    calibration or as estimated by it. What depends on a direction that the data do not determine is infinitely
+    uncertain. Fixed parameters count as exact, and so does the base frame (``d_1`` and ``theta_1`` only define it).
     """
 
     arm: Arm
@@ -53,7 +53,7 @@ class Uncertainty(eqx.Module):
         return self.covariance / (safe[:, None] * safe[None, :])
 
     def correlated(self, least: float = 0.9) -> list[tuple[str, str, float]]:
-        """Pairs of parameters whose correlation is at least so strong, the strongest first: (name, name, correlation)."""
+        """Pairs of parameters with at least this correlation, the strongest first: (name, name, correlation)."""
         if not 0 <= least <= 1:
             raise InputError(f"least is {least:g}; give a correlation between 0 and 1.")
         table = np.asarray(self.correlation)

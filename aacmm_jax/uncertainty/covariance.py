@@ -1,18 +1,18 @@
-"""How uncertain an identification is: the law of propagation (JCGM 100) from every reading and length to every parameter.
+"""Covariance of an identification: the law of propagation (JCGM 100) from readings and lengths to parameters.
 
-An identification is linearised at its result. `Sensitivity` is how its parameters follow the error of each tip and of each
-certified length; a noise model (`NOISE_MODELS`) is the covariance of those errors; the covariance of the parameters is
-the product of both.
+An identification is linearised at its result. `Sensitivity` is how its parameters follow the error of each tip and of
+each certified length; a noise model (`NOISE_MODELS`) is the covariance of those errors; the covariance of the
+parameters is the product of both.
 """
 
 import math
 from typing import Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..core.linear_algebra import inverse_positive_definite, semidefinite_eigen
 from ..core.units import ARCSEC
 from ..data.noise import Noise, encoder_covariances, tip_covariances
 from ..kinematics.arm import Arm
@@ -21,9 +21,10 @@ from ..model.measurement import Measurement, differences_matrix, length_directio
 from ..model.residuals import measured_lengths
 from ..model.weights import membership
 
-# Models of the tips' errors. "given": encoders and seat as stated. "estimated": encoders and seat, both standard deviations
-# estimated from the residuals. "common": one variance for every coordinate of every tip. "robust": each pose's own
-# residual, corrected for its leverage (a jackknife), whatever the errors are, as long as poses are independent.
+# Models of the tips' errors. "given": encoders and seat as stated. "estimated": encoders and seat, both standard
+# deviations estimated from the residuals. "common": one variance for every coordinate of every tip. "robust": each
+# pose's own residual, corrected for its leverage (a jackknife), whatever the errors are, as long as poses are
+# independent.
 NoiseModel = Literal["given", "estimated", "common", "robust"]
 NOISE_MODELS = ("given", "estimated", "common", "robust")
 
@@ -52,7 +53,7 @@ class ParameterCovariance(NamedTuple):
 
 
 class Linearisation(NamedTuple):
-    """An identification at its result: derivatives in natural steps of the parameters (1 mm, 1 mrad), 0 where they are fixed."""
+    """Derivatives of an identification at its result, in natural steps (1 mm, 1 mrad), 0 for fixed parameters."""
 
     scale: Float[Array, " p"]  # natural steps, 0 where fixed
     columns: Float[Array, "p 3 N"]  # of tips less their socket's mean
@@ -127,19 +128,18 @@ def sensitivity_of(
 def inverse_information(
     information: Float[Array, "p p"], fixed: Bool[Array, " p"]
 ) -> tuple[Float[Array, "p p"], Float[Array, "p p"], Bool[Array, " p"]]:
-    """Inverse on the identifiable subspace, the projector onto the undetermined directions, and which parameters are determined
-    one by one; natural steps. A poorly determined direction keeps its large variance, which does not affect the others.
+    """Inverse on the identifiable subspace, the projector onto the undetermined directions, and which parameters are
+    determined one by one; natural steps. A poorly determined direction keeps its large variance, which does not affect
+    the others.
     """
     free = ~fixed
-    # One decomposition, and what follows from it one after the other: jaxlib's batched LAPACK calls wait for each other's threads,
-    # and on two cores two that may run at the same time can wait for ever.
     information = information + jnp.diag(jnp.where(fixed, 1.0 + jnp.max(jnp.abs(information)), 0.0))
     # Only masks and a basis come from the eigenvectors: their derivative is infinite where eigenvalues repeat.
-    values, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(information))
-    known = values > _NULL * values[-1]
+    values, vectors = semidefinite_eigen(information)
+    known = values > _NULL * values[0]
     seen, lost = jnp.where(known[None, :], vectors, 0.0), jnp.where(known[None, :], 0.0, vectors)
     inner = seen.T @ information @ seen + jnp.diag(jnp.where(known, 0.0, 1.0))
-    inverse = seen @ jnp.linalg.inv(inner) @ seen.T
+    inverse = seen @ inverse_positive_definite(inner) @ seen.T
     hardly = jnp.where((values > _LEAST_INFORMATION)[None, :] & known[None, :], 0.0, vectors)
     determined = fixed | (jnp.sum(hardly**2, axis=1) < 1e-6)
     return jnp.where(free[:, None] & free[None, :], inverse, 0.0), lost @ lost.T, determined
@@ -159,7 +159,7 @@ def covariance_of(
 
 
 def residual_degrees_of_freedom(noise_model: NoiseModel, sizes: tuple[int, ...], fitted: int) -> float:
-    """Degrees of freedom of a noise model's estimate: of equations, or of poses where each has a variance of its own."""
+    """Degrees of freedom of a noise model: of all equations, or of poses where each has a variance of its own."""
     if noise_model == "given":
         return math.inf
     spare = sum(sizes) - len(sizes) - fitted / 3
@@ -214,9 +214,9 @@ def _components(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Variances of the encoders (arcsec^2) and of the seat (mm^2), from two moments of the residuals.
 
-    Residuals are r = M e, M a projector: the identity less the sockets' means less the fit. With D the encoders' part for
-    1 arcsec, E[r.r] = v tr(MD) + s tr(M) and E[r.Dr] = v tr(MDMD) + s tr(MD); a negative one is set to 0 and the other
-    taken from the first (variance components by the method of moments, Henderson 1953).
+    Residuals are r = M e, M a projector: the identity less the sockets' means less the fit. With D the encoders' part
+    for 1 arcsec, E[r.r] = v tr(MD) + s tr(M) and E[r.Dr] = v tr(MDMD) + s tr(MD); a negative one is set to 0 and the
+    other taken from the first (variance components by the method of moments, Henderson 1953).
     """
     sizes = np.asarray(measurement.sizes, dtype=float)
     members = jnp.asarray(membership(measurement.sizes))

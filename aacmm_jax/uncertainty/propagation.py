@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..core.linear_algebra import inverse_cholesky
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
@@ -50,8 +51,8 @@ def propagate_solve(
     noise: Noise | None,
     joint_weights: JointWeights | None = None,
 ) -> Propagated:
-    """Of one least squares: of the poses alone (stage 1), or with ``joint_weights`` of poses and lengths (the joint solve);
-    ``fixed`` parameters are the scale anchor, or on a bound."""
+    """Of one least squares: of the poses alone (stage 1), or with ``joint_weights`` of poses and lengths (the joint
+    solve); ``fixed`` parameters are the scale anchor, or on a bound."""
     whitening = None if joint_weights is None else joint_weights.whitening
     sigma = jnp.maximum(sigma, LEAST_SIGMA)
     counted = sigma if measurement.weights is None else jnp.ones_like(sigma)
@@ -70,7 +71,7 @@ def joint_weights(arm: Arm, measurement: Measurement, sigma: Float[Array, ""]) -
     """Weights of poses and lengths in a joint solve, given the scatter of a tip coordinate by a nearly right arm."""
     safe = jnp.maximum(sigma, LEAST_SIGMA)
     centroids = measurement.centroids(arm.position(measurement.q))
-    whitening = jnp.linalg.inv(jnp.linalg.cholesky(length_covariance(centroids, measurement, safe)))
+    whitening = inverse_cholesky(length_covariance(centroids, measurement, safe))
     counted = safe if measurement.weights is None else jnp.ones_like(safe)  # weights are in standard deviations already
     return JointWeights(measurement.ends, measurement.nominal, counted, whitening)
 
@@ -86,8 +87,8 @@ def propagate_division(
 ) -> Propagated:
     """After the lengths of stage 1's ``arm`` were divided by k, which itself follows the poses and the lengths.
 
-    x' = (x + r) / k - r for lengths, where r are the fixed lengths that x replaces (`model.scale.divide_free_lengths`), so
-    dx' = dx / k - (x' + r) / k dk; a parameter that stage 1 held or that was on a bound moves with k too.
+    x' = (x + r) / k - r for lengths, where r are the fixed lengths that x replaces (`model.scale.divide_free_lengths`),
+    so dx' = dx / k - (x' + r) / k dk; a parameter that stage 1 held or that was on a bound moves with k too.
     """
     scale = _scale_sensitivity(arm.position(measurement.q), measurement, before, sigma)
     divides = jnp.asarray(divisible(space))
@@ -107,9 +108,9 @@ def propagate_adjustment(
 ) -> Propagated:
     """After a length was adjusted until k = 1, the others being identified with it at each of its values.
 
-    A step of the adjusted length h moves the tips by their column of h, which the other parameters follow as they follow any
-    error of the tips: S J_h. With t = S J_h + e_h, k(x(h), e) = 1 gives dx = S de - t (dk/dh)^-1 (dk/de) de. ``fixed``: h is
-    on a bound, so that nothing follows k.
+    A step of the adjusted length h moves the tips by their column of h, which the other parameters follow as they
+    follow any error of the tips: S J_h. With t = S J_h + e_h, k(x(h), e) = 1 gives dx = S de - t (dk/dh)^-1 (dk/de) de.
+    ``fixed``: h is on a bound, so that nothing follows k.
     """
     scale = _scale_sensitivity(arm.position(measurement.q), measurement, solved, sigma)
     column = arm.jacobian(measurement.q, (adjusted,))[..., 0].T

@@ -1,4 +1,4 @@
-"""What a calibrated arm's uncertainty means where it is used: of its parameters, of a tip, of a length, all over its volume."""
+"""The uncertainty of a calibrated arm over its working volume: of tips and of lengths."""
 
 from typing import Any, NamedTuple
 
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.errors import InputError
+from ..core.linear_algebra import semidefinite_eigen
 from ..kinematics.arm import Arm, joint_limits
 from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.workspace import total_link_length
@@ -17,12 +18,12 @@ _LENGTH_MM = 300.0  # lengths of the map, where none is given: those of the pape
 
 
 class VolumetricUncertainty(NamedTuple):
-    """The uncertainty over the working volume, point by point, as NumPy arrays: mm, standard (k = 1).
+    """Standard uncertainties over the working volume, point by point, as NumPy arrays, mm.
 
-    At each point a tip and a length that starts there, in poses taken at random.
+    At each point: of a tip, and of a length that starts there, in random poses.
     """
 
-    length: float  # how long the lengths are
+    length: float  # nominal size of the lengths
     q: Float[np.ndarray, "v n"]
     q_end: Float[np.ndarray, "v n"]
     start: Float[np.ndarray, "v 3"]
@@ -50,12 +51,25 @@ class VolumetricUncertainty(NamedTuple):
 def volumetric_uncertainty(
     uncertainty: Uncertainty, *, points: int = 400, length: float | None = None, limits: Any = None, seed: int = 0
 ) -> VolumetricUncertainty:
-    """Uncertainty of tips and of lengths (mm; default 300, or half the reach of a small arm) all over the reachable volume.
+    """Uncertainty of tips and of lengths over the reachable volume; its points are the tips of random poses.
 
-    Points are where random poses within the joint limits take the tip. Raises `InputError` where no length fits.
+    Args:
+        uncertainty: of a calibrated arm.
+        points: number of points.
+        length: size of the lengths, mm; by default 300, or half the sum of a small arm's links.
+        limits: lowest and highest reading of each joint ``(n, 2)``, rad; by default the arm's own.
+        seed: of the random numbers.
+
+    Returns:
+        Standard uncertainties at every point, mm.
+
+    Raises:
+        InputError: no length of this size can be placed within the joint limits.
     """
     if not isinstance(uncertainty, Uncertainty):
-        raise InputError("over_volume takes an uncertainty; make one of a calibration with aj.uncertainty_of(result).")
+        raise InputError(
+            "volumetric_uncertainty takes an uncertainty; make one of a calibration with aj.uncertainty_of(result)."
+        )
     length = default_length(uncertainty.arm) if length is None else length
     start, end = sample_lengths(uncertainty.arm, points, length=length, limits=limits, seed=seed)
     tips, covariance, plain, read = _volume(uncertainty, jnp.asarray(start), jnp.asarray(end))
@@ -69,7 +83,7 @@ def volumetric_uncertainty(
 def _volume(uncertainty: Uncertainty, start: Array, end: Array) -> tuple[Array, Array, Array, Array]:
     covariance = uncertainty.tip(start)
     finite = jnp.where(jnp.isfinite(covariance), covariance, 0.0)
-    largest = jnp.sqrt(jnp.linalg.eigvalsh(finite)[..., -1])
+    largest = jnp.sqrt(semidefinite_eigen(finite)[0][..., 0])
     largest = jnp.where(jnp.all(jnp.isfinite(covariance), axis=(-1, -2)), largest, jnp.inf)
     tips = jnp.stack([uncertainty.arm.position(q) for q in (start, end)])
     return tips, largest, uncertainty.length(start, end), uncertainty.length(start, end, reading=True)
@@ -83,12 +97,12 @@ def default_length(arm: Arm) -> float:
 def sample_lengths(
     arm: Arm, count: int, *, length: float | None, limits: Any = None, seed: int = 0
 ) -> tuple[Float[np.ndarray, "v n"], Float[np.ndarray, "v n"]]:
-    """Lengths all over the volume, as the poses at their two ends: of ``length`` mm in random directions, or (None) between
-    independent poses. Within the joint limits, and where both ends can be reached."""
+    """Lengths all over the volume, as the poses at their two ends: of ``length`` mm in random directions, or (None)
+    between independent poses. Within the joint limits, and where both ends can be reached."""
     if length is not None and not 0 < length < 2 * total_link_length(arm):
         raise InputError(f"a length of {length:g} mm does not fit into the volume of this arm; give a shorter one.")
     if count < 1:
-        raise InputError(f"{count} points cannot be looked at; give at least one.")
+        raise InputError(f"points is {count}; give at least one.")
     random, allowed = (
         np.random.default_rng(seed),
         np.asarray(joint_limits(arm, None if limits is None else np.asarray(limits).tolist())),
@@ -99,8 +113,8 @@ def sample_lengths(
     starts, ends, found = [], [], 0
     for _ in range(60):
         q = draw(2 * count)
-        turn = random.normal(size=(2 * count, 3))
-        targets = np.asarray(arm.position(q)) + length * turn / np.linalg.norm(turn, axis=1, keepdims=True)
+        direction = random.normal(size=(2 * count, 3))
+        targets = np.asarray(arm.position(q)) + length * direction / np.linalg.norm(direction, axis=1, keepdims=True)
         other, arrived = project_to_targets(arm, draw(2 * count), targets, allowed)
         starts.append(q[arrived])
         ends.append(other[arrived])
@@ -108,5 +122,5 @@ def sample_lengths(
         if found >= count:
             return np.concatenate(starts)[:count], np.concatenate(ends)[:count]
     raise InputError(
-        f"lengths of {length:g} mm find no place that the arm reaches within its joint limits; give a shorter one."
+        f"lengths of {length:g} mm cannot be reached by this arm within its joint limits; give a shorter one."
     )

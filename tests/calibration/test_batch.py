@@ -1,4 +1,4 @@
-"""Many identifications at once: the same results as one by one, whatever the chunk, the lanes' neighbours and the devices."""
+"""Many identifications at once: the same results as one by one, whatever the chunk, the neighbours and the devices."""
 
 import os
 import subprocess
@@ -49,9 +49,9 @@ def test_equals_single_identifications(paper_arm, noisy_capture, box, starts, ho
 
 
 def test_the_chunk_changes_no_bit(paper_arm, noisy_capture, box, starts):
-    whole = aj.identify_many(paper_arm, noisy_capture, *box, starts, lanes=8)
-    for chunk in (20, 24):  # 20 is no multiple of the lanes, and neither divides the batch
-        parts = aj.identify_many(paper_arm, noisy_capture, *box, starts, lanes=8, chunk=chunk)
+    whole = aj.identify_many(paper_arm, noisy_capture, *box, starts, slots=8)
+    for chunk in (20, 24):  # 20 is no multiple of the slots, and neither divides the batch
+        parts = aj.identify_many(paper_arm, noisy_capture, *box, starts, slots=8, chunk=chunk)
         for field in ("parameters", "de", "deltam", "k", "steps", "active"):
             np.testing.assert_array_equal(getattr(whole, field), getattr(parts, field))
 
@@ -74,7 +74,7 @@ def test_batches_of_arms_and_captures(paper_arm):
 
 
 def test_failure_is_data(paper_arm, noisy_capture, box, starts):
-    """A problem that cannot be solved spoils no other: one lane gets a capture with NaN, and steps may run out."""
+    """A problem that cannot be solved spoils no other: one problem gets a capture with NaN, and steps may run out."""
     q = np.tile(np.asarray(noisy_capture.q), (3, 1, 1))
     q[1, 5, 2] = np.nan
     broken = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), noisy_capture)
@@ -96,7 +96,7 @@ def test_failure_is_data(paper_arm, noisy_capture, box, starts):
         ({"lower": np.full((BATCH + 1, 21), -1e9)}, "batches of 50 and 51 problems do not fit together"),
         ({"upper": np.full(21, -1e9)}, "lower bound of alpha_1 is above its upper bound"),
         ({"chunk": 0}, "chunk is 0; give at least 1"),
-        ({"lanes": -1}, "lanes is -1; give at least 1"),
+        ({"slots": -1}, "slots is -1; give at least 1"),
     ],
 )
 def test_bad_input(paper_arm, noisy_capture, box, starts, change, message):
@@ -113,14 +113,14 @@ import jax
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
 import numpy as np
 import aacmm_jax as aj
-from aacmm_jax import batch
+from aacmm_jax.calibration import batch
 from tests import published
 assert len(jax.devices()) == int(sys.argv[1])
 arm = aj.load_arm("cheng2018-simulation")
 capture = aj.simulate(arm, {"A": (400, 200, 300)}, poses=30, encoder_arcsec=2.0, seed=1)
 lower, upper = (np.array(side, dtype=float) for side in published.BOXES[1])
 starts = lower + (upper - lower) * np.random.default_rng(0).uniform(size=(64, 21))
-many = aj.identify_many(arm, capture, lower, upper, starts, hold="d_3", lanes=8, chunk=16)
+many = aj.identify_many(arm, capture, lower, upper, starts, hold="d_3", slots=8, chunk=16)
 np.save(sys.argv[2], many.parameters)
 """
 
@@ -152,9 +152,9 @@ def test_no_more_chunks_in_work_than_workers_and_a_failure_stops_the_rest():
         return piece.start
 
     pieces = [range(i, i + 1) for i in range(20)]
-    assert batch._spread(run, pieces[2:], ["one", "two"], 2) == list(range(2, 20))
+    assert batch._run_chunks(run, pieces[2:], ["one", "two"], 2) == list(range(2, 20))
     assert most == 2
     ran.clear()
     with pytest.raises(RuntimeError, match="chunk 1"):
-        batch._spread(run, pieces, ["one"], 1)
+        batch._run_chunks(run, pieces, ["one"], 1)
     assert ran == [0, 1]

@@ -313,9 +313,9 @@ def test_parameters_without_an_uncertainty_of_their_own_say_why(record, certific
     assert all(left[name] is None and values["As left", PARAMETERS, name].expanded for name in others)
 
 
-def test_a_fixed_length_that_the_scale_fix_divided_says_so(record):
+def test_a_fixed_length_says_so(record):
     i = record.names.index("probe_z")
-    parts = ("lower", "upper", "active_stage1", "active", "determined", "common_scale_error")
+    parts = ("lower", "upper", "active_stage1", "active", "determined")
     fewer = {name: np.delete(getattr(record, name), i) for name in parts}
     square = {name: np.delete(np.delete(getattr(record, name), i, 0), i, 1) for name in ("covariance", "open")}
     names = tuple(name for name in record.names if name != "probe_z")
@@ -324,7 +324,7 @@ def test_a_fixed_length_that_the_scale_fix_divided_says_so(record):
         AdministrativeData(),
         created=CREATED,
     )
-    assert "Not identified: fixed at its nominal value, and divided by k as all lengths are" in text
+    assert "Not identified: fixed at its nominal value" in text
     assert parse_dcc(text)["As left", PARAMETERS, "probe_z"].expanded is None
 
 

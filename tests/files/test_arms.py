@@ -66,7 +66,7 @@ def assert_same_arm(arm: aj.Arm, other: aj.Arm, rtol: float = 0.0) -> None:
 
 
 def test_simulated_arm_is_the_papers():
-    """The arm of the paper's section 3 stands in the middle of its first box; d_1 is that of the experiment."""
+    """The arm of the paper's section 3 is in the middle of its first box; d_1 is that of the experiment."""
     arm = aj.load_arm("cheng2018-simulation")
     space = aj.Parameters.free_of(arm)
     lower, upper = (np.array(side) for side in published.BOXES[1])

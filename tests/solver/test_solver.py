@@ -9,7 +9,7 @@ import pytest
 import scipy.optimize
 
 import aacmm_jax as aj
-from tests import bounded_problems, nist
+from tests.solver import bounded_problems, nist_problems
 
 PROBLEMS = 200
 
@@ -87,10 +87,10 @@ def test_residual_is_never_evaluated_outside_the_box():
     assert evaluated > 60
 
 
-@pytest.mark.parametrize("name", nist.MODELS)
-def test_nist_certified_digits(shared, name):
-    """At least 6 certified digits of every parameter, from both starts (NIST StRD)."""
-    data = nist.load(name)
+@pytest.mark.parametrize("name", nist_problems.MODELS)
+def test_nist_certified_digits(name):
+    """At least 6 certified digits of every parameter and 3 of its standard error, from both starts (NIST StRD)."""
+    data = nist_problems.load(name)
 
     @jax.jit
     def fit(start):
@@ -100,8 +100,10 @@ def test_nist_certified_digits(shared, name):
     for start in data.starts:
         value, cost, converged = fit(jnp.asarray(start))
         assert converged
-        assert nist.certified_digits(np.asarray(value), data.certified) >= 6
-        assert 2 * cost <= data.certified_sum_of_squares * (1 + 1e-9)
+        assert nist_problems.certified_digits(np.asarray(value), data.certified) >= 6
+        assert 2 * cost <= data.certified_sum_of_squares * (1 + 1e-9) + 1e-20
+        errors = nist_problems.standard_errors(data, value)
+        assert name == "Lanczos1" or nist_problems.certified_digits(errors, data.standard_error) >= 3
 
 
 def rosenbrock(y, args):
@@ -155,6 +157,31 @@ def test_a_false_derivative_is_not_called_converged():
     wrong.defjvp(lambda primals, tangents: (wrong(*primals), -tangents[0]))
     solution = aj.least_squares(lambda y, _: wrong(y), jnp.array([3.0, 4.0]), throw=False)
     assert solution.stats["reason"] == aj.Reason.stalled
+
+
+@pytest.mark.parametrize("bound", [0.5, np.float64(0.5), np.float32(0.5), jnp.asarray(0.5), np.array(0.5)])
+def test_scalar_bounds_of_every_type(bound):
+    found = aj.least_squares(lambda y, _: y - 2.0, jnp.zeros(3), lower=np.int64(-1), upper=bound)
+    np.testing.assert_array_equal(found.value, np.full(3, 0.5))
+
+
+def test_bounds_in_trees_with_none():
+    residual = lambda y, _: {"a": y["a"] - 2.0, "b": y["b"] + 2.0}  # noqa: E731
+    start = {"a": jnp.zeros(2), "b": jnp.zeros(())}
+    found = aj.least_squares(residual, start, lower={"a": None, "b": -1}, upper={"a": [1.0, np.inf], "b": None})
+    np.testing.assert_allclose(found.value["a"], [1.0, 2.0], rtol=1e-12)
+    assert found.value["b"] == -1
+
+
+def test_bounds_that_do_not_fit_are_refused():
+    for lower in ({"a": 0.0}, [0.0, 1.0], "low"):
+        with pytest.raises(aj.InputError, match="lower does not fit the start"):
+            aj.least_squares(lambda y, _: y, jnp.zeros(3), lower=lower)
+
+
+def test_without_64_bit_floats_nothing_runs():
+    with jax.enable_x64(False), pytest.raises(aj.InputError, match="64-bit floats were turned off"):
+        aj.least_squares(lambda y, _: y, jnp.zeros(3))
 
 
 def test_crossed_bounds_are_refused():

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.summaries import warnings as cautions
+from aacmm_jax.summaries import warnings
 
 
-def cautions_of(capture, arm, **options):
-    """Cautions of a calibration of the paper's arm on a capture."""
+def warnings_of(capture, arm, **options):
+    """Warnings of a calibration of the paper's arm on a capture."""
     specification = aj.kinematics.ArmSpecification(arm, "test")
     result = aj.calibrate(arm, capture, specification.bounds(), **options)
     return result, " ".join(
-        cautions.of_calibration(aj.calibration.record_of(result, aj.Recording(capture, specification)))
+        warnings.of_calibration(aj.calibration.record_of(result, aj.Recording(capture, specification)))
     )
 
 
@@ -32,8 +32,8 @@ def with_lengths(capture, *lengths):
 )
 def test_a_wrong_reference_length(paper_arm, noisy_capture, factor, said):
     true = float(noisy_capture.lengths[0].value)
-    result, text = cautions_of(with_lengths(noisy_capture, ("A", "B", factor * true, 0.002)), paper_arm)
-    assert cautions.plausible(float(result.scale.value)) == (factor in (1.0, 1.02))
+    result, text = warnings_of(with_lengths(noisy_capture, ("A", "B", factor * true, 0.002)), paper_arm)
+    assert warnings.plausible(float(result.scale.value)) == (factor in (1.0, 1.02))
     assert "cannot be the scale" not in text or factor < 1
     assert said is None or said in text
 
@@ -44,9 +44,9 @@ def test_one_length_of_three_that_disagrees(paper_arm):
     capture = aj.simulate(paper_arm, sockets, poses={"A": 70, "B": 10, "C": 10}, seed=4, **noise)
     diagonal = float(np.hypot(200, 300))
     right = with_lengths(capture, ("A", "B", 200.0, 0.002), ("A", "C", 300.0, 0.002), ("B", "C", diagonal, 0.002))
-    assert "disagree" not in cautions_of(right, paper_arm)[1]
+    assert "disagree" not in warnings_of(right, paper_arm)[1]
     wrong = with_lengths(capture, ("A", "B", 200.0, 0.002), ("A", "C", 301.0, 0.002), ("B", "C", diagonal, 0.002))
-    text = cautions_of(wrong, paper_arm)[1]
+    text = warnings_of(wrong, paper_arm)[1]
     assert "Reference lengths that disagree with the arm" in text
     assert "A - C (-" in text
 
@@ -56,22 +56,22 @@ def test_a_pose_that_was_not_seated(paper_arm, noisy_capture):
     q[12, 1] += 1e-3  # some tenths of a millimetre at the tip, tens of times the noise
     cut = noisy_capture.sizes[0]
     capture = aj.Capture({"A": q[:cut], "B": q[cut:]}, noisy_capture.lengths)
-    assert "Poses far from their socket" in cautions_of(capture, paper_arm)[1]
-    assert "A pose 13 (" in cautions_of(capture, paper_arm)[1]
-    assert "Poses far" not in cautions_of(noisy_capture, paper_arm)[1]
+    assert "Poses far from their socket" in warnings_of(capture, paper_arm)[1]
+    assert "A pose 13 (" in warnings_of(capture, paper_arm)[1]
+    assert "Poses far" not in warnings_of(noisy_capture, paper_arm)[1]
 
 
 def test_redundant_and_too_few(paper_arm, noisy_capture):
     sockets = noisy_capture.sockets
     few = aj.Capture({"A": sockets["A"][:8], "B": sockets["B"][:2]}, noisy_capture.lengths)
-    assert "Only 4 more equations than unknowns" in cautions_of(few, paper_arm)[1]
+    assert "Only 4 more equations than unknowns" in warnings_of(few, paper_arm)[1]
     specification = aj.kinematics.ArmSpecification(
         paper_arm, "test", held=("theta_1", "d_1", "a_6", "probe_x", "probe_y")
     )
     with pytest.warns(aj.IdentifiabilityWarning, match="alpha_6 and d_6 trade off"):
         result = aj.calibrate(paper_arm, noisy_capture, specification.bounds())
     text = " ".join(
-        cautions.of_calibration(aj.calibration.record_of(result, aj.Recording(noisy_capture, specification)))
+        warnings.of_calibration(aj.calibration.record_of(result, aj.Recording(noisy_capture, specification)))
     )
     assert "No measurement of this kind can separate: alpha_6 and d_6 trade off." in text
 
@@ -81,9 +81,9 @@ def test_readings_outside_the_limits():
     q = np.tile(np.deg2rad([0.0, 0, 0, -90, 0, 90, 0]), (3, 1)) + 0.01 * np.arange(3)[:, None]
     lengths = [aj.ReferenceLength("A", "B", 50.0)]
     right = aj.Capture({"A": q, "B": q + 0.1}, lengths)
-    assert [text.split(";")[0] for text in cautions.of_capture(aj.Recording(right, panda))] == [
+    assert [text.split(";")[0] for text in warnings.of_capture(aj.Recording(right, panda))] == [
         "Taken as exact, because u is 0: A - B"
     ]
     swapped = aj.Capture({"A": q[:, [0, 1, 3, 2, 4, 5, 6]], "B": jnp.asarray(q + 0.1)}, lengths)
-    found = cautions.of_capture(aj.Recording(swapped, panda))
+    found = warnings.of_capture(aj.Recording(swapped, panda))
     assert found[0].startswith("Joint 4: 3 of 6 readings lie outside its limits, -176 to -4 deg")

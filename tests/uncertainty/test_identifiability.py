@@ -33,7 +33,7 @@ def pairs(arm, positions) -> aj.Capture:
     return aj.simulate(arm, sockets, poses=1, lengths=lengths)
 
 
-# The paper's numbers (held ones beside), with how many lengths; rank, and the directions that nothing determines.
+# The paper's numbers: fixed parameters, number of lengths, rank, and the directions that nothing determines.
 RANKS = {
     "25 on one socket": (
         ("probe_x", "probe_y"),
@@ -63,7 +63,7 @@ def test_rank_and_null_space_of_the_paper(paper_arm, single, paper_capture, case
 
 
 def test_directions_move_nothing(paper_arm, single):
-    """A finite step along each named direction leaves the tips of settled poses together."""
+    """A finite step along each named direction leaves the tips of a socket together."""
     space = aj.Parameters.free_of(paper_arm, held=("probe_x", "probe_y"))
     seen = aj.observability(paper_arm, single, space)
     for direction in seen.null.T:
@@ -111,7 +111,7 @@ def test_calibrate_warns_or_refuses(paper_arm, paper_capture):
         aj.calibrate(paper_arm, paper_capture, bounds, strict=True)
 
 
-def test_few_poses_are_told_what_would_help(paper_arm, paper_capture):
+def test_what_few_poses_need(paper_arm, paper_capture):
     few = aj.Capture({"A": paper_capture.q[:5], "B": paper_capture.q[70:]}, paper_capture.lengths)
     (sentence,) = aj.observability(paper_arm, few).sentences()
     assert "8 combinations of 21 parameters" in sentence

@@ -53,7 +53,7 @@ def test_imitation_is_what_a_finite_step_shows(panda, capture):
 
 @pytest.mark.parametrize("off_axis", [0.0, 0.6, 50.0])
 def test_size_decides(off_axis):
-    """With a probe that stands far off the last axis, joint 6 is determined; on the axis it is not."""
+    """With a probe far off the last axis, joint 6 is determined; on the axis it is not."""
     arm = aj.load_arm("panda").replace(probe_x=off_axis)
     capture = aj.simulate(arm, ENDS, poses=60, lengths=[("A", "B")])
     chosen = set(aj.Parameters.independent(arm, capture).names)

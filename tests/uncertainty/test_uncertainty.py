@@ -85,7 +85,7 @@ def test_weighted_solve_is_the_dense_generalised_least_squares(paper_arm, space,
     ("method", "noise"),
     [pytest.param("two-stage", None, id="even", marks=pytest.mark.slow), pytest.param("joint", UNEVEN, id="weighted")],
 )
-def test_gains_are_derivatives_of_the_whole_calibration(paper_arm, space, bounds, method, noise):
+def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space, bounds, method, noise):
     """What the propagation says of readings and lengths is what central differences of whole calibrations say."""
     pairs, poses = [("A", "B", 0.002), ("B", "C", 0.004)], {"A": 30, "B": 5, "C": 8}
     capture = aj.simulate(paper_arm, SOCKETS, poses=poses, lengths=pairs, encoder_arcsec=0.1, seating=0.0002, seed=5)
@@ -106,18 +106,20 @@ def test_gains_are_derivatives_of_the_whole_calibration(paper_arm, space, bounds
     )
     slopes = (many.parameters[:6] - many.parameters[6:]) / (2 * step)
     found = aj.calibrate(paper_arm, capture, bounds, method=method, noise=noise)
-    stage1, form = found.stage1, "common" if noise is None else "given"
+    stage1, noise_model = found.stage1, "common" if noise is None else "given"
     if method == "joint":
         scaled, sigma = divide_lengths(stage1.arm, stage1.scale.value), stage1.after.sigma / stage1.scale.value
         measurement = Measurement.of(capture).weighted(scaled.geometry, noise)
-        weighing = propagation.joint_weights(scaled, measurement, sigma)
+        weights = propagation.joint_weights(scaled, measurement, sigma)
         none = jnp.zeros(21, dtype=bool)
-        whole = propagation.propagate_solve(found.arm, space, measurement, none, sigma, form, noise, weighing)
+        whole = propagation.propagate_solve(found.arm, space, measurement, none, sigma, noise_model, noise, weights)
     else:
         measurement = Measurement.of(capture).weighted(paper_arm.geometry, noise)
         held, sigma = jnp.asarray([name == "d_3" for name in space.names]), stage1.after.sigma
-        whole = propagation.propagate_solve(stage1.arm, space, measurement, held, sigma, form, noise)
-        whole = propagation.propagate_division(whole, stage1.arm, space, measurement, sigma, found.parameters)
+        whole = propagation.propagate_solve(stage1.arm, space, measurement, held, sigma, noise_model, noise)
+        whole = propagation.propagate_division(
+            whole, stage1.arm, space, measurement, sigma, found.parameters, jnp.zeros(21)
+        )
     by_joints = stage1.arm.jacobian(capture.q, [f"q_{i}" for i in range(1, 7)])
     moved = np.einsum("Nai,tNi->taN", by_joints, turns)
     mine = np.einsum("paN,taN->tp", whole.sensitivity.tips, moved) + shifts @ np.asarray(whole.sensitivity.lengths).T
@@ -143,7 +145,7 @@ def test_many_weighted_calibrations_equal_single_ones(paper_arm, bounds, capture
 
 # Least share of the worst parameter; a share of 95 % of 400 scatters by 1.1 %: 3.8 of it for the worst of 21.
 @pytest.mark.parametrize(
-    ("noise", "form", "least", "most"),
+    ("noise", "noise_model", "least", "most"),
     [
         (NOISE, "given", 0.91, 1.0),
         (None, "estimated", 0.91, 1.0),
@@ -152,7 +154,7 @@ def test_many_weighted_calibrations_equal_single_ones(paper_arm, bounds, capture
     ],
     ids=["given", "estimated", "common", "robust"],
 )
-def test_coverage(paper_arm, space, bounds, noise, form, least, most):
+def test_coverage(paper_arm, space, bounds, noise, noise_model, least, most):
     """400 simulated calibrations: 95 % intervals of noise given, or estimated from the residuals, hold the truth; a common variance does
     not (86 % for some), which is why it is not the default. The 10,000 trials of benchmarks/uncertainty.py are the sharp version."""
     pairs, poses = [("A", "B", 0.0)], {"A": 70, "B": 10}
@@ -166,12 +168,12 @@ def test_coverage(paper_arm, space, bounds, noise, form, least, most):
     )
     values = float(exact.lengths[0].value) + 0.002 * random.normal(size=400)
 
-    def shares(noise, form):
+    def shares(noise, noise_model):
         def one(row):
             q, value = row
             lengths = [aj.ReferenceLength("A", "B", value, 0.002)]
             found = aj.calibrate(
-                paper_arm, aj.Capture({"A": q[:70], "B": q[70:]}, lengths), bounds, noise=noise, noise_model=form
+                paper_arm, aj.Capture({"A": q[:70], "B": q[70:]}, lengths), bounds, noise=noise, noise_model=noise_model
             )
             return found.parameters - space.vector(), jnp.sqrt(jnp.diagonal(found.covariance))
 
@@ -180,9 +182,9 @@ def test_coverage(paper_arm, space, bounds, noise, form, least, most):
         )
         return np.mean(np.abs(error) <= 1.97 * np.asarray(u), axis=0)
 
-    share = shares(noise, form)
+    share = shares(noise, noise_model)
     assert least < share.min() <= most, dict(zip(space.names, share, strict=True))
-    if form in ("given", "estimated"):
+    if noise_model in ("given", "estimated"):
         assert 0.94 < share.mean() < 0.965
 
 
@@ -245,12 +247,12 @@ def test_intervals_and_correlations(result):
 
 
 @pytest.mark.slow
-def test_degrees_of_freedom_follow_the_form(paper_arm, capture, bounds):
+def test_degrees_of_freedom_follow_the_noise_model(paper_arm, capture, bounds):
     """43 poses in three sockets give 120 equations, less the 20 that stage 1 fits."""
-    for form, freedom in (("estimated", 100), ("common", 100), ("robust", 40 - 20 / 3)):
-        uncertainty = aj.uncertainty_of(aj.calibrate(paper_arm, capture, bounds, noise_model=form))
-        assert uncertainty.degrees_of_freedom == pytest.approx(freedom)
-        assert uncertainty.factor(0.95) == pytest.approx(stats.t.ppf(0.975, freedom))
+    for noise_model, expected in (("estimated", 100), ("common", 100), ("robust", 40 - 20 / 3)):
+        uncertainty = aj.uncertainty_of(aj.calibrate(paper_arm, capture, bounds, noise_model=noise_model))
+        assert uncertainty.degrees_of_freedom == pytest.approx(expected)
+        assert uncertainty.factor(0.95) == pytest.approx(stats.t.ppf(0.975, expected))
 
 
 @pytest.mark.slow
@@ -268,7 +270,7 @@ def test_estimated_noise_is_that_of_the_simulation(paper_arm, bounds):
     assert np.all(np.abs(mean - [16.0, 1e-4]) < 4 * error)
 
 
-def test_misfit_tells_that_the_noise_is_wrong(paper_arm, capture, bounds):
+def test_reduced_chi_shows_that_the_noise_is_wrong(paper_arm, capture, bounds):
     right = aj.calibrate(paper_arm, capture, bounds, noise=NOISE)
     wrong = aj.calibrate(paper_arm, capture, bounds, noise=aj.Noise(encoder_arcsec=1.0, seating=0.0025))
     assert 0.85 < float(right.stage1.reduced_chi) < 1.15
@@ -285,7 +287,7 @@ def test_socket_bases_are_orthonormal(paper_arm, capture):
         np.testing.assert_allclose(products[capture.owner == i].sum(axis=0), np.eye(3), atol=1e-12)
 
 
-def test_settled_poses_rest_in_their_sockets(paper_arm, capture):
+def test_projected_poses_meet_in_their_sockets(paper_arm, capture):
     tips = np.asarray(paper_arm.position(project_to_centroids(paper_arm, capture)))
     for i in range(3):
         assert np.ptp(tips[capture.owner == i], axis=0).max() < 1e-6

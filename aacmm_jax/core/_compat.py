@@ -1,0 +1,44 @@
+"""Every private or unstable name of JAX, Equinox and Optimistix that the package uses, each behind a name of its own.
+
+A new version of one of them is tried against this module; ruff forbids those names everywhere else (pyproject.toml).
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero as SymbolicZero
+from jaxtyping import Array, Int
+from optimistix.internal import implicit_jvp as implicit_jvp
+
+Static = eqxi.Static  # a leaf that jit takes as a constant
+
+
+def is_traced(value: object) -> bool:
+    """Whether a value is a tracer of jit, vmap or a derivative, so that its number is not known yet."""
+    return isinstance(value, jax.core.Tracer)
+
+
+def inside_trace() -> bool:
+    """Whether this runs inside jit or vmap, where even what is constant becomes a tracer once JAX computes with it."""
+    return is_traced(jnp.negative(0.0))
+
+
+def while_loop(cond_fun: Callable, body_fun: Callable, init_val: Any, *, max_steps: int | None) -> Any:
+    """XLA's own loop, with Equinox's limit on steps: the form that Optimistix asks of an adjoint."""
+    return eqxi.while_loop(cond_fun, body_fun, init_val, max_steps=max_steps, kind="lax")
+
+
+def member_numbers(member: Any) -> Int[Array | np.ndarray, "*batch"]:
+    """The number of each member in an array of members of an enumeration."""
+    return member._value
+
+
+def members(like: Any, numbers: Int[Array, "*batch"]) -> Any:
+    """An array of members of the enumeration of ``like``, from their numbers. (Equinox's own constructors take one.)"""
+    return eqx.tree_at(lambda item: item._value, like, numbers)

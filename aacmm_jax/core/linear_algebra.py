@@ -1,0 +1,159 @@
+"""Factorisations of small matrices (up to about 40 rows) as plain array operations; leading axes are batches.
+
+jaxlib's batched LAPACK calls split their batch over the thread pool whose threads they block, so that independent ones in
+one program can wait for each other forever (measured on two cores with four). Nothing here calls LAPACK.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+_EPSILON = float(np.finfo(np.float64).eps)
+_MAX_SWEEPS = 30  # of Jacobi rotations; matrices of 40 rows need about 10
+
+
+@jax.custom_jvp
+def solve_positive_definite(
+    matrix: Float[Array, "*batch p p"], right: Float[Array, "*batch p"]
+) -> Float[Array, "*batch p"]:
+    """Solution x of matrix x = right by Cholesky; NaN where the matrix is not positive definite to working precision."""
+    p = matrix.shape[-1]
+    # Rows of a multiple of four numbers: others take up to half as long again (22 of them, measured).
+    filled = jnp.zeros((*right.shape, -(p + 1) % 4))
+    rows = _triangular(jnp.concatenate([matrix, right[..., None], filled], axis=-1))
+
+    def substitute(i: Array, known: Array) -> Array:
+        k = p - 1 - i
+        row = lax.dynamic_index_in_dim(rows, k, -2, keepdims=False)
+        value = -jnp.sum(row * known, axis=-1, keepdims=True) / lax.dynamic_slice_in_dim(row, k, 1, -1)
+        return lax.dynamic_update_slice_in_dim(known, value, k, -1)
+
+    # The right side is column p of the triangle, so its factor is -1 throughout.
+    start = jnp.zeros(rows.shape[:-2] + rows.shape[-1:]).at[..., p].set(-1.0)
+    return lax.fori_loop(0, p, substitute, start)[..., :p]
+
+
+@solve_positive_definite.defjvp
+def _solve_jvp(primals: tuple[Array, Array], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
+    (matrix, right), (d_matrix, d_right) = primals, tangents
+    solution = solve_positive_definite(matrix, right)
+    change = d_right - (d_matrix @ solution[..., None])[..., 0]
+    return solution, (inverse_positive_definite(matrix) @ change[..., None])[..., 0]
+
+
+@jax.custom_jvp
+def inverse_cholesky(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batch p p"]:
+    """W, lower triangular with W matrix W^T = I: the inverse of the Cholesky factor. It whitens what has this covariance."""
+    p = matrix.shape[-1]
+    identity = jnp.broadcast_to(jnp.eye(p), matrix.shape)
+    return jnp.tril(_triangular(jnp.concatenate([matrix, identity], axis=-1))[..., p:])
+
+
+@inverse_cholesky.defjvp
+def _inverse_cholesky_jvp(primals: tuple[Array], tangents: tuple[Any]) -> tuple[Array, Array]:
+    # With L = W^-1: dL = L half(W dA W^T), hence dW = -half(W dA W^T) W.
+    whitening = inverse_cholesky(primals[0])
+    change = whitening @ tangents[0] @ jnp.swapaxes(whitening, -1, -2)
+    half = jnp.tril(change) - 0.5 * jnp.eye(change.shape[-1]) * change
+    return whitening, -half @ whitening
+
+
+def inverse_positive_definite(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batch p p"]:
+    """Inverse of a symmetric positive definite matrix; NaN where it is not."""
+    whitening = inverse_cholesky(matrix)
+    return jnp.swapaxes(whitening, -1, -2) @ whitening
+
+
+def _triangular(augmented: Float[Array, "*batch p m"]) -> Float[Array, "*batch p m"]:
+    """``[A B]`` to ``[U L^-1 B]``, where U = L^T and A = L U; below the diagonal of U stand rounding errors.
+
+    Row by row, each with one product of a vector and the rows so far: the loop over rows of batches is what the CPU does
+    fastest (as fast as LAPACK at 16 matrices of 20 rows; updates of the whole rest after each row take five times as long).
+    """
+
+    def row(j: Array, rows: Array) -> Array:
+        column = lax.dynamic_index_in_dim(rows, j, -1, keepdims=False)
+        fresh = lax.dynamic_index_in_dim(augmented, j, -2, keepdims=False) - (column[..., None, :] @ rows)[..., 0, :]
+        fresh = fresh * lax.rsqrt(lax.dynamic_slice_in_dim(fresh, j, 1, -1))
+        return lax.dynamic_update_index_in_dim(rows, fresh, j, -2)
+
+    return lax.fori_loop(0, augmented.shape[-2], row, jnp.zeros_like(augmented))
+
+
+def singular_values(
+    matrix: Float[Array, "*batch m p"],
+) -> tuple[Float[Array, "*batch m p"], Float[Array, "*batch p"], Float[Array, "*batch p p"]]:
+    """U, s, V with matrix = U diag(s) V^T, s in descending order; for m >= p. Not differentiable where values repeat.
+
+    Columns of U that belong to s = 0 are 0. One-sided Jacobi: pairs of columns are rotated until all are orthogonal, p/2
+    disjoint pairs at a time (Hestenes 1958; Demmel and Veselic 1992 for its accuracy, which scaling of columns does not spoil).
+    """
+    height, p = matrix.shape[-2:]
+    partners = jnp.asarray(_round_robin(p))
+    order = jnp.arange(p)
+
+    def rotate(step: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        stacked, largest_cosine = state
+        partner = partners[step]
+        other = stacked[..., partner]
+        columns = stacked[..., :height, :]
+        norm = jnp.sqrt(jnp.sum(columns**2, axis=-2))
+        norm = jnp.where(norm > 0, norm, 1.0)
+        # Divided by one norm after the other: the product of two squares may underflow.
+        cosine = jnp.sum(columns * other[..., :height, :], axis=-2) / norm / norm[..., partner]
+        alone, before = (jnp.broadcast_to(mask, norm.shape) for mask in (partner == order, order < partner))
+        cosine = jnp.where(alone, 0.0, cosine)
+        rotated = jnp.abs(cosine) > 0.5 * _EPSILON
+        ratio = norm[..., partner] / norm
+        cotangent = (ratio - 1 / ratio) / (2 * jnp.where(rotated, cosine, 1.0))  # of twice the angle
+        sign = jnp.where((cotangent > 0) | ((cotangent == 0) & before), 1.0, -1.0)
+        tangent = jnp.where(rotated, sign / (jnp.abs(cotangent) + jnp.hypot(1.0, cotangent)), 0.0)
+        stacked = lax.rsqrt(1 + tangent**2)[..., None, :] * (stacked - tangent[..., None, :] * other)
+        return stacked, jnp.maximum(largest_cosine, jnp.max(jnp.abs(cosine), axis=-1))
+
+    def sweep(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        count, stacked, _ = state
+        return count + 1, *lax.fori_loop(0, len(partners), rotate, (stacked, jnp.zeros(matrix.shape[:-2])))
+
+    def more(state: tuple[Array, Array, Array]) -> Array:
+        count, _, largest_cosine = state
+        return (count < _MAX_SWEEPS) & jnp.any(largest_cosine > p * _EPSILON)
+
+    identity = jnp.broadcast_to(jnp.eye(p), (*matrix.shape[:-2], p, p))
+    start = jnp.concatenate([matrix, identity], axis=-2)
+    _, stacked, _ = lax.while_loop(more, sweep, (jnp.zeros((), dtype=jnp.int32), start, jnp.ones(matrix.shape[:-2])))
+    values = jnp.linalg.norm(stacked[..., :height, :], axis=-2)
+    descending = jnp.argsort(-values, axis=-1)
+    values = jnp.take_along_axis(values, descending, axis=-1)
+    stacked = jnp.take_along_axis(stacked, descending[..., None, :], axis=-1)
+    left = stacked[..., :height, :] / jnp.where(values > 0, values, 1.0)[..., None, :]
+    return left, values, stacked[..., height:, :]
+
+
+def semidefinite_eigen(
+    matrix: Float[Array, "*batch p p"],
+) -> tuple[Float[Array, "*batch p"], Float[Array, "*batch p p"]]:
+    """Eigenvalues in descending order and eigenvectors (columns) of a symmetric positive semidefinite matrix.
+
+    Its singular values are its eigenvalues. No derivative passes: that of an eigenvector is infinite where values repeat.
+    """
+    _, values, vectors = singular_values(lax.stop_gradient(matrix))
+    return values, vectors
+
+
+def _round_robin(p: int) -> np.ndarray:
+    """The partner of each column in each round of a tournament in which every pair meets once; a column alone meets itself."""
+    even = p + p % 2
+    seats = list(range(even))
+    rounds = np.tile(np.arange(even), (even - 1, 1))
+    for row in rounds:
+        for a, b in zip(seats[: even // 2], reversed(seats[even // 2 :]), strict=True):
+            row[a], row[b] = b, a
+        seats[1:] = [seats[-1], *seats[1:-1]]
+    if p % 2:
+        rounds = np.where(rounds == p, np.arange(even), rounds)
+    return rounds[:, :p]
