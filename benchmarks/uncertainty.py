@@ -223,8 +223,12 @@ def shipped(trials: int = 400) -> dict:
     """Coverage of every free parameter of the shipped arms, one calibration after the other as a user makes them."""
     found: dict = {"trials": trials}
     for name, fixed in (
-        ("cheng2018-simulation", ()), ("panda", ()), ("iiwa14", ()), ("panda", ("alpha_6", "theta_6")), ("iiwa14", ("alpha_6", "theta_6")),
-    ):  # fmt: skip
+        ("cheng2018-simulation", ()),
+        ("panda", ()),
+        ("iiwa14", ()),
+        ("panda", ("alpha_6", "theta_6")),
+        ("iiwa14", ("alpha_6", "theta_6")),
+    ):
         specification = aj.files.load_specification(name)
         free = specification.bounds().space.names
         space = aj.Parameters(specification.arm, tuple(other for other in free if other not in fixed))
@@ -236,7 +240,8 @@ def shipped(trials: int = 400) -> dict:
 
 
 def shipped_coverage(space: aj.Parameters, method: str, trials: int, seed: int = 4) -> dict:
-    """Coverage of the 95 % intervals of each free parameter, %, over recordings of one arm that is not the nominal one."""
+    """Coverage of the 95 % intervals of each free parameter, %, over recordings of one arm that is not the nominal
+    one."""
     true = aj.perturbed_arm(space, length=0.5, angle=1e-3, seed=seed)
     reach = 0.6 * float(np.abs(np.asarray(space.base.a)).sum() + np.abs(np.asarray(space.base.d[1:])).sum())
     directions = np.array([[0.6, 0.2, 0.1], [0.3, -0.5, 0.2], [-0.4, 0.4, 0.3], [0.2, 0.5, -0.1]])

@@ -1,4 +1,5 @@
-"""Before anything is imported: one cache of compiled programs for all worker processes, the command line and the notebooks' kernels.
+"""Before anything is imported: one cache of compiled programs for all worker processes, the command line and the
+notebooks' kernels.
 
 Compiling is most of the suite's time. The cache is empty when the tests begin and gone when they end.
 """

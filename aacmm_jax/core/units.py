@@ -1,4 +1,5 @@
-"""Units in mm and rad, which everything inside is in: a value times its unit is in mm or rad; divided by it, in the unit."""
+"""Units in mm and rad, which everything inside is in: a value times its unit is in mm or rad; divided by it, in the
+unit."""
 
 import math
 

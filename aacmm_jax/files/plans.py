@@ -76,7 +76,7 @@ def file_of(procedure: Procedure, item: Item) -> str:
 def procedure_manifest(procedure: Procedure, arm: str) -> str:
     """A manifest for the readings of an acceptance test, in which the calibrated values are to be filled in."""
     lines = [
-        f"# {PLANNED[procedure.standard]}, as planned. Fill in the calibrated values and standard uncertainties of your",
+        f"# {PLANNED[procedure.standard]}, as planned. Fill in the calibrated values and uncertainties (k = 1) of your",
         "# artefacts, record a file for each socket and each group of touches (one row a pose, in the order of the",
         "# plan), then: aacmm import THIS.toml -o acceptance.h5",
         f"arm = {_quoted(arm)}",

@@ -65,8 +65,8 @@ def _implausible(record: CalibrationRecord) -> list[str]:
         return []
     rms = float(record.evaluations()["calibrated"].repeatability.rms)
     return [
-        f"The poses of a socket disagree by {rms:.3g} mm RMS, over a hundred times what an arm of this size can be, so data and arm "
-        "do not belong together: check the files, their columns and unit, the sockets and the arm."
+        f"The poses of a socket disagree by {rms:.3g} mm RMS, over a hundred times what an arm of this size can be, "
+        "so data and arm do not belong together: check the files, their columns and unit, the sockets and the arm."
     ]
 
 
@@ -102,9 +102,11 @@ def _scale(record: CalibrationRecord) -> list[str]:
         return [f"k = {k:.6g} cannot be the scale of this arm; {hint}"]
     fixed = record.scale_set_by
     if fixed and record.method == "two-stage":
-        which = f"{_some(list(fixed))} {'is' if len(fixed) == 1 else 'are'} fixed and already set{'s' * (len(fixed) == 1)} the scale"
+        verbs = "is fixed and already sets" if len(fixed) == 1 else "are fixed and already set"
+        which = f"{_some(list(fixed))} {verbs} the scale"
         return [
-            f"{which}, so the reference lengths changed nothing: by them the arm is {k:.6f} times too large (u = {record.u_k:.2g}). "
+            f"{which}, so the reference lengths changed nothing: by them the arm is {k:.6f} times too large "
+            f"(u = {record.u_k:.2g}). "
             "Free one of these lengths, or use both with the joint solve (--method joint)."
         ]
     if record.hold is None and stage1 and not fixed:

@@ -63,7 +63,8 @@ def test_monte_carlo_agrees_with_the_linear_result_and_is_stable(arm, sampled):
 
 @pytest.mark.slow
 def test_two_stages_with_fixed_lengths(arm, capture, bounds):
-    """Most lengths are fixed here, and set the scale: stage 2 changes nothing, in the linear result and in every trial."""
+    """Most lengths are fixed here, and set the scale: stage 2 changes nothing, in the linear result and in every
+    trial."""
     result = aj.calibrate(arm, capture, bounds, noise=NOISE)
     assert result.method == "two-stage"
     assert result.scale_set_by
@@ -119,7 +120,8 @@ def test_cross_validation_of_honest_data(arm, bounds, capture):
 
 
 def test_cross_validation_shows_what_the_uncertainty_misses(arm, bounds, capture):
-    """Errors that all poses of a placement share, as of an arm that gives way: the lengths come out wrong by far more than their u."""
+    """Errors that all poses of a placement share, as of an arm that gives way: the lengths come out wrong by far more
+    than their u."""
     wrong = [
         aj.ReferenceLength(r.start, r.end, float(r.value) + off, 0.01)
         for r, off in zip(capture.lengths, (0.15, -0.1, -0.1), strict=True)
@@ -140,7 +142,8 @@ def left_out(rms, errors, u, poses=24, predicted=0.01) -> LeftOut:
     return LeftOut(("A", "B"), poses, rms, predicted, np.array(errors), np.array(u), True)
 
 
-# Groups of sockets, and whether their errors are more than chance: a ratio of 1.5 with two lengths is nothing special, with fifty it is.
+# Groups of sockets, and whether their errors are more than chance: a ratio of 1.5 with two lengths is nothing special,
+# with fifty it is.
 SURPRISES = {
     "as predicted": ([left_out(0.01, [0.02], [0.02])] * 3, 1.0, False),
     "few lengths": ([left_out(0.01, [0.035], [0.02])] * 2, 1.75, False),

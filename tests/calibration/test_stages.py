@@ -67,7 +67,8 @@ def test_stage_2_makes_every_way_agree(calibrations, paper_arm, noisy_capture):
 
 
 def test_free_lengths_slide_to_a_bound_and_the_result_says_so(calibrations):
-    """AUDIT: shrinking the arm lowers the misfit, so with noise and nothing held stage 1 shrinks until a bound stops it."""
+    """AUDIT: shrinking the arm lowers the misfit, so with noise and nothing held stage 1 shrinks until a bound stops
+    it."""
     stage1 = calibrations["two-stage", None].stage1
     assert float(stage1.scale.value) < 0.999
     assert "lower" in stage1.active_names().values()
@@ -79,7 +80,8 @@ def test_free_lengths_slide_to_a_bound_and_the_result_says_so(calibrations):
 
 
 def test_joint_solve_is_the_weighted_minimum(calibrations, space, noisy_capture):
-    """Its gradient vanishes: recomputed here with the weights the contract states, by JAX and not by the package's model."""
+    """Its gradient vanishes: recomputed here with the weights the contract states, by JAX and not by the package's
+    model."""
     result = calibrations["joint", "longest"]
     sizes = np.array(noisy_capture.sizes)
     sigma = float(result.stage1.after.sigma / result.stage1.scale.value)
@@ -122,7 +124,8 @@ def test_scale_leaves_the_base_offset_alone(paper_arm, paper_capture):
 
 
 def test_metrics_by_hand():
-    """One socket with tips (0,0,0), (2,0,0), (0,4,0), (2,4,0): centroid (1,2,0), every distance sqrt(5), half range 2."""
+    """One socket with tips (0,0,0), (2,0,0), (0,4,0), (2,4,0): centroid (1,2,0), every distance sqrt(5), half range
+    2."""
     tips = jnp.array([[0.0, 0, 0], [2, 0, 0], [0, 4, 0], [2, 4, 0], [7, 7, 7]])
     figures = aj.model.repeatability(tips, (4, 1))
     assert float(figures.de) == pytest.approx(np.sqrt(5))
@@ -156,7 +159,8 @@ def central(function, point, direction, step=2e-3):
 
 @pytest.fixture(scope="module")
 def differentiated(paper_arm, noisy_capture, space, start):
-    """A calibration as a function of angles, bounds and length; with its forward and reverse derivative, compiled once."""
+    """A calibration as a function of angles, bounds and length; with its forward and reverse derivative, compiled
+    once."""
 
     def run(q, box, length):
         cut = noisy_capture.sizes[0]
@@ -175,7 +179,8 @@ def differentiated(paper_arm, noisy_capture, space, start):
 @pytest.mark.parametrize("boxed", [False, True], ids=["inactive", "active"])
 @pytest.mark.parametrize("by", ["angles", "bounds", "length"])
 def test_derivatives_of_a_calibration(paper_arm, noisy_capture, space, differentiated, by, boxed):
-    """Forward and reverse against central differences, relative to the largest component, with bounds active and not."""
+    """Forward and reverse against central differences, relative to the largest component, with bounds active and
+    not."""
     run, forward, reverse = differentiated
     bounds = aj.Bounds.around(paper_arm, space)
     lower, upper = np.array(bounds.lower), np.array(bounds.upper)
@@ -206,7 +211,8 @@ def test_derivatives_of_a_calibration(paper_arm, noisy_capture, space, different
 
 
 def test_hayatis_angle_tells_parallel_axes_apart():
-    """Two parallel axes: d_2 and d_3 trade off exactly, so one is held, and the tilt that D-H lacks is found as beta."""
+    """Two parallel axes: d_2 and d_3 trade off exactly, so one is held, and the tilt that D-H lacks is found as
+    beta."""
     parallel = aj.Arm(
         alpha=[np.pi / 2, 0.0, -np.pi / 2, np.pi / 2],
         a=[30.0, 400.0, 60.0, 0.0],
@@ -227,8 +233,8 @@ def test_hayatis_angle_tells_parallel_axes_apart():
 
 @pytest.mark.slow
 def test_uncertainties_are_those_that_trials_show(paper_arm, space, bounds):
-    """150 simulated calibrations with lengths that share sockets: normalised errors of every parameter, of k and of a length
-    elsewhere have a root mean square near 1, for each method and whether a length is held or not."""
+    """150 simulated calibrations with lengths that share sockets: normalised errors of every parameter, of k and of a
+    length elsewhere have a root mean square near 1, for each method and whether a length is held or not."""
     sockets = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (400, 500, 300), "D": (450, 250, 600)}
     pairs = [("A", "B"), ("A", "C"), ("A", "D"), ("B", "C")]
     exact = aj.simulate(paper_arm, sockets, poses=20, lengths=pairs, seed=2)
@@ -269,7 +275,8 @@ def test_uncertainties_are_those_that_trials_show(paper_arm, space, bounds):
     for method, hold in (("two-stage", "d_3"), ("two-stage", None), ("joint", "d_3")):
         normalised, length = trials(keys, method, hold)
         spread = np.sqrt(np.mean(np.asarray(normalised) ** 2, axis=0))
-        # With 150 trials an RMS of 1 scatters by 0.06; encoder noise is not the same in every pose, which adds a little.
+        # With 150 trials an RMS of 1 scatters by 0.06; encoder noise is not the same in every pose, which adds a
+        # little.
         assert np.all((spread > 0.75) & (spread < 1.35)), (
             method,
             hold,
@@ -290,7 +297,8 @@ def test_uncertainty_of_k_is_unknown_without_any_scatter(paper_arm, noisy_captur
 
 
 def test_a_known_length_leaves_nothing_more_to_hold(paper_arm, space):
-    """With d_3 held by the user the scale is known, so "longest" holds nothing; a redundant held length changes nothing."""
+    """With d_3 held by the user the scale is known, so "longest" holds nothing; a redundant held length changes
+    nothing."""
     held = (*space.held, "d_3")
     known = aj.Parameters.free_of(paper_arm, held=held)
     longer = known.arm(known.vector().at[known.index("d_5")].add(1.0))
@@ -302,7 +310,8 @@ def test_a_known_length_leaves_nothing_more_to_hold(paper_arm, space):
 
 
 def test_what_data_cannot_tell_apart_is_marked(paper_arm, noisy_capture):
-    """With everything free: d_1 and theta_1 only move the base frame, and (a_6, theta_6), (alpha_6, d_6) trade off (AUDIT)."""
+    """With everything free: d_1 and theta_1 only move the base frame, and (a_6, theta_6), (alpha_6, d_6) trade off
+    (AUDIT)."""
     everything = aj.Parameters.free_of(paper_arm, held=())
     bounds = aj.Bounds.around(paper_arm, everything)
     result = aj.identify(paper_arm, noisy_capture, bounds, hold="d_3")

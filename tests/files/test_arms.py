@@ -229,7 +229,8 @@ joint = [
 
 
 def test_a_file_without_identification_gets_independent_parameters(tmp_path):
-    """Three parallel axes: two of their offsets are fixed, and Hayati's angles are free instead; also after a round trip."""
+    """Three parallel axes: two of their offsets are fixed, and Hayati's angles are free instead; also after a round
+    trip."""
     path = written(tmp_path, ROBOT)
     specification = aj.files.load_specification(path)
     chosen = aj.Parameters.independent(specification.arm)

@@ -1,4 +1,5 @@
-"""Directions that have a rank of their own and are hardly determined all the same: named, fixed by choice, part of u."""
+"""Directions that have a rank of their own and are hardly determined all the same: named, fixed by choice, part of
+u."""
 
 import numpy as np
 import pytest
@@ -62,7 +63,8 @@ def test_size_decides(off_axis):
 
 
 def test_noise_and_bounds_decide(paper_arm, paper_capture):
-    """The paper's arm is well conditioned; but bounds narrower than the data resolve make a direction near-degenerate."""
+    """The paper's arm is well conditioned; but bounds narrower than the data resolve make a direction
+    near-degenerate."""
     assert aj.observability(paper_arm, paper_capture).trade_offs == ()
     space = aj.Parameters.free_of(paper_arm)
     for width, found in ((10.0, False), (1e-3, True)):
@@ -79,7 +81,8 @@ def test_shipped_arms_are_what_independent_chooses():
 
 @pytest.mark.parametrize("method", ["two-stage", pytest.param("joint", marks=pytest.mark.slow)])
 def test_a_bound_that_ends_such_a_direction_is_part_of_u(panda, capture, method):
-    """The arm is right but for 2 mm of a_6, so theta_6 goes to its bound; a_6 and theta_6 must not pass as exactly known."""
+    """The arm is right but for 2 mm of a_6, so theta_6 goes to its bound; a_6 and theta_6 must not pass as exactly
+    known."""
     nominal = panda.replace(a_6=90.0)
     space = aj.Parameters.free_of(nominal, held=REDUNDANT)
     override = {"a_6": 5.0, "theta_6": 0.001, "probe_x": 60.0, "probe_y": 60.0, "probe_z": 60.0}

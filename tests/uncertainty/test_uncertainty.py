@@ -1,4 +1,5 @@
-"""Uncertainties against independent ways to them: derivatives of whole calibrations, dense least squares, simulated trials."""
+"""Uncertainties against independent ways to them: derivatives of whole calibrations, dense least squares, simulated
+trials."""
 
 import jax
 import jax.numpy as jnp
@@ -53,7 +54,8 @@ def test_inverse_root_is_that_of_cholesky():
 
 
 def test_weighted_solve_is_the_dense_generalised_least_squares(paper_arm, space, bounds, capture, result):
-    """At the solution the gradient of the textbook's objective, sockets as unknowns, is zero; its curvature is the covariance."""
+    """At the solution the gradient of the textbook's objective, sockets as unknowns, is zero; its curvature is the
+    covariance."""
     noise = tip_covariances(result.stage1.arm.geometry, Measurement.of(capture).sines_cosines, NOISE)
     inverse = jnp.linalg.inv(jnp.moveaxis(noise, -1, 0))
     ends = capture.ends()
@@ -124,7 +126,8 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
     moved = np.einsum("Nai,tNi->taN", by_joints, turns)
     mine = np.einsum("paN,taN->tp", whole.sensitivity.tips, moved) + shifts @ np.asarray(whole.sensitivity.lengths).T
     mine = mine * np.asarray(space.scale)
-    # They differ only as residuals turn with the parameters: by 4 % with the noise of a real arm, which here is a twentieth.
+    # They differ only as residuals turn with the parameters: by 4 % with the noise of a real arm, which here is a
+    # twentieth.
     assert np.abs((mine - slopes) / np.abs(slopes).max(axis=0)).max() < 0.02
 
 
@@ -155,8 +158,9 @@ def test_many_weighted_calibrations_equal_single_ones(paper_arm, bounds, capture
     ids=["given", "estimated", "common", "robust"],
 )
 def test_coverage(paper_arm, space, bounds, noise, noise_model, least, most):
-    """400 simulated calibrations: 95 % intervals of noise given, or estimated from the residuals, hold the truth; a common variance does
-    not (86 % for some), which is why it is not the default. The 10,000 trials of benchmarks/uncertainty.py are the sharp version."""
+    """400 simulated calibrations: 95 % intervals of noise given, or estimated from the residuals, hold the truth; a
+    common variance does not (86 % for some), which is why it is not the default. The 10,000 trials of
+    benchmarks/uncertainty.py are the sharp version."""
     pairs, poses = [("A", "B", 0.0)], {"A": 70, "B": 10}
     sockets = {"A": (400, 200, 300), "B": (700, 500, 500)}
     exact = aj.simulate(paper_arm, sockets, poses=poses, lengths=pairs, seed=2)
@@ -219,7 +223,8 @@ def test_over_the_volume(result):
 
 
 def test_what_is_open_has_no_uncertainty(paper_arm, capture):
-    """With alpha_6 and d_6 both free neither is determined; the tip is, and so are lengths. Without a length the scale is open."""
+    """With alpha_6 and d_6 both free neither is determined; the tip is, and so are lengths. Without a length the scale
+    is open."""
     free = aj.Parameters.free_of(paper_arm, held=("d_1", "theta_1", "a_6", "probe_x", "probe_y"))
     identified = aj.identify(paper_arm, capture, aj.Bounds.around(paper_arm, free), hold="d_3", noise=NOISE)
     uncertainty = aj.uncertainty_of(identified)
