@@ -14,7 +14,7 @@ import aacmm_jax as aj
 from aacmm_jax.calibration.sampling import batch_of
 from aacmm_jax.calibration.scale_anchor import scale_anchor
 from aacmm_jax.core.units import ARCSEC
-from aacmm_jax.kinematics.arm import replace, value_of
+from aacmm_jax.kinematics.arm import value_of
 from aacmm_jax.model.scale import divide_lengths
 from aacmm_jax.summaries import warnings as cautions
 
@@ -245,7 +245,7 @@ def test_a_batch_of_arms_is_evaluated_arm_by_arm(paper_arm, too_long, capture):
     for i, arm in enumerate((paper_arm, too_long)):
         one = aj.evaluate(arm, capture)
         jax.tree.map(lambda many, single, i=i: np.testing.assert_allclose(many[i], single, rtol=1e-9), found, one)
-    shared = replace(both, probe=paper_arm.probe)  # a batch in some parameters only
+    shared = both.replace(probe=paper_arm.probe)  # a batch in some parameters only
     np.testing.assert_allclose(aj.evaluate(shared, capture).repeatability.de, found.repeatability.de, rtol=1e-9)
 
 
