@@ -1,4 +1,4 @@
-"""What people pass for arrays of numbers, converted to float64 arrays or refused."""
+"""Conversion of arguments to float64 arrays, with messages that name what is wrong."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

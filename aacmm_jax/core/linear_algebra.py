@@ -1,4 +1,4 @@
-"""Factorisations of small matrices (up to about 40 rows) as plain array operations; leading axes are batches.
+"""Factorisations of small matrices (up to about 40 rows) by array operations, for any leading batch axes.
 
 jaxlib's batched LAPACK calls split their batch over the thread pool whose threads they block, so that independent ones
 in one program can wait for each other forever (measured on two cores with four). Nothing here calls LAPACK.

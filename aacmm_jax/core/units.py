@@ -1,5 +1,4 @@
-"""Units in mm and rad, which everything inside is in: a value times its unit is in mm or rad; divided by it, in the
-unit."""
+"""Units as multiples of mm and rad: a value times its unit is in mm or rad."""
 
 import math
 

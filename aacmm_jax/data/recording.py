@@ -1,4 +1,4 @@
-"""A recording: a capture with the arms that it belongs to and its origin."""
+"""A recording: a capture, its nominal arm, the true arm of a simulation, and its origin."""
 
 from typing import NamedTuple
 

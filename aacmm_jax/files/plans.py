@@ -1,4 +1,4 @@
-"""Plans on paper: the poses of a calibration or of an acceptance test as CSV, and the manifest for what is recorded."""
+"""Plans as files: the poses of a calibration or of an acceptance test as CSV, and the manifest for the readings."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Near-degenerate parameters: combinations whose change the tips hardly show, whatever their rank says.
+"""Near-degenerate parameters: combinations that have full rank but hardly move the tips.
 
 A matrix of derivatives has full rank as soon as no combination of parameters leaves the tips exactly where they are.
 That says nothing of how well the combination is determined: a probe 0.6 mm off the last axis gives ``theta_6`` a rank

@@ -1,4 +1,4 @@
-"""Measurement and arm make residuals: weights, scale and repeatability."""
+"""The measurement model: residuals of a capture for an arm, weights, the scale, and repeatability."""
 
 import lazy_loader as _lazy_loader
 

@@ -1,4 +1,4 @@
-"""Stage 2: the scale k, which repeatability cannot determine, from reference lengths (Cheng et al. 2018, section 2.3).
+"""The scale k, which repeatability cannot determine, from reference lengths (Cheng et al. 2018, section 2.3).
 
 The uncertainty of k comes from the lengths and the scatter at their ends (here, `scale_and_weights`), and from the
 identified parameters (`uncertainty.scale_uncertainty`).

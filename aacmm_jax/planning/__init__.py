@@ -1,4 +1,4 @@
-"""Which poses to take, in which sockets, before the arm is touched."""
+"""Planning of calibrations: where sockets and reference lengths stand, and which poses to take."""
 
 import lazy_loader as _lazy_loader
 

@@ -1,5 +1,4 @@
-"""The adjoint: exact derivatives of a box-bounded minimum by implicit differentiation, where bounds are active as
-well."""
+"""The adjoint: exact derivatives of a box-bounded minimum by implicit differentiation, also on active bounds."""
 
 import inspect
 

@@ -1,5 +1,4 @@
-"""Box-bounded nonlinear least squares on Optimistix's extension points: the solver, and `least_squares`, which adds the
-adjoint."""
+"""Box-bounded nonlinear least squares: the Optimistix solver, and `least_squares`, which adds the adjoint."""
 
 from collections.abc import Callable
 

@@ -1,5 +1,4 @@
-"""The steps of the bounded Levenberg-Marquardt: from one evaluated model to the next trial, for any number of batch
-slots.
+"""The steps of the bounded Levenberg-Marquardt: from one evaluated model to the next trial.
 
 Minimises 1/2 |f(y)|^2 subject to lower <= y <= upper. A trial is accepted by what the model predicts for it (a clipped
 step can point uphill, and is then refused). f is never evaluated outside the box. `active_set` makes the trials.
