@@ -41,8 +41,11 @@ class Box(eqx.Module):
     @classmethod
     def of(cls, y: PyTree[Array], lower: PyTree, upper: PyTree, scale: PyTree) -> "Box":
         """Bounds and scale in any form that `expand` takes, but scale may be None as a whole."""
-        trees = expand(y, lower, -jnp.inf), expand(y, upper, jnp.inf), scale if scale is None else expand(y, scale, 1.0)
-        return cls(*(tree if tree is None else ravel_pytree(tree)[0] for tree in trees))
+
+        def flat(given: PyTree, absent: float) -> Flat:
+            return ravel_pytree(expand(y, given, absent))[0]
+
+        return cls(flat(lower, -jnp.inf), flat(upper, jnp.inf), None if scale is None else flat(scale, 1.0))
 
     def clip(self, y: Flat) -> Flat:
         """The nearest point of the box."""
