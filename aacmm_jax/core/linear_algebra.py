@@ -60,7 +60,7 @@ def _inverse_cholesky_jvp(primals: tuple[Array], tangents: tuple[Any]) -> tuple[
     # With L = W^-1: dL = L half(W dA W^T), hence dW = -half(W dA W^T) W.
     whitening = inverse_cholesky(primals[0])
     change = whitening @ tangents[0] @ jnp.swapaxes(whitening, -1, -2)
-    half = jnp.tril(change) - 0.5 * jnp.eye(change.shape[-1]) * change
+    half = 0.5 * (jnp.tril(change) + jnp.tril(change, -1))
     return whitening, -half @ whitening
 
 

@@ -73,6 +73,30 @@ def test_batches_of_arms_and_captures(paper_arm):
         np.testing.assert_allclose(lengths, np.asarray(space.vector(arm))[space.lengths], atol=1e-7)
 
 
+def test_bounds_of_a_space_equal_arrays(paper_arm, noisy_capture, box, starts):
+    """A space of fewer parameters in another order, and what is fixed taken from the arm."""
+    space = aj.Parameters(paper_arm, tuple(reversed([n for n in aj.Parameters.free_of(paper_arm).names if n != "a_2"])))
+    index = [aj.Parameters.free_of(paper_arm).names.index(name) for name in space.names]
+    lower, upper, start = box[0][index], box[1][index], starts[:3, index]
+    arrays = aj.identify_many(paper_arm, noisy_capture, lower, upper, start, space=space)
+    together = aj.identify_many(paper_arm, noisy_capture, aj.Bounds(space, lower, upper), start=start)
+    np.testing.assert_array_equal(together.parameters, arrays.parameters)
+    assert together.space.names == space.names
+    calibrated = aj.calibrate_many(paper_arm, noisy_capture, aj.Bounds(space, lower, upper), start=start)
+    np.testing.assert_array_equal(calibrated.k, arrays.k)
+
+
+def test_bounds_and_what_they_hold_already(paper_arm, noisy_capture, box, starts):
+    bounds = aj.Bounds(aj.Parameters.free_of(paper_arm), *box)
+    for many in (aj.identify_many, aj.calibrate_many):
+        with pytest.raises(aj.InputError, match=r"Bounds are given, and upper bounds as well, .* start=\.\.\."):
+            many(paper_arm, noisy_capture, bounds, starts)
+        with pytest.raises(aj.InputError, match="Bounds are given, and a space as well"):
+            many(paper_arm, noisy_capture, bounds, start=starts, space=bounds.space)
+        with pytest.raises(aj.InputError, match="without upper ones"):
+            many(paper_arm, noisy_capture, box[0], start=starts)
+
+
 def test_failure_is_data(paper_arm, noisy_capture, box, starts):
     """A problem that cannot be solved spoils no other: one problem gets a capture with NaN, and steps may run out."""
     q = np.tile(np.asarray(noisy_capture.q), (3, 1, 1))

@@ -133,6 +133,7 @@ def test_derivatives(function):
     other = (random.normal(size=(2, 5)),) if function == "solve_positive_definite" else ()
 
     def from_rows(rows, *other):
+        rows, *other = map(jnp.asarray, (rows, *other))
         return getattr(linear_algebra, function)(jnp.swapaxes(rows, -1, -2) @ rows, *other)
 
-    check_grads(from_rows, tuple(map(jnp.asarray, (rows, *other))), order=1, modes=("fwd", "rev"), rtol=1e-6)
+    check_grads(from_rows, (rows, *other), order=1, modes=("fwd", "rev"), rtol=1e-6)
