@@ -108,9 +108,10 @@ def identify_many(
     Memory is bounded by ``chunk``. Failure is data (``result``).
 
     Args:
-        arm: The nominal arm, or a batch of arms (every parameter ``(batch, n)``). capture: The readings, or a batch of
-            them (see `stack_captures`). lower: `Bounds`, whose space is then used; or lower bounds, ``(batch, p)`` or
-            ``(p,)``, mm and rad, in the order of ``space.names``.
+        arm: The nominal arm, or a batch of arms (every parameter ``(batch, n)``).
+        capture: The readings, or a batch of them (see `stack_captures`).
+        lower: `Bounds`, whose space is then used; or lower bounds, ``(batch, p)`` or ``(p,)``, mm and rad, in the order
+            of ``space.names``.
         upper: Upper bounds, likewise; left out where ``lower`` is `Bounds`.
         start: Starts, likewise, clipped to the bounds; by default the arm.
         space: The free parameters where bounds are arrays; by default the paper's of ``arm``.

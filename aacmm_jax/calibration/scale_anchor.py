@@ -10,7 +10,16 @@ from jaxtyping import Float
 from ..core.arrays import is_concrete
 from ..core.errors import InputError
 from ..data.noise import Noise
-from ..kinematics.arm import Arm, is_length, jacobian_at, natural_steps, neighbouring_arm, parameter_names, value_of
+from ..kinematics.arm import (
+    Arm,
+    is_length,
+    is_single,
+    jacobian_at,
+    natural_steps,
+    neighbouring_arm,
+    parameter_names,
+    value_of,
+)
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import total_link_length
 from ..model.scale import Partners
@@ -22,6 +31,7 @@ _LARGEST_UNCERTAINTY = 1e-4
 _EQUATIONS = 200
 _SCATTER = 0.02
 _CONFIGURATIONS = 100
+_LEAST_SHARE = 0.05  # of the longest link: a shorter length hardly changes the scale
 _EXACT = 1e-9  # residual, relative to the column, below which free lengths replace a fixed one exactly
 
 
@@ -29,7 +39,9 @@ class ScaleAnchor(NamedTuple):
     """What sets the scale in stage 1, and how stage 2 changes it; static, so that it may fix a compiled program."""
 
     hold: str | None  # free length that stage 1 keeps at its start
-    adjusted: str | None  # length that stage 2 adjusts where it has to identify again
+    # Length that stage 2 adjusts where it has to identify again; None without a free length, or where neither an anchor
+    # nor the values of the arm are known.
+    adjusted: str | None
     set_by: tuple[str, ...]  # fixed lengths that determine the scale well, so that stage 2 changes nothing
     # Fixed lengths that free ones replace exactly in stage 2; None where some have no such partner, or are not known.
     partners: Partners | None
@@ -52,7 +64,8 @@ def scale_anchor(space: Parameters, arm: Arm, hold: str | None, noise: Noise | N
     lengths = [name for name in space.names if is_length(name)]
     if hold not in (None, "longest") and hold not in lengths:
         space.index(hold)
-        raise InputError(f"hold is '{hold}', which is an angle; hold a length, for example '{lengths[0]}'.")
+        example = f", for example '{lengths[0]}'" if lengths else ", or leave out hold, since no length is free"
+        raise InputError(f"hold is '{hold}', which is an angle; hold a length{example}.")
     if hold == "longest" and (not lengths or len(space.names) == 1):
         hold = None
     if hold == "longest" and not known:
@@ -66,7 +79,8 @@ def scale_anchor(space: Parameters, arm: Arm, hold: str | None, noise: Noise | N
     if hold == "longest":
         hold = None if set_by else longest
     partners = _partners(arm, one, space, fixed) if one is not None else None if fixed else ((), ())
-    return ScaleAnchor(hold, longest if hold is None else hold, set_by, partners)
+    adjusted = hold if hold is not None and _carries_scale(hold, longest, arm if known else None) else longest
+    return ScaleAnchor(hold, None if hold is None and not known else adjusted, set_by, partners)
 
 
 def fixed_lengths(arm: Arm, space: Parameters) -> tuple[str, ...]:
@@ -84,9 +98,17 @@ def _longest_link(lengths: list[str], arm: Arm | None) -> str | None:
     return max(links, key=lambda name: np.abs(value_of(arm, name)).max())
 
 
+def _carries_scale(name: str, longest: str | None, arm: Arm | None) -> bool:
+    """Whether changing this length changes the scale: not ``d_1``, and not one that is nearly zero."""
+    if name == "d_1" or longest is None or arm is None:
+        return name != "d_1"
+    size, largest = (float(np.abs(value_of(arm, other)).max()) for other in (name, longest))
+    return size >= _LEAST_SHARE * largest
+
+
 def _first(arm: Arm) -> Arm:
-    """One arm of a batch."""
-    if arm.alpha.ndim == 1:
+    """One arm of a batch, which may be one in some of its parameters only."""
+    if is_single(arm):
         return arm
     with jax.ensure_compile_time_eval():
         return jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1])[0], arm)

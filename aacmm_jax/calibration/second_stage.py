@@ -31,6 +31,7 @@ from .task import Task, fit_repeatability
 # Identifications with an adjusted anchor; the secant method ends at k = 1 to rounding after three or four.
 _ROUNDS = 4
 _SLOPES = (0.1, 2.0)  # of log k by the log of the anchor: 1 unless bounds or fixed lengths set part of the scale
+_REACHED = 1e-7  # |log k| up to which k = 1 counts as reached
 _OUTSIDE = 1e-9  # mm: what the division may leave of the box by rounding
 
 
@@ -103,8 +104,14 @@ def adjust_anchor(
 
     length = jnp.clip(scaled[i], bounds.lower[i], bounds.upper[i])
     first = (scaled, length, length, jnp.zeros(()))
-    (x, *_), (steps, numbers) = jax.lax.scan(identify_again, first, length=_ROUNDS)
-    return Adjusted(x, jnp.sum(steps), reasons(numbers[-1]))
+    (x, _, length, log_k), (steps, numbers) = jax.lax.scan(identify_again, first, length=_ROUNDS)
+    on_bound = (length <= bounds.lower[i]) | (length >= bounds.upper[i])
+    return Adjusted(x, jnp.sum(steps), reasons(_number_of_reason(numbers[-1], log_k, on_bound)))
+
+
+def _number_of_reason(numbers: Any, log_k: Any, on_bound: Any) -> Array:
+    """The reason of the last identification, but for where k = 1 was not reached although no bound kept it from that."""
+    return jnp.where((jnp.abs(log_k) > _REACHED) & ~on_bound, numbers_of(Reason.max_steps), numbers)
 
 
 def second_stage_many(
@@ -131,10 +138,12 @@ def second_stage_many(
         scaled = np.where(space.lengths, np.clip(scaled, lower, upper), scaled)
         active = np.asarray(bounds.active(jnp.asarray(scaled)))
     if len(rows):
-        found, more = _adjust_many(anchor, space, scaled[rows], lower[rows], upper[rows], partial(identify_again, rows))
+        found, found_reason, more = _adjust_many(
+            anchor, space, scaled[rows], lower[rows], upper[rows], partial(identify_again, rows)
+        )
         de, deltam, steps, reason, active = (np.array(column) for column in (de, deltam, steps, reason, active))
         scaled[rows], de[rows], deltam[rows], steps[rows] = found.parameters, found.de, found.deltam, steps[rows] + more
-        reason[rows] = numbers_of(found.result)
+        reason[rows] = found_reason
         active[rows] = np.where(scaled[rows] <= lower[rows], -1, np.where(scaled[rows] >= upper[rows], 1, 0))
     result = reasons(jnp.asarray(reason))
     return {"parameters": scaled, "de": de, "deltam": deltam, "steps": steps, "result": result, "active": active}
@@ -147,8 +156,8 @@ def _adjust_many(
     lower: Float[np.ndarray, "b p"],
     upper: Float[np.ndarray, "b p"],
     identify_again: Callable[[np.ndarray], Any],
-) -> tuple[Any, Int[np.ndarray, " b"]]:
-    """`adjust_anchor` for a batch: the last identifications, and the evaluations of all."""
+) -> tuple[Any, Int[np.ndarray, " b"], Int[np.ndarray, " b"]]:
+    """`adjust_anchor` for a batch: the last identifications, the numbers of their reasons, and the evaluations of all."""
     assert anchor.adjusted is not None
     i = space.index(anchor.adjusted)
     length = last_length = scaled[:, i]
@@ -160,7 +169,9 @@ def _adjust_many(
         log_k, steps = np.log(found.k), steps + found.steps
         following = _secant(length, last_length, log_k, last_log_k, lower[:, i], upper[:, i])
         x, length, last_length, last_log_k = found.parameters, np.asarray(following), length, log_k
-    return found, steps
+    assert found is not None
+    on_bound = (last_length <= lower[:, i]) | (last_length >= upper[:, i])
+    return found, np.asarray(_number_of_reason(numbers_of(found.result), last_log_k, on_bound)), steps
 
 
 def rows_of(rows: np.ndarray, arm: Arm, capture: Capture, *boxes: np.ndarray) -> tuple[Any, ...]:

@@ -149,6 +149,11 @@ def calibrate(
             "from Python, identify for stage 1 alone)."
         )
     task = _checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
+    if hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
+        raise InputError(
+            "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
+            "hold."
+        )
     _check_identifiable(capture, task, strict)
     if method == "joint":
         return _joint(task)
@@ -172,18 +177,7 @@ def _check_identifiable(capture: Capture, task: Task, strict: bool) -> None:
 
 @eqx.filter_jit
 def _identify(task: Task) -> Identification:
-    found, _ = _stage1(task)
-    parameter_covariance = with_active_bounds(
-        found.parameter_covariance,
-        found.arm,
-        task.space,
-        task.measurement,
-        found.active,
-        task.bounds,
-        found.after.sigma,
-        task.anchor.hold,
-    )
-    return eqx.tree_at(lambda result: result.parameter_covariance, found, parameter_covariance)
+    return _stage1(task)[0]
 
 
 def _stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
@@ -211,7 +205,9 @@ def _stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
         scale=scale_uncertainty.propagated_scale(tips, measurement, propagated, after.sigma)
         if measurement.ends
         else None,
-        parameter_covariance=propagated.parameter_covariance,
+        parameter_covariance=with_active_bounds(
+            propagated.parameter_covariance, identified, space, measurement, active, task.bounds, after.sigma, hold
+        ),
         before=repeatability(space.arm(start).position(measurement.q), measurement.sizes),
         after=after,
         reduced_chi=_reduced_chi(measurement, tips, fitted),
@@ -240,8 +236,10 @@ def _calibration(
     steps: Int[Array, ""],
     result: Reason,
     parameter_covariance: ParameterCovariance,
+    conditional_on: Int[Array, " p"] | None = None,
 ) -> Calibration:
-    """The result of a calibration that ended with these parameters."""
+    """The result of a calibration that ended with these parameters. ``conditional_on`` are the active bounds that its
+    covariance takes as exact; by default ``active``."""
     assert stage1.scale is not None
     space = task.space
     start, calibrated = space.arm(task.start), space.arm(parameters)
@@ -249,7 +247,13 @@ def _calibration(
     tips = calibrated.position(measurement.q)
     after = repeatability(tips, measurement.sizes, fitted=len(space.names))
     parameter_covariance = with_active_bounds(
-        parameter_covariance, calibrated, space, measurement, active, task.bounds, stage1.after.sigma
+        parameter_covariance,
+        calibrated,
+        space,
+        measurement,
+        active if conditional_on is None else conditional_on,
+        task.bounds,
+        stage1.after.sigma,
     )
     return Calibration(
         arm=calibrated,
@@ -278,7 +282,7 @@ def _divided(task: Task) -> tuple[Calibration, Bool[Array, ""]]:
     space, bounds, anchor = task.space, task.bounds, task.anchor
     scaled = divided(anchor, space, stage1.parameters, stage1.scale.value)
     adjust = must_adjust(anchor, bounds, stage1.active, scaled)
-    active, parameter_covariance = stage1.active, stage1.parameter_covariance
+    active, parameter_covariance = stage1.active, propagated.parameter_covariance
     if can_scale(anchor):
         scaled = jnp.where(jnp.asarray(space.lengths), jnp.clip(scaled, bounds.lower, bounds.upper), scaled)
         active = bounds.active(scaled)
@@ -286,7 +290,11 @@ def _divided(task: Task) -> tuple[Calibration, Bool[Array, ""]]:
         parameter_covariance = scale_uncertainty.propagate_division(
             propagated, stage1.arm, space, measurement, stage1.after.sigma, scaled, replaced(anchor, space)
         ).parameter_covariance
-    result = _calibration(task, stage1, "two-stage", scaled, active, stage1.steps, stage1.result, parameter_covariance)
+    # Divided, a length may have left its bound, which stage 1's covariance takes as exact all the same.
+    conditional_on = jnp.where(active != 0, active, stage1.active)
+    result = _calibration(
+        task, stage1, "two-stage", scaled, active, stage1.steps, stage1.result, parameter_covariance, conditional_on
+    )
     return result, adjust
 
 

@@ -51,6 +51,8 @@ def inverse_cholesky(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batch
     """W, lower triangular with W matrix W^T = I: the inverse of the Cholesky factor. It whitens what has this
     covariance."""
     p = matrix.shape[-1]
+    if not p:
+        return matrix
     identity = jnp.broadcast_to(jnp.eye(p), matrix.shape)
     return jnp.tril(_triangular(jnp.concatenate([matrix, identity], axis=-1))[..., p:])
 

@@ -8,7 +8,7 @@ from ..calibration.record import CalibrationRecord
 from ..calibration.results import CrossValidation, LeftOut
 from ..core.errors import InputError
 from ..data.noise import Noise
-from ..kinematics.arm import is_length
+from ..kinematics.arm import is_length, parameter_names, value_of
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .hdf5 import Stored, Table, Variable, names_in, need, read_tables, undamaged, write_tables
 
@@ -74,9 +74,16 @@ def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
         return _record(path, stored)
 
 
+def _divided_fixed_lengths(path: str | os.PathLike, stored: Stored) -> bool:
+    """Whether a file of an earlier version holds an arm whose fixed lengths were divided by k, and not only zeros."""
+    arm, names = specification_of(path, stored, "calibrated_arm").arm, set(stored.tables["parameters"]["parameter"])
+    fixed = [name for name in parameter_names(arm) if is_length(name) and name not in ("d_1", *names)]
+    return any(value_of(arm, name) != 0 for name in fixed)
+
+
 def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
     table, attributes = stored.tables["parameters"], stored.attributes
-    if attributes.get("stretch_variance", 0.0):
+    if attributes.get("stretch_variance", 0.0) and _divided_fixed_lengths(path, stored):
         raise InputError(
             f"{path} is from an earlier version, which divided fixed lengths by k; calibrate again from its capture."
         )

@@ -30,11 +30,15 @@ class Arm(eqx.Module):
     Source: Denavit and Hartenberg 1955; Cheng et al. 2018, eq. 1.
 
     Args:
-        alpha: Link twists ``(..., n)``, rad. a: Link lengths ``(..., n)``, mm. d: Link offsets ``(..., n)``, mm.
-        theta: Zero offsets of the joints ``(..., n)``, rad; by default 0. beta: Hayati and Mirmirani's (1985)
-        additional angles for nearly parallel axes ``(..., n)``, rad; by default unused. probe: Tip in the last frame
-        ``(..., 3)``, mm. limits: Lowest and highest reading of each joint, n pairs, rad; not calibrated, but
-        respected when poses are made.
+        alpha: Link twists ``(..., n)``, rad.
+        a: Link lengths ``(..., n)``, mm.
+        d: Link offsets ``(..., n)``, mm.
+        theta: Zero offsets of the joints ``(..., n)``, rad; by default 0.
+        beta: Hayati and Mirmirani's (1985) additional angles for nearly parallel axes ``(..., n)``, rad; by default
+            unused.
+        probe: Tip in the last frame ``(..., 3)``, mm.
+        limits: Lowest and highest reading of each joint, n pairs, rad; not calibrated, but respected when poses are
+            made.
 
     Raises:
         InputError: Shapes do not fit together, or a value is not finite.

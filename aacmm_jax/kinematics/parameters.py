@@ -73,8 +73,9 @@ class Parameters(eqx.Module):
         nearly parallel, d of the first is fixed and Hayati's beta is free instead.
 
         Args:
-            arm: The nominal arm. capture: The poses and reference lengths; by default poses over the whole workspace
-            with one reference length.
+            arm: The nominal arm.
+            capture: The poses and reference lengths; by default poses over the whole workspace with one reference
+                length.
 
         Raises:
             InputError: The capture has another number of joints, or determines nothing.

@@ -103,11 +103,14 @@ def least_squares(
     Differentiable with respect to ``args`` and both bounds, forward and reverse.
 
     Args:
-        fn: The residual, a PyTree of arrays. y0: The start, any PyTree of floats; it is clipped to the box. args:
-            Passed to ``fn``. lower: Lower bounds: a PyTree like ``y0`` or a number for all unknowns; None, also as a
-            leaf, is no bound. upper: Upper bounds, likewise. scale: The natural step of each unknown, likewise; None
-            takes it from the columns of the Jacobian. normal: A global function of (y, args) that supplies cost,
-            gradient and Gram matrix of ``fn`` where they can be had more cheaply than from its Jacobian.
+        fn: The residual, a PyTree of arrays.
+        y0: The start, any PyTree of floats; it is clipped to the box.
+        args: Passed to ``fn``.
+        lower: Lower bounds: a PyTree like ``y0`` or a number for all unknowns; None, also as a leaf, is no bound.
+        upper: Upper bounds, likewise.
+        scale: The natural step of each unknown, likewise; None takes it from the columns of the Jacobian.
+        normal: A global function of (y, args) that supplies cost, gradient and Gram matrix of ``fn`` where they can be
+            had more cheaply than from its Jacobian.
         solver: Tolerances and initial damping.
         max_steps: The largest number of evaluations.
         throw: Whether a failure is an exception; otherwise it is only data (``result``), as a batch needs it.

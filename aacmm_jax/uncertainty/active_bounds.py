@@ -64,7 +64,10 @@ def with_active_bounds(
     follow = jnp.where(on_bound[:, None], 0.0, -inverse @ information)
     directions = jnp.where(on_bound[None, :], jnp.eye(len(space.names)) + follow, 0.0)
     information_along = jnp.einsum("pi,pq,qi->i", directions, information, directions)
-    half_widths = jnp.where(on_bound, (bounds.upper - bounds.lower) / 2 / space.scale, 0.0)
+    widths = jnp.where(on_bound, (bounds.upper - bounds.lower) / space.scale, 0.0)
+    # A bound with none opposite counts as one of the default box of `Bounds.around`, in natural steps.
+    default = jnp.where(jnp.asarray(space.lengths), 10.0, 17.5)
+    half_widths = jnp.where(jnp.isfinite(widths), widths / 2, default)
     moved = jnp.einsum("pi,paN->iaN", directions, linear.columns)
     movement = jnp.mean(jnp.sum(moved**2, axis=1), axis=-1)
     if measurement.ends:

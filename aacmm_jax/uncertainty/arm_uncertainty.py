@@ -40,14 +40,14 @@ class Uncertainty(eqx.Module):
     def u(self) -> Float[Array, " p"]:
         """Standard uncertainty of each free parameter; infinite where only a combination is determined.
 
-        0 on a bound.
+        0 on a bound, unless the data hardly determine the direction that it ends (`active_bounds`).
         """
         alone = jnp.sqrt(jnp.diagonal(self.covariance))
         return jnp.where(jnp.diagonal(self.open) > 1e-6, jnp.inf, alone)
 
     @property
     def correlation(self) -> Float[Array, "p p"]:
-        """Correlation of the free parameters; 0 with those that are on a bound."""
+        """Correlation of the free parameters; 0 with those whose uncertainty is 0."""
         u = jnp.sqrt(jnp.diagonal(self.covariance))
         safe = jnp.where(u > 0, u, 1.0)
         return self.covariance / (safe[:, None] * safe[None, :])

@@ -110,13 +110,14 @@ def observability(
     `kinematics.near_degeneracy`.
 
     Args:
-        arm: The arm, nominal or calibrated. capture: Poses and reference lengths. space: The free parameters; by
-        default those of ``bounds``, else those of `Parameters.free_of`. noise: Of readings and seat, if known: the
-        equations are then weighted by it. sigma: Standard deviation of a tip coordinate, mm, such as that of the
-        residuals; with ``noise`` it follows from that.
-            With it near-degenerate is also what the data determine hardly better than the bounds.
+        arm: The arm, nominal or calibrated.
+        capture: Poses and reference lengths.
+        space: The free parameters; by default those of ``bounds``, else those of `Parameters.free_of`.
+        noise: Of readings and seat, if known: the equations are then weighted by it.
+        sigma: Standard deviation of a tip coordinate, mm, such as that of the residuals; with ``noise`` it follows from
+            that. With it near-degenerate is also what the data determine hardly better than the bounds.
         bounds: Bounds that ``sigma`` is compared with; by default of +-10 mm and +-17.5 mrad, the default of
-        `Bounds.around`.
+            `Bounds.around`.
 
     Raises:
         InputError: Capture and arm do not fit.
@@ -128,7 +129,9 @@ def observability(
         noise.check(arm.joints)
         covariances = tip_covariances(arm.geometry, sines_cosines(jnp.asarray(capture.q)), noise)
         sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
-    base = space.arm(space.vector(arm))
+    # Fixed values are those of the arm, not of the space's base.
+    base = arm.replace(beta=jnp.zeros_like(arm.alpha)) if arm.beta is None and space.base.beta is not None else arm
+    space = Parameters(base, space.names)
     spectrum = _spectrum(base, base, capture, space, noise)
     if spectrum.rank < len(space.names):
         # A nominal arm may have an exact alignment (a probe on the last axis) that the real one does not share.
