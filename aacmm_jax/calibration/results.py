@@ -37,7 +37,8 @@ class Identification(eqx.Module):
     result: Reason  # why it ended
     optimality: Float[Array, ""]  # projected gradient as a cosine; 0 at a minimum
     scale: Scale | None  # k of this arm, where the capture holds reference lengths
-    parameter_covariance: ParameterCovariance  # given the scale anchor; rows of the anchor are 0, those of active parameters unless near-degenerate
+    # Given the scale anchor: its rows are 0, and those of active parameters but for near-degenerate directions.
+    parameter_covariance: ParameterCovariance
     before: Repeatability  # the start
     after: Repeatability
     # Root mean square of the residuals in units of what the given noise predicts (1 where it is right), or None.

@@ -110,7 +110,7 @@ def adjust_anchor(
 
 
 def _number_of_reason(numbers: Any, log_k: Any, on_bound: Any) -> Array:
-    """The reason of the last identification, but for where k = 1 was not reached although no bound kept it from that."""
+    """The reason of the last identification; not converged where k = 1 was not reached, unless a bound prevents it."""
     return jnp.where((jnp.abs(log_k) > _REACHED) & ~on_bound, numbers_of(Reason.max_steps), numbers)
 
 
@@ -157,7 +157,7 @@ def _adjust_many(
     upper: Float[np.ndarray, "b p"],
     identify_again: Callable[[np.ndarray], Any],
 ) -> tuple[Any, Int[np.ndarray, " b"], Int[np.ndarray, " b"]]:
-    """`adjust_anchor` for a batch: the last identifications, the numbers of their reasons, and the evaluations of all."""
+    """`adjust_anchor` for a batch: the last identifications, the numbers of their reasons, and all evaluations."""
     assert anchor.adjusted is not None
     i = space.index(anchor.adjusted)
     length = last_length = scaled[:, i]
