@@ -30,15 +30,15 @@ from .checks import check_enough
 from .results import converged
 from .scale_anchor import scale_anchor
 
-# Slots per loop. On a CPU the Jacobian columns of all slots should fit the second-level cache (measured from 20 to 7,000
-# poses: five times slower where they do not); a GPU needs thousands.
+# Slots per loop. On a CPU the Jacobian columns of all slots should fit the second-level cache (measured from 20 to
+# 7,000 poses: five times slower where they do not); a GPU needs thousands.
 _SLOTS_CPU, _POSES_IN_CACHE = 16, 2000
 _SLOTS_ELSEWHERE = 4096
 _ROUNDS = 64  # problems that a slot of one chunk takes at most, one after the other
 
 
 class ManyIdentifications(eqx.Module):
-    """Results of stage 1, problem by problem, as NumPy arrays; ``parameters`` in the order of ``space.names``, mm and rad."""
+    """Results of stage 1, problem by problem, as NumPy arrays; parameters in the order of the space, mm and rad."""
 
     parameters: Float[np.ndarray, "b p"]
     de: Float[np.ndarray, " b"]  # mm
@@ -101,9 +101,9 @@ def identify_many(
     Memory is bounded by ``chunk``. Failure is data (``result``).
 
     Args:
-        arm: The nominal arm, or a batch of arms (every parameter ``(batch, n)``).
-        capture: The readings, or a batch of them (see `stack_captures`).
-        lower: `Bounds`, whose space is then used; or lower bounds, ``(batch, p)`` or ``(p,)``, mm and rad, in the order of
+        arm: The nominal arm, or a batch of arms (every parameter ``(batch, n)``). capture: The readings, or a batch of
+        them (see `stack_captures`). lower: `Bounds`, whose space is then used; or lower bounds, ``(batch, p)`` or
+        ``(p,)``, mm and rad, in the order of
             ``space.names``.
         upper: Upper bounds, likewise; left out where ``lower`` is `Bounds`.
         start: Starts, likewise, clipped to the bounds; by default the arm.
@@ -205,8 +205,8 @@ def _bounds_and_space(
         for what, given in (("upper bounds", upper), ("a space", space)):
             if given is not None:
                 raise InputError(
-                    f"Bounds are given, and {what} as well, which they hold already; leave one out (a start goes by its "
-                    "name: start=...)."
+                    f"Bounds are given, and {what} as well, which they hold already; leave one out (and give a start by "
+                    "its name, start=...)."
                 )
         return lower.lower, lower.upper, lower.space
     if upper is None:
@@ -315,7 +315,7 @@ def _workers(devices: Sequence[Any]) -> int:
 
 
 def _chunks(size: int, slots: int, workers: int, chunk: int | None) -> list[range]:
-    """The batch in chunks: of the given size, or as few as keep all workers busy, since slots idle at the end of each."""
+    """The batch in chunks: of the given size, or as few as keep all workers busy, since slots idle at their ends."""
     if chunk is None:
         rounds = -(-size // (slots * _ROUNDS))
         calls = min(-(-rounds // workers) * workers, -(-size // slots))
@@ -385,7 +385,8 @@ def _problems(
     }
     if not sizes:
         raise InputError(
-            "nothing is a batch: give start, lower or upper as (batch, p), a batch of arms or of captures; or use identify."
+            "nothing is a batch: give start, lower or upper as (batch, p), a batch of arms or of captures; "
+            "or use identify."
         )
     if sizes == {0}:
         raise InputError("the batch is empty; give at least one problem.")

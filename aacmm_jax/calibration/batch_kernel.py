@@ -1,8 +1,8 @@
 """The compiled part of a batch: a fixed number of batch slots solves a chunk of problems.
 
-Every pass of the loop evaluates and advances all slots; a slot whose problem has ended writes its result and takes the next
-problem of the chunk, so no problem waits for another. The number of slots, not the chunk, fixes the arithmetic: results are
-the same to the bit whatever the chunk.
+Every pass of the loop evaluates and advances all slots; a slot whose problem has ended writes its result and takes the
+next problem of the chunk, so no problem waits for another. The number of slots, not the chunk, fixes the arithmetic:
+results are the same to the bit whatever the chunk.
 """
 
 from collections.abc import Callable
@@ -172,7 +172,7 @@ def _solve_all(batch: _Batch, shape: Shape, count: Int[Array, ""], capacity: int
 
 
 def _with_parameters(rows: Geometry, vector: Float[Array, "w p"], indices: tuple[tuple[str, int], ...]) -> Geometry:
-    """Geometry of every slot ``(w, 1, n)`` with its free parameters from ``vector``; the axis of ones is for the poses."""
+    """Geometry of every slot ``(w, 1, n)`` with its free parameters from ``vector``; the second axis is for poses."""
     return jax.tree.map(lambda leaf: leaf[:, None, :], rows._replace(**with_values(rows, vector, indices)))
 
 

@@ -1,7 +1,7 @@
 """Factorisations of small matrices (up to about 40 rows) as plain array operations; leading axes are batches.
 
-jaxlib's batched LAPACK calls split their batch over the thread pool whose threads they block, so that independent ones in
-one program can wait for each other forever (measured on two cores with four). Nothing here calls LAPACK.
+jaxlib's batched LAPACK calls split their batch over the thread pool whose threads they block, so that independent ones
+in one program can wait for each other forever (measured on two cores with four). Nothing here calls LAPACK.
 """
 
 from typing import Any
@@ -20,7 +20,7 @@ _MAX_SWEEPS = 30  # of Jacobi rotations; matrices of 40 rows need about 10
 def solve_positive_definite(
     matrix: Float[Array, "*batch p p"], right: Float[Array, "*batch p"]
 ) -> Float[Array, "*batch p"]:
-    """Solution x of matrix x = right by Cholesky; NaN where the matrix is not positive definite to working precision."""
+    """Solution x of matrix x = right by Cholesky; NaN where the matrix is numerically not positive definite."""
     p = matrix.shape[-1]
     # Rows of a multiple of four numbers: others take up to half as long again (22 of them, measured).
     filled = jnp.zeros((*right.shape, -(p + 1) % 4))
@@ -47,7 +47,7 @@ def _solve_jvp(primals: tuple[Array, Array], tangents: tuple[Any, Any]) -> tuple
 
 @jax.custom_jvp
 def inverse_cholesky(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batch p p"]:
-    """W, lower triangular with W matrix W^T = I: the inverse of the Cholesky factor. It whitens what has this covariance."""
+    """W, lower triangular with W matrix W^T = I: the inverse Cholesky factor; whitens what has this covariance."""
     p = matrix.shape[-1]
     identity = jnp.broadcast_to(jnp.eye(p), matrix.shape)
     return jnp.tril(_triangular(jnp.concatenate([matrix, identity], axis=-1))[..., p:])
@@ -71,8 +71,9 @@ def inverse_positive_definite(matrix: Float[Array, "*batch p p"]) -> Float[Array
 def _triangular(augmented: Float[Array, "*batch p m"]) -> Float[Array, "*batch p m"]:
     """``[A B]`` to ``[U L^-1 B]``, where U = L^T and A = L U; below the diagonal of U stand rounding errors.
 
-    Row by row, each with one product of a vector and the rows so far: the loop over rows of batches is what the CPU does
-    fastest (as fast as LAPACK at 16 matrices of 20 rows; updates of the whole rest after each row take five times as long).
+    Row by row, each with one product of a vector and the rows so far: the loop over rows of batches is what the CPU
+    does fastest (as fast as LAPACK at 16 matrices of 20 rows; updates of the whole rest after each row take five times
+    as long).
     """
 
     def row(j: Array, rows: Array) -> Array:
@@ -89,8 +90,9 @@ def singular_values(
 ) -> tuple[Float[Array, "*batch m p"], Float[Array, "*batch p"], Float[Array, "*batch p p"]]:
     """U, s, V with matrix = U diag(s) V^T, s in descending order; for m >= p. Not differentiable where values repeat.
 
-    Columns of U that belong to s = 0 are 0. One-sided Jacobi: pairs of columns are rotated until all are orthogonal, p/2
-    disjoint pairs at a time (Hestenes 1958; Demmel and Veselic 1992 for its accuracy, which scaling of columns does not spoil).
+    Columns of U that belong to s = 0 are 0. One-sided Jacobi: pairs of columns are rotated until all are orthogonal,
+    p/2 disjoint pairs at a time (Hestenes 1958; Demmel and Veselic 1992 for its accuracy, which scaling of columns does
+    not spoil).
     """
     height, p = matrix.shape[-2:]
     partners = jnp.asarray(_round_robin(p))
@@ -139,14 +141,15 @@ def semidefinite_eigen(
 ) -> tuple[Float[Array, "*batch p"], Float[Array, "*batch p p"]]:
     """Eigenvalues in descending order and eigenvectors (columns) of a symmetric positive semidefinite matrix.
 
-    Its singular values are its eigenvalues. No derivative passes: that of an eigenvector is infinite where values repeat.
+    Its singular values are its eigenvalues. No derivative passes: that of an eigenvector is infinite where values
+    repeat.
     """
     _, values, vectors = singular_values(lax.stop_gradient(matrix))
     return values, vectors
 
 
 def _round_robin(p: int) -> np.ndarray:
-    """The partner of each column in each round of a tournament in which every pair meets once; a column alone meets itself."""
+    """The partner of each column in each round of a tournament in which every pair meets once; alone, itself."""
     even = p + p % 2
     seats = list(range(even))
     rounds = np.tile(np.arange(even), (even - 1, 1))

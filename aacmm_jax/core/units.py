@@ -1,4 +1,4 @@
-"""Units in mm and rad, which everything inside is in: a value times its unit is in mm or rad; divided by it, in the unit."""
+"""Units, in mm and rad: a value times its unit is in mm or rad; one in mm or rad divided by a unit is in that unit."""
 
 import math
 

@@ -22,6 +22,6 @@ def check_x64() -> None:
     """Raise `InputError` where 64-bit floats were turned off after the import."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError(
-            "64-bit floats were turned off after aacmm_jax was imported, and in float32 a calibration is wrong by tens of "
-            "micrometres; leave jax.enable_x64(False), or call jax.config.update('jax_enable_x64', True)."
+            "64-bit floats were turned off after aacmm_jax was imported, and in float32 a calibration is wrong by tens "
+            "of micrometres; leave jax.enable_x64(False), or call jax.config.update('jax_enable_x64', True)."
         )

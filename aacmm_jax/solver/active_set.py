@@ -1,7 +1,7 @@
 """The active set: which unknowns sit on a bound, and the damped step that keeps to the box.
 
-An unknown on a bound with the gradient pushing outwards is pinned: it is left out of the step (Bertsekas 1982). The step of
-the others is clipped to the box, and what the model predicts is computed for the *clipped* step.
+An unknown on a bound with the gradient pushing outwards is pinned: it is left out of the step (Bertsekas 1982). The
+step of the others is clipped to the box, and what the model predicts is computed for the *clipped* step.
 """
 
 import equinox as eqx
@@ -19,7 +19,7 @@ _MAX_RAISES = 200  # of the damping, for one step
 
 
 class QuadraticModel(eqx.Module):
-    """The quadratic model of the cost at one point: all that a step needs from one evaluation of f and its Jacobian J."""
+    """The quadratic model of the cost at one point: what a step needs of one evaluation of f and its Jacobian J."""
 
     cost: Float[Array, "*slots"]  # |f|^2 / 2
     gradient: Float[Array, "*slots p"]  # J^T f
@@ -32,7 +32,7 @@ class QuadraticModel(eqx.Module):
 
 
 class Box(eqx.Module):
-    """The bounds as flat vectors, and the natural step of each unknown (None: the columns of J decide, as in MINPACK)."""
+    """The bounds as flat vectors, and the natural step of each unknown (None: from the columns of J, as in MINPACK)."""
 
     lower: Flat
     upper: Flat
@@ -77,11 +77,12 @@ class Step(eqx.Module):
 def propose(
     y: Flat, model: QuadraticModel, box: Box, scale: Flat, damping: Number, radius: Number | None
 ) -> tuple[Step, Number]:
-    """The damped step on the unpinned unknowns, clipped to the box; and the damping, raised until the step before clipping is
-    no longer than ``radius`` (scaled), where there is one.
+    """The damped step on the unpinned unknowns, clipped to the box; and its damping.
 
-    Solves (S J^T J S + damping I) z = -S J^T f with S = diag(scale) and y + S z as the unclipped trial. Unknowns that the
-    step would carry through a bound are put on it and the rest solved again, once: without that, strongly coupled
+    Where there is a ``radius``, the damping is raised until the step before clipping is no longer (scaled).
+
+    Solves (S J^T J S + damping I) z = -S J^T f with S = diag(scale) and y + S z as the unclipped trial. Unknowns that
+    the step would carry through a bound are put on it and the rest solved again, once: without that, strongly coupled
     unknowns zigzag along a bound.
     """
     pinned = box.pinned(y, model.gradient)
@@ -167,7 +168,7 @@ def _times(matrix: Float[Array, "*slots p p"], vector: Flat) -> Flat:
 
 
 def expand(y: PyTree[Array], given: PyTree, absent: float) -> PyTree[Array]:
-    """A tree like ``y``, from one like it whose leaves broadcast, or from a number for all; None stands for ``absent``."""
+    """A tree like ``y``, from one like it whose leaves broadcast, or from a number for all; None means ``absent``."""
 
     def leaf_of(leaf: Array, value: object) -> Array:
         return jnp.broadcast_to(jnp.asarray(absent if value is None else value, dtype=jnp.float64), leaf.shape)

@@ -1,4 +1,4 @@
-"""The adjoint: exact derivatives of a box-bounded minimum by implicit differentiation, where bounds are active as well."""
+"""The adjoint: exact derivatives of a box-bounded minimum by implicit differentiation, also on active bounds."""
 
 import inspect
 
@@ -58,8 +58,8 @@ def _inverse(size: Array) -> Array:
 class BoundedAdjoint(optx.AbstractAdjoint):
     """Implicit differentiation of the stationarity of a box-bounded minimum: y = clip(y - gradient).
 
-    Optimistix's own implicit adjoint takes the gradient to vanish, which is false on an active bound: there the solution
-    follows the bound. Exact (full Hessian, not Gauss-Newton's), forward and reverse.
+    Optimistix's own implicit adjoint takes the gradient to vanish, which is false on an active bound: there the
+    solution follows the bound. Exact (full Hessian, not Gauss-Newton's), forward and reverse.
     """
 
     linear_solver: lx.AbstractLinearSolver = EquilibratedPseudoInverse()
@@ -85,7 +85,8 @@ def stationarity(y: PyTree[Array], solved: PyTree, inputs: PyTree) -> Flat:
     gradient = jax.grad(cost)(flat)
     point, slope = jax.lax.stop_gradient((flat, gradient))
     nearer_lower = point - box.lower <= box.upper - point
-    # An absent bound is infinite; it is never the nearer one of a pinned unknown, but must not make NaN in the other branch.
+    # An absent bound is infinite; it is never the nearer one of a pinned unknown, but must not make NaN in the other
+    # branch.
     lower, upper = (jnp.where(jnp.isfinite(bound), bound, 0.0) for bound in (box.lower, box.upper))
     return jnp.where(box.pinned(point, slope), flat - jnp.where(nearer_lower, lower, upper), gradient)
 

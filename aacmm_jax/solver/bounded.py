@@ -1,4 +1,4 @@
-"""Box-bounded nonlinear least squares on Optimistix's extension points: the solver, and `least_squares`, which adds the adjoint."""
+"""Box-bounded least squares on Optimistix's extension points: the solver, and `least_squares`, with the adjoint."""
 
 from collections.abc import Callable
 
@@ -21,8 +21,8 @@ from .reason import Reason, either
 class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Levenberg-Marquardt within a box, as an Optimistix least-squares solver.
 
-    The box is in ``options``: ``lower``, ``upper`` and ``scale`` as in `least_squares`, and ``normal``. ``stats`` of the
-    solution holds ``reason``, ``num_accepted_steps``, ``cost``, ``gradient`` and ``optimality``.
+    The box is in ``options``: ``lower``, ``upper`` and ``scale`` as in `least_squares`, and ``normal``. ``stats`` of
+    the solution holds ``reason``, ``num_accepted_steps``, ``cost``, ``gradient`` and ``optimality``.
 
     Use it through `least_squares`, which also brings the adjoint that takes the bounds into account.
     """
@@ -30,8 +30,8 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     rtol: float = 1e-14  # on the next step, relative to |y| (both scaled)
     atol: float = 0.0  # on the step, scaled
     gtol: float = 1e-10  # on the projected gradient: cosine between the residual and a column of J
-    # Relative to the largest curvature; None: as little as keeps the steps within a trust region, whose first radius is the
-    # scaled length of the start. A value spares the search where a problem is known to need none.
+    # Relative to the largest curvature; None: as little as keeps the steps within a trust region, whose first radius is
+    # the scaled length of the start. A value spares the search where a problem is known to need none.
     initial_damping: float | None = None
     # Optimistix asks for a norm; every test here is written out, since it scales by unknowns.
     norm: Callable[[PyTree], Array] = optx.max_norm
@@ -103,13 +103,11 @@ def least_squares(
     Differentiable with respect to ``args`` and both bounds, forward and reverse.
 
     Args:
-        fn: The residual, a PyTree of arrays.
-        y0: The start, any PyTree of floats; it is clipped to the box.
-        args: Passed to ``fn``.
-        lower: Lower bounds: a PyTree like ``y0`` or a number for all unknowns; None, also as a leaf, is no bound.
-        upper: Upper bounds, likewise.
-        scale: The natural step of each unknown, likewise; None takes it from the columns of the Jacobian.
-        normal: A global function of (y, args) that supplies cost, gradient and Gram matrix of ``fn`` where they can be had
+        fn: The residual, a PyTree of arrays. y0: The start, any PyTree of floats; it is clipped to the box. args:
+        Passed to ``fn``. lower: Lower bounds: a PyTree like ``y0`` or a number for all unknowns; None, also as a leaf,
+        is no bound. upper: Upper bounds, likewise. scale: The natural step of each unknown, likewise; None takes it
+        from the columns of the Jacobian. normal: A global function of (y, args) that supplies cost, gradient and Gram
+        matrix of ``fn`` where they can be had
             more cheaply than from its Jacobian.
         solver: Tolerances and initial damping.
         max_steps: The largest number of evaluations.

@@ -1,7 +1,7 @@
-"""The steps of the bounded Levenberg-Marquardt: from one evaluated model to the next trial, for any number of batch slots.
+"""The steps of the bounded Levenberg-Marquardt: from one evaluated model to the next trial, for any number of slots.
 
-Minimises 1/2 |f(y)|^2 subject to lower <= y <= upper. A trial is accepted by what the model predicts for it (a clipped step
-can point uphill, and is then refused). f is never evaluated outside the box. `active_set` makes the trials.
+Minimises 1/2 |f(y)|^2 subject to lower <= y <= upper. A trial is accepted by what the model predicts for it (a clipped
+step can point uphill, and is then refused). f is never evaluated outside the box. `active_set` makes the trials.
 Sources: Marquardt 1963; More 1978 (scaling, tests); Nielsen 1999 (damping).
 """
 
@@ -87,9 +87,9 @@ def advance(progress: Progress, evaluated: QuadraticModel, box: Box, rules: Rule
 
     step, damping = propose(y, model, box, scale, damping, radius)
 
-    # After an accepted trial the next step is tested: where it is too small to matter it is not taken, which saves the last
-    # evaluation. After a refusal, the refused one. Both before clipping: a step that the box cuts to nothing says only that
-    # the damping is still too small.
+    # After an accepted trial the next step is tested: where it is too small to matter it is not taken, which saves the
+    # last evaluation. After a refusal, the refused one. Both before clipping: a step that the box cuts to nothing says
+    # only that the damping is still too small.
     small_step = jnp.where(accept, step.length, progress.step.length) <= rules.rtol * norm(y / scale) + rules.atol
     below_rounding = jnp.abs(progress.step.predicted) <= 4 * _EPSILON * progress.model.cost
     unclipped = norm((trial - progress.y) / scale) >= 0.5 * progress.step.length
@@ -122,8 +122,8 @@ def _improves(progress: Progress, evaluated: QuadraticModel, trial_optimality: N
 
 
 def _within_rounding(progress: Progress, evaluated: QuadraticModel) -> Bool[Array, "*slots"]:
-    # Close to the solution the decrease drowns in the rounding of the cost; the gradient still points downhill. (Tips at
-    # 1 m that differ by 10 um lose five digits, hence the wide margin.)
+    # Close to the solution the decrease drowns in the rounding of the cost; the gradient still points downhill. (Tips
+    # at 1 m that differ by 10 um lose five digits, hence the wide margin.)
     margin = 1e6 * _EPSILON * progress.model.cost
     return (progress.step.predicted < margin) & (jnp.abs(progress.model.cost - evaluated.cost) < margin)
 
@@ -145,9 +145,9 @@ def _next_damping(progress: Progress, ratio: Number, accept: Bool[Array, "*slots
 def _next_radius(
     progress: Progress, y: Flat, model: QuadraticModel, scale: Flat, ratio: Number, accept: Array
 ) -> Number:
-    # As in trust-region methods. At first the distance of the start from 0: from a bad start a step of Gauss and Newton can
-    # leave the region in which the residual depends on the unknowns at all (NIST's BoxBOD), and a step that is damped a
-    # given amount may follow the steepest descent into the wrong valley (MGH10).
+    # As in trust-region methods. At first the distance of the start from 0: from a bad start a step of Gauss and Newton
+    # can leave the region in which the residual depends on the unknowns at all (NIST's BoxBOD), and a step that is
+    # damped a given amount may follow the steepest descent into the wrong valley (MGH10).
     start = norm(y / scale)
     start = jnp.where(start > 0, start, jnp.sqrt(2 * model.cost))
     factor = jnp.where(accept, jnp.where(ratio > 0.75, 2.0, jnp.where(ratio > 0.25, 1.0, 0.5)), 0.25)

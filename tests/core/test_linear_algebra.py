@@ -1,4 +1,4 @@
-"""Small factorisations against NumPy: well and badly conditioned, scaled, repeated and zero eigenvalues, batches, derivatives."""
+"""Small factorisations against NumPy: condition, scale, repeated and zero eigenvalues, batches, derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -76,7 +76,7 @@ def test_singular_matrices():
 @settings(max_examples=150, deadline=None)
 @given(spectra(smallest=-12), st.floats(-10, 10))
 def test_inverse_solution_and_whitening(spectrum, decades):
-    """Errors relative to the condition number that is left after scaling the diagonal to 1, which Cholesky does not see."""
+    """Errors relative to the condition number after the diagonal is scaled to 1: Cholesky does not depend on scale."""
     values, seed = spectrum
     unit = 10.0 ** np.random.default_rng(seed).uniform(-abs(decades), abs(decades), size=len(values))
     core = symmetric(values, seed)

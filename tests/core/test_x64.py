@@ -30,5 +30,5 @@ SOCKETS = {"A": (400, 200, 300), "B": (600, 200, 300)}
 )
 def test_refused(paper_arm, noisy_capture, entry):
     bounds = aj.Bounds.around(paper_arm, aj.Parameters.free_of(paper_arm))
-    with jax.enable_x64(False), pytest.raises(aj.InputError, match="64-bit floats were turned off .*jax_enable_x64"):
+    with jax.enable_x64(False), pytest.raises(aj.InputError, match=r"64-bit floats were turned off .*jax_enable_x64"):
         entry(paper_arm, noisy_capture, bounds)

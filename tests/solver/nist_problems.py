@@ -1,4 +1,4 @@
-"""All NIST StRD nonlinear regression problems (folder nist/): parser of the files, and models written from the formulas in them."""
+"""All NIST StRD nonlinear regression problems (folder nist/): parser of the files, and their models."""
 
 import re
 from pathlib import Path

@@ -31,7 +31,7 @@ def solve(problem):
 
 @pytest.mark.parametrize("third", range(3))
 def test_never_worse_than_scipy_in_random_boxes(third):
-    """Cost against SciPy's TRF at its tightest tolerances; the drawn boxes must hold both active and inactive bounds."""
+    """Cost against SciPy's TRF at its tightest tolerances; bounds must be active in some problems, not in all."""
     active = 0
     for seed in range(third, PROBLEMS, 3):
         problem = bounded_problems.draw(seed)
