@@ -205,7 +205,7 @@ def _bounds_and_space(
         for what, given in (("upper bounds", upper), ("a space", space)):
             if given is not None:
                 raise InputError(
-                    f"Bounds are given, and {what} as well, which they hold already; leave one out (and give a start by "
+                    f"Bounds are given, and {what} as well, which they hold already; leave one out (give a start by "
                     "its name, start=...)."
                 )
         return lower.lower, lower.upper, lower.space

@@ -82,4 +82,4 @@ def test_derivatives_of_a_solve_and_the_factorisations_call_no_lapack():
     matrices = jnp.broadcast_to(jnp.eye(3), (4, 3, 3))
     for name in ("semidefinite_eigen", "inverse_positive_definite", "inverse_cholesky", "singular_values"):
         assert "lapack" not in jax.jit(getattr(linear_algebra, name)).lower(matrices).as_text()
-    assert "lapack" in jax.jit(jnp.linalg.eigh).lower(matrices).as_text()  # noqa: TID251 - what is avoided
+    assert "lapack" in jax.jit(jnp.linalg.eigh).lower(matrices).as_text()
