@@ -133,7 +133,7 @@ def test_cross_validation_shows_what_the_uncertainty_misses(arm, bounds, capture
     result = aj.calibrate(arm, bent, bounds, method="joint", noise=NOISE)
     record = aj.calibration.record_of(result, aj.Recording(bent, aj.kinematics.ArmSpecification(arm, "bent")))
     found = cautions.of_calibration(record._replace(validation=checked))
-    assert found[0].startswith("Sockets left out one placement after the other err")
+    assert found[0].startswith("Sockets left out one placement after the other have errors")
     assert "Use the cross-validated values" in found[0]
     assert any("The 3 reference lengths disagree" in sentence for sentence in found)
 
