@@ -13,10 +13,10 @@ from ..kinematics.workspace import Reach
 from .lengths import deviation_metrics, distinct_lengths, length_readings, values_by_artefact
 from .metrics import AcceptanceTest, Measured, Metric, acceptance_test, metric_value, percent
 from .procedure_items import (
-    Item,
     OutOfReach,
     PlannedItems,
     PlannedSphere,
+    ProcedureItem,
     ProcedureRegion,
     bar_items,
     far_apart,
@@ -140,7 +140,7 @@ def procedure_items(region: ProcedureRegion, diameter: float, stylus: float, bar
             left_out.append(f"{error} The test leaves out that zone.")
             continue
         q = q[far_apart(q, _SPAT_POSES)]
-        sockets.append(Item(_SPAT, f"spat/{name}", 1, np.tile(point, (len(q), 1)), q))
+        sockets.append(ProcedureItem(_SPAT, f"spat/{name}", 1, np.tile(point, (len(q), 1)), q))
     middle = next((item.points[0] for item in sockets if item.name == "spat/middle"), None)
     if middle is None:
         raise InputError(f"{left_out[0]} Nothing can be tested without the middle zone; lower the table or the margin.")

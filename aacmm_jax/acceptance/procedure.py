@@ -17,7 +17,7 @@ from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.specification import ArmSpecification
 from ..kinematics.workspace import Reach, arm_reach, search_region
 from . import asme_b89_4_22, iso_10360_12
-from .procedure_items import Item, PlannedSphere, ProcedureRegion
+from .procedure_items import PlannedSphere, ProcedureItem, ProcedureRegion
 from .standards import PLANNED, Planned
 
 # The tests of touched spheres: as an item names them, and as a manifest does.
@@ -35,8 +35,8 @@ class Procedure(NamedTuple):
     arm: Arm
     standard: Planned
     reach: Reach
-    sockets: tuple[Item, ...]  # poses in sockets and at the ends of bars
-    touches: tuple[Item, ...]  # poses that touch spheres
+    sockets: tuple[ProcedureItem, ...]  # poses in sockets and at the ends of bars
+    touches: tuple[ProcedureItem, ...]  # poses that touch spheres
     lengths: tuple[tuple[str, str, float], ...]  # sockets at both ends of each bar, and their distance
     spheres: tuple[PlannedSphere, ...]
     left_out: tuple[str, ...]  # sentences on what the arm cannot take, and on unsuitable bars
@@ -141,7 +141,7 @@ def simulate_procedure(
             raise InputError(f"{what} is {value:g}; noise must be zero or positive.")
     random = np.random.default_rng(seed)
 
-    def readings(item: Item, seating: float) -> Float[np.ndarray, "m n"]:
+    def readings(item: ProcedureItem, seating: float) -> Float[np.ndarray, "m n"]:
         targets = item.points + seating * random.normal(size=item.points.shape)
         q, arrived = project_to_targets(true.arm, item.q, targets)
         if not np.all(arrived):

@@ -18,7 +18,7 @@ _TILT = (0.6, 0.8)  # sine and cosine of the probe's angle from the vertical in 
 _OUTSIDE = 0.02  # cosine of probe and normal above which the probe does not come through the sphere
 
 
-class Item(NamedTuple):
+class ProcedureItem(NamedTuple):
     """Poses to take at one socket, at one end of a bar, or for one group of touches on a sphere."""
 
     test: str
@@ -41,8 +41,8 @@ class PlannedSphere(NamedTuple):
 class PlannedItems(NamedTuple):
     """What a standard's procedure consists of."""
 
-    sockets: list[Item]
-    touches: list[Item]
+    sockets: list[ProcedureItem]
+    touches: list[ProcedureItem]
     lengths: list[tuple[str, str, float]]
     spheres: list[PlannedSphere]
     left_out: list[str]
@@ -95,7 +95,7 @@ def far_apart(rows: Float[np.ndarray, "c k"], count: int) -> Int[np.ndarray, " m
 
 def bar_items(
     region: ProcedureRegion, name: str, length: float, positions: int, repeats: int, test: str
-) -> tuple[list[Item], list[tuple[str, str, float]]]:
+) -> tuple[list[ProcedureItem], list[tuple[str, str, float]]]:
     """Both ends of a bar in positions and directions far apart, each in ``repeats`` configurations; and the lengths."""
     search, reach = region
     seed = int(search.random.integers(2**31))
@@ -122,14 +122,14 @@ def bar_items(
                 poses = np.concatenate([poses, others])
                 enough = len(poses) >= repeats
                 poses = poses[far_apart(poses, repeats)] if enough else np.resize(poses, (repeats, poses.shape[1]))
-            items.append(Item(test, label, 1, np.tile(tip[row], (len(poses), 1)), poses))
+            items.append(ProcedureItem(test, label, 1, np.tile(tip[row], (len(poses), 1)), poses))
         pairs.append((*labels, float(length)))
     return items, pairs
 
 
 def touch_item(
     region: ProcedureRegion, sphere: PlannedSphere, test: str, count: int, group: int, azimuth: float | None = None
-) -> Item:
+) -> ProcedureItem:
     """Configurations that touch a sphere from outside; with an azimuth (rad), with about one direction of the probe."""
     arm = region.search.arm
     normals = _touch_directions(count)
@@ -150,7 +150,7 @@ def touch_item(
             centre = ", ".join(f"{x:.0f}" for x in sphere.centre)
             raise InputError(f"the sphere at ({centre}) mm cannot be touched on all sides; give another seed.")
         rows.append(possible[np.argmax(score[possible])])
-    return Item(test, sphere.name, group, points, q[rows])
+    return ProcedureItem(test, sphere.name, group, points, q[rows])
 
 
 def _touch_directions(count: int) -> Float[np.ndarray, "m 3"]:

@@ -128,7 +128,7 @@ def monte_carlo(
     block = max(math.ceil(100 / (1 - level)), 10_000)
     if most < block:
         raise InputError(f"most is {most}, but one block of trials has {block}; allow that many at least.")
-    task = _Task.of(result, capture, lengths)
+    task = _RepeatedTask.of(result, capture, lengths)
     exact, moves = _exact(result.arm, capture)
     true_lengths = np.asarray(_lengths_by(result.arm, capture))
     drawn, failed, blocks = [], 0, []
@@ -192,7 +192,7 @@ def bootstrap(
         raise InputError(f"{trials} trials show no distribution; ask for at least 100.")
     random = np.random.default_rng(seed)
     starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
-    task = _Task.of(result, capture, None)
+    task = _RepeatedTask.of(result, capture, None)
     rows = np.concatenate(
         [start + random.integers(size, size=(trials, size)) for start, size in zip(starts, capture.sizes, strict=True)],
         axis=1,
@@ -241,7 +241,7 @@ def _lengths_by(arm: Arm, capture: Capture) -> np.ndarray:
     return np.linalg.norm(tips[first[ends[:, 0]]] - tips[first[ends[:, 1]]], axis=1)
 
 
-class _Task(NamedTuple):
+class _RepeatedTask(NamedTuple):
     """What is the same in all trials."""
 
     result: Calibration
@@ -251,7 +251,9 @@ class _Task(NamedTuple):
     u: Float[np.ndarray, " l"]
 
     @classmethod
-    def of(cls, result: Calibration, capture: Capture, lengths: tuple[np.ndarray, np.ndarray] | None) -> "_Task":
+    def of(
+        cls, result: Calibration, capture: Capture, lengths: tuple[np.ndarray, np.ndarray] | None
+    ) -> "_RepeatedTask":
         if lengths is not None and (
             len(lengths) != 2 or np.ndim(lengths[0]) != 2 or np.shape(lengths[0]) != np.shape(lengths[1])
         ):

@@ -66,7 +66,7 @@ class Laboratory(Contact):
     code: Text | None = None
 
 
-class Item(Strict):
+class CalibratedItem(Strict):
     """The arm that was calibrated; without a name, it is called as in its arm file."""
 
     name: Text | None = None
@@ -133,7 +133,7 @@ class AdministrativeData(Strict):
 
     laboratory: Laboratory = Laboratory()
     customer: Contact = Contact()
-    item: Item = Item()
+    item: CalibratedItem = CalibratedItem()
     person: list[Person] = Field(default_factory=list)
     certificate: Certificate = Certificate()
     reference: list[Reference] = Field(default_factory=list)

@@ -1,33 +1,29 @@
 """Arms in TOML files, one row per joint, and the arms that ship with the package."""
 
-import math
 import os
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
+from pydantic import Field, FiniteFloat, PositiveFloat, model_validator
 
 from ..core.errors import InputError, nearest
+from ..core.units import DEG
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
 from ..kinematics.specification import ArmSpecification, single
-from .toml import read_toml
+from .toml import Strict, read_toml
 from .whole_file import storable, write_text
 
 if TYPE_CHECKING:
     from tomlkit import TOMLDocument
 
 _LENGTH_UNITS = {"mm": 1.0, "m": 1000.0}
-_ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180}
+_ANGLE_UNITS = {"rad": 1.0, "deg": DEG}
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
-class _Joint(_Strict):
+class _Joint(Strict):
     alpha: FiniteFloat
     a: FiniteFloat
     d: FiniteFloat
@@ -36,21 +32,21 @@ class _Joint(_Strict):
     limits: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
 
 
-class _Identification(_Strict):
+class _Identification(Strict):
     held: list[str] | None = None
-    free: list[str] = []
+    free: list[str] = Field(default_factory=list)
     length: PositiveFloat = 10.0
     angle: PositiveFloat | None = None
-    override: dict[str, PositiveFloat] = {}
+    override: dict[str, PositiveFloat] = Field(default_factory=dict)
 
 
-class _ArmModel(_Strict):
+class _ArmModel(Strict):
     name: str = ""
     source: str = ""
     convention: Literal["standard", "craig"] = "standard"
     length_unit: Literal["mm", "m"]
     angle_unit: Literal["rad", "deg"]
-    probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] = [0.0, 0.0, 0.0]
+    probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3, default_factory=lambda: [0.0, 0.0, 0.0])]
     joint: Annotated[list[_Joint], Field(min_length=1)]
     identification: _Identification | None = None
 

@@ -8,7 +8,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ..acceptance.procedure import TOUCHED, Item, Procedure
+from ..acceptance.procedure import TOUCHED, Procedure
+from ..acceptance.procedure_items import ProcedureItem
 from ..acceptance.standards import PLANNED
 from ..core.units import DEG
 from ..kinematics.arm import Arm
@@ -65,7 +66,7 @@ def _poses_csv(arm: Arm, headings: list[str], labels: Iterable[list[str]], point
     return text.getvalue()
 
 
-def file_of(procedure: Procedure, item: Item) -> str:
+def file_of(procedure: Procedure, item: ProcedureItem) -> str:
     """The file that a manifest of `procedure_manifest` expects an item's readings in."""
     if item.test not in TOUCHED:
         return f"{item.name}.csv"

@@ -1,7 +1,7 @@
 """The section of administrative data: laboratory, customer, item, persons and dates, and what is not stated of them."""
 
 from ..files.administrative_data import NOT_STATED, AdministrativeData
-from .elements import Section, Table, text_cell
+from .elements import ReportTable, Section, text_cell
 
 # Part, key and title: shown always, and shown if stated.
 _ALWAYS = (
@@ -57,5 +57,5 @@ def administrative_section(given: AdministrativeData, tested: bool) -> Section:
         conformity = given.conformity
         words = f"{conformity.verdict}: {conformity.specification}; {conformity.decision_rule}{source}"
         rows.append(("Statement of conformity", words))
-    table = Table("As stated", ("", ""), [[text_cell(title), text_cell(value)] for title, value in rows])
+    table = ReportTable("As stated", ("", ""), [[text_cell(title), text_cell(value)] for title, value in rows])
     return Section("about", "Laboratory, customer and item", [table])

@@ -13,7 +13,7 @@ from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
 from . import charts
 from .arm_view import view_of_arm
-from .elements import Chart, Report, Section, Table, decimals_for, format_number, number_cell, text_cell
+from .elements import Chart, Report, ReportTable, Section, decimals_for, format_number, number_cell, text_cell
 from .residuals import length_rows, metrics_table, residual_chart, socket_table
 from .uncertainty import (
     bounds_section,
@@ -101,8 +101,8 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
         introduction += f" {record.hold} was the scale anchor of stage 1, since poses alone do not determine the scale."
     blocks: list = [
         introduction,
-        Table("Sockets in which the tip was seated", ("socket", "poses"), sockets),
-        Table("Reference lengths", ("between", "calibrated value [mm]", "u [mm]"), lengths),
+        ReportTable("Sockets in which the tip was seated", ("socket", "poses"), sockets),
+        ReportTable("Reference lengths", ("between", "calibrated value [mm]", "u [mm]"), lengths),
         "Measurements of the arm are traceable to the metre through these reference lengths alone, as far as their "
         "calibration certificates are.",
     ]
@@ -129,11 +129,11 @@ def _found_and_left(record: CalibrationRecord, summary: dict[str, Any], evaluati
                 ("angle_error_largest_rad", "largest error of an angle parameter [arcsec]", 1 / ARCSEC),
             )
         ]
-        blocks.append(Table("Against the true arm of the simulation", ("", *stages.values()), rows))
+        blocks.append(ReportTable("Against the true arm of the simulation", ("", *stages.values()), rows))
     return Section("found-left", "As found and as left", blocks)
 
 
-def _validation_table(found: dict[str, Any]) -> Table:
+def _validation_table(found: dict[str, Any]) -> ReportTable:
     rows = [
         [text_cell(title), number_cell(found[value]), number_cell(found[predicted])]
         for title, value, predicted in (
@@ -142,7 +142,7 @@ def _validation_table(found: dict[str, Any]) -> Table:
         )
     ]
     caption = f"Cross-validated: each of {found['groups']} placements left out once [mm]"
-    return Table(caption, ("", "found", "predicted by u"), rows)
+    return ReportTable(caption, ("", "found", "predicted by u"), rows)
 
 
 def _scale(
@@ -169,12 +169,14 @@ def _scale(
     errors = {stage: np.asarray(evaluations[stage].error) for stage in ("nominal", "stage1", "calibrated")}
     before = {"as found": errors["nominal"], "after stage 1": errors["stage1"]}
     columns = ("between", "value", "as found", "after stage 1", "as left", "U of error")
-    table = Table("Reference lengths [mm]", columns, length_rows(summary["lengths"], factor, before, single))
+    table = ReportTable("Reference lengths [mm]", columns, length_rows(summary["lengths"], factor, before, single))
     block = table if single else _length_chart(summary["lengths"], errors, factor, table)
     return Section("scale", "Scale and reference lengths", [introduction, block])
 
 
-def _length_chart(lengths: list[dict[str, Any]], errors: dict[str, np.ndarray], factor: float, table: Table) -> Chart:
+def _length_chart(
+    lengths: list[dict[str, Any]], errors: dict[str, np.ndarray], factor: float, table: ReportTable
+) -> Chart:
     names = [f"{row['from']} – {row['to']}" for row in lengths]
     x = list(range(1, len(names) + 1))
     u = [factor * (row["error_u_mm"] or np.nan) for row in lengths]
@@ -215,7 +217,7 @@ def _parameters(summary: dict[str, Any], factor: float) -> Section:
     )
     by_unit = {unit: [row for row in summary["parameters"] if row["unit"] == unit] for unit in ("mm", "rad")}
     changes = [_change_chart(unit, chosen, factor) for unit, chosen in by_unit.items() if chosen]
-    return Section("parameters", "Parameters", [introduction, *changes, Table("Parameters", columns, rows)])
+    return Section("parameters", "Parameters", [introduction, *changes, ReportTable("Parameters", columns, rows)])
 
 
 def _change_chart(unit: str, parameters: list[dict[str, Any]], factor: float) -> Chart:

@@ -15,7 +15,7 @@ class Cell(NamedTuple):
     mark: str = ""  # "good", "bad", "unsure", "outlier"
 
 
-class Table(NamedTuple):
+class ReportTable(NamedTuple):
     """A table with headings; columns whose cells have values are right-aligned."""
 
     caption: str
@@ -35,7 +35,7 @@ class Chart(NamedTuple):
     title: str
     description: str
     figure: dict[str, Any]
-    table: Table | None = None
+    table: ReportTable | None = None
     height: int = 380
     printed: bool = False  # whether the table is printed on paper as well
 
@@ -54,7 +54,7 @@ class Section(NamedTuple):
 
     id: str
     title: str
-    blocks: list["str | Table | Chart | ArmView"]
+    blocks: list["str | ReportTable | Chart | ArmView"]
 
 
 class Report(NamedTuple):

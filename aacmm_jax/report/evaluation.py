@@ -15,7 +15,7 @@ from ..data.sphere import ProbedSphere
 from ..summaries.evaluation import evaluation_summary, points_summary
 from . import charts
 from .arm_view import view_of_arm
-from .elements import Cell, Chart, Report, Section, Table, format_number, number_cell, text_cell
+from .elements import Cell, Chart, Report, ReportTable, Section, format_number, number_cell, text_cell
 from .residuals import length_rows, metrics_table, residual_chart, socket_table
 
 _MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}
@@ -154,10 +154,10 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
     ]
     title = "Every part of every metric with a limit [mm]" if limited else "Every part of every metric [mm]"
     columns = ("standard", "metric", "at", "as left" if before else "value", "U", "MPE", "decision")
-    return [*blocks, _metrics_chart(tests)._replace(table=Table(title, columns, parts), printed=limited)]
+    return [*blocks, _metrics_chart(tests)._replace(table=ReportTable(title, columns, parts), printed=limited)]
 
 
-def _test_table(test: dict[str, Any], before: bool, limited: bool) -> Table:
+def _test_table(test: dict[str, Any], before: bool, limited: bool) -> ReportTable:
     """One acceptance test; ``before``: with columns of the arm as found; ``limited``: with limits and decisions."""
     columns = ["metric", "what it is"]
     if before:
@@ -174,7 +174,7 @@ def _test_table(test: dict[str, Any], before: bool, limited: bool) -> Table:
             decision = _decision(metric["decision"], metric["failing"], len(metric["parts"]))
             row += [number_cell(metric["limit_mm"]), decision]
         rows.append([*row, text_cell(metric["where"])])
-    return Table(f"{EDITIONS[test['standard']]}: {test['title']} [mm]", (*columns, "worst at"), rows)
+    return ReportTable(f"{EDITIONS[test['standard']]}: {test['title']} [mm]", (*columns, "worst at"), rows)
 
 
 def _expanded(value: float) -> Cell:
@@ -206,7 +206,7 @@ def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSpher
         touches = "+".join(str(len(group)) for group in sphere.groups)
         use = f"touched {touches} times by a ball of {sphere.stylus:g} mm; form error {format_number(sphere.form)} mm"
         rows.append([text_cell(name), number_cell(sphere.diameter), number_cell(sphere.u), text_cell(use)])
-    return [Table("Artefacts", ("artefact", "calibrated value [mm]", "u [mm]", "used"), rows)] if rows else []
+    return [ReportTable("Artefacts", ("artefact", "calibrated value [mm]", "u [mm]", "used"), rows)] if rows else []
 
 
 def _metrics_chart(tests: list[AcceptanceTest]) -> Chart:
@@ -267,7 +267,7 @@ def _lengths(
     ]
     columns = ("between", "value", "as found", "as left", "U of error")
     cells = length_rows(rows, 2.0, {"as found": np.asarray(found.error)})
-    table = Table("Lengths between the mean points of their sockets [mm]", columns, cells)
+    table = ReportTable("Lengths between the mean points of their sockets [mm]", columns, cells)
     note = (
         "Means of all poses, for comparison; no acceptance test uses them. Their U (factor 2) also contains the "
         "scatter of the poses at both ends."

@@ -13,7 +13,7 @@ from ..files.administrative_data import AdministrativeData, check_conformity
 from ..files.hdf5 import read_tables
 from ..files.whole_file import fingerprint, write_text
 from .administrative_data import administrative_section
-from .elements import ArmView, Chart, Report, Table
+from .elements import ArmView, Chart, Report, ReportTable
 
 KINDS = ("calibration", "evaluation", "study")
 _FOLDER = Path(__file__).parent
@@ -133,7 +133,7 @@ def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
         report=report,
         origin=origin,
         is_chart=lambda block: isinstance(block, Chart),
-        is_table=lambda block: isinstance(block, Table),
+        is_table=lambda block: isinstance(block, ReportTable),
         is_arm_view=lambda block: isinstance(block, ArmView),
         charts={block.id: block.figure for block in blocks if isinstance(block, Chart)},
         scenes={block.id: block.data for block in blocks if isinstance(block, ArmView)},

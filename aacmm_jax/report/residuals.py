@@ -8,7 +8,7 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..data.capture import Capture
 from . import charts
-from .elements import Cell, Chart, Table, format_number, number_cell, text_cell
+from .elements import Cell, Chart, ReportTable, format_number, number_cell, text_cell
 
 _METRICS = (
     ("de_mm", "DE, mean distance of poses from their socket's centroid"),
@@ -24,7 +24,7 @@ _LEAST = 1e-5  # mm: a distance of zero on a logarithmic axis
 
 def metrics_table(
     caption: str, summary: Mapping[str, Any], stages: Mapping[str, str], *, fixed_scale: bool = False
-) -> Table:
+) -> ReportTable:
     """Repeatability and length errors, one column per arm.
 
     ``fixed_scale``: a single length fixed the scale of the last arm, so its error is zero by construction.
@@ -39,7 +39,7 @@ def metrics_table(
     rows = [
         [text_cell(title), *(cell(stage, key) for stage in stages)] for key, title in _METRICS if key in summary[first]
     ]
-    return Table(caption, ("", *stages.values()), rows)
+    return ReportTable(caption, ("", *stages.values()), rows)
 
 
 def outliers(distances: np.ndarray) -> np.ndarray:
@@ -55,7 +55,7 @@ def pose_distances(capture: Capture, evaluation: Evaluation) -> np.ndarray:
     return np.where(single, np.nan, np.asarray(evaluation.distances))
 
 
-def socket_table(capture: Capture, evaluation: Evaluation) -> Table:
+def socket_table(capture: Capture, evaluation: Evaluation) -> ReportTable:
     """Repeatability and number of outliers, socket by socket."""
     found = evaluation.repeatability
     metrics = [np.asarray(column) for column in (found.socket_de, found.socket_deltam, found.socket_rms)]
@@ -69,7 +69,7 @@ def socket_table(capture: Capture, evaluation: Evaluation) -> Table:
         ]
         for i, (name, size) in enumerate(zip(capture.names, capture.sizes, strict=True))
     ]
-    return Table("Repeatability by socket [mm]", ("socket", "poses", "DE", "Δm", "RMS", "marked poses"), rows)
+    return ReportTable("Repeatability by socket [mm]", ("socket", "poses", "DE", "Δm", "RMS", "marked poses"), rows)
 
 
 def residual_chart(
@@ -116,7 +116,7 @@ def residual_chart(
     return Chart(id, title, description, {"data": traces, "layout": layout}, table)
 
 
-def _pose_table(capture: Capture, distances: Mapping[str, np.ndarray], far: np.ndarray, mark: bool) -> Table:
+def _pose_table(capture: Capture, distances: Mapping[str, np.ndarray], far: np.ndarray, mark: bool) -> ReportTable:
     """Every pose, or the farthest of very many."""
     last = list(distances.values())[-1]
     chosen, caption = np.arange(len(last)), "Every pose"
@@ -134,7 +134,7 @@ def _pose_table(capture: Capture, distances: Mapping[str, np.ndarray], far: np.n
         for i in chosen.tolist()
     ]
     columns = ("socket", "pose", *(f"{name} [mm]" for name in distances), *(["marked"] if mark else []))
-    return Table(caption, columns, rows)
+    return ReportTable(caption, columns, rows)
 
 
 def length_rows(

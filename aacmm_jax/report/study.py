@@ -8,7 +8,7 @@ from ..core.units import ARCSEC
 from ..study.results import Results
 from ..study.statistics import METRICS, study_summary
 from . import charts
-from .elements import Cell, Chart, Report, Section, Table, format_number, number_cell, text_cell
+from .elements import Cell, Chart, Report, ReportTable, Section, format_number, number_cell, text_cell
 
 # Metrics shown: name, factor and unit.
 _SHOWN = (
@@ -104,7 +104,7 @@ def _statistic_cell(entry: dict[str, Any] | None, factor: float) -> Cell:
     return Cell(f"{format_number(value, decimals)} ± {format_number(factor * error, decimals)}", value)
 
 
-def _cell_table(summary: dict[str, Any]) -> Table:
+def _cell_table(summary: dict[str, Any]) -> ReportTable:
     names, rows = list(summary["factors"]), []
     for cell in summary["results"]:
         levels, fraction = [cell["factors"][name] for name in names], cell["converged"]["value"]
@@ -118,7 +118,7 @@ def _cell_table(summary: dict[str, Any]) -> Table:
             number_cell(cell["steps_mean"], 1),
         ])  # fmt: skip
     columns = ("cell", *names, "trials run", "converged [%]", "truth within bounds [%]", "mean evaluations")
-    return Table("Trials by cell", columns, rows)
+    return ReportTable("Trials by cell", columns, rows)
 
 
 def _metric_section(summary: dict[str, Any], name: str, factor: float, unit: str) -> Section:
@@ -150,7 +150,7 @@ def _metric_section(summary: dict[str, Any], name: str, factor: float, unit: str
     layout = charts.layout(axis_title, unit or name, xaxis=axis, yaxis=y_axis, showlegend=False)
     heading = f"{title} [{unit}]" if unit else title
     columns = ("cell", "mean", "standard deviation", "5 %", "50 %", "95 %")
-    table = Table(f"{heading}; ± one Monte Carlo standard error", columns, rows)
+    table = ReportTable(f"{heading}; ± one Monte Carlo standard error", columns, rows)
     description = "Squares are medians, bars reach from the 5th to the 95th percentile of the converged trials."
     figure = {"data": [trace], "layout": layout}
     return Section(f"figure-{name}", title, [Chart(f"chart-{name}", heading, description, figure, table, 320)])
@@ -181,5 +181,5 @@ def _parameter_sections(summary: dict[str, Any]) -> list[Section]:
     if not rows:
         return []
     columns = ("cell", "parameter", "unit", "bias", "standard deviation")
-    table = Table("Errors of the parameters; ± one Monte Carlo standard error", columns, rows)
+    table = ReportTable("Errors of the parameters; ± one Monte Carlo standard error", columns, rows)
     return [Section("parameters", "Parameters", [table])]

@@ -12,7 +12,7 @@ from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
 from . import charts
-from .elements import Chart, Section, Table, format_number, number_cell, text_cell
+from .elements import Chart, ReportTable, Section, format_number, number_cell, text_cell
 
 _INDICES = {
     "O1": "geometric mean of the singular values (Menq, Borm)",
@@ -41,7 +41,7 @@ def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], facto
         f"At {len(volume.start)} positions that random poses within the joint limits reach ({box} mm), "
         f"expanded to 95 % with the factor {factor:.2f}."
     )
-    table = Table(
+    table = ReportTable(
         "Expanded uncertainty over the working volume [mm]", ("", "median", "95th percentile", "largest"), rows
     )
     chart = _volume_chart(volume, factor, length)
@@ -81,7 +81,7 @@ def _volume_chart(volume: VolumetricUncertainty, factor: float, length: str) -> 
         f"U of a {length} over the volume",
         "Larger and darker marks are more uncertain; height against distance from the first axis.",
         {"data": [trace], "layout": layout},
-        Table("All positions", columns, data),
+        ReportTable("All positions", columns, data),
         420,
     )
 
@@ -109,7 +109,7 @@ def correlations_section(record: CalibrationRecord, uncertainty: Uncertainty) ->
         "Darker is more strongly correlated; the sign is written where it is at least 0.5. Strongly correlated "
         "parameters are determined better in combination than one by one."
     )
-    table = Table("Pairs correlated by 0.5 or more", ("parameter", "with", "correlation"), pairs)
+    table = ReportTable("Pairs correlated by 0.5 or more", ("parameter", "with", "correlation"), pairs)
     traces = charts.correlation_heatmap(list(record.names), np.asarray(uncertainty.correlation))
     layout = charts.layout("", "")
     layout["yaxis"] |= {"autorange": "reversed", "showgrid": False, "tickfont": {"size": 10}}
@@ -138,10 +138,10 @@ def observability_section(observability: Observability) -> Section:
         "Singular values",
         "Sensitivity of the data to each independent direction of the parameters, in steps of 1 mm and 1 mrad.",
         {"data": [trace], "layout": layout},
-        Table("Singular values", ("number", "value"), cells),
+        ReportTable("Singular values", ("number", "value"), cells),
         300,
     )
-    metrics = Table("Metrics", ("", "value", "meaning"), [[text_cell(word) for word in row] for row in rows])
+    metrics = ReportTable("Metrics", ("", "value", "meaning"), [[text_cell(word) for word in row] for row in rows])
     return Section("observability", "Observability", [" ".join(sentences), metrics, chart])
 
 
@@ -173,7 +173,7 @@ def bounds_section(record: CalibrationRecord, summary: dict[str, Any]) -> Sectio
         "Position of every parameter within its bounds",
         "Diamonds are on a bound.",
         {"data": [trace], "layout": layout},
-        Table("Bounds", ("parameter", "unit", "lower", "as left", "upper", ""), rows),
+        ReportTable("Bounds", ("parameter", "unit", "lower", "as left", "upper", ""), rows),
         300,
     )
     return Section("bounds", "Bounds", [introduction, chart])
@@ -189,5 +189,5 @@ def monte_carlo_section(record: CalibrationRecord) -> Section:
         agrees = bool(found["agrees"][i])
         rows.append([text_cell(name), *values, text_cell("yes" if agrees else "no", "" if agrees else "unsure")])
     columns = ("quantity", "value", "u by Monte Carlo", "u by propagation", "from", "to", "agree")
-    table = Table("Quantities, in mm and rad; 95 % coverage intervals", columns, rows)
+    table = ReportTable("Quantities, in mm and rad; 95 % coverage intervals", columns, rows)
     return Section("monte-carlo", "Monte Carlo (JCGM 101)", [record.sampled_says or "", table])

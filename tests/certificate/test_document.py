@@ -15,9 +15,9 @@ import aacmm_jax as aj
 from aacmm_jax.certificate import dcc_xml, parse_dcc, xml_elements
 from aacmm_jax.files.administrative_data import (
     AdministrativeData,
+    CalibratedItem,
     Certificate,
     Conformity,
-    Item,
     Laboratory,
     Person,
     Reference,
@@ -422,7 +422,7 @@ def test_the_day_of_the_calibration_stands_in_for_missing_dates(record, stated, 
 def test_the_same_calibration_has_the_same_certificate(record):
     one, again = (dcc_xml(record, AdministrativeData(), created=CREATED) for _ in range(2))
     assert one == again
-    other = dcc_xml(record, AdministrativeData(item=Item(name="other")), created=CREATED)
+    other = dcc_xml(record, AdministrativeData(item=CalibratedItem(name="other")), created=CREATED)
     identifier = lambda text: ElementTree.fromstring(text).findtext(f"*/{DCC}coreData/{DCC}uniqueIdentifier")  # noqa: E731
     assert identifier(one) != identifier(other)
 

@@ -162,7 +162,7 @@ def tables_of(report):
                 block.table
                 if isinstance(block, elements.Chart)
                 else block
-                if isinstance(block, elements.Table)
+                if isinstance(block, elements.ReportTable)
                 else None
             )
             if table is not None:
