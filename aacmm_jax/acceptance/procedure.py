@@ -14,7 +14,7 @@ from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest
 from ..kinematics.arm import Arm, is_single
 from ..kinematics.inverse_kinematics import project_to_targets
-from ..kinematics.specification import ArmSpecification
+from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach, arm_reach, search_region
 from . import asme_b89_4_22, iso_10360_12
 from .procedure_items import PlannedSphere, ProcedureItem, ProcedureRegion

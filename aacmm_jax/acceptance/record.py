@@ -12,7 +12,7 @@ from ..calibration.record import CalibrationRecord
 from ..data.recording import Recording
 from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry
-from ..kinematics.specification import ArmSpecification
+from ..kinematics.parameters import ArmSpecification
 from .decision import Limit
 from .suite import AcceptanceTest, Measured, checked_limits, measured_by, run, without_stated_uncertainty
 

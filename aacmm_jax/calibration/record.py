@@ -8,8 +8,7 @@ import numpy as np
 
 from ..data.noise import Noise
 from ..data.recording import Recording
-from ..kinematics.parameters import Parameters
-from ..kinematics.specification import ArmSpecification
+from ..kinematics.parameters import ArmSpecification, Parameters
 from ..solver.reason import Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .checks import largest_plausible_residual

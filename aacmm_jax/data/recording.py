@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from ..kinematics.specification import ArmSpecification
+from ..kinematics.parameters import ArmSpecification
 from .capture import Capture
 from .sphere import ProbedSphere
 

@@ -11,8 +11,7 @@ from pydantic import Field, FiniteFloat, PositiveFloat, model_validator
 from ..core.errors import InputError, nearest
 from ..core.units import DEG
 from ..kinematics.arm import Arm
-from ..kinematics.parameters import Parameters
-from ..kinematics.specification import ArmSpecification, single
+from ..kinematics.parameters import ArmSpecification, Parameters, single
 from .toml import Strict, read_toml
 from .whole_file import storable, write_text
 

@@ -11,7 +11,7 @@ from ..data.capture import Capture, ReferenceLength
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm
-from ..kinematics.specification import ArmSpecification, single
+from ..kinematics.parameters import ArmSpecification, single
 from .hdf5 import Stored, Table, Variable, names_in, need, read_tables, undamaged, write_tables
 
 _KINDS = {

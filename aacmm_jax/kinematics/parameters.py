@@ -1,8 +1,9 @@
-"""Which parameters of an arm are free, and within what bounds."""
+"""Which parameters of an arm are free, within what bounds, and what the file of an arm proposes for both."""
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError
-from .arm import Arm, is_length, locate, natural_steps, parameter_names, with_arrays, with_values
+from .arm import Arm, is_length, is_single, locate, natural_steps, parameter_names, with_arrays, with_values
 from .independence import generic_poses, independent_names
 from .inverse_kinematics import SocketPoses
 
@@ -256,3 +257,40 @@ def perturbed_arm(space: Parameters, *, length: float, angle: float, seed: int =
     width = jnp.where(jnp.asarray(space.lengths), length, angle)
     shift = jax.random.uniform(jax.random.key(seed), width.shape, minval=-1.0, maxval=1.0)
     return space.arm(space.vector() + width * shift)
+
+
+class ArmSpecification(NamedTuple):
+    """An arm as a file states it, with the identification that the file proposes.
+
+    Args:
+        arm: The nominal arm.
+        name: What people call it.
+        held: Names of the fixed parameters; None for the default of `Parameters.free_of`.
+        length: Half-width of the bounds of lengths, mm.
+        angle: Half-width of the bounds of angles, rad.
+        override: Half-widths of single parameters by name, mm or rad.
+        free: Names that are free in addition, such as Hayati's ``beta_2``.
+    """
+
+    arm: Arm
+    name: str = ""
+    held: tuple[str, ...] | None = None
+    length: float = 10.0
+    angle: float = 0.0175
+    override: Mapping[str, float] = MappingProxyType({})
+    free: tuple[str, ...] = ()
+
+    def space(self) -> Parameters:
+        """The free parameters that the file proposes."""
+        return Parameters.free_of(self.arm, held=self.held, free=self.free)
+
+    def bounds(self) -> Bounds:
+        """The bounds that the file proposes."""
+        return Bounds.around(self.arm, self.space(), length=self.length, angle=self.angle, override=self.override)
+
+
+def single(arm: Arm) -> Arm:
+    """The same arm; raises `InputError` for a batch of arms, since a file holds one."""
+    if not is_single(arm):
+        raise InputError("a file holds one arm, but this is a batch; take one of it first.")
+    return arm

@@ -18,8 +18,7 @@ from ..data.capture import Capture
 from ..data.recording import Recording
 from ..files.arms import specification_toml
 from ..kinematics.arm import Arm, checked_limits, is_length
-from ..kinematics.parameters import Parameters
-from ..kinematics.specification import ArmSpecification, single
+from ..kinematics.parameters import ArmSpecification, Parameters, single
 from .specification import Point, Region, Specification, label
 
 POOL_PARTS = 32  # independent parts of a pose pool; trial t draws from part t modulo this

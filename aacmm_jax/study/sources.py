@@ -14,7 +14,7 @@ from ..files.captures import load_capture
 from ..files.toml import read_toml
 from ..files.whole_file import storable
 from ..kinematics.arm import Arm
-from ..kinematics.specification import ArmSpecification
+from ..kinematics.parameters import ArmSpecification
 from .definition import Study
 from .specification import Specification, checked
 

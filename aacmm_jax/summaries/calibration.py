@@ -11,8 +11,7 @@ from ..calibration.results import CrossValidation, active_names
 from ..data.capture import Capture, ReferenceLength
 from ..data.recording import Recording
 from ..kinematics.arm import is_length
-from ..kinematics.parameters import Parameters
-from ..kinematics.specification import ArmSpecification
+from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .warnings import observed, of_calibration, of_capture

@@ -24,7 +24,7 @@ from aacmm_jax.data.recording import Recording
 from aacmm_jax.drift.comparison import compare, trend
 from aacmm_jax.drift.statistics import coverage_factor, effective_degrees_of_freedom
 from aacmm_jax.files.hdf5 import provenance
-from aacmm_jax.kinematics.specification import ArmSpecification
+from aacmm_jax.kinematics.parameters import ArmSpecification
 from aacmm_jax.model.scale import divide_lengths
 from aacmm_jax.plot import drift as drift_figure
 from aacmm_jax.summaries.drift import drift_csv, drift_summary
