@@ -109,8 +109,8 @@ def test_lengths_and_sockets(given, call, parts):
 @pytest.mark.parametrize(
     ("changes", "parts"),
     [
-        ({"a": [1.0, 2.0]}, ["a has shape (2,)", "6 joints", "one value a joint"]),
-        ({"alpha": 1.5}, ["alpha", "one value a joint"]),
+        ({"a": [1.0, 2.0]}, ["a has shape (2,)", "6 joints", "one value per joint"]),
+        ({"alpha": 1.5}, ["alpha", "one value per joint"]),
         ({"d": [[1.0], [1.0, 2.0]]}, ["d has rows of unequal length"]),
         ({"d": ["one"] * 6}, ["d must be real numbers", "text"]),
         ({"d": [0.0, 0.0, np.inf, 0.0, 0.0, 0.0]}, ["d holds a value that is not finite"]),
