@@ -2,7 +2,7 @@
 
 The names below are those that most scripts need; everything else is grouped by subject: `acceptance`, `calibration`,
 `certificate`, `data`, `drift`, `files`, `kinematics`, `model`, `planning`, `plot`, `report`, `solver`, `study`,
-`uncertainty`, `units`. A name is imported when it is first asked for; the stub beside this file lists them, once.
+`uncertainty`, `units`. A name is imported when it is first asked for; the stub `__init__.pyi` lists them.
 """
 
 import lazy_loader as _lazy_loader

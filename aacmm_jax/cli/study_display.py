@@ -83,7 +83,7 @@ def _column(factor: str) -> str:
 
 
 def study(summary: dict[str, Any]) -> None:
-    """All cells: what converged, then every figure's mean; then spread and percentiles."""
+    """All cells: what converged, the mean of every metric, then standard deviations and percentiles."""
     console = new_console()
     _heading(console, summary)
     cells = [cell for cell in summary["results"] if cell["trials_run"]]
@@ -101,7 +101,7 @@ def study(summary: dict[str, Any]) -> None:
         table.add_row(str(cell["cell"]), *map(_text, cell["factors"].values()), *values)
     print_table(console, table)
     if len(cells) > 1:
-        _spreads(
+        _distributions(
             console, shown, ("length_error", "angle_error") if fixed else ("length_error_stage1", "angle_error_stage1")
         )
     if len(cells) > len(shown):
@@ -113,7 +113,7 @@ def study(summary: dict[str, Any]) -> None:
     if len(cells) == 1:
         _full(console, cells[0])
     else:
-        console.print("One cell in full, with every parameter's bias and spread: --cell N. Figures: --figures FOLDER.")
+        console.print("One cell in full, with every parameter's bias: --cell N. Figures: --figures FOLDER.")
     _written(console, summary)
 
 
@@ -176,10 +176,10 @@ def _mean(cell: dict[str, Any], name: str) -> dict[str, Any] | None:
     return cell["figures"][name]["mean"] if name in cell["figures"] else None
 
 
-def _spreads(console: Console, cells: list[dict[str, Any]], names: tuple[str, ...]) -> None:
+def _distributions(console: Console, cells: list[dict[str, Any]], names: tuple[str, ...]) -> None:
     for name in names:
         text, factor = _NAMES[name]
-        table = new_table(f"\n{text[0].upper()}{text[1:]}", "cell", "mean", "spread", "5 %", "50 %", "95 %")
+        table = new_table(f"\n{text[0].upper()}{text[1:]}", "cell", "mean", "standard deviation", "5 %", "50 %", "95 %")
         for cell in cells:
             if name in cell["figures"]:
                 table.add_row(str(cell["cell"]), *_row(cell["figures"][name], factor))
@@ -192,13 +192,13 @@ def _row(figure: dict[str, Any], factor: float) -> list[str]:
 
 
 def _full(console: Console, cell: dict[str, Any]) -> None:
-    table = new_table("\nFigures over converged trials", "", "mean", "spread", "5 %", "50 %", "95 %")
+    table = new_table("\nMetrics over converged trials", "", "mean", "standard deviation", "5 %", "50 %", "95 %")
     for name, (text, factor) in _NAMES.items():
         if name in cell["figures"]:
             table.add_row(escape(text), *_row(cell["figures"][name], factor))
     print_table(console, table)
     table = new_table(
-        "\nParameters: estimate less truth", "parameter", "unit", "bias", "spread", "on a bound [%]",
+        "\nParameters: estimate less truth", "parameter", "unit", "bias", "standard deviation", "on a bound [%]",
     )  # fmt: skip
     for row in cell["parameters"]:
         factor, unit = (1.0, "mm") if row["unit"] == "mm" else (1 / ARCSEC, "arcsec")
