@@ -11,11 +11,10 @@ from concurrent.futures import ThreadPoolExecutor
 from queue import Empty, SimpleQueue
 from typing import Any, Literal, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_array
 from ..core.errors import InputError
@@ -24,10 +23,10 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import check_joints
-from ..solver.reason import Reason, reasons
+from ..solver.reason import reasons
 from .batch_kernel import Problems, Shape, solve_chunk
 from .checks import based_on, check_enough
-from .results import converged
+from .results import ManyCalibrations, ManyIdentifications
 from .scale_anchor import ScaleAnchor, scale_anchor
 from .second_stage import divided, rows_of, second_stage_many
 
@@ -36,55 +35,6 @@ from .second_stage import divided, rows_of, second_stage_many
 _SLOTS_CPU, _POSES_IN_CACHE = 16, 2000
 _SLOTS_ELSEWHERE = 4096
 _ROUNDS = 64  # problems that a slot of one chunk takes at most, one after the other
-
-
-class ManyIdentifications(eqx.Module):
-    """Results of stage 1, problem by problem, as NumPy arrays; ``parameters`` in the order of ``space.names``, mm and
-    rad."""
-
-    parameters: Float[np.ndarray, "b p"]
-    de: Float[np.ndarray, " b"]  # mm
-    deltam: Float[np.ndarray, " b"]  # mm
-    k: Float[np.ndarray, " b"] | None  # measured / nominal, where the capture holds reference lengths
-    steps: Int[np.ndarray, " b"]  # evaluations
-    result: Reason  # why each ended
-    active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, 0 inside or fixed
-    space: Parameters
-    hold: str | None = eqx.field(static=True)
-
-    @property
-    def converged(self) -> Bool[np.ndarray, " b"]:
-        """Which problems ended at a minimum."""
-        return np.asarray(converged(self.result))
-
-
-class ManyCalibrations(eqx.Module):
-    """Results of both stages, or of the joint solve, problem by problem, as NumPy arrays; mm and rad."""
-
-    parameters: Float[np.ndarray, "b p"]
-    k: Float[np.ndarray, " b"]  # of stage 1
-    de: Float[np.ndarray, " b"]  # mm
-    deltam: Float[np.ndarray, " b"]  # mm
-    steps: Int[np.ndarray, " b"]  # evaluations of all solves
-    result: Reason  # why the last solve ended
-    active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, in the last solve
-    stage1: ManyIdentifications
-    method: str = eqx.field(static=True)
-
-    @property
-    def space(self) -> Parameters:
-        """The free parameters."""
-        return self.stage1.space
-
-    @property
-    def hold(self) -> str | None:
-        """The scale anchor of stage 1."""
-        return self.stage1.hold
-
-    @property
-    def converged(self) -> Bool[np.ndarray, " b"]:
-        """Which problems ended at a minimum in every solve."""
-        return self.stage1.converged & np.asarray(converged(self.result))
 
 
 def identify_many(
@@ -113,7 +63,7 @@ def identify_many(
         lower: `Bounds`, whose space is then used; or lower bounds, ``(batch, p)`` or ``(p,)``, mm and rad, in the order
             of ``space.names``.
         upper: Upper bounds, likewise; left out where ``lower`` is `Bounds`.
-        start: Starts, likewise, clipped to the bounds; by default the arm.
+        start: Starts, likewise, clipped to the bounds, that of the scale anchor too; by default the arm.
         space: The free parameters where bounds are arrays; by default the paper's of ``arm``.
         hold: The scale anchor, as in `identify`.
         noise: Weights poses, as in `identify`.
@@ -130,8 +80,8 @@ def identify_many(
         InputError: For shapes that do not fit, a lower bound above its upper one, and too few poses.
     """
     lower, upper, space = _bounds_and_space(arm, lower, upper, space)
-    effort = _Effort(max_steps, chunk, slots, devices, workers)
-    return _Work.of(arm, capture, lower, upper, start, space, hold, noise, effort).identified()
+    effort = Effort(max_steps, chunk, slots, devices, workers)
+    return BatchTask.of(arm, capture, lower, upper, start, space, hold, noise, effort).identified()
 
 
 def calibrate_many(
@@ -182,28 +132,29 @@ def calibrate_many(
             "the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many."
         )
     lower, upper, space = _bounds_and_space(arm, lower, upper, space)
-    effort = _Effort(max_steps, chunk, slots, devices, workers)
-    work = _Work.of(arm, capture, lower, upper, start, space, hold, noise, effort)
-    stage1 = work.identified()
-    k = stage1.k
-    assert k is not None
-    base = based_on(work.space, arm)
+    effort = Effort(max_steps, chunk, slots, devices, workers)
+    return calibrated(BatchTask.of(arm, capture, lower, upper, start, space, hold, noise, effort), method)
+
+
+def calibrated(task: "BatchTask", method: str) -> ManyCalibrations:
+    """`calibrate_many` for a batch that is checked."""
+    stage1 = task.identified()
+    assert stage1.k is not None
     if method == "two-stage":
-
-        def identify_again(rows: np.ndarray, start: np.ndarray) -> ManyIdentifications:
-            some, recorded, low, high = rows_of(rows, arm, capture, work.problems.lower, work.problems.upper)
-            adjusted = work.anchor.adjusted
-            return _Work.of(some, recorded, low, high, start, work.space, adjusted, noise, effort).identified()
-
-        found = second_stage_many(work.anchor, base, work.problems.lower, work.problems.upper, stage1, identify_again)
-        return ManyCalibrations(k=k, stage1=stage1, method=method, **found)
-    scaled = divided(work.anchor, base, stage1.parameters, k)
-    fitted = sum(work.shape.solved)
-    work = _Work.of(arm, capture, lower, upper, scaled, stage1.space, None, noise, effort, fitted)
-    joint = work.identified()
-    steps = stage1.steps + joint.steps
+        found = second_stage_many(task.anchor, stage1, task.identified_again)
+        return ManyCalibrations(k=stage1.k, stage1=stage1, method=method, **found)
+    scaled = divided(task.anchor, stage1.space, stage1.parameters, stage1.k)
+    joint = task.repeated(task.arm, task.capture, stage1.bounds, scaled, None, stage1.sigma / stage1.k).identified()
     return ManyCalibrations(
-        joint.parameters, k, joint.de, joint.deltam, steps, joint.result, joint.active, stage1, method
+        parameters=joint.parameters,
+        k=stage1.k,
+        de=joint.de,
+        deltam=joint.deltam,
+        steps=stage1.steps + joint.steps,
+        result=joint.result,
+        active=joint.active,
+        stage1=stage1,
+        method=method,
     )
 
 
@@ -224,19 +175,21 @@ def _bounds_and_space(
     return lower, upper, Parameters.free_of(arm) if space is None else space
 
 
-class _Effort(NamedTuple):
+class Effort(NamedTuple):
     """How much is computed at a time, and where."""
 
-    max_steps: int
-    chunk: int | None
-    slots: int | None
-    devices: Sequence[Any] | None
-    workers: int | None
+    max_steps: int = 300
+    chunk: int | None = None
+    slots: int | None = None
+    devices: Sequence[Any] | None = None
+    workers: int | None = None
 
 
-class _Work(NamedTuple):
-    """The whole batch on the host, and how a chunk of it is run on a device."""
+class BatchTask(NamedTuple):
+    """A batch of identifications, checked: the problems on the host, and how a chunk of them is run on a device."""
 
+    arm: Arm
+    capture: Capture
     problems: Problems
     shape: Shape
     chunks: list[range]
@@ -244,9 +197,9 @@ class _Work(NamedTuple):
     devices: list[Any]
     workers: int
     space: Parameters
-    hold: str | None
-    noise: Noise | None
     anchor: ScaleAnchor
+    noise: Noise | None
+    effort: Effort
 
     @classmethod
     def of(
@@ -257,15 +210,15 @@ class _Work(NamedTuple):
         upper: Numbers,
         start: Numbers | None,
         space: Parameters,
-        hold: str | None,
+        hold: str | ScaleAnchor | None,
         noise: Noise | None,
-        effort: _Effort,
-        fitted: int | None = None,
-    ) -> "_Work":
-        """Everything checked and laid out. ``fitted``: the joint solve, after a stage 1 of so many parameters."""
-        problems, batched, size = _problems(arm, capture, lower, upper, start, space)
-        anchor = scale_anchor(space, arm, hold, noise)
-        hold = anchor.hold
+        effort: Effort,
+        sigma: Float[np.ndarray, " b"] | None = None,
+    ) -> "BatchTask":
+        """Everything checked and laid out. ``hold`` may be an anchor that is known; ``sigma`` is of a joint solve, see
+        `Problems`."""
+        problems, batched, size = _problems(arm, capture, lower, upper, start, space, sigma)
+        anchor = hold if isinstance(hold, ScaleAnchor) else scale_anchor(space, arm, hold, noise)
         check_joints(capture, space)
         if noise is not None:
             noise.check(arm.joints)
@@ -281,16 +234,36 @@ class _Work(NamedTuple):
             sizes=capture.sizes,
             ends=tuple((int(a), int(b)) for a, b in capture.ends()),
             indices=space.indices(),
-            solved=tuple(name != hold for name in space.names),
+            solved=tuple(name != anchor.hold for name in space.names),
             scale=tuple(np.asarray(space.scale).tolist()),
             batched=batched,
             slots=slots,
             max_steps=effort.max_steps,
-            joint=fitted is not None,
-            fitted=fitted or 0,
         )
         capacity = _capacity(max(map(len, chunks)), slots)
-        return cls(problems, shape, chunks, capacity, devices, workers, space, hold, noise, anchor)
+        space = based_on(space, arm)
+        return cls(arm, capture, problems, shape, chunks, capacity, devices, workers, space, anchor, noise, effort)
+
+    def repeated(
+        self,
+        arm: Arm,
+        capture: Capture,
+        bounds: Bounds,
+        start: np.ndarray,
+        hold: str | None,
+        sigma: Float[np.ndarray, " b"] | None = None,
+    ) -> "BatchTask":
+        """Another solve of the same batch, or of a part of it, from another start and with another anchor."""
+        anchor = self.anchor._replace(hold=hold)
+        lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)
+        return BatchTask.of(arm, capture, lower, upper, start, self.space, anchor, self.noise, self.effort, sigma)
+
+    def identified_again(self, rows: np.ndarray, start: np.ndarray) -> ManyIdentifications:
+        """Stage 1 of some of the problems, with the adjusted length kept at its start."""
+        problems = self.problems
+        arm, capture, lower, upper = rows_of(rows, self.arm, self.capture, problems.lower, problems.upper)
+        bounds = Bounds(self.space, lower, upper)
+        return self.repeated(arm, capture, bounds, start, self.anchor.adjusted).identified()
 
     def run(self, chunk: range, device: Any) -> tuple[np.ndarray, ...]:
         """Solve one chunk, filled up to the capacity with copies of its first problem, which are never begun."""
@@ -305,12 +278,20 @@ class _Work(NamedTuple):
     def identified(self) -> ManyIdentifications:
         """All chunks solved."""
         found = _run_chunks(self.run, self.chunks, self.devices, self.workers)
-        parameters, de, deltam, k, steps, reason, active = (
+        parameters, de, deltam, sigma, k, steps, reason, active = (
             np.concatenate(column) for column in zip(*found, strict=True)
         )
-        scale = k if self.shape.ends else None
         return ManyIdentifications(
-            parameters, de, deltam, scale, steps, reasons(jnp.asarray(reason)), active, self.space, self.hold
+            parameters=parameters,
+            de=de,
+            deltam=deltam,
+            sigma=sigma,
+            k=k if self.shape.ends else None,
+            steps=steps,
+            result=reasons(jnp.asarray(reason)),
+            active=active,
+            bounds=Bounds(self.space, self.problems.lower, self.problems.upper),
+            anchor=self.anchor,
         )
 
 
@@ -374,7 +355,13 @@ def _run_chunks(run: Callable, chunks: Sequence[range], devices: Sequence[Any], 
 
 
 def _problems(
-    arm: Arm, capture: Capture, lower: Numbers, upper: Numbers, start: Numbers | None, space: Parameters
+    arm: Arm,
+    capture: Capture,
+    lower: Numbers,
+    upper: Numbers,
+    start: Numbers | None,
+    space: Parameters,
+    sigma: Float[np.ndarray, " b"] | None,
 ) -> tuple[Problems, Problems, int]:
     """The batch on the host, which leaves are batched, and its size. Raises `InputError` where shapes do not fit."""
     p = len(space.names)
@@ -390,8 +377,9 @@ def _problems(
     lengths = [[np.asarray(getattr(r, key)) for r in capture.lengths] for key in ("value", "u")]
     nominal, u = (np.stack(values, axis=-1) if values else np.zeros(0) for values in lengths)
     geometry = jax.tree.map(np.asarray, arm.geometry)
-    problems = Problems(boxes["start"], boxes["lower"], boxes["upper"], geometry, np.asarray(capture.q), nominal, u)
-    ranks = Problems(1, 1, 1, jax.tree.map(lambda _: 1, geometry), 2, 1, 1)
+    q = np.asarray(capture.q)
+    problems = Problems(boxes["start"], boxes["lower"], boxes["upper"], geometry, q, nominal, u, sigma)
+    ranks = Problems(1, 1, 1, jax.tree.map(lambda _: 1, geometry), 2, 1, 1, None if sigma is None else 0)
     batched = jax.tree.map(lambda leaf, rank: leaf.ndim > rank, problems, ranks)
     sizes = {
         leaf.shape[0] for leaf, many in zip(jax.tree.leaves(problems), jax.tree.leaves(batched), strict=True) if many
@@ -412,4 +400,7 @@ def _problems(
         raise InputError(
             f"lower bound of {space.names[i]} is above its upper bound in problem {row + 1}; exchange or widen them."
         )
+    if sigma is None:  # the joint solve is weighted in the arm that it starts from, wherever that is
+        start = np.clip(boxes["start"], boxes["lower"], boxes["upper"])
+        problems, batched = problems._replace(start=start), batched._replace(start=start.ndim > 1)
     return problems, batched, sizes.pop()

@@ -14,11 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..core.linear_algebra import inverse_cholesky
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import with_values
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass, sines_cosines
-from ..model.measurement import LEAST_SIGMA, Measurement, length_covariance
+from ..model.measurement import Measurement
 from ..model.metrics import repeatability
 from ..model.residuals import JointWeights, model_of
 from ..model.scale import scale_of
@@ -39,6 +38,8 @@ class Problems(NamedTuple):
     q: Any  # (N, n)
     nominal: Any  # (l,)
     u: Any  # (l,)
+    # (), of a joint solve only: standard deviation of a tip coordinate by stage 1, mm, in the arm divided by k.
+    sigma: Any = None
 
 
 class Shape(NamedTuple):
@@ -52,8 +53,6 @@ class Shape(NamedTuple):
     batched: Problems  # booleans
     slots: int
     max_steps: int
-    joint: bool = False  # poses and lengths in one least squares
-    fitted: int = 0  # parameters that stage 1 took from the poses (joint)
 
 
 class _Solutions(NamedTuple):
@@ -68,16 +67,16 @@ class _Solutions(NamedTuple):
 def solve_chunk(
     problems: Problems, count: Int[Array, ""], noise: Noise | None, shape: Shape, capacity: int
 ) -> tuple[Array, ...]:
-    """Solve the first ``count`` of ``capacity`` problems: parameters, DE, Deltam, k, steps, reasons, active bounds."""
+    """Solve the first ``count`` of ``capacity`` problems; the fields of `ManyIdentifications` up to ``active``."""
     batch = _Batch(problems, sines_cosines(problems.q), None, None)
     start = jnp.broadcast_to(problems.start, (capacity, len(shape.solved)))
     if noise is not None:
         batch = batch._replace(weights=_in_groups(partial(_weights, noise), batch, start, shape))
-    if shape.joint:
+    if problems.sigma is not None:
         batch = batch._replace(joint_weights=_in_groups(_joint_weights, batch, start, shape))
     solutions = _solve_all(batch, shape, count, capacity)
-    de, deltam, k, active = _in_groups(_metrics, batch, solutions.parameters, shape)
-    return solutions.parameters, de, deltam, k, solutions.steps, numbers_of(solutions.reason), active
+    de, deltam, sigma, k, active = _in_groups(_metrics, batch, solutions.parameters, shape)
+    return solutions.parameters, de, deltam, sigma, k, solutions.steps, numbers_of(solutions.reason), active
 
 
 class _Batch(NamedTuple):
@@ -191,7 +190,7 @@ def _measurement(
 
 
 def _metrics(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> tuple[Array, ...]:
-    """DE, Deltam, k and active bounds of one group."""
+    """DE, Deltam, sigma, k and active bounds of one group."""
     problems, tips = part.problems, _tips(part, parameters, shape)
     metrics = jax.vmap(lambda t: repeatability(t, shape.sizes, fitted=sum(shape.solved)))(tips)
     k = jnp.ones(shape.slots)
@@ -202,7 +201,7 @@ def _metrics(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> tup
 
         k = jax.vmap(scale)(tips, problems.nominal, problems.u, metrics.sigma, part.weights)
     side = jnp.where(parameters <= problems.lower, -1, jnp.where(parameters >= problems.upper, 1, 0))
-    return metrics.de, metrics.deltam, k, jnp.where(jnp.asarray(shape.solved)[None], side, 0)
+    return metrics.de, metrics.deltam, metrics.sigma, k, jnp.where(jnp.asarray(shape.solved)[None], side, 0)
 
 
 def _weights(noise: Noise, part: _Batch, start: Float[Array, "w p"], shape: Shape) -> Weights:
@@ -212,14 +211,14 @@ def _weights(noise: Noise, part: _Batch, start: Float[Array, "w p"], shape: Shap
 
 
 def _joint_weights(part: _Batch, start: Float[Array, "w p"], shape: Shape) -> tuple[Array, Array]:
-    """Sigma and whitening of every slot for a joint solve, from the scatter at its start."""
+    """Sigma and whitening of every slot for a joint solve, in the arm at its start."""
 
-    def joint_weights(t: Array, value: Array, uncertainty: Array, weights: Weights | None) -> tuple[Array, Array]:
-        metrics = repeatability(t, shape.sizes, fitted=shape.fitted)
-        sigma = jnp.maximum(metrics.sigma, LEAST_SIGMA)
-        measurement = _measurement(value, uncertainty, weights, shape)
-        covariance = length_covariance(measurement.centroids(t), measurement, sigma)
-        counted = sigma if weights is None else jnp.ones_like(sigma)
-        return counted, inverse_cholesky(covariance)
+    def joint_weights(
+        t: Array, value: Array, uncertainty: Array, sigma: Array, weights: Weights | None
+    ) -> tuple[Array, Array]:
+        found = JointWeights.of(t, _measurement(value, uncertainty, weights, shape), sigma)
+        return found.sigma, found.whitening
 
-    return jax.vmap(joint_weights)(_tips(part, start, shape), part.problems.nominal, part.problems.u, part.weights)
+    problems = part.problems
+    tips = _tips(part, start, shape)
+    return jax.vmap(joint_weights)(tips, problems.nominal, problems.u, problems.sigma, part.weights)

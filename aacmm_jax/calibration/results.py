@@ -1,9 +1,11 @@
-"""What an identification, a calibration and a cross-validation return."""
+"""What identifications and calibrations, of one and of many, and a cross-validation return."""
 
+import abc
 import math
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -18,11 +20,87 @@ from ..model.scale import Scale
 from ..solver.reason import Reason, numbers_of
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance
 from .checks import largest_plausible_residual
+from .scale_anchor import ScaleAnchor
 
 _GOOD = [int(member_numbers(reason)) for reason in (Reason.gradient, Reason.step, Reason.rounding)]
 
 
-class Identification(eqx.Module):
+class AbstractResult(eqx.Module):
+    """What the results of stage 1 and of a calibration have in common, of one problem and of many."""
+
+    result: eqx.AbstractVar[Reason]
+
+    @property
+    @abc.abstractmethod
+    def _stage1(self) -> "Identification | ManyIdentifications":
+        """The result of stage 1: this one, or that of a calibration."""
+
+    @property
+    def space(self) -> Parameters:
+        """The free parameters."""
+        return self._stage1.bounds.space
+
+    @property
+    def hold(self) -> str | None:
+        """The scale anchor of stage 1."""
+        return self._stage1.anchor.hold
+
+    @property
+    def scale_set_by(self) -> tuple[str, ...]:
+        """Fixed lengths that set the scale, so that k changes nothing in a two-stage calibration."""
+        return self._stage1.anchor.set_by
+
+    @property
+    def converged(self) -> Bool[Array | np.ndarray, "*batch"]:
+        """Whether every solve ended at a minimum."""
+        both = converged(self._stage1.result) & converged(self.result)
+        return np.asarray(both) if is_concrete(both) else both
+
+
+class AbstractSingleResult(AbstractResult):
+    """What an `Identification` and a `Calibration` have in common."""
+
+    arm: eqx.AbstractVar[Arm]
+    active: eqx.AbstractVar[Int[Array, " p"]]
+    parameter_covariance: eqx.AbstractVar[ParameterCovariance]
+    after: eqx.AbstractVar[Repeatability]
+
+    @property
+    @abc.abstractmethod
+    def _stage1(self) -> "Identification":
+        """The result of stage 1: this one, or that of a calibration."""
+
+    @property
+    def covariance(self) -> Float[Array, "*batch p p"]:
+        """Covariance of the parameters; that of what is determined, where not all is."""
+        return self.parameter_covariance.matrix
+
+    @property
+    def determined(self) -> Bool[Array, "*batch p"]:
+        """Which parameters are determined one by one, and not only in combination with others."""
+        return self.parameter_covariance.determined
+
+    @property
+    def noise(self) -> Noise:
+        """Noise of readings and seat: as given, or as estimated from the residuals."""
+        return self.parameter_covariance.noise
+
+    @property
+    def given_noise(self) -> Noise | None:
+        """The noise, where it was given and not estimated."""
+        return None if self._stage1.reduced_chi is None else self.noise
+
+    @property
+    def implausible_residual(self) -> bool:
+        """Whether the residual is a hundred times what an arm of this size can be, so that data and arm do not fit."""
+        return float(self.after.rms) > largest_plausible_residual(self.arm, self.given_noise)
+
+    def active_names(self) -> dict[str, str]:
+        """Parameters on a bound: name -> 'lower' or 'upper'."""
+        return active_names(self.space, self.active)
+
+
+class Identification(AbstractSingleResult):
     """Result of stage 1. A PyTree: under ``eqx.filter_vmap`` every array has the batch axis first.
 
     ``parameters``, ``active`` and ``covariance`` are in the order of ``space.names``; mm and rad.
@@ -44,53 +122,21 @@ class Identification(eqx.Module):
     # Root mean square of the residuals in units of what the given noise predicts (1 where it is right), or None.
     reduced_chi: Float[Array, ""] | None
     bounds: Bounds
-    hold: str | None = eqx.field(static=True)  # the scale anchor
-    scale_set_by: tuple[str, ...] = eqx.field(static=True)  # fixed lengths that set the scale, where there is no anchor
+    anchor: ScaleAnchor = eqx.field(static=True)  # what sets the scale
     noise_model: NoiseModel = eqx.field(static=True)  # model of the tips' errors
     degrees_of_freedom: float = eqx.field(static=True)  # of the covariance; infinite where the noise was given
 
     @property
-    def covariance(self) -> Float[Array, "*batch p p"]:
-        """Covariance of the parameters; that of what is determined, where not all is."""
-        return self.parameter_covariance.matrix
-
-    @property
-    def determined(self) -> Bool[Array, "*batch p"]:
-        """Which parameters are determined one by one, and not only in combination with others."""
-        return self.parameter_covariance.determined
-
-    @property
-    def noise(self) -> Noise:
-        """Noise of readings and seat: as given, or as estimated from the residuals."""
-        return self.parameter_covariance.noise
-
-    @property
-    def space(self) -> Parameters:
-        """The free parameters."""
-        return self.bounds.space
+    def _stage1(self) -> "Identification":
+        return self
 
     @property
     def k(self) -> Float[Array, "*batch"] | None:
         """k = measured / nominal, where the capture holds reference lengths."""
         return None if self.scale is None else self.scale.value
 
-    @property
-    def implausible_residual(self) -> bool:
-        """Whether the residual is a hundred times what an arm of this size can be, so that data and arm do not fit."""
-        given = None if self.reduced_chi is None else self.noise
-        return float(self.after.rms) > largest_plausible_residual(self.arm, given)
 
-    @property
-    def converged(self) -> Bool[Array | np.ndarray, "*batch"]:
-        """Whether the solve ended at a minimum."""
-        return converged(self.result)
-
-    def active_names(self) -> dict[str, str]:
-        """Parameters on a bound: name -> 'lower' or 'upper'."""
-        return active_names(self.space, self.active)
-
-
-class Calibration(eqx.Module):
+class Calibration(AbstractSingleResult):
     """Result of both stages, or of the joint solve. ``covariance`` is in the order of ``space.names``; mm and rad."""
 
     arm: Arm
@@ -110,40 +156,13 @@ class Calibration(eqx.Module):
     method: str = eqx.field(static=True)
 
     @property
-    def covariance(self) -> Float[Array, "*batch p p"]:
-        """Covariance of the parameters; that of what is determined, where not all is."""
-        return self.parameter_covariance.matrix
-
-    @property
-    def determined(self) -> Bool[Array, "*batch p"]:
-        """Which parameters are determined one by one, and not only in combination with others."""
-        return self.parameter_covariance.determined
-
-    @property
-    def noise(self) -> Noise:
-        """Noise of readings and seat: as given, or as estimated from the residuals."""
-        return self.parameter_covariance.noise
+    def _stage1(self) -> Identification:
+        return self.stage1
 
     @property
     def k(self) -> Float[Array, "*batch"]:
         """k = measured / nominal of stage 1."""
         return self.scale.value
-
-    @property
-    def hold(self) -> str | None:
-        """The scale anchor of stage 1."""
-        return self.stage1.hold
-
-    @property
-    def scale_set_by(self) -> tuple[str, ...]:
-        """Fixed lengths that set the scale, so that k changes nothing in a two-stage calibration."""
-        return self.stage1.scale_set_by
-
-    @property
-    def implausible_residual(self) -> bool:
-        """Whether the residual is a hundred times what an arm of this size can be, so that data and arm do not fit."""
-        given = None if self.stage1.reduced_chi is None else self.noise
-        return float(self.after.rms) > largest_plausible_residual(self.arm, given)
 
     @property
     def noise_model(self) -> NoiseModel:
@@ -156,24 +175,71 @@ class Calibration(eqx.Module):
         return self.stage1.degrees_of_freedom
 
     @property
-    def space(self) -> Parameters:
-        """The free parameters."""
-        return self.stage1.space
-
-    @property
     def bounds(self) -> Bounds:
         """The box of the identification."""
         return self.stage1.bounds
 
-    @property
-    def converged(self) -> Bool[Array | np.ndarray, "*batch"]:
-        """Whether every solve ended at a minimum."""
-        both = self.stage1.converged & converged(self.result)
-        return np.asarray(both) if is_concrete(both) else both
 
-    def active_names(self) -> dict[str, str]:
-        """Parameters on a bound: name -> 'lower' or 'upper'."""
-        return active_names(self.space, self.active)
+class AbstractManyResults(AbstractResult):
+    """What `ManyIdentifications` and `ManyCalibrations` have in common."""
+
+    parameters: eqx.AbstractVar[Float[np.ndarray, "b p"]]
+
+    @property
+    def arm(self) -> Arm:
+        """The arms found, as a batch; computed when it is asked for."""
+        arm, batch = self.space.arm(self.parameters), self.parameters.shape[:1]
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*batch, leaf.shape[-1])), arm)
+
+
+class ManyIdentifications(AbstractManyResults):
+    """Results of stage 1, problem by problem, as NumPy arrays; ``parameters`` in the order of ``space.names``, mm and
+    rad.
+
+    Fields have the names of an `Identification`'s. What costs more than the solve is left out: covariance, u of the
+    scale and metrics by socket come from ``jax.vmap`` of `identify` or, for one capture, of `evaluate` with ``arm``.
+    """
+
+    parameters: Float[np.ndarray, "b p"]
+    de: Float[np.ndarray, " b"]  # mm
+    deltam: Float[np.ndarray, " b"]  # mm
+    sigma: Float[np.ndarray, " b"]  # ``after.sigma`` of an `Identification`, mm
+    k: Float[np.ndarray, " b"] | None  # measured / nominal, where the capture holds reference lengths
+    steps: Int[np.ndarray, " b"]  # evaluations
+    result: Reason  # why each ended
+    active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, 0 inside or fixed
+    bounds: Bounds  # with a batch axis where bounds or arms were given as a batch
+    anchor: ScaleAnchor = eqx.field(static=True)  # what sets the scale
+
+    @property
+    def _stage1(self) -> "ManyIdentifications":
+        return self
+
+
+class ManyCalibrations(AbstractManyResults):
+    """Results of both stages, or of the joint solve, problem by problem, as NumPy arrays; mm and rad.
+
+    Fields have the names of a `Calibration`'s; what is left out comes from ``jax.vmap`` of `calibrate`.
+    """
+
+    parameters: Float[np.ndarray, "b p"]
+    k: Float[np.ndarray, " b"]  # of stage 1
+    de: Float[np.ndarray, " b"]  # mm
+    deltam: Float[np.ndarray, " b"]  # mm
+    steps: Int[np.ndarray, " b"]  # evaluations of all solves
+    result: Reason  # why the last solve ended
+    active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, in the last solve
+    stage1: ManyIdentifications
+    method: str = eqx.field(static=True)
+
+    @property
+    def _stage1(self) -> ManyIdentifications:
+        return self.stage1
+
+    @property
+    def bounds(self) -> Bounds:
+        """The boxes of the identifications."""
+        return self.stage1.bounds
 
 
 def converged(result: Reason) -> Bool[Array | np.ndarray, "*batch"]:

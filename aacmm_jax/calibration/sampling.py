@@ -16,7 +16,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..uncertainty.volume import default_length, sample_lengths
-from .batch import calibrate_many
+from .batch import BatchTask, Effort, calibrated
 from .record import uncertainty_of
 from .results import Calibration
 
@@ -267,18 +267,20 @@ class _RepeatedTask(NamedTuple):
     def solved(self, q: Float[np.ndarray, "t N n"], values: Float[np.ndarray, "t l"]) -> tuple[np.ndarray, int]:
         """Outputs of the trials that converged ``(t, q)``, and how many did not."""
         result = self.result
-        given = None if result.stage1.reduced_chi is None else result.noise  # weighted as the calibration was
-        many = calibrate_many(
-            result.stage1.arm,
+        stage1, bounds = result.stage1, result.bounds
+        # What sets the scale, and the noise that weights the poses, are the calibration's own.
+        task = BatchTask.of(
+            stage1.arm,
             batch_of(self.capture, q, values),
-            result.bounds.lower,
-            result.bounds.upper,
-            result.stage1.parameters,
-            method=result.method,  # pyright: ignore[reportArgumentType]
-            space=Parameters(result.stage1.arm, result.space.names),
-            hold=result.stage1.hold,
-            noise=given,
+            bounds.lower,
+            bounds.upper,
+            stage1.parameters,
+            result.space,
+            stage1.anchor,
+            result.given_noise,
+            Effort(),
         )
+        many = calibrated(task, result.method)
         good = many.converged
         ends = (jnp.asarray(self.start), jnp.asarray(self.end))
         lengths = _lengths_of(Parameters(result.arm, result.space.names), jnp.asarray(many.parameters), ends)

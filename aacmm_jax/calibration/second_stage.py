@@ -17,6 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from ..data.capture import Capture
@@ -25,6 +26,7 @@ from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement
 from ..model.scale import divide_free_lengths, divisible, replaced_lengths, scale_of
 from ..solver.reason import Reason, numbers_of, reasons
+from .results import ManyIdentifications
 from .scale_anchor import ScaleAnchor
 from .task import Task, fit_repeatability
 
@@ -87,26 +89,50 @@ def adjust_anchor(
 ) -> Adjusted:
     """Stage 1 repeated with its anchor adjusted by the secant method until k = 1, from the divided parameters.
 
-    Derivatives pass through every round, with the slope of the secant as a constant: exact where k = 1 is reached.
+    The adjusted length is the root of log k, so its derivative is that of an implicit function, exact where k = 1 is
+    reached; on a bound it follows the bound.
     """
-    space, bounds, name = task.space, task.bounds, task.anchor.adjusted
+    bounds, name = task.bounds, task.anchor.adjusted
     assert name is not None
-    i = space.index(name)
+    i = task.space.index(name)
+    lower, upper = bounds.lower[i], bounds.upper[i]
 
-    def identify_again(carry, _):
+    def identify_again(x: Float[Array, " p"], length: Float[Array, ""]) -> tuple[Array, Array, optx.Solution]:
+        start = jnp.clip(x, bounds.lower, bounds.upper).at[i].set(length)
+        x, solution = fit_repeatability(task, measurement, start, name)
+        return x, jnp.log(scale_of(task.space.arm(x).position(measurement.q), measurement, sigma).value), solution
+
+    def one_round(carry: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], Array]:
         x, length, last_length, last_log_k = carry
-        x, solution = fit_repeatability(
-            task, measurement, jnp.clip(x.at[i].set(length), bounds.lower, bounds.upper), name
-        )
-        log_k = jnp.log(scale_of(space.arm(x).position(measurement.q), measurement, sigma).value)
-        following = _secant(length, last_length, log_k, last_log_k, bounds.lower[i], bounds.upper[i])
-        return (x, following, length, log_k), (solution.stats["num_steps"], numbers_of(solution.stats["reason"]))
+        x, log_k, solution = identify_again(x, length)
+        following = _secant(length, last_length, log_k, last_log_k, lower, upper)
+        return (x, following, length, log_k), solution.stats["num_steps"]
 
-    length = jnp.clip(scaled[i], bounds.lower[i], bounds.upper[i])
-    first = (scaled, length, length, jnp.zeros(()))
-    (x, _, length, log_k), (steps, numbers) = jax.lax.scan(identify_again, first, length=_ROUNDS)
-    on_bound = (length <= bounds.lower[i]) | (length >= bounds.upper[i])
-    return Adjusted(x, jnp.sum(steps), reasons(_number_of_reason(numbers[-1], log_k, on_bound)))
+    def solve(_: Callable, length: Float[Array, ""]) -> tuple[Array, tuple[Array, Array]]:
+        first = (start, length, length, jnp.zeros(()))
+        (x, length, _, _), steps = jax.lax.scan(one_round, first, length=_ROUNDS - 1)
+        return length, (x, jnp.sum(steps))
+
+    def difference(length: Float[Array, ""]) -> Float[Array, ""]:
+        """Zero at the adjusted length: log k, or the distance from the bound that the length is on."""
+        _, log_k, _ = identify_again(start, length)
+        bound = jnp.where(length <= lower, lower, upper)
+        return jnp.where(_on_bound(length, lower, upper), length - jnp.where(jnp.isfinite(bound), bound, 0.0), log_k)
+
+    def divide_by_slope(derivative: Callable, right: Float[Array, ""]) -> Float[Array, ""]:
+        slope = derivative(jnp.ones(()))
+        return right / jnp.where(slope == 0, 1.0, slope)
+
+    start = jax.lax.stop_gradient(scaled)
+    first_length = jnp.clip(start[i], *jax.lax.stop_gradient((lower, upper)))
+    length, (x, steps) = jax.lax.custom_root(difference, first_length, solve, divide_by_slope, has_aux=True)
+    x, log_k, solution = identify_again(x, length)
+    number = _number_of_reason(numbers_of(solution.stats["reason"]), log_k, _on_bound(length, lower, upper))
+    return Adjusted(x, steps + solution.stats["num_steps"], reasons(number))
+
+
+def _on_bound(length: Any, lower: Any, upper: Any) -> Any:
+    return (length <= lower) | (length >= upper)
 
 
 def _number_of_reason(numbers: Any, log_k: Any, on_bound: Any) -> Array:
@@ -116,19 +142,18 @@ def _number_of_reason(numbers: Any, log_k: Any, on_bound: Any) -> Array:
 
 def second_stage_many(
     anchor: ScaleAnchor,
-    space: Parameters,
-    lower: Float[np.ndarray, "... p"],
-    upper: Float[np.ndarray, "... p"],
-    stage1: Any,
-    identify_again: Callable[[np.ndarray, np.ndarray], Any],
+    stage1: ManyIdentifications,
+    identify_again: Callable[[np.ndarray, np.ndarray], ManyIdentifications],
 ) -> dict[str, Any]:
-    """Stage 2 of a batch: the fields of `ManyCalibrations` that it decides, from stage 1's `ManyIdentifications`.
+    """Stage 2 of a batch: the fields of `ManyCalibrations` that it decides.
 
     ``identify_again(rows, start)`` repeats stage 1 for some of the problems and keeps the adjusted length.
     """
-    lower, upper = (np.broadcast_to(side, stage1.parameters.shape) for side in (lower, upper))
+    space, sides = stage1.space, (stage1.bounds.lower, stage1.bounds.upper)
+    assert stage1.k is not None
+    lower, upper = (np.broadcast_to(side, stage1.parameters.shape) for side in sides)
+    bounds = Bounds(space, lower, upper)
     scaled = np.array(divided(anchor, space, stage1.parameters, stage1.k))
-    bounds = Bounds(space, jnp.asarray(lower), jnp.asarray(upper))
     # Divided by k, the whole arm shrinks about the base, and so do the distances between its tips.
     factor = stage1.k if can_scale(anchor) else np.ones_like(stage1.k)
     de, deltam, steps, reason = stage1.de / factor, stage1.deltam / factor, stage1.steps, numbers_of(stage1.result)
@@ -155,8 +180,8 @@ def _adjust_many(
     scaled: Float[np.ndarray, "b p"],
     lower: Float[np.ndarray, "b p"],
     upper: Float[np.ndarray, "b p"],
-    identify_again: Callable[[np.ndarray], Any],
-) -> tuple[Any, Int[np.ndarray, " b"], Int[np.ndarray, " b"]]:
+    identify_again: Callable[[np.ndarray], ManyIdentifications],
+) -> tuple[ManyIdentifications, Int[np.ndarray, " b"], Int[np.ndarray, " b"]]:
     """`adjust_anchor` for a batch: the last identifications, the numbers of their reasons, and all evaluations."""
     assert anchor.adjusted is not None
     i = space.index(anchor.adjusted)
@@ -170,7 +195,7 @@ def _adjust_many(
         following = _secant(length, last_length, log_k, last_log_k, lower[:, i], upper[:, i])
         x, length, last_length, last_log_k = found.parameters, np.asarray(following), length, log_k
     assert found is not None
-    on_bound = (last_length <= lower[:, i]) | (last_length >= upper[:, i])
+    on_bound = _on_bound(last_length, lower[:, i], upper[:, i])
     return found, np.asarray(_number_of_reason(numbers_of(found.result), last_log_k, on_bound)), steps
 
 
@@ -191,4 +216,4 @@ def _secant(length: Any, last_length: Any, log_k: Any, last_log_k: Any, lower: A
     moved = length != last_length
     ratio = jnp.log(jnp.where(moved, length / jnp.where(moved, last_length, 1.0), 2.0))
     slope = jnp.where(moved, jnp.clip((log_k - last_log_k) / ratio, *_SLOPES), 1.0)
-    return jnp.clip(length * jnp.exp(-log_k / jax.lax.stop_gradient(slope)), lower, upper)
+    return jnp.clip(length * jnp.exp(-log_k / slope), lower, upper)

@@ -18,7 +18,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
 from ..model.measurement import Measurement, check_joints
 from ..model.metrics import repeatability
-from ..model.residuals import joint_model, joint_residual
+from ..model.residuals import JointWeights, joint_model, joint_residual
 from ..solver.bounded import least_squares
 from ..solver.reason import Reason
 from ..uncertainty import propagation, scale_uncertainty
@@ -160,8 +160,9 @@ def calibrate(
     result, adjust = _divided(task)
     if not can_scale(task.anchor) or (is_concrete(adjust) and not bool(adjust)):
         return result
-    again = _adjusted(task, result)
-    return again if is_concrete(adjust) else jax.tree.map(lambda new, old: jnp.where(adjust, new, old), again, result)
+    if is_concrete(adjust):
+        return _adjusted(task, result)
+    return jax.lax.cond(adjust, lambda: _adjusted(task, result), lambda: result)
 
 
 def _check_identifiable(capture: Capture, task: Task, strict: bool) -> None:
@@ -212,8 +213,7 @@ def _stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
         after=after,
         reduced_chi=_reduced_chi(measurement, tips, fitted),
         bounds=task.bounds,
-        hold=hold,
-        scale_set_by=task.anchor.set_by,
+        anchor=task.anchor,
         noise_model=task.noise_model,
         degrees_of_freedom=residual_degrees_of_freedom(task.noise_model, measurement.sizes, fitted),
     )
@@ -332,7 +332,7 @@ def _joint(task: Task) -> Calibration:
     scaled = space.arm(parameters)
     measurement = task.measurement.weighted(scaled.geometry, task.noise)
     sigma = stage1.after.sigma / k
-    joint_weights = propagation.joint_weights(scaled, measurement, sigma)
+    joint_weights = JointWeights.of(scaled.position(measurement.q), measurement, sigma)
     solution = least_squares(
         joint_residual,
         parameters,

@@ -6,11 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..core.linear_algebra import inverse_cholesky
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass
 from ..kinematics.jacobian import stacked_jacobian_columns
 from ..kinematics.parameters import Parameters
 from ..solver.active_set import QuadraticModel
-from .measurement import Measurement, averaging_matrix, differences_matrix
+from .measurement import LEAST_SIGMA, Measurement, averaging_matrix, differences_matrix, length_covariance
 from .weights import Weights
 
 
@@ -21,6 +22,15 @@ class JointWeights(NamedTuple):
     nominal: Float[Array, "*batch l"]  # mm
     sigma: Float[Array, "*batch"]  # standard deviation of a tip coordinate, mm
     whitening: Float[Array, "*batch l l"]  # inverse Cholesky factor of the lengths' covariance, 1/mm
+
+    @classmethod
+    def of(cls, tips: Float[Array, "N 3"], measurement: Measurement, sigma: Float[Array, ""]) -> "JointWeights":
+        """The weights at the tips of a nearly right arm, given the standard deviation of a tip coordinate, mm."""
+        sigma = jnp.maximum(sigma, LEAST_SIGMA)
+        whitening = inverse_cholesky(length_covariance(measurement.centroids(tips), measurement, sigma))
+        # Weights of poses are in standard deviations already.
+        counted = sigma if measurement.weights is None else jnp.ones_like(sigma)
+        return cls(measurement.ends, measurement.nominal, counted, whitening)
 
 
 def repeatability_residual(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Float[Array, "N 3"]:
@@ -81,7 +91,7 @@ def model_of(
     geometry: Geometry,
     sines_cosines: SinesCosines,
     sizes: tuple[int, ...],
-    entries: tuple[tuple[str, int], ...],
+    indices: tuple[tuple[str, int], ...],
     joint_weights: JointWeights | None = None,
     weights: Weights | None = None,
 ) -> QuadraticModel:
@@ -92,7 +102,7 @@ def model_of(
     mu, so that no centred copy of the columns is needed; nor for the gradient, because centred residuals sum to zero.
     """
     forward = forward_pass(geometry, sines_cosines)
-    columns = stacked_jacobian_columns(forward, entries)
+    columns = stacked_jacobian_columns(forward, indices)
     # Centred twice: the rounding error that one pass leaves in the mean (1e-13 mm) would otherwise be multiplied by the
     # columns' means, and exceed the gradient near a perfect fit.
     averaging = averaging_matrix(sizes)

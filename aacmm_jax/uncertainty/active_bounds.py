@@ -23,8 +23,8 @@ from ..kinematics.arm import Arm
 from ..kinematics.near_degeneracy import LEAST_MOVEMENT, SHARE_OF_BOUNDS
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import LEAST_SIGMA, Measurement
+from ..model.residuals import JointWeights
 from .covariance import ParameterCovariance, information_of, inverse_information, linearised
-from .propagation import joint_weights
 
 
 def with_active_bounds(
@@ -55,7 +55,7 @@ def with_active_bounds(
     sigma = jnp.maximum(sigma, LEAST_SIGMA)
     plain = dataclasses.replace(measurement, weights=None)
     linear = linearised(arm, space, plain, fixed)
-    whitening = joint_weights(arm, plain, sigma).whitening if measurement.ends else None
+    whitening = JointWeights.of(arm.position(plain.q), plain, sigma).whitening if measurement.ends else None
     information = information_of(linear, sigma, whitening)
     on_bound = active != 0
     inner = jnp.where(on_bound[:, None] | on_bound[None, :], 0.0, information)

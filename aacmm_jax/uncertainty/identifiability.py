@@ -16,9 +16,9 @@ from ..kinematics.inverse_kinematics import project_to_centroids, project_to_tar
 from ..kinematics.near_degeneracy import TradeOff, trade_offs
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement, check_joints
+from ..model.residuals import JointWeights
 from .covariance import linearised
 from .null_space import complement, named_directions, structural
-from .propagation import joint_weights
 
 _RANK = 1e-8  # singular values below this, of the largest, are zero
 _NAMED = 4
@@ -216,7 +216,7 @@ def whitened_equations(arm: Arm, space: Parameters, measurement: Measurement) ->
     The measurement has weights.
     """
     linear = linearised(arm, space, measurement, jnp.zeros(len(space.names), dtype=bool))
-    lengths = joint_weights(arm, measurement, jnp.zeros(())).whitening @ linear.lengths
+    lengths = JointWeights.of(arm.position(measurement.q), measurement, jnp.zeros(())).whitening @ linear.lengths
     return jnp.concatenate([linear.counted.reshape(linear.counted.shape[0], -1).T, lengths])
 
 

@@ -5,11 +5,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..core.linear_algebra import inverse_cholesky
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
-from ..model.measurement import LEAST_SIGMA, Measurement, length_covariance
+from ..model.measurement import LEAST_SIGMA, Measurement
 from ..model.residuals import JointWeights
 from .covariance import (
     Linearisation,
@@ -58,15 +57,6 @@ def propagate_solve(
     )
     matrix = in_units(covariance_of(sensitivity, linear, measurement, errors), space)
     return Propagated(linear, sensitivity, errors, ParameterCovariance(matrix, determined, lost, behind))
-
-
-def joint_weights(arm: Arm, measurement: Measurement, sigma: Float[Array, ""]) -> JointWeights:
-    """Weights of poses and lengths in a joint solve, given the scatter of a tip coordinate by a nearly right arm."""
-    safe = jnp.maximum(sigma, LEAST_SIGMA)
-    centroids = measurement.centroids(arm.position(measurement.q))
-    whitening = inverse_cholesky(length_covariance(centroids, measurement, safe))
-    counted = safe if measurement.weights is None else jnp.ones_like(safe)  # weights are in standard deviations already
-    return JointWeights(measurement.ends, measurement.nominal, counted, whitening)
 
 
 def _typical(linear: Linearisation, measurement: Measurement, sigma: Float[Array, ""]) -> Float[Array, ""]:

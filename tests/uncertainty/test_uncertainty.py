@@ -13,6 +13,7 @@ from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.data.noise import tip_covariances
 from aacmm_jax.kinematics.inverse_kinematics import project_to_centroids
 from aacmm_jax.model.measurement import Measurement
+from aacmm_jax.model.residuals import JointWeights
 from aacmm_jax.model.scale import divide_lengths
 from aacmm_jax.model.weights import Weights, inverse_root
 from aacmm_jax.uncertainty import propagation, scale_uncertainty
@@ -112,7 +113,7 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
     if method == "joint":
         scaled, sigma = divide_lengths(stage1.arm, stage1.scale.value), stage1.after.sigma / stage1.scale.value
         measurement = Measurement.of(capture).weighted(scaled.geometry, noise)
-        weights = propagation.joint_weights(scaled, measurement, sigma)
+        weights = JointWeights.of(scaled.position(measurement.q), measurement, sigma)
         none = jnp.zeros(21, dtype=bool)
         whole = propagation.propagate_solve(found.arm, space, measurement, none, sigma, noise_model, noise, weights)
     else:
