@@ -14,7 +14,7 @@ from ..uncertainty.arm_uncertainty import Uncertainty
 from .checks import largest_plausible_residual
 from .evaluation import Evaluation, evaluate
 from .results import Calibration, CrossValidation, Identification
-from .scale_anchor import scale_anchor
+from .second_stage import LARGEST_LOG_K
 
 
 class CalibrationRecord(NamedTuple):
@@ -26,6 +26,7 @@ class CalibrationRecord(NamedTuple):
     names: tuple[str, ...]  # free parameters
     held: tuple[str, ...]  # fixed parameters
     hold: str | None  # scale anchor of stage 1
+    scale_set_by: tuple[str, ...]  # fixed lengths that set the scale, so that two stages change nothing
     lower: np.ndarray
     upper: np.ndarray
     active_stage1: np.ndarray  # -1, 0, +1
@@ -54,17 +55,15 @@ class CalibrationRecord(NamedTuple):
         return None if self.reduced_chi is None else self.noise
 
     @property
-    def scale_set_by(self) -> tuple[str, ...]:
-        """Fixed lengths that set the scale, so that k changes nothing in a two-stage calibration."""
-        arm = self.recording.nominal.arm
-        if self.hold is not None:
-            return ()
-        return scale_anchor(Parameters(arm, self.names), arm, None, self.given_noise).set_by
-
-    @property
     def fixed_by_one_length(self) -> bool:
-        """Whether a single length fixed the scale, so that its own error as left is zero by construction."""
-        return self.method == "two-stage" and len(self.recording.capture.lengths) == 1 and not self.scale_set_by
+        """Whether a single length fixed the scale, so that its own error as left is zero by construction.
+
+        It is not zero where stage 2 ended with k off 1, on a bound of the adjusted length.
+        """
+        if self.method != "two-stage" or len(self.recording.capture.lengths) != 1 or self.scale_set_by:
+            return False
+        left = evaluate(self.calibrated.arm, self.recording.capture).error
+        return bool(np.abs(left[0]) <= LARGEST_LOG_K * float(self.recording.capture.lengths[0].value))
 
     @property
     def implausible_residual(self) -> bool:
@@ -106,6 +105,7 @@ def record_of(calibration: Calibration, recording: Recording) -> CalibrationReco
         names=calibration.space.names,
         held=calibration.space.held,
         hold=stage1.hold,
+        scale_set_by=stage1.scale_set_by,
         lower=np.asarray(calibration.bounds.lower),
         upper=np.asarray(calibration.bounds.upper),
         active_stage1=np.asarray(stage1.active),

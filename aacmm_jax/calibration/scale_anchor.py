@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.arrays import is_concrete
-from ..core.errors import InputError
+from ..core.errors import InputError, some
 from ..data.noise import Noise
 from ..kinematics.arm import (
     Arm,
@@ -81,6 +81,12 @@ def scale_anchor(space: Parameters, arm: Arm, hold: str | None, noise: Noise | N
     partners = _partners(arm, one, space, fixed) if one is not None else None if fixed else ((), ())
     adjusted = hold if hold is not None and _carries_scale(hold, longest, arm if known else None) else longest
     return ScaleAnchor(hold, None if hold is None and not known else adjusted, set_by, partners)
+
+
+def scale_set_by_clause(names: tuple[str, ...]) -> str:
+    """The beginning of a warning about fixed lengths that set the scale."""
+    verbs = "is fixed and already sets" if len(names) == 1 else "are fixed and already set"
+    return f"{some(names)} {verbs} the scale"
 
 
 def fixed_lengths(arm: Arm, space: Parameters) -> tuple[str, ...]:

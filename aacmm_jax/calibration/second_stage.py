@@ -33,7 +33,7 @@ from .task import Task, fit_repeatability
 # Identifications with an adjusted anchor; the secant method ends at k = 1 to rounding after three or four.
 _ROUNDS = 4
 _SLOPES = (0.1, 2.0)  # of log k by the log of the anchor: 1 unless bounds or fixed lengths set part of the scale
-_REACHED = 1e-7  # |log k| up to which k = 1 counts as reached
+LARGEST_LOG_K = 1e-7  # |log k| up to which k = 1 counts as reached
 _OUTSIDE = 1e-9  # mm: what the division may leave of the box by rounding
 
 
@@ -108,7 +108,7 @@ def adjust_anchor(
         following = _secant(length, last_length, log_k, last_log_k, lower, upper)
         return (x, following, length, log_k), solution.stats["num_steps"]
 
-    def solve(_: Callable, length: Float[Array, ""]) -> tuple[Array, tuple[Array, Array]]:
+    def solve(_: Any, length: Float[Array, ""]) -> tuple[Array, tuple[Array, Array]]:
         first = (start, length, length, jnp.zeros(()))
         (x, length, _, _), steps = jax.lax.scan(one_round, first, length=_ROUNDS - 1)
         return length, (x, jnp.sum(steps))
@@ -137,7 +137,7 @@ def _on_bound(length: Any, lower: Any, upper: Any) -> Any:
 
 def _number_of_reason(numbers: Any, log_k: Any, on_bound: Any) -> Array:
     """The reason of the last identification; not converged where k = 1 was not reached, unless a bound prevents it."""
-    return jnp.where((jnp.abs(log_k) > _REACHED) & ~on_bound, numbers_of(Reason.max_steps), numbers)
+    return jnp.where((jnp.abs(log_k) > LARGEST_LOG_K) & ~on_bound, numbers_of(Reason.max_steps), numbers)
 
 
 def second_stage_many(

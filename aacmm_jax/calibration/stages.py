@@ -27,7 +27,7 @@ from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_d
 from ..uncertainty.identifiability import observability
 from .checks import based_on, check_enough, check_noise_model, check_single, check_start
 from .results import Calibration, Identification
-from .scale_anchor import scale_anchor
+from .scale_anchor import scale_anchor, scale_set_by_clause
 from .second_stage import adjust_anchor, can_scale, divided, must_adjust, replaced
 from .task import SOLVER, Task, fit_repeatability
 
@@ -117,7 +117,8 @@ def calibrate(
 
     "two-stage" divides the arm of stage 1 by k = measured / nominal. Fixed parameters stay as they are, to the bit, and
     the result is inside the box: where the division cannot give that, stage 1 is repeated with its anchor adjusted
-    until k = 1 (`calibration.second_stage`). Where fixed lengths set the scale, k changes nothing.
+    until k = 1 (`calibration.second_stage`). Where fixed lengths set the scale, k changes nothing, and an
+    `IdentifiabilityWarning` says so. The uncertainty of k, ``scale.u``, takes parameters on a bound as exact.
 
     "joint" goes on from there with one least squares of repeatability and lengths together, each weighted by its
     standard deviation: that of a tip coordinate from stage 1's residuals; that of a length from its u and from the
@@ -155,6 +156,7 @@ def calibrate(
             "hold."
         )
     _check_identifiable(capture, task, strict)
+    _check_scale(task, method)
     if method == "joint":
         return _joint(task)
     result, adjust = _divided(task)
@@ -173,6 +175,16 @@ def _check_identifiable(capture: Capture, task: Task, strict: bool) -> None:
     if sentences and strict:
         raise InputError(" ".join(sentences))
     for sentence in sentences:
+        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=3)
+
+
+def _check_scale(task: Task, method: str) -> None:
+    """Warn where the reference lengths change nothing."""
+    if method == "two-stage" and task.anchor.set_by and not inside_trace():
+        sentence = (
+            f"{scale_set_by_clause(task.anchor.set_by)}, so the reference lengths change nothing; free one of these "
+            "lengths, or use both with method='joint'."
+        )
         warnings.warn(sentence, IdentifiabilityWarning, stacklevel=3)
 
 

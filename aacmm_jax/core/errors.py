@@ -1,7 +1,7 @@
-"""The exception and the warning of the package, and a helper for their wording."""
+"""The exception and the warning of the package, and helpers for their wording."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 class InputError(ValueError):
@@ -12,7 +12,13 @@ class InputError(ValueError):
 
 
 class IdentifiabilityWarning(UserWarning):
-    """Some of the free parameters cannot be determined by the data that are given; the message names the directions."""
+    """The data that are given cannot determine some of the free parameters, or change nothing in the scale; the message
+    names the parameters."""
+
+
+def some(items: Sequence[str], most: int = 5) -> str:
+    """The first items of a list, and how many more there are."""
+    return ", ".join(items[:most]) + (f" and {len(items) - most} more" if len(items) > most else "")
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

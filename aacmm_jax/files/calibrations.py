@@ -6,9 +6,11 @@ import numpy as np
 
 from ..calibration.record import CalibrationRecord
 from ..calibration.results import CrossValidation, LeftOut
+from ..calibration.scale_anchor import scale_anchor
 from ..core.errors import InputError
 from ..data.noise import Noise
-from ..kinematics.arm import is_length, parameter_names, value_of
+from ..kinematics.arm import Arm, is_length, parameter_names, value_of
+from ..kinematics.parameters import Parameters
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .hdf5 import Stored, Table, Variable, names_in, need, read_tables, undamaged, write_tables
 
@@ -42,6 +44,7 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
         "method": record.method,
         "held": list(record.held) or "",
         "hold": record.hold,
+        "scale_set_by": list(record.scale_set_by) or "",
         "scale_k": record.k,
         "scale_u": record.u_k,
         "encoder_arcsec": np.asarray(record.noise.encoder_arcsec),
@@ -81,6 +84,11 @@ def _divided_fixed_lengths(path: str | os.PathLike, stored: Stored) -> bool:
     return any(value_of(arm, name) != 0 for name in fixed)
 
 
+def _scale_set_by(arm: Arm, names: tuple[str, ...], hold: str | None, noise: Noise | None) -> tuple[str, ...]:
+    """Fixed lengths that set the scale, judged as in `scale_anchor`: files of earlier versions do not name them."""
+    return () if hold is not None else scale_anchor(Parameters(arm, names), arm, None, noise).set_by
+
+
 def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
     table, attributes = stored.tables["parameters"], stored.attributes
     if attributes.get("stretch_variance", 0.0) and _divided_fixed_lengths(path, stored):
@@ -88,13 +96,24 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
             f"{path} is from an earlier version, which divided fixed lengths by k; calibrate again from its capture."
         )
     need(path, table, "parameter", "lower", "upper", "active_stage1", "active", "covariance", "determined", of="entry")
+    recording, names = recording_of(path, stored), tuple(str(name) for name in table["parameter"])
+    noise = Noise(
+        encoder_arcsec=np.squeeze(np.atleast_1d(attributes.get("encoder_arcsec", 0.0))),
+        seating=attributes.get("seating_mm", 0.0),
+    )
+    if "scale_set_by" in attributes:
+        scale_set_by = names_in(attributes["scale_set_by"])
+    else:
+        given = None if attributes.get("misfit") is None else noise
+        scale_set_by = _scale_set_by(recording.nominal.arm, names, attributes.get("hold"), given)
     return CalibrationRecord(
-        recording=recording_of(path, stored),
+        recording=recording,
         stage1=specification_of(path, stored, "stage1_arm"),
         calibrated=specification_of(path, stored, "calibrated_arm"),
-        names=tuple(str(name) for name in table["parameter"]),
+        names=names,
         held=names_in(attributes.get("held")),
         hold=attributes.get("hold"),
+        scale_set_by=scale_set_by,
         lower=table["lower"],
         upper=table["upper"],
         active_stage1=table["active_stage1"],
@@ -103,10 +122,7 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
         determined=table["determined"].astype(bool),
         # Files of version 0.1 and before have none of the following.
         open=table.get("open", np.zeros_like(table["covariance"])),
-        noise=Noise(
-            encoder_arcsec=np.squeeze(np.atleast_1d(attributes.get("encoder_arcsec", 0.0))),
-            seating=attributes.get("seating_mm", 0.0),
-        ),
+        noise=noise,
         noise_model=attributes.get("form", "common"),
         degrees_of_freedom=float(attributes.get("freedom", np.inf)),
         reduced_chi=attributes.get("misfit"),

@@ -27,7 +27,7 @@ class Scale(eqx.Module):
     """k = measured / nominal with its standard uncertainty, and the lengths it was found from (mm)."""
 
     value: Float[Array, ""]
-    u: Float[Array, ""]
+    u: Float[Array, ""]  # conditional on active bounds: takes parameters on a bound as exact
     measured: Float[Array, " l"]
     nominal: Float[Array, " l"]
 

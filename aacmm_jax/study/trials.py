@@ -59,7 +59,7 @@ def _identified(
     )
     scaled = setting.method != "stage1"
     return {
-        "converged": many.converged.astype(np.int8),
+        "converged": np.asarray(many.converged, dtype=np.int8),
         "reason": np.asarray(numbers_of(many.result), dtype=np.int8),
         "steps": many.steps.astype(np.int32),
         "k": k,

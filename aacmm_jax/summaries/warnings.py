@@ -8,6 +8,8 @@ import numpy as np
 from ..calibration.checks import plausible
 from ..calibration.record import CalibrationRecord
 from ..calibration.results import active_names
+from ..calibration.scale_anchor import scale_set_by_clause
+from ..core.errors import some
 from ..core.units import INCH, M
 from ..data.noise import tip_covariances
 from ..data.recording import Recording
@@ -19,7 +21,6 @@ _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a r
 _LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 through errors outside the D-H model
 _POSE_OUTLIER = 8.0  # in median distances
 _EXCESS = 1.5  # ratio of errors to their prediction that is reported
-_NAMED = 5  # items of a list that are named
 
 
 def of_capture(recording: Recording) -> list[str]:
@@ -36,7 +37,7 @@ def of_capture(recording: Recording) -> list[str]:
             )
     exact = [f"{length.start} - {length.end}" for length in recording.capture.lengths if float(length.u) == 0]
     if exact and recording.true is None:
-        found.append(f"Taken as exact, because u is 0: {_some(exact)}; give the standard uncertainty of each length.")
+        found.append(f"Taken as exact, because u is 0: {some(exact)}; give the standard uncertainty of each length.")
     return found
 
 
@@ -102,18 +103,17 @@ def _scale(record: CalibrationRecord) -> list[str]:
         return [f"k = {k:.6g} cannot be the scale of this arm; {hint}"]
     fixed = record.scale_set_by
     if fixed and record.method == "two-stage":
-        verbs = "is fixed and already sets" if len(fixed) == 1 else "are fixed and already set"
-        which = f"{_some(list(fixed))} {verbs} the scale"
         return [
-            f"{which}, so the reference lengths changed nothing: by them the arm is {k:.6f} times too large "
-            f"(u = {record.u_k:.2g}). "
+            f"{scale_set_by_clause(fixed)}, so the reference lengths changed nothing: by them the arm is "
+            f"{k:.6f} times too large (u = {record.u_k:.2g}). "
             "Free one of these lengths, or use both with the joint solve (--method joint)."
         ]
     if record.hold is None and stage1 and not fixed:
         word = "shrank" if k < 1 else "stretched"
         return [
             f"Stage 1 ran with every length free and {word} the arm to k = {k:.5f} until a bound stopped it: "
-            f"{_some(stage1)}. The scale fix undoes that; hold a length (--hold) to avoid it."
+            f"{some(stage1)}. The scale fix undoes that; hold a length (--hold) to avoid it. The uncertainty of k "
+            "takes these bounds as exact."
         ]
     if record.hold is not None and abs(k - 1) > max(_SUSPICIOUS_SCALE, 3 * record.u_k):
         return [
@@ -137,14 +137,14 @@ def _bounds(record: CalibrationRecord, seen: Observability) -> list[str]:
     found = []
     if weak:
         found.append(
-            f"On a bound because the data hardly determine them: {_some(weak)}; fix one parameter of each combination "
+            f"On a bound because the data hardly determine them: {some(weak)}; fix one parameter of each combination "
             "named below (--held), and do not widen the bounds. Until then the width of the bounds is part of their "
             "uncertainties."
         )
     if others:
         found.append(
-            f"On a bound: {_some(others)}; widen the bounds unless they are known limits. Uncertainties leave these "
-            "out."
+            f"On a bound: {some(others)}; widen the bounds unless they are known limits. Every uncertainty, "
+            "that of k too, takes these values as exact."
         )
     return found
 
@@ -161,7 +161,7 @@ def _data(record: CalibrationRecord) -> list[str]:
         worst = sorted(far, key=lambda i: -distances[i])
         names = [f"{capture.names[owner[i]]} pose {i - first[owner[i]] + 1} ({distances[i]:.3g} mm)" for i in worst]
         found.append(
-            f"Poses far from their socket, where {typical:.2g} mm is typical: {_some(names)}; was the tip seated?"
+            f"Poses far from their socket, where {typical:.2g} mm is typical: {some(names)}; was the tip seated?"
         )
     error = np.asarray(evaluation.error)
     normalised = np.abs(error) / np.hypot(np.asarray(evaluation.u), 1e-9)
@@ -171,7 +171,7 @@ def _data(record: CalibrationRecord) -> list[str]:
         if len(error) > 1 and normalised[i] > _LENGTH_OUTLIER and abs(error[i]) > 1e-6
     ]
     if wrong:
-        found.append(f"Reference lengths that disagree with the arm: {_some(wrong)}; check their values and sockets.")
+        found.append(f"Reference lengths that disagree with the arm: {some(wrong)}; check their values and sockets.")
     surplus = 3 * sum(size - 1 for size in capture.sizes) - (len(record.names) - 1)
     if surplus < (len(record.names) - 1) / 2:
         found.append(
@@ -200,7 +200,7 @@ def _identifiability(record: CalibrationRecord, seen: Observability) -> list[str
     weak = [name for name in weak if name not in named]
     if weak:
         found.append(
-            f"Determined only together, hardly one by one: {_some(weak, 12)}. Tips and lengths that follow from them "
+            f"Determined only together, hardly one by one: {some(weak, 12)}. Tips and lengths that follow from them "
             "have an uncertainty, but these have none of their own; fix the redundant ones (--held)."
         )
     u, width = np.sqrt(np.diag(record.covariance)), (record.upper - record.lower) / 2
@@ -211,7 +211,7 @@ def _identifiability(record: CalibrationRecord, seen: Observability) -> list[str
     ]
     if loose:
         found.append(
-            f"Hardly determined, with a standard uncertainty over half of what the bounds allow: {_some(loose)}; "
+            f"Hardly determined, with a standard uncertainty over half of what the bounds allow: {some(loose)}; "
             "fix some (--held), or record poses that separate them."
         )
     return found
@@ -220,7 +220,3 @@ def _identifiability(record: CalibrationRecord, seen: Observability) -> list[str
 def _sides(record: CalibrationRecord) -> list[str]:
     space = Parameters(record.recording.nominal.arm, record.names)
     return [f"{name} ({side})" for name, side in active_names(space, record.active_stage1).items()]
-
-
-def _some(items: list[str], most: int = _NAMED) -> str:
-    return ", ".join(items[:most]) + (f" and {len(items) - most} more" if len(items) > most else "")
