@@ -65,7 +65,8 @@ def test_monte_carlo_agrees_with_the_linear_result_and_is_stable(arm, sampled):
 def test_two_stages_with_fixed_lengths(arm, capture, bounds):
     """Most lengths are fixed here, and set the scale: stage 2 changes nothing, in the linear result and in every
     trial."""
-    result = aj.calibrate(arm, capture, bounds, noise=NOISE)
+    with pytest.warns(aj.IdentifiabilityWarning, match="already set the scale"):
+        result = aj.calibrate(arm, capture, bounds, noise=NOISE)
     assert result.method == "two-stage"
     assert result.scale_set_by
     sampled = aj.monte_carlo(result, capture, most=20_000)
@@ -169,12 +170,14 @@ def test_one_placement_cannot_be_cross_validated(arm, bounds, capture):
         aj.cross_validate(arm, alone, bounds)
 
 
+@pytest.mark.filterwarnings("ignore:.* the scale, so the reference lengths change nothing")
 @pytest.mark.parametrize(("options", "text"), [({"digits": 3}, "1 or 2 significant"), ({"level": 95}, "level is 95")])
 def test_refused(arm, bounds, capture, options, text):
     with pytest.raises(aj.InputError, match=text):
         aj.monte_carlo(aj.calibrate(arm, capture, bounds), capture, **options)
 
 
+@pytest.mark.filterwarnings("ignore:.* the scale, so the reference lengths change nothing")
 def test_files_keep_all_of_it(arm, bounds, capture, tmp_path):
     sampled = aj.bootstrap(aj.calibrate(arm, capture, bounds, method="joint", noise=NOISE), capture, trials=100)
     nominal = aj.kinematics.ArmSpecification(arm, "small")

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import equinox as eqx
+import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,19 +104,30 @@ def test_a_free_partner_moves_in_place_of_a_fixed_length(panda, method):
     assert abs(float(result.parameters[i]) - 130.0) < 4 * np.sqrt(float(result.covariance[i, i]))
 
 
-def test_a_fixed_length_that_sets_the_scale_comes_back_as_given(too_long, capture):
+def test_a_fixed_length_that_sets_the_scale_comes_back_as_given(too_long, capture, tmp_path):
     """k compares it with the reference length, and the message offers what uses both."""
     space = held_by(too_long, "d_3")
     bounds = aj.Bounds.around(too_long, space, length=15.0)
-    result = aj.calibrate(too_long, capture, bounds)
+    with pytest.warns(aj.IdentifiabilityWarning, match="^d_3 is fixed and already sets the scale, .* method='joint'"):
+        result = aj.calibrate(too_long, capture, bounds)
     assert float(result.arm.d[2]) == 753.0
     assert result.scale_set_by == ("d_3",)
     assert result.hold is None
     assert float(result.k) == pytest.approx(753 / 750, abs=2e-4)
     np.testing.assert_array_equal(result.parameters, result.stage1.parameters)
     np.testing.assert_array_equal(result.covariance, result.stage1.covariance)
-    record = aj.calibration.record_of(result, aj.Recording(capture, aj.kinematics.ArmSpecification(too_long, "arm")))
+    nominal = aj.kinematics.ArmSpecification(too_long, "arm")
+    record = aj.calibration.record_of(result, aj.Recording(capture, nominal))
     assert not record.fixed_by_one_length
+    # The record keeps what the calibration found; a file of an earlier version does not, and is judged by its arm.
+    short = record._replace(recording=aj.Recording(capture, nominal._replace(arm=with_values(too_long, d_3=0.01))))
+    assert short.scale_set_by == ("d_3",)
+    aj.files.save_calibration(tmp_path / "new.h5", short)
+    assert aj.files.load_calibration(tmp_path / "new.h5").scale_set_by == ("d_3",)
+    aj.files.save_calibration(tmp_path / "old.h5", record)
+    with h5py.File(tmp_path / "old.h5", "a") as file:
+        del file.attrs["scale_set_by"]
+    assert aj.files.load_calibration(tmp_path / "old.h5").scale_set_by == ("d_3",)
     said = " ".join(cautions.of_calibration(record))
     assert "d_3 is fixed and already sets the scale" in said
     assert "--method joint" in said
@@ -123,10 +135,10 @@ def test_a_fixed_length_that_sets_the_scale_comes_back_as_given(too_long, captur
     assert float(joint.arm.d[2]) == 753.0
 
 
-def badly_determined(paper_arm) -> tuple[aj.Arm, aj.Arm, aj.Bounds]:
+def badly_determined(paper_arm, probe_x: float = 0.58, d_3: float = 753.0) -> tuple[aj.Arm, aj.Arm, aj.Bounds]:
     """True and nominal arm: a probe 0.58 mm off the axis, fixed, hardly determines the scale."""
-    true = with_values(paper_arm, probe_x=0.58, alpha_6=0.5)
-    nominal = with_values(true, d_3=753.0)
+    true = with_values(paper_arm, probe_x=probe_x, alpha_6=0.5)
+    nominal = with_values(true, d_3=d_3)
     return true, nominal, aj.Bounds.around(nominal, aj.Parameters.free_of(nominal), length=15.0)
 
 
@@ -179,10 +191,84 @@ def test_many_equal_single_ones_on_bounds_and_with_fixed_lengths(too_long, paper
         assert many.k[i] == pytest.approx(float(one.k), abs=1e-12)
     assert many.steps[0] > many.stage1.steps[0]
     assert many.steps[1] == many.stage1.steps[1]
-    true, nominal, bounds = badly_determined(paper_arm)
-    one = aj.calibrate(nominal, recorded(true), bounds)
-    many = aj.calibrate_many(nominal, recorded(true), bounds.lower, bounds.upper, bounds.space.vector()[None])
-    np.testing.assert_allclose(many.parameters[0], one.parameters, atol=1e-8)
+
+
+@pytest.mark.parametrize("method", ["two-stage", "joint"])
+def test_many_equal_single_ones_where_a_fixed_length_has_no_partner(paper_arm, method):
+    """Divided by k such an arm is no smaller copy of stage 1's, so that its tips scatter more. Two lengths that
+    contradict each other make the weights of poses and lengths matter."""
+    true, nominal, bounds = badly_determined(paper_arm, probe_x=5.0, d_3=760.0)
+    capture = recorded(true)
+    lengths = [*capture.lengths, aj.ReferenceLength("A", "B", float(capture.lengths[0].value) + 0.05, 0.01)]
+    capture = aj.Capture(capture.sockets, lengths)
+    one = aj.calibrate(nominal, capture, bounds, method=method, hold="d_3")
+    many = aj.calibrate_many(nominal, capture, bounds, start=bounds.space.vector()[None], method=method, hold="d_3")
+    error = (many.parameters[0] - one.parameters) / np.sqrt(np.diag(one.covariance))
+    assert np.max(np.abs(error)) < 1e-5  # standard deviations
+    assert many.stage1.sigma[0] == pytest.approx(float(one.stage1.after.sigma), rel=1e-9)
+
+
+def test_derivatives_where_the_anchor_is_adjusted(too_long, capture, cut):
+    """Forward against central differences of sixth order, and reverse against forward, by everything at once: readings,
+    the active bound and the length. Also from where stage 2 ended, so that k = 1 without any step of the secant."""
+    i, poses = cut.space.index("probe_z"), capture.sizes[0]
+    start = jnp.clip(cut.space.vector(too_long), cut.lower, cut.upper)
+    ended = aj.calibrate(too_long, capture, cut, start=start, hold="d_3")
+    assert float(aj.identify(too_long, capture, cut, start=ended.parameters, hold="d_3").k) == pytest.approx(
+        1, abs=1e-9
+    )
+
+    def run(change, start):
+        q = capture.q + 1e-4 * change["q"]
+        lengths = [aj.ReferenceLength("A", "B", capture.lengths[0].value + change["length"], 0.002)]
+        bounds = aj.Bounds(cut.space, cut.lower.at[i].add(change["bound"]), cut.upper)
+        drawn = aj.Capture({"A": q[:poses], "B": q[poses:]}, lengths)
+        return aj.calibrate(too_long, drawn, bounds, start=start, hold="d_3").parameters / cut.space.scale
+
+    random = np.random.default_rng(0)
+    at = {"q": jnp.zeros(capture.q.shape), "length": jnp.zeros(()), "bound": jnp.zeros(())}
+    direction = jax.tree.map(lambda leaf: jnp.asarray(random.normal(size=leaf.shape)), at)
+    cotangent = jnp.asarray(random.normal(size=len(cut.space.names)))
+    value = jax.jit(run)
+    forward = jax.jit(lambda start: jax.jvp(lambda change: run(change, start), (at,), (direction,))[1])
+    reverse = jax.jit(lambda start: jax.vjp(lambda change: run(change, start), at)[1](cotangent)[0])
+    for first in (start, ended.parameters):
+
+        def moved(steps, first=first):
+            return value(jax.tree.map(lambda leaf: 2e-3 * steps * leaf, direction), first)
+
+        weights = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
+        expected = sum(weight * (moved(n) - moved(-n)) for n, weight in weights) / 2e-3
+        found = forward(first)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * float(jnp.max(jnp.abs(expected))))
+        pulled = jax.tree.map(jnp.vdot, reverse(first), direction)
+        assert float(sum(jax.tree.leaves(pulled))) == pytest.approx(float(cotangent @ found), rel=1e-8)
+
+
+def test_a_bound_on_the_adjusted_length(too_long, capture, cut):
+    """d_3 cannot reach the value for which k = 1: it ends on its bound, and the length keeps its error."""
+    j = cut.space.index("d_3")
+    bounds = aj.Bounds(cut.space, cut.lower.at[j].set(751.0), cut.upper)
+    start = jnp.clip(cut.space.vector(too_long), bounds.lower, bounds.upper)
+    nominal = aj.Recording(capture, aj.kinematics.ArmSpecification(too_long, "arm"))
+    records = [
+        aj.calibration.record_of(aj.calibrate(too_long, capture, box, start=start), nominal) for box in (cut, bounds)
+    ]
+    assert [record.active[j] for record in records] == [0, -1]
+    assert [record.fixed_by_one_length for record in records] == [True, False]
+    assert [record.converged for record in records] == [True, True]
+
+
+def test_many_start_inside_their_boxes(too_long, capture, cut):
+    """The scale anchor too, which no step of stage 1 would bring back inside."""
+    start = np.array(cut.space.vector(too_long))
+    start[cut.space.index("d_3")] = 800.0
+    many, inside = (
+        aj.identify_many(too_long, capture, cut, start=one[None])
+        for one in (start, np.clip(start, cut.lower, cut.upper))
+    )
+    np.testing.assert_array_equal(many.parameters, inside.parameters)
+    assert many.parameters[0, cut.space.index("d_3")] == float(cut.upper[cut.space.index("d_3")])
 
 
 def test_covariance_on_a_bound_is_what_trials_show(too_long, paper_arm, capture, cut):
@@ -274,7 +360,12 @@ def test_results_of_one_and_of_many_have_the_same_fields(paper_arm, capture, cut
     for name in ("parameters", "k", "de", "deltam", "steps", "active", "converged"):
         for single, batch in ((one, many), (one.stage1, many.stage1)):
             assert np.shape(getattr(batch, name)) == (1, *np.shape(getattr(single, name)))
-    assert (many.hold, many.space.names) == (one.hold, one.space.names)
+    for single, batch in ((one, many), (one.stage1, many.stage1)):
+        for name in ("hold", "scale_set_by"):
+            assert getattr(batch, name) == getattr(single, name)
+        assert (batch.space.names, batch.bounds.space.names) == (single.space.names, single.space.names)
+        for both in zip(jax.tree.leaves(batch.arm), jax.tree.leaves(single.arm), strict=True):
+            np.testing.assert_allclose(both[0], both[1][None], rtol=1e-9, atol=1e-12)
     assert value_of(one.arm, "d_1") == value_of(paper_arm, "d_1")
 
 
