@@ -34,7 +34,7 @@ from .task import Task, fit_repeatability
 _ROUNDS = 4
 _SLOPES = (0.1, 2.0)  # of log k by the log of the anchor: 1 unless bounds or fixed lengths set part of the scale
 LARGEST_LOG_K = 1e-7  # |log k| up to which k = 1 counts as reached
-_OUTSIDE = 1e-9  # mm: what the division may leave of the box by rounding
+_ROUNDING = 1e-9  # mm: how far from a bound the division may leave a length by rounding
 
 
 def can_scale(anchor: ScaleAnchor) -> bool:
@@ -59,6 +59,18 @@ def replaced(anchor: ScaleAnchor, space: Parameters) -> Float[Array, "... p"]:
     return replaced_lengths(space, space.base, ((), ()) if anchor.partners is None else anchor.partners)
 
 
+def within_bounds(
+    space: Parameters, lower: Float[Array, "... p"], upper: Float[Array, "... p"], scaled: Float[Array, "... p"]
+) -> Float[Array, "... p"]:
+    """Divided lengths within their bounds, and on a bound that only rounding separates them from.
+
+    So short a step would not bring a solve onto the bound, which then counts as inactive, in derivatives too.
+    """
+    inside = jnp.clip(scaled, lower, upper)
+    inside = jnp.where(inside - lower <= _ROUNDING, lower, jnp.where(upper - inside <= _ROUNDING, upper, inside))
+    return jnp.where(jnp.broadcast_to(jnp.asarray(space.lengths), scaled.shape), inside, scaled)
+
+
 def must_adjust(
     anchor: ScaleAnchor,
     bounds: Bounds,
@@ -67,7 +79,7 @@ def must_adjust(
 ) -> Bool[Array, "..."]:
     """Whether the division is not the result of stage 2, given what was active in stage 1; see the module."""
     lengths = jnp.broadcast_to(jnp.asarray(divisible(bounds.space)), scaled.shape)
-    concerned = (scaled < bounds.lower - _OUTSIDE) | (scaled > bounds.upper + _OUTSIDE)
+    concerned = (scaled < bounds.lower - _ROUNDING) | (scaled > bounds.upper + _ROUNDING)
     if anchor.hold is not None:  # without an anchor it is the active bounds that set the scale of stage 1
         concerned = concerned | (active != 0)
     if anchor.partners is None:
@@ -111,7 +123,8 @@ def adjust_anchor(
     def solve(_: Any, length: Float[Array, ""]) -> tuple[Array, tuple[Array, Array]]:
         first = (start, length, length, jnp.zeros(()))
         (x, length, _, _), steps = jax.lax.scan(one_round, first, length=_ROUNDS - 1)
-        return length, (x, jnp.sum(steps))
+        # As a float: custom_root gives this a tangent of its own type, which an integer must not have.
+        return length, (x, jnp.sum(steps).astype(float))
 
     def difference(length: Float[Array, ""]) -> Float[Array, ""]:
         """Zero at the adjusted length: log k, or the distance from the bound that the length is on."""
@@ -128,7 +141,7 @@ def adjust_anchor(
     length, (x, steps) = jax.lax.custom_root(difference, first_length, solve, divide_by_slope, has_aux=True)
     x, log_k, solution = identify_again(x, length)
     number = _number_of_reason(numbers_of(solution.stats["reason"]), log_k, _on_bound(length, lower, upper))
-    return Adjusted(x, steps + solution.stats["num_steps"], reasons(number))
+    return Adjusted(x, steps.astype(int) + solution.stats["num_steps"], reasons(number))
 
 
 def _on_bound(length: Any, lower: Any, upper: Any) -> Any:
@@ -160,7 +173,7 @@ def second_stage_many(
     rows = np.flatnonzero(must_adjust(anchor, bounds, jnp.asarray(stage1.active), jnp.asarray(scaled)))
     active = stage1.active
     if can_scale(anchor):
-        scaled = np.where(space.lengths, np.clip(scaled, lower, upper), scaled)
+        scaled = np.array(within_bounds(space, bounds.lower, bounds.upper, jnp.asarray(scaled)))
         active = np.asarray(bounds.active(jnp.asarray(scaled)))
     if len(rows):
         found, found_reason, more = _adjust_many(

@@ -28,7 +28,7 @@ from ..uncertainty.identifiability import observability
 from .checks import based_on, check_enough, check_noise_model, check_single, check_start
 from .results import Calibration, Identification
 from .scale_anchor import scale_anchor, scale_set_by_clause
-from .second_stage import adjust_anchor, can_scale, divided, must_adjust, replaced
+from .second_stage import adjust_anchor, can_scale, divided, must_adjust, replaced, within_bounds
 from .task import SOLVER, Task, fit_repeatability
 
 _MAX_STEPS = 300
@@ -296,7 +296,7 @@ def _divided(task: Task) -> tuple[Calibration, Bool[Array, ""]]:
     adjust = must_adjust(anchor, bounds, stage1.active, scaled)
     active, parameter_covariance = stage1.active, propagated.parameter_covariance
     if can_scale(anchor):
-        scaled = jnp.where(jnp.asarray(space.lengths), jnp.clip(scaled, bounds.lower, bounds.upper), scaled)
+        scaled = within_bounds(space, bounds.lower, bounds.upper, scaled)
         active = bounds.active(scaled)
         measurement = task.measurement.weighted(space.arm(task.start).geometry, task.noise)
         parameter_covariance = scale_uncertainty.propagate_division(

@@ -158,11 +158,11 @@ def central(function, point, direction, step=2e-3):
 
 
 @pytest.fixture(scope="module")
-def differentiated(paper_arm, noisy_capture, space, start):
-    """A calibration as a function of angles, bounds and length; with its forward and reverse derivative, compiled
+def differentiated(paper_arm, noisy_capture, space):
+    """A calibration as a function of angles, bounds, length and start; with its forward and reverse derivative, compiled
     once."""
 
-    def run(q, box, length):
+    def run(q, box, length, start):
         cut = noisy_capture.sizes[0]
         # Two lengths of different u, measured on the same sockets, so that their weights matter.
         references = [aj.ReferenceLength("A", "B", length, 0.002), aj.ReferenceLength("A", "B", 200.005, 0.004)]
@@ -176,18 +176,21 @@ def differentiated(paper_arm, noisy_capture, space, start):
     return jax.jit(run), forward, reverse
 
 
-@pytest.mark.parametrize("boxed", [False, True], ids=["inactive", "active"])
+@pytest.mark.parametrize("case", ["inactive", "active", "repeated"])
 @pytest.mark.parametrize("by", ["angles", "bounds", "length"])
-def test_derivatives_of_a_calibration(paper_arm, noisy_capture, space, differentiated, by, boxed):
+def test_derivatives_of_a_calibration(paper_arm, noisy_capture, space, start, differentiated, by, case):
     """Forward and reverse against central differences, relative to the largest component, with bounds active and
-    not."""
+    not; and repeated from where it ended, so that k = 1 before the scale anchor is adjusted."""
+    boxed = case != "inactive"
     run, forward, reverse = differentiated
     bounds = aj.Bounds.around(paper_arm, space)
     lower, upper = np.array(bounds.lower), np.array(bounds.upper)
     if boxed:  # the box cuts off the minima of a_2 and alpha_3, which then end on a bound
         upper[space.index("a_2")] = 61.99
         lower[space.index("alpha_3")] = float(paper_arm.alpha[2]) + 1e-4
-    point = (noisy_capture.q, jnp.asarray(np.stack([lower, upper])), noisy_capture.lengths[0].value)
+    point = (noisy_capture.q, jnp.asarray(np.stack([lower, upper])), noisy_capture.lengths[0].value, start)
+    if case == "repeated":
+        point = (*point[:3], run(*point) * space.scale)
     random = np.random.default_rng(0)
     directions = {  # of about 1e-4 rad an angle; a hundredth of a unknown's natural step a bound; 1 mm
         "angles": 1e-4 * random.normal(size=point[0].shape),
@@ -196,7 +199,7 @@ def test_derivatives_of_a_calibration(paper_arm, noisy_capture, space, different
     }
     direction = tuple(
         jnp.asarray(directions[name]) if name == by else jnp.zeros_like(value)
-        for name, value in zip(("angles", "bounds", "length"), point, strict=True)
+        for name, value in zip(("angles", "bounds", "length", "start"), point, strict=True)
     )
     expected = central(run, point, direction)
     size = float(jnp.max(jnp.abs(expected)))
