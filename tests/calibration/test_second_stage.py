@@ -172,6 +172,9 @@ def test_the_result_is_inside_the_box(too_long, capture, cut):
     assert float(result.parameters[i]) == float(cut.lower[i])
     assert float(result.covariance[i, i]) == 0
     assert float(result.length_after[0]) == pytest.approx(float(capture.lengths[0].value), abs=1e-8)
+    # k of a calibration from there is 1 to rounding, which must not leave the length off its bound.
+    repeated = aj.calibrate(too_long, capture, cut, start=result.parameters)
+    assert repeated.active_names() == {"probe_z": "lower"}
     # It is stage 1 with the anchor where k = 1: nothing is gained by another solve from there.
     again = aj.identify(result.arm, capture, cut, hold="d_3")
     np.testing.assert_allclose(again.parameters, result.parameters, atol=1e-8)

@@ -159,8 +159,7 @@ def central(function, point, direction, step=2e-3):
 
 @pytest.fixture(scope="module")
 def differentiated(paper_arm, noisy_capture, space):
-    """A calibration as a function of angles, bounds, length and start; with its forward and reverse derivative, compiled
-    once."""
+    """A calibration as a function of angles, bounds, length and start; and its forward and reverse derivative."""
 
     def run(q, box, length, start):
         cut = noisy_capture.sizes[0]
