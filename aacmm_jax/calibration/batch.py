@@ -104,20 +104,9 @@ def calibrate_many(
     """Both stages for a batch: what `calibrate` does, problem by problem, fast.
 
     Args:
-        arm: As for `identify_many`, like all arguments but ``method``.
+        arm: As for `identify_many`, like all arguments that are not named here.
         capture: Readings and at least one reference length.
-        lower: `Bounds` or lower bounds.
-        upper: Upper bounds.
-        start: Starts.
-        method: As in `calibrate`.
-        space: The free parameters.
-        hold: The scale anchor of stage 1.
-        noise: Weights poses.
-        max_steps: The largest number of evaluations of one solve.
-        chunk: Problems in one call of the compiled program.
-        slots: Problems in work at the same time in one call.
-        devices: The devices to use.
-        workers: Threads.
+        method: "two-stage" or "joint", as in `calibrate`.
 
     Returns:
         Parameters, scale, metrics and reasons, problem by problem.
