@@ -490,7 +490,7 @@ def test_strange_arguments_are_refused_before_anything_is_written(study, tmp_pat
     assert not list(tmp_path.iterdir())
 
 
-def test_nobody_answers(aacmm, home):
-    done = aacmm("study", home / "spec.toml", "-o", "s.h5", "--dask", "tcp://127.0.0.1:1", expect=2)
+def test_nobody_answers(aacmm_process, home):
+    done = aacmm_process("study", home / "spec.toml", "-o", "s.h5", "--dask", "tcp://127.0.0.1:1", expect=2)
     assert done.stderr.count("\n") == 1
     assert "no Dask scheduler answers at tcp://127.0.0.1:1; start one, or use --dask local" in done.stderr
