@@ -21,7 +21,7 @@ import aacmm_jax as aj
 from aacmm_jax.calibration.sampling import batch_of
 from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.kinematics.inverse_kinematics import project_to_targets
-from aacmm_jax.study.drawing import draw
+from aacmm_jax.study.trial_simulation import draw
 from aacmm_jax.uncertainty.volume import sample_lengths
 
 CAPTURES = Path(__file__).resolve().parents[1] / "examples/mukca"

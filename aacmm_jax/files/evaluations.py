@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..acceptance.all_tests import checked_limits
 from ..acceptance.decision import Limit
-from ..acceptance.metrics import METRICS, Measured
 from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord
-from ..acceptance.suite import checked_limits
+from ..acceptance.results import METRICS, Measured
 from ..kinematics.workspace import Reach
 from .captures import (
     arm_table,

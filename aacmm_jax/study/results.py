@@ -11,8 +11,8 @@ from jaxtyping import Float
 from ..core.errors import InputError
 from ..files.hdf5 import undamaged
 from . import store
+from .blocks import VARIABLES, Layout, fill_of
 from .definition import POOL_PARTS, Study
-from .layout import VARIABLES, Layout, fill_of
 
 if TYPE_CHECKING:
     import xarray

@@ -25,8 +25,8 @@ from ..files.captures import arm_table, recording_of, recording_tables, specific
 from ..files.hdf5 import Table, Variable, need, read_tables, undamaged, write_tables
 from ..files.whole_file import ELSEWHERE, whole_file
 from ..kinematics.arm import is_length
+from .blocks import VARIABLES, Block, Layout, fill_of, part_of, parts_of
 from .definition import Study
-from .layout import VARIABLES, Block, Layout, fill_of, part_of, parts_of
 from .specification import Specification, unit
 
 _ADVICE = "free some space there, then run the same command again: what is finished is kept"

@@ -9,7 +9,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.cli.study_display import concise
 from aacmm_jax.study import store
-from aacmm_jax.study.layout import Layout
+from aacmm_jax.study.blocks import Layout
 from aacmm_jax.study.results import Results
 from aacmm_jax.study.statistics import distribution, statistic, study_summary
 

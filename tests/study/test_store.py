@@ -17,7 +17,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.study import runner, store
-from aacmm_jax.study.layout import Layout, parts_of
+from aacmm_jax.study.blocks import Layout, parts_of
 
 ROOT = Path(__file__).resolve().parents[2]
 SPECIFICATION = """
