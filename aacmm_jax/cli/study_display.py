@@ -1,12 +1,12 @@
 """A study's results on a terminal: means with the standard error of their last digits in parentheses."""
 
-import math
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 
 from ..core.units import ARCSEC
+from ..study.statistics import concise
 from .display import new_console, new_table, print_table
 
 _MOST = 40  # cells in a table
@@ -39,25 +39,6 @@ _NAMES = {
     "length_error": ("largest length error after the scale fix [mm]", 1.0),
     "angle_error": ("largest angle error after the scale fix [arcsec]", 1 / ARCSEC),
 }
-
-
-def concise(value: float | None, se: float | None) -> str:
-    """A number with the standard error of its last digits in parentheses: 0.01068(3)."""
-    if value is None or math.isnan(value):
-        return "-"
-    if not se:
-        return f"{value:.4g}"
-    if not math.isfinite(se):
-        return f"{value:.4g}(?)"
-    magnitude = math.floor(math.log10(abs(value))) if value else 0
-    if magnitude < -4 and se < 1:
-        mantissa = concise(value / 10.0**magnitude, se / 10.0**magnitude)
-        return f"{mantissa}e{magnitude:+03d}"
-    decimals = max(-math.floor(math.log10(se)), 0)
-    digits = round(se * 10**decimals)
-    if digits == 10 and decimals > 0:  # 0.0096 is 0.01
-        decimals, digits = decimals - 1, 1
-    return f"{value:.{decimals}f}({digits})"
 
 
 def _both(pair: dict[str, Any] | None, factor: float = 1.0) -> str:

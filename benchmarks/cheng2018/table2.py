@@ -4,7 +4,6 @@ import numpy as np
 from paper import NAMES, PUBLISHED, Row, arm_of, is_length, row, tips_of, vector
 
 import aacmm_jax as aj
-from aacmm_jax.core.units import ARCSEC
 
 
 def printed_table() -> np.ndarray:
@@ -72,7 +71,7 @@ def elements(rows: list[Row], k: float) -> None:
         else:
             recomputed = mine = f"{np.rad2deg(given[i]):.4f}"
             text, agrees = f"{np.rad2deg(table[i]):.4f}", recomputed == f"{np.rad2deg(table[i]):.4f}"
-            verdict = "agrees" if agrees else f"disagrees by {(table[i] - given[i]) / ARCSEC:+.0f} arcsec"
+            verdict = "agrees" if agrees else f"disagrees by {(table[i] - given[i]) / aj.units.ARCSEC:+.0f} arcsec"
         unit = "mm" if is_length()[i] else "deg"
         rows.append(
             row(

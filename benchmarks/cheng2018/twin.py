@@ -16,7 +16,6 @@ from paper import NAMES, POSES, PUBLISHED, arm_of, box, is_length, metrics_of, t
 from scipy.optimize import minimize
 
 import aacmm_jax as aj
-from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.kinematics.inverse_kinematics import random_configurations
 
 # mm: three sockets well within the reach of 1.4 m; the paper does not print the positions of its own.
@@ -27,6 +26,7 @@ PLATE, PLACEMENTS = PUBLISHED["verification"]["nominal"], 30
 # Readings averaged at each end of the reference length. The paper does not state it; with single readings the range of
 # the four measurements would be three times the printed 0.006 mm, for any noise that matches the sockets.
 READINGS = 10
+ARCSEC = aj.units.ARCSEC
 _POOL = 40  # times as many poses and placements as a twin takes
 
 

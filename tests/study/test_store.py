@@ -398,9 +398,7 @@ def test_reading_needs_no_more_files_than_one(home, study, tmp_path):
     program = (
         "import resource, sys; resource.setrlimit(resource.RLIMIT_NOFILE, (60, int(sys.argv[2])))\n"
         "import aacmm_jax as aj\n"
-        "from aacmm_jax.study.results import Results\n"
-        "from aacmm_jax.study.statistics import study_summary\n"
-        "print(study_summary(Results.of(sys.argv[1]))['trials_run'])\n"
+        "print(aj.study.study_summary(aj.study.Results.of(sys.argv[1]))['trials_run'])\n"
         "print((aj.study.open_study(sys.argv[1]).converged.values >= 0).sum())\n"
     )
     for hard, said in ((1000, ""), (60, "more files than this process may open (60)")):
