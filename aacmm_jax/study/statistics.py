@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..core.units import ARCSEC
 from ..solver.reason import Reason, numbers_of
 from .results import Results
 from .specification import label
@@ -30,6 +31,19 @@ METRICS = {
     "angle_error": "largest angle error after the scale fix",
 }
 PERCENTILES = (5, 50, 95)
+
+
+def shown_unit(metric: str) -> tuple[str, float]:
+    """The unit in which people read a metric, and the factor to it from mm and rad."""
+    if metric.startswith("angle"):
+        return "arcsec", 1 / ARCSEC
+    return ("" if metric in ("k", "scale", "scale_error") else "mm"), 1.0
+
+
+def metric_title(metric: str) -> str:
+    """What a metric is, with the unit in which people read it."""
+    unit, _ = shown_unit(metric)
+    return METRICS[metric] + (f" [{unit}]" if unit else "")
 
 
 def study_summary(results: Results, only: int | None = None) -> dict[str, Any]:
