@@ -53,7 +53,7 @@ def _limit_table(limits: Mapping[str, Limit | float]) -> Table:
     checked = checked_limits(limits)
     rows = columns(
         "figure",
-        figure=(list(checked), "", "figure of an acceptance test"),
+        figure=(list(checked), "", "metric of an acceptance test"),
         fixed=([limit.fixed for limit in checked.values()], "mm", "MPE at length 0"),
         divisor=([limit.divisor for limit in checked.values()], "1", "MPE grows by the length over this"),
     )
@@ -82,7 +82,7 @@ def _metric_table(record: EvaluationRecord) -> Table:
         "row",
         arm=([stage for stage, *_ in rows], "", "arm that measured"),
         standard=([standard for _, standard, *_ in rows], "", "standard of the test"),
-        name=([metric.name for *_, metric, _ in rows], "", "figure"),
+        name=([metric.name for *_, metric, _ in rows], "", "metric"),
         value=([metric.value for *_, metric, _ in rows], "mm", "value of the worst part"),
         expanded=([worst.expanded for *_, worst in rows], "mm", "expanded uncertainty, coverage factor 2"),
         limit=([math.nan if worst.limit is None else worst.limit for *_, worst in rows], "mm", "MPE"),
