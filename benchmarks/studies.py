@@ -63,9 +63,9 @@ def once(trials: int, repeats: int, bare: int) -> dict:
 
 
 def forget_pools() -> None:
-    from aacmm_jax.study import drawing, pools
+    from aacmm_jax.study import configuration_pool, trial_simulation
 
-    for cached in (pools._pool, pools._fixture_table, drawing._prepared):
+    for cached in (configuration_pool._pool, configuration_pool._fixture_table, trial_simulation._prepared):
         cached.cache_clear()
 
 
@@ -74,7 +74,7 @@ def bare_seconds(study) -> float:
     import jax
 
     import aacmm_jax as aj
-    from aacmm_jax.study.drawing import draw
+    from aacmm_jax.study.trial_simulation import draw
     from aacmm_jax.study.trials import captures_of
 
     total = 0.0

@@ -19,11 +19,11 @@ import numpy as np
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.sampling import batch_of
-from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.kinematics.inverse_kinematics import project_to_targets
-from aacmm_jax.study.drawing import draw
+from aacmm_jax.study.trial_simulation import draw
 from aacmm_jax.uncertainty.volume import sample_lengths
 
+ARCSEC = aj.units.ARCSEC
 CAPTURES = Path(__file__).resolve().parents[1] / "examples/mukca"
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
 SIZES, NAMES = (70, 5, 5), ("S", "A", "B")

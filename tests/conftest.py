@@ -1,5 +1,8 @@
 """Strictness for all tests: shapes checked at run time, no silent promotion of rank or dtype; and common fixtures."""
 
+import contextlib
+import gc
+import io
 import os
 import subprocess
 import sys
@@ -15,6 +18,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 install_import_hook("aacmm_jax", "tests.run_time_types.checked")
 import aacmm_jax as aj  # noqa: E402 - the hook is never removed, and checks every module imported after it
+from aacmm_jax.cli import main  # noqa: E402
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -31,8 +35,42 @@ def cache(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def aacmm(tmp_path, cache):
-    """Run the real command line in a fresh process, in an empty folder; returns exit code, output and error text."""
+def aacmm(tmp_path):
+    """Run the command line in this process, in an empty folder; returns exit code, output and error text.
+
+    Programs that this process has compiled are used again. A Python warning is an error, as in all tests.
+    """
+
+    def run(*arguments: object, expect: int = 0) -> subprocess.CompletedProcess[str]:
+        output, errors = io.StringIO(), io.StringIO()
+        command = ["aacmm", *map(str, arguments)]
+        thresholds, compile_time = gc.get_threshold(), jax.config.jax_persistent_cache_min_compile_time_secs
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            contextlib.chdir(tmp_path),
+            contextlib.redirect_stdout(output),
+            contextlib.redirect_stderr(errors),
+        ):
+            patch.setattr(sys, "argv", list(command))
+            patch.setenv("COLUMNS", "110")
+            try:
+                main()
+                code = 0
+            except SystemExit as ended:
+                code = int(ended.code or 0)
+            finally:
+                gc.set_threshold(*thresholds)
+                gc.unfreeze()
+                jax.config.update("jax_persistent_cache_min_compile_time_secs", compile_time)
+        assert code == expect, output.getvalue() + errors.getvalue()
+        return subprocess.CompletedProcess(command, code, output.getvalue(), errors.getvalue())
+
+    return run
+
+
+@pytest.fixture
+def aacmm_process(tmp_path, cache):
+    """The same in a fresh process, for tests of start-up, exit codes, caches and streams of a real one."""
 
     def run(*arguments: object, expect: int = 0) -> subprocess.CompletedProcess[str]:
         environment = os.environ | {"XDG_CACHE_HOME": str(cache), "COLUMNS": "110"}

@@ -1,5 +1,6 @@
 """The notebooks run from beginning to end, as a reader would run them."""
 
+import re
 import warnings
 from pathlib import Path
 
@@ -33,3 +34,8 @@ def test_all_are_there_with_their_outputs():
     assert [path.stem[:2] for path in NOTEBOOKS] == ["01", "02", "03", "04", "05"]
     for path in NOTEBOOKS:
         assert '"image/png"' in path.read_text()
+
+
+@pytest.mark.parametrize("path", [*NOTEBOOKS, ROOT / "README.md"], ids=lambda path: path.stem)
+def test_readers_are_shown_public_names_only(path):
+    assert not re.findall(r"from aacmm_jax[.\w]* import|import aacmm_jax\.\w+", path.read_text())

@@ -11,7 +11,6 @@ from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..kinematics.workspace import Reach
 from .lengths import deviation_metrics, distinct_lengths, length_readings, values_by_artefact
-from .metrics import AcceptanceTest, Measured, Metric, acceptance_test, metric_value, percent
 from .procedure_items import (
     OutOfReach,
     PlannedItems,
@@ -23,6 +22,7 @@ from .procedure_items import (
     socket_in_zone,
     touch_item,
 )
+from .results import AcceptanceTest, Measured, Metric, acceptance_test, metric_value, percent
 from .spheres import errors_named, missing_touches, points_of, size_error
 from .standards import ASME_B89_4_22
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from ..core.arrays import Numbers
 from ..kinematics.workspace import Reach
 from .lengths import distinct_lengths, length_readings, values_by_artefact
-from .metrics import AcceptanceTest, Measured, Metric, acceptance_test, metric_value
 from .procedure_items import PlannedItems, PlannedSphere, ProcedureRegion, bar_items, socket_in_zone, touch_item
+from .results import AcceptanceTest, Measured, Metric, acceptance_test, metric_value
 from .spheres import EXACT_POINTS, enclosing_sphere, errors_named, fit_sphere, missing_touches, size_error
 from .standards import ISO_10360_12
 

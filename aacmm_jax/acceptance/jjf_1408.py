@@ -4,7 +4,7 @@ import numpy as np
 
 from ..core.arrays import Numbers
 from .lengths import deviation_metrics, distinct_lengths, length_readings
-from .metrics import AcceptanceTest, Measured, Metric, acceptance_test, metric_value
+from .results import AcceptanceTest, Measured, Metric, acceptance_test, metric_value
 from .spheres import points_of
 from .standards import JJF_1408
 

@@ -9,7 +9,7 @@ from ..core.errors import InputError
 from ..data.sphere import SphereTest
 from ..kinematics.workspace import Reach, SearchRegion, configurations_at, lowest_point
 from ..uncertainty.volume import sample_lengths
-from .metrics import percent
+from .results import percent
 
 _POINTS_TRIED, _STARTS, _RANDOM_TIPS, _RANDOM_BARS = 16, 48, 6000, 300
 # Rings of touched points on the upper half of a sphere, by the number of points: elevation in degrees, points.

@@ -13,8 +13,8 @@ from ..data.recording import Recording
 from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry
 from ..kinematics.parameters import ArmSpecification
+from .all_tests import AcceptanceTest, Measured, checked_limits, measured_by, run, without_stated_uncertainty
 from .decision import Limit
-from .suite import AcceptanceTest, Measured, checked_limits, measured_by, run, without_stated_uncertainty
 
 MAXIMA = ("rms_mm", "deltam_mm", "length_error_largest_mm")
 SIMULATED = "The readings are simulated: no real arm was measured."

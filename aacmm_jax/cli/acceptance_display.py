@@ -67,25 +67,25 @@ def _acceptance(console: Console, summary: dict[str, Any]) -> None:
     if not tests:
         console.print("No acceptance test applies: there is no socket with several poses, no length and no sphere.")
         return
-    before = any(figure["as_found_mm"] is not None for test in tests for figure in test["figures"])
-    limited = any(figure["limit_mm"] is not None for test in tests for figure in test["figures"])
+    before = any(metric["as_found_mm"] is not None for test in tests for metric in test["figures"])
+    limited = any(metric["limit_mm"] is not None for test in tests for metric in test["figures"])
     headings = ["standard", "result", *(["as found"] if before else []), "as left" if before else "value", "U (k=2)"]
     table = new_table(
         "\nAcceptance tests, single readings [mm]", *headings, *(["MPE", "decision"] if limited else []), "worst at"
     )
     for test in tests:
-        for figure in test["figures"]:
-            cells = [formatted(figure["as_found_mm"])] if before else []
-            cells += [formatted(figure["value_mm"]), formatted(figure["expanded_mm"] or None)]
+        for metric in test["figures"]:
+            cells = [formatted(metric["as_found_mm"])] if before else []
+            cells += [formatted(metric["value_mm"]), formatted(metric["expanded_mm"] or None)]
             if limited:
-                decision = figure["decision"]
+                decision = metric["decision"]
                 count = (
-                    f" ({figure['failing']} of {len(figure['parts'])})"
-                    if figure["failing"] and len(figure["parts"]) > 1
+                    f" ({metric['failing']} of {len(metric['parts'])})"
+                    if metric["failing"] and len(metric["parts"]) > 1
                     else ""
                 )
-                cells += [formatted(figure["limit_mm"]), f"[{_STYLES[decision]}]{decision or '-'}{count}[/]"]
-            table.add_row(test["standard"], figure["name"], *cells, escape(figure["where"]))
+                cells += [formatted(metric["limit_mm"]), f"[{_STYLES[decision]}]{decision or '-'}{count}[/]"]
+            table.add_row(test["standard"], metric["name"], *cells, escape(metric["where"]))
     for column in table.columns[1], table.columns[-1]:
         column.justify = "left"
     print_table(console, table, keys=2)

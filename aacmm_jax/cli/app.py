@@ -38,6 +38,32 @@ Without = Annotated[
 
 CaptureFile = Annotated[Path, typer.Argument(metavar="CAPTURE.h5", help="Capture, written by import or simulate.")]
 
+CaptureOutput = Annotated[Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Capture to write (HDF5).")]
+
+NominalArm = Annotated[
+    str, typer.Argument(metavar="ARM", help="Nominal arm: a TOML file, or the name of an arm that ships with aacmm.")
+]
+
+EncoderNoise = Annotated[
+    float, typer.Option("--encoder-arcsec", min=0, metavar="ARCSEC", help="Standard deviation of a joint reading.")
+]
+
+SeatingNoise = Annotated[
+    float,
+    typer.Option(
+        "--seating-mm", min=0, metavar="MM", help="Standard deviation of the tip in its socket, for each coordinate."
+    ),
+]
+
+ReferenceLengths = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--length",
+        metavar="A,B[,U]",
+        help="Reference length between two sockets, u in mm; repeatable. Quote a name with a comma: '\"a, b\",C'.",
+    ),
+]
+
 CalibrationFile = Annotated[Path, typer.Argument(metavar="CALIBRATION.h5", help="Calibration, written by calibrate.")]
 
 

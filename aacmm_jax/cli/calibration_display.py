@@ -9,7 +9,7 @@ from rich.markup import escape
 from ..core.units import ARCSEC, DEG
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
-_FIGURES = (
+_METRICS = (
     ("de_mm", "DE, mean distance of poses from their socket's centroid"),
     ("deltam_mm", "Deltam, largest half range of a coordinate in a socket"),
     ("rms_mm", "RMS distance of poses from their socket's centroid"),
@@ -184,14 +184,14 @@ def demo(summary: dict[str, Any]) -> None:
 
 
 def print_stages(
-    console: Console, title: str, figures: dict[str, Any], stages: tuple[str, ...], *, fitted: bool = False
+    console: Console, title: str, metrics: dict[str, Any], stages: tuple[str, ...], *, fitted: bool = False
 ) -> None:
     """Repeatability and length errors by stage; ``fitted``: the scale makes the last length error zero."""
     names = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
     table = new_table(title, "", *(names[stage] for stage in stages))
-    for key, text in _FIGURES:
-        if key in figures[stages[0]]:
-            cells = [formatted(figures[stage][key]) for stage in stages]
+    for key, text in _METRICS:
+        if key in metrics[stages[0]]:
+            cells = [formatted(metrics[stage][key]) for stage in stages]
             table.add_row(escape(text), *cells[:-1], "by fit" if fitted and key.startswith("length") else cells[-1])
     print_table(console, table)
 

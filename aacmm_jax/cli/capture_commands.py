@@ -9,7 +9,12 @@ import typer
 from ..core.errors import InputError
 from ..core.units import DEG
 from .app import (
+    CaptureOutput,
+    EncoderNoise,
     Json,
+    NominalArm,
+    ReferenceLengths,
+    SeatingNoise,
     app,
     bad_option,
     check_outputs,
@@ -50,11 +55,8 @@ def demo(
     )
 )
 def simulate(
-    arm: Annotated[
-        str,
-        typer.Argument(metavar="ARM", help="Nominal arm: a TOML file, or the name of an arm that ships with aacmm."),
-    ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Capture to write (HDF5).")],
+    arm: NominalArm,
+    output: CaptureOutput,
     socket: Annotated[
         list[str] | None, typer.Option(metavar="NAME=X,Y,Z", help="A socket and its position in mm; repeatable.")
     ] = None,
@@ -62,23 +64,12 @@ def simulate(
         list[str] | None,
         typer.Option(metavar="[NAME=]N", help="Poses in each socket, or in the named one; repeatable. Default 70."),
     ] = None,
-    length: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="A,B[,U]",
-            help="Reference length between two sockets, u in mm; repeatable. Quote a name with a comma: '\"a, b\",C'.",
-        ),
-    ] = None,
-    encoder_arcsec: Annotated[
-        float, typer.Option(min=0, metavar="ARCSEC", help="Standard deviation of a joint reading.")
-    ] = 0.0,
+    length: ReferenceLengths = None,
+    encoder_arcsec: EncoderNoise = 0.0,
     resolution_arcsec: Annotated[
         float, typer.Option(min=0, metavar="ARCSEC", help="Resolution of a joint reading.")
     ] = 0.0,
-    seating_mm: Annotated[
-        float,
-        typer.Option(min=0, metavar="MM", help="Standard deviation of the tip in its socket, for each coordinate."),
-    ] = 0.0,
+    seating_mm: SeatingNoise = 0.0,
     true_arm: Annotated[
         str | None,
         typer.Option(metavar="ARM", help="The true arm, where it is not the nominal one: a TOML file or a name."),
@@ -121,12 +112,8 @@ def simulate(
                 "--acceptance brings its own sockets, poses and lengths; leave out --socket, --poses, --length and "
                 "--resolution-arcsec."
             )
-        noise = {
-            "encoder_arcsec": encoder_arcsec,
-            "seating": seating_mm,
-            "u_length": _U_ARTEFACT,
-            "u_diameter": _U_ARTEFACT,
-        }
+        noise = {"encoder_arcsec": encoder_arcsec, "seating": seating_mm}
+        noise |= {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
 
         def taken() -> Recording:
             from ..acceptance.procedure import plan_procedure, simulate_procedure
@@ -164,7 +151,7 @@ def import_(
             metavar="MANIFEST.toml", help="Which files hold the poses of which socket, in which unit, and the lengths."
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Capture to write (HDF5).")],
+    output: CaptureOutput,
     as_json: Json = False,
 ) -> None:
     """Read recorded joint readings into a capture."""

@@ -92,21 +92,21 @@ def _compared(records: list, created: list[str], labels: list[str], level: float
     if len(records) > 2:
         found = trend(records, created, level=level, length=length, labels=labels)
         if list(found.order) != sorted(found.order):
-            caution = (
+            warning = (
                 f"Ordered by date, not as named: {', '.join(labels[i] for i in found.order)}. The date is when the "
                 "poses were measured, where the manifest states it, and otherwise when the file was made."
             )
             first = found.drifts[0]
-            found = found._replace(drifts=(first._replace(warnings=(caution, *first.warnings)), *found.drifts[1:]))
+            found = found._replace(drifts=(first._replace(warnings=(warning, *first.warnings)), *found.drifts[1:]))
         return found
     drift = compare(*records, level=level, length=length, labels=labels)
     dates = tuple(moment(date) for date in created)
     if dates[1] < dates[0]:
-        caution = (
+        warning = (
             f"{labels[1]} was made before {labels[0]} ({dates[1]:%Y-%m-%d %H:%M} and {dates[0]:%Y-%m-%d %H:%M}): "
             "is the order right?"
         )
-        drift = drift._replace(warnings=(*drift.warnings, caution))
+        drift = drift._replace(warnings=(*drift.warnings, warning))
     return Trend(dates, (0, 1), (drift,))
 
 

@@ -74,7 +74,7 @@ def _lengths(console: Console, summary: dict[str, Any]) -> None:
 
 def _trend(console: Console, rows: list[dict[str, Any]]) -> None:
     table = new_table(
-        "\nEach calibration against the first (whose own error all of them share)",
+        "\nEach calibration against the first (whose own error is in all of them)",
         *("", "calibration", "date", "beyond U", "p together"),
         *("RMS [mm]", "by chance [mm]", "largest [mm]", "mean [um/m]"),
     )
@@ -114,7 +114,7 @@ def _changes(console: Console, rows: list[dict[str, Any]]) -> None:
 
 
 def _decimals(expanded: float | None, default: int) -> int:
-    """Digits that show two figures of an uncertainty."""
+    """Decimals that show two significant digits of an uncertainty."""
     return default if not expanded else min(max(1 - math.floor(math.log10(expanded)), 0), 9)
 
 

@@ -10,7 +10,11 @@ import typer
 from ..core.errors import InputError
 from ..core.units import DEG
 from .app import (
+    EncoderNoise,
     Json,
+    NominalArm,
+    ReferenceLengths,
+    SeatingNoise,
     app,
     check_outputs,
     examples,
@@ -30,9 +34,7 @@ from .app import (
     )
 )
 def plan(
-    arm: Annotated[
-        str, typer.Argument(metavar="ARM", help="Arm: a TOML file, or the name of an arm that ships with aacmm.")
-    ],
+    arm: NominalArm,
     output: Annotated[
         Path,
         typer.Option(
@@ -52,23 +54,15 @@ def plan(
         list[str] | None,
         typer.Option(metavar="NAME=X,Y,Z", help="Instead: a socket at a given position, mm; repeatable."),
     ] = None,
-    length: Annotated[
-        list[str] | None,
-        typer.Option(metavar="A,B[,U]", help="Reference length between two given sockets, with u in mm; repeatable."),
-    ] = None,
+    length: ReferenceLengths = None,
     length_mm: Annotated[
         str, typer.Option(metavar="L[:M]", help="Reference length to position; of a range, the best length is chosen.")
     ] = "500",
     u_mm: Annotated[
         float, typer.Option(metavar="MM", help="Standard uncertainty of the reference length to position.")
     ] = 0.002,
-    encoder_arcsec: Annotated[
-        float, typer.Option(min=0, metavar="ARCSEC", help="Standard deviation of a joint reading.")
-    ] = 2.0,
-    seating_mm: Annotated[
-        float,
-        typer.Option(min=0, metavar="MM", help="Standard deviation of the tip in its socket, for each coordinate."),
-    ] = 0.005,
+    encoder_arcsec: EncoderNoise = 2.0,
+    seating_mm: SeatingNoise = 0.005,
     criterion: Annotated[
         Literal["length", "A", "D", "E"],
         typer.Option(

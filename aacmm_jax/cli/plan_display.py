@@ -15,17 +15,17 @@ def progress() -> Iterator[Callable[[str, float], None]]:
     """A bar on standard error, where that is a terminal; yields the callback that moves it."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield lambda what, share: None
+        yield lambda what, fraction: None
         return
     from rich.progress import Progress
 
     with Progress(console=console, transient=True) as bar:
         tasks: dict[str, Any] = {}
 
-        def report(what: str, share: float) -> None:
+        def report(what: str, fraction: float) -> None:
             if what not in tasks:
                 tasks[what] = bar.add_task(what, total=1.0)
-            bar.update(tasks[what], completed=share)
+            bar.update(tasks[what], completed=fraction)
 
         yield report
 
@@ -56,7 +56,7 @@ def plan(summary: dict[str, Any]) -> None:
         ("random", f"{summary['poses']} random poses in the same sockets"),
         ("more", f"this plan and {summary['more_poses']} more poses"),
     ):
-        table.add_row(text, *(f"{1e3 * summary[key][figure]:.1f}" for figure in ("median_mm", "largest_mm")))
+        table.add_row(text, *(f"{1e3 * summary[key][which]:.1f}" for which in ("median_mm", "largest_mm")))
     print_table(console, table)
     console.print(
         f"For a joint calibration with encoders of {summary['encoder_arcsec']:g} arcsec and a seat of "

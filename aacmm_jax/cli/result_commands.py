@@ -71,7 +71,7 @@ def evaluate(
     Runs every acceptance test that the capture allows. A manifest of points is tested without a calibration.
     """
     from ..acceptance.decision import read_limits
-    from ..acceptance.metrics import METRICS
+    from ..acceptance.results import METRICS
     from . import acceptance_display
 
     limits = read_limits(mpe or [], METRICS)

@@ -1,63 +1,30 @@
 """A study's results on a terminal: means with the standard error of their last digits in parentheses."""
 
-import math
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 
 from ..core.units import ARCSEC
+from ..study.statistics import METRICS, concise, metric_title, shown_unit
 from .display import new_console, new_table, print_table
 
 _MOST = 40  # cells in a table
-# Figure, heading, factor to the shown unit.
-_OVERVIEW = (
-    ("k", "k", 1.0),
-    ("de", "DE [mm]", 1.0),
-    ("deltam", "Deltam [mm]", 1.0),
-    ("length_error_stage1", "length error before [mm]", 1.0),
-    ("length_error", "and after [mm]", 1.0),
-    ("angle_error", "angle error [arcsec]", 1 / ARCSEC),
-)
-_STAGE1 = (
-    ("scale", "scale", 1.0),
-    ("de_stage1", "DE [mm]", 1.0),
-    ("deltam_stage1", "Deltam [mm]", 1.0),
-    ("length_error_stage1", "length error [mm]", 1.0),
-    ("angle_error_stage1", "angle error [arcsec]", 1 / ARCSEC),
-)
-_NAMES = {
-    "k": ("k = measured / nominal", 1.0),
-    "scale": ("scale of stage 1, found / true", 1.0),
-    "scale_error": ("scale after the fix, found / true - 1", 1.0),
-    "de_stage1": ("DE before the scale fix [mm]", 1.0),
-    "deltam_stage1": ("Deltam before the scale fix [mm]", 1.0),
-    "length_error_stage1": ("largest length error before the scale fix [mm]", 1.0),
-    "angle_error_stage1": ("largest angle error before the scale fix [arcsec]", 1 / ARCSEC),
-    "de": ("DE after the scale fix [mm]", 1.0),
-    "deltam": ("Deltam after the scale fix [mm]", 1.0),
-    "length_error": ("largest length error after the scale fix [mm]", 1.0),
-    "angle_error": ("largest angle error after the scale fix [arcsec]", 1 / ARCSEC),
+_OVERVIEW = {
+    "k": "k",
+    "de": "DE [mm]",
+    "deltam": "Deltam [mm]",
+    "length_error_stage1": "length error before [mm]",
+    "length_error": "and after [mm]",
+    "angle_error": "angle error [arcsec]",
 }
-
-
-def concise(value: float | None, se: float | None) -> str:
-    """A number with the standard error of its last digits in parentheses: 0.01068(3)."""
-    if value is None or math.isnan(value):
-        return "-"
-    if not se:
-        return f"{value:.4g}"
-    if not math.isfinite(se):
-        return f"{value:.4g}(?)"
-    magnitude = math.floor(math.log10(abs(value))) if value else 0
-    if magnitude < -4 and se < 1:
-        mantissa = concise(value / 10.0**magnitude, se / 10.0**magnitude)
-        return f"{mantissa}e{magnitude:+03d}"
-    decimals = max(-math.floor(math.log10(se)), 0)
-    digits = round(se * 10**decimals)
-    if digits == 10 and decimals > 0:  # 0.0096 is 0.01
-        decimals, digits = decimals - 1, 1
-    return f"{value:.{decimals}f}({digits})"
+_STAGE1 = {
+    "scale": "scale",
+    "de_stage1": "DE [mm]",
+    "deltam_stage1": "Deltam [mm]",
+    "length_error_stage1": "length error [mm]",
+    "angle_error_stage1": "angle error [arcsec]",
+}
 
 
 def _both(pair: dict[str, Any] | None, factor: float = 1.0) -> str:
@@ -94,10 +61,10 @@ def study(summary: dict[str, Any]) -> None:
     names = [_column(name) for name in factors]
     _identified(console, shown, names)
     fixed = any("de" in cell["figures"] for cell in cells)
-    figures = _OVERVIEW if fixed else _STAGE1
-    table = new_table("\nMeans over converged trials", "cell", *names, *(heading for _, heading, _ in figures))
+    metrics = _OVERVIEW if fixed else _STAGE1
+    table = new_table("\nMeans over converged trials", "cell", *names, *metrics.values())
     for cell in shown:
-        values = (_both(_mean(cell, name), factor) for name, _, factor in figures)
+        values = (_both(cell["figures"].get(name, {}).get("mean"), shown_unit(name)[1]) for name in metrics)
         table.add_row(str(cell["cell"]), *map(_text, cell["factors"].values()), *values)
     print_table(console, table)
     if len(cells) > 1:
@@ -172,30 +139,29 @@ def _identified(console: Console, cells: list[dict[str, Any]], names: list[str])
             )
 
 
-def _mean(cell: dict[str, Any], name: str) -> dict[str, Any] | None:
-    return cell["figures"][name]["mean"] if name in cell["figures"] else None
-
-
 def _distributions(console: Console, cells: list[dict[str, Any]], names: tuple[str, ...]) -> None:
     for name in names:
-        text, factor = _NAMES[name]
-        table = new_table(f"\n{text[0].upper()}{text[1:]}", "cell", "mean", "standard deviation", "5 %", "50 %", "95 %")
+        title = metric_title(name)
+        table = new_table(
+            f"\n{title[0].upper()}{title[1:]}", "cell", "mean", "standard deviation", "5 %", "50 %", "95 %"
+        )
         for cell in cells:
             if name in cell["figures"]:
-                table.add_row(str(cell["cell"]), *_row(cell["figures"][name], factor))
+                table.add_row(str(cell["cell"]), *_row(cell, name))
         if table.row_count:
             print_table(console, table)
 
 
-def _row(figure: dict[str, Any], factor: float) -> list[str]:
-    return [_both(figure.get(key), factor) for key in ("mean", "spread", "p5", "p50", "p95")]
+def _row(cell: dict[str, Any], metric: str) -> list[str]:
+    statistics, (_, factor) = cell["figures"][metric], shown_unit(metric)
+    return [_both(statistics.get(key), factor) for key in ("mean", "spread", "p5", "p50", "p95")]
 
 
 def _full(console: Console, cell: dict[str, Any]) -> None:
     table = new_table("\nMetrics over converged trials", "", "mean", "standard deviation", "5 %", "50 %", "95 %")
-    for name, (text, factor) in _NAMES.items():
+    for name in METRICS:
         if name in cell["figures"]:
-            table.add_row(escape(text), *_row(cell["figures"][name], factor))
+            table.add_row(escape(metric_title(name)), *_row(cell, name))
     print_table(console, table)
     table = new_table(
         "\nParameters: estimate less truth", "parameter", "unit", "bias", "standard deviation", "on a bound [%]",

@@ -12,7 +12,7 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm, is_length, parameter_names, value_of
 from ..kinematics.parameters import Parameters
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
-from .hdf5 import Stored, Table, Variable, names_in, need, read_tables, undamaged, write_tables
+from .hdf5 import Stored, Table, Variable, axes, columns, names_in, need, read_tables, undamaged, write_tables
 
 
 def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None:
@@ -141,26 +141,21 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
 def _parameter_table(record: CalibrationRecord) -> Table:
     names = list(record.names)
     units = ["mm" if is_length(name) else "rad" for name in names]
-    both = "mm or rad, see unit"
-    variables = {
-        "parameter": Variable(("parameter",), names, "", "free parameter"),
-        "parameter_2": Variable(("parameter_2",), names, "", "free parameter, second axis of the covariance"),
-        "unit": Variable(("parameter",), units, "", "unit of the parameter"),
-        "lower": Variable(("parameter",), record.lower, both, "lower bound of the identification"),
-        "upper": Variable(("parameter",), record.upper, both, "upper bound of the identification"),
-        "u": Variable(("parameter",), np.sqrt(np.diag(record.covariance)), both, "standard uncertainty"),
-        "active_stage1": Variable(
-            ("parameter",), record.active_stage1, "1", "-1 on the lower bound, +1 on the upper, in stage 1"
-        ),
-        "active": Variable(("parameter",), record.active, "1", "-1 on the lower bound, +1 on the upper"),
-        "determined": Variable(
-            ("parameter",), record.determined.astype(np.int8), "1", "0: only a combination is determined"
-        ),
-        "open": Variable(
-            ("parameter", "parameter_2"), record.open, "1", "projector onto what is not determined, in mm and mrad"
-        ),
-        "covariance": Variable(("parameter", "parameter_2"), record.covariance, "products of units", "covariance"),
-    }
+    both, square = "mm or rad, see unit", ("parameter", "parameter_2")
+    variables = columns("parameter", parameter=(names, "", "free parameter"))
+    variables |= columns("parameter_2", parameter_2=(names, "", "free parameter, second axis of the covariance"))
+    variables |= columns(
+        "parameter",
+        unit=(units, "", "unit of the parameter"),
+        lower=(record.lower, both, "lower bound of the identification"),
+        upper=(record.upper, both, "upper bound of the identification"),
+        u=(np.sqrt(np.diag(record.covariance)), both, "standard uncertainty"),
+        active_stage1=(record.active_stage1, "1", "-1 on the lower bound, +1 on the upper, in stage 1"),
+        active=(record.active, "1", "-1 on the lower bound, +1 on the upper"),
+        determined=(record.determined.astype(np.int8), "1", "0: only a combination is determined"),
+    )
+    variables["open"] = Variable(square, record.open, "1", "projector onto what is not determined, in mm and mrad")
+    variables["covariance"] = Variable(square, record.covariance, "products of units", "covariance")
     for stage, vector in record.vectors().items():
         variables[stage] = Variable(("parameter",), vector, both, f"value in the {stage} arm")
     return Table(variables)
@@ -171,38 +166,28 @@ def _validation_table(record: CalibrationRecord) -> Table:
     groups = record.validation.groups
     sockets = [(number, name) for number, group in enumerate(groups) for name in group.sockets]
     number = np.concatenate([np.full(len(group.length_error), i) for i, group in enumerate(groups)])
-    variables = {
-        "group": Variable(
-            ("group",), [", ".join(group.sockets) for group in groups], "", "sockets left out together, as a label"
-        ),
-        "left_out_socket": Variable(
-            ("left_out_socket",), [name for _, name in sockets], "", "sockets left out, one after the other"
-        ),
-        "socket_number": Variable(
-            ("left_out_socket",), [i for i, _ in sockets], "1", "which group a socket is of, from 0"
-        ),
-        "poses": Variable(("group",), [group.poses for group in groups], "1", "poses in sockets with more than one"),
-        "rms": Variable(("group",), [group.rms for group in groups], "mm", "RMS distance from the centroid, found"),
-        "rms_predicted": Variable(("group",), [group.rms_predicted for group in groups], "mm", "the same, predicted"),
-        "converged": Variable(("group",), [int(group.converged) for group in groups], "1", "1: the others converged"),
-        "left_out_length": Variable(
-            ("left_out_length",), np.arange(len(number)), "1", "lengths left out, one after the other"
-        ),
-        "number": Variable(("left_out_length",), number, "1", "which group a length is of, from 0"),
-        "length_error": Variable(
-            ("left_out_length",),
-            np.concatenate([group.length_error for group in groups]),
-            "mm",
-            "error of a length left out",
-        ),
-        "length_u": Variable(
-            ("left_out_length",),
-            np.concatenate([group.length_u for group in groups]),
-            "mm",
-            "its standard uncertainty, predicted",
-        ),
-    }
-    return Table(variables)
+    errors, u = (np.concatenate([getattr(group, key) for group in groups]) for key in ("length_error", "length_u"))
+    by_group = columns(
+        "group",
+        group=([", ".join(group.sockets) for group in groups], "", "sockets left out together, as a label"),
+        poses=([group.poses for group in groups], "1", "poses in sockets with more than one"),
+        rms=([group.rms for group in groups], "mm", "RMS distance from the centroid, found"),
+        rms_predicted=([group.rms_predicted for group in groups], "mm", "the same, predicted"),
+        converged=([int(group.converged) for group in groups], "1", "1: the others converged"),
+    )
+    by_socket = columns(
+        "left_out_socket",
+        left_out_socket=([name for _, name in sockets], "", "sockets left out, one after the other"),
+        socket_number=([i for i, _ in sockets], "1", "which group a socket is of, from 0"),
+    )
+    by_length = columns(
+        "left_out_length",
+        left_out_length=(np.arange(len(number)), "1", "lengths left out, one after the other"),
+        number=(number, "1", "which group a length is of, from 0"),
+        length_error=(errors, "mm", "error of a length left out"),
+        length_u=(u, "mm", "its standard uncertainty, predicted"),
+    )
+    return Table(by_group | by_socket | by_length)
 
 
 def _validation_of(stored: Stored) -> CrossValidation | None:
@@ -237,33 +222,31 @@ def _sampled_table(record: CalibrationRecord) -> Table:
         "high": "upper end of the Monte Carlo interval",
         "linear_u": "standard uncertainty by the law of propagation",
     }
-    variables = {
-        "quantity": Variable(("quantity",), [str(x) for x in record.sampled["quantity"]], "", "parameter, k or length")
-    }
-    for name, text in texts.items():
-        variables[name] = Variable(("quantity",), record.sampled[name], "mm or rad; 1 for k", text)
+    quantities = [str(x) for x in record.sampled["quantity"]]
+    values = {name: (record.sampled[name], "mm or rad; 1 for k", text) for name, text in texts.items()}
     agrees = np.asarray(record.sampled["agrees"], dtype=np.int8)
-    variables["agrees"] = Variable(
-        ("quantity",), agrees, "1", "1: the linear interval is within the tolerance of JCGM 101"
+    return Table(
+        columns(
+            "quantity",
+            quantity=(quantities, "", "parameter, k or length"),
+            **values,
+            agrees=(agrees, "1", "1: the linear interval is within the tolerance of JCGM 101"),
+        )
     )
-    return Table(variables)
 
 
 def _socket_table(record: CalibrationRecord) -> Table:
     capture = record.recording.capture
-    variables = {
-        "socket": Variable(("socket",), list(capture.names), "", "socket"),
-        "axis": Variable(("axis",), ["x", "y", "z"], "", "axis of the base frame"),
-        "poses": Variable(("socket",), list(capture.sizes), "1", "number of poses"),
-    }
+    variables = columns("socket", socket=(list(capture.names), "", "socket")) | axes("axis of the base frame")
+    variables |= columns("socket", poses=(list(capture.sizes), "1", "number of poses"))
     for stage, evaluation in record.evaluations().items():
-        figures = evaluation.repeatability
+        metrics = evaluation.repeatability
         for name, values, text in (
-            ("de", figures.socket_de, "mean distance from the centroid"),
-            ("deltam", figures.socket_deltam, "largest half range"),
-            ("rms", figures.socket_rms, "root mean square distance from the centroid"),
+            ("de", metrics.socket_de, "mean distance from the centroid"),
+            ("deltam", metrics.socket_deltam, "largest half range"),
+            ("rms", metrics.socket_rms, "root mean square distance from the centroid"),
         ):
             variables[f"{name}_{stage}"] = Variable(("socket",), np.asarray(values), "mm", f"{text}, {stage} arm")
         if stage == "calibrated":
-            variables["centroid"] = Variable(("socket", "axis"), np.asarray(figures.centroids), "mm", "socket position")
+            variables["centroid"] = Variable(("socket", "axis"), np.asarray(metrics.centroids), "mm", "socket position")
     return Table(variables)

@@ -12,7 +12,19 @@ from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import ArmSpecification, single
-from .hdf5 import Stored, Table, Variable, names_in, need, read_tables, undamaged, write_tables
+from .hdf5 import (
+    Stored,
+    Table,
+    Variable,
+    axes,
+    columns,
+    names_in,
+    need,
+    numbering,
+    read_tables,
+    undamaged,
+    write_tables,
+)
 
 _KINDS = {
     "alpha": "link twist",
@@ -64,12 +76,10 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     owner = [capture.names[i] for i in capture.owner]
     tables = {
         "capture": Table(
-            {
-                "pose": Variable(("pose",), np.arange(1, len(owner) + 1), "1", "pose number"),
-                "joint": Variable(("joint",), np.arange(1, capture.joints + 1), "1", "joint number"),
-                "angle": Variable(("pose", "joint"), np.asarray(capture.q), "rad", "joint angle as read"),
-                "socket": Variable(("pose",), owner, "", "socket that held the tip"),
-            }
+            numbering("pose", len(owner))
+            | numbering("joint", capture.joints)
+            | {"angle": Variable(("pose", "joint"), np.asarray(capture.q), "rad", "joint angle as read")}
+            | columns("pose", socket=(owner, "", "socket that held the tip"))
         ),
         "reference": reference_table(capture.lengths),
         "nominal_arm": arm_table(recording.nominal),
@@ -83,14 +93,14 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
 
 def reference_table(lengths: Sequence[ReferenceLength]) -> Table:
     """Reference lengths, one row each."""
-    columns = {
-        "length": (np.arange(1, len(lengths) + 1), "1", "reference length number"),
-        "start": ([length.start for length in lengths], "", "socket at one end"),
-        "end": ([length.end for length in lengths], "", "socket at the other end"),
-        "value": ([float(length.value) for length in lengths], "mm", "calibrated length"),
-        "u": ([float(length.u) for length in lengths], "mm", "standard uncertainty"),
-    }
-    return Table({name: Variable(("length",), *column) for name, column in columns.items()})
+    rows = columns(
+        "length",
+        start=([length.start for length in lengths], "", "socket at one end"),
+        end=([length.end for length in lengths], "", "socket at the other end"),
+        value=([float(length.value) for length in lengths], "mm", "calibrated length"),
+        u=([float(length.u) for length in lengths], "mm", "standard uncertainty"),
+    )
+    return Table(numbering("length", len(lengths), "reference length number") | rows)
 
 
 def lengths_of(path: str | os.PathLike, stored: Stored) -> list[ReferenceLength]:
@@ -106,25 +116,24 @@ def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False) -> Ta
     rows = [
         (sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group
     ]
-    each = {
-        "sphere": ([sphere.name for sphere, *_ in rows], "", "reference sphere"),
-        "test": ([sphere.test for sphere, *_ in rows], "", "acceptance test that the sphere was touched for"),
-        "group": ([number for _, number, _ in rows], "1", "repeat, or orientation of the wrist"),
-        "diameter": ([sphere.diameter for sphere, *_ in rows], "mm", "calibrated diameter"),
-        "u": ([sphere.u for sphere, *_ in rows], "mm", "standard uncertainty of the diameter"),
-        "stylus": ([sphere.stylus for sphere, *_ in rows], "mm", "diameter of the probe's ball"),
-        "form": ([sphere.form for sphere, *_ in rows], "mm", "calibrated form error"),
-    }
-    variables = {name: Variable(("touch",), *column) for name, column in each.items()}
-    variables["touch"] = Variable(("touch",), np.arange(1, len(rows) + 1), "1", "touch number")
+    variables = columns(
+        "touch",
+        sphere=([sphere.name for sphere, *_ in rows], "", "reference sphere"),
+        test=([sphere.test for sphere, *_ in rows], "", "acceptance test that the sphere was touched for"),
+        group=([number for _, number, _ in rows], "1", "repeat, or orientation of the wrist"),
+        diameter=([sphere.diameter for sphere, *_ in rows], "mm", "calibrated diameter"),
+        u=([sphere.u for sphere, *_ in rows], "mm", "standard uncertainty of the diameter"),
+        stylus=([sphere.stylus for sphere, *_ in rows], "mm", "diameter of the probe's ball"),
+        form=([sphere.form for sphere, *_ in rows], "mm", "calibrated form error"),
+    )
+    variables |= numbering("touch", len(rows))
     values = np.array([touched for *_, touched in rows])
     if points:
-        variables["axis"] = Variable(("axis",), ["x", "y", "z"], "", "axis")
-        variables["position"] = Variable(("touch", "axis"), values, "mm", "centre of the probe")
-    else:
-        variables["joint"] = Variable(("joint",), np.arange(1, values.shape[1] + 1), "1", "joint number")
-        variables["angle"] = Variable(("touch", "joint"), values, "rad", "joint angle as read")
-    return Table(variables)
+        return Table(
+            variables | axes() | {"position": Variable(("touch", "axis"), values, "mm", "centre of the probe")}
+        )
+    angle = Variable(("touch", "joint"), values, "rad", "joint angle as read")
+    return Table(variables | numbering("joint", values.shape[1]) | {"angle": angle})
 
 
 def spheres_of(path: str | os.PathLike, stored: Stored, entry: str = "angle") -> tuple[ProbedSphere, ...]:
@@ -169,11 +178,8 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
 def arm_table(specification: ArmSpecification) -> Table:
     """An arm as a table over ``joint``, with its proposed identification in attributes."""
     arm = single(specification.arm)
-    variables = {
-        "joint": Variable(("joint",), np.arange(1, arm.joints + 1), "1", "joint number"),
-        "axis": Variable(("axis",), ["x", "y", "z"], "", "axis of the last frame"),
-        "probe": Variable(("axis",), np.asarray(arm.probe), "mm", "tip in the last frame"),
-    }
+    variables = numbering("joint", arm.joints) | axes("axis of the last frame")
+    variables |= columns("axis", probe=(np.asarray(arm.probe), "mm", "tip in the last frame"))
     for kind, long_name in _KINDS.items():
         values = getattr(arm, kind)
         if values is not None:

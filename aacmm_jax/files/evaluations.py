@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..acceptance.all_tests import checked_limits
 from ..acceptance.decision import Limit
-from ..acceptance.metrics import METRICS, Measured
 from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord
-from ..acceptance.suite import checked_limits
+from ..acceptance.results import METRICS, Measured
 from ..kinematics.workspace import Reach
 from .captures import (
     arm_table,
@@ -22,7 +22,7 @@ from .captures import (
     sphere_table,
     spheres_of,
 )
-from .hdf5 import Stored, Table, Variable, need, read_tables, undamaged, write_tables
+from .hdf5 import Stored, Table, Variable, axes, columns, need, numbering, read_tables, undamaged, write_tables
 
 
 def save_evaluation(path: str | os.PathLike, record: EvaluationRecord) -> None:
@@ -37,11 +37,9 @@ def save_evaluation(path: str | os.PathLike, record: EvaluationRecord) -> None:
     """
     tables = recording_tables(record.recording)
     tables["calibrated_arm"] = arm_table(record.calibrated)
-    tables["used"] = Table(
-        {"used": Variable(("used",), sorted(record.used), "", "socket that the arm was identified from")}
-    )
+    tables["used"] = Table(columns("used", used=(sorted(record.used), "", "socket that the arm was identified from")))
     tables["limits"] = _limit_table(record.limits)
-    tables["figures"] = _figure_table(record)
+    tables["figures"] = _metric_table(record)
     attributes = recording_attributes(record.recording) | {
         "warnings": list(record.warnings) or None,
         "u_test_mm": record.u_test,
@@ -53,12 +51,13 @@ def save_evaluation(path: str | os.PathLike, record: EvaluationRecord) -> None:
 def _limit_table(limits: Mapping[str, Limit | float]) -> Table:
     """Limits by the name of a result."""
     checked = checked_limits(limits)
-    columns = {
-        "figure": (list(checked), "", "figure of an acceptance test"),
-        "fixed": ([limit.fixed for limit in checked.values()], "mm", "MPE at length 0"),
-        "divisor": ([limit.divisor for limit in checked.values()], "1", "MPE grows by the length over this"),
-    }
-    return Table({name: Variable(("figure",), *column) for name, column in columns.items()})
+    rows = columns(
+        "figure",
+        figure=(list(checked), "", "metric of an acceptance test"),
+        fixed=([limit.fixed for limit in checked.values()], "mm", "MPE at length 0"),
+        divisor=([limit.divisor for limit in checked.values()], "1", "MPE grows by the length over this"),
+    )
+    return Table(rows)
 
 
 def _limits_in(stored: Stored) -> dict[str, Limit]:
@@ -71,26 +70,26 @@ def _limits_in(stored: Stored) -> dict[str, Limit]:
     return found
 
 
-def _figure_table(record: EvaluationRecord) -> Table:
+def _metric_table(record: EvaluationRecord) -> Table:
     """The results, for other programs; this package computes them again on reading."""
     rows = [
-        (stage, test, figure)
+        (stage, test.standard, metric, metric.worst)
         for stage, tests in record.acceptance().items()
         for test in tests
-        for figure in test.metrics
+        for metric in test.metrics
     ]
-    columns = {
-        "arm": ([stage for stage, *_ in rows], "", "arm that measured"),
-        "standard": ([test.standard for _, test, _ in rows], "", "standard of the test"),
-        "name": ([figure.name for *_, figure in rows], "", "figure"),
-        "value": ([figure.value for *_, figure in rows], "mm", "value of the worst part"),
-        "expanded": ([figure.worst.expanded for *_, figure in rows], "mm", "expanded uncertainty, coverage factor 2"),
-        "limit": ([math.nan if figure.worst.limit is None else figure.worst.limit for *_, figure in rows], "mm", "MPE"),
-        "decision": ([figure.decision or "" for *_, figure in rows], "", "decision by ISO 14253-1"),
-        "where": ([figure.worst.where for *_, figure in rows], "", "what gave the worst part"),
-    }
-    row = {"row": Variable(("row",), np.arange(1, len(rows) + 1), "1", "row number")}
-    return Table(row | {name: Variable(("row",), *column) for name, column in columns.items()})
+    results = columns(
+        "row",
+        arm=([stage for stage, *_ in rows], "", "arm that measured"),
+        standard=([standard for _, standard, *_ in rows], "", "standard of the test"),
+        name=([metric.name for *_, metric, _ in rows], "", "metric"),
+        value=([metric.value for *_, metric, _ in rows], "mm", "value of the worst part"),
+        expanded=([worst.expanded for *_, worst in rows], "mm", "expanded uncertainty, coverage factor 2"),
+        limit=([math.nan if worst.limit is None else worst.limit for *_, worst in rows], "mm", "MPE"),
+        decision=([metric.decision or "" for *_, metric, _ in rows], "", "decision by ISO 14253-1"),
+        where=([worst.where for *_, worst in rows], "", "what gave the worst part"),
+    )
+    return Table(numbering("row", len(rows)) | results)
 
 
 def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
@@ -140,12 +139,10 @@ def save_points(path: str | os.PathLike, record: PointsRecord) -> None:
     position = np.concatenate([np.zeros((0, 3)), *measured.sockets.values()])
     tables = {
         "points": Table(
-            {
-                "point": Variable(("point",), np.arange(1, len(owner) + 1), "1", "point number"),
-                "axis": Variable(("axis",), ["x", "y", "z"], "", "axis"),
-                "position": Variable(("point", "axis"), position, "mm", "centre of the probe"),
-                "socket": Variable(("point",), owner, "", "socket that held it"),
-            }
+            numbering("point", len(owner))
+            | axes()
+            | {"position": Variable(("point", "axis"), position, "mm", "centre of the probe")}
+            | columns("point", socket=(owner, "", "socket that held it"))
         ),
         "reference": reference_table(measured.lengths),
         "limits": _limit_table(record.limits),

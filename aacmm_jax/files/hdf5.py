@@ -37,6 +37,21 @@ class Table(NamedTuple):
     attributes: Mapping[str, Any] = MappingProxyType({})
 
 
+def columns(dimension: str, **by_name: tuple[np.ndarray | Sequence, str, str]) -> dict[str, Variable]:
+    """Variables over one dimension: values, unit and long name of each."""
+    return {name: Variable((dimension,), *column) for name, column in by_name.items()}
+
+
+def numbering(dimension: str, size: int, long_name: str | None = None) -> dict[str, Variable]:
+    """The coordinate of a dimension that is numbered from 1."""
+    return columns(dimension, **{dimension: (np.arange(1, size + 1), "1", long_name or f"{dimension} number")})
+
+
+def axes(long_name: str = "axis") -> dict[str, Variable]:
+    """The coordinate of the dimension of x, y and z."""
+    return columns("axis", axis=(["x", "y", "z"], "", long_name))
+
+
 def write_tables(
     path: str | os.PathLike,
     kind: str,

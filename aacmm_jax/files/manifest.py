@@ -123,10 +123,10 @@ class PointsManifest(_Recorded):
 def read_manifest(path: str | os.PathLike) -> Recording:
     """Read a manifest and every file it names; paths are relative to the manifest.
 
-    A field in braces stands for part of a path and makes one socket for each value found: with
+    A field in braces matches part of a path and makes one socket for each value found: with
     ``file = "run_1/{place}/hole_{hole}.csv"`` and ``name = "{place}/{hole}"``, the length ``from = "{place}/0"``,
     ``to = "{place}/1"`` is measured at every place. A field that makes up a whole folder or file name, such as
-    ``{place}``, matches anything but "/"; beside other text in a name, as ``{hole}``, it matches letters, digits and
+    ``{place}``, matches anything but "/"; next to other text in a name, as ``{hole}``, it matches letters, digits and
     "-" only, so that ``hole_0_pose.csv`` is left alone. ``exclude = ["*_old.csv"]`` in ``[[socket]]`` leaves out the
     files that match such a shell pattern. Angles: reading -> sign * (reading - offset), in the stated unit.
 
@@ -239,7 +239,7 @@ def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dic
 def _lengths(
     entries: list[_Length], fields: list[dict[str, str]], sockets: Mapping[str, np.ndarray]
 ) -> list[ReferenceLength]:
-    """Reference lengths; one with fields in braces stands for every combination that the sockets' files have."""
+    """Reference lengths; one with fields in braces gives every combination that the sockets' files have."""
     lengths = []
     for entry in entries:
         names = fields_of(entry.start + entry.end)

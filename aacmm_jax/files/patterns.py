@@ -1,4 +1,4 @@
-"""Fields in braces: one entry of a manifest stands for every file that its pattern matches."""
+"""Fields in braces: one entry of a manifest names every file that its pattern matches."""
 
 import difflib
 import fnmatch
@@ -55,7 +55,7 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
         near = [path.removeprefix(before) for path in kept if loose.fullmatch(path)]
         if near:
             raise InputError(
-                f"{where}, but nearly {_some(near)}: beside other text in a name, a field is letters, digits and "
+                f"{where}, but nearly {_some(near)}: next to other text in a name, a field is letters, digits and "
                 "'-' only; write more of the name out."
             )
         if left_out:
@@ -66,7 +66,7 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
 
 
 def _expression(pattern: str, partial: str) -> str:
-    """Regular expression of a path with fields; ``partial`` is what a field may be beside other text in a name.
+    """Regular expression of a path with fields; ``partial`` is what a field may be next to other text in a name.
 
     A field that is repeated must match the same text each time.
     """

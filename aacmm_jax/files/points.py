@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..acceptance.metrics import Measured
+from ..acceptance.results import Measured
 from ..core.errors import InputError, nearest
 from ..core.units import INCH, UM, M
 from ..kinematics.workspace import Reach

@@ -13,7 +13,7 @@ ELSEWHERE = "choose another output path"
 
 @contextlib.contextmanager
 def whole_file(path: str | os.PathLike, advice: str = ELSEWHERE) -> Iterator[Path]:
-    """Write a file whole or not at all: yields a temporary path beside the target, renamed onto it at the end.
+    """Write a file whole or not at all: yields a temporary path in the same folder, renamed onto it at the end.
 
     Whatever goes wrong (Ctrl-C included), the temporary file is removed and an existing target stays as it was.
     Raises `InputError` where the path cannot be written.
@@ -56,14 +56,14 @@ def check_readable(path: Path) -> None:
         raise InputError(f"{str(path)!r} cannot be read: {reason.lower()}; name another file.") from error
 
 
-def fingerprint(path: str | os.PathLike, beside: str | os.PathLike | None = None) -> str:
-    """A file's name and SHA-256, which identify it; the name is relative to ``beside`` where the file is below it."""
+def fingerprint(path: str | os.PathLike, folder: str | os.PathLike | None = None) -> str:
+    """A file's name and SHA-256, which identify it; the name is relative to ``folder`` where the file is below it."""
     import hashlib
 
     path = Path(path)
     check_readable(path)
-    below = beside is not None and path.is_relative_to(beside)
-    name = path.relative_to(beside).as_posix() if below and beside is not None else path.name
+    below = folder is not None and path.is_relative_to(folder)
+    name = path.relative_to(folder).as_posix() if below and folder is not None else path.name
     return storable_name(f"{name} (SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()})")
 
 

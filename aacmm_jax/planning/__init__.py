@@ -1,4 +1,4 @@
-"""Planning of calibrations: where sockets and reference lengths stand, and which poses to take."""
+"""Planning of calibrations: positions of sockets and reference lengths, and the poses to take."""
 
 import lazy_loader as _lazy_loader
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from ..acceptance.metrics import AcceptanceTest
+from ..acceptance.results import AcceptanceTest
 from ..core.errors import InputError
 from .style import DARK, axes_or_new, label_axes
 

@@ -7,13 +7,11 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..core.units import ARCSEC
 from ..study.results import Results
 from ..study.specification import unit
-from ..study.statistics import METRICS, correlation
+from ..study.statistics import METRICS, correlation, metric_title, shown_unit
 from .style import ACCENT, DARK, axes_or_new, label_axes, save_figure
 
-_UNITS = {"de": "mm", "deltam": "mm", "length_error": "mm", "angle_error": "arcsec"}
 _WIDTHS = ("bounds.length_mm", "bounds.angle_deg")
 _SHIFTS = ("bounds.length_shift_mm", "bounds.angle_shift_deg")
 _AXES = {
@@ -54,8 +52,7 @@ def study_metric(results: Results, metric: str = "length_error", axes: Any = Non
             bars = [[middle - low], [high - middle]]
             axes.errorbar(cell + 1, middle, yerr=bars, fmt="s", color=DARK, capsize=4)
     axes.set_xticks([cell + 1 for cell in cells] if len(cells) <= 30 else axes.get_xticks())
-    measure = _UNITS.get(metric.removesuffix("_stage1"))
-    label_axes(axes, "cell", METRICS[metric] + (f" [{measure}]" if measure else ""))
+    label_axes(axes, "cell", metric_title(metric))
     return axes
 
 
@@ -264,9 +261,8 @@ def _available(results: Results, metric: str) -> str | None:
 
 def _values(results: Results, metric: str, cells: Sequence[int]) -> np.ndarray:
     """A metric of the converged trials of some cells; angles in arcseconds."""
-    factor = 1 / ARCSEC if metric.startswith("angle") else 1.0
     rows = [results.column(metric, cell)[results.column("converged", cell) == 1] for cell in cells]
-    values = factor * np.concatenate(rows)
+    values = shown_unit(metric)[1] * np.concatenate(rows)
     return values[np.isfinite(values)]
 
 
@@ -331,14 +327,13 @@ def _axis(factor: str) -> str:
 
 
 def _title(metric: str) -> str:
-    measure = _UNITS.get(metric.removesuffix("_stage1"), "1")
-    return f"{METRICS[metric].removesuffix(' after the scale fix')} [{measure}]"
+    return f"{METRICS[metric].removesuffix(' after the scale fix')} [{shown_unit(metric)[0] or '1'}]"
 
 
 def _spans_decades(values: list[np.ndarray]) -> bool:
     """Whether medians differ more than tenfold."""
     medians = [np.median(v) for v in values if len(v)]
-    return bool(medians) and max(medians) > 10 * min(medians)
+    return bool(medians and max(medians) > 10 * min(medians))
 
 
 def _finish(panel: Any, x: str, y: str, title: str = "") -> None:

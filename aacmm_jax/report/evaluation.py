@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from ..acceptance.decision import worst
-from ..acceptance.metrics import METRICS, AcceptanceTest, Metric
 from ..acceptance.record import EvaluationRecord, PointsRecord
+from ..acceptance.results import METRICS, AcceptanceTest, Metric
 from ..acceptance.standards import EDITIONS
 from ..calibration.evaluation import Evaluation, evaluate
 from ..data.capture import ReferenceLength

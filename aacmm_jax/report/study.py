@@ -6,22 +6,13 @@ import numpy as np
 
 from ..core.units import ARCSEC
 from ..study.results import Results
-from ..study.statistics import METRICS, study_summary
+from ..study.statistics import METRICS, shown_unit, study_summary
 from . import charts
 from .elements import Cell, Chart, Report, ReportTable, Section, format_number, number_cell, text_cell
 
-# Metrics shown: name, factor and unit.
 _SHOWN = (
-    ("length_error", 1.0, "mm"),
-    ("angle_error", 1 / ARCSEC, "arcsec"),
-    ("de", 1.0, "mm"),
-    ("deltam", 1.0, "mm"),
-    ("scale_error", 1e6, "parts in a million"),
-    ("length_error_stage1", 1.0, "mm"),
-    ("angle_error_stage1", 1 / ARCSEC, "arcsec"),
-    ("de_stage1", 1.0, "mm"),
-    ("deltam_stage1", 1.0, "mm"),
-    ("k", 1.0, ""),
+    *("length_error", "angle_error", "de", "deltam", "scale_error"),
+    *("length_error_stage1", "angle_error_stage1", "de_stage1", "deltam_stage1", "k"),
 )
 _MOST_CELLS, _MOST_ROWS, _MOST_WARNINGS = 400, 4000, 12
 
@@ -35,7 +26,7 @@ def study_report(results: Results) -> tuple[Report, dict[str, Any]]:
         sum(cell["trials_run"] * (cell["converged"]["value"] or 0.0) for cell in cells),
     )
     fraction = converged / ran if ran else 0.0
-    present = [entry for entry in _SHOWN if any(entry[0] in cell["figures"] for cell in cells)]
+    present = [name for name in _SHOWN if any(name in cell["figures"] for cell in cells)]
     factors = (f"{name}: {', '.join(map(_level, levels))}" for name, levels in summary["factors"].items())
     mark = "good" if summary["finished"] and fraction > 0.999 and not warnings else "unsure"
     report = Report(
@@ -49,7 +40,7 @@ def study_report(results: Results) -> tuple[Report, dict[str, Any]]:
         facts=[("Factors", "; ".join(factors) or "none varied"), ("Seed", str(summary["seed"]))],
         sections=[
             Section("cells", "Cells", [_cell_table(summary)]),
-            *(_metric_section(summary, *entry) for entry in present),
+            *(_metric_section(summary, name) for name in present),
             *_parameter_sections(summary),
         ],
     )
@@ -121,8 +112,9 @@ def _cell_table(summary: dict[str, Any]) -> ReportTable:
     return ReportTable("Trials by cell", columns, rows)
 
 
-def _metric_section(summary: dict[str, Any], name: str, factor: float, unit: str) -> Section:
+def _metric_section(summary: dict[str, Any], name: str) -> Section:
     """One metric in every cell: median and 5th to 95th percentile, with a table of its statistics."""
+    unit, factor = ("parts in a million", 1e6) if name == "scale_error" else shown_unit(name)
     labels = _labels(summary)[:_MOST_CELLS]
     cells = [(label, cell["figures"].get(name)) for label, cell in zip(labels, summary["results"], strict=False)]
     keys = ("mean", "spread", "p5", "p50", "p95")

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from ..core.errors import InputError
 from ..files.hdf5 import undamaged
 from . import store
+from .blocks import VARIABLES, Layout, fill_of
 from .definition import POOL_PARTS, Study
-from .layout import VARIABLES, Layout, fill_of
 
 if TYPE_CHECKING:
     import xarray
@@ -81,7 +81,7 @@ def _allow_files(count: int, path: Path) -> None:
 
 
 class Results(NamedTuple):
-    """A study's file for reading."""
+    """Results of a study, read cell by cell from its file; ``Results.of(path)`` opens it, also while the study runs."""
 
     path: Path
     stored: store.StoredStudy
@@ -98,7 +98,17 @@ class Results(NamedTuple):
 
     @classmethod
     def of(cls, path: str | os.PathLike) -> "Results":
-        """Raises `InputError` where the file is missing, damaged or no study, or its folder of blocks is missing."""
+        """Open a study.
+
+        Args:
+            path: File of the study (HDF5).
+
+        Returns:
+            Its results, for `cell_summary`, `study_summary` and the figures of `aacmm_jax.plot`.
+
+        Raises:
+            InputError: Where the file is missing, damaged or no study, or its folder of blocks is missing.
+        """
         path = Path(path).resolve()
         stored = store.read(path)
         store.check_parts(path, stored)

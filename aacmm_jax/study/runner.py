@@ -16,9 +16,9 @@ from filelock import FileLock, Timeout
 
 from ..core.errors import InputError
 from . import store
+from .blocks import Block, Layout, parts_of
+from .configuration_pool import check_reach
 from .definition import Study
-from .layout import Block, Layout, parts_of
-from .pools import check_reach
 from .trials import run_block
 
 _CHUNK_CPU, _CHUNK_ELSEWHERE = 1000, 65_536

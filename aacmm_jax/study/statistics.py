@@ -5,12 +5,14 @@ Standard errors come from the scatter between groups, so they contain the whole 
 pools included, and need no formula for the statistic: one group at a time is left out (delete-a-group jackknife).
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..core.units import ARCSEC
 from ..solver.reason import Reason, numbers_of
 from .results import Results
 from .specification import label
@@ -31,8 +33,29 @@ METRICS = {
 PERCENTILES = (5, 50, 95)
 
 
+def shown_unit(metric: str) -> tuple[str, float]:
+    """The unit in which people read a metric, and the factor to it from mm and rad."""
+    if metric.startswith("angle"):
+        return "arcsec", 1 / ARCSEC
+    return ("" if metric in ("k", "scale", "scale_error") else "mm"), 1.0
+
+
+def metric_title(metric: str) -> str:
+    """What a metric is, with the unit in which people read it."""
+    unit, _ = shown_unit(metric)
+    return METRICS[metric] + (f" [{unit}]" if unit else "")
+
+
 def study_summary(results: Results, only: int | None = None) -> dict[str, Any]:
-    """A study, cell by cell (or one cell, counted from 1), units in the keys; what ``aacmm show --json`` prints."""
+    """Summarise a study as ``aacmm show --json`` prints it.
+
+    Args:
+        results: The study.
+        only: Only this cell, counted from 1; all if None.
+
+    Returns:
+        The study's name, arm, seed, size and factors, and under "results" the `cell_summary` of each cell.
+    """
     study = results.study
     cells = [cell_summary(results, cell) for cell in range(len(study.cells)) if only is None or cell == only - 1]
     return {
@@ -50,7 +73,17 @@ def study_summary(results: Results, only: int | None = None) -> dict[str, Any]:
 
 
 def cell_summary(results: Results, cell: int) -> dict[str, Any]:
-    """Statistics of one cell (counted from 0)."""
+    """Statistics of the trials of one cell, each a dictionary of its ``value`` and Monte Carlo standard error ``se``.
+
+    Args:
+        results: The study.
+        cell: The cell, counted from 0.
+
+    Returns:
+        Fractions of trials that converged, had the truth within their bounds, or ended on a bound; under "figures"
+        mean, standard deviation ("spread") and percentiles of each metric of `METRICS` over the converged trials, mm
+        and rad; under "parameters" the bias and standard deviation of each parameter.
+    """
     columns = results.columns(cell)
     ran = columns["converged"] >= 0
     columns = {name: values[ran] for name, values in columns.items()}
@@ -170,3 +203,30 @@ def correlation(results: Results, cell: int) -> Float[np.ndarray, "p p"]:
     deviation = np.sqrt(np.maximum(np.diag(covariance), 0))
     scale = np.outer(deviation, deviation)
     return np.divide(covariance, scale, out=np.zeros_like(scale), where=scale > 0)
+
+
+def concise(value: float | None, se: float | None) -> str:
+    """Write a number with the standard error of its last digits in parentheses, as in 0.01068(3) (JCGM 100, 7.2.2).
+
+    Args:
+        value: The number; "-" is written for None and NaN.
+        se: Its standard error; without one four digits are written.
+
+    Returns:
+        The text.
+    """
+    if value is None or math.isnan(value):
+        return "-"
+    if not se:
+        return f"{value:.4g}"
+    if not math.isfinite(se):
+        return f"{value:.4g}(?)"
+    magnitude = math.floor(math.log10(abs(value))) if value else 0
+    if magnitude < -4 and se < 1:
+        mantissa = concise(value / 10.0**magnitude, se / 10.0**magnitude)
+        return f"{mantissa}e{magnitude:+03d}"
+    decimals = max(-math.floor(math.log10(se)), 0)
+    digits = round(se * 10**decimals)
+    if digits == 10 and decimals > 0:  # 0.0096 is 0.01
+        decimals, digits = decimals - 1, 1
+    return f"{value:.{decimals}f}({digits})"

@@ -22,11 +22,11 @@ from ..core._compat import named_members
 from ..core.errors import InputError
 from ..data.recording import Recording
 from ..files.captures import arm_table, recording_of, recording_tables, specification_of
-from ..files.hdf5 import Table, Variable, need, read_tables, undamaged, write_tables
+from ..files.hdf5 import Table, Variable, columns, need, numbering, read_tables, undamaged, write_tables
 from ..files.whole_file import ELSEWHERE, whole_file
 from ..kinematics.arm import is_length
+from .blocks import VARIABLES, Block, Layout, fill_of, part_of, parts_of
 from .definition import Study
-from .layout import VARIABLES, Block, Layout, fill_of, part_of, parts_of
 from .specification import Specification, unit
 
 _ADVICE = "free some space there, then run the same command again: what is finished is kept"
@@ -182,31 +182,28 @@ def _write(
 
 
 def _tables(study: Study) -> dict[str, Table]:
-    def number(name: str, size: int, text: str) -> Variable:
-        return Variable((name,), np.arange(1, size + 1), "1", text)
-
     names = list(study.space.names)
     units = ["mm" if is_length(name) else "rad" for name in names]
     nominal = np.asarray(study.space.vector())
     text = study.specification.model_dump_json(exclude_unset=True)
+    parameter = columns("parameter", parameter=(names, "", "free parameter"))
     tables = {
         "specification": Table(
-            {"line": number("line", 1, "line"), "text": Variable(("line",), [text], "", "specification as JSON")}
+            numbering("line", 1, "line") | columns("line", text=([text], "", "specification as JSON"))
         ),
-        "cells": Table({"cell": number("cell", len(study.cells), "cell of the grid")} | factor_columns(study)),
+        "cells": Table(numbering("cell", len(study.cells), "cell of the grid") | factor_columns(study)),
         "parameters": Table(
-            {
-                "parameter": Variable(("parameter",), names, "", "free parameter"),
-                "unit": Variable(("parameter",), units, "", "unit of the parameter"),
-                "nominal": Variable(("parameter",), nominal, "mm or rad", "value in the nominal arm"),
-            }
+            parameter
+            | columns(
+                "parameter",
+                unit=(units, "", "unit of the parameter"),
+                nominal=(nominal, "mm or rad", "value in the nominal arm"),
+            )
         ),
         "trials": Table(
-            {
-                "cell": number("cell", len(study.cells), "cell of the grid, see group cells"),
-                "trial": number("trial", study.trials, "trial in the cell"),
-                "parameter": Variable(("parameter",), names, "", "free parameter"),
-            }
+            numbering("cell", len(study.cells), "cell of the grid, see group cells")
+            | numbering("trial", study.trials, "trial in the cell")
+            | parameter
         ),
     }
     if study.recording is not None:
@@ -218,12 +215,12 @@ def factor_columns(study: Study) -> dict[str, Variable]:
     """One column for each factor: its level in every cell."""
     sizes = [len(levels) for levels in study.factors.values()]
     index = np.indices(sizes).reshape(len(sizes), -1) if sizes else np.zeros((0, 1), dtype=int)
-    columns = {}
+    found = {}
     for (name, levels), chosen in zip(study.factors.items(), index, strict=True):
         text = isinstance(levels[0], str)
         values = [levels[i] for i in chosen]
-        columns[name.replace(".", "_")] = Variable(("cell",), values, "" if text else unit(name), name)
-    return columns
+        found[name.replace(".", "_")] = Variable(("cell",), values, "" if text else unit(name), name)
+    return found
 
 
 class StoredStudy(NamedTuple):

@@ -10,13 +10,13 @@ import numpy as np
 from ..calibration.batch import calibrate_many, identify_many
 from ..data.capture import Capture, ReferenceLength
 from ..solver.reason import numbers_of
+from .blocks import Block
 from .definition import Setting, Study
-from .drawing import Drawn, draw, ends_of
-from .layout import Block
+from .trial_simulation import Drawn, draw, ends_of
 
 
 def run_block(study: Study, block: Block, *, device: Any = None, workers: int | None = None) -> dict[str, np.ndarray]:
-    """Results of a block: name -> array ``(cells, trials, ...)``; `VARIABLES` in `layout` says what each is.
+    """Results of a block: name -> array ``(cells, trials, ...)``; `VARIABLES` in `blocks` says what each is.
 
     They depend on the study and on which trials they are, and on nothing else: not on the block, the machine's load or
     the order; on the kind of processor to rounding.

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.metrics import METRICS, AcceptanceTest, Metric, MetricValue
 from ..acceptance.record import EvaluationRecord, PointsRecord, unstated_uncertainty_warning
+from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from ..calibration.evaluation import Evaluation, evaluate
 from ..data.capture import Capture
 from .calibration import length_metrics, metrics, metrics_by_socket_and_length

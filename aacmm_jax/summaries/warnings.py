@@ -21,6 +21,16 @@ _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a r
 _LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 through errors outside the D-H model
 _POSE_OUTLIER = 8.0  # in median distances
 _EXCESS = 1.5  # ratio of errors to their prediction that is reported
+_NAMED = 5  # items of a list that are named
+# By k, which is a length measured by the nominal arm over its reference value: one in m, read as mm, makes k = 1000.
+_MISTAKEN_UNITS = {
+    M: "are the reference lengths in m by mistake?",
+    10.0: "are the reference lengths in cm by mistake?",
+    INCH: "are the reference lengths in inches by mistake?",
+    1 / M: "is the arm in m, or are the reference lengths in um by mistake?",
+    1 / 10.0: "is the arm in cm by mistake?",
+    1 / INCH: "is the arm in inches by mistake?",
+}
 
 
 def of_capture(recording: Recording) -> list[str]:
@@ -98,8 +108,8 @@ def _scale(record: CalibrationRecord) -> list[str]:
     k = record.k
     stage1 = _sides(record)
     if not plausible(k):
-        unit = next((u for u, factor in (("m", M), ("cm", 10), ("inch", 1 / INCH)) if abs(k / factor - 1) < 0.1), None)
-        hint = f"are the lengths in {unit} by mistake?" if unit else "check units, sockets, lengths and arm."
+        mistakes = (question for ratio, question in _MISTAKEN_UNITS.items() if abs(k / ratio - 1) < 0.1)
+        hint = next(mistakes, "check units, sockets, lengths and arm.")
         return [f"k = {k:.6g} cannot be the scale of this arm; {hint}"]
     fixed = record.scale_set_by
     if fixed and record.method == "two-stage":

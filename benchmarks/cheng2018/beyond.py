@@ -17,7 +17,7 @@ WIDTHS = (1.0, 2.0, 5.0, 10.0, 20.0)  # mm
 SOCKETS, POSES, LENGTHS = (1, 2, 4), (16, 32, 70, 140), (1, 2, 4)
 BARS = (50.0, 100.0, twin.REFERENCE, 400.0)  # mm
 # Where a reference length lies: distance of its middle from the second joint, and its direction.
-PLACES = {
+POSITIONS = {
     "near, radial": (450.0, 0),
     "near, tangential": (450.0, 1),
     "far, radial": (850.0, 0),
@@ -27,7 +27,7 @@ NOISE = twin.Noise(2.0, 0.005, 0.0)
 
 
 def noise_and_box() -> list[dict[str, float]]:
-    """k by noise and by the half-width of the box, with every length free as in the paper and with one held."""
+    """k by noise and by the half-width of the box, with every length free as in the paper and with a scale anchor."""
     made, truth = twin.pool(), np.asarray(aj.Parameters(twin.true_arm(), NAMES).vector())
     lower, upper = box("experiment")
     space = aj.Parameters(twin.true_arm(), NAMES)
@@ -39,7 +39,7 @@ def noise_and_box() -> list[dict[str, float]]:
             half = np.where(is_length(), width, (upper - lower) / 2)
             line = {"encoder_arcsec": noise, "half_width_mm": width}
             anywhere = random_starts(truth - half, truth + half, TRIALS, 22)
-            # A length that is held keeps its starting value, which is the true one.
+            # The scale anchor keeps its starting value, which is the true one.
             for name, hold, start in (("free", None, anywhere), ("held", "d_3", truth)):
                 many = aj.identify_many(
                     twin.true_arm(), captures, truth - half, truth + half, start, space=space, hold=hold
@@ -104,7 +104,7 @@ def references() -> list[dict[str, float | str]]:
     values = np.where(is_length(), stage1.parameters * stage1.k[:, None], stage1.parameters)
     ratio = twin.lengths_of(values, twins.plate) / twin.PLATE
     generator = np.random.default_rng(42)
-    for place, (distance, direction) in PLACES.items():
+    for place, (distance, direction) in POSITIONS.items():
         for length in BARS:
             ends = _bar(distance, direction, length)
             limits = jnp.array([(-np.pi, np.pi)] * 6)
@@ -149,7 +149,7 @@ def run() -> tuple[list[Row], dict[str, list[dict]]]:
     worst = max(max(abs(x["k_low_held"] - 1), abs(x["k_high_held"] - 1)) for x in noise)
     rows.append(
         row(
-            "beyond: a free scale shrinks as far as the box lets it",
+            "beyond: a free scale shrinks as far as the box allows",
             "-",
             toolkit="; ".join(
                 f"+/-{width:g} mm: k = {at[width, 2.0]['k_median_free']:.4f}, "
@@ -158,9 +158,9 @@ def run() -> tuple[list[Row], dict[str, list[dict]]]:
             ),
             verdict=f"squared distances, random starts, {noisy[0]['encoder_arcsec']:g} to {max(NOISES):g} arcsec: "
             f"at least {100 * min(x['on_a_bound_free'] for x in noisy):.0f} % end on a bound in every cell; "
-            f"noise-free at most {100 * max(x['on_a_bound_free'] for x in exact):.1f} %, but as small an arm "
+            f"noise-free at most {100 * max(x['on_a_bound_free'] for x in exact):.1f} %, but the arm is as small "
             f"(medians of k within {apart:.0e} of those at 2 arcsec); "
-            f"with d_3 held at its true value 95 % of k lie within {worst:.1e} of 1",
+            f"with scale anchor d_3 at its true value 95 % of k lie within {worst:.1e} of 1",
         )
     )
     best = {(x["sockets"], x["poses"], x["lengths"]): x["rms_mm"] for x in accuracy}
@@ -174,7 +174,7 @@ def run() -> tuple[list[Row], dict[str, list[dict]]]:
     standard_error = max(x["rms_standard_error_mm"] for x in accuracy if x["poses"] >= 70)
     rows.append(
         row(
-            "beyond: what buys accuracy on 300 mm [mm RMS]",
+            "beyond: what improves the accuracy on 300 mm [mm RMS]",
             "-",
             toolkit=f"1 socket, 70 poses, 1 length: {best[1, 70, 1]:.4f}; instead "
             + "; ".join(f"{what}: {improved[what]:.4f}" for what in order),
@@ -187,7 +187,7 @@ def run() -> tuple[list[Row], dict[str, list[dict]]]:
     of = {(x["place"], x["length_mm"], x["u_mm"]): float(x["u_k"]) for x in bars}
     left = {(x["place"], x["length_mm"], x["u_mm"]): float(x["rms_300_mm"]) for x in bars}
     short, long, where = min(BARS), max(BARS), "far, tangential"
-    by_position = [of[place, twin.REFERENCE, 0.0] for place in PLACES]
+    by_position = [of[place, twin.REFERENCE, 0.0] for place in POSITIONS]
     rows.append(
         row(
             "beyond: a poor reference length, u of k",
@@ -195,10 +195,10 @@ def run() -> tuple[list[Row], dict[str, list[dict]]]:
             toolkit=f"{long:g} mm {of[where, long, 0.0]:.2g}; {short:g} mm {of[where, short, 0.0]:.2g}; "
             f"{short:g} mm known to 10 um {of[where, short, 0.01]:.2g}",
             verdict=(
-                f"short: {of[where, short, 0.0] / of[where, long, 0.0]:.0f} times from {long:g} to {short:g} mm, "
-                f"and 300 mm are then off by {left[where, short, 0.0]:.3f} mm instead of {left[where, long, 0.0]:.3f}; "
-                f"badly placed: {max(by_position) / min(by_position):.1f} times between the best and the worst of "
-                f"{len(PLACES)} places; wrong by u: the last figure before"
+                f"short: {of[where, short, 0.0] / of[where, long, 0.0]:.0f} times u from {long:g} to {short:g} mm, "
+                f"and 300 mm then have an error of {left[where, short, 0.0]:.3f} mm instead of "
+                f"{left[where, long, 0.0]:.3f}; badly placed: {max(by_position) / min(by_position):.1f} times between "
+                f"the best and the worst of {len(POSITIONS)} positions; inexact: the last value given"
             ),
         )
     )

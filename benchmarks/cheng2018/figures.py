@@ -126,8 +126,8 @@ def distributions(runs: Table) -> Any:
 
 
 def box_and_scale(table: Table) -> Any:
-    """k against the boxes of the lengths: this toolkit by where they are centred (left), the paper's method by their
-    width (right)."""
+    """k against the boxes of the lengths: this toolkit by the shift of their centres (left), the paper's method
+    by their width (right)."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(7.2, 3.2), sharey=True, width_ratios=(1.5, 1))
     widths = sorted({line["half_width_mm"] for line in table})
     for i, ((marker, colour), width) in enumerate(zip(MARKS, widths, strict=True)):
@@ -185,7 +185,7 @@ def repeatability(points: Table) -> Any:
 
 
 def plate(deviations: Table) -> Any:
-    """Figure 8: the plate at 30 places, in a typical twin, with the printed extremes."""
+    """Figure 8: the plate in 30 placements, in a typical twin, with the printed extremes."""
     check = PUBLISHED["verification"]
     figure, axes = plt.subplots(figsize=(4.6, 3.0))
     values = 1e3 * column(deviations, "deviation_mm")
@@ -199,7 +199,7 @@ def plate(deviations: Table) -> Any:
 
 
 def twins(table: Table) -> Any:
-    """Where the printed figures of the experiment lie among the twins."""
+    """Where the printed numbers of the experiment lie among the twins."""
     table3, check = PUBLISHED["table3"], PUBLISHED["verification"]
     panels = (
         ("deltam_Data1_mm", table3["Data1"], "Deltam, Data1 [mm]"),
@@ -220,9 +220,9 @@ def twins(table: Table) -> Any:
 
 
 def stages(table: Table) -> Any:
-    """RMS on the plate by what was done."""
+    """RMS on the plate by procedure."""
     names = [key for key in table[0] if key != "twin"]
-    figure, axes = plt.subplots(figsize=(4.9, 2.6))
+    figure, axes = plt.subplots(figsize=(5.6, 2.6))
     boxes = [column(table, name) for name in names]
     axes.boxplot(
         boxes,
@@ -238,19 +238,19 @@ def stages(table: Table) -> Any:
 
 
 def noise_and_box(table: Table) -> Any:
-    """k by noise, every length free, for several boxes; and with one length held."""
+    """k by noise, every length free, for several boxes; and with a scale anchor."""
     figure, axes = plt.subplots(figsize=(4.6, 3.2))
     widths = sorted({line["half_width_mm"] for line in table})
     for (marker, colour), width in zip(MARKS, widths, strict=True):
         part = [line for line in table if line["half_width_mm"] == width]
         joined_points(axes, part, "encoder_arcsec", "k_median_free", (marker, colour), f"all free, ±{width:g} mm")
-    held = [line for line in table if line["half_width_mm"] == widths[-1]]
+    anchored = [line for line in table if line["half_width_mm"] == widths[-1]]
     axes.plot(
-        column(held, "encoder_arcsec"),
-        column(held, "k_median_held"),
+        column(anchored, "encoder_arcsec"),
+        column(anchored, "k_median_held"),
         "k--",
         linewidth=1.4,
-        label=f"$d_3$ held, ±{widths[-1]:g} mm",
+        label=f"scale anchor $d_3$, ±{widths[-1]:g} mm",
     )
     axes.set(xlabel="encoder noise [arcsec]", ylabel="k of stage 1, median")
     axes.set_xscale("symlog", linthresh=0.1)
@@ -279,7 +279,7 @@ def sockets_poses_lengths(table: Table) -> Any:
 
 
 def reference_lengths(table: Table) -> Any:
-    """u of k by how long the reference is, where it lies, and how well it is known."""
+    """u of k by the length, the position and the standard uncertainty of the reference."""
     figure, grid = plt.subplots(1, 2, figsize=(7.0, 2.9), sharey=True)
     exact = [line for line in table if line["u_mm"] == 0]
     for (marker, colour), place in zip(MARKS, dict.fromkeys(line["place"] for line in exact), strict=False):
@@ -289,7 +289,7 @@ def reference_lengths(table: Table) -> Any:
     for (marker, colour), u in zip(MARKS, sorted({line["u_mm"] for line in worst}), strict=False):
         part = [line for line in worst if line["u_mm"] == u]
         joined_points(grid[1], part, "length_mm", "u_k", (marker, colour), f"u = {1e3 * u:g} µm")
-    for axes, what in zip(grid, ("exact, by place", "far, tangential"), strict=True):
+    for axes, what in zip(grid, ("exact, by position", "far, tangential"), strict=True):
         axes.set(xscale="log", yscale="log", xlabel=f"reference length [mm] ({what})", xticks=[50, 100, 200, 400])
         axes.xaxis.set_major_formatter(matplotlib.ticker.ScalarFormatter())
         axes.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())

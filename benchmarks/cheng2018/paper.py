@@ -20,7 +20,7 @@ SETS = 1_000  # independent sets of poses
 
 
 class Row(NamedTuple):
-    """One published number beside its recomputed values; each column holds text ready to print."""
+    """One published number and its recomputed values; each column holds text ready to print."""
 
     what: str
     printed: str
@@ -95,7 +95,7 @@ def random_starts(lower: np.ndarray, upper: np.ndarray, count: int, seed: int) -
     return lower + (upper - lower) * np.random.default_rng(seed).uniform(size=(count, len(lower)))
 
 
-def figures_of(tips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def metrics_of(tips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """DE and Deltam (eq. 11-15) of tips ``(..., poses, 3)`` of one socket each, mm."""
     from_centre = np.linalg.norm(tips - tips.mean(axis=-2, keepdims=True), axis=-1)
     return from_centre.mean(axis=-1), np.max(np.ptp(tips, axis=-2), axis=-1) / 2
@@ -114,7 +114,7 @@ def _positions(arms: aj.Arm, q: jnp.ndarray) -> jnp.ndarray:
     return aj.Arm(**kinds).position(q)
 
 
-def place(value: float, sample: np.ndarray) -> str:
+def position_in(value: float, sample: np.ndarray) -> str:
     """Position of a printed number in a sample of reruns: its percentile, and the middle 95 % of the sample."""
     low, middle, high = (number(x) for x in np.percentile(sample, [2.5, 50, 97.5]))
     share = 100 * np.mean(sample <= value)

@@ -27,7 +27,7 @@ from paper import (
     NAMES,
     SETS,
     box,
-    figures_of,
+    metrics_of,
     is_length,
     pose_sets,
     random_starts,
@@ -96,7 +96,7 @@ def one(simulation: int, q: np.ndarray, number: int) -> dict[str, float]:
     lower, upper = box("simulation", str(simulation))
     values, iterations = minimise(q, lower, upper, random_starts(lower, upper, SETS, simulation)[number])
     truth = vector("simulation", "nominal")
-    de, deltam = (float(x[0]) for x in figures_of(tips_of(values[None], q[None])))
+    de, deltam = (float(x[0]) for x in metrics_of(tips_of(values[None], q[None])))
     error = np.abs(values - truth)
     numbers = (de, deltam, float(scale_to(values, truth)), error[is_length()].max(), error[~is_length()].max())
     return dict(zip(COLUMNS, (simulation, number, *(float(f"{x:.6g}") for x in numbers), iterations), strict=True))

@@ -26,33 +26,27 @@ import table3
 from paper import HERE, PUBLISHED, Row
 
 VECTORS = ("eq. 16: ", "eq. 17: ", "eq. 18: ", "Table 2: ")
-# A backslash joins two lines: the paragraphs of REPRODUCTION.md are longer than the lines of this file.
 HEADER = """\
 # Cheng et al. 2018, reproduced and questioned
 
-Every result that the paper prints (doi 10.1155/2018/1760190), against what its own printed vectors give, \
-its method rerun, and this
-toolkit. Made by `make reproduce`; no figure below is typed in but the published ones, and the last column \
-names the line that made
-each row. Lengths in mm, angles in rad unless a unit is given.
+Every result that the paper prints (doi 10.1155/2018/1760190), compared with what its own printed vectors give, with its
+method rerun, and with this toolkit. Made by `make reproduce`; only the published numbers are typed in, and the last
+column names the line of code that made each row. Lengths in mm, angles in rad unless a unit is given.
 
 - **Recomputed** uses printed numbers only.
-- **Paper's method**: for the simulations, an interior-point search on DE within the printed box, every length free \
-(`paper_method.py`); all runs stop at 300 iterations, so what they
-  leave of DE, Deltam and the angles depends on that number. For the experiment, whose recordings (figshare 6223811) \
-could not be had here, made-up twins (`twin.py`): with every length free as the paper has it, but
-  by squared distances; the interior point itself is in the row on k.
-- **This toolkit** minimises squared distances within the same box: for the simulations with every length \
-free, and after both stages; for the experiment with `d_3` held in stage 1.
-- A verdict that gives a percentage says where the printed number lies among the reruns.
-- Not printed, and therefore chosen here: where the simulated socket stood, where the searches began \
-(at random in the box), where the three sockets, the
-  reference length and the plate of the experiment stood (all round the arm, every joint turning fully), and how many \
-readings made one end of a length (ten, in one pose; a tip on the plate is one reading). \
-In the joint solve an end counts as one pose.
-- Repaired, because print lost an element: the simulation's nominal vector (one zero of theta), the upper bounds \
-of simulation 1 (a joined "7210"
-  and one theta) and of the experiment (one theta).
+- **Paper's method**: for the simulations, an interior-point search on DE within the printed box, every length free
+  (`paper_method.py`); all runs stop at 300 iterations, so their DE, Deltam and angles depend on that number. For the
+  experiment, whose recordings (figshare 6223811) were not available, simulated twins of it (`twin.py`): with every
+  length free as in the paper, but with squared distances; the row on k uses the interior-point search itself.
+- **This toolkit** minimises squared distances within the same box: for the simulations with every length free, and
+  after both stages; for the experiment with `d_3` as the scale anchor of stage 1.
+- A verdict with a percentage gives the position of the printed number among the reruns.
+- Not printed, and therefore chosen here: the position of the simulated socket, the starts of the searches (at random in
+  the box), the positions of the three sockets, the reference length and the plate of the experiment (all round the arm,
+  every joint turning fully), and how many readings are averaged at each end of a length (ten, in one pose; one at an
+  end of the plate). In the joint solve an end counts as one pose.
+- Repaired, because an element is missing in print: the simulation's nominal vector (one zero of theta), the upper
+  bounds of simulation 1 (a joined "7210" and one theta) and of the experiment (one theta).
 """
 
 
@@ -94,7 +88,7 @@ def page(rows: list[Row], about: dict[str, str]) -> str:
         HEADER,
         f"Python {platform.python_version()}, JAX {jax.__version__}, NumPy {np.__version__}. {len(rows)} rows; "
         f"published.toml holds {counted} values, bounds and nominal vectors among them.\n",
-        "## Figures and claims\n",
+        "## Numbers and claims\n",
         markdown([row for row in rows if row not in vectors]),
         "## The vectors, element by element\n",
         markdown(vectors),

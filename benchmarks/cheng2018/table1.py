@@ -1,4 +1,4 @@
-"""Table 1 and section 3: what identification from one point can find without noise, and what determines its scale."""
+"""Table 1 and section 3: what can be identified from one point without noise, and what determines its scale."""
 
 import itertools
 
@@ -11,10 +11,10 @@ from paper import (
     Row,
     arm_of,
     box,
-    figures_of,
     is_length,
-    place,
+    metrics_of,
     pose_sets,
+    position_in,
     random_starts,
     row,
     scale_to,
@@ -38,13 +38,13 @@ def half_scale(rows: list[Row]) -> None:
     simulation, q = PUBLISHED["simulation"], pose_sets(100)
     vectors = {key: np.tile(vector("simulation", key), (len(q), 1)) for key in ("nominal", "half_scale")}
     deltam = {
-        digits: {key: np.median(figures_of(tips_of(values, np.round(q, digits)))[1]) for key, values in vectors.items()}
+        digits: {key: np.median(metrics_of(tips_of(values, np.round(q, digits)))[1]) for key, values in vectors.items()}
         for digits in range(6, 12)
     }
     printed = simulation["deltam_nominal"]
     digits = min(deltam, key=lambda d: abs(np.log(deltam[d]["nominal"] / printed)))
     ratio = deltam[digits]["half_scale"] / deltam[digits]["nominal"]
-    exact = max(figures_of(tips_of(values, q))[1].max() for values in vectors.values())
+    exact = max(metrics_of(tips_of(values, q))[1].max() for values in vectors.values())
     for key, what in (("nominal", "nominal arm"), ("half_scale", "same, half scale")):
         rows.append(
             row(
@@ -96,19 +96,19 @@ def simulation(number: int, rows: list[Row], methods: list[dict[str, float]]) ->
                 method=f"median {np.median(theirs[column]):.2g}",
                 toolkit=f"median {np.median(mine[column]):.2g}, largest {mine[column].max():.2g}"
                 + (f"; after both stages {after[column]:.1g} at most" if column in after else ""),
-                verdict=place(printed[key], theirs[column]) + " (paper's method)",
+                verdict=position_in(printed[key], theirs[column]) + " (paper's method)",
             )
         )
     rows.append(
         row(
             f"eq. {15 + number}: a scaled copy of the truth",
             "claimed",
-            recomputed=f"k = {k:.5f}; scaling leaves {1e3 * left:.1f} um",
+            recomputed=f"k = {k:.5f}; residual after scaling {1e3 * left:.1f} um",
             method=f"k: {np.percentile(theirs['k'], 2.5):.4f} to {np.percentile(theirs['k'], 97.5):.4f}",
             toolkit=f"k: {np.percentile(mine['k'], 2.5):.4f} to {np.percentile(mine['k'], 97.5):.4f}",
             verdict=("the scale law holds" if left < 0.01 * difference[lengths].max() else "the scale law fails")
             + "; k is "
-            + place(k, theirs["k"])
+            + position_in(k, theirs["k"])
             + " (paper's method)",
         )
     )
@@ -128,7 +128,7 @@ def simulation(number: int, rows: list[Row], methods: list[dict[str, float]]) ->
 
 
 def two_stages(q: np.ndarray, lower: np.ndarray, upper: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Parameters after both stages: one length held at its start, the scale fixed with one exact length of 200 mm."""
+    """Parameters after both stages: `d_3` as scale anchor, the scale fixed with one exact length of 200 mm."""
     found = many_of(q, lower, upper, starts, hold="d_3").parameters
     ends = np.asarray(aj.simulate(simulated_arm(), {"A": (400, 200, 300), "B": (600, 200, 300)}, poses=1, seed=2).q)
     tips = tips_of(found, np.broadcast_to(ends, (len(found), *ends.shape)))
@@ -146,7 +146,7 @@ def many_of(
 
 
 def methods_rerun(rows: list[Row]) -> list[dict[str, float]]:
-    """The stored reruns of the paper's method, after a few were run again and compared."""
+    """The stored reruns of the paper's method, after a few have been run again and compared."""
     stored = paper_method.stored()
     again = paper_method.rerun(SAMPLE)
     pairs = [
@@ -202,7 +202,7 @@ def boxes() -> list[dict[str, float]]:
 
 
 def narrower(rows: list[Row], table: list[dict[str, float]]) -> None:
-    """The claim that smaller boxes scale less, for boxes that are centred on the truth, contain it, or miss it."""
+    """The claim that smaller boxes scale less, for boxes centred on the truth, around it, or without it."""
     inside = [line for line in table if line["truth_inside"]]
 
     def largest(shift: float, width: float, *keys: str) -> float:
@@ -219,12 +219,12 @@ def narrower(rows: list[Row], table: list[dict[str, float]]) -> None:
         row(
             "3.2 smaller boxes scale less: largest |k - 1|",
             "claimed",
-            method=f"centred on the truth: {shown(centred)}; 5 mm beside it, median: {shown(shifted)}",
+            method=f"centred on the truth: {shown(centred)}; 5 mm off it, median: {shown(shifted)}",
             toolkit=f"centred on the truth: {shown(mine)}",
             verdict=("holds" if holds else "does not hold")
             + " for boxes centred on the truth, "
             + ("holds" if list(shifted.values()) == sorted(shifted.values()) else "does not hold")
-            + f" for boxes 5 mm beside it; a box that misses the truth leaves DE of {missed:.2g} mm or more",
+            + f" for boxes 5 mm off it; a box without the truth ends at a DE of {missed:.2g} mm or more",
         )
     )
 

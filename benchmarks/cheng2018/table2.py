@@ -4,7 +4,6 @@ import numpy as np
 from paper import NAMES, PUBLISHED, Row, arm_of, is_length, row, tips_of, vector
 
 import aacmm_jax as aj
-from aacmm_jax.core.units import ARCSEC
 
 
 def printed_table() -> np.ndarray:
@@ -50,7 +49,7 @@ def scale(rows: list[Row]) -> tuple[float, float]:
             recomputed=f"{reference['mean'] / nominal:.7f}",
             toolkit=f"{value:.7f}, u = {u:.1e} from the repeats alone",
             verdict=("agree within u" if abs(reference["mean"] / nominal - value) < u else "differ by more than u")
-            + f"; that u knows nothing of the arm's own errors ({300e3 * u:.1f} um over 300 mm): see k among the twins",
+            + f"; that u does not contain the arm's own errors ({300e3 * u:.1f} um over 300 mm): see k among the twins",
         )
     )
     return value, u
@@ -72,21 +71,21 @@ def elements(rows: list[Row], k: float) -> None:
         else:
             recomputed = mine = f"{np.rad2deg(given[i]):.4f}"
             text, agrees = f"{np.rad2deg(table[i]):.4f}", recomputed == f"{np.rad2deg(table[i]):.4f}"
-            verdict = "agrees" if agrees else f"disagrees by {(table[i] - given[i]) / ARCSEC:+.0f} arcsec"
+            verdict = "agrees" if agrees else f"disagrees by {(table[i] - given[i]) / aj.units.ARCSEC:+.0f} arcsec"
         unit = "mm" if is_length()[i] else "deg"
         rows.append(
             row(
                 f"eq. 18: {name} [{'mm' if is_length()[i] else 'rad'}]",
                 f"{given[i]:.6f}",
                 recomputed="-",
-                verdict="taken as data: the deposited recordings could not be had here",
+                verdict="taken as data: the deposited recordings were not available",
             )
         )
         rows.append(row(f"Table 2: {name} [{unit}]", text, recomputed=recomputed, toolkit=mine, verdict=verdict))
 
 
-def held(rows: list[Row]) -> None:
-    """The four numbers that Table 2 prints and no identification frees."""
+def constants(rows: list[Row]) -> None:
+    """The four numbers that Table 2 prints and that are fixed in every identification."""
     table, fixed = PUBLISHED["table2"], PUBLISHED["fixed"]
     pairs = (("alpha_6", table["alpha_deg"][5], np.rad2deg(fixed["alpha_6"])), ("a_6", table["a"][5], fixed["a_6"]))
     pairs += (("theta_1", table["theta_deg"][0], np.rad2deg(fixed["theta_1"])), ("d_1", table["d"][0], fixed["d_1"]))
@@ -96,7 +95,7 @@ def held(rows: list[Row]) -> None:
                 f"Table 2: {name}",
                 printed,
                 recomputed=constant,
-                verdict="held, as printed" if np.isclose(printed, constant) else "disagrees",
+                verdict="fixed, as printed" if np.isclose(printed, constant) else "disagrees",
             )
         )
 
@@ -105,7 +104,7 @@ def angles(rows: list[Row]) -> list[dict[str, float]]:
     """Effect on the tip of the angles that differ: eq. 18's against Table 2's, both with the lengths of Table 2."""
     table, given = printed_table(), vector("experiment", "identified")
     mixed = np.where(is_length(), table, given)
-    # Poses in which the arm with eq. 18's angles has its tip on one point: its Deltam is 0, that of Table 2's is not.
+    # Poses with one tip position for the arm with eq. 18's angles: its Deltam is 0, that of Table 2's is not.
     q = np.asarray(aj.simulate(arm_of(mixed), {"A": (400, 200, 300)}, poses=2_000, seed=3).q)
     both = tips_of(np.stack([mixed, table]), np.stack([q, q]))
     moved = np.linalg.norm(both[1] - both[0], axis=-1)
@@ -117,7 +116,7 @@ def angles(rows: list[Row]) -> list[dict[str, float]]:
             "Table 2 angles against eq. 18's",
             "same arm",
             recomputed=f"tips {np.median(moved):.2f} mm apart (median), {moved.max():.2f} at most",
-            verdict="cannot both be right: with Table 2's angles, poses that eq. 18 brings together have "
+            verdict="cannot both be right: with Table 2's angles, poses that share a point by eq. 18 have "
             f"Deltam {np.median(deltam):.2f} mm, not {printed}",
         )
     )
@@ -128,7 +127,7 @@ def run() -> tuple[list[Row], dict[str, list[dict[str, float]]]]:
     rows: list[Row] = []
     k, _ = scale(rows)
     elements(rows, k)
-    held(rows)
+    constants(rows)
     moved = angles(rows)
     return rows, {"angle_mismatch": moved}
 

@@ -1,9 +1,9 @@
-"""Table 3, figure 8 and the 93 %: where the printed figures lie among a thousand twins of the experiment."""
+"""Table 3, figure 8 and the 93 %: where the printed numbers lie among a thousand twins of the experiment."""
 
 import numpy as np
 import paper_method
 import twin
-from paper import PUBLISHED, Row, box, number, place, random_starts, row, vector
+from paper import PUBLISHED, Row, box, number, position_in, random_starts, row, vector
 
 TWINS = 1_000
 SEED = 6
@@ -28,8 +28,8 @@ def noise_models(made: twin.Pool, rows: list[Row]) -> tuple[twin.Noise, list[dic
             f"{printed:.2f}",
             toolkit="; ".join(f"{name} {ratio:.2f}" for name, ratio in ratios.items()),
             verdict=(
-                f"nearest: {nearest}; seating alone gives least ({min(ratios.values()):.2f}), since angle errors grow "
-                "with the distance from the joints and the twins' Data2 and Data3 stand farther out. "
+                f"nearest: {nearest}; seating alone gives the least ({min(ratios.values()):.2f}), since angle errors "
+                "grow with the distance from the joints and the twins' Data2 and Data3 are farther out. "
                 f"The twins have {chosen.encoder_arcsec:.1g} arcsec, {1e3 * chosen.seating_mm:.1g} um and "
                 f"{chosen.eccentricity_arcsec:.1g} arcsec, fitted to all three printed Deltam and to DE"
             ),
@@ -39,7 +39,7 @@ def noise_models(made: twin.Pool, rows: list[Row]) -> tuple[twin.Noise, list[dic
 
 
 def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
-    """Every printed metric of sections 4.1 to 4.4 among the twins: with all lengths free, and with one held."""
+    """Every printed metric of sections 4.1 to 4.4 among the twins: with all lengths free, and with a scale anchor."""
     experiment, table3, check = PUBLISHED["experiment"], PUBLISHED["table3"], PUBLISHED["verification"]
 
     def line(what: str, printed: float, of, note: str = "predicted; ", recomputed: str = "-") -> None:
@@ -51,7 +51,7 @@ def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
                 recomputed=recomputed,
                 method=f"all lengths free: median {number(np.median(theirs))}",
                 toolkit=f"median {number(np.median(mine))}",
-                verdict=note + place(printed, mine),
+                verdict=note + position_in(printed, mine),
             )
         )
 
@@ -62,7 +62,7 @@ def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
     largest = max(check["maximum"] - nominal, nominal - check["minimum"])
     mean = np.mean([table3[name] for name in twin.SOCKETS])
     fitted, held_out = "fitted, with the others of Table 3; ", np.mean([table3["Data2"], table3["Data3"]])
-    # Before the scale fix all tips, and so both figures, are k times as large.
+    # Before the scale fix all tips, and so both metrics, are k times as large.
     line("4.1 DE of Data1 [mm]", experiment["de"], lambda o: o.de[:, 0] * o.k, fitted)
     line("4.1 Deltam of Data1 [mm]", experiment["deltam"], lambda o: o.deltam[:, 0] * o.k, fitted)
     line(
@@ -74,9 +74,9 @@ def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
     )
     line("Table 3 Data2 [mm]", table3["Data2"], lambda o: o.deltam[:, 1], fitted)
     line("Table 3 Data3 [mm]", table3["Data3"], lambda o: o.deltam[:, 2], fitted)
-    note = f"averages in the set identified from: held out alone it is {held_out:.4f}; {fitted}"
+    note = f"includes Data1, from which the arm was identified: {held_out:.4f} without it; {fitted}"
     line("Table 3 mean [mm]", table3["mean"], lambda o: o.deltam.mean(axis=1), note, f"{mean:.4f}")
-    note = f"matched by taking {twin.READINGS} readings an end; "
+    note = f"matched by averaging {twin.READINGS} readings at each end; "
     line(
         "4.2 range of four lengths [mm]",
         experiment["length_reference"]["range"],
@@ -110,13 +110,13 @@ def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
             "4.4 improvement [%]",
             printed,
             recomputed=f"{100 * (1 - check['max_deviation'] / before):.1f}; "
-            f"length for length {100 * (1 - check['max_deviation'] / twin.PLATE / before * twin.REFERENCE):.1f}",
+            f"for equal lengths {100 * (1 - check['max_deviation'] / twin.PLATE / before * twin.REFERENCE):.1f}",
             method=f"all lengths free: median {np.median(improvement(result)):.1f}",
             toolkit=f"median {np.median(improvement(own)):.1f}",
-            verdict="a figure of k, not of the method: it compares an error of 201.5 mm with errors of 300 mm, "
-            "and the one before is as large as the search left k. "
-            f"With the printed {before} mm before, {printed} is "
-            + place(printed, 100 * (1 - np.abs(own.plate).max(axis=1) / before)),
+            verdict="a measure of k, not of the method: it compares an error of 201.5 mm with errors of 300 mm, "
+            "and the former is as large as the error of k that the search leaves. "
+            f"With the printed {before} mm as the former, {printed} is "
+            + position_in(printed, 100 * (1 - np.abs(own.plate).max(axis=1) / before)),
         )
     )
 
@@ -128,7 +128,7 @@ def improvement(result: twin.Outcome) -> np.ndarray:
 
 
 def scale_of_experiment(rows: list[Row], twins: twin.Twins, free: twin.Outcome, own: twin.Outcome) -> None:
-    """k of the experiment against what free lengths give with noise."""
+    """k of the experiment against k of identifications with noise and every length free."""
     reference = PUBLISHED["experiment"]["length_reference"]
     printed = reference["mean"] / reference["nominal"]
     lower, upper = box("experiment")
@@ -151,9 +151,9 @@ def scale_of_experiment(rows: list[Row], twins: twin.Twins, free: twin.Outcome, 
             f"{100 * np.mean(edge(found)):.0f} % on a bound",
             toolkit=f"all free, squared distances: median {np.median(free.k):.4f}, "
             f"{100 * np.mean(free.on_a_bound):.0f} % on a bound; "
-            f"d_3 held at its nominal value: {np.median(own.k):.5f}, standard deviation {np.std(own.k):.1e}",
-            verdict=f"eq. 18 lies {inside}; its k is {place(printed, k)} (interior point, which stops where its start "
-            f"and its {paper_method.ITERATIONS} iterations leave it)",
+            f"scale anchor d_3 at its nominal value: {np.median(own.k):.5f}, standard deviation {np.std(own.k):.1e}",
+            verdict=f"eq. 18 lies {inside}; its k is {position_in(printed, k)} (interior point, whose end "
+            f"depends on its start and on its limit of {paper_method.ITERATIONS} iterations)",
         )
     )
 
@@ -162,12 +162,13 @@ def stages(rows: list[Row], twins: twin.Twins, free: twin.Outcome, own: twin.Out
     """Improvement on the plate by two stages over one, and by the joint solve over two."""
     together = twin.joint(twins)
     joint = twin.lengths_of(together, twins.plate) - twin.PLATE
-    noise_free = {"one stage, all free": free.plate_before, "one stage, d_3 held": own.plate_before}
-    errors = noise_free | {"two stages, all free": free.plate, "two stages, d_3 held": own.plate, "joint": joint}
+    noise_free = {"one stage, all free": free.plate_before, "one stage, scale anchor d_3": own.plate_before}
+    two_stages = {"two stages, all free": free.plate, "two stages, scale anchor d_3": own.plate}
+    errors = noise_free | two_stages | {"joint": joint}
     rms = {name: np.sqrt((error**2).mean(axis=1)) for name, error in errors.items()}
     middle = {name: float(np.median(values)) for name, values in rms.items()}
-    all_free, d_3_held = middle["one stage, all free"], middle["one stage, d_3 held"]
-    two = middle["two stages, d_3 held"]
+    all_free, anchored = middle["one stage, all free"], middle["one stage, scale anchor d_3"]
+    two = middle["two stages, scale anchor d_3"]
     reference = PUBLISHED["experiment"]["length_reference"]
     at_printed = twin.PLATE * (1 - reference["mean"] / reference["nominal"])
     rows.append(
@@ -175,12 +176,12 @@ def stages(rows: list[Row], twins: twin.Twins, free: twin.Outcome, own: twin.Out
             "Two stages over one, joint over two: RMS on the plate [mm]",
             "-",
             method=f"all lengths free: one stage {all_free:.3f}, two {middle['two stages, all free']:.4f}",
-            toolkit=f"d_3 held: one stage {d_3_held:.3f}, two {two:.4f}, joint {middle['joint']:.4f}",
+            toolkit=f"scale anchor d_3: one stage {anchored:.3f}, two {two:.4f}, joint {middle['joint']:.4f}",
             verdict=(
-                f"the scale fix gains as much as k was wrong: {all_free / two:.0f} times where it slid to a bound, "
-                f"{d_3_held / two:.0f} times with d_3 held at its nominal value, "
-                f"{at_printed / two:.0f} times at the printed k. With one length in one place the joint solve changes "
-                f"the median by {100 * (middle['joint'] / two - 1):+.1f} %"
+                f"the scale fix reduces the RMS as much as k was wrong: {all_free / two:.0f} times where k ended "
+                f"on a bound, {anchored / two:.0f} times with scale anchor d_3 at its nominal value, "
+                f"{at_printed / two:.0f} times at the printed k. With one length in one position the joint solve "
+                f"changes the median by {100 * (middle['joint'] / two - 1):+.1f} %"
             ),
         )
     )

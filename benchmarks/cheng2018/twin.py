@@ -12,11 +12,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from paper import NAMES, POSES, PUBLISHED, arm_of, box, figures_of, is_length, tips_of
+from paper import NAMES, POSES, PUBLISHED, arm_of, box, is_length, metrics_of, tips_of
 from scipy.optimize import minimize
 
 import aacmm_jax as aj
-from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.kinematics.inverse_kinematics import random_configurations
 
 # mm: three sockets well within the reach of 1.4 m; the paper does not print the positions of its own.
@@ -27,6 +26,7 @@ PLATE, PLACEMENTS = PUBLISHED["verification"]["nominal"], 30
 # Readings averaged at each end of the reference length. The paper does not state it; with single readings the range of
 # the four measurements would be three times the printed 0.006 mm, for any noise that matches the sockets.
 READINGS = 10
+ARCSEC = aj.units.ARCSEC
 _POOL = 40  # times as many poses and placements as a twin takes
 
 
@@ -72,7 +72,7 @@ def pool() -> Pool:
 
 
 def placed(arm: aj.Arm, length: float, count: int, seed: int) -> np.ndarray:
-    """Poses at both ends of a bar in random places and directions of the working volume, ``(count, 2, 6)``."""
+    """Poses at both ends of a bar at random positions and directions in the working volume, ``(count, 2, 6)``."""
     generator = np.random.default_rng(seed)
     centre = generator.normal(size=(count, 3))
     centre *= generator.uniform(350, 850, size=(count, 1)) / np.linalg.norm(centre, axis=1, keepdims=True)
@@ -141,7 +141,7 @@ def joint(twins: Twins, u: float = 0.001) -> np.ndarray:
 
 
 class Outcome(NamedTuple):
-    """Figures of every twin after an identification and its scale fix; mm."""
+    """Metrics of every twin after an identification and its scale fix; mm."""
 
     parameters: np.ndarray  # (t, 21), after the scale fix
     k: np.ndarray
@@ -154,7 +154,7 @@ class Outcome(NamedTuple):
 
 
 def identified(twins: Twins, hold: str | None) -> Outcome:
-    """Both stages, as the paper ran them, with every length free (None) or one held in stage 1."""
+    """Both stages, as the paper ran them, with every length free (None) or with a scale anchor in stage 1."""
     lower, upper = box("experiment")
     start = (lower + upper) / 2
     space = aj.Parameters(true_arm(), NAMES)
@@ -168,8 +168,8 @@ def outcome(twins: Twins, stage1: np.ndarray, on_a_bound: np.ndarray) -> Outcome
     reference = lengths_of(stage1, twins.reference)
     k = reference.mean(axis=1) / REFERENCE
     fixed = np.where(is_length(), stage1 / k[:, None], stage1)
-    figures = [figures_of(tips_of(fixed, q)) for q in np.moveaxis(twins.sockets, 1, 0)]
-    de, deltam = (np.stack(columns, axis=1) for columns in zip(*figures, strict=True))
+    metrics = [metrics_of(tips_of(fixed, q)) for q in np.moveaxis(twins.sockets, 1, 0)]
+    de, deltam = (np.stack(columns, axis=1) for columns in zip(*metrics, strict=True))
     before, after = (lengths_of(values, twins.plate) - PLATE for values in (stage1, fixed))
     return Outcome(fixed, k, on_a_bound, de, deltam, reference, before, after)
 
@@ -181,7 +181,7 @@ def lengths_of(values: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def printed_targets() -> dict[str, float]:
-    """The printed figures that a noise model has to match."""
+    """The printed metrics that a noise model has to match."""
     experiment, table3 = PUBLISHED["experiment"], PUBLISHED["table3"]
     return {
         "DE of Data1": experiment["de"],
@@ -192,7 +192,7 @@ def printed_targets() -> dict[str, float]:
 
 
 def medians(result: Outcome) -> dict[str, float]:
-    """The same figures, as the median twin shows them."""
+    """The same metrics of the median twin."""
     return {
         "DE of Data1": float(np.median(result.de[:, 0])),
         "Deltam of Data1": float(np.median(result.deltam[:, 0])),
@@ -204,7 +204,7 @@ def medians(result: Outcome) -> dict[str, float]:
 def fitted_noise(
     made: Pool, kinds: tuple[int, ...] = (0, 1, 2), targets: int = 3, count: int = 100, seed: int = 5
 ) -> Noise:
-    """The noise whose median twin comes closest, in ratios, to the printed figures (the first ``targets`` of them).
+    """The noise whose median twin comes closest, in ratios, to the printed metrics (the first ``targets`` of them).
 
     ``kinds`` names the parts of `Noise` that are used; the others are zero.
     """

@@ -1,4 +1,4 @@
-"""The command line in fresh processes: the whole path, what is printed for people and for machines, and exit codes."""
+"""The command line: the whole path, what is printed for people and for machines, and exit codes."""
 
 import json
 import re
@@ -115,13 +115,22 @@ def test_bad_input_is_exit_code_2_and_one_sentence(aacmm, tmp_path, arguments, m
     assert list(tmp_path.iterdir()) == []
 
 
-def test_debug_shows_the_traceback(aacmm):
-    assert "Traceback" in aacmm("calibrate", "none.h5", "-o", "x.h5", "--debug", expect=1).stderr
+def test_debug_shows_the_traceback(aacmm_process):
+    assert "Traceback" in aacmm_process("calibrate", "none.h5", "-o", "x.h5", "--debug", expect=1).stderr
 
 
-def test_float32_is_refused_at_import(aacmm, monkeypatch):
+def test_float32_is_refused_at_import(aacmm_process, monkeypatch):
     monkeypatch.setenv("JAX_ENABLE_X64", "0")
-    assert "needs 64-bit floats, but JAX_ENABLE_X64=0" in aacmm("show", "panda", expect=1).stderr
+    assert "needs 64-bit floats, but JAX_ENABLE_X64=0" in aacmm_process("show", "panda", expect=1).stderr
+
+
+def test_a_process_of_its_own(aacmm_process, cache, tmp_path, monkeypatch):
+    """Exit codes of real processes, and the folder in which compiled programs are kept for the next one."""
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    aacmm_process("simulate", "panda", "-o", "capture.h5", "--socket", "A=400,0,300", "--poses", 2)
+    assert (tmp_path / "capture.h5").exists()
+    assert list((cache / "aacmm_jax").iterdir())
+    assert "No such command" in aacmm_process("frobnicate", expect=2).stderr
 
 
 PLAN = (

@@ -27,7 +27,6 @@ COMMANDS = get_command(app).commands
 def run(tmp_path, monkeypatch):
     """A command in this process, in an empty folder."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))  # so that the command leaves JAX's own setting alone
     return lambda *arguments: CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 

@@ -454,7 +454,6 @@ def run(tmp_path, monkeypatch):
     """The command in this process, in an empty folder: exit code and standard output, or the refusal that it raised."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "110")
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))  # so that the command leaves JAX's own setting alone
 
     def command(*arguments):
         return CliRunner().invoke(app, ["compare", *map(str, arguments)])
@@ -532,6 +531,6 @@ def test_command_refuses(run, files):
     assert sorted(files.iterdir()) == before
 
 
-def test_command_in_a_process_of_its_own(aacmm, files):
-    refused = aacmm("compare", "a.h5", "b.h5", "--length-mm", 100000, expect=2)
+def test_command_in_a_process_of_its_own(aacmm_process, files):
+    refused = aacmm_process("compare", "a.h5", "b.h5", "--length-mm", 100000, expect=2)
     assert refused.stderr.startswith("Error: a length of 100000 mm does not fit")

@@ -32,7 +32,6 @@ def made(record, tmp_path_factory):
     aj.study.run_study(study, path)
     arm, capture = record.calibrated.arm, record.recording.capture
     sockets = {name: np.asarray(arm.position(q)) for name, q in capture.sockets.items()}
-    from aacmm_jax.study.results import Results
 
     return {
         "pose_distances": (record,),
@@ -45,7 +44,7 @@ def made(record, tmp_path_factory):
         "acceptance_metrics": (
             aj.acceptance.run(aj.acceptance.Measured(sockets), {"Deltam": aj.acceptance.Limit(0.05)}),
         ),
-        "study_metric": (Results.of(path), "de_stage1"),
+        "study_metric": (aj.study.Results.of(path), "de_stage1"),
     }
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.study import pools
+from aacmm_jax.study import configuration_pool
 from aacmm_jax.study.definition import Fixture
 from aacmm_jax.study.specification import Region
 
@@ -65,5 +65,5 @@ def test_copies_derive_once(studies):
 )
 def test_pools_have_the_keys_of_all_versions(fixture, data):
     """Published results were drawn from these keys."""
-    key = pools.pool_key(7, fixture, ((1.0, 2.0),), (3, 4))
+    key = configuration_pool.pool_key(7, fixture, ((1.0, 2.0),), (3, 4))
     np.testing.assert_array_equal(jax.random.key_data(key), np.array(data, dtype=np.uint32))

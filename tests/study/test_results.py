@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.cli.study_display import concise
 from aacmm_jax.study import store
-from aacmm_jax.study.layout import Layout
-from aacmm_jax.study.results import Results
-from aacmm_jax.study.statistics import distribution, statistic, study_summary
+from aacmm_jax.study.blocks import Layout
+from aacmm_jax.study.statistics import concise, distribution, statistic
 
 matplotlib.use("Agg")
 
@@ -44,7 +42,7 @@ def test_percentiles_are_numpys():
 
 @pytest.fixture(scope="module")
 def summary(path):
-    return study_summary(Results.of(path))
+    return aj.study.study_summary(aj.study.Results.of(path))
 
 
 STATISTICS = {

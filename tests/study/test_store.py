@@ -17,7 +17,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.study import runner, store
-from aacmm_jax.study.layout import Layout, parts_of
+from aacmm_jax.study.blocks import Layout, parts_of
 
 ROOT = Path(__file__).resolve().parents[2]
 SPECIFICATION = """
@@ -398,9 +398,7 @@ def test_reading_needs_no_more_files_than_one(home, study, tmp_path):
     program = (
         "import resource, sys; resource.setrlimit(resource.RLIMIT_NOFILE, (60, int(sys.argv[2])))\n"
         "import aacmm_jax as aj\n"
-        "from aacmm_jax.study.results import Results\n"
-        "from aacmm_jax.study.statistics import study_summary\n"
-        "print(study_summary(Results.of(sys.argv[1]))['trials_run'])\n"
+        "print(aj.study.study_summary(aj.study.Results.of(sys.argv[1]))['trials_run'])\n"
         "print((aj.study.open_study(sys.argv[1]).converged.values >= 0).sum())\n"
     )
     for hard, said in ((1000, ""), (60, "more files than this process may open (60)")):
@@ -490,7 +488,7 @@ def test_strange_arguments_are_refused_before_anything_is_written(study, tmp_pat
     assert not list(tmp_path.iterdir())
 
 
-def test_nobody_answers(aacmm, home):
-    done = aacmm("study", home / "spec.toml", "-o", "s.h5", "--dask", "tcp://127.0.0.1:1", expect=2)
+def test_nobody_answers(aacmm_process, home):
+    done = aacmm_process("study", home / "spec.toml", "-o", "s.h5", "--dask", "tcp://127.0.0.1:1", expect=2)
     assert done.stderr.count("\n") == 1
     assert "no Dask scheduler answers at tcp://127.0.0.1:1; start one, or use --dask local" in done.stderr

@@ -7,8 +7,8 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.core.units import ARCSEC
-from aacmm_jax.study import drawing, pools
-from aacmm_jax.study.layout import Block
+from aacmm_jax.study import configuration_pool, trial_simulation
+from aacmm_jax.study.blocks import Block
 from aacmm_jax.study.trials import run_block
 
 DEVICE = jax.devices()[0]
@@ -22,11 +22,11 @@ def made(**tables) -> "aj.study.Study":
     return aj.study.make_study(**{"arm": "cheng2018-simulation", "trials": 64, "seed": 3, "capture": capture} | tables)
 
 
-def drawn(study: "aj.study.Study", count: int = 64, cell: int = 0) -> drawing.Drawn:
-    return drawing.draw(study, study.settings[cell], np.full(count, cell), np.arange(count), DEVICE)
+def drawn(study: "aj.study.Study", count: int = 64, cell: int = 0) -> trial_simulation.Drawn:
+    return trial_simulation.draw(study, study.settings[cell], np.full(count, cell), np.arange(count), DEVICE)
 
 
-def tips(study: "aj.study.Study", trials: drawing.Drawn) -> np.ndarray:
+def tips(study: "aj.study.Study", trials: trial_simulation.Drawn) -> np.ndarray:
     arms = jax.vmap(study.space.arm)(jnp.asarray(trials.true))
     return np.asarray(jax.vmap(lambda arm, q: arm.position(q))(arms, jnp.asarray(trials.q)))
 
@@ -179,7 +179,7 @@ def test_equals_one_by_one(whole):
     names = [f"s{i}" for i in range(len(sizes))]
     for i in range(3):
         sockets = dict(zip(names, np.split(trials.q[i], np.cumsum(sizes)[:-1]), strict=True))
-        pairs = drawing.ends_of(study, study.settings[1])
+        pairs = trial_simulation.ends_of(study, study.settings[1])
         lengths = [
             aj.ReferenceLength(names[a], names[b], value, u)
             for (a, b), value, u in zip(pairs, trials.value[i], trials.u[i], strict=True)
@@ -214,6 +214,11 @@ def test_a_trial_depends_on_its_key_alone(whole):
 
 def test_pools_are_the_same_in_every_study_of_a_seed():
     one, two = (made(noise=noise) for noise in ({}, NOISE))
-    np.testing.assert_array_equal(pools.pool_of(one, one.settings[0]).table, pools.pool_of(two, two.settings[0]).table)
+    np.testing.assert_array_equal(
+        configuration_pool.pool_of(one, one.settings[0]).table, configuration_pool.pool_of(two, two.settings[0]).table
+    )
     other = made(seed=4)
-    assert not np.array_equal(pools.pool_of(one, one.settings[0]).table, pools.pool_of(other, other.settings[0]).table)
+    assert not np.array_equal(
+        configuration_pool.pool_of(one, one.settings[0]).table,
+        configuration_pool.pool_of(other, other.settings[0]).table,
+    )

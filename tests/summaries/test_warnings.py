@@ -25,8 +25,12 @@ def with_lengths(capture, *lengths):
     ("factor", "said"),
     [
         (1.0, None),
-        (1e-3, "are the lengths in m by mistake?"),
-        (0.1, "are the lengths in cm by mistake?"),
+        (1 / 1000, "are the reference lengths in m by mistake?"),
+        (1 / 10, "are the reference lengths in cm by mistake?"),
+        (1 / 25.4, "are the reference lengths in inches by mistake?"),
+        (1000, "is the arm in m, or are the reference lengths in um by mistake?"),
+        (25.4, "is the arm in inches by mistake?"),
+        (3.0, "check units, sockets, lengths and arm."),
         (1.02, "far from 1"),
     ],
 )
@@ -34,7 +38,7 @@ def test_a_wrong_reference_length(paper_arm, noisy_capture, factor, said):
     true = float(noisy_capture.lengths[0].value)
     result, text = warnings_of(with_lengths(noisy_capture, ("A", "B", factor * true, 0.002)), paper_arm)
     assert warnings.plausible(float(result.scale.value)) == (factor in (1.0, 1.02))
-    assert "cannot be the scale" not in text or factor < 1
+    assert ("cannot be the scale" in text) == (factor not in (1.0, 1.02))
     assert said is None or said in text
 
 

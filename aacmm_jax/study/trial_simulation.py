@@ -20,8 +20,8 @@ from ..kinematics.arm import with_values
 from ..kinematics.chain import Geometry, forward_pass
 from ..kinematics.inverse_kinematics import damped_inverse
 from ..kinematics.jacobian import jacobian_columns
+from .configuration_pool import Pool, pool_of
 from .definition import POOL_PARTS, CellValues, Setting, Study
-from .pools import Pool, pool_of
 
 _WIDTH = 16  # trials at a time: of one width, so that every trial's arithmetic is the same whatever the chunk
 _TOLERANCE = 1e-9  # mm: how far from its point a tip may end

@@ -19,7 +19,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach
 from . import asme_b89_4_22, iso_10360_12, jjf_1408
 from .decision import LEAST_DIVISOR, MOST, Limit, decide
-from .metrics import METRICS, AcceptanceTest, Measured, Metric
+from .results import METRICS, AcceptanceTest, Measured, Metric
 from .spheres import points_of
 
 _TESTS: tuple[Callable[[Measured, float], AcceptanceTest | None], ...] = (
