@@ -7,6 +7,9 @@ The names below are those that most scripts need; everything else is grouped by 
 
 import lazy_loader as _lazy_loader
 
+from .core import compilation_cache as _compilation_cache
 from .core import x64 as _x64  # noqa: F401 - turns on 64-bit floats before anything makes an array
+
+_compilation_cache.set_up()
 
 __getattr__, __dir__, __all__ = _lazy_loader.attach_stub(__name__, __file__)

@@ -115,6 +115,16 @@ def noisy_capture(paper_arm) -> "aj.Capture":
     )
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _few_memory_maps():
+    """Forget compiled programs before Linux refuses more memory maps (65,530 a process), which ends in a crash."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_bytes().splitlines()) > 20_000:
+        jax.clear_caches()
+        gc.collect()
+
+
 # Modules in decreasing order of their run time: a long one started last would keep a single worker busy at the end.
 LONGEST = (
     "cli/test_cli",

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..core.namespace import AnyArray
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import with_values
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass, sines_cosines
@@ -24,7 +25,7 @@ from ..model.scale import scale_of
 from ..model.weights import Weights
 from ..solver.active_set import Box, choose
 from ..solver.levenberg_marquardt import advance, begin
-from ..solver.reason import Reason, either, numbers_of, reasons
+from ..solver.reason import MAX_STEPS, RUNNING
 from .task import SOLVER
 
 
@@ -58,15 +59,15 @@ class Shape(NamedTuple):
 class _Solutions(NamedTuple):
     """Results of the solves of a chunk."""
 
-    parameters: Float[Array, "b p"]
+    parameters: Float[AnyArray, "b p"]
     steps: Int[Array, " b"]
-    reason: Reason
+    reason: Int[Array, " b"]  # number of a `Reason`
 
 
 @partial(jax.jit, static_argnames=("shape", "capacity"))
 def solve_chunk(
     problems: Problems, count: Int[Array, ""], noise: Noise | None, shape: Shape, capacity: int
-) -> tuple[Array, ...]:
+) -> tuple[Any, ...]:
     """Solve the first ``count`` of ``capacity`` problems; the fields of `ManyIdentifications` up to ``active``."""
     batch = _Batch(problems, sines_cosines(problems.q), None, None)
     start = jnp.broadcast_to(problems.start, (capacity, len(shape.solved)))
@@ -76,7 +77,7 @@ def solve_chunk(
         batch = batch._replace(joint_weights=_in_groups(_joint_weights, batch, start, shape))
     solutions = _solve_all(batch, shape, count, capacity)
     de, deltam, sigma, k, active = _in_groups(_metrics, batch, solutions.parameters, shape)
-    return solutions.parameters, de, deltam, sigma, k, solutions.steps, numbers_of(solutions.reason), active
+    return solutions.parameters, de, deltam, sigma, k, solutions.steps, solutions.reason, active
 
 
 class _Batch(NamedTuple):
@@ -85,7 +86,7 @@ class _Batch(NamedTuple):
     problems: Problems
     sines_cosines: SinesCosines
     weights: Weights | None  # of poses, where the noise is given
-    joint_weights: tuple[Array, Array] | None  # of a joint solve: sigma and whitening
+    joint_weights: tuple[Any, Any] | None  # of a joint solve: sigma and whitening
 
     def selected(self, shape: Shape, index: Int[Array, " w"]) -> "_Batch":
         """The problems of an index, one a slot."""
@@ -99,14 +100,14 @@ class _Batch(NamedTuple):
 def _selected(problems: Problems, shape: Shape, index: Int[Array, " w"]) -> Problems:
     """The problems of an index, one a slot; what is shared is repeated, but for q."""
 
-    def slots_of(leaf: Array, many: bool) -> Array:
+    def slots_of(leaf: Array, many: bool) -> AnyArray:
         return leaf[index] if many else jnp.broadcast_to(leaf, (shape.slots, *leaf.shape))
 
     q = problems.q[index] if shape.batched.q else problems.q
     return jax.tree.map(slots_of, problems, shape.batched)._replace(q=q)
 
 
-def _in_groups(work: Callable, batch: _Batch, parameters: Float[Array, "capacity p"], shape: Shape) -> Any:
+def _in_groups(work: Callable, batch: _Batch, parameters: Float[AnyArray, "capacity p"], shape: Shape) -> Any:
     """``work(batch, parameters, shape)`` for all, as many at a time as there are slots."""
 
     def group(row: Int[Array, ""]) -> Any:
@@ -147,14 +148,14 @@ def _solve_all(batch: _Batch, shape: Shape, count: Int[Array, ""], capacity: int
         _, box = starts(now)
         progress = advance(progress, evaluate(progress.step.trial, now), box, SOLVER.rules)
         late = progress.steps >= shape.max_steps
-        done = (progress.reason != Reason.running) | late
-        reason = either(late & (progress.reason == Reason.running), Reason.max_steps, progress.reason)
+        done = (progress.reason != RUNNING) | late
+        reason = jnp.where(late & (progress.reason == RUNNING), MAX_STEPS, progress.reason)
         slot = jnp.where(done & (index < count), index, capacity)
         whole = _selected(batch.problems, shape, now).start.at[:, solved].set(progress.y)
         solutions = _Solutions(
             solutions.parameters.at[slot].set(whole, mode="drop"),
             solutions.steps.at[slot].set(progress.steps, mode="drop"),
-            reasons(numbers_of(solutions.reason).at[slot].set(numbers_of(reason), mode="drop")),
+            solutions.reason.at[slot].set(reason, mode="drop"),
         )
         index = jnp.where(done, upcoming + jnp.cumsum(done) - 1, index)
         upcoming = upcoming + jnp.sum(done)
@@ -164,39 +165,39 @@ def _solve_all(batch: _Batch, shape: Shape, count: Int[Array, ""], capacity: int
     first = jnp.arange(shape.slots)
     p = len(shape.solved)
     empty = _Solutions(
-        jnp.zeros((capacity, p)), jnp.zeros(capacity, dtype=jnp.int64), reasons(jnp.zeros(capacity, dtype=jnp.int32))
+        jnp.zeros((capacity, p)), jnp.zeros(capacity, dtype=jnp.int64), jnp.zeros(capacity, dtype=jnp.int32)
     )
     carry = (begin(*starts(jnp.minimum(first, count - 1))), first, jnp.asarray(shape.slots), empty)
     return jax.lax.while_loop(more, once, carry)[3]
 
 
-def _with_parameters(rows: Geometry, vector: Float[Array, "w p"], indices: tuple[tuple[str, int], ...]) -> Geometry:
+def _with_parameters(rows: Geometry, vector: Float[AnyArray, "w p"], indices: tuple[tuple[str, int], ...]) -> Geometry:
     """Geometry of every slot ``(w, 1, n)`` with its free parameters from ``vector``; the axis of ones is for the
     poses."""
     return jax.tree.map(lambda leaf: leaf[:, None, :], rows._replace(**with_values(rows, vector, indices)))
 
 
-def _tips(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> Float[Array, "w N 3"]:
+def _tips(part: _Batch, parameters: Float[AnyArray, "w p"], shape: Shape) -> Float[AnyArray, "w N 3"]:
     geometry = _with_parameters(part.problems.geometry, parameters, shape.indices)
     return jnp.swapaxes(forward_pass(geometry, part.sines_cosines).tip, -1, -2)
 
 
 def _measurement(
-    nominal: Float[Array, " l"], u: Float[Array, " l"], weights: Weights | None, shape: Shape
+    nominal: Float[AnyArray, " l"], u: Float[AnyArray, " l"], weights: Weights | None, shape: Shape
 ) -> Measurement:
     """The lengths of one problem; its poses are known by their tips already."""
     empty = jnp.zeros((sum(shape.sizes), 1))
     return Measurement(empty, sines_cosines(empty), nominal, u, shape.sizes, shape.ends, weights)
 
 
-def _metrics(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> tuple[Array, ...]:
+def _metrics(part: _Batch, parameters: Float[AnyArray, "w p"], shape: Shape) -> tuple[Any, ...]:
     """DE, Deltam, sigma, k and active bounds of one group."""
     problems, tips = part.problems, _tips(part, parameters, shape)
     metrics = jax.vmap(lambda t: repeatability(t, shape.sizes, fitted=sum(shape.solved)))(tips)
     k = jnp.ones(shape.slots)
     if shape.ends:
 
-        def scale(t: Array, value: Array, uncertainty: Array, sigma: Array, weights: Weights | None) -> Array:
+        def scale(t: AnyArray, value: Array, uncertainty: Array, sigma: AnyArray, weights: Weights | None) -> AnyArray:
             return scale_of(t, _measurement(value, uncertainty, weights, shape), sigma).value
 
         k = jax.vmap(scale)(tips, problems.nominal, problems.u, metrics.sigma, part.weights)
@@ -204,18 +205,18 @@ def _metrics(part: _Batch, parameters: Float[Array, "w p"], shape: Shape) -> tup
     return metrics.de, metrics.deltam, metrics.sigma, k, jnp.where(jnp.asarray(shape.solved)[None], side, 0)
 
 
-def _weights(noise: Noise, part: _Batch, start: Float[Array, "w p"], shape: Shape) -> Weights:
+def _weights(noise: Noise, part: _Batch, start: Float[AnyArray, "w p"], shape: Shape) -> Weights:
     """Weights of poses by the noise, in the arm at the start of one group."""
     geometry = _with_parameters(part.problems.geometry, start, shape.indices)
     return Weights.of(tip_covariances(geometry, part.sines_cosines, noise), shape.sizes)
 
 
-def _joint_weights(part: _Batch, start: Float[Array, "w p"], shape: Shape) -> tuple[Array, Array]:
+def _joint_weights(part: _Batch, start: Float[AnyArray, "w p"], shape: Shape) -> tuple[Any, Any]:
     """Sigma and whitening of every slot for a joint solve, in the arm at its start."""
 
     def joint_weights(
-        t: Array, value: Array, uncertainty: Array, sigma: Array, weights: Weights | None
-    ) -> tuple[Array, Array]:
+        t: AnyArray, value: Array, uncertainty: Array, sigma: AnyArray, weights: Weights | None
+    ) -> tuple[Any, Any]:
         found = JointWeights.of(t, _measurement(value, uncertainty, weights, shape), sigma)
         return found.sigma, found.whitening
 

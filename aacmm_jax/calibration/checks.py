@@ -4,10 +4,10 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from ..core.arrays import is_concrete
 from ..core.errors import InputError
+from ..core.namespace import AnyArray
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm, is_single
@@ -42,7 +42,7 @@ def check_single(arm: Arm, capture: Capture, bounds: Bounds, many: str) -> None:
         )
 
 
-def check_start(bounds: Bounds, vector: Array, what: str) -> None:
+def check_start(bounds: Bounds, vector: AnyArray, what: str) -> None:
     """Raise `InputError` where a start is not one value a parameter, inside the box."""
     if vector.shape != (len(bounds.space.names),):
         raise InputError(

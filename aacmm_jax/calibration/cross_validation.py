@@ -1,18 +1,19 @@
 """Cross-validation: the arm identified without some of the sockets, and evaluated on those left out."""
 
+import math
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ..core.errors import InputError
+from ..core.namespace import to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm
 from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Bounds
-from ..model.measurement import averaging_matrix
+from ..model.socket_sums import means_over_sockets, sums_over_sockets
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .evaluation import evaluate
 from .record import uncertainty_of
@@ -79,7 +80,7 @@ def cross_validate(
     found = []
     for group in groups_of(capture):
         rest = _part(capture, tuple(name for name in capture.names if name not in group))
-        result = calibrate(arm, rest, bounds, method=method, hold=hold, noise=noise)
+        result = calibrate(arm, rest, bounds, method=method, hold=hold, noise=noise, check_identifiability=False)
         left = _part(capture, group)
         found.append(_evaluated(uncertainty_of(result), left, group, bool(result.converged)))
     return CrossValidation(tuple(found))
@@ -98,38 +99,34 @@ def _evaluated(uncertainty: Uncertainty, left: Capture, group: tuple[str, ...], 
         sockets=group,
         poses=sum(size for size in left.sizes if size > 1),
         rms=float(evaluation.repeatability.rms),
-        rms_predicted=float(predicted),
+        rms_predicted=predicted,
         length_error=np.asarray(evaluation.error),
-        length_u=np.asarray(length_u),
+        length_u=length_u,
         converged=converged,
     )
 
 
-def predicted_errors(uncertainty: Uncertainty, capture: Capture) -> tuple[Float[Array, ""], Float[Array, " l"]]:
+def predicted_errors(uncertainty: Uncertainty, capture: Capture) -> tuple[float, Float[np.ndarray, " l"]]:
     """Predictions of an arm's uncertainty and the readings' noise for a capture that it was not identified from, mm:
     the RMS distance from the sockets' centroids, and the standard uncertainty of the error of every reference
     length."""
+    uncertainty, capture = to_numpy((uncertainty, capture))
     arm, owner = uncertainty.arm, capture.owner
     sizes = np.asarray(capture.sizes, dtype=float)
     slopes = np.asarray(uncertainty.derivatives(capture.q))
-    averaging = averaging_matrix(capture.sizes)
-    means = np.einsum("sN,Ncp->scp", averaging, slopes)
+    means = np.moveaxis(np.asarray(means_over_sockets(np.moveaxis(slopes, 0, -1), capture.sizes)), -1, 0)
     centred = slopes - means[owner]
     reading = np.asarray(tip_covariances(arm.geometry, sines_cosines(capture.q), uncertainty.noise))
-    squares = np.trace(np.asarray(uncertainty.covariance_of_functions(jnp.asarray(centred))), axis1=1, axis2=2)
+    squares = np.trace(uncertainty.covariance_of_functions(centred), axis1=1, axis2=2)
     squares = squares + np.einsum("ccN->N", reading) * (1 - 1 / sizes[owner])
     scattered = sizes[owner] > 1
-    centroids = averaging @ np.asarray(arm.position(capture.q))
+    centroids = means_over_sockets(np.asarray(arm.position(capture.q)).T, capture.sizes).T
     ends = capture.ends()
     between = centroids[ends[:, 1]] - centroids[ends[:, 0]]
     direction = between / np.linalg.norm(between, axis=1, keepdims=True)
     along = np.einsum("lc,lcp->lp", direction, means[ends[:, 1]] - means[ends[:, 0]])
-    of_means = np.einsum("sN,cdN->scd", averaging**2, reading)
+    of_means = np.moveaxis(np.asarray(sums_over_sockets(reading, capture.sizes)) / sizes**2, -1, 0)
     scatter = np.einsum("lc,lcd,ld->l", direction, of_means[ends[:, 0]] + of_means[ends[:, 1]], direction)
     own = np.array([float(length.u) for length in capture.lengths])
-    variance = (
-        np.asarray(uncertainty.covariance_of_functions(jnp.asarray(along[:, None, :])))[:, 0, 0] + scatter + own**2
-    )
-    return jnp.sqrt(jnp.asarray(squares[scattered].mean() if scattered.any() else np.nan)), jnp.asarray(
-        np.sqrt(variance)
-    )
+    variance = np.asarray(uncertainty.covariance_of_functions(along[:, None, :]))[:, 0, 0] + scatter + own**2
+    return math.sqrt(squares[scattered].mean()) if scattered.any() else math.nan, np.sqrt(variance)

@@ -8,10 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..core._compat import member_numbers
 from ..core.arrays import Numbers, is_concrete
+from ..core.distributions import chi_square_quantile
+from ..core.namespace import AnyArray
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
@@ -51,7 +53,7 @@ class AbstractResult(eqx.Module):
         return self._stage1.anchor.set_by
 
     @property
-    def converged(self) -> Bool[Array | np.ndarray, "*batch"]:
+    def converged(self) -> Bool[AnyArray, "*batch"]:
         """Whether every solve ended at a minimum."""
         both = converged(self._stage1.result) & converged(self.result)
         return np.asarray(both) if is_concrete(both) else both
@@ -61,7 +63,7 @@ class AbstractSingleResult(AbstractResult):
     """What an `Identification` and a `Calibration` have in common."""
 
     arm: eqx.AbstractVar[Arm]
-    active: eqx.AbstractVar[Int[Array, " p"]]
+    active: eqx.AbstractVar[Int[AnyArray, " p"]]
     parameter_covariance: eqx.AbstractVar[ParameterCovariance]
     after: eqx.AbstractVar[Repeatability]
 
@@ -71,12 +73,12 @@ class AbstractSingleResult(AbstractResult):
         """The result of stage 1: this one, or that of a calibration."""
 
     @property
-    def covariance(self) -> Float[Array, "*batch p p"]:
+    def covariance(self) -> Float[AnyArray, "*batch p p"]:
         """Covariance of the parameters; that of what is determined, where not all is."""
         return self.parameter_covariance.matrix
 
     @property
-    def determined(self) -> Bool[Array, "*batch p"]:
+    def determined(self) -> Bool[AnyArray, "*batch p"]:
         """Which parameters are determined one by one, and not only in combination with others."""
         return self.parameter_covariance.determined
 
@@ -107,20 +109,20 @@ class Identification(AbstractSingleResult):
     """
 
     arm: Arm
-    parameters: Float[Array, " p"]
-    de: Float[Array, ""]  # mean distance from the centroid, mm
-    deltam: Float[Array, ""]  # largest half range, mm
-    active: Int[Array, " p"]  # -1 on the lower bound, +1 on the upper, 0 inside
-    steps: Int[Array, ""]  # evaluations
+    parameters: Float[AnyArray, " p"]
+    de: Float[AnyArray, ""]  # mean distance from the centroid, mm
+    deltam: Float[AnyArray, ""]  # largest half range, mm
+    active: Int[AnyArray, " p"]  # -1 on the lower bound, +1 on the upper, 0 inside
+    steps: Int[AnyArray, ""]  # evaluations
     result: Reason  # why it ended
-    optimality: Float[Array, ""]  # projected gradient as a cosine; 0 at a minimum
+    optimality: Float[AnyArray, ""]  # projected gradient as a cosine; 0 at a minimum
     scale: Scale | None  # k of this arm, where the capture holds reference lengths
     # Given the scale anchor: its rows are 0, and those of active parameters but for near-degenerate directions.
     parameter_covariance: ParameterCovariance
     before: Repeatability  # the start
     after: Repeatability
     # Root mean square of the residuals in units of what the given noise predicts (1 where it is right), or None.
-    reduced_chi: Float[Array, ""] | None
+    reduced_chi: Float[AnyArray, ""] | None
     bounds: Bounds
     anchor: ScaleAnchor = eqx.field(static=True)  # what sets the scale
     noise_model: NoiseModel = eqx.field(static=True)  # model of the tips' errors
@@ -131,7 +133,7 @@ class Identification(AbstractSingleResult):
         return self
 
     @property
-    def k(self) -> Float[Array, "*batch"] | None:
+    def k(self) -> Float[AnyArray, "*batch"] | None:
         """k = measured / nominal, where the capture holds reference lengths."""
         return None if self.scale is None else self.scale.value
 
@@ -140,18 +142,18 @@ class Calibration(AbstractSingleResult):
     """Result of both stages, or of the joint solve. ``covariance`` is in the order of ``space.names``; mm and rad."""
 
     arm: Arm
-    parameters: Float[Array, " p"]
+    parameters: Float[AnyArray, " p"]
     scale: Scale  # k of stage 1
-    de: Float[Array, ""]  # mean distance from the centroid, mm
-    deltam: Float[Array, ""]  # largest half range, mm
-    active: Int[Array, " p"]  # -1 on the lower bound, +1 on the upper, 0 inside
-    steps: Int[Array, ""]  # evaluations of all solves
+    de: Float[AnyArray, ""]  # mean distance from the centroid, mm
+    deltam: Float[AnyArray, ""]  # largest half range, mm
+    active: Int[AnyArray, " p"]  # -1 on the lower bound, +1 on the upper, 0 inside
+    steps: Int[AnyArray, ""]  # evaluations of all solves
     result: Reason  # why the last solve ended
     parameter_covariance: ParameterCovariance
     before: Repeatability
     after: Repeatability
-    length_before: Float[Array, " l"]  # measured reference lengths, mm: at the start
-    length_after: Float[Array, " l"]  # by the calibrated arm
+    length_before: Float[AnyArray, " l"]  # measured reference lengths, mm: at the start
+    length_after: Float[AnyArray, " l"]  # by the calibrated arm
     stage1: Identification
     method: str = eqx.field(static=True)
 
@@ -160,7 +162,7 @@ class Calibration(AbstractSingleResult):
         return self.stage1
 
     @property
-    def k(self) -> Float[Array, "*batch"]:
+    def k(self) -> Float[AnyArray, "*batch"]:
         """k = measured / nominal of stage 1."""
         return self.scale.value
 
@@ -242,7 +244,7 @@ class ManyCalibrations(AbstractManyResults):
         return self.stage1.bounds
 
 
-def converged(result: Reason) -> Bool[Array | np.ndarray, "*batch"]:
+def converged(result: Reason) -> Bool[AnyArray, "*batch"]:
     """Whether a reason means that a minimum was reached."""
     number = numbers_of(result)
     good = np.array(_GOOD, dtype=number.dtype)
@@ -334,6 +336,6 @@ class CrossValidation(NamedTuple):
     @property
     def surprising(self) -> bool:
         """Whether errors exceed their prediction by half, and by more than chance allows in one case of a hundred."""
-        from scipy import stats
-
-        return any(ratio > max(1.5, math.sqrt(stats.chi2.ppf(0.99, count) / count)) for ratio, count in self.ratios())
+        return any(
+            ratio > max(1.5, math.sqrt(chi_square_quantile(0.99, count) / count)) for ratio, count in self.ratios()
+        )

@@ -15,20 +15,20 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from ..core._compat import member_numbers
+from ..core.namespace import AnyArray, namespace, scan, set_at, stop_gradient, to_jax
 from ..data.capture import Capture
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement
 from ..model.scale import divide_free_lengths, divisible, replaced_lengths, scale_of
-from ..solver.reason import Reason, numbers_of, reasons
+from ..solver.reason import MAX_STEPS, Reason, numbers_of, reasons
 from .results import ManyIdentifications
 from .scale_anchor import ScaleAnchor
-from .task import Task, fit_repeatability
+from .task import Fit, Task, fit_repeatability
 
 # Identifications with an adjusted anchor; the secant method ends at k = 1 to rounding after three or four.
 _ROUNDS = 4
@@ -54,103 +54,113 @@ def divided(
     return divide_free_lengths(space, parameters, k, replaced(anchor, space))
 
 
-def replaced(anchor: ScaleAnchor, space: Parameters) -> Float[Array, "... p"]:
+def replaced(anchor: ScaleAnchor, space: Parameters) -> Float[AnyArray, "... p"]:
     """Fixed lengths that the free ones replace in the division, mm."""
     return replaced_lengths(space, space.base, ((), ()) if anchor.partners is None else anchor.partners)
 
 
 def within_bounds(
-    space: Parameters, lower: Float[Array, "... p"], upper: Float[Array, "... p"], scaled: Float[Array, "... p"]
-) -> Float[Array, "... p"]:
+    space: Parameters,
+    lower: Float[AnyArray, "... p"],
+    upper: Float[AnyArray, "... p"],
+    scaled: Float[AnyArray, "... p"],
+) -> Float[AnyArray, "... p"]:
     """Divided lengths within their bounds, and on a bound that only rounding separates them from.
 
     So short a step would not bring a solve onto the bound, which then counts as inactive, in derivatives too.
     """
-    inside = jnp.clip(scaled, lower, upper)
-    inside = jnp.where(inside - lower <= _ROUNDING, lower, jnp.where(upper - inside <= _ROUNDING, upper, inside))
-    return jnp.where(jnp.broadcast_to(jnp.asarray(space.lengths), scaled.shape), inside, scaled)
+    xp = namespace(lower, upper, scaled)
+    inside = xp.clip(scaled, lower, upper)
+    inside = xp.where(inside - lower <= _ROUNDING, lower, xp.where(upper - inside <= _ROUNDING, upper, inside))
+    return xp.where(np.broadcast_to(space.lengths, scaled.shape), inside, scaled)
 
 
 def must_adjust(
     anchor: ScaleAnchor,
     bounds: Bounds,
-    active: Int[Array, "... p"],
-    scaled: Float[Array, "... p"],
-) -> Bool[Array, "..."]:
+    active: Int[AnyArray, "... p"],
+    scaled: Float[AnyArray, "... p"],
+) -> Bool[AnyArray, "..."]:
     """Whether the division is not the result of stage 2, given what was active in stage 1; see the module."""
-    lengths = jnp.broadcast_to(jnp.asarray(divisible(bounds.space)), scaled.shape)
+    xp = namespace(anchor, bounds, active, scaled)
+    lengths = np.broadcast_to(divisible(bounds.space), scaled.shape)
     concerned = (scaled < bounds.lower - _ROUNDING) | (scaled > bounds.upper + _ROUNDING)
     if anchor.hold is not None:  # without an anchor it is the active bounds that set the scale of stage 1
         concerned = concerned | (active != 0)
     if anchor.partners is None:
-        concerned = jnp.ones_like(concerned)
-    needed = jnp.any(concerned & lengths, axis=-1) & jnp.all(jnp.isfinite(scaled), axis=-1)
-    return needed if can_scale(anchor) else jnp.zeros_like(needed)
+        concerned = xp.ones_like(concerned)
+    needed = xp.any(concerned & lengths, axis=-1) & xp.all(xp.isfinite(scaled), axis=-1)
+    return needed if can_scale(anchor) else xp.zeros_like(needed)
 
 
 class Adjusted(NamedTuple):
     """The parameters for which k = 1."""
 
-    parameters: Float[Array, " p"]
-    steps: Int[Array, ""]
+    parameters: Float[AnyArray, " p"]
+    steps: Int[AnyArray, ""]
     result: Reason
 
 
 def adjust_anchor(
-    task: Task, measurement: Measurement, scaled: Float[Array, " p"], sigma: Float[Array, ""]
+    task: Task, measurement: Measurement, scaled: Float[AnyArray, " p"], sigma: Float[AnyArray, ""]
 ) -> Adjusted:
     """Stage 1 repeated with its anchor adjusted by the secant method until k = 1, from the divided parameters.
 
     The adjusted length is the root of log k, so its derivative is that of an implicit function, exact where k = 1 is
     reached; on a bound it follows the bound.
     """
-    bounds, name = task.bounds, task.anchor.adjusted
+    xp, bounds, name = namespace(task, scaled), task.bounds, task.anchor.adjusted
     assert name is not None
     i = task.space.index(name)
     lower, upper = bounds.lower[i], bounds.upper[i]
 
-    def identify_again(x: Float[Array, " p"], length: Float[Array, ""]) -> tuple[Array, Array, optx.Solution]:
-        start = jnp.clip(x, bounds.lower, bounds.upper).at[i].set(length)
-        x, solution = fit_repeatability(task, measurement, start, name)
-        return x, jnp.log(scale_of(task.space.arm(x).position(measurement.q), measurement, sigma).value), solution
+    def identify_again(x: Float[AnyArray, " p"], length: Float[AnyArray, ""]) -> tuple[Any, Fit]:
+        again = set_at(xp.clip(x, bounds.lower, bounds.upper), i, length)
+        found = fit_repeatability(task, measurement, again, name)
+        tips = task.space.arm(found.parameters).position(measurement.q)
+        return xp.log(scale_of(tips, measurement, sigma).value), found
 
-    def one_round(carry: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], Array]:
+    def one_round(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], Any]:
         x, length, last_length, last_log_k = carry
-        x, log_k, solution = identify_again(x, length)
+        log_k, found = identify_again(x, length)
         following = _secant(length, last_length, log_k, last_log_k, lower, upper)
-        return (x, following, length, log_k), solution.stats["num_steps"]
+        return (found.parameters, following, length, log_k), found.steps
 
-    def solve(_: Any, length: Float[Array, ""]) -> tuple[Array, tuple[Array, Array]]:
-        first = (start, length, length, jnp.zeros(()))
-        (x, length, _, _), steps = jax.lax.scan(one_round, first, length=_ROUNDS - 1)
+    def solve(_: Any, length: Float[AnyArray, ""]) -> tuple[Any, tuple[Any, Any]]:
+        first = (start, length, length, xp.zeros(()))
+        (x, length, _, _), steps = scan(one_round, first, length=_ROUNDS - 1)
         # As a float: custom_root gives this a tangent of its own type, which an integer must not have.
-        return length, (x, jnp.sum(steps).astype(float))
+        return length, (x, xp.sum(steps).astype(float))
 
-    def difference(length: Float[Array, ""]) -> Float[Array, ""]:
+    def difference(length: Float[AnyArray, ""]) -> Float[AnyArray, ""]:
         """Zero at the adjusted length: log k, or the distance from the bound that the length is on."""
-        _, log_k, _ = identify_again(start, length)
-        bound = jnp.where(length <= lower, lower, upper)
-        return jnp.where(_on_bound(length, lower, upper), length - jnp.where(jnp.isfinite(bound), bound, 0.0), log_k)
+        log_k, _ = identify_again(start, length)
+        bound = xp.where(length <= lower, lower, upper)
+        return xp.where(_on_bound(length, lower, upper), length - xp.where(xp.isfinite(bound), bound, 0.0), log_k)
 
-    def divide_by_slope(derivative: Callable, right: Float[Array, ""]) -> Float[Array, ""]:
-        slope = derivative(jnp.ones(()))
-        return right / jnp.where(slope == 0, 1.0, slope)
+    def divide_by_slope(derivative: Callable, right: Float[AnyArray, ""]) -> Float[AnyArray, ""]:
+        slope = derivative(xp.ones(()))
+        return right / xp.where(slope == 0, 1.0, slope)
 
-    start = jax.lax.stop_gradient(scaled)
-    first_length = jnp.clip(start[i], *jax.lax.stop_gradient((lower, upper)))
-    length, (x, steps) = jax.lax.custom_root(difference, first_length, solve, divide_by_slope, has_aux=True)
-    x, log_k, solution = identify_again(x, length)
-    number = _number_of_reason(numbers_of(solution.stats["reason"]), log_k, _on_bound(length, lower, upper))
-    return Adjusted(x, steps.astype(int) + solution.stats["num_steps"], reasons(number))
+    start = stop_gradient(scaled)
+    first_length = xp.clip(start[i], *stop_gradient((lower, upper)))
+    if xp is np:
+        length, (x, steps) = solve(None, first_length)
+    else:
+        length, (x, steps) = jax.lax.custom_root(difference, first_length, solve, divide_by_slope, has_aux=True)
+    log_k, found = identify_again(x, length)
+    number = _number_of_reason(member_numbers(found.result), log_k, _on_bound(length, lower, upper))
+    return Adjusted(found.parameters, steps.astype(int) + found.steps, reasons(number))
 
 
 def _on_bound(length: Any, lower: Any, upper: Any) -> Any:
     return (length <= lower) | (length >= upper)
 
 
-def _number_of_reason(numbers: Any, log_k: Any, on_bound: Any) -> Array:
+def _number_of_reason(numbers: Any, log_k: Any, on_bound: Any) -> Int[AnyArray, "..."]:
     """The reason of the last identification; not converged where k = 1 was not reached, unless a bound prevents it."""
-    return jnp.where((jnp.abs(log_k) > LARGEST_LOG_K) & ~on_bound, numbers_of(Reason.max_steps), numbers)
+    xp = namespace(numbers, log_k)
+    return xp.where((xp.abs(log_k) > LARGEST_LOG_K) & ~on_bound, MAX_STEPS, numbers)
 
 
 def second_stage_many(
@@ -170,11 +180,11 @@ def second_stage_many(
     # Divided by k, the whole arm shrinks about the base, and so do the distances between its tips.
     factor = stage1.k if can_scale(anchor) else np.ones_like(stage1.k)
     de, deltam, steps, reason = stage1.de / factor, stage1.deltam / factor, stage1.steps, numbers_of(stage1.result)
-    rows = np.flatnonzero(must_adjust(anchor, bounds, jnp.asarray(stage1.active), jnp.asarray(scaled)))
+    rows = np.flatnonzero(must_adjust(anchor, bounds, stage1.active, scaled))
     active = stage1.active
     if can_scale(anchor):
-        scaled = np.array(within_bounds(space, bounds.lower, bounds.upper, jnp.asarray(scaled)))
-        active = np.asarray(bounds.active(jnp.asarray(scaled)))
+        scaled = np.array(within_bounds(space, lower, upper, scaled))
+        active = np.asarray(bounds.active(scaled))
     if len(rows):
         found, found_reason, more = _adjust_many(
             anchor, space, scaled[rows], lower[rows], upper[rows], partial(identify_again, rows)
@@ -183,7 +193,7 @@ def second_stage_many(
         scaled[rows], de[rows], deltam[rows], steps[rows] = found.parameters, found.de, found.deltam, steps[rows] + more
         reason[rows] = found_reason
         active[rows] = np.where(scaled[rows] <= lower[rows], -1, np.where(scaled[rows] >= upper[rows], 1, 0))
-    result = reasons(jnp.asarray(reason))
+    result = to_jax(reasons(np.asarray(reason)))
     return {"parameters": scaled, "de": de, "deltam": deltam, "steps": steps, "result": result, "active": active}
 
 
@@ -224,9 +234,12 @@ def rows_of(rows: np.ndarray, arm: Arm, capture: Capture, *boxes: np.ndarray) ->
     return (arm, capture, *(chosen(1, box) for box in boxes))
 
 
-def _secant(length: Any, last_length: Any, log_k: Any, last_log_k: Any, lower: Any, upper: Any) -> Array:
+def _secant(
+    length: Any, last_length: Any, log_k: Any, last_log_k: Any, lower: Any, upper: Any
+) -> Float[AnyArray, "..."]:
     """The next value of the adjusted length, within bounds: a secant step of log k towards 0, the first of slope 1."""
+    xp = namespace(length, last_length, log_k, last_log_k, lower, upper)
     moved = length != last_length
-    ratio = jnp.log(jnp.where(moved, length / jnp.where(moved, last_length, 1.0), 2.0))
-    slope = jnp.where(moved, jnp.clip((log_k - last_log_k) / ratio, *_SLOPES), 1.0)
-    return jnp.clip(length * jnp.exp(-log_k / slope), lower, upper)
+    ratio = xp.log(xp.where(moved, length / xp.where(moved, last_length, 1.0), 2.0))
+    slope = xp.where(moved, xp.clip((log_k - last_log_k) / ratio, *_SLOPES), 1.0)
+    return xp.clip(length * xp.exp(-log_k / slope), lower, upper)

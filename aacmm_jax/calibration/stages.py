@@ -5,13 +5,13 @@ from typing import Literal
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..core._compat import inside_trace
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
+from ..core.namespace import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
@@ -19,7 +19,6 @@ from ..kinematics.parameters import Bounds
 from ..model.measurement import Measurement, check_joints
 from ..model.metrics import repeatability
 from ..model.residuals import JointWeights, joint_model, joint_residual
-from ..solver.bounded import least_squares
 from ..solver.reason import Reason
 from ..uncertainty import propagation, scale_uncertainty
 from ..uncertainty.active_bounds import with_active_bounds
@@ -29,7 +28,7 @@ from .checks import based_on, check_enough, check_noise_model, check_single, che
 from .results import Calibration, Identification
 from .scale_anchor import scale_anchor, scale_set_by_clause
 from .second_stage import adjust_anchor, can_scale, divided, must_adjust, replaced, within_bounds
-from .task import SOLVER, Task, fit_repeatability
+from .task import Task, fit, fit_repeatability
 
 _MAX_STEPS = 300
 
@@ -73,7 +72,8 @@ def identify(
     Raises:
         InputError: too few poses, a start outside the box, names that do not fit, or a batch (see `identify_many`).
     """
-    return _identify(_checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many"))
+    task = _checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many")
+    return to_jax(_identify(to_numpy(task)))
 
 
 def _checked(
@@ -110,6 +110,7 @@ def calibrate(
     start: Numbers | None = None,
     noise: Noise | None = None,
     noise_model: NoiseModel | None = None,
+    check_identifiability: bool = True,
     strict: bool = False,
     max_steps: int = _MAX_STEPS,
 ) -> Calibration:
@@ -133,6 +134,8 @@ def calibrate(
         start: free parameters ``(p,)`` to start from, mm and rad.
         noise: standard deviations of readings and seat.
         noise_model: another model of the tips' errors.
+        check_identifiability: warn where free parameters are not determined by these data; the check takes about as
+            long as the calibration.
         strict: raise instead of warn where free parameters are not determined by these data.
         max_steps: most evaluations of each solve.
 
@@ -155,15 +158,17 @@ def calibrate(
             "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
             "hold."
         )
-    _check_identifiable(capture, task, strict)
+    if check_identifiability or strict:
+        _check_identifiable(capture, task, strict)
     _check_scale(task, method)
+    task = to_numpy(task)
     if method == "joint":
-        return _joint(task)
+        return to_jax(_joint(task))
     result, adjust = _divided(task)
     if not can_scale(task.anchor) or (is_concrete(adjust) and not bool(adjust)):
-        return result
+        return to_jax(result)
     if is_concrete(adjust):
-        return _adjusted(task, result)
+        return to_jax(_adjusted(task, result))
     return jax.lax.cond(adjust, lambda: _adjusted(task, result), lambda: result)
 
 
@@ -188,23 +193,25 @@ def _check_scale(task: Task, method: str) -> None:
         warnings.warn(sentence, IdentifiabilityWarning, stacklevel=3)
 
 
-@eqx.filter_jit
+@compiled(jit=eqx.filter_jit)
 def _identify(task: Task) -> Identification:
     return _stage1(task)[0]
 
 
 def _stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
+    xp = namespace(task)
     space, start, hold = task.space, task.start, task.anchor.hold
     measurement = task.measurement.weighted(space.arm(start).geometry, task.noise)
-    parameters, solution = fit_repeatability(task, measurement, start, hold)
+    found = fit_repeatability(task, measurement, start, hold)
+    parameters = found.parameters
     kept = np.array([name == hold for name in space.names])
     fitted = int((~kept).sum())
     identified = space.arm(parameters)
     tips = identified.position(measurement.q)
     after = repeatability(tips, measurement.sizes, fitted=fitted)
-    active = jnp.where(jnp.asarray(kept), 0, task.bounds.active(parameters))
+    active = xp.where(xp.asarray(kept), 0, task.bounds.active(parameters))
     propagated = propagation.propagate_solve(
-        identified, space, measurement, (active != 0) | jnp.asarray(kept), after.sigma, task.noise_model, task.noise
+        identified, space, measurement, (active != 0) | xp.asarray(kept), after.sigma, task.noise_model, task.noise
     )
     identification = Identification(
         arm=identified,
@@ -212,9 +219,9 @@ def _stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
         de=after.de,
         deltam=after.deltam,
         active=active,
-        steps=solution.stats["num_steps"],
-        result=solution.stats["reason"],
-        optimality=solution.stats["optimality"],
+        steps=found.steps,
+        result=found.result,
+        optimality=found.optimality,
         scale=scale_uncertainty.propagated_scale(tips, measurement, propagated, after.sigma)
         if measurement.ends
         else None,
@@ -232,23 +239,24 @@ def _stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
     return identification, propagated
 
 
-def _reduced_chi(measurement: Measurement, tips: Float[Array, "N 3"], fitted: int) -> Float[Array, ""] | None:
+def _reduced_chi(measurement: Measurement, tips: Float[AnyArray, "N 3"], fitted: int) -> Float[AnyArray, ""] | None:
+    xp = namespace(measurement, tips, fitted)
     if measurement.weights is None:
         return None
     degrees_of_freedom = max(3 * sum(size - 1 for size in measurement.sizes) - fitted, 1)
-    return jnp.sqrt(jnp.sum(measurement.whitened(measurement.centred(tips)) ** 2) / degrees_of_freedom)
+    return xp.sqrt(xp.sum(measurement.whitened(measurement.centred(tips)) ** 2) / degrees_of_freedom)
 
 
 def _calibration(
     task: Task,
     stage1: Identification,
     method: str,
-    parameters: Float[Array, " p"],
-    active: Int[Array, " p"],
-    steps: Int[Array, ""],
+    parameters: Float[AnyArray, " p"],
+    active: Int[AnyArray, " p"],
+    steps: Int[AnyArray, ""],
     result: Reason,
     parameter_covariance: ParameterCovariance,
-    conditional_on: Int[Array, " p"] | None = None,
+    conditional_on: Int[AnyArray, " p"] | None = None,
 ) -> Calibration:
     """The result of a calibration that ended with these parameters. ``conditional_on`` are the active bounds that its
     covariance takes as exact; by default ``active``."""
@@ -286,9 +294,10 @@ def _calibration(
     )
 
 
-@eqx.filter_jit
-def _divided(task: Task) -> tuple[Calibration, Bool[Array, ""]]:
+@compiled(jit=eqx.filter_jit)
+def _divided(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]:
     """Stage 1 and the division by k; and whether the anchor must be adjusted instead."""
+    xp = namespace(task)
     stage1, propagated = _stage1(task)
     assert stage1.scale is not None
     space, bounds, anchor = task.space, task.bounds, task.anchor
@@ -303,16 +312,17 @@ def _divided(task: Task) -> tuple[Calibration, Bool[Array, ""]]:
             propagated, stage1.arm, space, measurement, stage1.after.sigma, scaled, replaced(anchor, space)
         ).parameter_covariance
     # Divided, a length may have left its bound, which stage 1's covariance takes as exact all the same.
-    conditional_on = jnp.where(active != 0, active, stage1.active)
+    conditional_on = xp.where(active != 0, active, stage1.active)
     result = _calibration(
         task, stage1, "two-stage", scaled, active, stage1.steps, stage1.result, parameter_covariance, conditional_on
     )
     return result, adjust
 
 
-@eqx.filter_jit
+@compiled(jit=eqx.filter_jit)
 def _adjusted(task: Task, by_division: Calibration) -> Calibration:
     """Stage 2 where the division leaves the box, or would need a fixed length to move."""
+    xp = namespace(task, by_division)
     stage1, space, name = by_division.stage1, task.space, task.anchor.adjusted
     assert stage1.scale is not None
     assert name is not None
@@ -321,12 +331,12 @@ def _adjusted(task: Task, by_division: Calibration) -> Calibration:
     measurement = task.measurement.weighted(scaled.geometry, task.noise)
     adjusted = adjust_anchor(task, measurement, by_division.parameters, sigma)
     arm, active = space.arm(adjusted.parameters), task.bounds.active(adjusted.parameters)
-    is_anchor = jnp.asarray([other == name for other in space.names])
+    is_anchor = xp.asarray([other == name for other in space.names])
     solved = propagation.propagate_solve(
         arm, space, measurement, (active != 0) | is_anchor, sigma, task.noise_model, task.noise
     )
     parameter_covariance = scale_uncertainty.propagate_adjustment(
-        solved, arm, space, measurement, sigma, name, jnp.any((active != 0) & is_anchor)
+        solved, arm, space, measurement, sigma, name, xp.any((active != 0) & is_anchor)
     ).parameter_covariance
     steps = stage1.steps + adjusted.steps
     return _calibration(
@@ -334,7 +344,7 @@ def _adjusted(task: Task, by_division: Calibration) -> Calibration:
     )
 
 
-@eqx.filter_jit
+@compiled(jit=eqx.filter_jit)
 def _joint(task: Task) -> Calibration:
     """One weighted least squares of poses and lengths, from the arm of stage 1 divided by k."""
     stage1, _ = _stage1(task)
@@ -345,21 +355,12 @@ def _joint(task: Task) -> Calibration:
     measurement = task.measurement.weighted(scaled.geometry, task.noise)
     sigma = stage1.after.sigma / k
     joint_weights = JointWeights.of(scaled.position(measurement.q), measurement, sigma)
-    solution = least_squares(
-        joint_residual,
-        parameters,
-        (space, measurement, joint_weights.sigma, joint_weights.whitening),
-        lower=stage1.bounds.lower,
-        upper=stage1.bounds.upper,
-        scale=space.scale,
-        normal=joint_model,
-        solver=SOLVER,
-        max_steps=task.max_steps,
-        throw=False,
-    )
-    stats, active = solution.stats, stage1.bounds.active(solution.value)
+    args = (space, measurement, joint_weights.sigma, joint_weights.whitening)
+    bounds = task.bounds.lower, task.bounds.upper
+    found = fit(joint_residual, joint_model, parameters, args, bounds, space.scale, task.max_steps)
+    active = task.bounds.active(found.parameters)
     parameter_covariance = propagation.propagate_solve(
-        space.arm(solution.value), space, measurement, active != 0, sigma, task.noise_model, task.noise, joint_weights
+        space.arm(found.parameters), space, measurement, active != 0, sigma, task.noise_model, task.noise, joint_weights
     ).parameter_covariance
-    steps = stage1.steps + stats["num_steps"]
-    return _calibration(task, stage1, "joint", solution.value, active, steps, stats["reason"], parameter_covariance)
+    steps = stage1.steps + found.steps
+    return _calibration(task, stage1, "joint", found.parameters, active, steps, found.result, parameter_covariance)

@@ -1,17 +1,18 @@
-"""One identification, checked, and the least squares of its repeatability that both stages share."""
+"""One identification, checked, and the least squares that both stages and the joint solve share."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Float, Int
 
+from ..core.namespace import AnyArray, namespace, set_at
 from ..data.noise import Noise
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement
 from ..model.residuals import repeatability_model, repeatability_residual
-from ..solver.bounded import BoundedLevenbergMarquardt, least_squares
+from ..solver.bounded import BoundedLevenbergMarquardt, least_squares, minimise
+from ..solver.reason import Reason, reasons
 from ..uncertainty.covariance import NoiseModel
 from .scale_anchor import ScaleAnchor
 
@@ -24,7 +25,7 @@ class Task(NamedTuple):
 
     measurement: Measurement
     bounds: Bounds
-    start: Float[Array, " p"]
+    start: Float[AnyArray, " p"]
     noise: Noise | None
     anchor: ScaleAnchor
     noise_model: NoiseModel
@@ -36,23 +37,51 @@ class Task(NamedTuple):
         return self.bounds.space
 
 
-def fit_repeatability(
-    task: Task, measurement: Measurement, start: Float[Array, " p"], hold: str | None
-) -> tuple[Float[Array, " p"], optx.Solution]:
-    """Stage 1's least squares within bounds, with one parameter kept at its start; the parameters and how it ended."""
-    space = task.space
-    index = jnp.asarray(np.flatnonzero([name != hold for name in space.names]))
-    reduced = Parameters(base=space.arm(start), names=tuple(name for name in space.names if name != hold))
+class Fit(NamedTuple):
+    """Result of one least squares."""
+
+    parameters: Float[AnyArray, " p"]
+    steps: Int[AnyArray, ""]  # evaluations
+    result: Reason
+    optimality: Float[AnyArray, ""]
+
+
+def fit(
+    residual: Callable,
+    model: Callable,
+    start: Float[AnyArray, " p"],
+    args: Any,
+    bounds: tuple[Float[AnyArray, " p"], Float[AnyArray, " p"]],
+    scale: Float[AnyArray, " p"],
+    max_steps: int,
+) -> Fit:
+    """A least squares within bounds: by Optimistix for arrays of JAX, step by step for NumPy's."""
+    lower, upper = bounds
+    if namespace(start, args, bounds) is np:
+        last = minimise(model, start, args, lower=lower, upper=upper, scale=scale, solver=SOLVER, max_steps=max_steps)
+        return Fit(last.y, last.steps, reasons(last.reason), last.optimality)
     solution = least_squares(
-        repeatability_residual,
-        start[index],
-        (reduced, measurement),
-        lower=task.bounds.lower[index],
-        upper=task.bounds.upper[index],
-        scale=reduced.scale,
-        normal=repeatability_model,
+        residual,
+        start,
+        args,
+        lower=lower,
+        upper=upper,
+        scale=scale,
+        normal=model,
         solver=SOLVER,
-        max_steps=task.max_steps,
+        max_steps=max_steps,
         throw=False,
     )
-    return start.at[index].set(solution.value), solution
+    stats = solution.stats
+    return Fit(solution.value, stats["num_steps"], stats["reason"], stats["optimality"])
+
+
+def fit_repeatability(task: Task, measurement: Measurement, start: Float[AnyArray, " p"], hold: str | None) -> Fit:
+    """Stage 1's least squares within bounds, with one parameter kept at its start."""
+    space = task.space
+    index = np.flatnonzero([name != hold for name in space.names])
+    reduced = Parameters(base=space.arm(start), names=tuple(name for name in space.names if name != hold))
+    bounds = task.bounds.lower[index], task.bounds.upper[index]
+    args = (reduced, measurement)
+    found = fit(repeatability_residual, repeatability_model, start[index], args, bounds, reduced.scale, task.max_steps)
+    return found._replace(parameters=set_at(start, index, found.parameters))

@@ -39,7 +39,7 @@ def member_numbers(member: Any) -> Int[Array | np.ndarray, "*batch"]:
     return member._value
 
 
-def members(like: Any, numbers: Int[Array, "*batch"]) -> Any:
+def members(like: Any, numbers: Any) -> Any:
     """An array of members of the enumeration of ``like``, from their numbers. (Equinox's own constructors take one.)"""
     return eqx.tree_at(lambda item: item._value, like, numbers)
 

@@ -1,7 +1,8 @@
 """Conversion of arguments to float64 arrays, with messages that name what is wrong."""
 
+import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from jaxtyping import Array, ArrayLike
 
 from . import _compat
 from .errors import InputError
+from .namespace import AnyArray, namespace
 from .x64 import check_x64
 
 # What people pass for an array of numbers; lists are converted and checked.
@@ -24,8 +26,13 @@ def is_concrete(*arrays: object) -> bool:
     return not any(_compat.is_traced(array) for array in arrays)
 
 
-def as_array(value: Numbers, what: str) -> Array:
-    """A float64 array, or `InputError` that names ``what``."""
+def as_array(value: Any, what: str, like: Any = ()) -> AnyArray:
+    """A float64 array, or `InputError` that names ``what``.
+
+    It is NumPy's where ``value`` and ``like``, an array or a tree with at least one, are NumPy's; else JAX's.
+    """
+    if isinstance(value, np.ndarray) and value.dtype == np.float64 and jax.tree.leaves(like) and namespace(like) is np:
+        return value
     check_x64()
     try:
         array = value if isinstance(value, jax.Array) else np.asarray(value)
@@ -50,7 +57,17 @@ def joined(rows: Sequence[Array | np.ndarray], axis: int = 0, new: bool = False)
     return jax.device_put(whole) if known else whole
 
 
-def as_floats(value: Numbers, what: str) -> Array:
+def random_numbers(kind: Literal["normal", "uniform"], key: Array, shape: tuple[int, ...]) -> np.ndarray:
+    """Random numbers of JAX: standard normal, or uniform from 0 to 1; the same as ``jax.random`` draws in this shape.
+
+    A number depends on the key and its place alone, so one compiled size serves all shapes up to it.
+    """
+    count = math.prod(shape)
+    drawn = getattr(jax.random, kind)(key, (max(256, 2 ** math.ceil(math.log2(max(count, 1)))),))
+    return np.asarray(drawn)[:count].reshape(shape)
+
+
+def as_floats(value: Numbers, what: str) -> AnyArray:
     """A finite float64 array, or `InputError` that names ``what``."""
     array = as_array(value, what)
     if is_concrete(array) and not np.all(np.isfinite(np.asarray(array))):

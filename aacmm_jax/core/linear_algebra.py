@@ -1,7 +1,8 @@
 """Factorisations of small matrices (up to about 40 rows) by array operations, for any leading batch axes.
 
 jaxlib's batched LAPACK calls split their batch over the thread pool whose threads they block, so that independent ones
-in one program can wait for each other forever (measured on two cores with four). Nothing here calls LAPACK.
+in one program can wait for each other forever (measured on two cores with four). Nothing here calls LAPACK for arrays
+of JAX; for NumPy's it is the better choice.
 """
 
 from typing import Any
@@ -12,16 +13,25 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from .namespace import AnyArray, namespace
+
 _EPSILON = float(np.finfo(np.float64).eps)
 _MAX_SWEEPS = 30  # of Jacobi rotations; matrices of 40 rows need about 10
 
 
-@jax.custom_jvp
 def solve_positive_definite(
-    matrix: Float[Array, "*batch p p"], right: Float[Array, "*batch p"]
-) -> Float[Array, "*batch p"]:
+    matrix: Float[AnyArray, "*batch p p"], right: Float[AnyArray, "*batch p"]
+) -> Float[AnyArray, "*batch p"]:
     """Solution x of matrix x = right by Cholesky; NaN where the matrix is not positive definite to working
     precision."""
+    if namespace(matrix, right) is jnp:
+        return _solve(matrix, right)
+    whitening = inverse_cholesky(matrix)
+    return (np.swapaxes(whitening, -1, -2) @ (whitening @ right[..., None]))[..., 0]
+
+
+@jax.custom_jvp
+def _solve(matrix: Float[Array, "*batch p p"], right: Float[Array, "*batch p"]) -> Float[Array, "*batch p"]:
     p = matrix.shape[-1]
     # Rows of a multiple of four numbers: others take up to half as long again (22 of them, measured).
     filled = jnp.zeros((*right.shape, -(p + 1) % 4))
@@ -38,18 +48,30 @@ def solve_positive_definite(
     return lax.fori_loop(0, p, substitute, start)[..., :p]
 
 
-@solve_positive_definite.defjvp
+@_solve.defjvp
 def _solve_jvp(primals: tuple[Array, Array], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
     (matrix, right), (d_matrix, d_right) = primals, tangents
-    solution = solve_positive_definite(matrix, right)
+    solution = _solve(matrix, right)
     change = d_right - (d_matrix @ solution[..., None])[..., 0]
     return solution, (inverse_positive_definite(matrix) @ change[..., None])[..., 0]
 
 
-@jax.custom_jvp
-def inverse_cholesky(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batch p p"]:
+def inverse_cholesky(matrix: Float[AnyArray, "*batch p p"]) -> Float[AnyArray, "*batch p p"]:
     """W, lower triangular with W matrix W^T = I: the inverse of the Cholesky factor. It whitens what has this
     covariance."""
+    if namespace(matrix) is jnp:
+        return _inverse_cholesky(matrix)
+    try:
+        factor = np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        if matrix.ndim == 2:
+            return np.full_like(matrix, np.nan)
+        return np.stack([inverse_cholesky(one) for one in matrix])
+    return np.tril(np.linalg.inv(factor))
+
+
+@jax.custom_jvp
+def _inverse_cholesky(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batch p p"]:
     p = matrix.shape[-1]
     if not p:
         return matrix
@@ -57,19 +79,19 @@ def inverse_cholesky(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batch
     return jnp.tril(_triangular(jnp.concatenate([matrix, identity], axis=-1))[..., p:])
 
 
-@inverse_cholesky.defjvp
+@_inverse_cholesky.defjvp
 def _inverse_cholesky_jvp(primals: tuple[Array], tangents: tuple[Any]) -> tuple[Array, Array]:
     # With L = W^-1: dL = L half(W dA W^T), hence dW = -half(W dA W^T) W.
-    whitening = inverse_cholesky(primals[0])
+    whitening = _inverse_cholesky(primals[0])
     change = whitening @ tangents[0] @ jnp.swapaxes(whitening, -1, -2)
     half = 0.5 * (jnp.tril(change) + jnp.tril(change, -1))
     return whitening, -half @ whitening
 
 
-def inverse_positive_definite(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batch p p"]:
+def inverse_positive_definite(matrix: Float[AnyArray, "*batch p p"]) -> Float[AnyArray, "*batch p p"]:
     """Inverse of a symmetric positive definite matrix; NaN where it is not."""
     whitening = inverse_cholesky(matrix)
-    return jnp.swapaxes(whitening, -1, -2) @ whitening
+    return namespace(matrix).swapaxes(whitening, -1, -2) @ whitening
 
 
 def _triangular(augmented: Float[Array, "*batch p m"]) -> Float[Array, "*batch p m"]:
@@ -141,14 +163,17 @@ def singular_values(
 
 
 def semidefinite_eigen(
-    matrix: Float[Array, "*batch p p"],
-) -> tuple[Float[Array, "*batch p"], Float[Array, "*batch p p"]]:
+    matrix: Float[AnyArray, "*batch p p"],
+) -> tuple[Float[AnyArray, "*batch p"], Float[AnyArray, "*batch p p"]]:
     """Eigenvalues in descending order and eigenvectors (columns) of a symmetric positive semidefinite matrix.
 
     Its singular values are its eigenvalues. No derivative passes: that of an eigenvector is infinite where values
     repeat.
     """
-    _, values, vectors = singular_values(lax.stop_gradient(matrix))
+    if namespace(matrix) is np:
+        values, vectors = np.linalg.eigh(matrix) if np.isfinite(matrix).all() else (matrix[..., 0], matrix)
+        return values[..., ::-1], vectors[..., ::-1]
+    _, values, vectors = singular_values(lax.stop_gradient(jnp.asarray(matrix)))
     return values, vectors
 
 

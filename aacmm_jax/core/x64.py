@@ -4,8 +4,7 @@ A calibration in float32 is wrong by tens of micrometres without any sign of it.
 """
 
 import os
-
-import jax
+import sys
 
 from .errors import InputError
 
@@ -15,11 +14,16 @@ if _setting is not None and _setting.strip().lower() in {"0", "false", "off", "n
         f"aacmm_jax needs 64-bit floats, but JAX_ENABLE_X64={_setting} forbids them: in float32 a calibration is "
         "wrong by tens of micrometres; unset JAX_ENABLE_X64 or set it to 1."
     )
-jax.config.update("jax_enable_x64", True)
+if "jax" in sys.modules:
+    sys.modules["jax"].config.update("jax_enable_x64", True)
+else:
+    os.environ["JAX_ENABLE_X64"] = "1"  # read when JAX is imported, which takes a second that ``aacmm --help`` can save
 
 
 def check_x64() -> None:
     """Raise `InputError` where 64-bit floats were turned off after the import."""
+    import jax
+
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError(
             "64-bit floats were turned off after aacmm_jax was imported, and in float32 a calibration is wrong by tens "

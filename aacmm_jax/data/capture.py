@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError, nearest
+from ..core.namespace import AnyArray
 
 # Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
 _MOST_RADIANS = 8 * np.pi
@@ -31,8 +32,8 @@ class ReferenceLength(eqx.Module):
 
     start: str = eqx.field(static=True)
     end: str = eqx.field(static=True)
-    value: Float[Array, ""]
-    u: Float[Array, ""]
+    value: Float[AnyArray, ""]
+    u: Float[AnyArray, ""]
 
     def __init__(self, start: str, end: str, value: Numbers, u: Numbers = 0.0):
         self.start, self.end = start, end
@@ -67,7 +68,7 @@ class Capture(eqx.Module):
             same poses, and lengths that join unknown sockets.
     """
 
-    q: Float[Array, "N n"]
+    q: Float[AnyArray, "N n"]
     lengths: tuple[ReferenceLength, ...]
     names: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)

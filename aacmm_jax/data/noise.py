@@ -1,12 +1,12 @@
 """The noise of a measurement: errors of the encoders, and of the tip in its seat."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_floats, is_concrete
 from ..core.errors import InputError
+from ..core.namespace import AnyArray, namespace
 from ..core.units import ARCSEC
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass
 from ..kinematics.jacobian import jacobian_columns
@@ -25,8 +25,8 @@ class Noise(eqx.Module):
         InputError: For values that are negative, not finite or of another shape.
     """
 
-    encoder: Float[Array, "..."]  # rad
-    seating: Float[Array, ""]  # mm
+    encoder: Float[AnyArray, "..."]  # rad
+    seating: Float[AnyArray, ""]  # mm
 
     def __init__(self, *, encoder_arcsec: Numbers = 0.0, seating: Numbers = 0.0):
         self.encoder = as_floats(encoder_arcsec, "encoder_arcsec") * ARCSEC
@@ -41,7 +41,7 @@ class Noise(eqx.Module):
                 raise InputError(f"{what} must be a standard deviation: zero or positive.")
 
     @property
-    def encoder_arcsec(self) -> Float[Array, "..."]:
+    def encoder_arcsec(self) -> Float[AnyArray, "..."]:
         """Standard deviation of readings, scalar or ``(n,)``, arcsec."""
         return self.encoder / ARCSEC
 
@@ -82,19 +82,25 @@ class Noise(eqx.Module):
             )
 
 
-def tip_covariances(geometry: Geometry, sines_cosines: SinesCosines, noise: Noise) -> Float[Array, "... 3 3 N"]:
+def noise_of(encoder: Float[AnyArray, "..."], seating: Float[AnyArray, ""]) -> Noise:
+    """Noise of these standard deviations, rad and mm, as computed: nothing is converted or checked."""
+    return eqx.tree_at(lambda noise: (noise.encoder, noise.seating), Noise(), (encoder, seating))
+
+
+def tip_covariances(geometry: Geometry, sines_cosines: SinesCosines, noise: Noise) -> Float[AnyArray, "... 3 3 N"]:
     """Covariance of the tip of every pose, mm^2: J_q S J_q^T of the encoders, plus the seat's in every direction."""
     # Plus (1 nm)^2: a pose in which no joint moves the tip in some direction would have an infinite weight.
-    seat = (noise.seating**2 + 1e-12) * jnp.eye(3)[..., None]
+    seat = (noise.seating**2 + 1e-12) * namespace(geometry, noise).eye(3)[..., None]
     encoders = encoder_covariances(geometry, sines_cosines, noise.encoder)
     return encoders + seat.reshape((1,) * (encoders.ndim - 3) + seat.shape)
 
 
 def encoder_covariances(
-    geometry: Geometry, sines_cosines: SinesCosines, encoder: Float[Array, "..."]
-) -> Float[Array, "... 3 3 N"]:
+    geometry: Geometry, sines_cosines: SinesCosines, encoder: Float[AnyArray, "..."]
+) -> Float[AnyArray, "... 3 3 N"]:
     """J_q S J_q^T of every pose, mm^2, for encoders of standard deviation ``encoder`` (scalar or ``(n,)``, rad)."""
     columns = jacobian_columns(forward_pass(geometry, sines_cosines))["theta"]
-    each = jnp.broadcast_to(encoder, (columns.shape[0],))
+    xp = namespace(columns, encoder)
+    each = xp.broadcast_to(encoder, (columns.shape[0],))
     columns = columns * each.reshape(-1, *(1,) * (columns.ndim - 1))
-    return jnp.sum(columns[..., :, None, :] * columns[..., None, :, :], axis=0)
+    return xp.sum(columns[..., :, None, :] * columns[..., None, :, :], axis=0)

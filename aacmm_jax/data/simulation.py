@@ -5,12 +5,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core.arrays import Numbers, as_floats
+from ..core.arrays import Numbers, as_floats, random_numbers
 from ..core.errors import InputError, nearest
+from ..core.namespace import AnyArray, to_numpy
 from ..core.units import ARCSEC
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.inverse_kinematics import random_configurations
@@ -61,21 +61,21 @@ def simulate(
     noise.check_joints(arm.joints)
     if not sockets:
         raise InputError("simulate needs at least one socket with its position.")
-    limits_array = joint_limits(arm, limits)
+    limits_array = np.asarray(joint_limits(arm, limits))
+    arm, noise = to_numpy((arm, noise))
     points = {name: socket_point(name, point) for name, point in sockets.items()}
     counts = _counts(points, poses)
     reach_key, seat_key, encoder_key, length_key = jax.random.split(jax.random.key(seed), 4)
     owner = [name for name, count in counts.items() for _ in range(count)]
     rows = np.stack([np.asarray(point) for point in points.values()])
-    exact = jnp.asarray(np.repeat(rows, list(counts.values()), axis=0))
-    targets = exact + noise.seating * jax.random.normal(seat_key, exact.shape)
+    exact = np.repeat(rows, list(counts.values()), axis=0)
+    targets = exact + noise.seating * random_numbers("normal", seat_key, exact.shape)
     references = _reference_lengths(points, lengths, length_key)
     labels = [f"socket '{name}'" for name in owner]
     angles = random_configurations(arm, targets, reach_key, limits_array, labels=labels)
-    encoder = jnp.broadcast_to(noise.encoder, (1, arm.joints))
-    angles = angles + encoder * jax.random.normal(encoder_key, angles.shape)
+    angles = angles + noise.encoder * random_numbers("normal", encoder_key, angles.shape)
     if resolution_arcsec > 0:
-        angles = jnp.round(angles / (resolution_arcsec * ARCSEC)) * (resolution_arcsec * ARCSEC)
+        angles = np.round(angles / (resolution_arcsec * ARCSEC)) * (resolution_arcsec * ARCSEC)
     ends = np.cumsum(list(counts.values()))
     readings = {name: angles[end - count : end] for (name, count), end in zip(counts.items(), ends, strict=True)}
     return Capture(readings, references)
@@ -101,7 +101,7 @@ def _noise(noise: Any, encoder_arcsec: Any, seating: Any, resolution_arcsec: Any
     return noise
 
 
-def socket_point(name: str, point: Numbers) -> Float[Array, " 3"]:
+def socket_point(name: str, point: Numbers) -> Float[AnyArray, " 3"]:
     """A socket's position, mm, or `InputError` that names the socket."""
     array = as_floats(point, f"position of socket '{name}'")
     if array.shape != (3,):
@@ -111,7 +111,7 @@ def socket_point(name: str, point: Numbers) -> Float[Array, " 3"]:
     return array
 
 
-def _counts(points: Mapping[str, Array], poses: int | Mapping[str, int]) -> dict[str, int]:
+def _counts(points: Mapping[str, AnyArray], poses: int | Mapping[str, int]) -> dict[str, int]:
     counts = {name: poses.get(name, 0) if isinstance(poses, Mapping) else poses for name in points}
     for name in poses if isinstance(poses, Mapping) else ():
         if name not in points:
@@ -122,7 +122,7 @@ def _counts(points: Mapping[str, Array], poses: int | Mapping[str, int]) -> dict
     return counts
 
 
-def _reference_lengths(points: Mapping[str, Array], lengths: Iterable, key: Array) -> list[ReferenceLength]:
+def _reference_lengths(points: Mapping[str, AnyArray], lengths: Iterable, key: Array) -> list[ReferenceLength]:
     drawn = []
     for number, length in enumerate(lengths):
         if isinstance(length, ReferenceLength):
@@ -134,7 +134,7 @@ def _reference_lengths(points: Mapping[str, Array], lengths: Iterable, key: Arra
             )
         start, end = length[:2]
         u = float(length[2]) if len(length) == 3 else 0.0
-        draw = jax.random.normal(jax.random.fold_in(key, number))
-        true = jnp.linalg.norm(points[start] - points[end])
+        draw = float(random_numbers("normal", jax.random.fold_in(key, number), ()))
+        true = float(np.linalg.norm(np.asarray(points[start]) - np.asarray(points[end])))
         drawn.append(ReferenceLength(start, end, true + u * draw, u))
     return drawn

@@ -1,17 +1,16 @@
 """Statistics of the change between two calibrations: its uncertainty, a test of all parameters together, lengths."""
 
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from ..calibration.record import CalibrationRecord, uncertainty_of
-from ..data.noise import Noise
+from ..core.distributions import chi_square_tail, f_tail, student_quantile
+from ..core.namespace import AnyArray, compiled, namespace, to_numpy
 from ..kinematics.arm import is_length
 from ..uncertainty.arm_uncertainty import Uncertainty
 
@@ -87,10 +86,7 @@ def effective_degrees_of_freedom(
 
 def coverage_factor(level: float, degrees_of_freedom: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
     """Student's t for a coverage of ``level``; the normal quantile for infinite degrees of freedom."""
-    from scipy import stats
-
-    tail, infinite = 0.5 + level / 2, np.isinf(degrees_of_freedom)
-    return np.where(infinite, stats.norm.ppf(tail), stats.t.ppf(tail, np.where(infinite, 1.0, degrees_of_freedom)))
+    return student_quantile(0.5 + level / 2, degrees_of_freedom)
 
 
 def joint_test(
@@ -175,16 +171,14 @@ def _probability(statistic: float, rank: int, degrees_of_freedom: float, robust:
     covariance from as many poses as it has degrees of freedom, so its statistic is treated as Hotelling's T^2 (1931);
     its variances are rather too large, so such a p is too large rather than too small.
     """
-    from scipy import stats
-
     if rank == 0:
         return math.nan
     if math.isinf(degrees_of_freedom):
-        return float(stats.chi2.sf(statistic, rank))
+        return chi_square_tail(statistic, rank)
     spare = degrees_of_freedom - rank + 1 if robust else degrees_of_freedom
     if spare < 1:
         return math.nan
-    return float(stats.f.sf(statistic / rank * spare / degrees_of_freedom, rank, spare))
+    return f_tail(statistic / rank * spare / degrees_of_freedom, rank, spare)
 
 
 def length_change(
@@ -192,7 +186,7 @@ def length_change(
 ) -> LengthChange:
     """Change of ``lengths``: their length, mm, and the configurations at both ends (``(v, n)`` each)."""
     length, start, end = lengths
-    both = [_measured(_plain(record), jnp.asarray(start), jnp.asarray(end)) for record in (old, new)]
+    both = [_measured(to_numpy(uncertainty_of(record)), start, end) for record in (old, new)]
     (before, u_old, mean_old), (after, u_new, mean_new) = ([np.asarray(part) for part in found] for found in both)
     nu_old, nu_new = old.degrees_of_freedom, new.degrees_of_freedom
     factors = coverage_factor(level, effective_degrees_of_freedom(u_old, nu_old, u_new, nu_new))
@@ -212,20 +206,16 @@ def length_change(
     )
 
 
-def _plain(record: CalibrationRecord) -> Uncertainty:
-    """A calibration's uncertainty without what lengths do not depend on, so that all share one compiled program."""
-    return dataclasses.replace(uncertainty_of(record), degrees_of_freedom=math.inf, noise=Noise(), u_k=None)
-
-
-@eqx.filter_jit
+@compiled(jit=eqx.filter_jit)
 def _measured(
-    uncertainty: Uncertainty, start: Float[Array, "v n"], end: Float[Array, "v n"]
-) -> tuple[Float[Array, " v"], Float[Array, " v"], Float[Array, ""]]:
+    uncertainty: Uncertainty, start: Float[AnyArray, "v n"], end: Float[AnyArray, "v n"]
+) -> tuple[Float[AnyArray, " v"], Float[AnyArray, " v"], Float[AnyArray, ""]]:
     """Lengths by an arm, their standard uncertainties, and that of their mean; mm."""
+    xp = namespace(uncertainty, start, end)
     between = uncertainty.arm.position(end) - uncertainty.arm.position(start)
-    measured = jnp.linalg.norm(between, axis=-1)
+    measured = xp.linalg.norm(between, axis=-1)
     slopes = uncertainty.derivatives(end) - uncertainty.derivatives(start)
-    along = jnp.einsum("vc,vcw->vw", between / measured[:, None], slopes)
+    along = xp.einsum("vc,vcw->vw", between / measured[:, None], slopes)
     each = uncertainty.covariance_of_functions(along[:, None, :])[:, 0, 0]
-    mean = uncertainty.covariance_of_functions(jnp.mean(along, axis=0)[None, :])[0, 0]
-    return measured, jnp.sqrt(each), jnp.sqrt(mean)
+    mean = uncertainty.covariance_of_functions(xp.mean(along, axis=0)[None, :])[0, 0]
+    return measured, xp.sqrt(each), xp.sqrt(mean)

@@ -1,18 +1,18 @@
 """The arm: a serial chain of revolute joints in standard Denavit-Hartenberg form, with a probe on its last frame."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_array, as_floats, in_chunks
 from ..core.errors import InputError, nearest
+from ..core.namespace import AnyArray, namespace, to_jax, to_numpy
 from .chain import Geometry, tip_pose
 from .jacobian import tip_jacobian, tip_position
 
@@ -21,6 +21,7 @@ _LENGTH_STEP, _ANGLE_STEP = 1.0, 1e-3
 LENGTHS = ("a", "d", "probe")
 ANGLES = ("alpha", "theta", "beta")
 _PROBE_AXES = ("x", "y", "z")
+_LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a compiler
 
 
 class Arm(eqx.Module):
@@ -44,12 +45,12 @@ class Arm(eqx.Module):
         InputError: Shapes do not fit together, or a value is not finite.
     """
 
-    alpha: Float[Array, "... n"]  # link twist, rad
-    a: Float[Array, "... n"]  # link length, mm
-    d: Float[Array, "... n"]  # link offset, mm
-    theta: Float[Array, "... n"]  # joint zero offset, rad
-    beta: Float[Array, "... n"] | None  # Hayati's angle, rad
-    probe: Float[Array, "... 3"]  # tip in the last frame, mm
+    alpha: Float[AnyArray, "... n"]  # link twist, rad
+    a: Float[AnyArray, "... n"]  # link length, mm
+    d: Float[AnyArray, "... n"]  # link offset, mm
+    theta: Float[AnyArray, "... n"]  # joint zero offset, rad
+    beta: Float[AnyArray, "... n"] | None  # Hayati's angle, rad
+    probe: Float[AnyArray, "... 3"]  # tip in the last frame, mm
     limits: tuple[tuple[float, float], ...] | None = eqx.field(static=True)  # rad
 
     def __init__(
@@ -66,7 +67,7 @@ class Arm(eqx.Module):
         self.alpha = as_floats(alpha, "alpha")
         self.a = as_floats(a, "a")
         self.d = as_floats(d, "d")
-        self.theta = jnp.zeros_like(self.alpha) if theta is None else as_floats(theta, "theta")
+        self.theta = as_floats(np.zeros(self.alpha.shape), "theta") if theta is None else as_floats(theta, "theta")
         self.beta = None if beta is None else as_floats(beta, "beta")
         self.probe = as_floats(probe, "probe")
         if self.alpha.ndim == 0 or self.alpha.shape[-1] == 0:
@@ -100,15 +101,15 @@ class Arm(eqx.Module):
         """The parameters without the limits."""
         return Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe)
 
-    def position(self, q: Numbers) -> Float[Array, "... 3"]:
+    def position(self, q: Numbers) -> Float[AnyArray, "... 3"]:
         """Tip in the base frame, mm, at joint angles q in rad: ``(..., n) -> (..., 3)``."""
-        return tip_position(self.geometry, self._checked(q))
+        return self._evaluated(tip_position, q)
 
-    def pose(self, q: Numbers) -> Float[Array, "... 4 4"]:
+    def pose(self, q: Numbers) -> Float[AnyArray, "... 4 4"]:
         """Homogeneous transform of the last frame, with the tip (mm) as its origin: ``(..., n) -> (..., 4, 4)``."""
-        return tip_pose(self.geometry, self._checked(q))
+        return self._evaluated(tip_pose, q)
 
-    def jacobian(self, q: Numbers, names: Sequence[str] | None = None) -> Float[Array, "... 3 p"]:
+    def jacobian(self, q: Numbers, names: Sequence[str] | None = None) -> Float[AnyArray, "... 3 p"]:
         """Exact derivative of the tip by named parameters: analytic, equal to ``jax.jacfwd`` to rounding.
 
         Args:
@@ -123,7 +124,9 @@ class Arm(eqx.Module):
             InputError: A name is unknown, or q has another number of joints.
         """
         names = parameter_names(self) if names is None else names
-        return tip_jacobian(self.geometry, self._checked(q), tuple(locate(self, n, extra=("q",)) for n in names))
+        return self._evaluated(
+            partial(tip_jacobian, indices=tuple(locate(self.joints, n, extra=("q",)) for n in names)), q
+        )
 
     def replace(self, **changes: Any) -> "Arm":
         """The same arm with some values replaced, checked as a new arm is; also on traced values.
@@ -140,16 +143,27 @@ class Arm(eqx.Module):
         for name, value in changes.items():
             if name in whole:
                 continue
-            kind, i = locate(self, name)
+            kind, i = locate(self.joints, name)
             value = as_floats(math.nan if value is None else value, name)
-            array = jnp.zeros_like(self.alpha) if arguments[kind] is None else as_floats(arguments[kind], kind)
-            array = jnp.broadcast_to(array, (*np.broadcast_shapes(array.shape[:-1], value.shape), array.shape[-1]))
+            array = np.zeros(self.alpha.shape) if arguments[kind] is None else as_floats(arguments[kind], kind)
+            array, value = to_numpy((array, value))
+            xp = namespace(array, value)
+            array = xp.broadcast_to(array, (*np.broadcast_shapes(array.shape[:-1], value.shape), array.shape[-1]))
             chosen = np.arange(array.shape[-1]) == i
-            arguments[kind] = jnp.where(chosen, value[..., None], array)
+            arguments[kind] = xp.where(chosen, value[..., None], array)
         return Arm(**arguments)
 
-    def _checked(self, q: Numbers) -> Float[Array, "... n"]:
-        array = as_array(q, "q")
+    def _evaluated(self, function: Callable, q: Numbers) -> Any:
+        """A function of the geometry and q: by NumPy, which compiles nothing, for a moderate number of known values."""
+        q = self._checked(q)
+        shape = np.broadcast_shapes(q.shape[:-1], *(leaf.shape[:-1] for leaf in jax.tree.leaves(self.geometry)))
+        if math.prod(shape) > _LARGEST:
+            return function(self.geometry, q)
+        values = function(*to_numpy((self.geometry, q)))
+        return values if namespace(self.geometry, q) is np else to_jax(values)
+
+    def _checked(self, q: Numbers) -> Float[AnyArray, "... n"]:
+        array = as_array(q, "q", like=self.alpha)
         if array.shape[-1:] != (self.joints,):
             raise InputError(
                 f"q has shape {array.shape}, but the arm has {self.joints} joints; the last axis is the joint."
@@ -182,19 +196,19 @@ def parameter_names(arm: Arm) -> tuple[str, ...]:
     return (*by_joint, *(f"probe_{axis}" for axis in _PROBE_AXES))
 
 
-def locate(arm: Arm, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
+def locate(joints: int, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
     """Kind and 0-based index of a parameter name: ``d_3 -> ("d", 2)``; an `InputError` names the nearest spelling."""
     kinds = ("alpha", "a", "d", "theta", "beta", *extra)
     kind, _, index = name.rpartition("_") if isinstance(name, str) else ("", "", "")
     if kind == "probe" and index in _PROBE_AXES:
         return "probe", _PROBE_AXES.index(index)
-    if kind in kinds and index.isdecimal() and str(int(index)) == index and 1 <= int(index) <= arm.joints:
+    if kind in kinds and index.isdecimal() and str(int(index)) == index and 1 <= int(index) <= joints:
         return kind, int(index) - 1
-    known = [f"{k}_{i}" for k in kinds for i in range(1, arm.joints + 1)] + [f"probe_{axis}" for axis in _PROBE_AXES]
-    raise InputError(f"unknown parameter '{name}' of a {arm.joints}-joint arm{nearest(str(name), known)}")
+    known = [f"{k}_{i}" for k in kinds for i in range(1, joints + 1)] + [f"probe_{axis}" for axis in _PROBE_AXES]
+    raise InputError(f"unknown parameter '{name}' of a {joints}-joint arm{nearest(str(name), known)}")
 
 
-def with_arrays(arm: Arm, **changes: Array | None) -> Arm:
+def with_arrays(arm: Arm, **changes: AnyArray | None) -> Arm:
     """`Arm.replace` for whole arrays without its checks: in numerical code a diverged iteration may hold NaN."""
     kinds = tuple(changes)
     return eqx.tree_at(
@@ -202,12 +216,12 @@ def with_arrays(arm: Arm, **changes: Array | None) -> Arm:
     )
 
 
-def joint_limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[Array, "n 2"]:
+def joint_limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[np.ndarray, "n 2"]:
     """Lowest and highest reading of each joint: those given, else the arm's own, else -pi to pi; rad."""
     rows = limits if limits is not None else arm.limits
     if rows is None:
         rows = [(-math.pi, math.pi)] * arm.joints
-    return jnp.asarray(checked_limits(rows, arm.joints))
+    return np.asarray(checked_limits(rows, arm.joints))
 
 
 def jacobian_at(arm: Arm, q: Float[np.ndarray, "N n"], names: Sequence[str]) -> Float[np.ndarray, "N 3 p"]:
@@ -218,7 +232,7 @@ def jacobian_at(arm: Arm, q: Float[np.ndarray, "N n"], names: Sequence[str]) -> 
 def value_of(arm: Arm, name: str) -> np.ndarray:
     """Value of a named parameter of a concrete arm, mm or rad, with the arm's batch axes."""
     # Read with NumPy: under jit even a constant arm's values become tracers once JAX computes with them.
-    kind, i = locate(arm, name)
+    kind, i = locate(arm.joints, name)
     return np.asarray(getattr(arm, kind))[..., i]
 
 
@@ -227,10 +241,9 @@ def is_length(name: str) -> bool:
     return name.rpartition("_")[0] in LENGTHS
 
 
-@partial(jax.jit, static_argnames=("indices",))
 def with_values(
-    geometry: Geometry, vector: Float[Array, "... p"], indices: tuple[tuple[str, int], ...]
-) -> dict[str, Float[Array, "... n"]]:
+    geometry: Geometry, vector: Float[AnyArray, "... p"], indices: tuple[tuple[str, int], ...]
+) -> dict[str, Float[AnyArray, "... n"]]:
     """The arrays, by kind, that change when the parameters at ``indices`` take the values of ``vector``."""
     changed = {}
     for kind in dict.fromkeys(kind for kind, _ in indices):
@@ -239,10 +252,10 @@ def with_values(
         for position, (other, i) in enumerate(indices):
             if other == kind:
                 sources[i] = before.shape[-1] + position
-        batch = np.broadcast_shapes(before.shape[:-1], vector.shape[:-1])
-        both = [jnp.broadcast_to(values, (*batch, values.shape[-1])) for values in (before, vector)]
+        batch, xp = np.broadcast_shapes(before.shape[:-1], vector.shape[:-1]), namespace(before, vector)
+        both = xp.concatenate([xp.broadcast_to(x, (*batch, x.shape[-1])) for x in (before, vector)], axis=-1)
         # One gather from known positions: a third as many operations to trace and compile as a scatter.
-        changed[kind] = jnp.concatenate(both, axis=-1).at[..., sources].get(mode="promise_in_bounds")
+        changed[kind] = both[..., sources] if xp is np else both.at[..., sources].get(mode="promise_in_bounds")
     return changed
 
 
@@ -255,6 +268,5 @@ def neighbouring_arm(arm: Arm, names: Sequence[str]) -> Arm:
     """The arm with the named parameters changed by about 1 mm and 1 mrad, so that nothing is exactly aligned."""
     steps = np.random.default_rng(0).normal(size=len(names)) * natural_steps(names)
     vector = np.array([value_of(arm, name) for name in names]) + steps
-    return with_arrays(
-        arm, **with_values(arm.geometry, jnp.asarray(vector), tuple(locate(arm, name) for name in names))
-    )
+    arm = to_numpy(arm)
+    return with_arrays(arm, **with_values(arm.geometry, vector, tuple(locate(arm.joints, name) for name in names)))

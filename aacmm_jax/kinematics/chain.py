@@ -9,36 +9,35 @@ XLA then computes the chain again for every column, and compiling takes four tim
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from ..core.arrays import is_concrete
+from ..core.namespace import AnyArray, compiled, namespace, scan
 
-SinesCosines = tuple[Float[Array, "n ... 1 N"], Float[Array, "n ... 1 N"]]
+SinesCosines = tuple[Float[AnyArray, "n ... 1 N"], Float[AnyArray, "n ... 1 N"]]
 
 
 class Geometry(NamedTuple):
     """Parameters of a chain as arrays. Lengths mm, angles rad; ``beta`` is None where Hayati's angle is unused."""
 
-    alpha: Float[Array, "... n"]
-    a: Float[Array, "... n"]
-    d: Float[Array, "... n"]
-    theta: Float[Array, "... n"]
-    beta: Float[Array, "... n"] | None
-    probe: Float[Array, "... 3"]
+    alpha: Float[AnyArray, "... n"]
+    a: Float[AnyArray, "... n"]
+    d: Float[AnyArray, "... n"]
+    theta: Float[AnyArray, "... n"]
+    beta: Float[AnyArray, "... n"] | None
+    probe: Float[AnyArray, "... 3"]
 
 
 class ForwardPass(NamedTuple):
     """The last frame, the tip, and the unit axes and origins that the Jacobian is made of; base frame, mm."""
 
-    frame: tuple[Float[Array, "... 3 N"], Float[Array, "... 3 N"], Float[Array, "... 3 N"]]  # x, y, z
-    tip: Float[Array, "... 3 N"]
-    z_before: Float[Array, "n ... 3 N"]  # axis of q, theta and d
-    origin_before: Float[Array, "n ... 3 N"]
-    x: Float[Array, "n ... 3 N"]  # axis of a and alpha
-    y: Float[Array, "n ... 3 N"] | None  # axis of beta
-    origin: Float[Array, "n ... 3 N"]
+    frame: tuple[Float[AnyArray, "... 3 N"], Float[AnyArray, "... 3 N"], Float[AnyArray, "... 3 N"]]  # x, y, z
+    tip: Float[AnyArray, "... 3 N"]
+    z_before: Float[AnyArray, "n ... 3 N"]  # axis of q, theta and d
+    origin_before: Float[AnyArray, "n ... 3 N"]
+    x: Float[AnyArray, "n ... 3 N"]  # axis of a and alpha
+    y: Float[AnyArray, "n ... 3 N"] | None  # axis of beta
+    origin: Float[AnyArray, "n ... 3 N"]
 
 
 def joints_first(values: Any, rank: int) -> Any:
@@ -51,29 +50,27 @@ def joints_first(values: Any, rank: int) -> Any:
     return moved.reshape(*moved.shape[:1], *batch[:-1], 1, *batch[-1:])
 
 
-def sines_cosines(q: Float[Array, "... n"]) -> SinesCosines:
+def sines_cosines(q: Float[AnyArray, "... n"]) -> SinesCosines:
     """Cosines and sines of joint angles for `forward_pass`: computed once for many arms, they save half of its time."""
-    if is_concrete(q):  # outside jit NumPy saves compiling four kernels
-        rows = joints_first(np.asarray(q), max(q.ndim - 1, 1))
-        return jax.device_put((np.cos(rows), np.sin(rows)))
-    rows = joints_first(q, max(q.ndim - 1, 1))
-    return jnp.cos(rows), jnp.sin(rows)
+    rows, xp = joints_first(q, max(q.ndim - 1, 1)), namespace(q)
+    return xp.cos(rows), xp.sin(rows)
 
 
-@jax.jit
+@compiled
 def forward_pass(geometry: Geometry, sines_cosines: SinesCosines) -> ForwardPass:
     """All frames from the base to the tip: T_i = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)].
 
     Batches of the parameters (their leading axes) and of the sines and cosines (configurations last) broadcast.
     """
+    xp = namespace(geometry, sines_cosines)
     rank = max(sines_cosines[0].ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
-    cos_q, sin_q = (jnp.reshape(t, t.shape[:1] + (1,) * (rank + 2 - t.ndim) + t.shape[1:]) for t in sines_cosines)
+    cos_q, sin_q = (xp.reshape(t, t.shape[:1] + (1,) * (rank + 2 - t.ndim) + t.shape[1:]) for t in sines_cosines)
     parameters = jax.tree.map(lambda leaf: joints_first(leaf, rank), geometry)
-    cos_theta, sin_theta = jnp.cos(parameters.theta), jnp.sin(parameters.theta)
+    cos_theta, sin_theta = xp.cos(parameters.theta), xp.sin(parameters.theta)
     inputs = (
         (cos_q * cos_theta - sin_q * sin_theta, sin_q * cos_theta + cos_q * sin_theta),
-        (jnp.cos(parameters.alpha), jnp.sin(parameters.alpha)),
-        None if parameters.beta is None else (jnp.cos(parameters.beta), jnp.sin(parameters.beta)),
+        (xp.cos(parameters.alpha), xp.sin(parameters.alpha)),
+        None if parameters.beta is None else (xp.cos(parameters.beta), xp.sin(parameters.beta)),
         parameters.a,
         parameters.d,
     )
@@ -92,31 +89,30 @@ def forward_pass(geometry: Geometry, sines_cosines: SinesCosines) -> ForwardPass
             new_x, new_z = cos_beta * new_x - sin_beta * new_z, sin_beta * new_x + cos_beta * new_z
         return ((new_x, new_y, new_z), new_origin), axes
 
-    batch = jnp.broadcast_shapes(*(leaf.shape[1:] for leaf in jax.tree.leaves((sines_cosines, parameters))))
+    batch = np.broadcast_shapes(*(leaf.shape[1:] for leaf in jax.tree.leaves((sines_cosines, parameters))))
     shape = (*batch[:-2], 3, batch[-1])
-    axes_of_base = [jnp.broadcast_to(axis.reshape((1,) * len(batch[:-2]) + (3, 1)), shape) for axis in jnp.eye(3)]
-    start = ((axes_of_base[0], axes_of_base[1], axes_of_base[2]), jnp.zeros(shape))
-    (frame, origin), axes = jax.lax.scan(joint, start, inputs)
+    axes_of_base = [xp.broadcast_to(axis.reshape((1,) * len(batch[:-2]) + (3, 1)), shape) for axis in xp.eye(3)]
+    start = ((axes_of_base[0], axes_of_base[1], axes_of_base[2]), xp.zeros(shape))
+    (frame, origin), axes = scan(joint, start, inputs)
     probe = parameters.probe
     tip = origin + probe[0] * frame[0] + probe[1] * frame[1] + probe[2] * frame[2]
     return ForwardPass(frame, tip, *axes)
 
 
 def components_last(
-    rows: Float[Array, "... 3 N"], geometry: Geometry, q: Float[Array, "... n"]
-) -> Float[Array, "... 3"]:
+    rows: Float[AnyArray, "... 3 N"], geometry: Geometry, q: Float[AnyArray, "... n"]
+) -> Float[AnyArray, "... 3"]:
     """``(..., 3, N) -> (..., N, 3)``; without the axis of configurations where neither q nor the arm has a batch."""
-    moved = jnp.moveaxis(rows, -2, -1)
+    moved = namespace(rows).moveaxis(rows, -2, -1)
     return moved if max(leaf.ndim for leaf in jax.tree.leaves((geometry, q))) > 1 else moved[0]
 
 
-@jax.jit
-def tip_pose(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 4 4"]:
+@compiled
+def tip_pose(geometry: Geometry, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 4 4"]:
     """Homogeneous pose of the last frame with the tip as its origin (mm), in the base frame."""
     forward = forward_pass(geometry, sines_cosines(q))
     columns = [components_last(rows, geometry, q) for rows in (*forward.frame, forward.tip)]
-    top = jnp.stack(columns, axis=-1)
-    bottom = jnp.broadcast_to(
-        jnp.array([0.0, 0.0, 0.0, 1.0]).reshape((1,) * (top.ndim - 1) + (4,)), (*top.shape[:-2], 1, 4)
-    )
-    return jnp.concatenate([top, bottom], axis=-2)
+    xp = namespace(geometry, q)
+    top = xp.stack(columns, axis=-1)
+    bottom = xp.broadcast_to(xp.asarray(np.eye(4)[3]).reshape((1,) * (top.ndim - 1) + (4,)), (*top.shape[:-2], 1, 4))
+    return xp.concatenate([top, bottom], axis=-2)

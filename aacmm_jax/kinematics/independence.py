@@ -4,13 +4,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
-from .arm import LENGTHS, Arm, jacobian_at, joint_limits, locate, natural_steps, neighbouring_arm
+from .arm import LENGTHS, Arm, jacobian_at, joint_limits, locate, natural_steps, neighbouring_arm, with_arrays
 from .inverse_kinematics import SocketPoses, project_to_centroids, project_to_targets
 from .near_degeneracy import trade_offs
 
@@ -57,7 +56,7 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
         )
     parallel = nearly_parallel(arm)
     if parallel and arm.beta is None:
-        arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
+        arm = with_arrays(arm, beta=np.zeros_like(arm.alpha))
     order = _order(arm, parallel)
     taken: tuple[str, ...] = ()
     for _ in range(5):
@@ -87,7 +86,7 @@ def tip_movements(poses: Float[np.ndarray, "N 3 p"], lengths: Float[np.ndarray, 
 class _GenericPoses:
     """`SocketPoses` all over the workspace; the reference length joins the first two sockets."""
 
-    q: Float[Array, "N n"]
+    q: Float[np.ndarray, "N n"]
     sizes: tuple[int, ...]
 
     @property
@@ -114,7 +113,7 @@ def generic_poses(arm: Arm) -> SocketPoses:
     starts = random.uniform(limits[:, 0], limits[:, 1], (len(owner), arm.joints))
     q, arrived = project_to_targets(arm, starts, np.asarray(arm.position(first))[owner], limits)
     sockets = [np.concatenate([first[i : i + 1], q[arrived & (owner == i)]]) for i in range(_SOCKETS)]
-    return _GenericPoses(jnp.asarray(np.concatenate(sockets)), tuple(len(socket) for socket in sockets))
+    return _GenericPoses(np.concatenate(sockets), tuple(len(socket) for socket in sockets))
 
 
 def _independent(arm: Arm, order: list[str], rows: Float[np.ndarray, "r p"]) -> tuple[str, ...]:
@@ -126,7 +125,7 @@ def _independent(arm: Arm, order: list[str], rows: Float[np.ndarray, "r p"]) -> 
         for _ in range(2):  # twice is enough for orthogonality to rounding
             column = column - basis @ (basis.T @ column)
         least = 1e-7 * (
-            1.0 if locate(arm, name)[0] in LENGTHS else 1e3
+            1.0 if locate(arm.joints, name)[0] in LENGTHS else 1e3
         )  # small at the tip for steps of 1 mm and 1 mrad
         size = float(np.linalg.norm(column))
         if size > max(_INDEPENDENT * float(np.linalg.norm(whole)), least) and basis.shape[1] < rows.shape[0]:

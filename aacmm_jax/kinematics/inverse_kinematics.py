@@ -9,15 +9,16 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..core.arrays import in_chunks
+from ..core.arrays import in_chunks, random_numbers
 from ..core.errors import InputError
+from ..core.namespace import AnyArray, compiled, namespace, to_numpy, while_loop
 from .arm import Arm
 from .chain import Geometry, forward_pass, sines_cosines
 from .jacobian import jacobian_columns
@@ -27,6 +28,7 @@ _ROUNDS = 12
 _STEPS = 60  # of one attempt; five of six random starts converge
 _TOLERANCE, _ARRIVED = 1e-9, 1e-6  # mm
 _LARGEST_STEP = 0.5  # rad
+_EXACT = 1e-7  # mm: one more step closes a gap of this size to rounding
 
 
 @runtime_checkable
@@ -34,7 +36,7 @@ class SocketPoses(Protocol):
     """The part of a capture that kinematics needs: poses, socket after socket, and the ends of reference lengths."""
 
     @property
-    def q(self) -> Float[Array | np.ndarray, "N n"]:
+    def q(self) -> Float[AnyArray, "N n"]:
         """Joint readings, rad."""
         ...
 
@@ -58,38 +60,44 @@ class SocketPoses(Protocol):
         ...
 
 
-@partial(jax.jit, static_argnames=("steps",))
+@compiled(jit=partial(jax.jit, static_argnames=("steps",)))
 def solve_to_targets(
     geometry: Geometry,
-    q: Float[Array, "c n"],
-    targets: Float[Array, "c 3"],
-    limits: Float[Array, "n 2"],
+    q: Float[AnyArray, "c n"],
+    targets: Float[AnyArray, "c 3"],
+    limits: Float[AnyArray, "n 2"],
     steps: int = _STEPS,
-) -> tuple[Float[Array, "c n"], Float[Array, " c"]]:
+) -> tuple[Float[AnyArray, "c n"], Float[AnyArray, " c"]]:
     """Damped least-norm steps from ``q`` to the targets, within the limits: configurations and final distances, mm.
 
     Each joint moves by at most 0.5 rad in a step.
     """
-    low, high = limits[:, 0, None, None], limits[:, 1, None, None]
+    xp, low, high = namespace(geometry, q, targets), limits[:, 0, None, None], limits[:, 1, None, None]
     wanted = targets.T
 
-    def step(_, q):
-        forward = forward_pass(geometry, (jnp.cos(q), jnp.sin(q)))
+    def more(state: tuple[Any, Any, Any]) -> Any:
+        count, _, gap = state
+        return (count < steps) & xp.any(xp.abs(gap) > _EXACT)
+
+    def step(state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+        count, q, _ = state
+        forward = forward_pass(geometry, (xp.cos(q), xp.sin(q)))
         gap = wanted - forward.tip
         # The damping vanishes with the distance, so that the last steps are Newton's.
-        damping = 1e-2 * jnp.sum(gap**2, axis=0) + 1e-12
+        damping = 1e-2 * xp.sum(gap**2, axis=0) + 1e-12
         inverse = damped_inverse(jacobian_columns(forward)["theta"], damping)
-        change = jnp.sum(inverse * gap[None], axis=1, keepdims=True)
-        return jnp.clip(q + jnp.clip(change, -_LARGEST_STEP, _LARGEST_STEP), low, high)
+        change = xp.sum(inverse * gap[None], axis=1, keepdims=True)
+        return count + 1, xp.clip(q + xp.clip(change, -_LARGEST_STEP, _LARGEST_STEP), low, high), gap
 
-    q = jax.lax.fori_loop(0, steps, step, q.T[:, None, :])
-    tip = forward_pass(geometry, (jnp.cos(q), jnp.sin(q))).tip
-    return q[:, 0].T, jnp.linalg.norm(wanted - tip, axis=0)
+    # A step after the gap was seen to be closed takes what Newton's method leaves to rounding.
+    _, q, _ = while_loop(more, step, (xp.zeros((), dtype=np.int32), q.T[:, None, :], xp.ones_like(wanted)))
+    tip = forward_pass(geometry, (xp.cos(q), xp.sin(q))).tip
+    return q[:, 0].T, xp.linalg.norm(wanted - tip, axis=0)
 
 
 def newton_projection(
-    geometry: Geometry, q: Float[Array, "N n"], targets: Float[Array, "N 3"], steps: int
-) -> Float[Array, "N n"]:
+    geometry: Geometry, q: Float[AnyArray, "N n"], targets: Float[AnyArray, "N 3"], steps: int
+) -> Float[AnyArray, "N n"]:
     """Configurations brought to their targets by a fixed number of least-norm steps: differentiable, without limits."""
 
     def step(rows: Array, _: None) -> tuple[Array, None]:
@@ -98,23 +106,26 @@ def newton_projection(
         inverse = damped_inverse(jacobian_columns(forward)["theta"], jnp.full(rows.shape[0], 1e-6))
         return rows + jnp.sum(inverse * gap[None], axis=1).T, None
 
-    return jax.lax.scan(step, q, None, length=steps)[0]
+    return jax.lax.scan(step, jnp.asarray(q), None, length=steps)[0]
 
 
-def least_norm_inverse(geometry: Geometry, q: Float[Array, "N n"]) -> Float[Array, "n 3 N"]:
+def least_norm_inverse(geometry: Geometry, q: Float[AnyArray, "N n"]) -> Float[AnyArray, "n 3 N"]:
     """Least change of every joint per mm that the tip moves along each axis: the pseudo-inverse of the Jacobian."""
-    return damped_inverse(jacobian_columns(forward_pass(geometry, sines_cosines(q)))["theta"], jnp.zeros(q.shape[0]))
+    return damped_inverse(jacobian_columns(forward_pass(geometry, sines_cosines(q)))["theta"], np.zeros(q.shape[0]))
 
 
-def damped_inverse(columns: Float[Array, "n ... 3 N"], damping: Float[Array, "... N"]) -> Float[Array, "n ... 3 N"]:
+def damped_inverse(
+    columns: Float[AnyArray, "n ... 3 N"], damping: Float[AnyArray, "... N"]
+) -> Float[AnyArray, "n ... 3 N"]:
     """J^T (J J^T + damping)^-1 for each configuration, from ``columns``, the derivatives of the tip by the joints, mm.
 
     The inverse is written out (adjugate over determinant): for matrices this small a library call costs ten times the
     arithmetic.
     """
     x, y, z = columns[..., 0, :], columns[..., 1, :], columns[..., 2, :]
-    xx, yy, zz = (jnp.sum(c * c, axis=0) + damping for c in (x, y, z))
-    xy, xz, yz = jnp.sum(x * y, axis=0), jnp.sum(x * z, axis=0), jnp.sum(y * z, axis=0)
+    xp = namespace(columns)
+    xx, yy, zz = (xp.sum(c * c, axis=0) + damping for c in (x, y, z))
+    xy, xz, yz = xp.sum(x * y, axis=0), xp.sum(x * z, axis=0), xp.sum(y * z, axis=0)
     adjugate = (
         (yy * zz - yz * yz, yz * xz - xy * zz, xy * yz - yy * xz),
         (yz * xz - xy * zz, xx * zz - xz * xz, xy * xz - xx * yz),
@@ -122,35 +133,36 @@ def damped_inverse(columns: Float[Array, "n ... 3 N"], damping: Float[Array, "..
     )
     determinant = xx * adjugate[0][0] + xy * adjugate[0][1] + xz * adjugate[0][2]
     rows = [[entry / determinant for entry in row] for row in adjugate]
-    return jnp.stack([x * row[0][None] + y * row[1][None] + z * row[2][None] for row in rows], axis=-2)
+    return xp.stack([x * row[0][None] + y * row[1][None] + z * row[2][None] for row in rows], axis=-2)
 
 
 def random_configurations(
-    arm: Arm, targets: Float[Array, "m 3"], key: Array, limits: Float[Array, "n 2"], labels: Sequence[str] | None = None
-) -> Float[Array, "m n"]:
+    arm: Arm,
+    targets: Float[AnyArray, "m 3"],
+    key: Array,
+    limits: Float[AnyArray, "n 2"],
+    labels: Sequence[str] | None = None,
+) -> Float[AnyArray, "m n"]:
     """One random configuration for each target, within the limits, exact to 1e-9 mm.
 
     Raises `InputError`, with the target's label, if none is found.
     """
+    arm, targets, limits = to_numpy((arm, targets, limits))
     wanted = targets.shape[0]
     angles = np.zeros((wanted, arm.joints))
     missing = np.arange(wanted)
     for round_number in range(_ROUNDS * (1 + wanted // _BATCH)):
         # Every missing target is tried, several times at once if they are few; the first success counts.
         tried = np.resize(missing, _BATCH)
-        start = jax.random.uniform(
-            jax.random.fold_in(key, round_number),
-            (_BATCH, arm.joints),
-            minval=limits[None, :, 0],
-            maxval=limits[None, :, 1],
-        )
-        solved, distance = (np.asarray(x) for x in solve_to_targets(arm.geometry, start, targets[tried], limits))
+        key_of_round = jax.random.fold_in(key, round_number)
+        start = limits[:, 0] + random_numbers("uniform", key_of_round, (_BATCH, arm.joints)) * np.ptp(limits, axis=1)
+        solved, distance = solve_to_targets(*to_numpy((arm.geometry, start, targets[tried], limits)))
         successes = np.flatnonzero(distance <= _TOLERANCE)[::-1]
         angles[tried[successes]] = solved[successes]
         missing = np.setdiff1d(missing, tried[successes])
         if not len(missing):
-            return jnp.asarray(angles)
-    links = float(jnp.sum(jnp.abs(arm.a)) + jnp.sum(jnp.abs(arm.d)) + jnp.linalg.norm(arm.probe))
+            return angles
+    links = float(np.abs(arm.a).sum() + np.abs(arm.d).sum() + np.linalg.norm(arm.probe))
     point = ", ".join(f"{x:.0f}" for x in np.asarray(targets[missing[0]]))
     what = labels[missing[0]] if labels else "the target"
     raise InputError(
@@ -166,11 +178,12 @@ def project_to_targets(
     limits: Float[np.ndarray, "n 2"] | None = None,
 ) -> tuple[Float[np.ndarray, "N n"], Bool[np.ndarray, " N"]]:
     """Configurations moved by least-norm steps to their targets within limits (default: none), and which arrived."""
-    allowed = jnp.asarray(np.tile([-np.inf, np.inf], (arm.joints, 1)) if limits is None else limits)
+    allowed = np.tile([-np.inf, np.inf], (arm.joints, 1)) if limits is None else np.asarray(limits)
+    geometry = to_numpy(arm.geometry)
 
     def moved(rows: np.ndarray) -> np.ndarray:
-        found, distance = solve_to_targets(arm.geometry, jnp.asarray(rows[:, :-3]), jnp.asarray(rows[:, -3:]), allowed)
-        return np.hstack([np.asarray(found), np.asarray(distance)[:, None]])
+        found, distance = solve_to_targets(geometry, rows[:, :-3], rows[:, -3:], allowed)
+        return np.hstack([found, distance[:, None]])
 
     found = in_chunks(moved, np.hstack([q, targets]))
     return found[:, :-1], found[:, -1] <= _ARRIVED

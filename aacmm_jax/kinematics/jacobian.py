@@ -8,18 +8,20 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
 from ..core._compat import SymbolicZero
+from ..core.namespace import AnyArray, compiled, namespace
 from .chain import ForwardPass, Geometry, components_last, forward_pass, joints_first, sines_cosines
 
 
-def _cross(u: Float[Array, "... 3 N"], v: Float[Array, "... 3 N"]) -> Float[Array, "... 3 N"]:
+def _cross(u: Float[AnyArray, "... 3 N"], v: Float[AnyArray, "... 3 N"]) -> Float[AnyArray, "... 3 N"]:
     (u0, u1, u2), (v0, v1, v2) = ((w[..., 0, :], w[..., 1, :], w[..., 2, :]) for w in (u, v))
-    return jnp.stack([u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0], axis=-2)
+    return namespace(u, v).stack([u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0], axis=-2)
 
 
-def jacobian_columns(forward: ForwardPass) -> dict[str, Float[Array, "k ... 3 N"]]:
+def jacobian_columns(forward: ForwardPass) -> dict[str, Float[AnyArray, "k ... 3 N"]]:
     """Derivative of the tip by every parameter: kind -> one vector per joint (or probe axis).
 
     ``theta`` also serves for q, since the two enter only as their sum.
@@ -30,24 +32,28 @@ def jacobian_columns(forward: ForwardPass) -> dict[str, Float[Array, "k ... 3 N"
         "a": forward.x,
         "d": forward.z_before,
         "theta": _cross(forward.z_before, tip - forward.origin_before),
-        "probe": jnp.stack(forward.frame),
+        "probe": namespace(tip).stack(forward.frame),
     }
     if forward.y is not None:
         columns["beta"] = _cross(forward.y, tip - forward.origin)
     return columns
 
 
-@partial(jax.jit, static_argnames=("indices",))
-def stacked_jacobian_columns(forward: ForwardPass, indices: tuple[tuple[str, int], ...]) -> Float[Array, "... p 3 N"]:
+@compiled(jit=partial(jax.jit, static_argnames=("indices",)))
+def stacked_jacobian_columns(
+    forward: ForwardPass, indices: tuple[tuple[str, int], ...]
+) -> Float[AnyArray, "... p 3 N"]:
     """The Jacobian columns of some parameters, each a kind (``q`` counts as ``theta``) and a 0-based index."""
-    columns = jacobian_columns(forward)
+    columns, xp = jacobian_columns(forward), namespace(forward)
     chosen = [columns["theta" if kind == "q" else kind][i] for kind, i in indices]
-    return jnp.stack(chosen, axis=-3) if chosen else jnp.zeros((*forward.tip.shape[:-2], 0, *forward.tip.shape[-2:]))
+    return xp.stack(chosen, axis=-3) if chosen else xp.zeros((*forward.tip.shape[:-2], 0, *forward.tip.shape[-2:]))
 
 
-@jax.custom_jvp
-def _tip_position(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 3"]:
+def _plain_tip_position(geometry: Geometry, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3"]:
     return components_last(forward_pass(geometry, sines_cosines(q)).tip, geometry, q)
+
+
+_tip_position = jax.custom_jvp(_plain_tip_position)
 
 
 def _tip_position_jvp(primals, tangents):
@@ -68,21 +74,22 @@ def _tip_position_jvp(primals, tangents):
 _tip_position.defjvp(_tip_position_jvp, symbolic_zeros=True)
 
 
-@jax.jit
-def tip_position(geometry: Geometry, q: Float[Array, "... n"]) -> Float[Array, "... 3"]:
+@compiled
+def tip_position(geometry: Geometry, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3"]:
     """Tip position in mm, in the base frame. Leading shapes of the parameters and of q broadcast.
 
     JAX's own differentiation of this function uses the analytic columns, forward and reverse, to any order.
     """
-    return _tip_position(geometry, q)
+    return (_plain_tip_position if namespace(geometry, q) is np else _tip_position)(geometry, q)
 
 
-@partial(jax.jit, static_argnames=("indices",))
+@compiled(jit=partial(jax.jit, static_argnames=("indices",)))
 def tip_jacobian(
-    geometry: Geometry, q: Float[Array, "... n"], indices: tuple[tuple[str, int], ...]
-) -> Float[Array, "... 3 p"]:
+    geometry: Geometry, q: Float[AnyArray, "... n"], indices: tuple[tuple[str, int], ...]
+) -> Float[AnyArray, "... 3 p"]:
     """Derivative of the tip by some parameters, each a kind (``alpha`` ... ``probe``, or ``q``) and a 0-based index."""
     stacked = stacked_jacobian_columns(forward_pass(geometry, sines_cosines(q)), indices)
-    columns = jnp.moveaxis(stacked, -1, -3)
+    xp = namespace(stacked)
+    columns = xp.moveaxis(stacked, -1, -3)
     batched = max(leaf.ndim for leaf in jax.tree.leaves((geometry, q))) > 1
-    return jnp.moveaxis(columns if batched else columns[0], -2, -1)
+    return xp.moveaxis(columns if batched else columns[0], -2, -1)

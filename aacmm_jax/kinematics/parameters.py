@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -9,11 +10,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float, Int
 
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError
+from ..core.namespace import AnyArray, namespace
 from .arm import Arm, is_length, is_single, locate, natural_steps, parameter_names, with_arrays, with_values
+from .chain import Geometry
 from .independence import generic_poses, independent_names
 from .inverse_kinematics import SocketPoses
 
@@ -97,24 +100,24 @@ class Parameters(eqx.Module):
         return np.array([is_length(name) for name in self.names])
 
     @property
-    def scale(self) -> Float[Array, " p"]:
+    def scale(self) -> Float[AnyArray, " p"]:
         """Natural step of each free parameter ``(p,)``: 1 mm for a length, 1 mrad for an angle."""
-        return jnp.asarray(natural_steps(self.names))
+        return namespace(self.base).asarray(natural_steps(self.names))
 
     def indices(self) -> tuple[tuple[str, int], ...]:
         """Kind and 0-based index of each free parameter."""
-        return tuple(locate(self.base, name) for name in self.names)
+        return _indices(self.base.joints, self.names)
 
     def index(self, name: str) -> int:
         """Position of a free parameter in the vector; raises `InputError` if it is not free."""
         if name not in self.names:
-            locate(self.base, name)
+            locate(self.base.joints, name)
             raise InputError(
                 f"parameter '{name}' is held, not free; free it, or name a free one, such as '{self.names[0]}'."
             )
         return self.names.index(name)
 
-    def vector(self, arm: Arm | None = None) -> Float[Array, "... p"]:
+    def vector(self, arm: Arm | None = None) -> Float[AnyArray, "... p"]:
         """The free parameters of an arm as ``(..., p)``, mm and rad.
 
         Args:
@@ -133,7 +136,8 @@ class Parameters(eqx.Module):
         tools: Any = np if known else jnp  # see `joined`
         values = {kind: tools.asarray(getattr(arm, kind)) for kind in ("alpha", "a", "d", "theta", "probe")}
         values["beta"] = tools.zeros_like(values["alpha"]) if arm.beta is None else tools.asarray(arm.beta)
-        return joined(tools.broadcast_arrays(*(values[kind][..., i] for kind, i in self.indices())), axis=-1, new=True)
+        rows = tools.broadcast_arrays(*(values[kind][..., i] for kind, i in self.indices()))
+        return np.stack(rows, axis=-1) if namespace(arm) is np else joined(rows, axis=-1, new=True)
 
     def arm(self, vector: Numbers) -> Arm:
         """The base arm with its free parameters taken from a vector.
@@ -144,15 +148,27 @@ class Parameters(eqx.Module):
         Raises:
             InputError: The vector does not have p values.
         """
-        vector = as_array(vector, "vector")
+        vector = as_array(vector, "vector", like=self.base)
         if vector.shape[-1:] != (len(self.names),):
             raise InputError(
                 f"vector has shape {vector.shape}, but {len(self.names)} parameters are free; give one value each."
             )
         base = self.base
         if base.beta is None and any(kind == "beta" for kind, _ in self.indices()):
-            base = base.replace(beta=jnp.zeros_like(base.alpha))
+            base = with_arrays(base, beta=0.0 * base.alpha)
         return with_arrays(base, **with_values(base.geometry, vector, self.indices()))
+
+    def geometry(self, vector: Float[AnyArray, "... p"]) -> Geometry:
+        """The geometry of ``arm(vector)``, unchecked: what an iteration evaluates."""
+        base = self.base.geometry
+        if base.beta is None and any(kind == "beta" for kind, _ in self.indices()):
+            base = base._replace(beta=0.0 * base.alpha)
+        return base._replace(**with_values(base, vector, self.indices()))
+
+
+@lru_cache(maxsize=256)
+def _indices(joints: int, names: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
+    return tuple(locate(joints, name) for name in names)
 
 
 def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
@@ -160,7 +176,7 @@ def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
         names = (names,)
     names = tuple(names)
     for name in names:
-        locate(arm, name)
+        locate(arm.joints, name)
         if names.count(name) > 1:
             raise InputError(f"parameter '{name}' is named twice in {what}; name it once.")
     return names
@@ -179,13 +195,13 @@ class Bounds(eqx.Module):
     """
 
     space: Parameters
-    lower: Float[Array, " p"]
-    upper: Float[Array, " p"]
+    lower: Float[AnyArray, " p"]
+    upper: Float[AnyArray, " p"]
 
     def __init__(self, space: Parameters, lower: Numbers, upper: Numbers):
         self.space = space
-        self.lower = as_array(lower, "lower")
-        self.upper = as_array(upper, "upper")
+        self.lower = as_array(lower, "lower", like=space)
+        self.upper = as_array(upper, "upper", like=space)
         for what, bound in (("lower", self.lower), ("upper", self.upper)):
             if bound.shape[-1:] != (len(space.names),):
                 raise InputError(
@@ -233,10 +249,10 @@ class Bounds(eqx.Module):
         centre = np.asarray(centre) if is_concrete(centre) else centre
         return cls(space, centre - widths, centre + widths)
 
-    def active(self, vector: Float[Array, "... p"]) -> "Array":
+    def active(self, vector: Float[AnyArray, "... p"]) -> Int[AnyArray, "... p"]:
         """Which parameters of ``(..., p)`` are on a bound: -1 on the lower, +1 on the upper, 0 inside."""
-        on_lower, on_upper = vector <= self.lower, vector >= self.upper
-        return jnp.where(on_lower, -1, jnp.where(on_upper, 1, 0))
+        on_lower, on_upper, xp = vector <= self.lower, vector >= self.upper, namespace(self.lower, vector)
+        return xp.where(on_lower, -1, xp.where(on_upper, 1, 0))
 
 
 def perturbed_arm(space: Parameters, *, length: float, angle: float, seed: int = 0) -> Arm:

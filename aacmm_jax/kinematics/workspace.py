@@ -4,15 +4,14 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
+from ..core.namespace import to_numpy
 from .arm import Arm, joint_limits
-from .chain import Geometry, forward_pass, sines_cosines
+from .chain import forward_pass, sines_cosines
 from .inverse_kinematics import project_to_targets
 
 _STARTS, _SWEEPS = 256, 30
@@ -67,7 +66,7 @@ def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"
     """Corners of the arm, mm: the base, the end of each joint's offset and of its link, and the tip (c = 2 n + 2)."""
 
     def lines(rows: np.ndarray) -> np.ndarray:
-        forward = forward_pass(arm.geometry, sines_cosines(jnp.asarray(rows)))
+        forward = forward_pass(*to_numpy((arm.geometry, sines_cosines(rows))))
         before, after, axis = (
             np.asarray(part).reshape(arm.joints, 3, -1)
             for part in (forward.origin_before, forward.origin, forward.z_before)
@@ -82,13 +81,12 @@ def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"
 
 def lowest_point(arm: Arm, q: Float[np.ndarray, "c n"]) -> Float[np.ndarray, " c"]:
     """Height of the lowest joint or tip in the base frame, mm, without the base itself, for each configuration."""
-    return in_chunks(lambda rows: np.asarray(_lowest(arm.geometry, jnp.asarray(rows))), q)
 
+    def lowest(rows: np.ndarray) -> np.ndarray:
+        forward = forward_pass(*to_numpy((arm.geometry, sines_cosines(rows))))
+        return np.minimum(np.min(forward.origin[:, 2], axis=0), forward.tip[2])
 
-@jax.jit
-def _lowest(geometry: Geometry, q: Array) -> Float[Array, " c"]:
-    forward = forward_pass(geometry, sines_cosines(q))
-    return jnp.minimum(jnp.min(forward.origin[:, 2], axis=0), forward.tip[2])
+    return in_chunks(lowest, q)
 
 
 def total_link_length(arm: Arm) -> float:

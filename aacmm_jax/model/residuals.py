@@ -2,16 +2,17 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
+from ..core.namespace import AnyArray, namespace
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass
 from ..kinematics.jacobian import stacked_jacobian_columns
 from ..kinematics.parameters import Parameters
 from ..solver.active_set import QuadraticModel
-from .measurement import LEAST_SIGMA, Measurement, averaging_matrix, differences_matrix, length_covariance
+from .measurement import LEAST_SIGMA, Measurement, between_ends, length_covariance
+from .socket_sums import counts, means_over_sockets, sums_over_sockets, to_poses
 from .weights import Weights
 
 
@@ -19,21 +20,24 @@ class JointWeights(NamedTuple):
     """Reference lengths of a joint solve, and the weights of poses and lengths. Leading axes may be a batch."""
 
     ends: tuple[tuple[int, int], ...]
-    nominal: Float[Array, "*batch l"]  # mm
-    sigma: Float[Array, "*batch"]  # standard deviation of a tip coordinate, mm
-    whitening: Float[Array, "*batch l l"]  # inverse Cholesky factor of the lengths' covariance, 1/mm
+    nominal: Float[AnyArray, "*batch l"]  # mm
+    sigma: Float[AnyArray, "*batch"]  # standard deviation of a tip coordinate, mm
+    whitening: Float[AnyArray, "*batch l l"]  # inverse Cholesky factor of the lengths' covariance, 1/mm
 
     @classmethod
-    def of(cls, tips: Float[Array, "N 3"], measurement: Measurement, sigma: Float[Array, ""]) -> "JointWeights":
+    def of(cls, tips: Float[AnyArray, "N 3"], measurement: Measurement, sigma: Float[AnyArray, ""]) -> "JointWeights":
         """The weights at the tips of a nearly right arm, given the standard deviation of a tip coordinate, mm."""
-        sigma = jnp.maximum(sigma, LEAST_SIGMA)
+        xp = namespace(tips, measurement, sigma)
+        sigma = xp.maximum(sigma, LEAST_SIGMA)
         whitening = inverse_cholesky(length_covariance(measurement.centroids(tips), measurement, sigma))
         # Weights of poses are in standard deviations already.
-        counted = sigma if measurement.weights is None else jnp.ones_like(sigma)
+        counted = sigma if measurement.weights is None else xp.ones_like(sigma)
         return cls(measurement.ends, measurement.nominal, counted, whitening)
 
 
-def repeatability_residual(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> Float[Array, "N 3"]:
+def repeatability_residual(
+    vector: Float[AnyArray, " p"], args: tuple[Parameters, Measurement]
+) -> Float[AnyArray, "N 3"]:
     """Vectors of all tips from their socket's centroid, mm (Cheng et al. 2018, eq. 13-14, by component); whitened where
     the measurement has weights."""
     space, measurement = args
@@ -41,9 +45,9 @@ def repeatability_residual(vector: Float[Array, " p"], args: tuple[Parameters, M
 
 
 def joint_residual(
-    vector: Float[Array, " p"],
-    args: tuple[Parameters, Measurement, Float[Array, ""], Float[Array, "l l"]],
-) -> tuple[Float[Array, "N 3"], Float[Array, " l"]]:
+    vector: Float[AnyArray, " p"],
+    args: tuple[Parameters, Measurement, Float[AnyArray, ""], Float[AnyArray, "l l"]],
+) -> tuple[Float[AnyArray, "N 3"], Float[AnyArray, " l"]]:
     """Repeatability and reference lengths together, each in units of its standard deviation.
 
     ``args`` are the free parameters, the measurement, the standard deviation of a tip coordinate (mm), and the
@@ -56,33 +60,33 @@ def joint_residual(
     )
 
 
-def repeatability_model(vector: Float[Array, " p"], args: tuple[Parameters, Measurement]) -> QuadraticModel:
+def repeatability_model(vector: Float[AnyArray, " p"], args: tuple[Parameters, Measurement]) -> QuadraticModel:
     """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic Jacobian columns."""
     space, measurement = args
-    geometry = space.arm(vector).geometry
+    geometry = space.geometry(vector)
     return model_of(
         geometry, measurement.sines_cosines, measurement.sizes, space.indices(), weights=measurement.weights
     )
 
 
 def joint_model(
-    vector: Float[Array, " p"],
-    args: tuple[Parameters, Measurement, Float[Array, ""], Float[Array, "l l"]],
+    vector: Float[AnyArray, " p"],
+    args: tuple[Parameters, Measurement, Float[AnyArray, ""], Float[AnyArray, "l l"]],
 ) -> QuadraticModel:
     """Cost, gradient and Gram matrix of `joint_residual`."""
     space, measurement, sigma, whitening = args
     joint_weights = JointWeights(measurement.ends, measurement.nominal, sigma, whitening)
-    geometry = space.arm(vector).geometry
+    geometry = space.geometry(vector)
     return model_of(
         geometry, measurement.sines_cosines, measurement.sizes, space.indices(), joint_weights, measurement.weights
     )
 
 
 def measured_lengths(
-    vector: Float[Array, " p"], space: Parameters, measurement: Measurement
-) -> tuple[Float[Array, " l"], Float[Array, "l p"]]:
+    vector: Float[AnyArray, " p"], space: Parameters, measurement: Measurement
+) -> tuple[Float[AnyArray, " l"], Float[AnyArray, "l p"]]:
     """Measured reference lengths, mm, and their analytic Jacobian by the free parameters."""
-    forward = forward_pass(space.arm(vector).geometry, measurement.sines_cosines)
+    forward = forward_pass(space.geometry(vector), measurement.sines_cosines)
     columns = stacked_jacobian_columns(forward, space.indices())
     return _distances(forward.tip, columns, measurement.sizes, measurement.ends, measurement.weights)
 
@@ -105,11 +109,11 @@ def model_of(
     columns = stacked_jacobian_columns(forward, indices)
     # Centred twice: the rounding error that one pass leaves in the mean (1e-13 mm) would otherwise be multiplied by the
     # columns' means, and exceed the gradient near a perfect fit.
-    averaging = averaging_matrix(sizes)
-    residual = _centred_rows(forward.tip, averaging)
+    xp = namespace(forward)
+    residual = _centred(forward.tip, sizes)
     if weights is None:
-        residual, counted = _centred_rows(residual, averaging), columns
-        shifts = columns @ jnp.asarray((averaging * np.sqrt(np.asarray(sizes, dtype=float))[:, None]).T)
+        residual, counted = _centred(residual, sizes), columns
+        shifts = sums_over_sockets(columns, sizes) / np.sqrt(counts(sizes, columns.ndim))
     else:
         residual, counted = weights.centred(weights.whiten(residual), sizes), weights.whiten(columns)
         shifts = weights.sums(counted, sizes)
@@ -117,9 +121,9 @@ def model_of(
     flat = counted.reshape(*counted.shape[:-2], -1)
     weighted = shifts.reshape(*shifts.shape[:-2], -1)
     poses = QuadraticModel(
-        0.5 * jnp.sum(residual**2, axis=-1),
+        0.5 * xp.sum(residual**2, axis=-1),
         (flat @ residual[..., None])[..., 0],
-        flat @ jnp.swapaxes(flat, -1, -2) - weighted @ jnp.swapaxes(weighted, -1, -2),
+        flat @ flat.swapaxes(-1, -2) - weighted @ weighted.swapaxes(-1, -2),
     )
     if joint_weights is None:
         return poses
@@ -128,30 +132,26 @@ def model_of(
     rows = joint_weights.whitening @ rows
     weight = 1 / joint_weights.sigma**2
     return QuadraticModel(
-        weight * poses.cost + 0.5 * jnp.sum(off**2, axis=-1),
+        weight * poses.cost + 0.5 * xp.sum(off**2, axis=-1),
         weight[..., None] * poses.gradient + (off[..., None, :] @ rows)[..., 0, :],
-        weight[..., None, None] * poses.gram + jnp.swapaxes(rows, -1, -2) @ rows,
+        weight[..., None, None] * poses.gram + rows.swapaxes(-1, -2) @ rows,
     )
 
 
 def _distances(
-    tip: Float[Array, "*batch 3 N"],
-    columns: Float[Array, "*batch p 3 N"],
+    tip: Float[AnyArray, "*batch 3 N"],
+    columns: Float[AnyArray, "*batch p 3 N"],
     sizes: tuple[int, ...],
     ends: tuple[tuple[int, int], ...],
     weights: Weights | None,
-) -> tuple[Float[Array, "*batch l"], Float[Array, "*batch l p"]]:
+) -> tuple[Float[AnyArray, "*batch l"], Float[AnyArray, "*batch l p"]]:
     """Distances between the centroids of sockets, mm, and their derivatives."""
-    between = differences_matrix(ends, len(sizes)).T
-    if weights is None:
-        between = averaging_matrix(sizes).T @ between
-        vectors, derivatives = tip @ jnp.asarray(between), columns @ jnp.asarray(between)
-    else:
-        vectors, derivatives = (weights.centroids(rows, sizes) @ jnp.asarray(between) for rows in (tip, columns))
-    distance = jnp.linalg.norm(vectors, axis=-2)
+    xp, mean = namespace(tip), means_over_sockets if weights is None else weights.centroids
+    vectors, derivatives = (between_ends(mean(rows, sizes), ends) for rows in (tip, columns))
+    distance = xp.linalg.norm(vectors, axis=-2)
     directions = vectors / distance[..., None, :]
-    return distance, jnp.einsum("...cl,...pcl->...lp", directions, derivatives)
+    return distance, xp.einsum("...cl,...pcl->...lp", directions, derivatives)
 
 
-def _centred_rows(tip: Float[Array, "... 3 N"], averaging: np.ndarray) -> Float[Array, "... 3 N"]:
-    return tip - (tip @ jnp.asarray(averaging.T)) @ jnp.asarray((averaging > 0).astype(float))
+def _centred(tip: Float[AnyArray, "... 3 N"], sizes: tuple[int, ...]) -> Float[AnyArray, "... 3 N"]:
+    return tip - to_poses(means_over_sockets(tip, sizes), sizes)

@@ -4,17 +4,18 @@ The uncertainty of k comes from the lengths and the scatter at their ends (here,
 identified parameters (`uncertainty.scale_uncertainty`).
 """
 
-from typing import Any
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
+from ..core.namespace import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, with_arrays
 from ..kinematics.parameters import Parameters
 from .measurement import Measurement, length_covariance
 from .metrics import repeatability
@@ -26,10 +27,10 @@ Partners = tuple[tuple[str, ...], tuple[tuple[float, ...], ...]]
 class Scale(eqx.Module):
     """k = measured / nominal with its standard uncertainty, and the lengths it was found from (mm)."""
 
-    value: Float[Array, ""]
-    u: Float[Array, ""]  # conditional on active bounds: takes parameters on a bound as exact
-    measured: Float[Array, " l"]
-    nominal: Float[Array, " l"]
+    value: Float[AnyArray, ""]
+    u: Float[AnyArray, ""]  # conditional on active bounds: takes parameters on a bound as exact
+    measured: Float[AnyArray, " l"]
+    nominal: Float[AnyArray, " l"]
 
 
 class ScaleFix(eqx.Module):
@@ -39,34 +40,32 @@ class ScaleFix(eqx.Module):
     scale: Scale
 
 
-def divide_lengths(arm: Arm, k: Float[Array, ""]) -> Arm:
+def divide_lengths(arm: Arm, k: Float[AnyArray, ""]) -> Arm:
     """The arm with its lengths divided by k: every a, every d but ``d_1``, and the probe.
 
     ``d_1`` only shifts the whole base frame along the first axis. No length and no repeatability depends on it, k says
     nothing about it, and it stays as given (as in Table 2 of the paper).
     """
     k = k[..., None]
-    d = jnp.concatenate([arm.d[..., :1], arm.d[..., 1:] / k], axis=-1)
-    return arm.replace(a=arm.a / k, d=d, probe=arm.probe / k)
+    d = namespace(arm, k).concatenate([arm.d[..., :1], arm.d[..., 1:] / k], axis=-1)
+    return with_arrays(arm, a=arm.a / k, d=d, probe=arm.probe / k)
 
 
 def divide_free_lengths(
     space: Parameters,
-    parameters: Float[Array | np.ndarray, "... p"],
-    k: Float[Array | np.ndarray, "..."],
-    replaced: Float[Array, "... p"],
-) -> Float[Array | np.ndarray, "... p"]:
+    parameters: Float[AnyArray, "... p"],
+    k: Float[AnyArray, "..."],
+    replaced: Float[AnyArray, "... p"],
+) -> Float[AnyArray, "... p"]:
     """Free parameters with which the arm, its fixed lengths as they are, equals the arm with every length divided by k.
 
     Tips are linear in the lengths, so a fixed length f that free lengths x can replace with weights w leaves
     x' = x / k + (1 / k - 1) w f. ``replaced`` is w f (see `replaced_lengths`), 0 where nothing is replaced.
     """
     # NumPy for arrays of NumPy: XLA rounds a division by a broadcast k differently.
-    tools: Any = np if isinstance(parameters, np.ndarray) else jnp
-    divided, replaced = (
-        tools.broadcast_to(tools.asarray(row), parameters.shape) for row in (divisible(space), replaced)
-    )
-    return tools.where(divided, (parameters + replaced) / k[..., None] - replaced, parameters)
+    xp = namespace(parameters, k)
+    divided, replaced = (xp.broadcast_to(xp.asarray(row), parameters.shape) for row in (divisible(space), replaced))
+    return xp.where(divided, (parameters + replaced) / k[..., None] - replaced, parameters)
 
 
 def divisible(space: Parameters) -> np.ndarray:
@@ -74,13 +73,13 @@ def divisible(space: Parameters) -> np.ndarray:
     return space.lengths & np.array([name != "d_1" for name in space.names])
 
 
-def replaced_lengths(space: Parameters, arm: Arm, partners: Partners) -> Float[Array, "... p"]:
+def replaced_lengths(space: Parameters, arm: Arm, partners: Partners) -> Float[AnyArray, "... p"]:
     """w f of `divide_free_lengths`, mm: the fixed lengths of the arm by the weights of their partners."""
     names, weights = partners
     if not names:
-        return jnp.zeros(len(space.names))
+        return np.zeros(len(space.names))
     fixed = Parameters(arm, names).vector(arm)
-    return fixed @ jnp.asarray(np.array(weights).T)
+    return fixed @ np.array(weights).T
 
 
 def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> ScaleFix:
@@ -107,38 +106,40 @@ def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> Scal
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one between two of its sockets."
         )
-    return _fixed(arm, Measurement.of(capture), sigma)
+    scatter = None if sigma is None else as_array(sigma, "sigma", like=np.zeros(0))
+    return to_jax(_fixed(*to_numpy((arm, Measurement.of(capture), scatter))))
 
 
-@eqx.filter_jit
-def _fixed(arm: Arm, measurement: Measurement, sigma: float | Array | None) -> ScaleFix:
+@partial(compiled, jit=eqx.filter_jit)
+def _fixed(arm: Arm, measurement: Measurement, sigma: Float[AnyArray, ""] | None) -> ScaleFix:
     tips = arm.position(measurement.q)
-    scatter = repeatability(tips, measurement.sizes).sigma if sigma is None else jnp.asarray(sigma, dtype=jnp.float64)
+    scatter = repeatability(tips, measurement.sizes).sigma if sigma is None else sigma
     scale = scale_of(tips, measurement, scatter)
     return ScaleFix(divide_lengths(arm, scale.value), scale)
 
 
-def scale_of(tips: Float[Array, "N 3"], measurement: Measurement, sigma: Float[Array, ""]) -> Scale:
+def scale_of(tips: Float[AnyArray, "N 3"], measurement: Measurement, sigma: Float[AnyArray, ""]) -> Scale:
     """k from tips, given the standard deviation of a tip coordinate (NaN where unknown)."""
     return scale_and_weights(tips, measurement, sigma)[0]
 
 
 def scale_and_weights(
-    tips: Float[Array, "N 3"], measurement: Measurement, sigma: Float[Array, ""]
-) -> tuple[Scale, Float[Array, " l"]]:
+    tips: Float[AnyArray, "N 3"], measurement: Measurement, sigma: Float[AnyArray, ""]
+) -> tuple[Scale, Float[AnyArray, " l"]]:
     """k from tips, and its derivative by each measured length, 1/mm."""
+    xp = namespace(tips, sigma)
     measured = measurement.distances(tips)
     ratio = measured / measurement.nominal
-    known = jnp.where(jnp.isnan(sigma), 0.0, sigma)
+    known = xp.where(xp.isnan(sigma), 0.0, sigma)
     centroids = measurement.centroids(tips)
-    plain = jnp.diagonal(length_covariance(centroids, measurement, known, ratio))
+    plain = xp.diagonal(length_covariance(centroids, measurement, known, ratio))
     weight = measurement.nominal**2 / plain
-    weight_of = weight / jnp.sum(weight)
-    value = jnp.sum(weight_of * ratio)
+    weight_of = weight / xp.sum(weight)
+    value = xp.sum(weight_of * ratio)
     relative = weight_of / measurement.nominal
     predicted = relative @ length_covariance(centroids, measurement, sigma, value) @ relative
-    observed = jnp.sum(weight_of * (ratio - value) ** 2) / max(ratio.shape[0] - 1, 1)
-    return Scale(value, jnp.sqrt(jnp.maximum(predicted, observed)), measured, measurement.nominal), relative
+    observed = xp.sum(weight_of * (ratio - value) ** 2) / max(ratio.shape[0] - 1, 1)
+    return Scale(value, xp.sqrt(xp.maximum(predicted, observed)), measured, measurement.nominal), relative
 
 
 def scale_from_lengths(measured: Numbers, nominal: Numbers, u: float = 0.0) -> Scale:

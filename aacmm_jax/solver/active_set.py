@@ -4,16 +4,20 @@ An unknown on a bound with the gradient pushing outwards is pinned: it is left o
 step of the others is clipped to the box, and what the model predicts is computed for the *clipped* step.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..core.linear_algebra import solve_positive_definite
+from ..core.namespace import AnyArray, cond, namespace, while_loop
 
-Flat = Float[Array, "*slots p"]
-Number = Float[Array, "*slots"]
+Flat = Float[AnyArray, "*slots p"]
+Number = Float[AnyArray, "*slots"]
 
 _MAX_RAISES = 200  # of the damping, for one step
 
@@ -22,14 +26,15 @@ class QuadraticModel(eqx.Module):
     """The quadratic model of the cost at one point: all that a step needs from one evaluation of f and its Jacobian
     J."""
 
-    cost: Float[Array, "*slots"]  # |f|^2 / 2
-    gradient: Float[Array, "*slots p"]  # J^T f
-    gram: Float[Array, "*slots p p"]  # J^T J
+    cost: Float[AnyArray, "*slots"]  # |f|^2 / 2
+    gradient: Float[AnyArray, "*slots p"]  # J^T f
+    gram: Float[AnyArray, "*slots p p"]  # J^T J
 
-    def finite(self) -> Bool[Array, "*slots"]:
+    def finite(self) -> Bool[AnyArray, "*slots"]:
         """Whether every number of it is finite."""
-        sums = jnp.sum(self.gradient, axis=-1) + jnp.sum(self.gram, axis=(-2, -1))
-        return jnp.isfinite(self.cost) & jnp.isfinite(sums)
+        xp = namespace(self)
+        sums = xp.sum(self.gradient, axis=-1) + xp.sum(self.gram, axis=(-2, -1))
+        return xp.isfinite(self.cost) & xp.isfinite(sums)
 
 
 class Box(eqx.Module):
@@ -51,9 +56,9 @@ class Box(eqx.Module):
 
     def clip(self, y: Flat) -> Flat:
         """The nearest point of the box."""
-        return jnp.clip(y, self.lower, self.upper)
+        return namespace(y).clip(y, self.lower, self.upper)
 
-    def pinned(self, y: Flat, gradient: Flat) -> Bool[Array, "*slots p"]:
+    def pinned(self, y: Flat, gradient: Flat) -> Bool[AnyArray, "*slots p"]:
         """Unknowns on a bound with the gradient pushing outwards."""
         return ((y <= self.lower) & (gradient >= 0)) | ((y >= self.upper) & (gradient <= 0))
 
@@ -62,10 +67,10 @@ class Box(eqx.Module):
 
         Away from bounds it is MINPACK's cosine between the residual and a column of J; it does not depend on units.
         """
-        h = diagonal(model.gram)
-        safe = jnp.where(h > 0, h, 1.0)
-        step = jnp.where(h > 0, jnp.sqrt(safe) * jnp.abs(y - self.clip(y - model.gradient / safe)), 0.0)
-        return jnp.max(step, axis=-1) / jnp.sqrt(2 * jnp.maximum(model.cost, jnp.finfo(jnp.float64).tiny))
+        h, xp = diagonal(model.gram), namespace(y)
+        safe = xp.where(h > 0, h, 1.0)
+        step = xp.where(h > 0, xp.sqrt(safe) * xp.abs(y - self.clip(y - model.gradient / safe)), 0.0)
+        return xp.max(step, axis=-1) / xp.sqrt(2 * xp.maximum(model.cost, np.finfo(np.float64).tiny))
 
 
 class Step(eqx.Module):
@@ -86,7 +91,7 @@ def propose(
     the step would carry through a bound are put on it and the rest solved again, once: without that, strongly coupled
     unknowns zigzag along a bound.
     """
-    pinned = box.pinned(y, model.gradient)
+    xp, pinned = namespace(y), box.pinned(y, model.gradient)
     gram, downhill = scale[..., :, None] * model.gram * scale[..., None, :], -scale * model.gradient
     if radius is None:
         z = _damped(gram, downhill, pinned, damping)
@@ -97,74 +102,82 @@ def propose(
     def solve_again(step: Flat) -> Flat:
         landed = box.clip(y + step)
         through = landed != y + step
-        shift = jnp.where(through, landed - y, 0.0)
-        return jnp.where(
+        shift = xp.where(through, landed - y, 0.0)
+        return xp.where(
             through, shift, scale * _damped(gram, downhill - _times(gram, shift / scale), pinned | through, damping)
         )
 
     # One test for all slots: solving again changes nothing in a slot whose step stays inside.
-    step = jax.lax.cond(jnp.any(box.clip(y + step) != y + step), solve_again, lambda s: s, step)
+    step = cond(xp.any(box.clip(y + step) != y + step), solve_again, lambda s: s, step)
     trial = box.clip(y + step)
     step = trial - y
-    predicted = -jnp.sum(step * (model.gradient + 0.5 * _times(model.gram, step)), axis=-1)
+    predicted = -xp.sum(step * (model.gradient + 0.5 * _times(model.gram, step)), axis=-1)
     # A failed factorisation shows as NaN: stay, predict nothing, and let the damping grow.
-    usable = jnp.isfinite(predicted)
-    nowhere = Step(y, jnp.zeros_like(predicted), jnp.full_like(length, jnp.inf))
+    usable = xp.isfinite(predicted)
+    nowhere = Step(y, xp.zeros_like(predicted), xp.full_like(length, np.inf))
     return choose(usable, Step(trial, predicted, length), nowhere), damping
 
 
 def _solve_within(
-    gram: Float[Array, "*slots p p"], right: Flat, fixed: Bool[Array, "*slots p"], damping: Number, radius: Number
+    gram: Float[AnyArray, "*slots p p"], right: Flat, fixed: Bool[AnyArray, "*slots p"], damping: Number, radius: Number
 ) -> tuple[Flat, Number]:
     """`_damped` with the damping raised as far as z needs it to be no longer than ``radius``; and that damping."""
 
-    def too_long(state: tuple[Array, Flat, Number]) -> Bool[Array, ""]:
-        count, z, _ = state
-        return (count < _MAX_RAISES) & jnp.any(~(norm(z) <= radius))
+    xp = namespace(gram)
 
-    def raised(state: tuple[Array, Flat, Number]) -> tuple[Array, Flat, Number]:
+    def too_long(state: tuple[Any, Flat, Number]) -> Any:
+        count, z, _ = state
+        return (count < _MAX_RAISES) & xp.any(~(norm(z) <= radius))
+
+    def raised(state: tuple[Any, Flat, Number]) -> tuple[Any, Flat, Number]:
         count, z, damping = state
         ratio = norm(z) / radius
         # The length falls at most inversely to the damping, so the root does not go past the radius by much. A failed
         # factorisation shows as NaN.
-        factor = jnp.where(jnp.isfinite(ratio), jnp.maximum(jnp.sqrt(ratio), 1.05), 10.0)
-        damping = jnp.where((count == 0) | (ratio <= 1), damping, factor * damping)
+        factor = xp.where(xp.isfinite(ratio), xp.maximum(xp.sqrt(ratio), 1.05), 10.0)
+        damping = xp.where((count == 0) | (ratio <= 1), damping, factor * damping)
         return count + 1, _damped(gram, right, fixed, damping), damping
 
-    nothing = jnp.full_like(right, jnp.nan)
-    return jax.lax.while_loop(too_long, raised, (jnp.zeros((), dtype=jnp.int32), nothing, damping))[1:]
+    nothing = xp.full_like(right, np.nan)
+    return while_loop(too_long, raised, (xp.zeros((), dtype=np.int32), nothing, damping))[1:]
 
 
-def _damped(gram: Float[Array, "*slots p p"], right: Flat, fixed: Bool[Array, "*slots p"], damping: Number) -> Flat:
+def _damped(
+    gram: Float[AnyArray, "*slots p p"], right: Flat, fixed: Bool[AnyArray, "*slots p"], damping: Number
+) -> Flat:
     """Solution of (gram + damping I) z = right on the unknowns that are not fixed; 0 for those that are."""
-    p = gram.shape[-1]
-    identity = jnp.eye(p, dtype=bool).reshape((1,) * (gram.ndim - 2) + (p, p))
+    p, xp = gram.shape[-1], namespace(gram)
+    identity = xp.eye(p, dtype=bool).reshape((1,) * (gram.ndim - 2) + (p, p))
     inside = ~fixed
-    matrix = jnp.where(inside[..., :, None] & inside[..., None, :], gram, 0.0)
-    matrix = matrix + jnp.where(identity, jnp.where(fixed, 1.0, damping[..., None])[..., None, :], 0.0)
-    return solve_positive_definite(matrix, jnp.where(fixed, 0.0, right))
+    matrix = xp.where(inside[..., :, None] & inside[..., None, :], gram, 0.0)
+    matrix = matrix + xp.where(identity, xp.where(fixed, 1.0, damping[..., None])[..., None, :], 0.0)
+    return solve_positive_definite(matrix, xp.where(fixed, 0.0, right))
 
 
-def choose(predicate: Bool[Array, "*slots"], new: PyTree, old: PyTree) -> PyTree:
+def choose(predicate: Bool[AnyArray, "*slots"], new: PyTree, old: PyTree) -> PyTree:
     """Slot by slot, the new tree or the old one."""
 
-    def pick(one: Array, other: Array) -> Array:
+    if namespace(predicate) is np and predicate.ndim == 0:
+        return new if predicate else old
+
+    def pick(one: Any, other: Any) -> Any:
         return jnp.where(predicate.reshape(predicate.shape + (1,) * (one.ndim - predicate.ndim)), one, other)
 
     return jax.tree.map(pick, new, old)
 
 
-def diagonal(matrix: Float[Array, "*slots p p"]) -> Flat:
+def diagonal(matrix: Float[AnyArray, "*slots p p"]) -> Flat:
     """Diagonals of a batch of matrices."""
-    return jnp.diagonal(matrix, axis1=-2, axis2=-1)
+    return namespace(matrix).diagonal(matrix, axis1=-2, axis2=-1)
 
 
 def norm(vector: Flat) -> Number:
     """Euclidean lengths of a batch of vectors."""
-    return jnp.sqrt(jnp.sum(vector**2, axis=-1))
+    xp = namespace(vector)
+    return xp.sqrt(xp.sum(vector**2, axis=-1))
 
 
-def _times(matrix: Float[Array, "*slots p p"], vector: Flat) -> Flat:
+def _times(matrix: Float[AnyArray, "*slots p p"], vector: Flat) -> Flat:
     return (matrix @ vector[..., None])[..., 0]
 
 

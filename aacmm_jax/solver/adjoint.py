@@ -78,7 +78,7 @@ def stationarity(y: PyTree[Array], solved: PyTree, inputs: PyTree) -> Flat:
     flat, unravel = ravel_pytree(y)
     box = box_of(y, options)
 
-    def cost(point: Flat) -> Array:
+    def cost(point: Array) -> Array:
         value = ravel_pytree(fn(unravel(point), args)[0])[0]
         return 0.5 * jnp.dot(value, value)
 

@@ -1,21 +1,24 @@
 """Box-bounded nonlinear least squares: the Optimistix solver, and `least_squares`, which adds the adjoint."""
 
 from collections.abc import Callable
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ..core.arrays import is_concrete
 from ..core.errors import InputError
+from ..core.namespace import AnyArray
 from ..core.x64 import check_x64
 from .active_set import Box, Flat, QuadraticModel, expand
 from .adjoint import BoundedAdjoint, box_of
 from .levenberg_marquardt import Progress, Rules, advance, begin
-from .reason import Reason, either
+from .reason import MAX_STEPS, NONFINITE, RUNNING, STALLED, reasons
 
 
 class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
@@ -46,7 +49,7 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return begin(flat, box_of(y, options))
 
     def step(self, fn, y, args, options, state, tags):
-        _, unravel = ravel_pytree(y)
+        unravel: Callable = ravel_pytree(y)[1]
         normal = options.get("normal")
         if normal is None:
             evaluated, aux = _evaluate(fn, unravel, state.step.trial, args)
@@ -56,17 +59,15 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return unravel(state.y), state, aux
 
     def terminate(self, fn, y, args, options, state, tags):
-        result = optx.RESULTS.where(
-            state.reason == Reason.stalled, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
-        )
-        result = optx.RESULTS.where(state.reason == Reason.nonfinite, optx.RESULTS.nonfinite, result)
-        return state.reason != Reason.running, result
+        result = optx.RESULTS.where(state.reason == STALLED, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
+        result = optx.RESULTS.where(state.reason == NONFINITE, optx.RESULTS.nonfinite, result)
+        return state.reason != RUNNING, result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         # Optimistix itself stops, before any step, where y is not finite.
-        unfinished = either(result == optx.RESULTS.nonfinite, Reason.nonfinite, Reason.max_steps)
+        unfinished = jnp.where(result == optx.RESULTS.nonfinite, NONFINITE, MAX_STEPS)
         stats = {
-            "reason": either(state.reason == Reason.running, unfinished, state.reason),
+            "reason": reasons(jnp.where(state.reason == RUNNING, unfinished, state.reason)),
             "num_accepted_steps": state.accepted,
             "cost": state.model.cost,
             "gradient": state.model.gradient,
@@ -138,6 +139,41 @@ def least_squares(
         adjoint=BoundedAdjoint(),
         throw=throw,
     )
+
+
+def minimise(
+    model: Callable[[Any, Any], QuadraticModel],
+    start: Float[AnyArray, " p"],
+    args: Any,
+    *,
+    lower: Float[AnyArray, " p"],
+    upper: Float[AnyArray, " p"],
+    scale: Float[AnyArray, " p"] | None,
+    solver: BoundedLevenbergMarquardt,
+    max_steps: int,
+) -> Progress:
+    """The steps of `least_squares` in NumPy, one after the other, with nothing to compile; no derivatives pass.
+
+    Args:
+        model: A function of (y, args): the `QuadraticModel`.
+        start: Where to start ``(p,)``; it is clipped to the box.
+        args: Passed to ``model``.
+        lower: Lower bounds ``(p,)``.
+        upper: Upper bounds ``(p,)``.
+        scale: The natural step of each unknown ``(p,)``; None takes it from the curvature.
+        solver: Tolerances and initial damping.
+        max_steps: The largest number of evaluations.
+
+    Returns:
+        The last state; its reason is the step limit where that was reached.
+    """
+    box = Box(lower, upper, scale)
+    progress = begin(start, box)
+    for _ in range(max_steps):
+        progress = advance(progress, model(progress.step.trial, args), box, solver.rules)
+        if progress.reason != RUNNING:
+            return progress
+    return eqx.tree_at(lambda p: p.reason, progress, np.asarray(MAX_STEPS))
 
 
 def _expanded(y0: PyTree[Array], tree: PyTree, absent: float, what: str) -> PyTree[Array]:

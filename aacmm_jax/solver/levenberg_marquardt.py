@@ -5,16 +5,17 @@ step can point uphill, and is then refused). f is never evaluated outside the bo
 Sources: Marquardt 1963; More 1978 (scaling, tests); Nielsen 1999 (damping).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+import numpy as np
+from jaxtyping import Bool, Int
 
+from ..core.namespace import AnyArray, namespace
 from .active_set import Box, Flat, Number, QuadraticModel, Step, choose, diagonal, norm, propose
-from .reason import Reason, either
+from .reason import GRADIENT, NONFINITE, ROUNDING, RUNNING, STALLED, STEP
 
-_EPSILON = float(jnp.finfo(jnp.float64).eps)
+_EPSILON = float(np.finfo(np.float64).eps)
 
 
 class Rules(NamedTuple):
@@ -36,32 +37,32 @@ class Progress(eqx.Module):
     damping: Number
     growth: Number  # what the next refusal multiplies the damping by
     curvature: Flat  # running maximum of diag(J^T J)
-    steps: Int[Array, "*slots"]  # evaluations
-    accepted: Int[Array, "*slots"]
-    reason: Reason
+    steps: Int[AnyArray, "*slots"]  # evaluations
+    accepted: Int[AnyArray, "*slots"]
+    reason: Int[AnyArray, "*slots"]  # number of a `Reason`
 
 
 def begin(y: Flat, box: Box) -> Progress:
     """State before the first evaluation, which happens at the start clipped to the box."""
-    y = box.clip(y)
-    zero, none = jnp.zeros(y.shape[:-1]), jnp.zeros(y.shape[:-1], dtype=jnp.int64)
+    y, xp = box.clip(y), namespace(y)
+    zero, none = xp.zeros(y.shape[:-1]), xp.zeros(y.shape[:-1], dtype=np.int64)
     return Progress(
         y=y,
-        model=QuadraticModel(zero + jnp.inf, jnp.zeros_like(y), jnp.zeros((*y.shape, y.shape[-1]))),
-        optimality=zero + jnp.inf,
-        step=Step(y, zero, zero + jnp.inf),
+        model=QuadraticModel(zero + np.inf, xp.zeros_like(y), xp.zeros((*y.shape, y.shape[-1]))),
+        optimality=zero + np.inf,
+        step=Step(y, zero, zero + np.inf),
         damping=zero,
         growth=zero + 2.0,
-        curvature=jnp.zeros_like(y),
+        curvature=xp.zeros_like(y),
         steps=none,
         accepted=none,
-        reason=either(zero == 0, Reason.running, Reason.running),
+        reason=xp.full(y.shape[:-1], RUNNING, dtype=np.int32),
     )
 
 
 def advance(progress: Progress, evaluated: QuadraticModel, box: Box, rules: Rules) -> Progress:
     """Accept or refuse the trial from its evaluated model, test for convergence, and propose the next trial."""
-    first = progress.steps == 0
+    xp, first = namespace(progress), progress.steps == 0
     finite = evaluated.finite()
     trial = progress.step.trial
     trial_optimality = box.optimality(trial, evaluated)
@@ -69,37 +70,37 @@ def advance(progress: Progress, evaluated: QuadraticModel, box: Box, rules: Rule
     y, model, optimality = choose(
         accept, (trial, evaluated, trial_optimality), (progress.y, progress.model, progress.optimality)
     )
-    curvature = jnp.maximum(progress.curvature, diagonal(model.gram))
+    curvature = xp.maximum(progress.curvature, diagonal(model.gram))
     scale = _scale(box, curvature)
 
     ratio = _ratio(progress, evaluated, accept)
     damping, growth = _next_damping(progress, ratio, accept)
-    largest = jnp.max(scale**2 * curvature, axis=-1)
+    largest = xp.max(scale**2 * curvature, axis=-1)
     # With less, rounding in the Gram matrix can make it indefinite.
     least = 1e3 * _EPSILON * largest
     initial = 0.0 if rules.initial_damping is None else rules.initial_damping * largest
-    damping = jnp.maximum(jnp.where(first, initial, damping), least)
+    damping = xp.maximum(xp.where(first, initial, damping), least)
     radius = None
     if rules.initial_damping is None:
-        trusted = jnp.where(_within_rounding(progress, evaluated), 1.0, ratio)
+        trusted = xp.where(_within_rounding(progress, evaluated), 1.0, ratio)
         radius = _next_radius(progress, y, model, scale, trusted, accept)
-        radius = jnp.where(model.finite(), radius, jnp.inf)
+        radius = xp.where(model.finite(), radius, np.inf)
 
     step, damping = propose(y, model, box, scale, damping, radius)
 
     # After an accepted trial the next step is tested: where it is too small to matter it is not taken, which saves the
     # last evaluation. After a refusal, the refused one. Both before clipping: a step that the box cuts to nothing says
     # only that the damping is still too small.
-    small_step = jnp.where(accept, step.length, progress.step.length) <= rules.rtol * norm(y / scale) + rules.atol
-    below_rounding = jnp.abs(progress.step.predicted) <= 4 * _EPSILON * progress.model.cost
+    small_step = xp.where(accept, step.length, progress.step.length) <= rules.rtol * norm(y / scale) + rules.atol
+    below_rounding = xp.abs(progress.step.predicted) <= 4 * _EPSILON * progress.model.cost
     unclipped = norm((trial - progress.y) / scale) >= 0.5 * progress.step.length
     tiny = small_step | (below_rounding & unclipped & ~accept & finite)
     # Refusals alone made this step tiny, far from any minimum: the model is wrong (a false derivative, a kink).
     forced = ~accept & (progress.damping > 1e-3 * largest) & (optimality > 1e-6)
-    reason = either(tiny, either(small_step, Reason.step, Reason.rounding), Reason.running)
-    reason = either(tiny & forced, Reason.stalled, reason)
-    reason = either(optimality <= rules.gtol, Reason.gradient, reason)
-    reason = either(first & ~finite, Reason.nonfinite, reason)
+    reason = xp.where(tiny, xp.where(small_step, STEP, ROUNDING), RUNNING)
+    reason = xp.where(tiny & forced, STALLED, reason)
+    reason = xp.where(optimality <= rules.gtol, GRADIENT, reason)
+    reason = xp.where(first & ~finite, NONFINITE, reason).astype(np.int32)
     return Progress(
         y=y,
         model=model,
@@ -109,52 +110,56 @@ def advance(progress: Progress, evaluated: QuadraticModel, box: Box, rules: Rule
         growth=growth,
         curvature=curvature,
         steps=progress.steps + 1,
-        accepted=progress.accepted + jnp.where(accept, 1, 0),
+        accepted=progress.accepted + xp.where(accept, 1, 0),
         reason=reason,
     )
 
 
-def _improves(progress: Progress, evaluated: QuadraticModel, trial_optimality: Number) -> Bool[Array, "*slots"]:
+def _improves(progress: Progress, evaluated: QuadraticModel, trial_optimality: Number) -> Bool[AnyArray, "*slots"]:
+    xp = namespace(progress)
     predicted = progress.step.predicted
     decreases = progress.model.cost - evaluated.cost > 1e-4 * predicted
     closer = trial_optimality < progress.optimality
-    return (predicted > 0) & jnp.where(_within_rounding(progress, evaluated), closer, decreases)
+    return (predicted > 0) & xp.where(_within_rounding(progress, evaluated), closer, decreases)
 
 
-def _within_rounding(progress: Progress, evaluated: QuadraticModel) -> Bool[Array, "*slots"]:
+def _within_rounding(progress: Progress, evaluated: QuadraticModel) -> Bool[AnyArray, "*slots"]:
+    xp = namespace(progress)
     # Close to the solution the decrease drowns in the rounding of the cost; the gradient still points downhill. (Tips
     # at 1 m that differ by 10 um lose five digits, hence the wide margin.)
     margin = 1e6 * _EPSILON * progress.model.cost
-    return (progress.step.predicted < margin) & (jnp.abs(progress.model.cost - evaluated.cost) < margin)
+    return (progress.step.predicted < margin) & (xp.abs(progress.model.cost - evaluated.cost) < margin)
 
 
-def _ratio(progress: Progress, evaluated: QuadraticModel, accept: Bool[Array, "*slots"]) -> Number:
+def _ratio(progress: Progress, evaluated: QuadraticModel, accept: Bool[AnyArray, "*slots"]) -> Number:
     """Actual to predicted decrease of an accepted step."""
-    predicted = jnp.where(progress.step.predicted > 0, progress.step.predicted, 1.0)
-    ratio = jnp.where(accept, (progress.model.cost - evaluated.cost) / predicted, 0.0)
-    return jnp.where(jnp.isfinite(ratio), ratio, 0.0)
+    xp = namespace(progress)
+    predicted = xp.where(progress.step.predicted > 0, progress.step.predicted, 1.0)
+    ratio = xp.where(accept, (progress.model.cost - evaluated.cost) / predicted, 0.0)
+    return xp.where(xp.isfinite(ratio), ratio, 0.0)
 
 
-def _next_damping(progress: Progress, ratio: Number, accept: Bool[Array, "*slots"]) -> tuple[Number, Number]:
+def _next_damping(progress: Progress, ratio: Number, accept: Bool[AnyArray, "*slots"]) -> tuple[Number, Number]:
+    xp = namespace(progress)
     # Nielsen's rule: shrink smoothly with the ratio, grow ever faster with refusals.
-    shrink = jnp.clip(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1, 2.0)
-    damping = progress.damping * jnp.where(accept, shrink, progress.growth)
-    return damping, jnp.where(accept, 2.0, 2.0 * progress.growth)
+    shrink = xp.clip(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1, 2.0)
+    damping = progress.damping * xp.where(accept, shrink, progress.growth)
+    return damping, xp.where(accept, 2.0, 2.0 * progress.growth)
 
 
-def _next_radius(
-    progress: Progress, y: Flat, model: QuadraticModel, scale: Flat, ratio: Number, accept: Array
-) -> Number:
+def _next_radius(progress: Progress, y: Flat, model: QuadraticModel, scale: Flat, ratio: Number, accept: Any) -> Number:
+    xp = namespace(progress)
     # As in trust-region methods. At first the distance of the start from 0: from a bad start a step of Gauss and Newton
     # can leave the region in which the residual depends on the unknowns at all (NIST's BoxBOD), and a step that is
     # damped a given amount may follow the steepest descent into the wrong valley (MGH10).
     start = norm(y / scale)
-    start = jnp.where(start > 0, start, jnp.sqrt(2 * model.cost))
-    factor = jnp.where(accept, jnp.where(ratio > 0.75, 2.0, jnp.where(ratio > 0.25, 1.0, 0.5)), 0.25)
-    return jnp.where(progress.steps == 0, start, factor * progress.step.length)
+    start = xp.where(start > 0, start, xp.sqrt(2 * model.cost))
+    factor = xp.where(accept, xp.where(ratio > 0.75, 2.0, xp.where(ratio > 0.25, 1.0, 0.5)), 0.25)
+    return xp.where(progress.steps == 0, start, factor * progress.step.length)
 
 
 def _scale(box: Box, curvature: Flat) -> Flat:
+    xp = namespace(curvature)
     if box.scale is not None:
         return box.scale
-    return jnp.where(curvature > 0, 1.0 / jnp.sqrt(jnp.where(curvature > 0, curvature, 1.0)), 1.0)
+    return xp.where(curvature > 0, 1.0 / xp.sqrt(xp.where(curvature > 0, curvature, 1.0)), 1.0)

@@ -2,9 +2,10 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Int
 
 from ..core import _compat
+from ..core.namespace import AnyArray
 
 
 class Reason(eqx.Enumeration):
@@ -21,7 +22,22 @@ class Reason(eqx.Enumeration):
     )
 
 
-def reasons(numbers: Int[Array, "*slots"]) -> Reason:
+# Their numbers, which the steps of a solve compute with.
+RUNNING, GRADIENT, STEP, ROUNDING, MAX_STEPS, STALLED, NONFINITE = (
+    int(_compat.member_numbers(reason))
+    for reason in (
+        Reason.running,
+        Reason.gradient,
+        Reason.step,
+        Reason.rounding,
+        Reason.max_steps,
+        Reason.stalled,
+        Reason.nonfinite,
+    )
+)
+
+
+def reasons(numbers: Int[AnyArray, "*slots"]) -> Reason:
     """Reasons of a batch from their numbers."""
     return _compat.members(Reason.running, numbers)
 
@@ -29,8 +45,3 @@ def reasons(numbers: Int[Array, "*slots"]) -> Reason:
 def numbers_of(reason: Reason) -> Int[Array, "*slots"]:
     """The number of each reason of a batch."""
     return jnp.asarray(_compat.member_numbers(reason))
-
-
-def either(predicate: Bool[Array, "*slots"], one: Reason, other: Reason) -> Reason:
-    """Element by element, one reason or the other."""
-    return reasons(jnp.where(predicate, numbers_of(one), numbers_of(other)))

@@ -2,7 +2,6 @@
 
 import math
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..calibration.checks import plausible
@@ -10,6 +9,7 @@ from ..calibration.record import CalibrationRecord
 from ..calibration.results import active_names
 from ..calibration.scale_anchor import scale_set_by_clause
 from ..core.errors import some
+from ..core.namespace import to_numpy
 from ..core.units import INCH, M
 from ..data.noise import tip_covariances
 from ..data.recording import Recording
@@ -64,7 +64,7 @@ def of_calibration(record: CalibrationRecord, seen: Observability | None = None)
 def observed(record: CalibrationRecord) -> Observability:
     """What the data of a calibration determine about the calibrated arm, given its noise and bounds."""
     arm, capture = record.calibrated.arm, record.recording.capture
-    covariances = tip_covariances(arm.geometry, sines_cosines(jnp.asarray(capture.q)), record.noise)
+    covariances = tip_covariances(*to_numpy((arm.geometry, sines_cosines(np.asarray(capture.q)), record.noise)))
     sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
     space = Parameters(arm, record.names)
     return observability(arm, capture, space, sigma=sigma, bounds=Bounds(space, record.lower, record.upper))

@@ -15,10 +15,10 @@ of an arm that stage 1 shrank to its bounds is not meant: the lengths determine 
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from ..core.namespace import AnyArray, namespace
 from ..kinematics.arm import Arm
 from ..kinematics.near_degeneracy import LEAST_MOVEMENT, SHARE_OF_BOUNDS
 from ..kinematics.parameters import Bounds, Parameters
@@ -32,9 +32,9 @@ def with_active_bounds(
     arm: Arm,
     space: Parameters,
     measurement: Measurement,
-    active: Int[Array, " p"],
+    active: Int[AnyArray, " p"],
     bounds: Bounds,
-    sigma: Float[Array, ""],
+    sigma: Float[AnyArray, ""],
     anchor: str | None = None,
 ) -> ParameterCovariance:
     """The covariance with the widths of those active bounds that end a near-degenerate direction.
@@ -49,32 +49,33 @@ def with_active_bounds(
         sigma: Standard deviation of a tip coordinate, mm.
         anchor: A length that stays fixed too: the anchor of the scale.
     """
+    xp = namespace(known, arm, space, measurement, active, bounds, sigma, anchor)
     if anchor is None and not measurement.ends:
         return known  # nothing determines the scale: it cannot be distinguished from a near-degenerate direction
-    fixed = jnp.asarray(np.array([name == anchor for name in space.names]))
-    sigma = jnp.maximum(sigma, LEAST_SIGMA)
+    fixed = xp.asarray(np.array([name == anchor for name in space.names]))
+    sigma = xp.maximum(sigma, LEAST_SIGMA)
     plain = dataclasses.replace(measurement, weights=None)
     linear = linearised(arm, space, plain, fixed)
     whitening = JointWeights.of(arm.position(plain.q), plain, sigma).whitening if measurement.ends else None
     information = information_of(linear, sigma, whitening)
     on_bound = active != 0
-    inner = jnp.where(on_bound[:, None] | on_bound[None, :], 0.0, information)
+    inner = xp.where(on_bound[:, None] | on_bound[None, :], 0.0, information)
     inverse, _, _ = inverse_information(inner, on_bound | fixed)
     # Column i: one step of a parameter on its bound, and what the parameters inside their bounds do to imitate it.
-    follow = jnp.where(on_bound[:, None], 0.0, -inverse @ information)
-    directions = jnp.where(on_bound[None, :], jnp.eye(len(space.names)) + follow, 0.0)
-    information_along = jnp.einsum("pi,pq,qi->i", directions, information, directions)
-    widths = jnp.where(on_bound, (bounds.upper - bounds.lower) / space.scale, 0.0)
+    follow = xp.where(on_bound[:, None], 0.0, -inverse @ information)
+    directions = xp.where(on_bound[None, :], xp.eye(len(space.names)) + follow, 0.0)
+    information_along = xp.einsum("pi,pq,qi->i", directions, information, directions)
+    widths = xp.where(on_bound, (bounds.upper - bounds.lower) / space.scale, 0.0)
     # A bound with none opposite counts as one of the default box of `Bounds.around`, in natural steps.
-    default = jnp.where(jnp.asarray(space.lengths), 10.0, 17.5)
-    half_widths = jnp.where(jnp.isfinite(widths), widths / 2, default)
-    moved = jnp.einsum("pi,paN->iaN", directions, linear.columns)
-    movement = jnp.mean(jnp.sum(moved**2, axis=1), axis=-1)
+    default = xp.where(xp.asarray(space.lengths), 10.0, 17.5)
+    half_widths = xp.where(xp.isfinite(widths), widths / 2, default)
+    moved = xp.einsum("pi,paN->iaN", directions, linear.columns)
+    movement = xp.mean(xp.sum(moved**2, axis=1), axis=-1)
     if measurement.ends:
-        movement = movement + jnp.mean((linear.lengths @ directions) ** 2, axis=0)
-    size = jnp.where(on_bound, jnp.sum(directions**2, axis=0), 1.0)
+        movement = movement + xp.mean((linear.lengths @ directions) ** 2, axis=0)
+    size = xp.where(on_bound, xp.sum(directions**2, axis=0), 1.0)
     weak = information_along * (SHARE_OF_BOUNDS * half_widths) ** 2 < 1
     weak = on_bound & (weak | (movement < LEAST_MOVEMENT**2 * size))
-    variance = jnp.where(weak, (2 * half_widths) ** 2 / 3, 0.0)
+    variance = xp.where(weak, (2 * half_widths) ** 2 / 3, 0.0)
     added = space.scale[:, None] * ((directions * variance[None, :]) @ directions.T) * space.scale[None, :]
     return known._replace(matrix=known.matrix + added)

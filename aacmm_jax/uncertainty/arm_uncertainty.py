@@ -1,14 +1,13 @@
 """The uncertainty of a calibrated arm: of its parameters, of a tip, of a length."""
 
-import math
-
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Bool, Float
 
 from ..core.arrays import Numbers, is_concrete
+from ..core.distributions import student_quantile
 from ..core.errors import InputError
+from ..core.namespace import AnyArray, namespace, numpy_if_known
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm
 from ..kinematics.chain import sines_cosines
@@ -24,10 +23,10 @@ class Uncertainty(eqx.Module):
     """
 
     arm: Arm
-    covariance: Float[Array, "p p"]
-    open: Float[Array, "p p"]  # projector onto undetermined directions, natural steps
+    covariance: Float[AnyArray, "p p"]
+    open: Float[AnyArray, "p p"]  # projector onto undetermined directions, natural steps
     noise: Noise
-    u_k: Float[Array, ""] | None
+    u_k: Float[AnyArray, ""] | None
     names: tuple[str, ...] = eqx.field(static=True)
     degrees_of_freedom: float = eqx.field(static=True)  # degrees of freedom; infinite where the noise was given
 
@@ -37,19 +36,23 @@ class Uncertainty(eqx.Module):
         return Parameters(self.arm, self.names)
 
     @property
-    def u(self) -> Float[Array, " p"]:
+    @numpy_if_known
+    def u(self) -> Float[AnyArray, " p"]:
         """Standard uncertainty of each free parameter; infinite where only a combination is determined.
 
         0 on a bound, unless the data hardly determine the direction that it ends (`active_bounds`).
         """
-        alone = jnp.sqrt(jnp.diagonal(self.covariance))
-        return jnp.where(jnp.diagonal(self.open) > 1e-6, jnp.inf, alone)
+        xp = namespace(self)
+        alone = xp.sqrt(xp.diagonal(self.covariance))
+        return xp.where(xp.diagonal(self.open) > 1e-6, np.inf, alone)
 
     @property
-    def correlation(self) -> Float[Array, "p p"]:
+    @numpy_if_known
+    def correlation(self) -> Float[AnyArray, "p p"]:
         """Correlation of the free parameters; 0 with those whose uncertainty is 0."""
-        u = jnp.sqrt(jnp.diagonal(self.covariance))
-        safe = jnp.where(u > 0, u, 1.0)
+        xp = namespace(self)
+        u = xp.sqrt(xp.diagonal(self.covariance))
+        safe = xp.where(u > 0, u, 1.0)
         return self.covariance / (safe[:, None] * safe[None, :])
 
     def correlated(self, least: float = 0.9) -> list[tuple[str, str, float]]:
@@ -65,21 +68,19 @@ class Uncertainty(eqx.Module):
         """Coverage factor of a level: Student's t for the degrees of freedom (JCGM 100, annex G)."""
         if not 0 < level < 1:
             raise InputError(f"level is {level:g}; give a probability between 0 and 1, for example 0.95.")
-        from scipy import stats
+        return float(student_quantile(0.5 + level / 2, self.degrees_of_freedom))
 
-        tail = 0.5 + level / 2
-        return float(
-            stats.norm.ppf(tail) if math.isinf(self.degrees_of_freedom) else stats.t.ppf(tail, self.degrees_of_freedom)
-        )
-
-    def tip(self, q: Numbers, *, reading: bool = False) -> Float[Array, "... 3 3"]:
+    @numpy_if_known
+    def tip(self, q: Numbers, *, reading: bool = False) -> Float[AnyArray, "... 3 3"]:
         """Covariance of the tip's position in the base frame at joint angles ``(..., n)``, mm^2."""
         q = self._checked(q)
         covariance = self.covariance_of_functions(self.derivatives(q))
         return covariance + self._reading(q) if reading else covariance
 
-    def length(self, start: Numbers, end: Numbers, *, reading: bool = False) -> Float[Array, "..."]:
+    @numpy_if_known
+    def length(self, start: Numbers, end: Numbers, *, reading: bool = False) -> Float[AnyArray, "..."]:
         """Standard uncertainty of the distance between the tips at two poses, ``(..., n)`` each, mm."""
+        xp = namespace(self, start, end, reading)
         start, end = self._checked(start), self._checked(end)
         try:
             np.broadcast_shapes(start.shape, end.shape)
@@ -92,38 +93,41 @@ class Uncertainty(eqx.Module):
             raise InputError(
                 "both poses put the tip in the same place, so there is no length between them; give others."
             )
-        direction = between / jnp.linalg.norm(between, axis=-1, keepdims=True)
-        along = jnp.einsum("...c,...cp->...p", direction, self.derivatives(end) - self.derivatives(start))
+        direction = between / xp.linalg.norm(between, axis=-1, keepdims=True)
+        along = xp.einsum("...c,...cp->...p", direction, self.derivatives(end) - self.derivatives(start))
         variance = self.covariance_of_functions(along[..., None, :])[..., 0, 0]
         if reading:
             both = self._reading(start) + self._reading(end)
-            variance = variance + jnp.einsum("...c,...cd,...d->...", direction, both, direction)
-        return jnp.sqrt(variance)
+            variance = variance + xp.einsum("...c,...cd,...d->...", direction, both, direction)
+        return xp.sqrt(variance)
 
-    def derivatives(self, q: Float[Array, "... n"]) -> Float[Array, "... 3 p"]:
+    def derivatives(self, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3 p"]:
         """Derivatives of the tip by the free parameters."""
         return self.arm.jacobian(q, self.names)
 
-    def covariance_of_functions(self, derivatives: Float[Array, "... k p"]) -> Float[Array, "... k k"]:
+    def covariance_of_functions(self, derivatives: Float[AnyArray, "... k p"]) -> Float[AnyArray, "... k k"]:
         """Covariance of functions of the parameters with these derivatives; infinite where they follow what is open."""
-        covariance = derivatives @ self.covariance @ jnp.swapaxes(derivatives, -1, -2)
-        return jnp.where(self._is_open(derivatives)[..., None], jnp.inf, covariance)
+        xp = namespace(self, derivatives)
+        covariance = derivatives @ self.covariance @ xp.swapaxes(derivatives, -1, -2)
+        return xp.where(self._is_open(derivatives)[..., None], np.inf, covariance)
 
-    def _checked(self, q: Numbers) -> Float[Array, "... n"]:
+    def _checked(self, q: Numbers) -> Float[AnyArray, "... n"]:
         q = self.arm._checked(q)
         if is_concrete(q) and not np.all(np.isfinite(np.asarray(q))):
             raise InputError("a joint angle is not finite; give angles in rad.")
         return q
 
-    def _reading(self, q: Float[Array, "... n"]) -> Float[Array, "... 3 3"]:
+    def _reading(self, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3 3"]:
+        xp = namespace(self, q)
         flat = q.reshape(-1, q.shape[-1])
-        covariance = jnp.moveaxis(tip_covariances(self.arm.geometry, sines_cosines(flat), self.noise), -1, 0)
+        covariance = xp.moveaxis(tip_covariances(self.arm.geometry, sines_cosines(flat), self.noise), -1, 0)
         return covariance.reshape(*q.shape[:-1], 3, 3)
 
-    def _is_open(self, derivatives: Float[Array, "... k p"]) -> Array:
+    def _is_open(self, derivatives: Float[AnyArray, "... k p"]) -> Bool[AnyArray, "... k"]:
         """Which rows follow an undetermined direction."""
+        xp = namespace(self, derivatives)
         inside = derivatives @ (self.space.scale[:, None] * self.open)
-        return jnp.sqrt(jnp.sum(inside**2, axis=-1)) > _LEAST_COMPONENT
+        return xp.sqrt(xp.sum(inside**2, axis=-1)) > _LEAST_COMPONENT
 
 
 # An undetermined direction is uncertain by 10 mm or 10 mrad at least: this component of it by 0.1 um.

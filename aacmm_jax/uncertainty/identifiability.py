@@ -3,13 +3,13 @@
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from ..core.namespace import AnyArray, compiled, namespace, to_numpy
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise, tip_covariances
-from ..kinematics.arm import Arm, joint_limits, neighbouring_arm
+from ..kinematics.arm import Arm, joint_limits, neighbouring_arm, with_arrays
 from ..kinematics.chain import sines_cosines
 from ..kinematics.independence import equations, nearly_parallel, tip_movements
 from ..kinematics.inverse_kinematics import project_to_centroids, project_to_targets
@@ -125,12 +125,13 @@ def observability(
     if space is None:
         space = Parameters.free_of(arm) if bounds is None else bounds.space
     check_joints(capture, space)
+    arm, capture, space, noise, bounds = to_numpy((arm, capture, space, noise, bounds))
     if noise is not None:
         noise.check(arm.joints)
-        covariances = tip_covariances(arm.geometry, sines_cosines(jnp.asarray(capture.q)), noise)
+        covariances = tip_covariances(arm.geometry, sines_cosines(capture.q), noise)
         sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
     # Fixed values are those of the arm, not of the space's base.
-    base = arm.replace(beta=jnp.zeros_like(arm.alpha)) if arm.beta is None and space.base.beta is not None else arm
+    base = with_arrays(arm, beta=np.zeros_like(arm.alpha)) if arm.beta is None and space.base.beta is not None else arm
     space = Parameters(base, space.names)
     spectrum = _spectrum(base, base, capture, space, noise)
     if spectrum.rank < len(space.names):
@@ -171,7 +172,9 @@ def _spectrum(arm: Arm, targets_of: Arm, capture: Capture, space: Parameters, no
     rows = np.concatenate([poses.reshape(-1, len(space.names)), lengths])
     if noise is not None:
         moved = Capture({name: q[capture.owner == i] for i, name in enumerate(capture.names)}, capture.lengths)
-        rows = np.asarray(whitened_equations(arm, space, Measurement.of(moved).weighted(arm.geometry, noise)))
+        rows = np.asarray(
+            whitened_equations(arm, Parameters(arm, space.names), Measurement.of(moved).weighted(arm.geometry, noise))
+        )
     _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
     singular = np.concatenate([singular, np.zeros(len(space.names) - len(singular))])
     rank = int(np.sum(singular > _RANK * max(singular[0], 1e-300)))
@@ -209,15 +212,16 @@ def _lacks_beta(space: Parameters, i: int) -> bool:
     return f"beta_{i}" not in space.names and f"alpha_{i}" in space.names
 
 
-@eqx.filter_jit
-def whitened_equations(arm: Arm, space: Parameters, measurement: Measurement) -> Float[Array, "rows p"]:
+@compiled(jit=eqx.filter_jit)
+def whitened_equations(arm: Arm, space: Parameters, measurement: Measurement) -> Float[AnyArray, "rows p"]:
     """Derivatives of everything measured by the free parameters, in natural steps and standard deviations.
 
     The measurement has weights.
     """
-    linear = linearised(arm, space, measurement, jnp.zeros(len(space.names), dtype=bool))
-    lengths = JointWeights.of(arm.position(measurement.q), measurement, jnp.zeros(())).whitening @ linear.lengths
-    return jnp.concatenate([linear.counted.reshape(linear.counted.shape[0], -1).T, lengths])
+    xp = namespace(arm, space, measurement)
+    linear = linearised(arm, space, measurement, xp.zeros(len(space.names), dtype=bool))
+    lengths = JointWeights.of(arm.position(measurement.q), measurement, xp.zeros(())).whitening @ linear.lengths
+    return xp.concatenate([linear.counted.reshape(linear.counted.shape[0], -1).T, lengths])
 
 
 def _remedy(arm: Arm, capture: Capture, space: Parameters, rank: int) -> str:

@@ -2,9 +2,9 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from ..core.namespace import AnyArray, namespace
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
@@ -29,7 +29,7 @@ class Propagated(NamedTuple):
 
     linear: Linearisation
     sensitivity: Sensitivity  # natural steps
-    errors: Float[Array, "3 3 N"]  # covariance of every tip's error, mm^2
+    errors: Float[AnyArray, "3 3 N"]  # covariance of every tip's error, mm^2
     parameter_covariance: ParameterCovariance
 
 
@@ -37,17 +37,18 @@ def propagate_solve(
     arm: Arm,
     space: Parameters,
     measurement: Measurement,
-    fixed: Bool[Array, " p"],
-    sigma: Float[Array, ""],
+    fixed: Bool[AnyArray, " p"],
+    sigma: Float[AnyArray, ""],
     noise_model: NoiseModel,
     noise: Noise | None,
     joint_weights: JointWeights | None = None,
 ) -> Propagated:
     """Of one least squares: of the poses alone (stage 1), or with ``joint_weights`` of poses and lengths (the joint
     solve); ``fixed`` parameters are the scale anchor, or on a bound."""
+    xp = namespace(arm, space, measurement, fixed, sigma, noise_model, noise, joint_weights)
     whitening = None if joint_weights is None else joint_weights.whitening
-    sigma = jnp.maximum(sigma, LEAST_SIGMA)
-    counted = sigma if measurement.weights is None else jnp.ones_like(sigma)
+    sigma = xp.maximum(sigma, LEAST_SIGMA)
+    counted = sigma if measurement.weights is None else xp.ones_like(sigma)
     linear = linearised(arm, space, measurement, fixed)
     information = information_of(linear, counted, whitening)
     inverse, lost, determined = inverse_information(information, fixed)
@@ -59,14 +60,15 @@ def propagate_solve(
     return Propagated(linear, sensitivity, errors, ParameterCovariance(matrix, determined, lost, behind))
 
 
-def _typical(linear: Linearisation, measurement: Measurement, sigma: Float[Array, ""]) -> Float[Array, ""]:
+def _typical(linear: Linearisation, measurement: Measurement, sigma: Float[AnyArray, ""]) -> Float[AnyArray, ""]:
     """Scatter of the noise model "common": of a coordinate, mm; with weights, in units of what these predict."""
+    xp = namespace(linear, measurement, sigma)
     if measurement.weights is None:
         return sigma
     degrees_of_freedom = 3 * sum(size - 1 for size in measurement.sizes) - linear.columns.shape[0]
-    return jnp.sqrt(jnp.sum(measurement.weights.whiten(linear.residual) ** 2) / max(degrees_of_freedom, 1))
+    return xp.sqrt(xp.sum(measurement.weights.whiten(linear.residual) ** 2) / max(degrees_of_freedom, 1))
 
 
-def in_units(matrix: Float[Array, "p p"], space: Parameters) -> Float[Array, "p p"]:
+def in_units(matrix: Float[AnyArray, "p p"], space: Parameters) -> Float[AnyArray, "p p"]:
     """A covariance in mm and rad, of one in natural steps."""
     return space.scale[:, None] * matrix * space.scale[None, :]

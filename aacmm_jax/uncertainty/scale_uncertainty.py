@@ -7,9 +7,9 @@ all sockets once more through the parameters that stage 1 identified from them: 
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from ..core.namespace import AnyArray, namespace, set_at
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
 from ..model.measurement import Measurement, length_covariance
@@ -23,19 +23,20 @@ def propagate_division(
     arm: Arm,
     space: Parameters,
     measurement: Measurement,
-    sigma: Float[Array, ""],
-    divided: Float[Array, " p"],
-    replaced: Float[Array, " p"],
+    sigma: Float[AnyArray, ""],
+    divided: Float[AnyArray, " p"],
+    replaced: Float[AnyArray, " p"],
 ) -> Propagated:
     """After the lengths of stage 1's ``arm`` were divided by k, which itself follows the poses and the lengths.
 
     x' = (x + r) / k - r for lengths, where r are the fixed lengths that x replaces (`model.scale.divide_free_lengths`),
     so dx' = dx / k - (x' + r) / k dk; a parameter that stage 1 held or that was on a bound moves with k too.
     """
+    xp = namespace(before, arm, space, measurement, sigma, divided, replaced)
     scale = _scale_sensitivity(arm.position(measurement.q), measurement, before, sigma)
-    divides = jnp.asarray(divisible(space))
-    by_k = jnp.where(divides, (divided + replaced) / scale.k.value, 0.0)  # lengths only: their natural step is 1 mm
-    change = jnp.where(divides, 1 / scale.k.value, 1.0)
+    divides = xp.asarray(divisible(space))
+    by_k = xp.where(divides, (divided + replaced) / scale.k.value, 0.0)  # lengths only: their natural step is 1 mm
+    change = xp.where(divides, 1 / scale.k.value, 1.0)
     return _with_scale(before, space, measurement, scale, by_k, change)
 
 
@@ -44,9 +45,9 @@ def propagate_adjustment(
     arm: Arm,
     space: Parameters,
     measurement: Measurement,
-    sigma: Float[Array, ""],
+    sigma: Float[AnyArray, ""],
     adjusted: str,
-    fixed: Bool[Array, ""],
+    fixed: Bool[AnyArray, ""],
 ) -> Propagated:
     """After a length was adjusted until k = 1, the others being identified with it at each of its values.
 
@@ -54,44 +55,47 @@ def propagate_adjustment(
     follow any error of the tips: S J_h. With t = S J_h + e_h, k(x(h), e) = 1 gives dx = S de - t (dk/dh)^-1 (dk/de) de.
     ``fixed``: h is on a bound, so that nothing follows k.
     """
+    xp = namespace(solved, arm, space, measurement, sigma, adjusted, fixed)
     scale = _scale_sensitivity(arm.position(measurement.q), measurement, solved, sigma)
     column = arm.jacobian(measurement.q, (adjusted,))[..., 0].T
-    by_length = jnp.einsum("paN,aN->p", solved.sensitivity.tips, column)
-    by_length = by_length.at[space.index(adjusted)].set(1.0)
-    k_by_length = jnp.sum(scale.by_tips * column)
-    by_k = jnp.where(fixed, 0.0, by_length / jnp.where(k_by_length == 0, 1.0, k_by_length))
-    return _with_scale(solved, space, measurement, scale, by_k, jnp.ones_like(by_k))
+    by_length = xp.einsum("paN,aN->p", solved.sensitivity.tips, column)
+    by_length = set_at(by_length, space.index(adjusted), 1.0)
+    k_by_length = xp.sum(scale.by_tips * column)
+    by_k = xp.where(fixed, 0.0, by_length / xp.where(k_by_length == 0, 1.0, k_by_length))
+    return _with_scale(solved, space, measurement, scale, by_k, xp.ones_like(by_k))
 
 
 def propagated_scale(
-    tips: Float[Array, "N 3"], measurement: Measurement, propagated: Propagated, sigma: Float[Array, ""]
+    tips: Float[AnyArray, "N 3"], measurement: Measurement, propagated: Propagated, sigma: Float[AnyArray, ""]
 ) -> Scale:
     """k of stage 1, with an uncertainty that includes that of the identified parameters."""
+    xp = namespace(tips, measurement, propagated, sigma)
     scale = _scale_sensitivity(tips, measurement, propagated, sigma)
-    by_tips = jnp.einsum("aN,abN,bN->", scale.by_tips, propagated.errors, scale.by_tips)
-    variance = by_tips + jnp.sum((scale.by_lengths * measurement.u) ** 2) + scale.surplus
-    return eqx.tree_at(lambda s: s.u, scale.k, jnp.sqrt(variance))
+    by_tips = xp.einsum("aN,abN,bN->", scale.by_tips, propagated.errors, scale.by_tips)
+    variance = by_tips + xp.sum((scale.by_lengths * measurement.u) ** 2) + scale.surplus
+    return eqx.tree_at(lambda s: s.u, scale.k, xp.sqrt(variance))
 
 
 class _ScaleSensitivity(NamedTuple):
     """k and its derivatives by the errors of tips and of certified lengths, 1/mm."""
 
     k: Scale
-    by_tips: Float[Array, "3 N"]
-    by_lengths: Float[Array, " l"]
-    surplus: Float[Array, ""]  # what the lengths' disagreement adds to its variance
+    by_tips: Float[AnyArray, "3 N"]
+    by_lengths: Float[AnyArray, " l"]
+    surplus: Float[AnyArray, ""]  # what the lengths' disagreement adds to its variance
 
 
 def _scale_sensitivity(
-    tips: Float[Array, "N 3"], measurement: Measurement, propagated: Propagated, sigma: Float[Array, ""]
+    tips: Float[AnyArray, "N 3"], measurement: Measurement, propagated: Propagated, sigma: Float[AnyArray, ""]
 ) -> _ScaleSensitivity:
+    xp = namespace(tips, measurement, propagated, sigma)
     k, by_lengths = scale_and_weights(tips, measurement, sigma)
     linear = propagated.linear
-    measured = linear.lengths_by_tips + jnp.einsum("lp,paN->laN", linear.lengths, propagated.sensitivity.tips)
-    by_tips = jnp.einsum("l,laN->aN", by_lengths, measured)
+    measured = linear.lengths_by_tips + xp.einsum("lp,paN->laN", linear.lengths, propagated.sensitivity.tips)
+    by_tips = xp.einsum("l,laN->aN", by_lengths, measured)
     centroids = measurement.centroids(tips)
     predicted = by_lengths @ length_covariance(centroids, measurement, sigma, k.value) @ by_lengths
-    surplus = jnp.maximum(k.u**2 - predicted, 0.0)
+    surplus = xp.maximum(k.u**2 - predicted, 0.0)
     return _ScaleSensitivity(k, by_tips, -by_lengths * k.measured / k.nominal, surplus)
 
 
@@ -100,8 +104,8 @@ def _with_scale(
     space: Parameters,
     measurement: Measurement,
     scale: _ScaleSensitivity,
-    by_k: Float[Array, " p"],
-    change: Float[Array, " p"],
+    by_k: Float[AnyArray, " p"],
+    change: Float[AnyArray, " p"],
 ) -> Propagated:
     """Sensitivities multiplied by ``change``, less what follows k: dx = change S de - by_k dk, in natural steps."""
     sensitivity = Sensitivity(

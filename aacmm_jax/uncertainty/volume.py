@@ -3,12 +3,12 @@
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ..core.errors import InputError
 from ..core.linear_algebra import semidefinite_eigen
+from ..core.namespace import AnyArray, compiled, namespace, to_numpy
 from ..kinematics.arm import Arm, joint_limits
 from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.workspace import total_link_length
@@ -72,20 +72,20 @@ def volumetric_uncertainty(
         )
     length = default_length(uncertainty.arm) if length is None else length
     start, end = sample_lengths(uncertainty.arm, points, length=length, limits=limits, seed=seed)
-    tips, covariance, plain, read = _volume(uncertainty, jnp.asarray(start), jnp.asarray(end))
-    tips = np.asarray(tips)
-    return VolumetricUncertainty(
-        length, start, end, tips[0], tips[1], np.asarray(covariance), np.asarray(plain), np.asarray(read)
-    )
+    tips, covariance, plain, read = _volume(to_numpy(uncertainty), start, end)
+    return VolumetricUncertainty(length, start, end, tips[0], tips[1], covariance, plain, read)
 
 
-@eqx.filter_jit
-def _volume(uncertainty: Uncertainty, start: Array, end: Array) -> tuple[Array, Array, Array, Array]:
+@compiled(jit=eqx.filter_jit)
+def _volume(
+    uncertainty: Uncertainty, start: Float[AnyArray, "v n"], end: Float[AnyArray, "v n"]
+) -> tuple[Any, Any, Any, Any]:
+    xp = namespace(uncertainty, start, end)
     covariance = uncertainty.tip(start)
-    finite = jnp.where(jnp.isfinite(covariance), covariance, 0.0)
-    largest = jnp.sqrt(semidefinite_eigen(finite)[0][..., 0])
-    largest = jnp.where(jnp.all(jnp.isfinite(covariance), axis=(-1, -2)), largest, jnp.inf)
-    tips = jnp.stack([uncertainty.arm.position(q) for q in (start, end)])
+    finite = xp.where(xp.isfinite(covariance), covariance, 0.0)
+    largest = xp.sqrt(semidefinite_eigen(finite)[0][..., 0])
+    largest = xp.where(xp.all(xp.isfinite(covariance), axis=(-1, -2)), largest, np.inf)
+    tips = xp.stack([uncertainty.arm.position(q) for q in (start, end)])
     return tips, largest, uncertainty.length(start, end), uncertainty.length(start, end, reading=True)
 
 

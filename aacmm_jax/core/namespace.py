@@ -1,0 +1,134 @@
+"""One code for two array libraries: JAX for batches, derivatives and accelerators, NumPy for one calibration at a time.
+
+XLA compiles a program anew for every shape, which takes seconds, and a user's capture always has a new shape. The
+arithmetic of one calibration takes milliseconds in NumPy, which compiles nothing. So numerical functions are written
+once, against the names that both libraries share (the Python array API standard), and compute with the library that
+their arguments come from: `namespace`. What cannot be written with shared names (loops, writing to an element) is here.
+
+At the edge, `to_numpy` decides: values that are known become NumPy's arrays, tracers of jit, vmap and derivatives stay
+JAX's; and `to_jax` gives users arrays of JAX.
+"""
+
+from collections.abc import Callable
+from functools import wraps
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ._compat import is_traced
+from .x64 import check_x64
+
+# An array of either library; NumPy's sums over all axes are scalars, `np.generic`, that a type checker knows no
+# arithmetic of.
+if TYPE_CHECKING:
+    AnyArray = Array | np.ndarray
+else:
+    AnyArray = Array | np.ndarray | np.generic
+
+Tree = TypeVar("Tree")
+Function = TypeVar("Function", bound=Callable)
+
+
+def namespace(*trees: Any) -> Any:
+    """``numpy`` where every array in these trees is NumPy's, else ``jax.numpy``."""
+    return jnp if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(trees)) else np
+
+
+def to_numpy(tree: Tree) -> Tree:
+    """The tree with its arrays as NumPy's where all values are known; the same tree where one is a tracer."""
+    check_x64()
+    leaves, structure = jax.tree.flatten(tree)
+    if any(is_traced(leaf) for leaf in leaves):
+        return tree
+    return jax.tree.unflatten(structure, [np.asarray(x) if isinstance(x, jax.Array) else x for x in leaves])
+
+
+def to_jax(tree: Tree) -> Tree:
+    """The tree with its arrays as JAX's, in one transfer."""
+    check_x64()
+    leaves, structure = jax.tree.flatten(tree)
+    known = [i for i, leaf in enumerate(leaves) if isinstance(leaf, (np.ndarray, np.generic))]
+    for i, leaf in zip(known, jax.device_put([leaves[i] for i in known]), strict=True):
+        leaves[i] = leaf
+    return jax.tree.unflatten(structure, leaves)
+
+
+def compiled(function: Function | None = None, *, jit: Callable = jax.jit) -> Any:
+    """Decorator: ``jit`` for arrays of JAX; called as it is, without warnings of NaN and 1 / 0, for NumPy's."""
+
+    def decorate(function: Callable) -> Callable:
+        fast = jit(function)
+
+        @wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if namespace(args, kwargs) is jnp:
+                return fast(*args, **kwargs)
+            with np.errstate(all="ignore"):
+                return function(*args, **kwargs)
+
+        return call
+
+    return decorate if function is None else decorate(function)
+
+
+def numpy_if_known(function: Function) -> Function:
+    """Decorator for the edge: computes with NumPy where all values are known, and returns arrays of JAX.
+
+    Where all arguments are NumPy's already, so is what it returns.
+    """
+
+    @wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        known = to_numpy((args, kwargs))
+        if namespace(known) is jnp:
+            return function(*args, **kwargs)
+        with np.errstate(all="ignore"):
+            values = function(*known[0], **known[1])
+        return values if namespace(args, kwargs) is np else to_jax(values)
+
+    return call  # pyright: ignore[reportReturnType]
+
+
+def scan(body: Callable, start: Any, inputs: Any = None, length: int | None = None) -> tuple[Any, Any]:
+    """`jax.lax.scan` in either library: ``carry, output = body(carry, row)`` over the rows of ``inputs``."""
+    if namespace(start, inputs) is jnp:
+        return jax.lax.scan(body, start, inputs, length=length)
+    rows, structure = jax.tree.flatten(inputs)
+    carry, outputs = start, []
+    for i in range(len(rows[0]) if length is None else length):
+        carry, output = body(carry, jax.tree.unflatten(structure, [row[i] for row in rows]))
+        outputs.append(output)
+    return carry, jax.tree.map(lambda *leaves: np.stack(leaves), *outputs)
+
+
+def while_loop(condition: Callable, body: Callable, start: Any) -> Any:
+    """`jax.lax.while_loop` in either library."""
+    if namespace(start) is jnp:
+        return jax.lax.while_loop(condition, body, start)
+    while condition(start):
+        start = body(start)
+    return start
+
+
+def cond(predicate: Any, true: Callable, false: Callable, *operands: Any) -> Any:
+    """`jax.lax.cond` in either library."""
+    if namespace(predicate, operands) is jnp:
+        return jax.lax.cond(predicate, true, false, *operands)
+    return (true if predicate else false)(*operands)
+
+
+def set_at(array: AnyArray, index: Any, value: Any) -> Any:
+    """A copy of the array with other values at an index."""
+    if namespace(array, value) is jnp:
+        return jnp.asarray(array).at[index].set(value)
+    changed = np.array(array)
+    changed[index] = value
+    return changed
+
+
+def stop_gradient(tree: Tree) -> Tree:
+    """The tree as a constant of differentiation."""
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf, tree)
