@@ -1,7 +1,10 @@
 """Bad input from Python: every refusal names what is wrong, where, and what to do. Nearly all come before any solve."""
 
 import inspect
+import json
 import re
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import jax
@@ -57,7 +60,12 @@ def shifted(given: SimpleNamespace, **changes: float) -> np.ndarray:
             ["socket 'B' pose 1 joint 6 is -inf", "must be finite"],
         ),
         (lambda q: {"A": [[0.1, 0.2], [0.1]]}, ["socket 'A'", "rows of unequal length"]),
-        (lambda q: {"A": [["left", "right"]]}, ["socket 'A'", "not a number"]),
+        (lambda q: {"A": [["left", "right"]]}, ["socket 'A' must be real numbers", "text"]),
+        (lambda q: {"A": q + 1j}, ["socket 'A' must be real numbers", "complex"]),
+        (lambda q: {"A": [["0.1", "0.2"]]}, ["socket 'A' must be real numbers", "text"]),
+        (lambda q: {"A": q > 0}, ["socket 'A' must be real numbers", "true or false"]),
+        (lambda q: {"": q}, ["a socket has the name ''", "of one line"]),
+        (lambda q: {"A\n": q}, ["a socket has the name 'A\\n'"]),
         (lambda q: {"A": q, "B": q[:, :5]}, ["socket 'B' has 5 columns", "socket 'A' has 6", "one column a joint"]),
         (lambda q: {"A": q[0]}, ["socket 'A' has shape (6,)", "one row a pose and one column a joint"]),
         (lambda q: {"A": q[:0]}, ["socket 'A' has shape (0, 6)", "at least one"]),
@@ -68,7 +76,10 @@ def shifted(given: SimpleNamespace, **changes: float) -> np.ndarray:
             ["socket 'A' pose 2 joint 6 is 178.5 rad", "degrees", "numpy.deg2rad"],
         ),
     ],
-    ids=["nan", "infinite", "ragged", "text", "columns", "one row", "no pose", "no socket", "socket twice", "degrees"],
+    ids=[
+        *("nan", "infinite", "ragged", "text", "complex", "numbers as text", "booleans", "no name", "line end"),
+        *("columns", "one row", "no pose", "no socket", "socket twice", "degrees"),
+    ],
 )
 def test_angles(given, sockets, parts):
     assert_refused(lambda: aj.Capture(sockets(given.q)), *parts)
@@ -156,6 +167,8 @@ def test_arm(paper_arm, changes, parts):
         (lambda x: aj.Bounds(x.space, x.start[:-1], x.start), ["lower has shape (20,)", "21 parameters are free"]),
         (lambda x: aj.Bounds(x.space, x.start, [[0.0], [0.0, 1.0]]), ["upper has rows of unequal length"]),
         (lambda x: x.space.arm([1.0, 2.0]), ["vector has shape (2,)", "21 parameters are free"]),
+        (lambda x: aj.Parameters(x.arm, ("d_3", "d_3")), ["'d_3' is named twice in names", "once"]),
+        (lambda x: x.arm.jacobian(x.q, "d_9"), ["unknown parameter 'd_9'"]),
         (lambda x: x.arm.jacobian(x.q, ["q_7"]), ["'q_7'", "6-joint arm", "did you mean"]),
         (lambda x: x.arm.position(x.q[:, :5]), ["q has shape (10, 5)", "6 joints", "last axis is the joint"]),
         (lambda x: x.arm.position("straight up"), ["q must be real numbers"]),
@@ -169,6 +182,8 @@ def test_arm(paper_arm, changes, parts):
             "short bound",
             "ragged bound",
             "short vector",
+            "parameters twice",
+            "jacobian of one",
             "jacobian",
             "columns",
             "text",
@@ -192,9 +207,10 @@ def test_parameters_and_bounds(given, call, parts):
         ),
         (lambda x: {"start": shifted(x, a_4=11.0)}, ["the start is outside", "a_4 is 73, not within 52 to 72"]),
         (lambda x: {"start": shifted(x, a_4=np.nan)}, ["the start is outside", "a_4 is nan"]),
+        (lambda x: {"max_steps": -1}, ["max_steps is -1", "at least 1"]),
         (lambda x: {"start": x.start[:-2]}, ["the start has shape (19,)", "21 parameters are free", "one value each"]),
     ],
-    ids=["misspelt", "angle", "held", "columns", "arm outside", "start outside", "start nan", "start short"],
+    ids=["misspelt", "angle", "held", "columns", "arm outside", "start outside", "start nan", "steps", "start short"],
 )
 @pytest.mark.parametrize("run", [aj.identify, aj.calibrate], ids=["identify", "calibrate"])
 def test_identification(given, run, arguments, parts):
@@ -225,6 +241,21 @@ def test_identification(given, run, arguments, parts):
 )
 def test_calibration_and_evaluation(given, call, parts):
     assert_refused(lambda: call(given), *parts)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda x, batch: batch.select("A"),
+        lambda x, batch: aj.stack_captures([batch]),
+        lambda x, batch: aj.fix_scale(x.arm, batch),
+        lambda x, batch: aj.observability(x.arm, batch),
+        lambda x, batch: aj.files.save_capture("no.h5", aj.Recording(batch, aj.files.load_specification("panda"))),
+    ],
+    ids=["select", "stack", "fix_scale", "observability", "save_capture"],
+)
+def test_one_capture_is_needed(given, call):
+    assert_refused(lambda: call(given, aj.stack_captures([given.capture] * 2)), "a batch of stacked captures")
 
 
 class Reached(Exception):
@@ -282,7 +313,9 @@ def test_too_few_poses(given, monkeypatch, sizes, held, hold):
         ({"sockets": {"A": (400.0, np.inf, 200.0)}}, ["socket 'A'", "not finite"]),
         ({"limits": [(-1, 1)] * 5}, ["6 rows of (lowest, highest)"]),
         ({"limits": [(-1, 1)] * 5 + [(2, 1)]}, ["limits of joint 6 are 2 to 1 rad"]),
-        ({"lengths": [("A", "B")], "poses": 1}, ["('A', 'B')", "of simulated sockets"]),
+        ({"lengths": [("A", "B")], "poses": 1}, ["'A' to 'B' names the unknown socket 'B'; known are A."]),
+        ({"lengths": [("A", "B", 1.0, 2.0)], "poses": 1}, ["('A', 'B', 1.0, 2.0)", "(socket, socket, u)"]),
+        ({"seed": 2**63, "poses": 1}, ["the seed is 9223372036854775808", "whole number of at most 63 bits"]),
         (
             {"sockets": {"far": (9000, 0, 0)}, "poses": 1},
             ["socket 'far' at (9000, 0, 0) mm", "cannot be reached", "1864 mm"],
@@ -290,7 +323,16 @@ def test_too_few_poses(given, monkeypatch, sizes, held, hold):
     ],
     ids=[
         *("encoder", "resolution", "seating", "no poses", "no poses of one", "poses of unknown", "no socket"),
-        *("two coordinates", "infinite", "limits rows", "limits reversed", "length", "out of reach"),
+        *(
+            "two coordinates",
+            "infinite",
+            "limits rows",
+            "limits reversed",
+            "length",
+            "length of four",
+            "seed",
+            "out of reach",
+        ),
     ],
 )
 def test_simulation(paper_arm, arguments, parts):
@@ -314,3 +356,44 @@ def test_values_are_not_looked_at_inside_jit(given):
     assert_refused(
         lambda: jax.jit(lambda x: aj.Bounds(given.space, [x] * 20, given.start).lower)(1.0), "lower has shape (20,)"
     )
+
+
+# Of another type than the annotations say, which the run-time type checker of the tests would refuse first.
+WRONG_TYPES = {
+    "aj.Capture({'A': q, 'B': -q}, [('A', 'B', 100.0)])": "no reference length; give aj.ReferenceLength(",
+    "aj.Capture({1: q})": "a socket has the name 1",
+    "aj.identify(arm, capture, bounds, noise=2.0)": "noise is a float; give aj.Noise(",
+    "aj.simulate(arm, {'A': (400, 200, 300)}, poses=2.5)": "'A' is given 2.5 poses; give at least one, and a whole",
+    "aj.simulate(arm, {'A': (400, 200, 300)}, poses=1, seed=1.5)": "the seed is 1.5; give a whole number",
+    "aj.load_arm(None)": "by its name or from a file, not from None",
+    "aj.Arm(alpha=[0.0], a=[1.0], d=[0.0], limits=[0, 1])": "limits must be 1 row of (lowest, highest)",
+}
+
+
+def test_what_has_another_type():
+    """In one process without that checker."""
+    program = """
+import json, sys
+import numpy as np
+import aacmm_jax as aj
+q = np.random.default_rng(0).uniform(-1, 1, (10, 6))
+arm = aj.load_arm("cheng2018-simulation")
+space = aj.Parameters.free_of(arm)
+bounds = aj.Bounds.around(arm, space)
+capture = aj.Capture({"A": q, "B": q[:1]}, [aj.ReferenceLength("A", "B", 100.0)])
+said = []
+for call in json.load(sys.stdin):
+    try:
+        said.append(repr(eval(call)))
+    except aj.InputError as error:
+        said.append(str(error))
+    except Exception as error:
+        said.append(repr(error))
+print(json.dumps(said))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], input=json.dumps(list(WRONG_TYPES)), capture_output=True, text=True, check=True
+    )
+    said = dict(zip(WRONG_TYPES, json.loads(done.stdout), strict=True))
+    wrong = {call: said[call] for call, part in WRONG_TYPES.items() if part not in said[call] or "\n" in said[call]}
+    assert not wrong

@@ -97,10 +97,10 @@ def volumetric(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None
     missing = []
     lengths = distinct_lengths(measured.lengths)
     if len(lengths) < _POSITIONS:
-        missing.append(f"{_POSITIONS} positions of the bars ({len(lengths)} are there)")
+        missing.append(f"{_POSITIONS} positions of the bars ({len(lengths)} given)")
     bars = values_by_artefact(lengths)
     if len(bars) != len(BARS):
-        missing.append(f"two bars, no fewer and no more ({len(bars)} are there)")
+        missing.append(f"two bars, no fewer and no more ({len(bars)} given)")
     elif min(map(len, bars)) < _POSITIONS // 4:
         missing.append(f"each bar in {_POSITIONS // 4} positions or more")
     if measured.reach is None:

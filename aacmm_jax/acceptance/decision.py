@@ -79,7 +79,7 @@ def read_limits(texts: list[str], known: Mapping[str, str]) -> dict[str, Limit]:
                 f"--mpe '{text}' is not of the form NAME=A or NAME=A+L/K, in mm; for example E_Uni=0.025+L/40000."
             )
         if name.strip().lower() not in names:
-            raise InputError(f"--mpe '{text}' names the unknown metric '{name}'{nearest(name, list(known))}")
+            raise InputError(f"--mpe '{text}' names the unknown metric '{name}'{nearest(name, known, len(known))}")
         name = names[name.strip().lower()]
         if name in found:
             raise InputError(f"--mpe gives {name} two limits; give it one.")

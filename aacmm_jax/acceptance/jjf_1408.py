@@ -42,6 +42,6 @@ def single_point_and_length(measured: Measured, u_test: float = 0.0) -> Acceptan
         missing.append(f"a socket measured in {_SOCKET_POSES} poses or more")
     positions = len(distinct_lengths(measured.lengths))
     if positions < _LENGTH_POSITIONS:
-        missing.append(f"a length in {_LENGTH_POSITIONS} positions ({positions} are there)")
+        missing.append(f"a length in {_LENGTH_POSITIONS} positions ({positions} given)")
     title = "single point and length, as in Cheng et al. 2018"
     return acceptance_test(JJF_1408, title, [Metric("Deltam", deltam), *lengths], missing)

@@ -149,7 +149,7 @@ def missing_touches(sphere: ProbedSphere, *, groups: int, points: int, of: str) 
             f"a sphere of {_DIAMETERS[0]:g} to {_DIAMETERS[1]:g} mm ('{sphere.name}' has {sphere.diameter:g} mm)"
         )
     if len(sphere.groups) < groups:
-        found.append(f"{groups} {of} of sphere '{sphere.name}' ({len(sphere.groups)} are there)")
+        found.append(f"{groups} {of} of sphere '{sphere.name}' ({len(sphere.groups)} given)")
     fewest = min(len(group) for group in sphere.groups)
     if fewest < points:
         found.append(f"{points} points per group on sphere '{sphere.name}' (one has {fewest})")

@@ -212,7 +212,8 @@ class BatchTask(NamedTuple):
         if noise is not None:
             noise.check(arm.joints)
         check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
-        for what, number in (("chunk", effort.chunk), ("slots", effort.slots), ("workers", effort.workers)):
+        for what in ("max_steps", "chunk", "slots", "workers"):
+            number = getattr(effort, what)
             if number is not None and number < 1:
                 raise InputError(f"{what} is {number}; give at least 1, or leave it out.")
         devices = jax.local_devices() if effort.devices is None else list(effort.devices)

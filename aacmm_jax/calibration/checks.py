@@ -9,7 +9,7 @@ from ..core.arrays import is_concrete
 from ..core.errors import InputError
 from ..core.namespace import AnyArray
 from ..data.capture import Capture
-from ..data.noise import Noise
+from ..data.noise import Noise, check_noise
 from ..kinematics.arm import Arm, is_single
 from ..kinematics.parameters import Bounds, Parameters
 from ..kinematics.workspace import total_link_length
@@ -75,6 +75,7 @@ def check_enough(sizes: tuple[int, ...], unknowns: int) -> None:
 def check_noise_model(noise_model: NoiseModel | None, noise: Noise | None, joints: int) -> NoiseModel:
     """The model of the tips' errors: by default the noise that is given, else one estimated from the residuals."""
     if noise is not None:
+        check_noise(noise)
         noise.check(joints)
     if noise_model is None:
         return "estimated" if noise is None else "given"

@@ -91,6 +91,8 @@ def _checked(
     space = based_on(bounds.space, arm)
     bounds = Bounds(space, bounds.lower, bounds.upper)
     vector = space.vector() if start is None else as_array(start, "the start")
+    if max_steps < 1:
+        raise InputError(f"max_steps is {max_steps}; give at least 1.")
     check_joints(capture, space)
     check_start(bounds, vector, "the start" if start is not None else "the arm")
     # Repeatability does not determine the scale: where lengths are free, it determines one parameter less.

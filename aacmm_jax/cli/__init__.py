@@ -1,11 +1,15 @@
 """The command line, ``aacmm``."""
 
+import errno
 import gc
+import io
+import os
 import sys
 from importlib import import_module
 from typing import NoReturn
 
 _INTERRUPTED = 130
+_CLOSED_PIPE = 141  # what a shell reports of other programs whose output nobody reads any longer
 # Modules of commands, in the order in which ``--help`` lists them.
 _FAMILIES = (
     "capture_commands",
@@ -18,10 +22,15 @@ _FAMILIES = (
 
 
 def main() -> None:
-    """Run ``aacmm``. Exit codes: 0 done, 1 not achieved, 2 bad input, 130 interrupted. ``--debug`` shows tracebacks."""
+    """Run ``aacmm``. ``--debug`` shows tracebacks.
+
+    Exit codes: 0 done, 1 not achieved, 2 bad input, 130 interrupted, 141 standard output closed by its reader.
+    """
     debug = "--debug" in sys.argv
     if debug:
         sys.argv.remove("--debug")
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names that the terminal's encoding does not have
     # Tracing makes hundreds of thousands of objects that live until the process ends. Looking for garbage among them
     # would take a sixth of the time of a short command.
     gc.set_threshold(200_000, 20, 20)
@@ -42,6 +51,9 @@ def main() -> None:
     except SystemExit as done:
         if done.code == _INTERRUPTED:
             _interrupted()
+        if isinstance(done.__context__, BrokenPipeError):  # typer and rich both exit with 1 while they handle it
+            _discard_output()
+            sys.exit(_CLOSED_PIPE)
         raise
     except KeyboardInterrupt:
         _interrupted()
@@ -55,6 +67,9 @@ def main() -> None:
     except Exception as error:
         if debug:
             raise
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            _discard_output()
+            _fail("standard output cannot be written: no space left on the device; free some, or write elsewhere.", 1)
         _fail(
             f"aacmm failed unexpectedly ({type(error).__name__}: {error}); report what it says with --debug.",
             1,
@@ -66,6 +81,11 @@ def main() -> None:
 def _interrupted() -> NoReturn:
     print("Interrupted; nothing was written that is not whole.", file=sys.stderr)
     sys.exit(_INTERRUPTED)
+
+
+def _discard_output() -> None:
+    """Standard output leads nowhere from now on: Python would write what is left at its end, and fail again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(message: str, code: int) -> NoReturn:

@@ -5,6 +5,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from ..core.errors import counted
 from .calibration_display import print_lengths, print_stages
 from .display import (
     formatted,
@@ -53,8 +54,8 @@ def points(summary: dict[str, Any]) -> None:
     """Acceptance tests of points."""
     console = new_console()
     console.print(
-        f"{summary['points']} points: {summary['sockets']} sockets, {summary['lengths']} lengths, "
-        f"{summary['spheres']} spheres"
+        f"{counted(summary['points'], 'point')}: {counted(summary['sockets'], 'socket')}, "
+        f"{counted(summary['lengths'], 'length')}, {counted(summary['spheres'], 'sphere')}"
     )
     print_warnings(console, summary)
     _acceptance(console, summary)

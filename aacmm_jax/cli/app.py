@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -90,13 +89,6 @@ def prepare(
     ] = False,
 ) -> None:
     """Calibrate articulated-arm coordinate measuring machines and other serial arms."""
-    # Compiled kernels are kept between runs; it more than halves the time of a short command.
-    import jax
-
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(home / "aacmm_jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def with_spinner(what: str, work: Callable[[], Any]) -> Any:

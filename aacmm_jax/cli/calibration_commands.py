@@ -90,7 +90,7 @@ def calibrate(
         typer.Option("--strict", help="Refuse free parameters that such data could not determine even without noise."),
     ] = False,
     figure: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Plot the residual of every pose (PNG).")
+        Path | None, typer.Option(metavar="FILE", help="Plot the residual of every pose: PNG, SVG or PDF by the name.")
     ] = None,
     max_steps: Annotated[int, typer.Option(min=1, metavar="N", help="Largest number of steps of each solve.")] = 300,
     as_json: Json = False,
@@ -109,6 +109,10 @@ def calibrate(
     from . import calibration_display
 
     check_outputs([output, figure], [capture])
+    if figure is not None:
+        from ..plot.style import check_format
+
+        check_format(figure)
     recording = load_capture(capture)
     recording = recording._replace(
         capture=recording.capture.select(only or None, without or ()),
@@ -168,8 +172,12 @@ def _bounds(
     names = _names(held) if held is not None else nominal.held
     space = Parameters.free_of(nominal.arm, held=names, free=_names(free or ""))
     override = {name: width for name, width in nominal.override.items() if name in space.names}
+    seen = set()
     for text in single:
         name, _, width = text.partition("=")
+        if name in seen:
+            raise InputError(f"--bound gives {name} two half-widths; give it one.")
+        seen.add(name)
         try:
             value = float(width)
         except ValueError as error:

@@ -6,6 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from ..core.errors import counted
 from ..core.units import ARCSEC, DEG
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
@@ -46,9 +47,9 @@ def capture(summary: dict[str, Any]) -> None:
     """One capture."""
     console = new_console()
     console.print(
-        f"[bold]{escape(summary['arm'])}[/bold]: {summary['poses']} poses of {summary['joints']} joints in "
-        f"{len(summary['sockets'])} sockets, {len(summary['lengths'])} reference lengths"
-        + (", simulated" if summary["simulated"] else "")
+        f"[bold]{escape(summary['arm'])}[/bold]: {counted(summary['poses'], 'pose')} of "
+        f"{counted(summary['joints'], 'joint')} in {counted(len(summary['sockets']), 'socket')}, "
+        f"{counted(len(summary['lengths']), 'reference length')}" + (", simulated" if summary["simulated"] else "")
     )
     print_warnings(console, summary)
     table = new_table("", "socket", "poses")
@@ -94,8 +95,9 @@ def print_verdict(console: Console, summary: dict[str, Any]) -> None:
     if summary["converged"] and not summary["residual_plausible"]:
         verdict = "[red]ended with a residual that no arm has[/red],"
     console.print(
-        f"[bold]{escape(summary['arm'])}[/bold], {summary['method']}: {verdict} in {summary['steps']} steps on "
-        f"{summary['poses']} poses in {len(summary['sockets_used'])} sockets"
+        f"[bold]{escape(summary['arm'])}[/bold], {summary['method']}: {verdict} in "
+        f"{counted(summary['steps'], 'step')} on {counted(summary['poses'], 'pose')} in "
+        f"{counted(len(summary['sockets_used']), 'socket')}"
     )
 
 

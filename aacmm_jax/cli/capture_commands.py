@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from ..core.arrays import LARGEST_SEED
 from ..core.errors import InputError
 from ..core.units import DEG
 from .app import (
@@ -33,7 +34,7 @@ def demo(
     folder: Annotated[Path, typer.Argument(help="Folder for the files; made if it does not exist.")] = Path(
         "aacmm-demo"
     ),
-    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of the noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, metavar="N", help="Seed of the noise.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Calibrate a simulated arm and compare it with the truth.
@@ -87,7 +88,7 @@ def simulate(
             "ISO 10360-12; artefacts have u = 0.001 mm."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of poses and noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, metavar="N", help="Seed of poses and noise.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Make a capture with a simulated arm."""
@@ -102,6 +103,11 @@ def simulate(
     check_outputs([output], [arm, true_arm])
     nominal = load_specification(arm)
     true = load_specification(true_arm) if true_arm else nominal
+    if true.arm.joints != nominal.arm.joints:
+        raise InputError(
+            f"the true arm {true_arm} has {true.arm.joints} joints, but {arm} has {nominal.arm.joints}; "
+            "choose a true arm with as many."
+        )
     if deviate_length_mm or deviate_angle_deg:
         space = true.space()
         drawn = perturbed_arm(space, length=deviate_length_mm, angle=deviate_angle_deg * DEG, seed=seed)

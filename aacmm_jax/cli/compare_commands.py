@@ -120,7 +120,7 @@ def _created(file: Path) -> str:
 
 def _check_outputs(files: list[Path], figure: Path | None, csv: Path | None) -> None:
     if figure is not None:
-        from ..plot.drift import check_format
+        from ..plot.style import check_format
 
         check_format(figure)
     check_outputs([figure, csv], files)

@@ -9,7 +9,9 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-_PIPED = 110  # columns of what is not a terminal, where COLUMNS does not say
+_DEFAULT = 110  # columns of what is not a terminal, where COLUMNS does not say
+_LEAST = 20  # columns: fewer than these cannot be meant
+_MOST = 1e9  # from here on decimals say nothing
 _GAP = 2  # between columns
 _LONGEST_WORD = 24  # a longer one (a path) is broken over lines
 
@@ -17,8 +19,8 @@ _LONGEST_WORD = 24  # a longer one (a path) is broken over lines
 def new_console() -> Console:
     """Standard output, as wide as the terminal or as COLUMNS says."""
     console = Console(highlight=False, emoji=False)  # a name with ":art:" in it is not to become a picture
-    if not console.is_terminal and not os.environ.get("COLUMNS", "").isdigit():
-        console.width = _PIPED
+    if console.width < _LEAST or (not console.is_terminal and not os.environ.get("COLUMNS", "").isdigit()):
+        console.width = _DEFAULT
     return console
 
 
@@ -80,11 +82,13 @@ def _fitted(natural: list[int], least: list[int], available: int) -> list[int]:
 
 
 def formatted(value: float | None, decimals: int = 4) -> str:
-    """A number of mm with a fixed number of decimals, or in scientific notation where it is too small for them."""
+    """A number of mm with a fixed number of decimals, or in scientific notation if too small or too large for them."""
     if value is None:
         return "-"
     if abs(value) < 1e-9:  # mm: rounding
         value = 0.0
+    if not abs(value) < _MOST:
+        return f"{value:.6g}"
     small = value != 0 and abs(value) < 0.5 * 10**-decimals
     return f"{value:.1e}" if small else f"{value:.{decimals}f}"
 

@@ -7,6 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from ..core.errors import counted
 from .display import new_console, new_table, print_table, print_written
 
 
@@ -34,7 +35,8 @@ def plan(summary: dict[str, Any]) -> None:
     """Positions of the sockets, and the predicted uncertainty, compared with that of random poses."""
     console = new_console()
     console.print(
-        f"[bold]{escape(summary['arm'])}[/bold]: {summary['poses']} poses in {len(summary['sockets'])} sockets"
+        f"[bold]{escape(summary['arm'])}[/bold]: {summary['poses']} poses in "
+        f"{counted(len(summary['sockets']), 'socket')}"
     )
     table = new_table("", "socket", "x [mm]", "y [mm]", "z [mm]", "poses")
     for row in summary["sockets"]:

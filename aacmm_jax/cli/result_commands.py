@@ -189,9 +189,11 @@ def export(
         ),
     ] = "toml",
     which: Annotated[
-        Literal["calibrated", "nominal", "true"],
-        typer.Option("--arm", help="Which arm to write with --format toml; a simulation has a true one."),
-    ] = "calibrated",
+        Literal["calibrated", "nominal", "true"] | None,
+        typer.Option(
+            "--arm", help="Which arm to write with --format toml; a simulation has a true one. Default: calibrated."
+        ),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write. Default: standard output.")
     ] = None,
@@ -200,6 +202,9 @@ def export(
     """Write a calibration for other programs."""
     if about is not None and form != "dcc":
         raise InputError("--about is for certificates; give it with --format dcc.")
+    if which is not None and form != "toml":
+        raise InputError("--arm is for --format toml; leave it out, since the other formats hold all arms.")
+    which = which or "calibrated"
     check_outputs([output], [calibration, about])
     from ..files.arms import specification_toml
     from ..files.calibrations import load_calibration
@@ -228,6 +233,7 @@ def export(
         typer.echo(text, nl=False)
     else:
         write_text(output, text)
+        typer.echo(f"Written: {output}")
 
 
 def _certificate(calibration: Path, record: Any, about: Path | None) -> str:

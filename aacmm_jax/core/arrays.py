@@ -17,6 +17,7 @@ from .x64 import check_x64
 # What people pass for an array of numbers; lists are converted and checked.
 Numbers = ArrayLike | Sequence[Any]
 
+LARGEST_SEED = 2**63 - 1
 _CHUNK = 256  # rows of a block
 _KINDS = {"U": "text", "S": "text", "b": "true or false", "c": "complex numbers"}
 
@@ -55,6 +56,13 @@ def joined(rows: Sequence[Array | np.ndarray], axis: int = 0, new: bool = False)
     tools: Any = np if known else jnp
     whole = (tools.stack if new else tools.concatenate)(rows, axis=axis)
     return jax.device_put(whole) if known else whole
+
+
+def random_key(seed: int) -> Array:
+    """The key of JAX for a seed, or `InputError`."""
+    if not isinstance(seed, int | np.integer) or not -LARGEST_SEED <= seed <= LARGEST_SEED:
+        raise InputError(f"the seed is {seed!r}; give a whole number of at most 63 bits.")
+    return jax.random.key(seed)
 
 
 def random_numbers(kind: Literal["normal", "uniform"], key: Array, shape: tuple[int, ...]) -> np.ndarray:

@@ -21,11 +21,16 @@ def some(items: Sequence[str], most: int = 5) -> str:
     return ", ".join(items[:most]) + (f" and {len(items) - most} more" if len(items) > most else "")
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
-    """A hint ``; did you mean 'x'?`` for a misspelt word, or the list of what is known when nothing is near."""
+def counted(number: int, noun: str) -> str:
+    """A number of things: ``1 socket``, ``2 sockets``."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def nearest(word: str, known: Iterable[str], most: int = 12) -> str:
+    """A hint ``; did you mean 'x'?`` for a misspelt word, or ``most`` of what is known when nothing is near."""
     known = list(known)
     matches = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     if matches:
         return f"; did you mean '{matches[0]}'?"
-    shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
+    shown = ", ".join(known[:most]) + (", ..." if len(known) > most else "")
     return f"; known are {shown}." if known else "."

@@ -61,11 +61,11 @@ class Capture(eqx.Module):
 
     Args:
         sockets: Socket name -> joint readings, shape ``(m, n)``, rad; m poses may differ from socket to socket.
-        lengths: Reference lengths between these sockets.
+        lengths: Reference lengths between these sockets, or one.
 
     Raises:
-        InputError: For readings that are not finite or look like degrees, sockets of different joint counts or with the
-            same poses, and lengths that join unknown sockets.
+        InputError: For names that are empty or longer than a line, readings that are not finite or look like degrees,
+            sockets of different joint counts or with the same poses, and lengths that join unknown sockets.
     """
 
     q: Float[AnyArray, "N n"]
@@ -73,7 +73,7 @@ class Capture(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, sockets: Mapping[str, Numbers], lengths: Iterable[ReferenceLength] = ()):
+    def __init__(self, sockets: Mapping[str, Numbers], lengths: Iterable[ReferenceLength] | ReferenceLength = ()):
         if not sockets:
             raise InputError("a capture needs at least one socket with poses.")
         blocks = {name: _checked_angles(name, angles) for name, angles in sockets.items()}
@@ -88,8 +88,10 @@ class Capture(eqx.Module):
         self.q = joined(list(blocks.values()))
         self.names = tuple(blocks)
         self.sizes = tuple(block.shape[0] for block in blocks.values())
-        self.lengths = tuple(lengths)
+        self.lengths = (lengths,) if isinstance(lengths, ReferenceLength) else tuple(lengths)
         for length in self.lengths:
+            if not isinstance(length, ReferenceLength):
+                raise InputError(f"{length!r} is no reference length; give aj.ReferenceLength(start, end, value, u).")
             for end in (length.start, length.end):
                 if end not in self.names:
                     raise InputError(
@@ -103,11 +105,11 @@ class Capture(eqx.Module):
         return self.q.shape[-1]
 
     @property
-    def sockets(self) -> dict[str, Float[Array | np.ndarray, "m n"]]:
-        """Joint readings by socket, ``(m, n)`` each, rad."""
+    def sockets(self) -> dict[str, Float[Array | np.ndarray, "*batch m n"]]:
+        """Joint readings by socket, ``(m, n)`` each, of a batch ``(batch, m, n)``; rad."""
         q = np.asarray(self.q) if is_concrete(self.q) else self.q
         ends = np.cumsum(self.sizes)
-        return {name: q[end - size : end] for name, size, end in zip(self.names, self.sizes, ends, strict=True)}
+        return {name: q[..., end - size : end, :] for name, size, end in zip(self.names, self.sizes, ends, strict=True)}
 
     @property
     def owner(self) -> Int[np.ndarray, " N"]:
@@ -130,8 +132,9 @@ class Capture(eqx.Module):
             A capture of the remaining sockets, in their order.
 
         Raises:
-            InputError: Where a pattern matches no socket, or no socket remains.
+            InputError: Where a pattern matches no socket, no socket remains, or the capture is a batch.
         """
+        check_one_capture(self)
         only = [only] if isinstance(only, str) else only
         without = [without] if isinstance(without, str) else list(without)
         kept = list(self.names) if only is None else _matching(self.names, only)
@@ -144,6 +147,14 @@ class Capture(eqx.Module):
         return Capture({name: sockets[name] for name in kept}, lengths)
 
 
+def check_one_capture(capture: Capture) -> None:
+    """Raise `InputError` for a batch of `stack_captures`."""
+    if capture.q.ndim != 2:
+        raise InputError(
+            "the capture is a batch of stacked captures, but one capture is needed; use the captures one by one."
+        )
+
+
 def _matching(names: Sequence[str], patterns: Iterable[str]) -> list[str]:
     chosen: set[str] = set()
     for pattern in patterns:
@@ -154,17 +165,10 @@ def _matching(names: Sequence[str], patterns: Iterable[str]) -> list[str]:
     return [name for name in names if name in chosen]
 
 
-def _checked_angles(name: str, angles: Numbers) -> Array | np.ndarray:
-    if not is_concrete(angles):
-        array = jnp.asarray(angles, dtype=jnp.float64)
-    else:
-        try:
-            array = np.asarray(angles, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"socket '{name}' has something that is not a number, or rows of unequal length; give one row of "
-                "numbers a pose."
-            ) from error
+def _checked_angles(name: str, angles: Numbers) -> AnyArray:
+    if not isinstance(name, str) or not name.strip() or name.splitlines() != [name]:
+        raise InputError(f"a socket has the name {name!r}; give it a name of one line.")
+    array = as_array(angles, f"socket '{name}'", like=np.zeros(0))
     if array.ndim != 2 or 0 in array.shape:
         raise InputError(
             f"socket '{name}' has shape {array.shape}; give one row a pose and one column a joint, at least one of "
@@ -211,9 +215,13 @@ def stack_captures(captures: Iterable[Capture]) -> Capture:
         A capture whose ``q`` is ``(batch, N, n)`` and whose lengths are ``(batch,)``; rad and mm.
 
     Raises:
-        InputError: Where the captures differ in shape.
+        InputError: Where there is none, one is a batch, or they differ in shape.
     """
     captures = list(captures)
+    if not captures:
+        raise InputError("there is no capture to stack; give at least one.")
+    for capture in captures:
+        check_one_capture(capture)
     if len({(c.names, c.sizes, tuple((r.start, r.end) for r in c.lengths), c.joints) for c in captures}) != 1:
         raise InputError("captures of a batch must have the same sockets, numbers of poses, joints and lengths.")
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *captures)

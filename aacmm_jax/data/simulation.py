@@ -8,14 +8,14 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core.arrays import Numbers, as_floats, random_numbers
+from ..core.arrays import Numbers, as_floats, random_key, random_numbers
 from ..core.errors import InputError, nearest
 from ..core.namespace import AnyArray, to_numpy
 from ..core.units import ARCSEC
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture, ReferenceLength
-from .noise import Noise
+from .noise import Noise, check_noise
 
 
 def simulate(
@@ -65,7 +65,7 @@ def simulate(
     arm, noise = to_numpy((arm, noise))
     points = {name: socket_point(name, point) for name, point in sockets.items()}
     counts = _counts(points, poses)
-    reach_key, seat_key, encoder_key, length_key = jax.random.split(jax.random.key(seed), 4)
+    reach_key, seat_key, encoder_key, length_key = jax.random.split(random_key(seed), 4)
     owner = [name for name, count in counts.items() for _ in range(count)]
     rows = np.stack([np.asarray(point) for point in points.values()])
     exact = np.repeat(rows, list(counts.values()), axis=0)
@@ -94,8 +94,7 @@ def _noise(noise: Any, encoder_arcsec: Any, seating: Any, resolution_arcsec: Any
             raise InputError(f"{what} is {value:g}; noise must be zero or positive.")
     if noise is None:
         return Noise(**given)
-    if not isinstance(noise, Noise):
-        raise InputError(f"noise is a {type(noise).__name__}; give aj.Noise(encoder_arcsec=..., seating=...).")
+    check_noise(noise)
     if given:
         raise InputError(f"simulate is given noise and {' and '.join(given)}; put all of it into noise.")
     return noise
@@ -117,8 +116,8 @@ def _counts(points: Mapping[str, AnyArray], poses: int | Mapping[str, int]) -> d
         if name not in points:
             raise InputError(f"poses are given for the unknown socket '{name}'{nearest(name, points)}")
     for name, count in counts.items():
-        if count < 1:
-            raise InputError(f"socket '{name}' is given {count} poses; give at least one.")
+        if not isinstance(count, int | np.integer) or count < 1:
+            raise InputError(f"socket '{name}' is given {count} poses; give at least one, and a whole number.")
     return counts
 
 
@@ -128,11 +127,14 @@ def _reference_lengths(points: Mapping[str, AnyArray], lengths: Iterable, key: A
         if isinstance(length, ReferenceLength):
             drawn.append(length)
             continue
-        if len(length) not in (2, 3) or any(end not in points for end in length[:2]):
-            raise InputError(
-                f"reference length {length} must be (socket, socket) or (socket, socket, u), of simulated sockets."
-            )
+        if isinstance(length, str) or len(length) not in (2, 3):
+            raise InputError(f"reference length {length!r} must be (socket, socket) or (socket, socket, u), u in mm.")
         start, end = length[:2]
+        for name in (start, end):
+            if name not in points:
+                raise InputError(
+                    f"reference length '{start}' to '{end}' names the unknown socket '{name}'{nearest(name, points)}"
+                )
         u = float(length[2]) if len(length) == 3 else 0.0
         draw = float(random_numbers("normal", jax.random.fold_in(key, number), ()))
         true = float(np.linalg.norm(np.asarray(points[start]) - np.asarray(points[end])))

@@ -30,6 +30,13 @@ class _Joint(Strict):
     beta: FiniteFloat | None = None
     limits: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
 
+    @model_validator(mode="after")
+    def _ordered(self) -> "_Joint":
+        if self.limits is not None and not self.limits[0] < self.limits[1]:
+            low, high = self.limits
+            raise ValueError(f"the limits are {low:g} to {high:g}; the lower must be below the upper.")
+        return self
+
 
 class _Identification(Strict):
     held: list[str] | None = None
@@ -102,6 +109,8 @@ def _read(source: str | os.PathLike, *, choose: bool) -> ArmSpecification:
     if isinstance(source, str) and source in shipped_arms():
         with resources.as_file(resources.files("aacmm_jax.files") / "shipped_arms" / f"{source}.toml") as path:
             return _specification(path, choose)
+    if not isinstance(source, str | os.PathLike):
+        raise InputError(f"an arm is read by its name or from a file, not from {source!r}; give one of the two.")
     path = Path(source)
     if not path.exists() and path.suffix != ".toml":
         raise InputError(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..data.capture import Capture, ReferenceLength
+from ..data.capture import Capture, ReferenceLength, check_one_capture
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm
@@ -73,6 +73,7 @@ def recording_attributes(recording: Recording) -> dict[str, Any]:
 def recording_tables(recording: Recording) -> dict[str, Table]:
     """The tables of a recording: ``capture``, ``reference``, ``nominal_arm`` and perhaps ``true_arm``."""
     capture = recording.capture
+    check_one_capture(capture)
     owner = [capture.names[i] for i in capture.owner]
     tables = {
         "capture": Table(

@@ -168,7 +168,7 @@ def _write_attributes(item: Any, attributes: Mapping[str, Any]) -> None:
 def _attribute(value: Any) -> Any:
     if isinstance(value, list):
         return [_attribute(item) for item in value]
-    return storable(value) if isinstance(value, str) else value
+    return storable(str(value)) if isinstance(value, str) else value  # `str`: h5py cannot store NumPy's own
 
 
 def _write_group(group: Any, table: Table) -> None:

@@ -5,10 +5,19 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, FiniteFloat, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    FiniteFloat,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    model_validator,
+)
 
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG
@@ -18,18 +27,19 @@ from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
 from .arms import load_specification
 from .patterns import fields_of, fill, in_braces, matches
 from .text_table import read_numbers
-from .toml import Strict, read_toml
+from .toml import Strict, each_once, read_toml
 from .whole_file import fingerprint
 
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _UNITS = {"rad": 1.0, "deg": DEG, "arcsec": ARCSEC}
 
 
 class _Angles(Strict):
     unit: Literal["rad", "deg", "arcsec", "counts"]
-    counts_per_turn: PositiveFloat | list[PositiveFloat] | None = None
+    counts_per_turn: _Positive | Annotated[list[_Positive], Field(min_length=1)] | None = None
     sign: Literal[1, -1] | list[Literal[1, -1]] = 1
     offset: FiniteFloat | list[FiniteFloat] = 0.0
-    columns: list[PositiveInt] | None = None
+    columns: Annotated[list[PositiveInt], AfterValidator(each_once)] | None = None
 
     @model_validator(mode="after")
     def _counts(self) -> "_Angles":
@@ -42,7 +52,7 @@ class _Files(Strict):
     """What is recorded in one file, or in several."""
 
     file: str | None = None
-    files: Annotated[list[str], Field(min_length=1)] | None = None
+    files: Annotated[list[str], Field(min_length=1), AfterValidator(each_once)] | None = None
 
     @property
     def paths(self) -> list[str]:
@@ -86,7 +96,7 @@ class _Sphere(_Files):
 
 class _Points(Strict):
     unit: Literal["mm", "m", "um", "inch"]
-    columns: Annotated[list[PositiveInt], Field(min_length=3, max_length=3)] | None = None
+    columns: Annotated[list[PositiveInt], Field(min_length=3, max_length=3), AfterValidator(each_once)] | None = None
     reach: PositiveFloat | None = None  # mm
     shoulder: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None  # mm
 
@@ -99,10 +109,14 @@ class _Points(Strict):
         return self
 
 
+def _day(value: Any) -> Any:
+    return value.date() if isinstance(value, datetime.datetime) else value
+
+
 class _Recorded(Strict):
     """What manifests of poses and of points have in common."""
 
-    date: datetime.date | None = None  # when it was recorded
+    date: Annotated[datetime.date, BeforeValidator(_day)] | None = None  # when it was recorded
     socket: list[_Socket] = Field(default_factory=list)
     length: list[_Length] = Field(default_factory=list)
     sphere: list[_Sphere] = Field(default_factory=list)
@@ -229,7 +243,7 @@ def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dic
     if not fields:
         if entry.exclude:
             raise InputError(f"exclude is for files with a field in braces, but '{first}' has none; leave it out.")
-        yield entry.name or Path(first).stem, [folder / file for file in entry.paths], {}
+        yield Path(first).stem if entry.name is None else entry.name, [folder / file for file in entry.paths], {}
         return
     assert entry.name is not None  # its fields are those of the file
     for values in matches(folder, first, entry.exclude):
@@ -256,4 +270,9 @@ def _lengths(
         # The field may also be in the names of sockets that this length is not between.
         known = [pair for pair in pairs if pair[0] in sockets or pair[1] in sockets]
         lengths += [ReferenceLength(*pair, entry.value, entry.u) for pair in known or pairs]
+    # Repeated measurements have other values, or are named in the other direction.
+    given = [(length.start, length.end, float(length.value)) for length in lengths]
+    for start, end, value in given:
+        if given.count((start, end, value)) > 1:
+            raise InputError(f"length from '{start}' to '{end}' of {value:g} mm is given twice; give it once.")
     return lengths

@@ -47,7 +47,8 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
     found = sorted(path.replace(os.sep, "/") for path in glob.glob(glob.escape(before) + "*".join(literals)))
     strict = re.compile(re.escape(before) + _expression(pattern, _WORD))
     kept = [path for path in found if not _excluded(path.removeprefix(before), exclude)]
-    values = [match.groupdict() for path in kept if (match := strict.fullmatch(path))]
+    names = list(dict.fromkeys(_FIELD.findall(pattern)))
+    values = [dict(zip(names, match.groups(), strict=True)) for path in kept if (match := strict.fullmatch(path))]
     if not values:
         where = f"no file matches '{pattern}' in {folder}"
         left_out = [path.removeprefix(before) for path in found if path not in kept]
@@ -66,19 +67,24 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
 
 
 def _expression(pattern: str, partial: str) -> str:
-    """Regular expression of a path with fields; ``partial`` is what a field may be next to other text in a name.
+    """Regular expression of a path, with a group for each field, in the order in which they first appear.
 
-    A field that is repeated must match the same text each time.
+    ``partial`` is what a field may be next to other text in a name. A field that is repeated must match the same text
+    each time.
     """
     components = [text for text in pattern.split("/") if _FIELD.search(text)]
     shared = {name for text in components if not _WHOLE.fullmatch(text) for name in _FIELD.findall(text)}
-    parts, last, seen = "", 0, set()
+    parts, last, seen = "", 0, []
     for field in _FIELD.finditer(pattern):
         name = field.group(1)
         value = partial if name in shared else _ANYTHING
         parts += re.escape(pattern[last : field.start()])
-        parts += f"(?P={name})" if name in seen else f"(?P<{name}>{value})"
-        seen.add(name)
+        # Groups have numbers: the name of a field, such as {1}, may be none that a group can have.
+        if name in seen:
+            parts += f"(?:\\{seen.index(name) + 1})"
+        else:
+            parts += f"({value})"
+            seen.append(name)
         last = field.end()
     return parts + re.escape(pattern[last:])
 

@@ -29,7 +29,7 @@ def read_numbers(path: str | os.PathLike, columns: Sequence[int] | None = None) 
         if not cells or cells[0].startswith("#"):
             continue
         try:
-            rows.append([float(cell) for cell in cells])
+            rows.append([_number(cell) for cell in cells])
         except ValueError as error:
             if not rows and not any(_is_number(cell) for cell in cells):
                 continue  # a header
@@ -65,9 +65,15 @@ def _cells(line: str) -> list[str]:
     return line.split()
 
 
+def _number(cell: str) -> float:
+    if "_" in cell:
+        raise ValueError  # Python takes 1_0 for 10
+    return float(cell)
+
+
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        _number(cell)
     except ValueError:
         return False
     return True

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from ..core.errors import InputError, nearest
 from .whole_file import check_readable
@@ -18,6 +18,15 @@ class Strict(BaseModel):
     """A table whose keys are all known: any other key is refused. Values cannot be assigned to."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_booleans(cls, value: Any, info: Any) -> Any:
+        """Refuse true and false where a number is wanted; pydantic takes them for 1 and 0."""
+        wanted = cls.model_fields[str(info.field_name)].annotation
+        if wanted is not bool and any(isinstance(x, bool) for x in (value if isinstance(value, list) else [value])):
+            raise ValueError("true and false are no numbers; give a number.")
+        return value
 
 
 def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
@@ -38,9 +47,21 @@ def validated(model: type[Model], content: Mapping[str, Any], where: str) -> Mod
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        # A misspelt key is also a missing one, and says more; an error inside a list says more than "not a number".
-        worst = max(error.errors(), key=lambda found: (found["type"] == "extra_forbidden", len(found["loc"])))
+        # A misspelt key is also a missing one, and says more; so does an error of or inside a
+        # list, compared with "not a number".
+        worst = max(
+            error.errors(),
+            key=lambda found: (found["type"] == "extra_forbidden", len(found["loc"]), found["type"] == "too_short"),
+        )
         raise InputError(f"{where}: {_explain(worst, model, content)}") from error
+
+
+def each_once(items: list[Any]) -> list[Any]:
+    """Validator of a list: refuses an entry that is there twice."""
+    for item in items:
+        if items.count(item) > 1:
+            raise ValueError(f"{item!r} is given twice; give it once.")
+    return items
 
 
 def _written(steps: Sequence[Any], content: Any) -> list[Any]:

@@ -15,14 +15,17 @@ ELSEWHERE = "choose another output path"
 def whole_file(path: str | os.PathLike, advice: str = ELSEWHERE) -> Iterator[Path]:
     """Write a file whole or not at all: yields a temporary path in the same folder, renamed onto it at the end.
 
-    Whatever goes wrong (Ctrl-C included), the temporary file is removed and an existing target stays as it was.
-    Raises `InputError` where the path cannot be written.
+    A symbolic link is followed: the file that it points to is written. Whatever goes wrong (Ctrl-C included), the
+    temporary file is removed and an existing target stays as it was. Raises `InputError` where the path cannot be
+    written, or is a folder, a device or a pipe.
     """
-    target = Path(path)
+    named = Path(path)
+    target = Path(os.path.realpath(named))
     # Named before it is made: an interrupt between the two must not leave a file that nobody removes.
     temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
     try:
-        if target.exists() and not target.is_file():
+        # A link in /proc (/dev/stdout) leads to what has no path, and one that leads to itself remains a link.
+        if (named.exists() or target.exists() or target.is_symlink()) and not target.is_file():
             raise OSError(None, "it is a folder" if target.is_dir() else "it is not an ordinary file")
         open(temporary, "xb").close()
         yield temporary
@@ -31,7 +34,7 @@ def whole_file(path: str | os.PathLike, advice: str = ELSEWHERE) -> Iterator[Pat
         os.replace(temporary, target)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
-        raise InputError(f"{target} cannot be written: {reason}; {advice}.") from error
+        raise InputError(f"{named} cannot be written: {reason}; {advice}.") from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()

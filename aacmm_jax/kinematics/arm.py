@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_array, as_floats, in_chunks
-from ..core.errors import InputError, nearest
+from ..core.errors import InputError, counted, nearest
 from ..core.namespace import AnyArray, namespace, to_jax, to_numpy
 from .chain import Geometry, tip_pose
 from .jacobian import tip_jacobian, tip_position
@@ -114,8 +114,8 @@ class Arm(eqx.Module):
 
         Args:
             q: Joint angles ``(..., n)``, rad.
-            names: Parameter names (``alpha_1`` ... ``probe_z``) or joint readings ``q_1`` ... ``q_n``; by default all
-                parameters, in the order of `parameter_names`.
+            names: Parameter names (``alpha_1`` ... ``probe_z``) or joint readings ``q_1`` ... ``q_n``, or one of
+                them; by default all parameters, in the order of `parameter_names`.
 
         Returns:
             ``(..., 3, p)``, mm per mm or mm per rad.
@@ -123,7 +123,7 @@ class Arm(eqx.Module):
         Raises:
             InputError: A name is unknown, or q has another number of joints.
         """
-        names = parameter_names(self) if names is None else names
+        names = parameter_names(self) if names is None else (names,) if isinstance(names, str) else names
         return self._evaluated(
             partial(tip_jacobian, indices=tuple(locate(self.joints, n, extra=("q",)) for n in names)), q
         )
@@ -173,9 +173,12 @@ class Arm(eqx.Module):
 
 def checked_limits(limits: Sequence[Sequence[float]], joints: int) -> tuple[tuple[float, float], ...]:
     """Lowest and highest reading of each joint, rad, or `InputError` that names the joint."""
-    rows = [tuple(float(reading) for reading in row) for row in limits]
+    try:
+        rows = [tuple(float(reading) for reading in row) for row in limits]
+    except (TypeError, ValueError):
+        rows = []  # no rows of numbers
     if len(rows) != joints or any(len(row) != 2 for row in rows):
-        raise InputError(f"limits must be {joints} rows of (lowest, highest) in rad, one per joint.")
+        raise InputError(f"limits must be {counted(joints, 'row')} of (lowest, highest) in rad, one per joint.")
     for i, (low, high) in enumerate(rows, start=1):
         if not -math.inf < low < high < math.inf:
             raise InputError(

@@ -163,11 +163,11 @@ def random_configurations(
         if not len(missing):
             return angles
     links = float(np.abs(arm.a).sum() + np.abs(arm.d).sum() + np.linalg.norm(arm.probe))
-    point = ", ".join(f"{x:.0f}" for x in np.asarray(targets[missing[0]]))
+    point = ", ".join(f"{round(float(x)):.6g}" for x in np.asarray(targets[missing[0]]))
     what = labels[missing[0]] if labels else "the target"
     raise InputError(
-        f"{what} at ({point}) mm cannot be reached within the joint limits (the links together measure {links:.0f} "
-        "mm); move it closer or widen the limits."
+        f"{what} at ({point}) mm cannot be reached within the joint limits (the links together measure "
+        f"{round(links):.6g} mm); move it closer or widen the limits."
     )
 
 

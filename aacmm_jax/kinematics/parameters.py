@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.arrays import Numbers, as_array, is_concrete, joined
+from ..core.arrays import Numbers, as_array, is_concrete, joined, random_key
 from ..core.errors import InputError
 from ..core.namespace import AnyArray, namespace
 from .arm import Arm, is_length, is_single, locate, natural_steps, parameter_names, with_arrays, with_values
@@ -29,10 +29,17 @@ class Parameters(eqx.Module):
     Args:
         base: The arm that fixed parameters are taken from.
         names: Names of the free parameters.
+
+    Raises:
+        InputError: A name is there twice.
     """
 
     base: Arm
     names: tuple[str, ...] = eqx.field(static=True)
+
+    def __check_init__(self):
+        if len(set(self.names)) != len(self.names):
+            _unique_names(self.base, self.names, "names")
 
     @classmethod
     def free_of(cls, arm: Arm, *, held: Iterable[str] | None = None, free: Iterable[str] = ()) -> "Parameters":
@@ -271,7 +278,7 @@ def perturbed_arm(space: Parameters, *, length: float, angle: float, seed: int =
         if not (math.isfinite(value) and value >= 0):
             raise InputError(f"the deviation of a free {what} is {value:g}; it must be zero or positive.")
     width = jnp.where(jnp.asarray(space.lengths), length, angle)
-    shift = jax.random.uniform(jax.random.key(seed), width.shape, minval=-1.0, maxval=1.0)
+    shift = jax.random.uniform(random_key(seed), width.shape, minval=-1.0, maxval=1.0)
     return space.arm(space.vector() + width * shift)
 
 

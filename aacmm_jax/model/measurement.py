@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from ..core.errors import InputError
 from ..core.namespace import AnyArray, namespace, to_numpy
-from ..data.capture import Capture
+from ..data.capture import Capture, check_one_capture
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.chain import Geometry, SinesCosines, sines_cosines
 from ..kinematics.parameters import Parameters
@@ -34,7 +34,8 @@ class Measurement(eqx.Module):
 
     @classmethod
     def of(cls, capture: Capture) -> "Measurement":
-        """The measurement of a capture."""
+        """The measurement of a capture. Raises `InputError` for a batch of captures."""
+        check_one_capture(capture)
         capture = to_numpy(capture)
         xp = namespace(capture)
         return cls(

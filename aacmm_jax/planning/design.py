@@ -300,7 +300,7 @@ def _candidates(
     q, owner = configurations_at(problem.region, placement.points, max(count // len(placement.points), 50))
     for i, point in enumerate(placement.points):
         if np.sum(owner == i) < _LEAST_CANDIDATES:
-            where = ", ".join(f"{x:.0f}" for x in point)
+            where = ", ".join(f"{round(float(x)):.6g}" for x in point)
             raise InputError(
                 f"socket {i + 1} at ({where}) mm cannot be reached in enough poses within the joint limits and their "
                 "margin; move it."

@@ -142,14 +142,14 @@ def reference_length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
 
 
 def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
-    """Write the distances of the poses and, if the truth is known, the errors of the length parameters, as PNG.
+    """Write the distances of the poses and, if the truth is known, the errors of the length parameters.
 
     Args:
         record: The calibration.
-        path: The file to write, whole or not at all.
+        path: The file to write, whole or not at all; its name ends in ``.png``, ``.svg`` or ``.pdf``.
 
     Raises:
-        InputError: If the file cannot be written.
+        InputError: For another format, or if the file cannot be written.
     """
     from matplotlib.figure import Figure
 

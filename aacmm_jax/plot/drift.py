@@ -5,11 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import InputError
 from ..drift.results import Drift, Trend, in_words
-from .style import ACCENT, DARK, save_figure
+from .style import ACCENT, DARK, check_format, save_figure
 
-FORMATS = ("png", "svg", "pdf")
 _LIGHT = "0.72"
 _LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (2, 1)), (0, (4, 1, 1, 1)))
 _MARKERS = "os^Dv<>p"
@@ -17,14 +15,6 @@ _COLORS = ("#1b3a6b", "#d95f02", "#111111", "#1b7a5a", "#7a3b8f", "#555555", "#a
 _NAMED = len(_MARKERS)  # lines that remain distinct, each with its name
 _CROWDED = 0.03  # calibrations nearer in time than this fraction of the whole are spaced evenly
 _FAR = 8.0  # changes beyond so many expanded uncertainties need a logarithmic axis
-
-
-def check_format(path: Path) -> str:
-    """The format of a figure by its file name; `InputError` for any but PNG, SVG and PDF."""
-    suffix = path.suffix.lower().removeprefix(".")
-    if suffix not in FORMATS:
-        raise InputError(f"{path} is no figure that can be drawn; end its name in .png, .svg or .pdf.")
-    return suffix
 
 
 def save_drift_trend(trend: Trend, path: Path) -> None:
@@ -37,8 +27,8 @@ def save_drift_trend(trend: Trend, path: Path) -> None:
     Raises:
         InputError: For another format, or if the file cannot be written.
     """
-    file_format = check_format(path)
-    save_figure(drift_trend(trend)[0].figure, path, file_format)
+    check_format(path)
+    save_figure(drift_trend(trend)[0].figure, path)
 
 
 def drift_trend(trend: Trend, axes: Any = None) -> Any:

@@ -3,8 +3,10 @@
 from pathlib import Path
 from typing import Any
 
+from ..core.errors import InputError
 from ..files.whole_file import whole_file
 
+_FORMATS = ("png", "svg", "pdf")
 DARK, ACCENT, LIGHT = "#1b3a6b", "#d95f02", "0.65"
 
 
@@ -28,7 +30,16 @@ def label_parameters(axes: Any, names: list[str]) -> None:
     axes.set_xticks(range(len(names)), names, rotation=60, ha="right")
 
 
-def save_figure(figure: Any, path: Path, file_format: str = "png") -> None:
-    """Write a figure into a file, whole or not at all."""
+def check_format(path: Path) -> str:
+    """The format of a figure by its file name; `InputError` for any but PNG, SVG and PDF."""
+    suffix = path.suffix.lower().removeprefix(".")
+    if suffix not in _FORMATS:
+        raise InputError(f"{path} is no figure that can be drawn; end its name in .png, .svg or .pdf.")
+    return suffix
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """Write a figure into a file, whole or not at all, in the format that its name ends in."""
+    file_format = check_format(path)
     with whole_file(path) as temporary:
         figure.savefig(temporary, format=file_format, dpi=150)

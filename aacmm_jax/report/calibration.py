@@ -7,6 +7,7 @@ import numpy as np
 
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord, uncertainty_of
+from ..core.errors import counted
 from ..core.units import ARCSEC, DEG
 from ..summaries.calibration import calibration_summary
 from ..summaries.warnings import observed
@@ -53,8 +54,8 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
     good, count = record.converged, len(summary["lengths"])
     report = Report(
         title="Calibration of " + (record.recording.nominal.name or "an arm"),
-        subtitle=f"{_METHODS[record.method]}; {summary['poses']} poses in {len(summary['sockets_used'])} sockets, "
-        f"{count} reference length{'' if count == 1 else 's'}",
+        subtitle=f"{_METHODS[record.method]}; {counted(summary['poses'], 'pose')} in "
+        f"{counted(len(summary['sockets_used']), 'socket')}, {counted(count, 'reference length')}",
         verdict=record.reason if good else f"Not to be used. {record.reason}",
         verdict_mark="good" if good and not summary["warnings"] else "unsure" if good else "bad",
         warnings=summary["warnings"],

@@ -10,6 +10,7 @@ from ..acceptance.record import EvaluationRecord, PointsRecord
 from ..acceptance.results import METRICS, AcceptanceTest, Metric
 from ..acceptance.standards import EDITIONS
 from ..calibration.evaluation import Evaluation, evaluate
+from ..core.errors import counted
 from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
 from ..summaries.evaluation import evaluation_summary, points_summary
@@ -34,8 +35,9 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
     residuals = residual_chart("residuals", "Residuals as left", capture, {"as left": left}, mark=True)
     report = Report(
         title="Evaluation of " + (record.recording.nominal.name or "an arm"),
-        subtitle=f"{sum(capture.sizes)} poses in {len(capture.names)} sockets, "
-        f"{len(capture.lengths)} reference lengths, {len(record.recording.spheres)} touched spheres",
+        subtitle=f"{counted(sum(capture.sizes), 'pose')} in {counted(len(capture.names), 'socket')}, "
+        f"{counted(len(capture.lengths), 'reference length')}, "
+        f"{counted(len(record.recording.spheres), 'touched sphere')}",
         verdict=verdict,
         verdict_mark=mark,
         warnings=summary["warnings"] + [f"Over the limit: {sentence}" for sentence in summary["failed"]],
@@ -62,8 +64,8 @@ def points_report(record: PointsRecord) -> tuple[Report, dict[str, Any]]:
         *([] if chart is None else [Section("lengths", "Lengths", [chart])]),
     ]
     subtitle = (
-        f"{summary['points']} points as they were recorded: {summary['sockets']} sockets, "
-        f"{summary['lengths']} lengths, {summary['spheres']} spheres"
+        f"{counted(summary['points'], 'point')} as recorded: {counted(summary['sockets'], 'socket')}, "
+        f"{counted(summary['lengths'], 'length')}, {counted(summary['spheres'], 'sphere')}"
     )
     report = Report("Acceptance test of points", subtitle, verdict, mark, summary["warnings"], [], sections)
     return report, summary

@@ -20,6 +20,7 @@ from ..uncertainty.identifiability import Observability, observability
 _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a reference length is wrong
 _LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 through errors outside the D-H model
 _POSE_OUTLIER = 8.0  # in median distances
+_TOLERANCE = math.radians(0.01)  # beyond a limit: more than the noise of any encoder
 _EXCESS = 1.5  # ratio of errors to their prediction that is reported
 _NAMED = 5  # items of a list that are named
 # By k, which is a length measured by the nominal arm over its reference value: one in m, read as mm, makes k = 1000.
@@ -34,11 +35,14 @@ _MISTAKEN_UNITS = {
 
 
 def of_capture(recording: Recording) -> list[str]:
-    """Readings outside the arm's limits (a wrong unit, or exchanged columns), and lengths taken as exact."""
+    """Of what was recorded: readings outside the arm's limits (a wrong unit, or exchanged columns), and exact lengths.
+
+    A simulation keeps within the limits but for its noise.
+    """
     found = []
     q = np.asarray(recording.capture.q)
-    for joint, limits in enumerate(recording.nominal.arm.limits or ()):
-        outside = int(np.sum((q[:, joint] < limits[0]) | (q[:, joint] > limits[1])))
+    for joint, limits in enumerate(recording.nominal.arm.limits or () if recording.true is None else ()):
+        outside = int(np.sum((q[:, joint] < limits[0] - _TOLERANCE) | (q[:, joint] > limits[1] + _TOLERANCE)))
         if outside:
             low, high = (f"{math.degrees(x):.0f}" for x in limits)
             found.append(
@@ -57,8 +61,10 @@ def of_calibration(record: CalibrationRecord, seen: Observability | None = None)
     found = [] if record.converged else [record.reason]
     found += _implausible(record)
     found += _validation(record)
-    found += [*_scale(record), *of_capture(record.recording), *_bounds(record, seen), *_data(record)]
-    return found + _identifiability(record, seen)
+    found += [*_scale(record), *of_capture(record.recording)]
+    if record.implausible_residual:
+        return found + _data(record)  # bounds and uncertainties of such a solve say nothing
+    return [*found, *_bounds(record, seen), *_data(record), *_identifiability(record, seen)]
 
 
 def observed(record: CalibrationRecord) -> Observability:

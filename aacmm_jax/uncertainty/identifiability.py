@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.namespace import AnyArray, compiled, namespace, to_numpy
-from ..data.capture import Capture, ReferenceLength
+from ..data.capture import Capture, ReferenceLength, check_one_capture
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, joint_limits, neighbouring_arm, with_arrays
 from ..kinematics.chain import sines_cosines
@@ -124,6 +124,7 @@ def observability(
     """
     if space is None:
         space = Parameters.free_of(arm) if bounds is None else bounds.space
+    check_one_capture(capture)
     check_joints(capture, space)
     arm, capture, space, noise, bounds = to_numpy((arm, capture, space, noise, bounds))
     if noise is not None:

@@ -359,7 +359,7 @@ def test_a_probe_that_is_off_scatters_tips_on_a_sphere(cheng):
             {
                 "single-point articulation": ["at 0 to 20 %", "at 80 to 100 %"],
                 "volumetric": ["20 positions", "two bars, no fewer", "500 to 750 mm", "1200 to 1500 mm"],
-                "length error": ["105 in all (1 readings of 1 length", "1320 mm"],
+                "length error": ["105 in all (1 reading of 1 length", "1320 mm"],
             },
         ),
     ],
@@ -409,7 +409,7 @@ def test_a_volumetric_test_needs_both_bars_often_enough(near, far, missing):
 def test_lengths_between_the_same_sockets_are_one_position():
     measured = complete_volumetric(10, 10)
     twice = measured._replace(lengths=measured.lengths[:19] + measured.lengths[:1])
-    assert "(19 are there)" in titled(run(twice), "volumetric").missing[0]
+    assert "(19 given)" in titled(run(twice), "volumetric").missing[0]
 
 
 @pytest.mark.parametrize("recorded", ["iso"], indirect=True)
@@ -510,6 +510,7 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
         (("diameter = 30.98", "diameter = 0"), "diameter"),
         (('file = "sphere/touch.txt"', ""), "either file or files"),
         (('unit = "um"', 'unit = "um"\ncolumns = [1, 2, 4]'), "column 4"),
+        (('unit = "um"', 'unit = "um"\ncolumns = [1, 1, 2]'), "1 is given twice"),
         (("reach = 1000", "reech = 1000"), "did you mean 'reach'"),
         (("shoulder = [0, 0, 0]", ""), "reach and shoulder together"),
     ],

@@ -1,7 +1,10 @@
 """The command line: the whole path, what is printed for people and for machines, and exit codes."""
 
 import json
+import os
 import re
+import subprocess
+import sys
 import tomllib
 
 import numpy as np
@@ -101,6 +104,11 @@ def test_not_converged_is_exit_code_1_and_still_written(aacmm, tmp_path, monkeyp
             ("simulate", "panda", "-o", "no/where.h5", "--socket", "A=400,0,300", "--poses", "2"),
             "no/where.h5 cannot be written",
         ),
+        (
+            ("simulate", "cheng2018-simulation", "-o", "x.h5", "--true-arm", "panda", "--socket", "A=400,0,300"),
+            "true arm panda has 7 joints, but cheng2018-simulation has 6",
+        ),
+        (("simulate", "panda", "-o", "x.h5", "--socket", "A=400,0,300", "--seed", 2**63), "Invalid value for '--seed'"),
         (("demo", "/dev/null/x"), "/dev/null/x cannot be used as a folder"),
         (("calibrate", "capture.h5"), "Missing option"),
         (("frobnicate",), "No such command"),
@@ -131,6 +139,33 @@ def test_a_process_of_its_own(aacmm_process, cache, tmp_path, monkeypatch):
     assert (tmp_path / "capture.h5").exists()
     assert list((cache / "aacmm_jax").iterdir())
     assert "No such command" in aacmm_process("frobnicate", expect=2).stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "redirection", "encoding", "code", "error"),
+    [
+        ("show panda", "| true", "utf-8", 141, ""),
+        ("show panda --json", "| true", "utf-8", 141, ""),
+        ("show panda", "> /dev/full", "utf-8", 1, "Error: standard output cannot be written: no space left"),
+        ("show named.toml", "> out.txt", "ascii", 0, ""),
+    ],
+)
+def test_standard_output(tmp_path, arguments, redirection, encoding, code, error):
+    """A pipe that nobody reads, a full device, and an encoding without the letters of a name."""
+    arm = aj.load_arm("panda")
+    aj.files.save_arm(arm, tmp_path / "named.toml", name="Meßarm")
+    done = subprocess.run(
+        ["bash", "-c", f"{sys.executable} -m aacmm_jax {arguments} {redirection}; exit ${{PIPESTATUS[0]}}"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONIOENCODING": encoding},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == code
+    assert done.stderr.startswith(error)
+    assert done.stderr.count("\n") == bool(error)
+    if encoding == "ascii":
+        assert "Me\\xdfarm" in (tmp_path / "out.txt").read_text()
 
 
 PLAN = (

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import aacmm_jax as aj
 from aacmm_jax.cli import _FAMILIES, acceptance_display, calibration_display
 from aacmm_jax.cli.app import app, examples, length_option
-from aacmm_jax.cli.display import new_console, new_table, print_table
+from aacmm_jax.cli.display import formatted, new_console, new_table, print_table
 from aacmm_jax.summaries.calibration import calibration_summary
 from tests.refusals import assert_refused
 
@@ -79,7 +79,7 @@ def test_nothing_in_a_table_is_cut(columns, keys, data):
     assert max(map(len, lines)) <= columns
 
 
-@pytest.mark.parametrize(("given_columns", "width"), [("72", 72), ("200", 200), (None, 110)])
+@pytest.mark.parametrize(("given_columns", "width"), [("72", 72), ("200", 200), (None, 110), ("0", 110)])
 def test_what_is_piped_is_as_wide_as_asked(monkeypatch, given_columns, width):
     monkeypatch.delenv("COLUMNS", raising=False)
     if given_columns:
@@ -124,6 +124,7 @@ def test_a_residual_that_no_arm_has_is_not_called_converged():
     summary = calibration_summary(record)
     assert any("a hundred times what an arm of this size can be" in warning for warning in summary["warnings"])
     assert not summary["residual_plausible"]
+    assert not any("determine" in warning for warning in summary["warnings"])
 
 
 @pytest.mark.parametrize(
@@ -194,6 +195,38 @@ SAME = [
     ("plan", "there.toml", "-o", "there.toml"),
     ("compare", "there.h5", "no.h5", "--csv", "there.h5"),
 ]
+
+
+REFUSED = [
+    (("calibrate", "there.h5", "-o", "x.h5", "--figure", "x.txt"), "x.txt is no figure that can be drawn"),
+    (("export", "there.h5", "--format", "csv", "--arm", "true"), "--arm is for --format toml"),
+    (
+        ("evaluate", "there.h5", "there.h5", "--mpe", "zzz=1"),
+        "names the unknown metric 'zzz'; known are " + ", ".join(aj.acceptance.METRICS),
+    ),
+]
+
+
+@pytest.mark.parametrize(("arguments", "said"), REFUSED, ids=lambda value: value[-1])
+def test_options_are_refused_before_any_work(run, tmp_path, arguments, said):
+    (tmp_path / "there.h5").touch()
+    error = run(*arguments).exception
+    assert isinstance(error, aj.InputError), error
+    assert said in str(error)
+
+
+def test_a_bound_given_twice(run):
+    run("simulate", "panda", "-o", "c.h5", "--socket", "A=400,0,300", "--poses", 2)
+    error = run("calibrate", "c.h5", "-o", "x.h5", "--bound", "d_3=1", "--bound", "d_3=2").exception
+    assert "--bound gives d_3 two half-widths" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "-"), (1e-12, "0.0000"), (0.25, "0.2500"), (1e-5, "1.0e-05"), (1e300, "1e+300"), (-2.5e9, "-2.5e+09")],
+)
+def test_numbers_of_any_size(value, text):
+    assert formatted(value) == text
 
 
 @pytest.mark.parametrize("arguments", SAME, ids=" ".join)

@@ -10,3 +10,18 @@ from ..refusals import assert_refused
 def test_degrees_are_recognized():
     said = ["socket 'A' pose 2 joint 1 is 90 rad", "more than four revolutions", "look like degrees", "numpy.deg2rad"]
     assert_refused(lambda: aj.Capture({"A": np.array([[0.0, 1.0], [90.0, 2.0]])}), *said)
+
+
+def test_sockets_of_a_batch():
+    """Poses are sliced, whatever comes before them."""
+    q = np.random.default_rng(0).uniform(-1, 1, (5, 3, 2))
+    batch = aj.stack_captures([aj.Capture({"A": rows[:2], "B": rows[2:]}) for rows in q])
+    np.testing.assert_array_equal(batch.sockets["A"], q[:, :2])
+    np.testing.assert_array_equal(batch.sockets["B"], q[:, 2:])
+    assert_refused(lambda: aj.stack_captures([]), "no capture to stack")
+
+
+def test_one_reference_length_needs_no_list():
+    q = np.array([[0.1, 0.2]])
+    length = aj.ReferenceLength("A", "B", 100.0)
+    assert aj.Capture({"A": q, "B": -q}, length).lengths == (length,)

@@ -170,7 +170,7 @@ def test_saved_arm_reads_back_the_same_numbers(tmp_path):
         ("a = 400.0, ", "", ["'joint 2.a' is missing; add it"]),
         (", limits = [-101.0, 10.0]", "", ["limits are given for some joints only", "for all or for none"]),
         ("[-101.0, 10.0]", "[10.0]", ["'joint 2.limits' has 1 entries", "give at least 2"]),
-        ("[-101.0, 10.0]", "[10.0, -101.0]", ["limits of joint 2", "lower below the upper"]),
+        ("[-101.0, 10.0]", "[10.0, -101.0]", ["joint 2: the limits are 10 to -101", "lower must be below"]),
         ("45.0", '"forty-five"', ["'joint 2.alpha' must be a valid number, not 'forty-five'"]),
         ("45.0", "nan", ["'joint 2.alpha' must be a finite number, not nan"]),
         ("45.0", "", ["not valid TOML", "line 10"]),

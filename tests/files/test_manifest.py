@@ -147,6 +147,7 @@ FILES = (
         ("{file}", "front_left/{file}", ["*_pose.csv"], {"hole_0.csv", "hole_1.csv"}),
         ("{side}/{h}", "{side}-high/hole_{h}.csv", [], {"mid/0"}),
         ("{h}", "front_left/hole_{h}_pose.csv", [], {"0"}),
+        ("{1}", "front_left/hole_{1}_pose.csv", [], {"0"}),
     ],
 )
 def test_what_a_field_matches(tmp_path, motion, name, file, exclude, expected):
@@ -214,6 +215,13 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL + LENGTH.replace("200.0", '"long"'), ["'length 1.value' must be a valid number, not 'long'"]),
         (SMALL + LENGTH + "u = -1", ["'length 1.u' must be greater than or equal to 0, not -1"]),
         (SMALL + LENGTH.replace('"b"', '"{x}"'), ["from 'a' to '{x}'", "field that no [[socket]] has"]),
+        (SMALL + LENGTH.replace("200.0", "true"), ["length 1.value: true and false are no numbers"]),
+        (SMALL + SOCKET.replace("file", 'name = "b"\nfile') + 2 * LENGTH, ["from 'a' to 'b' of 200 mm is given twice"]),
+        (
+            HEAD + ANGLES + '[[socket]]\nname = "a"\nfiles = ["a.csv", "a.csv"]',
+            ["socket 1.files: 'a.csv' is given twice"],
+        ),
+        (SMALL.replace('"a.csv"', '"a.csv"\nname = ""'), ["a socket has the name ''"]),
         (SMALL.replace("rad", "counts"), ["angles", "give counts_per_turn with unit = 'counts'"]),
         (SMALL.replace(SOCKET, "counts_per_turn = 9\n" + SOCKET), ["angles", "only with it"]),
         (
@@ -224,6 +232,13 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
             SMALL.replace('"rad"', '"counts"\ncounts_per_turn = "many"'),
             ["'angles.counts_per_turn' must be", "not 'many'"],
         ),
+        (
+            SMALL.replace('"rad"', '"counts"\ncounts_per_turn = inf'),
+            ["'angles.counts_per_turn' must be a finite number"],
+        ),
+        (SMALL.replace('"rad"', '"counts"\ncounts_per_turn = 0'), ["'angles.counts_per_turn' must be greater than 0"]),
+        (SMALL.replace('"rad"', '"counts"\ncounts_per_turn = []'), ["'angles.counts_per_turn' has no entries"]),
+        (SMALL.replace('"rad"', '"rad"\ncolumns = [1, 1, 2, 3, 4, 5]'), ["angles.columns: 1 is given twice"]),
         (SMALL.replace('"rad"', '"rad"\nsign = 2'), ["'angles.sign' must be 1 or -1, not 2"]),
         (SMALL.replace('"rad"', '"rad"\nsign = [1, 1, 0, 1, 1, 1]'), ["'angles.sign 3' must be 1 or -1, not 0"]),
         (SMALL.replace('"rad"', '"rad"\noffset = [1, 2]'), ["angles.offset has 2 values", "give one, or one a joint"]),
@@ -267,12 +282,20 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
             "length text",
             "u negative",
             "length field",
+            "length true",
+            "length twice",
+            "file twice",
+            "empty name",
         ),
         *(
             "counts without per turn",
             "per turn without counts",
             "per turn of two",
             "per turn text",
+            "per turn infinite",
+            "per turn zero",
+            "per turn of none",
+            "column twice",
             "sign",
             "sign of one",
         ),
@@ -298,6 +321,7 @@ def test_bad_manifest(tmp_path, motion, text, parts):
         (b"1,2,3,4,5\n", ["has 5 columns", "the arm has 6 joints", "one column a joint", "columns = [...]"]),
         (b"1,2,3,4,5,6\n1,2,3,4,5\n", ["line 2 has 5 columns", "before it 6", "give all the same"]),
         (b"q\n1,2,3,4,5,6\n\n1,2,x,4,5,6\n", ["line 4 column 3", "'x' is not a number", "correct it"]),
+        (b"1,2,3,4,5,6\n1,2,3,4,5,1_0\n", ["line 2 column 6", "'1_0' is not a number"]),
         (b"1,2,3,4,5,\n", ["line 1 column 6", "'' is not a number"]),
         (b"1,2,3,4,5,6\n1,2,3,4,nan,6\n", ["line 2 column 5", "'nan' is not finite", "correct it"]),
         (b"q1,q2,q3,q4,q5,q6\n", ["holds no numbers", "one line a pose"]),
@@ -305,7 +329,18 @@ def test_bad_manifest(tmp_path, motion, text, parts):
         (b"0,5;1,5;2,5;0,5;1,5;2,5\n", ["holds no numbers", "with decimal points"]),
         (bytes(range(256)), ["cannot be read as text", "UTF-8"]),
     ],
-    ids=["columns", "ragged", "text", "last cell empty", "nan", "header only", "empty", "decimal commas", "binary"],
+    ids=[
+        "columns",
+        "ragged",
+        "text",
+        "underscore",
+        "last cell empty",
+        "nan",
+        "header only",
+        "empty",
+        "decimal commas",
+        "binary",
+    ],
 )
 def test_bad_table(tmp_path, content, parts):
     """The message names the manifest, the file and the place in it."""
@@ -323,3 +358,8 @@ def test_degrees_taken_for_radians(tmp_path, motion):
 def test_what_is_not_a_manifest(tmp_path):
     assert_refused(lambda: aj.files.read_manifest(tmp_path / "none.toml"), "none.toml does not exist", "check the path")
     assert_refused(lambda: aj.files.read_manifest(tmp_path), tmp_path, "is a folder", "name a file")
+
+
+def test_the_time_of_day_of_a_date_is_left_out(tmp_path, motion):
+    (tmp_path / "capture.toml").write_text("date = 2026-01-02T10:00:00\n" + SMALL)
+    assert aj.files.read_manifest(tmp_path / "capture.toml").measured == "2026-01-02"

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 import aacmm_jax as aj
 from aacmm_jax.calibration.results import CrossValidation, LeftOut
 from aacmm_jax.files.arms import specification_toml
+from aacmm_jax.files.hdf5 import write_tables
 from tests.refusals import assert_refused
 
 LOAD = {"capture": aj.files.load_capture, "calibration": aj.files.load_calibration}
@@ -453,6 +454,13 @@ def test_names_that_no_file_can_hold(tmp_path, good, name):
         )
     assert_refused(lambda: aj.files.save_arm(arm.nominal.arm, tmp_path / "a.toml", name=name), repr(name), "rename it")
     assert folder_of(tmp_path) == []
+
+
+def test_texts_of_numpy(tmp_path):
+    """Names that come from an array of NumPy, such as that of the scale anchor."""
+    write_tables(tmp_path / "c.h5", "capture", {}, {"hold": np.str_("d_3"), "sources": [np.str_("a.csv")]})
+    with h5py.File(tmp_path / "c.h5") as file:
+        assert (file.attrs["hold"], file.attrs["sources"].tolist()) == ("d_3", ["a.csv"])
 
 
 JOINTS = {"joint": 3, "axis": 3}

@@ -88,6 +88,13 @@ def test_readings_outside_the_limits():
     assert [text.split(";")[0] for text in warnings.of_capture(aj.Recording(right, panda))] == [
         "Taken as exact, because u is 0: A - B"
     ]
+    near = q.copy()
+    near[0, 3] = panda.arm.limits[3][1] + np.deg2rad(0.009)  # as far beyond a limit as noise may take it
+    assert warnings.of_capture(aj.Recording(aj.Capture({"A": near}), panda)) == []
+    near[0, 3] += np.deg2rad(0.002)
+    beyond = aj.Recording(aj.Capture({"A": near}), panda)
+    assert warnings.of_capture(beyond)[0].startswith("Joint 4: 1 of 3")
+    assert warnings.of_capture(beyond._replace(true=panda)) == []
     swapped = aj.Capture({"A": q[:, [0, 1, 3, 2, 4, 5, 6]], "B": jnp.asarray(q + 0.1)}, lengths)
     found = warnings.of_capture(aj.Recording(swapped, panda))
     assert found[0].startswith("Joint 4: 3 of 6 readings lie outside its limits, -176 to -4 deg")
