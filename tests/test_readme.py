@@ -23,6 +23,13 @@ def test_python_runs(capsys, tmp_path, monkeypatch):
     assert "\nTrue " in printed
 
 
+def test_no_command_overwrites_an_earlier_result():
+    written = re.findall(r"^aacmm .*? -o (\S+)", README, flags=re.MULTILINE)
+    assert "calibration.h5" in written
+    # A report of one calibration may be written again, with the laboratory's data.
+    assert len({*written}) == len(written) - written.count("report.html") + 1
+
+
 def test_study_is_read(tmp_path):
     (tmp_path / "study.toml").write_text(blocks("toml")[3])
     assert len(aj.study.read_study(tmp_path / "study.toml").cells) == 6

@@ -8,7 +8,9 @@ import jax
 import numpy as np
 
 from ..calibration.checks import plausible
+from ..calibration.evaluation import evaluate
 from ..calibration.record import CalibrationRecord
+from ..calibration.second_stage import LARGEST_LOG_K
 from ..data.recording import Recording
 from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry
@@ -32,13 +34,22 @@ class EvaluationRecord(NamedTuple):
     maxima: Mapping[str, float] = MappingProxyType({})  # limits of the quantities in `MAXIMA`, mm
 
     def arms(self) -> dict[str, ArmSpecification]:
-        """The arm as found and as left."""
+        """The arm as found (nominal) and as left (calibrated)."""
         return {"nominal": self.recording.nominal, "calibrated": self.calibrated}
 
     def held_out_lengths(self) -> list[int]:
         """Indices of the lengths with an end that the calibration was not identified from."""
         lengths = self.recording.capture.lengths
         return [i for i, length in enumerate(lengths) if not {length.start, length.end} <= self.used]
+
+    def length_that_fixed_scale(self) -> int | None:
+        """Index of the only length identified from, if its error is zero by construction because it fixed the scale."""
+        lengths, held_out = self.recording.capture.lengths, self.held_out_lengths()
+        known = [i for i in range(len(lengths)) if i not in held_out]
+        if len(known) != 1:
+            return None
+        error = float(evaluate(self.calibrated.arm, self.recording.capture).error[known[0]])
+        return known[0] if abs(error) <= LARGEST_LOG_K * float(lengths[known[0]].value) else None
 
     def measured(self, arm: Arm) -> Measured:
         """What acceptance tests are run on: held-out data, or everything if there are none."""

@@ -21,22 +21,26 @@ _STYLES = {"conforms": "green", "fails": "red", "undecided": "yellow", None: "de
 
 
 def evaluation(summary: dict[str, Any]) -> None:
-    """One evaluation: sockets that the calibration has not used come first, since they are what counts."""
+    """One evaluation: held-out sockets come first, since they are what counts."""
     console = new_console()
     console.print(f"[bold]{escape(summary['arm'])}[/bold]")
     print_warnings(console, summary)
-    for group, text in (("held_out", "Sockets not used by the calibration"), ("identified_from", "Sockets used by it")):
+    for group, text in (
+        ("held_out", "Held-out sockets, which the calibration has not used"),
+        ("identified_from", "Sockets used for identification"),
+    ):
         part = summary[group]
         if part is None:
             continue
-        print_stages(console, f"\n{text} [mm]", part, ("nominal", "calibrated"))
+        fitted = part["fixed_by_one_length"]
+        print_stages(console, f"\n{text} [mm]", part, ("nominal", "calibrated"), fitted=fitted)
         table = new_table("", "socket", "poses", "DE [mm]", "Deltam [mm]", "RMS [mm]")
         for row in part["sockets"]:
             cells = (formatted(row[key]) for key in ("de_mm", "deltam_mm", "rms_mm"))
             table.add_row(escape(row["socket"]), str(row["poses"]), *cells)
         print_table(console, table)
         if part["lengths"]:
-            print_lengths(console, part["lengths"])
+            print_lengths(console, part["lengths"], fitted=fitted)
     print_verdicts(console, summary)
     _acceptance(console, summary)
     print_written(console, summary)
@@ -100,6 +104,7 @@ def _acceptance(console: Console, summary: dict[str, Any]) -> None:
         "U: the uncertainty of the artefacts"
         + (" and --test-u-mm" if summary["u_test_mm"] else "")
         + ". Decisions by ISO 14253-1."
+        + (" As found: the nominal arm; as left: the calibrated one." if before else "")
     )
 
 

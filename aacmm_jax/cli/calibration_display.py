@@ -72,8 +72,8 @@ def calibration(summary: dict[str, Any]) -> None:
     """One calibration: warnings first."""
     console = new_console()
     print_verdict(console, summary)
-    held = f"{summary['hold']} fixed meanwhile" if summary["hold"] else "no length fixed"
-    console.print(f"Scale of stage 1: k = {summary['scale_k']:.8f}, u(k) = {summary['scale_u']:.1e} ({held})")
+    anchor = f"scale anchor {summary['hold']}" if summary["hold"] else "no scale anchor"
+    console.print(f"Scale of stage 1: k = {summary['scale_k']:.8f}, u(k) = {summary['scale_u']:.1e} ({anchor})")
     print_warnings(console, summary)
     _validated(console, summary["cross_validation"])
     stages = ("nominal", "stage1", "calibrated")
@@ -83,6 +83,8 @@ def calibration(summary: dict[str, Any]) -> None:
     if "truth" in summary:
         _truth(console, summary["truth"])
     _parameters(console, summary["parameters"])
+    if summary["held"]:
+        console.print(f"Fixed at their nominal values: {', '.join(summary['held'])}.")
     if summary["lengths"]:
         print_lengths(console, summary["lengths"], fitted=summary["fixed_by_one_length"])
     _uncertainty(console, summary)
@@ -105,7 +107,7 @@ def _validated(console: Console, found: dict[str, Any] | None) -> None:
     """Cross-validation."""
     if found is None:
         return
-    title = f"\nCross-validated: each of {found['groups']} placements left out once [mm]"
+    title = f"\nCross-validated: each of {found['groups']} placements held out once [mm]"
     table = new_table(title, "", "found", "predicted by u")
     table.add_row(
         "RMS distance of poses from their socket's centroid",
@@ -158,7 +160,7 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
 
 
 def demo(summary: dict[str, Any]) -> None:
-    """The demonstration: before, stage 1 and stage 2 against the truth."""
+    """The demonstration: nominal arm, stage 1 and calibrated arm against the truth."""
     console = new_console()
     console.print(
         f"The simulated arm of Cheng et al. 2018, off by up to {summary['deviation_mm']:g} mm and "
@@ -167,7 +169,7 @@ def demo(summary: dict[str, Any]) -> None:
         f"another (stage 1), between them one length of {summary['length_mm']:.4f} mm with u = "
         f"{summary['length_u_um']:g} um (stage 2)."
     )
-    table = new_table("", "against the truth", "before", "stage 1", "stage 2")
+    table = new_table("", "against the truth", "nominal", "stage 1", "calibrated")
     for key, text, factor in (
         ("de_mm", "DE, mean distance from centroid [mm]", 1.0),
         ("deltam_mm", "Deltam, largest half range [mm]", 1.0),
@@ -194,7 +196,9 @@ def print_stages(
     for key, text in _METRICS:
         if key in metrics[stages[0]]:
             cells = [formatted(metrics[stage][key]) for stage in stages]
-            table.add_row(escape(text), *cells[:-1], "by fit" if fitted and key.startswith("length") else cells[-1])
+            table.add_row(
+                escape(text), *cells[:-1], "fixed the scale" if fitted and key.startswith("length") else cells[-1]
+            )
     print_table(console, table)
 
 
@@ -207,9 +211,9 @@ def _truth(console: Console, truth: dict[str, Any]) -> None:
 
 
 def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
-    """Every parameter in its own unit, to two digits of its standard uncertainty."""
+    """Every free parameter in its own unit, to two digits of its standard uncertainty."""
     table = new_table(
-        "\nParameters, with standard uncertainty u",
+        "\nFree parameters, with standard uncertainty u",
         *("parameter", "unit", "nominal", "calibrated", "change", "u", "bound"),
     )
     for row in rows:

@@ -68,6 +68,7 @@ def compare(
     created = [record.recording.measured or _created(file) for record, file in zip(records, files, strict=True)]
     labels = [str(file) for file in files]
     found = with_spinner("Comparing", lambda: _compared(records, created, labels, level, length_mm))
+    found = found._replace(dated_by_file=tuple(not records[i].recording.measured for i in found.order))
     summary: dict[str, Any] = compared_summary(found, labels, records[0].recording.nominal.name)
     summary["kept"], summary["failed"] = change_exceeded(found.drifts[-1].lengths, max_length_change_mm)
     written = []

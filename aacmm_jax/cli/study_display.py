@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..core.units import ARCSEC
-from ..study.statistics import METRICS, concise, metric_title, shown_unit
+from ..study.statistics import METRICS, concise, factor_title, level_text, level_title, metric_title, shown_unit
 from .display import new_console, new_table, print_table
 
 _MOST = 40  # cells in a table
@@ -38,15 +38,7 @@ def _percent(pair: dict[str, Any]) -> str:
 
 
 def _text(level: float | str) -> str:
-    return escape(level) if isinstance(level, str) else f"{level:g}"
-
-
-def _column(factor: str) -> str:
-    """Heading of a factor's column: bounds.length_mm is "bounds length [mm]"."""
-    table, _, name = factor.partition(".")
-    words, _, last = name.rpartition("_")
-    name = f"{words.replace('_', ' ')} [{last}]" if last in ("mm", "deg", "arcsec") else name.replace("_", " ")
-    return name if table in ("capture", "noise", "identification") else f"{table} {name}"
+    return escape(level_text(level))
 
 
 def study(summary: dict[str, Any]) -> None:
@@ -58,7 +50,7 @@ def study(summary: dict[str, Any]) -> None:
         console.print("No trial has ended yet.")
         return
     shown, factors = cells[:_MOST], list(summary["factors"])
-    names = [_column(name) for name in factors]
+    names = [factor_title(name) for name in factors]
     _identified(console, shown, names)
     fixed = any("de" in cell["figures"] for cell in cells)
     metrics = _OVERVIEW if fixed else _STAGE1
@@ -89,10 +81,10 @@ def one_cell(summary: dict[str, Any]) -> None:
     console = new_console()
     _heading(console, summary)
     for cell in summary["results"]:
-        levels = ", ".join(f"{name} {_text(level)}" for name, level in cell["factors"].items())
+        levels = ", ".join(escape(level_title(name, level)) for name, level in cell["factors"].items())
         console.print(f"Cell {cell['cell']}{': ' + levels if levels else ''}")
         if cell["trials_run"]:
-            _identified(console, [cell], [_column(name) for name in cell["factors"]])
+            _identified(console, [cell], [factor_title(name) for name in cell["factors"]])
             _full(console, cell)
         else:
             console.print("No trial of it has ended yet.")
@@ -109,19 +101,14 @@ def _heading(console: Console, summary: dict[str, Any]) -> None:
 
 
 def _identified(console: Console, cells: list[dict[str, Any]], names: list[str]) -> None:
-    table = new_table(
-        "\nIdentifications",
-        *("cell", *names, "trials", "converged [%]", "truth within bounds [%]", "on a bound [%]", "most often"),
-    )
-    for cell in cells:
-        worst = max(cell["parameters"], key=lambda row: row["on_a_bound"]["value"], default=None)
-        often = (
-            f"{worst['parameter']} {_percent(worst['on_a_bound'])} %" if worst and worst["on_a_bound"]["value"] else ""
-        )
+    often = [_most_often_on_a_bound(cell) for cell in cells]
+    headings = ["cell", *names, "trials", "converged [%]", "truth within bounds [%]", "on a bound [%]"]
+    table = new_table("\nIdentifications", *headings, *(["most often"] if any(often) else []))
+    for cell, parameter in zip(cells, often, strict=True):
         rates = (_percent(cell[key]) for key in ("converged", "truth_inside", "on_a_bound"))
-        table.add_row(
-            str(cell["cell"]), *map(_text, cell["factors"].values()), f"{cell['trials_run']:,}", *rates, often
-        )
+        levels = map(_text, cell["factors"].values())
+        last = [parameter] if any(often) else []
+        table.add_row(str(cell["cell"]), *levels, f"{cell['trials_run']:,}", *rates, *last)
     print_table(console, table)
     failed = {}
     for cell in cells:
@@ -137,6 +124,14 @@ def _identified(console: Console, cells: list[dict[str, Any]], names: list[str])
             console.print(
                 f"[yellow]{count:,} trial{'s' if count > 1 else ''} {words[reason]};[/yellow] left out of the means."
             )
+
+
+def _most_often_on_a_bound(cell: dict[str, Any]) -> str:
+    """The parameter that is on a bound in most trials, and in how many; empty if none ever is."""
+    worst = max(cell["parameters"], key=lambda row: row["on_a_bound"]["value"], default=None)
+    if worst is None or not worst["on_a_bound"]["value"]:
+        return ""
+    return f"{worst['parameter']} {_percent(worst['on_a_bound'])} %"
 
 
 def _distributions(console: Console, cells: list[dict[str, Any]], names: tuple[str, ...]) -> None:

@@ -66,6 +66,7 @@ class Trend(NamedTuple):
     dates: tuple[datetime.datetime, ...]
     order: tuple[int, ...]  # index of each among the calibrations given
     drifts: tuple[Drift, ...]  # of the second, third ... against the first; all with the same names
+    dated_by_file: tuple[bool, ...] = ()  # whose date is when the file was made; of none if empty
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Figures of a calibration: distances of the poses, parameters and reference lengths, as found and as left."""
+"""Figures of a calibration: distances of the poses, parameters and reference lengths, nominal and calibrated."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,14 +14,14 @@ from ..model.measurement import Measurement
 from .style import ACCENT, DARK, LIGHT, axes_or_new, label_axes, label_parameters, save_figure
 
 _STAGES: Mapping[str, Mapping[str, Any]] = {
-    "nominal": {"label": "as found", "color": LIGHT, "marker": "o"},
-    "stage1": {"label": "after stage 1", "color": ACCENT, "marker": "^"},
-    "calibrated": {"label": "as left", "color": DARK, "marker": "s"},
+    "nominal": {"label": "nominal", "color": LIGHT, "marker": "o"},
+    "stage1": {"label": "stage 1", "color": ACCENT, "marker": "^"},
+    "calibrated": {"label": "calibrated", "color": DARK, "marker": "s"},
 }
 
 
 def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
-    """Plot the distance of each pose's tip from its socket's centroid, as found and as left, mm (logarithmic).
+    """Plot the distance of each pose's tip from its socket's centroid, nominal and calibrated, mm (logarithmic).
 
     Args:
         record: The calibration.
@@ -42,7 +42,7 @@ def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
     axes.set_yscale("log")
     x = "pose (dashed lines separate sockets)" if len(sizes) > 1 else "pose"
     label_axes(axes, x, "distance from the socket's centroid [mm]")
-    axes.legend(loc="center right", framealpha=1, edgecolor="none")
+    _legend_above(axes, 2)
     return axes
 
 
@@ -70,7 +70,7 @@ def length_parameter_errors(record: CalibrationRecord, axes: Any = None) -> Any:
     axes.set_yscale("log")
     label_parameters(axes, [record.names[i] for i in chosen])
     label_axes(axes, "", "error against the true arm [mm]")
-    axes.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    _legend_above(axes, 3)
     return axes
 
 
@@ -104,7 +104,7 @@ def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any
         style = {"color": ACCENT, "markersize": 8, "label": "only determined with others"}
         axes.plot(np.flatnonzero(~known), change[~known], "x", **style)
     label_parameters(axes, [record.names[i] for i in chosen])
-    label_axes(axes, "", f"as left - as found [{'mm' if kind == 'length' else 'arcsec'}]")
+    label_axes(axes, "", f"calibrated - nominal [{'mm' if kind == 'length' else 'arcsec'}]")
     axes.legend(frameon=False)
     return axes
 
@@ -126,19 +126,24 @@ def reference_length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
     if not lengths:
         raise InputError("the calibration has no reference lengths, so there are no errors of lengths to draw.")
     axes = axes_or_new(axes)
-    stage1, left = (record.evaluations()[stage] for stage in ("stage1", "calibrated"))
+    stage1, calibrated = (record.evaluations()[stage] for stage in ("stage1", "calibrated"))
     x = np.arange(len(lengths))
     axes.plot(x - 0.1, np.asarray(stage1.error), linestyle="none", **_STAGES["stage1"])
-    u = np.asarray(left.u)
+    u = np.asarray(calibrated.u)
     bars = np.where(np.isfinite(u), uncertainty_of(record).factor() * u, 0.0)
-    style = {"fmt": "s", "color": DARK, "capsize": 3, "markersize": 4, "label": "as left, with U (95 %)"}
-    axes.errorbar(x + 0.1, np.asarray(left.error), yerr=bars, **style)
+    style = {"fmt": "s", "color": DARK, "capsize": 3, "markersize": 4, "label": "calibrated, with U (95 %)"}
+    axes.errorbar(x + 0.1, np.asarray(calibrated.error), yerr=bars, **style)
     axes.axhline(0, color="0.4", linewidth=0.8)
     names = [f"{length.start} - {length.end}" for length in lengths]
     label_parameters(axes, names if len(names) <= 20 else [str(i + 1) for i in x])
     label_axes(axes, "", "measured - value [mm]")
     axes.legend(frameon=False)
     return axes
+
+
+def _legend_above(axes: Any, columns: int) -> None:
+    """A legend outside the axes, where it cannot cover data."""
+    axes.legend(frameon=False, ncols=columns, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 
 
 def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:

@@ -186,10 +186,17 @@ def _positions_in_time(trend: Trend, axes: Any) -> np.ndarray:
     count = len(seconds)
     positions = np.arange(count, dtype=float) if even else (seconds - seconds[0]) / span * (count - 1)
     date_format = "%Y-%m-%d" if span > 86400 else "%m-%d %H:%M"
-    dates = [f"{date:{date_format}}" for date in trend.dates]
+    by_file = trend.dated_by_file or (False,) * count
+    mark = "*" if any(by_file) and not all(by_file) else ""
+    dates = [
+        f"{date:{date_format}}{mark if of_file else ''}" for date, of_file in zip(trend.dates, by_file, strict=True)
+    ]
     axes[0].set_xticks(positions, [])
     axes[1].set_xticks(positions, dates, rotation=45, ha="right", rotation_mode="anchor", fontsize=8)
-    axes[1].set_xlabel("calibration" + (", evenly spaced" if even else ""))
+    label = "calibration" + (", evenly spaced" if even else "")
+    if any(by_file):
+        label += f" ({mark}{': ' if mark else ''}when its file was made; the manifest states no date)"
+    axes[1].set_xlabel(label)
     return positions
 
 
@@ -228,7 +235,8 @@ def _label_ends(axes: Any, labels: list[tuple[float, str, str]], positions: np.n
         for i in tight:
             push = (least - (heights[i + 1] - heights[i])) / 2
             heights[i], heights[i + 1] = heights[i] - push, heights[i + 1] + push
-    arrow = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.7, "shrinkA": 1, "shrinkB": 4}
+    # From the middle of a label's left edge: from its centre, a steep line would cross the labels above and below.
+    arrow = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.7, "relpos": (0, 0.5), "shrinkA": 2, "shrinkB": 4}
     style = {"textcoords": "axes fraction", "fontsize": 8.5, "va": "center", "annotation_clip": False}
     for height, (_, value, text, color) in zip(heights, wanted, strict=True):
         axes.annotate(text, (positions[-1], value), xytext=(1.03, height), color=color, arrowprops=arrow, **style)

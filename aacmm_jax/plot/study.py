@@ -8,23 +8,19 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..study.results import Results
-from ..study.specification import unit
-from ..study.statistics import METRICS, correlation, metric_title, shown_unit
+from ..study.statistics import (
+    METRICS,
+    correlation,
+    factor_title,
+    level_text,
+    level_title,
+    metric_title,
+    shown_unit,
+)
 from .style import ACCENT, DARK, axes_or_new, label_axes, save_figure
 
 _WIDTHS = ("bounds.length_mm", "bounds.angle_deg")
 _SHIFTS = ("bounds.length_shift_mm", "bounds.angle_shift_deg")
-_AXES = {
-    "bounds.length_mm": "half-width of lengths [mm]",
-    "bounds.angle_deg": "half-width of angles [deg]",
-    "bounds.length_shift_mm": "shift of the centre, lengths [mm]",
-    "bounds.angle_shift_deg": "shift of the centre, angles [deg]",
-    "identification.hold": "scale anchor",
-    "identification.method": "method",
-    "capture.poses": "poses in a socket",
-    "capture.sockets": "sockets",
-    "reference.positions": "positions of the reference length",
-}
 
 
 def study_metric(results: Results, metric: str = "length_error", axes: Any = None) -> Any:
@@ -120,10 +116,12 @@ def study_distributions(
             [v if len(v) else [np.nan] for v in values], whis=(5, 95), showfliers=False,
             tick_labels=_levels(results, factor), medianprops={"color": DARK, "linewidth": 1.8},
         )  # fmt: skip
-        _finish(panel, _axis(factor), _title(name))
+        _finish(panel, factor_title(factor), _title(name))
         if all(np.nanmin(v, initial=np.inf) > 0 for v in values) and _spans_decades(values):
             panel.set_yscale("log")
-    figure.suptitle("boxes: quartiles and median; whiskers: 5 % and 95 %", fontsize=9)
+    others = [factor_title(name) for name in results.study.factors if name != factor]
+    pooled = f"\ntrials pooled over all levels of: {', '.join(others)}" if others else ""
+    figure.suptitle(f"boxes: quartiles and median; whiskers: 5 % and 95 %{pooled}", fontsize=9)
     return figure
 
 
@@ -154,7 +152,7 @@ def study_errors(results: Results, factor: str) -> Any:
         panel.set_yscale("log")
         panel.set_xticks(x, [f"{value:g}" for value in x])
         panel.minorticks_off()
-        _finish(panel, _axis(factor), _title(kind) if panel is axes[0, 0] else "", words)
+        _finish(panel, factor_title(factor), _title(kind) if panel is axes[0, 0] else "", words)
     axes[0, 0].legend(frameon=False)
     return figure
 
@@ -180,7 +178,7 @@ def study_scale(results: Results, factor: str) -> Any:
             panel.fill_between(x, low, high, color=grey, alpha=0.12, linewidth=0)
         panel.plot(x, middle, color=grey, marker="os^Dv<>p*h"[i % 10], label=words or None)
     panel.axhline(1.0, color=ACCENT, linewidth=0.9, linestyle="--")
-    _finish(panel, _axis(factor), "scale of stage 1, found / true")
+    _finish(panel, factor_title(factor), "scale of stage 1, found / true")
     if len(runs) > 1:
         panel.legend(frameon=False, fontsize=8)
     return figure
@@ -236,8 +234,8 @@ def study_convergence(results: Results) -> Any:
         panel.text(column, row, text, ha="center", va="center", fontsize=8, color=color)
     panel.set_xticks(range(len(levels[0])), levels[0])
     panel.set_yticks(range(len(levels[1])), levels[1])
-    panel.set_xlabel(_axis(factors[0]) if factors else "")
-    panel.set_ylabel(_axis(factors[1]) if len(factors) > 1 else "")
+    panel.set_xlabel(factor_title(factors[0]) if factors else "")
+    panel.set_ylabel(factor_title(factors[1]) if len(factors) > 1 else "")
     panel.set_title("trials that converged [%]", fontsize=10)
     return figure
 
@@ -300,30 +298,12 @@ def _runs(results: Results, factor: str, most: int) -> dict[str, list[int]]:
 
 def _cell_label(results: Results, cell: int, without: str = "") -> str:
     """The levels of a cell's factors in words."""
-    factors, words = results.study.factors, []
-    for factor, i in _index(results, cell).items():
-        if factor != without:
-            name, _, measure = _axis(factor).partition(" [")
-            words.append(f"{name} {_text(factors[factor][i])}" + (f" {measure[:-1]}" if measure else ""))
-    return ", ".join(words)
+    factors, index = results.study.factors, _index(results, cell)
+    return ", ".join(level_title(name, factors[name][i]) for name, i in index.items() if name != without)
 
 
 def _levels(results: Results, factor: str) -> list[str]:
-    return [_text(level) for level in results.study.factors[factor]]
-
-
-def _text(level: float | str) -> str:
-    return level if isinstance(level, str) else f"{level:g}"
-
-
-def _axis(factor: str) -> str:
-    """Label of a factor's axis."""
-    if factor in _AXES:
-        return _AXES[factor]
-    table, _, name = factor.partition(".")
-    words = name.removesuffix(f"_{unit(factor)}").replace("_", " ")
-    prefix = {"reference": "reference ", "deviation": "deviation of "}.get(table, "")
-    return prefix + words + (f" [{unit(factor)}]" if unit(factor) != "1" else "")
+    return [level_text(level) for level in results.study.factors[factor]]
 
 
 def _title(metric: str) -> str:

@@ -14,7 +14,17 @@ from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
 from . import charts
 from .arm_view import view_of_arm
-from .elements import Chart, Report, ReportTable, Section, decimals_for, format_number, number_cell, text_cell
+from .elements import (
+    Chart,
+    Report,
+    ReportTable,
+    Section,
+    decimals_for,
+    format_number,
+    number_cell,
+    scientific,
+    text_cell,
+)
 from .residuals import length_rows, metrics_table, residual_chart, socket_table
 from .uncertainty import (
     bounds_section,
@@ -40,7 +50,7 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
     view = view_of_arm(record.calibrated.arm, record.recording.capture, evaluations["calibrated"])
     sections = [
         _data(record, summary),
-        _found_and_left(record, summary, evaluations),
+        _nominal_and_calibrated(record, summary, evaluations),
         _scale(record, summary, evaluations, factor),
         _parameters(summary, factor),
         _residuals(record, evaluations["calibrated"]),
@@ -51,13 +61,16 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
         observability_section(observability),
         bounds_section(record, summary),
     ]
-    good, count = record.converged, len(summary["lengths"])
+    count = len(summary["lengths"])
+    verdict, good = record.reason, record.converged and not record.implausible_residual
+    if not good:
+        verdict = "Not to be used" + (": data and arm do not belong together." if record.converged else f". {verdict}")
     report = Report(
         title="Calibration of " + (record.recording.nominal.name or "an arm"),
         subtitle=f"{_METHODS[record.method]}; {counted(summary['poses'], 'pose')} in "
         f"{counted(len(summary['sockets_used']), 'socket')}, {counted(count, 'reference length')}",
-        verdict=record.reason if good else f"Not to be used. {record.reason}",
-        verdict_mark="good" if good and not summary["warnings"] else "unsure" if good else "bad",
+        verdict=verdict,
+        verdict_mark="good" if good else "bad",
         warnings=summary["warnings"],
         facts=_facts(summary, factor),
         sections=sections,
@@ -66,24 +79,33 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
 
 
 def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
-    found, left, facts = summary["nominal"], summary["calibrated"], []
+    nominal, calibrated, facts = summary["nominal"], summary["calibrated"], []
     validated = summary["cross_validation"]
     if validated is not None and not math.isnan(validated["rms_mm"]):
         rms, predicted = format_number(validated["rms_mm"]), format_number(validated["rms_predicted_mm"])
-        facts.append(("Left-out placements, RMS distance", f"{rms} mm (predicted {predicted})"))
-    for key, name in (("de_mm", "DE"), ("deltam_mm", "Δm")) if "de_mm" in left else ():
-        change = f"{format_number(found[key])} → {format_number(left[key])} mm"
-        facts.append((f"{name}, as found → as left", change))
+        facts.append(("Held-out placements, RMS distance", f"{rms}\u00a0mm (predicted {predicted})"))
+    for key, name in (("de_mm", "DE"), ("deltam_mm", "Deltam")) if "de_mm" in calibrated else ():
+        change = f"{format_number(nominal[key])} → {format_number(calibrated[key])}\u00a0mm"
+        facts.append((f"{name}, nominal → calibrated", change))
     volume = summary["uncertainty"]["volume"]
     length = f"U of a {volume['length_mm']:g} mm length"
     largest, median = volume["u_length_largest_mm"], volume["u_length_median_mm"]
     if median is not None and largest is not None:
-        value = f"median {format_number(factor * median)}, largest {format_number(factor * largest)} mm"
-        facts.append((f"{length} (95 %)", value))
+        facts.append(
+            (f"{length} (95 %)", f"median {_two_digits(factor * median)}, largest {_two_digits(factor * largest)}")
+        )
     else:
         facts.append((length, "not determined everywhere"))
-    facts.append(("Scale k of stage 1", f"{summary['scale_k']:.7f} ± {factor * summary['scale_u']:.7f} (95 %)"))
+    expanded = factor * summary["scale_u"]
+    decimals = decimals_for(expanded, 7)
+    k = f"{summary['scale_k']:.{decimals}f}\u00a0±\u00a0{expanded:.{decimals}f} (95\u00a0%)"
+    facts.append(("Scale k of stage 1", k))
     return facts
+
+
+def _two_digits(expanded: float) -> str:
+    """An uncertainty in mm to two digits, which no line break divides."""
+    return f"{format_number(expanded, decimals_for(expanded))}\u00a0mm"
 
 
 def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
@@ -110,18 +132,18 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     return Section("data", "What was calibrated, and from which data", blocks)
 
 
-def _found_and_left(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation]) -> Section:
-    stages = {"nominal": "as found", "stage1": "after stage 1", "calibrated": "as left"}
-    blocks: list = [
-        "As found is the nominal arm, as left the calibrated one, both on the poses used for identification."
-    ]
+def _nominal_and_calibrated(
+    record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation]
+) -> Section:
+    stages = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
+    blocks: list = ["The nominal and the calibrated arm on the poses used for identification."]
     if summary["cross_validation"] is not None:
         blocks.append(_validation_table(summary["cross_validation"]))
     fixed = record.fixed_by_one_length
-    blocks.append(metrics_table("Metrics as found and as left [mm]", summary, stages, fixed_scale=fixed))
-    pair = {"as found": evaluations["nominal"], "as left": evaluations["calibrated"]}
+    blocks.append(metrics_table("Metrics by arm [mm]", summary, stages, fixed_scale=fixed))
+    pair = {stage: evaluations[stage] for stage in ("nominal", "calibrated")}
     title = "Distance of every pose from its socket's centroid"
-    blocks.append(residual_chart("found-left", title, record.recording.capture, pair))
+    blocks.append(residual_chart("stages", title, record.recording.capture, pair))
     if "truth" in summary:
         rows = [
             [text_cell(title), *(number_cell(scale * summary["truth"][stage][key]) for stage in stages)]
@@ -131,7 +153,7 @@ def _found_and_left(record: CalibrationRecord, summary: dict[str, Any], evaluati
             )
         ]
         blocks.append(ReportTable("Against the true arm of the simulation", ("", *stages.values()), rows))
-    return Section("found-left", "As found and as left", blocks)
+    return Section("stages", "Nominal and calibrated arm", blocks)
 
 
 def _validation_table(found: dict[str, Any]) -> ReportTable:
@@ -142,7 +164,7 @@ def _validation_table(found: dict[str, Any]) -> ReportTable:
             ("RMS error of reference lengths", "length_error_rms_mm", "length_u_mm"),
         )
     ]
-    caption = f"Cross-validated: each of {found['groups']} placements left out once [mm]"
+    caption = f"Cross-validated: each of {found['groups']} placements held out once [mm]"
     return ReportTable(caption, ("", "found", "predicted by u"), rows)
 
 
@@ -150,15 +172,16 @@ def _scale(
     record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation], factor: float
 ) -> Section:
     k, u, single = record.k, record.u_k, record.fixed_by_one_length
+    u_of_k = f"u(k)\u00a0=\u00a0{scientific(u)}"
     if record.method == "joint":
         introduction = (
             "Poses and reference lengths were fitted together. The arm that poses alone give measures the lengths as "
-            f"k = {k:.8f} times their calibrated value, with u(k) = {u:.1e}."
+            f"k = {k:.8f} times their calibrated value, with {u_of_k}."
         )
     else:
         introduction = (
             "Repeatability does not determine the size of an arm; the reference lengths do. The arm of stage 1 "
-            f"measures them as k = {k:.8f} times their calibrated value, with u(k) = {u:.1e}. The lengths of the arm "
+            f"measures them as k = {k:.8f} times their calibrated value, with {u_of_k}. The lengths of the arm "
             f"were divided by k: {format_number(abs(k - 1) * 1000, 4)} mm in a metre, known to "
             f"± {format_number(1000 * factor * u, 4)} mm in a metre (95 %)."
         )
@@ -168,9 +191,11 @@ def _scale(
         else " U of a length contains the uncertainty of its certificate and the scatter of the poses at its ends."
     )
     errors = {stage: np.asarray(evaluations[stage].error) for stage in ("nominal", "stage1", "calibrated")}
-    before = {"as found": errors["nominal"], "after stage 1": errors["stage1"]}
-    columns = ("between", "value", "as found", "after stage 1", "as left", "U of error")
-    table = ReportTable("Reference lengths [mm]", columns, length_rows(summary["lengths"], factor, before, single))
+    before = [errors["nominal"], errors["stage1"]]
+    columns = ("between", "value", "error, nominal", "error, stage 1", "error, calibrated", "U of error")
+    table = ReportTable(
+        "Reference lengths [mm]", columns, length_rows(summary["lengths"], factor, before, 0 if single else None)
+    )
     block = table if single else _length_chart(summary["lengths"], errors, factor, table)
     return Section("scale", "Scale and reference lengths", [introduction, block])
 
@@ -182,8 +207,8 @@ def _length_chart(
     x = list(range(1, len(names) + 1))
     u = [factor * (row["error_u_mm"] or np.nan) for row in lengths]
     traces = [
-        charts.markers("after stage 1", x, errors["stage1"], charts.WARM, "triangle-up-open", hover=names),
-        charts.markers("as left, with U", x, errors["calibrated"], charts.DARK, "square", hover=names, bars=u),
+        charts.markers("stage 1", x, errors["stage1"], charts.WARM, "triangle-up-open", hover=names),
+        charts.markers("calibrated, with U", x, errors["calibrated"], charts.DARK, "square", hover=names, bars=u),
     ]
     shapes = charts.horizontal([0.0], "solid")
     figure = {"data": traces, "layout": charts.layout("reference length", "measured − value [mm]", shapes=shapes)}
@@ -211,7 +236,7 @@ def _parameters(summary: dict[str, Any], factor: float) -> Section:
             number_cell(expanded, decimals),
             text_cell(state, "unsure" if state else ""),
         ])  # fmt: skip
-    columns = ("parameter", "unit", "as found", "as left", "change", "U (95 %)", "")
+    columns = ("parameter", "unit", "nominal", "calibrated", "change", "U (95 %)", "")
     introduction = (
         f"U is the expanded uncertainty, coverage factor {factor:.2f}. A parameter on a bound, or one that the data "
         "determine only together with others, has none of its own."
@@ -230,14 +255,14 @@ def _change_chart(unit: str, parameters: list[dict[str, Any]], factor: float) ->
         f"{name}: {format_number(value)} ± {'–' if math.isnan(bar) else format_number(bar)} {label}"
         for name, value, bar in zip(names, y, bars, strict=True)
     ]
-    trace = charts.markers("as left − as found, with U", names, y, charts.DARK, "circle", hover=hover, bars=bars)
+    trace = charts.markers("calibrated − nominal, with U", names, y, charts.DARK, "circle", hover=hover, bars=bars)
     trace["marker"]["symbol"] = ["x-thin" if math.isnan(bar) else "circle" for bar in bars]
     shapes = charts.horizontal([0.0], "solid")
     layout = charts.layout("", f"change [{label}]", shapes=shapes, showlegend=False)
     return Chart(
         f"change-{unit}",
         f"Change of {kind} parameters",
-        "As left minus as found; bars are U (95 %), and smaller than the marker if not visible. Crosses have no U of "
+        "Calibrated minus nominal; bars are U (95 %), and smaller than the marker if not visible. Crosses have no U of "
         "their own.",
         {"data": [trace], "layout": layout},
         height=320,
@@ -246,7 +271,9 @@ def _change_chart(unit: str, parameters: list[dict[str, Any]], factor: float) ->
 
 def _residuals(record: CalibrationRecord, evaluation: Evaluation) -> Section:
     capture = record.recording.capture
-    chart = residual_chart("residuals", "Residuals as left", capture, {"as left": evaluation}, mark=True)
+    chart = residual_chart(
+        "residuals", "Residuals of the calibrated arm", capture, {"calibrated": evaluation}, mark=True
+    )
     introduction = (
         "The distance of each pose's tip from the centroid of its socket, by the calibrated arm. Poses more than four "
         "times as far as the median are marked: check how the tip was seated there."

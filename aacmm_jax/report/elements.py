@@ -63,7 +63,7 @@ class Report(NamedTuple):
     title: str
     subtitle: str
     verdict: str
-    verdict_mark: str  # "good", "bad", "unsure"
+    verdict_mark: str  # "good", "bad", "unsure", or "neutral" where nothing was decided
     warnings: list[str]
     facts: list[tuple[str, str]]
     sections: list[Section]
@@ -89,6 +89,11 @@ def format_number(value: float, decimals: int = 4, *, signed: bool = False) -> s
     if value != 0 and abs(value) < 0.5 * 10**-decimals:
         return f"{value:{sign}.1e}".replace("-", "−")
     return f"{value:{sign}.{decimals}f}".replace("-", "−")
+
+
+def scientific(value: float) -> str:
+    """A number with two digits in powers of ten, which no line break divides."""
+    return f"{value:.1e}".replace("-", "−")
 
 
 def decimals_for(u: float | None, default: int = 4) -> int:

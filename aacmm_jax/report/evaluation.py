@@ -1,4 +1,4 @@
-"""The report of an evaluation: acceptance tests, and the arm on a capture as found and as left."""
+"""The report of an evaluation: acceptance tests, and the nominal and the calibrated arm on a capture."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +21,7 @@ from .residuals import length_rows, metrics_table, residual_chart, socket_table
 
 _MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}
 _SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
-_STAGES = {"nominal": "as found", "calibrated": "as left"}
+_STAGES = ("nominal", "calibrated")
 _GROUPS = (("held_out", "Held-out sockets"), ("identified_from", "Sockets used for identification"))
 
 
@@ -30,9 +30,11 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
     tests, capture = record.acceptance(), record.recording.capture
     summary = evaluation_summary(record, tests)
     evaluations = {stage: evaluate(arm.arm, capture) for stage, arm in record.arms().items()}
-    left = evaluations["calibrated"]
+    calibrated = evaluations["calibrated"]
     verdict, mark = _verdict(summary)
-    residuals = residual_chart("residuals", "Residuals as left", capture, {"as left": left}, mark=True)
+    residuals = residual_chart(
+        "residuals", "Residuals of the calibrated arm", capture, {"calibrated": calibrated}, mark=True
+    )
     report = Report(
         title="Evaluation of " + (record.recording.nominal.name or "an arm"),
         subtitle=f"{counted(sum(capture.sizes), 'pose')} in {counted(len(capture.names), 'socket')}, "
@@ -44,10 +46,10 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
         facts=_facts(summary),
         sections=[
             _acceptance_section(tests["calibrated"], summary, capture.lengths, record.recording.spheres),
-            Section("found-left", "As found and as left", _found_and_left(record, summary, evaluations)),
-            *_lengths(record, tests["calibrated"], left, evaluations["nominal"]),
-            Section("residuals", "Residuals by socket and pose", [socket_table(capture, left), residuals]),
-            Section("arm", "The arm in its poses", [view_of_arm(record.calibrated.arm, capture, left)]),
+            Section("stages", "Nominal and calibrated arm", _nominal_and_calibrated(record, summary, evaluations)),
+            *_lengths(record, tests["calibrated"], evaluations),
+            Section("residuals", "Residuals by socket and pose", [socket_table(capture, calibrated), residuals]),
+            Section("arm", "The arm in its poses", [view_of_arm(record.calibrated.arm, capture, calibrated)]),
         ],
     )
     return report, summary
@@ -89,7 +91,7 @@ def _verdict(summary: dict[str, Any]) -> tuple[str, str]:
         incomplete = any(test["missing"] for test in summary["acceptance"] if test["decision"])
         verdict = "Every limit is kept" + ("; a procedure was not complete" if incomplete else "")
         return verdict, "unsure" if incomplete or summary["warnings"] else "good"
-    return "Measured; no limit was given", "unsure" if summary["warnings"] else "good"
+    return "Measured; no limit was given", "neutral"
 
 
 def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
@@ -97,12 +99,13 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
     group, title = next(((group, title) for group, title in _GROUPS if summary[group] is not None), ("", ""))
     for key, name in (
         ("rms_mm", "RMS distance"),
-        ("deltam_mm", "Δm"),
+        ("deltam_mm", "Deltam"),
         ("length_error_largest_mm", "largest length error"),
     ):
-        if group and key in summary[group]["calibrated"]:
-            found, left = (format_number(summary[group][stage][key]) for stage in _STAGES)
-            facts.append((f"{name}, {title[0].lower()}{title[1:]}, as found → as left", f"{found} → {left} mm"))
+        by_construction = group and key.startswith("length") and summary[group]["fixed_by_one_length"]
+        if group and key in summary[group]["calibrated"] and not by_construction:
+            values = " → ".join(format_number(summary[group][stage][key]) for stage in _STAGES)
+            facts.append((f"{name}, {title[0].lower()}{title[1:]}, nominal → calibrated", f"{values}\u00a0mm"))
     return facts
 
 
@@ -138,6 +141,8 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
         "the editions named.",
     ]
     before = any(metric["as_found_mm"] is not None for test in rows for metric in test["figures"])
+    if before:
+        blocks.append("As found is the nominal arm, as left the calibrated one.")
     limited = any(metric["limit_mm"] is not None for test in rows for metric in test["figures"])
     for test in rows:
         blocks.append(_test_table(test, before, limited))
@@ -231,19 +236,27 @@ def _metrics_chart(tests: list[AcceptanceTest]) -> Chart:
     hover = [f"{metric.name}: {format_number(metric.value)} mm at {metric.worst.where}" for metric in metrics]
     names = [metric.name for metric in metrics]
     trace = charts.markers("as left", names, values, charts.DARK, "square", hover=hover, bars=bars)
-    layout = charts.layout("", y, shapes=shapes, showlegend=False, yaxis={"rangemode": "tozero"})
+    # An absolute value is not negative, so a bar that is longer than its value ends at 0.
+    top = 1.05 * max([value + bar for value, bar in zip(values, bars, strict=True)] + [1.0 if limited else 0.0])
+    layout = charts.layout("", y, shapes=shapes, showlegend=False, yaxis={"range": [0.0, top]})
     return Chart("margins", title, description, {"data": [trace], "layout": layout}, height=320)
 
 
-def _found_and_left(record: EvaluationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation]) -> list:
+def _nominal_and_calibrated(
+    record: EvaluationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation]
+) -> list:
     blocks: list = [
-        metrics_table(f"{title} [mm]", summary[group], _STAGES)
+        metrics_table(
+            f"{title} [mm]",
+            summary[group],
+            dict(zip(_STAGES, _STAGES, strict=True)),
+            fixed_scale=summary[group]["fixed_by_one_length"],
+        )
         for group, title in _GROUPS
         if summary[group] is not None
     ]
-    pair = {_STAGES[stage]: evaluation for stage, evaluation in evaluations.items()}
     title = "Distance of every pose from its socket's centroid"
-    blocks.append(residual_chart("found-left", title, record.recording.capture, pair))
+    blocks.append(residual_chart("stages", title, record.recording.capture, evaluations))
     if record.used:
         used = ", ".join(sorted(record.used))
         blocks.append(f"The calibration was identified from: {used}. All other data were held out.")
@@ -251,10 +264,10 @@ def _found_and_left(record: EvaluationRecord, summary: dict[str, Any], evaluatio
 
 
 def _lengths(
-    record: EvaluationRecord, tests: list[AcceptanceTest], left: Evaluation, found: Evaluation
+    record: EvaluationRecord, tests: list[AcceptanceTest], evaluations: dict[str, Evaluation]
 ) -> list[Section]:
     """Errors of lengths: of single readings if acceptance tests took them, with their limits; and of means."""
-    capture, chart = record.recording.capture, _length_chart(tests)
+    capture, chart, calibrated = record.recording.capture, _length_chart(tests), evaluations["calibrated"]
     if not capture.lengths:
         return []
     rows = [
@@ -262,13 +275,14 @@ def _lengths(
             "from": length.start,
             "to": length.end,
             "value_mm": float(length.value),
-            "error_mm": float(left.error[i]),
-            "error_u_mm": float(left.u[i]) if np.isfinite(left.u[i]) else None,
+            "error_mm": float(calibrated.error[i]),
+            "error_u_mm": float(calibrated.u[i]) if np.isfinite(calibrated.u[i]) else None,
         }
         for i, length in enumerate(capture.lengths)
     ]
-    columns = ("between", "value", "as found", "as left", "U of error")
-    cells = length_rows(rows, 2.0, {"as found": np.asarray(found.error)})
+    columns = ("between", "value", "error, nominal", "error, calibrated", "U of error")
+    before = [np.asarray(evaluations["nominal"].error)]
+    cells = length_rows(rows, 2.0, before, record.length_that_fixed_scale())
     table = ReportTable("Lengths between the mean points of their sockets [mm]", columns, cells)
     note = (
         "Means of all poses, for comparison; no acceptance test uses them. Their U (factor 2) also contains the "
@@ -283,6 +297,10 @@ def _length_chart(tests: list[AcceptanceTest]) -> Chart | None:
     if metric is None:
         return None
     lengths = [part.length or 0.0 for part in metric.values]
+    x_title = "length [mm]"
+    if max(lengths) - min(lengths) < 0.01 * max(lengths):  # of one nominal length, which would be one vertical line
+        x_title = f"reading of a length of {np.mean(lengths):g} mm"
+        lengths = [float(i + 1) for i in range(len(lengths))]
     hover = [f"{part.where}: {format_number(part.value, signed=True)} mm" for part in metric.values]
     style = {"hover": hover, "bars": [part.expanded for part in metric.values], "size": 5}
     values = [part.value for part in metric.values]
@@ -296,7 +314,7 @@ def _length_chart(tests: list[AcceptanceTest]) -> Chart | None:
             charts.markers("MPE", x, y, "#444", "circle", **line),
             charts.markers("MPE", x, -y, "#444", "circle", showlegend=False, **line),
         ]
-    layout = charts.layout("length [mm]", "measured − value [mm]", shapes=charts.horizontal([0.0], "dot"))
+    layout = charts.layout(x_title, "measured − value [mm]", shapes=charts.horizontal([0.0], "dot"))
     description = "Errors of the reference lengths, reading by reading, by the calibrated arm"
     description += ", and their limits." if limits else "."
     return Chart("length-errors", "Errors of lengths", description, {"data": traces, "layout": layout})

@@ -44,7 +44,7 @@ def write_report(
     report, simulated, decision = _REPORTS[kind](source, stored.attributes)
     if simulated:
         warnings = list(dict.fromkeys([SIMULATED, *report.warnings]))
-        mark = "bad" if report.verdict_mark == "bad" else "unsure"
+        mark = "unsure" if decision == "conforms" else report.verdict_mark  # no real arm conforms
         report = report._replace(warnings=warnings, verdict_mark=mark)
     if administrative_data is not None:
         tested = kind == "evaluation"

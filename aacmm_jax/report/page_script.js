@@ -110,12 +110,21 @@
         const [cx, cy] = project(point);
         add("circle", { cx, cy, r: 4, fill: "#fff", stroke: "#1b3a6b", "stroke-width": 2 });
       }
-      const labelled = sockets.length <= 30;
-      for (const socket of sockets) {
-        const [x, y] = project(socket.at);
+      // From the lowest socket upwards: a label that would cover an earlier one moves up and is joined to its socket.
+      const labelled = sockets.length <= 30, labels = [], line = 15;
+      const projected = sockets.map(({ name, at }) => [name, ...project(at)]).sort((one, other) => other[2] - one[2]);
+      for (const [name, x, y] of projected) {
         add("path", { d: `M${x - 6},${y}h12M${x},${y - 6}v12`, stroke: "#c8560a", "stroke-width": 2.5 });
+        if (!labelled) continue;
         const style = { "font-size": 13, fill: "#7a3400", stroke: "#fff", "stroke-width": 3, "paint-order": "stroke" };
-        if (labelled) add("text", { x: x + 9, y: y - 7, ...style }, socket.name);
+        const text = add("text", { x: x + 9, y: y - 7, ...style }, name);
+        const left = x + 9, right = left + text.getComputedTextLength();
+        let height = y - 7;
+        const covers = (label) => Math.abs(label.height - height) < line && label.left < right && left < label.right;
+        while (labels.some(covers)) height -= line;
+        labels.push({ left, right, height });
+        text.setAttribute("y", height);
+        if (height < y - 7) add("path", { d: `M${x},${y}L${left},${height}`, stroke: "#7a3400", "stroke-width": 0.7 });
       }
       container.dataset.turn = view.turn.toFixed(3);
       container.dataset.tilt = view.tilt.toFixed(3);

@@ -12,7 +12,7 @@ from .elements import Cell, Chart, ReportTable, format_number, number_cell, text
 
 _METRICS = (
     ("de_mm", "DE, mean distance of poses from their socket's centroid"),
-    ("deltam_mm", "Δm, largest half range of a coordinate in a socket"),
+    ("deltam_mm", "Deltam, largest half range of a coordinate in a socket"),
     ("rms_mm", "RMS distance of poses from their socket's centroid"),
     ("length_error_mean_absolute_mm", "length error, mean absolute"),
     ("length_error_largest_mm", "length error, largest"),
@@ -69,7 +69,7 @@ def socket_table(capture: Capture, evaluation: Evaluation) -> ReportTable:
         ]
         for i, (name, size) in enumerate(zip(capture.names, capture.sizes, strict=True))
     ]
-    return ReportTable("Repeatability by socket [mm]", ("socket", "poses", "DE", "Δm", "RMS", "marked poses"), rows)
+    return ReportTable("Repeatability by socket [mm]", ("socket", "poses", "DE", "Deltam", "RMS", "marked poses"), rows)
 
 
 def residual_chart(
@@ -109,7 +109,7 @@ def residual_chart(
     layout = charts.layout(x, "distance [mm]", yaxis=axis, shapes=borders)
     median, largest = (format_number(float(reduced)) for reduced in (np.median(last[known]), last[known].max()))
     description = "Dotted lines separate the sockets. " if borders else ""
-    description += f"Median as left {median} mm, largest {largest} mm."
+    description += f"Median {median} mm, largest {largest} mm ({list(evaluations)[-1]} arm)."
     description += " The only pose of a socket has no distance." if len(known) < len(owner) else ""
     description += f" {len(drawn)} of {len(known)} poses are drawn." if len(drawn) < len(known) else ""
     table = _pose_table(capture, distances, far, mark)
@@ -138,15 +138,18 @@ def _pose_table(capture: Capture, distances: Mapping[str, np.ndarray], far: np.n
 
 
 def length_rows(
-    rows: Sequence[Mapping[str, Any]], factor: float, before: Mapping[str, np.ndarray], fixed_scale: bool = False
+    rows: Sequence[Mapping[str, Any]], factor: float, before: Sequence[np.ndarray], fixed_scale: int | None = None
 ) -> list[list[Cell]]:
-    """Rows of a table of lengths: value, errors by earlier arms, error as left (if it did not fix the scale), its U."""
+    """Rows of a table of lengths: value, errors by earlier arms, error of the calibrated arm, and its U.
+
+    ``fixed_scale``: index of the length that fixed the scale, so that its error is zero by construction.
+    """
     return [
         [
             text_cell(f"{row['from']} – {row['to']}"),
             number_cell(row["value_mm"]),
-            *(number_cell(float(errors[i]), signed=True) for errors in before.values()),
-            text_cell("fixed the scale") if fixed_scale else number_cell(row["error_mm"], signed=True),
+            *(number_cell(float(errors[i]), signed=True) for errors in before),
+            text_cell("fixed the scale") if i == fixed_scale else number_cell(row["error_mm"], signed=True),
             number_cell(None if row["error_u_mm"] is None else factor * row["error_u_mm"]),
         ]
         for i, row in enumerate(rows)

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..core.units import ARCSEC
 from ..study.results import Results
-from ..study.statistics import METRICS, shown_unit, study_summary
+from ..study.statistics import METRICS, factor_title, level_text, level_title, shown_unit, study_summary
 from . import charts
 from .elements import Cell, Chart, Report, ReportTable, Section, format_number, number_cell, text_cell
 
@@ -27,7 +27,9 @@ def study_report(results: Results) -> tuple[Report, dict[str, Any]]:
     )
     fraction = converged / ran if ran else 0.0
     present = [name for name in _SHOWN if any(name in cell["figures"] for cell in cells)]
-    factors = (f"{name}: {', '.join(map(_level, levels))}" for name, levels in summary["factors"].items())
+    factors = (
+        f"{factor_title(name)}: {', '.join(map(level_text, levels))}" for name, levels in summary["factors"].items()
+    )
     mark = "good" if summary["finished"] and fraction > 0.999 and not warnings else "unsure"
     report = Report(
         title=f"Study {summary['name']}".strip() + f" of {summary['arm'] or 'an arm'}",
@@ -68,18 +70,13 @@ def _warnings(summary: dict[str, Any]) -> list[str]:
     return found[:_MOST_WARNINGS] + ([f"And {more} more of this kind; see the table of cells."] if more > 0 else [])
 
 
-def _level(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float | int) else str(value)
-
-
 def _varied(summary: dict[str, Any]) -> list[str]:
     return [name for name, levels in summary["factors"].items() if len(levels) > 1]
 
 
 def _labels(summary: dict[str, Any]) -> list[str]:
     return [
-        f"cell {cell['cell']}"
-        + "".join(f", {name.split('.')[-1]} {_level(cell['factors'][name])}" for name in _varied(summary))
+        f"cell {cell['cell']}" + "".join(f", {level_title(name, cell['factors'][name])}" for name in _varied(summary))
         for cell in summary["results"]
     ]
 
@@ -102,13 +99,20 @@ def _cell_table(summary: dict[str, Any]) -> ReportTable:
         mark = "unsure" if fraction is not None and fraction < 0.99 else ""
         rows.append([
             number_cell(cell["cell"], 0),
-            *(Cell(_level(level), float(level) if isinstance(level, float) else None) for level in levels),
+            *(Cell(level_text(level), float(level) if isinstance(level, float) else None) for level in levels),
             number_cell(cell["trials_run"], 0),
             number_cell(None if fraction is None else 100 * fraction, 2, mark=mark),
             number_cell(100 * (cell["truth_inside"]["value"] or 0.0), 2),
             number_cell(cell["steps_mean"], 1),
         ])  # fmt: skip
-    columns = ("cell", *names, "trials run", "converged [%]", "truth within bounds [%]", "mean evaluations")
+    columns = (
+        "cell",
+        *map(factor_title, names),
+        "trials run",
+        "converged [%]",
+        "truth within bounds [%]",
+        "mean evaluations",
+    )
     return ReportTable("Trials by cell", columns, rows)
 
 
@@ -155,10 +159,10 @@ def _cell_axis(summary: dict[str, Any], numbers: list[int]) -> tuple[dict[str, A
         return ({"dtick": 1} if len(numbers) <= 24 else {}), "cell"
     cells = {cell["cell"]: cell["factors"] for cell in summary["results"]}
     ticks = [
-        "<br>".join([str(number), *(charts.escaped(_level(cells[number][name])[:14]) for name in varied)])
+        "<br>".join([str(number), *(charts.escaped(level_text(cells[number][name])[:14]) for name in varied)])
         for number in numbers
     ]
-    names = ", ".join(charts.escaped(name.split(".")[-1].replace("_", " ")) for name in varied)
+    names = ", ".join(charts.escaped(factor_title(name)) for name in varied)
     return {"tickvals": numbers, "ticktext": ticks, "tickangle": 0}, f"cell, and under it {names}"
 
 

@@ -163,7 +163,7 @@ def bounds_section(record: CalibrationRecord, summary: dict[str, Any]) -> Sectio
     introduction = f"On a bound: {', '.join(on_bound)}." if on_bound else "No bound is active."
     if record.method == "two-stage":
         introduction += " Bounds are those of stage 1; the scale fix comes after it."
-    trace = charts.markers("as left", record.names, positions, charts.DARK, "circle")
+    trace = charts.markers("calibrated", record.names, positions, charts.DARK, "circle")
     trace["marker"]["symbol"] = ["diamond" if name in on_bound else "circle" for name in record.names]
     axis = {"range": [-1.15, 1.15], "tickvals": [-1, 0, 1], "ticktext": ["lower", "middle", "upper"]}
     shapes = charts.horizontal([-1, 1], "solid")
@@ -173,7 +173,7 @@ def bounds_section(record: CalibrationRecord, summary: dict[str, Any]) -> Sectio
         "Position of every parameter within its bounds",
         "Diamonds are on a bound.",
         {"data": [trace], "layout": layout},
-        ReportTable("Bounds", ("parameter", "unit", "lower", "as left", "upper", ""), rows),
+        ReportTable("Bounds", ("parameter", "unit", "lower", "calibrated", "upper", ""), rows),
         300,
     )
     return Section("bounds", "Bounds", [introduction, chart])

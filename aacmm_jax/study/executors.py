@@ -33,7 +33,7 @@ def dask_executor(address: str, workers: int | None = None) -> Iterator[tuple[Ex
     try:
         import distributed
     except ImportError as error:
-        raise InputError("--dask needs Dask; install it with: pip install 'aacmm_jax[dask]'.") from error
+        raise InputError("--dask needs Dask; install it with: pip install 'dask[distributed]'.") from error
     with _client(distributed, address, workers) as client:
         count = len(client.scheduler_info(n_workers=-1)["workers"])
         if not count:

@@ -36,7 +36,7 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
     try:
         import xarray
     except ImportError as error:
-        raise InputError("open_study needs xarray; install it with: pip install 'aacmm_jax[data]'.") from error
+        raise InputError("open_study needs xarray; install it with: pip install xarray h5netcdf.") from error
     opened = Results.of(path)
     study = opened.study
     if opened.stored.parts is not None:

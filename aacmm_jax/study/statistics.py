@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from ..core.units import ARCSEC
 from ..solver.reason import Reason, numbers_of
 from .results import Results
-from .specification import label
+from .specification import label, unit
 
 METRICS = {
     "k": "k, measured / nominal",
@@ -31,6 +31,19 @@ METRICS = {
     "angle_error": "largest angle error after the scale fix",
 }
 PERCENTILES = (5, 50, 95)
+_FACTORS = {
+    "bounds.length_mm": "half-width of lengths [mm]",
+    "bounds.angle_deg": "half-width of angles [deg]",
+    "bounds.length_shift_mm": "shift of the centre, lengths [mm]",
+    "bounds.angle_shift_deg": "shift of the centre, angles [deg]",
+    "identification.hold": "scale anchor",
+    "identification.method": "method",
+    "noise.encoder_arcsec": "encoder noise [arcsec]",
+    "noise.seating_mm": "seating noise [mm]",
+    "capture.poses": "poses in a socket",
+    "capture.sockets": "sockets",
+    "reference.positions": "positions of the reference length",
+}
 
 
 def shown_unit(metric: str) -> tuple[str, float]:
@@ -44,6 +57,27 @@ def metric_title(metric: str) -> str:
     """What a metric is, with the unit in which people read it."""
     unit, _ = shown_unit(metric)
     return METRICS[metric] + (f" [{unit}]" if unit else "")
+
+
+def factor_title(name: str) -> str:
+    """What a factor is, with its unit: ``noise.encoder_arcsec`` is "encoder noise [arcsec]"."""
+    if name in _FACTORS:
+        return _FACTORS[name]
+    table, _, key = name.partition(".")
+    words = key.removesuffix(f"_{unit(name)}").replace("_", " ")
+    prefix = {"reference": "reference ", "deviation": "deviation of "}.get(table, "")
+    return prefix + words + (f" [{unit(name)}]" if unit(name) != "1" else "")
+
+
+def level_title(name: str, level: float | str) -> str:
+    """A factor and one of its levels with the unit: "encoder noise 2 arcsec"."""
+    words, _, measure = factor_title(name).partition(" [")
+    return f"{words} {level_text(level)}" + (f" {measure.removesuffix(']')}" if measure else "")
+
+
+def level_text(level: float | str) -> str:
+    """A level of a factor: numbers in their shortest form."""
+    return level if isinstance(level, str) else f"{level:g}"
 
 
 def study_summary(results: Results, only: int | None = None) -> dict[str, Any]:

@@ -130,7 +130,7 @@ def calibration_summary(
     observability: Observability | None = None,
     volume: VolumetricUncertainty | None = None,
 ) -> dict[str, Any]:
-    """A calibration: method, metrics as found and as left, scale, parameters, uncertainty and warnings.
+    """A calibration: method, metrics by arm, scale, parameters, uncertainty and warnings.
 
     ``observability`` (`warnings.observed`) and ``volume`` (`volumetric_uncertainty`) are computed if not given.
     """

@@ -29,6 +29,7 @@ def evaluation_summary(
     }
     whole = {stage: evaluate(specification.arm, capture) for stage, specification in record.arms().items()}
     rows = metrics_by_socket_and_length(capture, whole["calibrated"])
+    fixed_scale = record.length_that_fixed_scale()
     for group in ("held_out", "identified_from"):
         wanted = group == "identified_from"
         names = [name for name in capture.names if (name in record.used) == wanted]
@@ -43,6 +44,7 @@ def evaluation_summary(
         }
         summary[group]["sockets"] = [row for row in rows["sockets"] if row["socket"] in names]
         summary[group]["lengths"] = [rows["lengths"][i] for i in lengths]
+        summary[group]["fixed_by_one_length"] = fixed_scale in lengths
     summary["kept"], summary["failed"] = _exceeded(summary, record)
     found = record.acceptance() if tests is None else tests
     summary["acceptance"] = acceptance_summary(found["calibrated"], found["nominal"])

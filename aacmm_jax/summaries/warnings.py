@@ -92,18 +92,25 @@ def _validation(record: CalibrationRecord) -> list[str]:
     found = []
     validation = record.validation
     if validation is not None and validation.surprising:
+        pairs = (
+            ("poses", validation.rms, validation.rms_predicted),
+            ("reference lengths", validation.length_rms, validation.length_u),
+        )
+        ratios = [
+            f"{name} {error:.3g} mm RMS, {error / predicted:.1f} times the predicted {predicted:.3g} mm"
+            for name, error, predicted in pairs
+            if predicted > 0 and math.isfinite(error)
+        ]
         found.append(
-            f"Sockets left out one placement after the other have errors {validation.excess:.1f} times their predicted "
-            f"uncertainty ({validation.rms:.3g} mm RMS instead of {validation.rms_predicted:.3g}, lengths "
-            f"{validation.length_rms:.3g} mm instead of {validation.length_u:.3g}): errors of neighbouring poses are "
-            "alike, as of effects outside the D-H model (compliant joints, eccentric encoders). Use the "
-            "cross-validated values; every u below is too small."
+            f"Held out one after the other, placements have larger errors than predicted: {'; '.join(ratios)}. Errors "
+            "of neighbouring poses are alike, as of effects outside the D-H model (compliant joints, eccentric "
+            "encoders). Use the cross-validated values; every u of this calibration is too small."
         )
     if record.reduced_chi is not None and not 1 / _EXCESS < record.reduced_chi < _EXCESS:
         word = "small" if record.reduced_chi > 1 else "large"
         factor = max(record.reduced_chi, 1 / record.reduced_chi)
         found.append(
-            f"Residuals are {record.reduced_chi:.2g} times what the given noise predicts, and every uncertainty below "
+            f"Residuals are {record.reduced_chi:.2g} times what the given noise predicts, and every uncertainty "
             f"follows from that noise: it is about {factor:.2g} times too {word}. Check the noise, or leave it out to "
             "have it estimated."
         )

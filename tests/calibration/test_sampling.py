@@ -134,7 +134,9 @@ def test_cross_validation_shows_what_the_uncertainty_misses(arm, bounds, capture
     result = aj.calibrate(arm, bent, bounds, method="joint", noise=NOISE)
     record = aj.calibration.record_of(result, aj.Recording(bent, aj.kinematics.ArmSpecification(arm, "bent")))
     found = cautions.of_calibration(record._replace(validation=checked))
-    assert found[0].startswith("Sockets left out one placement after the other have errors")
+    assert found[0].startswith("Held out one after the other, placements have larger errors than predicted")
+    assert f"{checked.rms / checked.rms_predicted:.1f} times the predicted {checked.rms_predicted:.3g} mm;" in found[0]
+    assert f"{checked.length_rms / checked.length_u:.1f} times the predicted {checked.length_u:.3g} mm." in found[0]
     assert "Use the cross-validated values" in found[0]
     assert any("The 3 reference lengths disagree" in sentence for sentence in found)
 

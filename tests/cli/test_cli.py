@@ -66,6 +66,9 @@ def test_whole_path(aacmm, tmp_path):
     aacmm("evaluate", "calibration.h5", "capture.h5", "--max-rms-mm", 0.05)
     failed = aacmm("evaluate", "calibration.h5", "capture.h5", "--max-rms-mm", 0.001, expect=1)
     assert "over the limit of 0.001 mm" in " ".join(failed.stdout.split())
+    # The only length identified from fixed the scale: its error is zero by construction, and nothing that was measured.
+    assert [evaluated[group]["fixed_by_one_length"] for group in ("held_out", "identified_from")] == [False, True]
+    assert failed.stdout.count("fixed the scale") == 3
     # Three ways out, with the same numbers.
     arm = tomllib.loads(aacmm("export", "calibration.h5").stdout)
     assert arm["joint"][2]["d"] == float(record.calibrated.arm.d[2])

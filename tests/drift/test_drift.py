@@ -442,6 +442,10 @@ def test_figures_draw_the_numbers(calibrated, tmp_path):
     np.testing.assert_allclose(found.get_ydata(), [1e3 * drift.lengths.rms for drift in table.drifts])
     # January is 31 of 181 days: places are in proportion to time.
     np.testing.assert_allclose(found.get_xdata(), [2 * 31 / 181, 2])
+    assert lower.get_xlabel() == "calibration"
+    by_file = drift_figure.drift_trend(table._replace(dated_by_file=(True, False, True)))[1]
+    assert "(*: when its file was made" in by_file.get_xlabel()
+    assert [label.get_text().endswith("*") for label in by_file.get_xticklabels()] == [True, False, True]
     two = drift_figure.drift_trend(trend(given[::2], dates[::2], points=40))
     assert [label.get_text() for label in two[0].get_xticklabels()] == list(table.names)
     for suffix, start in (("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")):

@@ -1,5 +1,7 @@
 """Figures: each returns the axes that it was plotted into, and shows the numbers of its record."""
 
+import io
+
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -76,6 +78,13 @@ def test_figures_hold_the_numbers(record, made):
     np.testing.assert_allclose(changes, expected)
     values = aj.plot.singular_values(*made["singular_values"]).lines[0].get_ydata()
     np.testing.assert_allclose(values, made["singular_values"][0].singular)
+
+
+@pytest.mark.parametrize("name", ["pose_distances", "length_parameter_errors"])
+def test_a_legend_covers_no_data(made, name):
+    axes = getattr(aj.plot, name)(*made[name])
+    axes.figure.savefig(io.BytesIO())  # sets the layout
+    assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1
 
 
 def test_an_arm_is_drawn_in_space(record):

@@ -177,8 +177,8 @@ def test_numbers_of_a_report_are_under_the_right_heading(written):
     report = calibration_report(record)[0]
     tables = tables_of(report)
     evaluations, factor = record.evaluations(), aj.uncertainty_of(record).factor(0.95)
-    stages = {"as found": "nominal", "after stage 1": "stage1", "as left": "calibrated"}
-    metrics = tables["Metrics as found and as left [mm]"]
+    stages = {"nominal": "nominal", "stage 1": "stage1", "calibrated": "calibrated"}
+    metrics = tables["Metrics by arm [mm]"]
     for heading, stage in stages.items():
         cell = metrics.rows[0][metrics.columns.index(heading)]
         assert cell.value == pytest.approx(float(evaluations[stage].repeatability.de))
@@ -187,7 +187,7 @@ def test_numbers_of_a_report_are_under_the_right_heading(written):
     for row in parameters.rows:
         i = record.names.index(row[0].text)
         scale = 1 / aj.units.DEG if row[1].text == "deg" else 1.0
-        assert row[parameters.columns.index("as left")].value == pytest.approx(
+        assert row[parameters.columns.index("calibrated")].value == pytest.approx(
             scale * record.vectors()["calibrated"][i]
         )
         if row[parameters.columns.index("U (95 %)")].value is not None:
@@ -222,8 +222,8 @@ def test_lengths_of_a_report_by_arm_and_with_expanded_uncertainty(written):
     factor, evaluations = aj.uncertainty_of(record).factor(0.95), record.evaluations()
     for i, row in enumerate(table.rows):
         cells = dict(zip(table.columns, row, strict=True))
-        for heading, stage in (("as found", "nominal"), ("after stage 1", "stage1"), ("as left", "calibrated")):
-            assert cells[heading].value == pytest.approx(float(evaluations[stage].error[i]))
+        for heading, stage in (("nominal", "nominal"), ("stage 1", "stage1"), ("calibrated", "calibrated")):
+            assert cells[f"error, {heading}"].value == pytest.approx(float(evaluations[stage].error[i]))
         assert cells["U of error"].value == pytest.approx(factor * float(evaluations["calibrated"].u[i]))
 
 
@@ -236,7 +236,7 @@ def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
         size=(120 * 52, 6)
     )
     capture = aj.Capture({"A": q[:6000], "B": q[6000:6001]})
-    chart = residual_chart("r", "R", capture, {"as left": aj.evaluate(arm, capture)}, mark=True)
+    chart = residual_chart("r", "R", capture, {"calibrated": aj.evaluate(arm, capture)}, mark=True)
     assert chart.table is not None
     assert len(chart.table.rows) == 1000
     assert len(chart.figure["data"][0]["x"]) <= 2001
@@ -255,9 +255,9 @@ def test_poses_alone_in_their_socket_show_no_scatter(written):
     assert distances[10] is None
     assert None not in distances[:10]
     assert [cell.text for cell in socket_table(capture, evaluation).rows[1]][2:5] == ["–"] * 3
-    assert len(residual_chart("r", "R", capture, {"as left": evaluation}).figure["data"][0]["x"]) == 10
+    assert len(residual_chart("r", "R", capture, {"calibrated": evaluation}).figure["data"][0]["x"]) == 10
     single = aj.Capture({"B": q[:1]})
-    assert "no scatter" in residual_chart("r", "R", single, {"as left": aj.evaluate(arm, single)}).description
+    assert "no scatter" in residual_chart("r", "R", single, {"calibrated": aj.evaluate(arm, single)}).description
 
 
 CONFORMITY = """
@@ -303,6 +303,32 @@ def test_an_evaluation_report_decides(written):
     assert "✓ conforms" in text  # Deltam of 5 mm
     assert "A limit is not kept" in text
     assert "it also needs" in text
+
+
+def test_charts_of_an_evaluation(written):
+    from aacmm_jax.report.evaluation import evaluation_report
+
+    sections = evaluation_report(written.evaluation)[0].sections
+    figures = {
+        block.id: block.figure for section in sections for block in section.blocks if isinstance(block, elements.Chart)
+    }
+    assert figures["margins"]["layout"]["yaxis"]["range"][0] == 0  # of absolute values
+    readings = figures["length-errors"]  # one held-out length: by reading, not all at one abscissa
+    assert readings["layout"]["xaxis"]["title"]["text"].startswith("reading of a length of")
+    assert readings["data"][0]["x"] == list(range(1, len(readings["data"][0]["y"]) + 1))
+
+
+def test_a_verdict_is_marked_as_what_it_is(written):
+    from aacmm_jax.acceptance.record import PointsRecord
+    from aacmm_jax.report.calibration import calibration_report
+    from aacmm_jax.report.evaluation import points_report
+
+    report = calibration_report(written.record)[0]
+    assert (report.verdict[:9], report.verdict_mark, bool(report.warnings)) == ("Converged", "good", True)
+    failed = calibration_report(written.record._replace(converged=False))[0]
+    assert (failed.verdict[:14], failed.verdict_mark) == ("Not to be used", "bad")
+    measured = points_report(PointsRecord(aj.acceptance.Measured({"A": np.eye(3)})))[0]
+    assert (measured.verdict, measured.verdict_mark) == ("Measured; no limit was given", "neutral")
 
 
 def test_outliers_by_hand():
@@ -475,7 +501,7 @@ def test_tables_sort_by_click_and_by_keyboard(shown):
     column = lambda: [  # noqa: E731
         float(cell.get_attribute("data-value")) for cell in table.locator("tbody tr td:nth-child(4)").all()
     ]
-    heading = table.locator("th button", has_text="as left")
+    heading = table.locator("th button", has_text="calibrated")
     heading.click()
     assert column() == sorted(column())
     assert table.locator("th[aria-sort=ascending]").count() == 1

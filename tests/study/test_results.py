@@ -9,7 +9,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.study import store
 from aacmm_jax.study.blocks import Layout
-from aacmm_jax.study.statistics import concise, distribution, statistic
+from aacmm_jax.study.statistics import concise, distribution, level_title, statistic
 
 matplotlib.use("Agg")
 
@@ -104,6 +104,25 @@ def test_standard_errors_where_groups_differ_are_those_of_repetition(name, count
 )
 def test_concise_notation(value, se, text):
     assert concise(value, se) == text
+
+
+def test_boxes_say_what_is_pooled(path):
+    title = aj.plot.study_distributions(aj.study.Results.of(path), "bounds.length_mm").get_suptitle()
+    assert title.endswith("trials pooled over all levels of: shift of the centre, lengths [mm]")
+
+
+@pytest.mark.parametrize(
+    ("name", "level", "text"),
+    [
+        ("bounds.length_mm", 10.0, "half-width of lengths 10 mm"),
+        ("capture.poses", 20, "poses in a socket 20"),
+        ("noise.encoder_arcsec", 2.0, "encoder noise 2 arcsec"),
+        ("deviation.angle_deg", 0.1, "deviation of angle 0.1 deg"),
+        ("identification.method", "joint", "method joint"),
+    ],
+)
+def test_factors_are_named_in_words(name, level, text):
+    assert level_title(name, level) == text
 
 
 def test_summary_says_what_the_arrays_say(path, summary):
