@@ -183,7 +183,8 @@ def second_stage_many(
     rows = np.flatnonzero(must_adjust(anchor, bounds, stage1.active, scaled))
     active = stage1.active
     if can_scale(anchor):
-        scaled = np.array(within_bounds(space, lower, upper, scaled))
+        # Rows are contiguous, so that what is summed over one is summed in the same order in every batch.
+        scaled = np.array(within_bounds(space, lower, upper, scaled), order="C")
         active = np.asarray(bounds.active(scaled))
     if len(rows):
         found, found_reason, more = _adjust_many(

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import typer
 
-from ..core.arrays import LARGEST_SEED
 from ..core.errors import InputError
 from .app import Json, Stopped, app, examples, show_summary, with_spinner
 
@@ -33,9 +32,7 @@ def study(
     trials: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Trials in each cell, instead of the specification's.")
     ] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, max=LARGEST_SEED, metavar="N", help="Seed, instead of the specification's.")
-    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, metavar="N", help="Seed, instead of the specification's.")] = None,
     chunk: Annotated[
         int | None,
         typer.Option(min=1, metavar="N", help="Trials computed at a time; no result depends on it. Default 1000."),

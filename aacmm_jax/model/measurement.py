@@ -15,6 +15,7 @@ from .weights import Weights
 
 # Standard deviation of a tip coordinate (mm) below which noise-free data would get infinite weight.
 LEAST_SIGMA = 1e-9
+_FEW = 1000  # sockets
 
 
 class Measurement(eqx.Module):
@@ -83,7 +84,10 @@ class Measurement(eqx.Module):
 def between_ends(centroids: Float[AnyArray, "... s"], ends: tuple[tuple[int, int], ...]) -> Float[AnyArray, "... l"]:
     """The differences between both ends of every length, of values that sockets have."""
     pairs = np.asarray(ends, dtype=int).reshape(-1, 2)
-    return centroids[..., pairs[:, 1]] - centroids[..., pairs[:, 0]]
+    if namespace(centroids) is np or centroids.shape[-1] > _FEW:
+        return centroids[..., pairs[:, 1]] - centroids[..., pairs[:, 0]]
+    unit = np.eye(centroids.shape[-1])
+    return centroids @ (unit[pairs[:, 1]] - unit[pairs[:, 0]]).T  # a product, for the reason given in `socket_sums`
 
 
 def check_joints(capture: Capture, space: Parameters) -> None:

@@ -1,5 +1,7 @@
 """Sums over the poses of each socket, and back: poses are kept socket after socket, along the last axis."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +9,9 @@ from jaxtyping import Float
 
 from ..core.namespace import AnyArray, namespace
 
-# JAX multiplies by a matrix of (sockets, poses) up to this size, which suits batches of few sockets; larger problems
-# take a segmented sum, which needs no memory beyond its result.
+# JAX multiplies by a matrix of (sockets, poses) up to this size, which suits batches of few sockets: the product is not
+# fused with what surrounds it, so that a trial of a study has the same bits in every block. Larger problems take a
+# segmented sum, which needs no memory beyond its result.
 _LARGEST_MATRIX = 1_000_000
 
 
@@ -16,17 +19,27 @@ def sums_over_sockets(rows: Float[AnyArray, "... N"], sizes: tuple[int, ...]) ->
     """The sum of each socket's poses."""
     if namespace(rows) is np:
         return np.add.reduceat(rows, _starts(sizes), axis=-1)
-    if len(sizes) * sum(sizes) <= _LARGEST_MATRIX:
-        return rows @ jnp.asarray(membership(sizes).T)
-    summed = jax.ops.segment_sum(
-        jnp.moveaxis(rows, -1, 0), jnp.asarray(owner_of(sizes)), num_segments=len(sizes), indices_are_sorted=True
-    )
-    return jnp.moveaxis(summed, 0, -1)
+    return _product(rows, membership(sizes)) if _is_small(sizes) else _segmented(jax.ops.segment_sum, rows, sizes)
 
 
 def means_over_sockets(rows: Float[AnyArray, "... N"], sizes: tuple[int, ...]) -> Float[AnyArray, "... s"]:
     """The mean of each socket's poses."""
+    if namespace(rows) is jnp and _is_small(sizes):
+        return _product(rows, membership(sizes) / np.asarray(sizes, dtype=float)[:, None])
     return sums_over_sockets(rows, sizes) / counts(sizes, rows.ndim)
+
+
+def _is_small(sizes: tuple[int, ...]) -> bool:
+    return len(sizes) * sum(sizes) <= _LARGEST_MATRIX
+
+
+def _product(rows: Float[AnyArray, "... N"], matrix: Float[np.ndarray, "s N"]) -> Float[AnyArray, "... s"]:
+    return rows @ jnp.asarray(matrix.T) if rows.ndim != 2 else (jnp.asarray(matrix) @ rows.T).T
+
+
+def _segmented(operation: Callable, rows: Float[AnyArray, "... N"], sizes: tuple[int, ...]) -> Float[AnyArray, "... s"]:
+    by_pose, owner = jnp.moveaxis(rows, -1, 0), jnp.asarray(owner_of(sizes))
+    return jnp.moveaxis(operation(by_pose, owner, num_segments=len(sizes), indices_are_sorted=True), 0, -1)
 
 
 def counts(sizes: tuple[int, ...], rank: int) -> Float[np.ndarray, "... s"]:
@@ -38,17 +51,14 @@ def largest_of_sockets(rows: Float[AnyArray, "... N"], sizes: tuple[int, ...]) -
     """The largest value of each socket's poses."""
     if namespace(rows) is np:
         return np.maximum.reduceat(rows, _starts(sizes), axis=-1)
-    largest = jax.ops.segment_max(
-        jnp.moveaxis(rows, -1, 0), jnp.asarray(owner_of(sizes)), num_segments=len(sizes), indices_are_sorted=True
-    )
-    return jnp.moveaxis(largest, 0, -1)
+    return _segmented(jax.ops.segment_max, rows, sizes)
 
 
 def to_poses(values: Float[AnyArray, "... s"], sizes: tuple[int, ...]) -> Float[AnyArray, "... N"]:
     """Each socket's value at each of its poses."""
     if namespace(values) is np:
         return np.repeat(values, sizes, axis=-1)
-    if len(sizes) * sum(sizes) <= _LARGEST_MATRIX:
+    if _is_small(sizes):
         return values @ jnp.asarray(membership(sizes))
     return values[..., owner_of(sizes)]
 

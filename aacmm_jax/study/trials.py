@@ -52,9 +52,9 @@ def _identified(
     lengths = study.space.lengths
     # Scale of the arm: the factor that best maps the true lengths onto the identified ones. Rows are contiguous, so
     # that each is summed in the same order however many there are.
-    true = np.where(lengths, drawn.true, 0.0)
+    true = np.ascontiguousarray(np.where(lengths, drawn.true, 0.0))
     scale, scale_after = (
-        (found.parameters * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300)
+        np.ascontiguousarray(found.parameters * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300)
         for found in (stage1, many)
     )
     scaled = setting.method != "stage1"

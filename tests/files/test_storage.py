@@ -353,7 +353,8 @@ def arms(draw) -> dict:
 @st.composite
 def captures(draw, joints: int) -> dict:
     pose = st.lists(angles, min_size=joints, max_size=joints)
-    sockets = draw(st.dictionaries(texts | st.just(""), st.lists(pose, min_size=1, max_size=3), min_size=1, max_size=3))
+    of_one_line = texts.filter(lambda text: text.strip() and text.splitlines() == [text])
+    sockets = draw(st.dictionaries(of_one_line, st.lists(pose, min_size=1, max_size=3), min_size=1, max_size=3))
     assume(len({str(poses) for poses in sockets.values()}) == len(sockets))  # a capture refuses a file given twice
     ends = st.lists(st.sampled_from(list(sockets)), min_size=2, max_size=2, unique=True)
     lengths = st.lists(st.tuples(ends, positive, st.floats(0, 1e9)), max_size=2) if len(sockets) > 1 else st.just([])
