@@ -12,7 +12,8 @@ PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
 BIN := .venv/bin
 INSTALL := -m pip install --quiet --disable-pip-version-check
-PYTEST := -m pytest -n auto --dist loadscope --no-loadscope-reorder
+# A worker that dies ends the run: a replacement might wait for ever for tests that went with the first.
+PYTEST := -m pytest -n auto --max-worker-restart 0 --dist loadscope --no-loadscope-reorder
 # Numerics, differentiation, storage and the command line on real captures: what a change of a dependency breaks first.
 SELECTION := tests/test_package.py tests/kinematics tests/solver tests/calibration/test_stages.py \
 	tests/files/test_storage.py tests/test_real_captures.py

@@ -127,24 +127,28 @@ def _few_memory_maps():
 
 # Modules in decreasing order of their run time: a long one started last would keep a single worker busy at the end.
 LONGEST = (
-    "cli/test_cli",
     "study/test_trials",
+    "acceptance/test_acceptance",
     "uncertainty/test_uncertainty",
     "calibration/test_stages",
-    "report/test_report",
-    "study/test_store",
     "solver/test_solver",
-    "calibration/test_sampling",
     "planning/test_planning",
+    "study/test_store",
+    "report/test_report",
     "drift/test_drift",
-    "test_real_captures",
+    "cli/test_cli",
+    "calibration/test_sampling",
+    "calibration/test_second_stage",
+    "test_reproduction",
+    "core/test_deadlock",
     "test_readme",
-    "acceptance/test_acceptance",
-    "uncertainty/test_identifiability",
-    "kinematics/test_chain",
-    "study/test_results",
-    "calibration/test_batch",
     "test_paper",
+    "study/test_results",
+    "core/test_namespace",
+    "calibration/test_batch",
+    "test_real_captures",
+    "kinematics/test_chain",
+    "files/test_storage",
 )
 
 
