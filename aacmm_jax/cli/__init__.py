@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import NoReturn
 
 _INTERRUPTED = 130
-_CLOSED_PIPE = 141  # what a shell reports of other programs whose output nobody reads any longer
+_CLOSED_PIPE = 141  # as a shell reports of a program whose output is closed (128 + SIGPIPE)
 # Modules of commands, in the order in which ``--help`` lists them.
 _FAMILIES = (
     "capture_commands",

@@ -84,10 +84,6 @@ def as_floats(value: Numbers, what: str) -> AnyArray:
 
 
 def in_chunks(work: Callable[[np.ndarray], np.ndarray], rows: np.ndarray) -> np.ndarray:
-    """``work`` on blocks of equal size, so that it is compiled once; the last is filled up with its first row."""
-    results = []
-    for first in range(0, len(rows), _CHUNK):
-        block = rows[first : first + _CHUNK]
-        filled = np.concatenate([block, np.repeat(block[:1], _CHUNK - len(block), axis=0)])
-        results.append(work(filled)[: len(block)])
-    return np.concatenate(results)
+    """``work`` on blocks of rows that the processor's cache can hold; an empty array is one block."""
+    starts = range(0, max(len(rows), 1), _CHUNK)
+    return np.concatenate([work(rows[first : first + _CHUNK]) for first in starts])

@@ -60,7 +60,7 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
                 "'-' only; write more of the name out."
             )
         if left_out:
-            raise InputError(f"{where} but {_some(left_out)}, which exclude leaves out; mend exclude.")
+            raise InputError(f"{where} but {_some(left_out)}, which exclude leaves out; change exclude.")
         alike = _alike(folder, before, pattern)
         raise InputError(f"{where}" + (f"; there is {_some(alike)}" if alike else "") + "; check the path.")
     return values

@@ -95,7 +95,7 @@ def _explain(error: Any, model: Any, content: Any) -> str:
         limit = f"at least {context['min_length']}" if kind == "too_short" else f"at most {context['max_length']}"
         return f"'{place}' has {len(given) or 'no'} entries; give {limit}."
     shown = "a table" if isinstance(given, dict) else "a list" if isinstance(given, list) else repr(given)
-    mend = f"; write [[{place}]]" if kind == "list_type" and isinstance(given, dict) else ""
+    advice = f"; write [[{place}]]" if kind == "list_type" and isinstance(given, dict) else ""
     wanted = {
         "tuple_type": "must be a list of numbers",
         "dict_type": "must be a table",
@@ -104,7 +104,7 @@ def _explain(error: Any, model: Any, content: Any) -> str:
     if context.get("class_name") == "Distribution":
         wanted = "must be a number, { uniform = ... } or { normal = ... }"
     wanted = wanted or error["msg"].replace("Input should", "must").partition(", unable")[0]
-    return f"'{place}' {wanted}, not {shown}{mend}."
+    return f"'{place}' {wanted}, not {shown}{advice}."
 
 
 def _known_keys(model: Any, steps: Sequence[Any]) -> list[str]:

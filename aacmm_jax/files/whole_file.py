@@ -21,7 +21,7 @@ def whole_file(path: str | os.PathLike, advice: str = ELSEWHERE) -> Iterator[Pat
     """
     named = Path(path)
     target = Path(os.path.realpath(named))
-    # Named before it is made: an interrupt between the two must not leave a file that nobody removes.
+    # Named before it is made: an interrupt between the two must not leave a file behind.
     temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
     try:
         # A link in /proc (/dev/stdout) leads to what has no path, and one that leads to itself remains a link.

@@ -4,8 +4,6 @@ The uncertainty of k comes from the lengths and the scatter at their ends (here,
 identified parameters (`uncertainty.scale_uncertainty`).
 """
 
-from functools import partial
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -110,7 +108,7 @@ def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> Scal
     return to_jax(_fixed(*to_numpy((arm, Measurement.of(capture), scatter))))
 
 
-@partial(compiled, jit=eqx.filter_jit)
+@compiled(jit=eqx.filter_jit)
 def _fixed(arm: Arm, measurement: Measurement, sigma: Float[AnyArray, ""] | None) -> ScaleFix:
     tips = arm.position(measurement.q)
     scatter = repeatability(tips, measurement.sizes).sigma if sigma is None else sigma

@@ -4,14 +4,13 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
+from ..core.namespace import to_numpy
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, jacobian_at
 from ..kinematics.chain import Geometry, sines_cosines
@@ -58,7 +57,8 @@ def candidates_of(
     p, sockets = len(problem.space.names), len(placement.points)
     unknowns = p + 3 * sockets
     jacobian = jacobian_at(problem.arm, q, problem.space.names) * np.asarray(problem.space.scale)
-    roots = in_chunks(lambda rows: np.asarray(_roots(problem.arm.geometry, jnp.asarray(rows), problem.noise)), q)
+    geometry, noise = to_numpy((problem.arm.geometry, problem.noise))
+    roots = in_chunks(lambda block: _whitening(geometry, block, noise), q)
     rows = np.zeros((len(q), 3, unknowns))
     rows[:, :, :p] = roots @ jacobian
     for axis in range(3):
@@ -73,9 +73,8 @@ def candidates_of(
     return Candidates(rows, owner, base, p)
 
 
-@jax.jit
-def _roots(geometry: Geometry, q: Array, noise: Noise) -> Float[Array, "c 3 3"]:
-    return jnp.moveaxis(inverse_root(tip_covariances(geometry, sines_cosines(q), noise)), -1, 0)
+def _whitening(geometry: Geometry, q: Float[np.ndarray, "c n"], noise: Noise) -> Float[np.ndarray, "c 3 3"]:
+    return np.moveaxis(np.asarray(inverse_root(tip_covariances(geometry, sines_cosines(q), noise))), -1, 0)
 
 
 def random_score(problem: DesignProblem, placement: FixturePlacement, poses: int) -> float:

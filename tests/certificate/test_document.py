@@ -423,7 +423,10 @@ def test_the_same_calibration_has_the_same_certificate(record):
     one, again = (dcc_xml(record, AdministrativeData(), created=CREATED) for _ in range(2))
     assert one == again
     other = dcc_xml(record, AdministrativeData(item=CalibratedItem(name="other")), created=CREATED)
-    identifier = lambda text: ElementTree.fromstring(text).findtext(f"*/{DCC}coreData/{DCC}uniqueIdentifier")  # noqa: E731
+
+    def identifier(text: str) -> str | None:
+        return ElementTree.fromstring(text).findtext(f"*/{DCC}coreData/{DCC}uniqueIdentifier")
+
     assert identifier(one) != identifier(other)
 
 

@@ -161,7 +161,7 @@ def test_what_a_field_matches(tmp_path, motion, name, file, exclude, expected):
     ("file", "exclude", "parts"),
     [
         ("hole_{hole}.csv", [], ["but nearly 'hole_0_pose.csv', 'hole_1_pose.csv'", "letters, digits and '-' only"]),
-        ("{hole}_pose.csv", ["*_pose.csv"], ["but 'hole_0_pose.csv'", "which exclude leaves out; mend exclude"]),
+        ("{hole}_pose.csv", ["*_pose.csv"], ["but 'hole_0_pose.csv'", "which exclude leaves out; change exclude"]),
         ("hole_{hole}_poze.csv", [], ["there is 'hole_1_pose.csv', 'hole_0_pose.csv'", "check the path"]),
         ("plate/{hole}.csv", [], ["no file matches 'plate/{hole}.csv'", "check the path"]),
     ],
