@@ -10,14 +10,13 @@ from pathlib import Path
 
 import jax
 import pytest
-from jaxtyping import install_import_hook
 
-from . import run_time_types as run_time_types  # named in the hook below, as an attribute of this package
+from . import run_time_types
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-install_import_hook("aacmm_jax", "tests.run_time_types.checked")
-import aacmm_jax as aj  # noqa: E402 - the hook is never removed, and checks every module imported after it
+run_time_types.install()
+import aacmm_jax as aj  # noqa: E402 - the hook checks every module imported after it
 from aacmm_jax.cli import main  # noqa: E402
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -113,6 +112,12 @@ def noisy_capture(paper_arm) -> "aj.Capture":
         seating=0.005,
         seed=5,
     )
+
+
+@pytest.fixture(autouse=True)
+def _types_checked_anew():
+    """Each test has the types of its own calls checked."""
+    run_time_types.check_anew()
 
 
 @pytest.fixture(scope="module", autouse=True)
