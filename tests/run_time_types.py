@@ -1,4 +1,4 @@
-"""The run-time type checker of the tests: jaxtyping's hook with beartype, for the first calls of each function in a test.
+"""Types checked at run time, by jaxtyping's hook and beartype: the first calls of each function in each test.
 
 A check costs about 0.1 ms, ten times as much as many of the functions that it checks. A function that is called
 thousands of times in one test sees the same types and shapes again and again, so only its first calls are checked.

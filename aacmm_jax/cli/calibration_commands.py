@@ -147,12 +147,13 @@ def calibrate(
 
         sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))
         record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
-    save_calibration(output, record)
+    summary = calibration_summary(record)
+    save_calibration(output, record, summary)
     if figure is not None:
         from ..plot import save_calibration_figure
 
         save_calibration_figure(record, figure)
-    show_summary(calibration_summary(record) | {"written": str(output)}, as_json, calibration_display.calibration)
+    show_summary(summary | {"written": str(output)}, as_json, calibration_display.calibration)
     if not record.converged or not plausible(record.k) or record.implausible_residual:
         raise typer.Exit(1)
 

@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from ..core.arrays import LARGEST_SEED
 from ..core.errors import InputError
 from ..core.units import DEG
+from ..core.x64 import LARGEST_INTEGER
 from .app import (
     CaptureOutput,
     EncoderNoise,
@@ -34,7 +34,7 @@ def demo(
     folder: Annotated[Path, typer.Argument(help="Folder for the files; made if it does not exist.")] = Path(
         "aacmm-demo"
     ),
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, metavar="N", help="Seed of the noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_INTEGER, metavar="N", help="Seed of the noise.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Calibrate a simulated arm and compare it with the truth.
@@ -88,7 +88,7 @@ def simulate(
             "ISO 10360-12; artefacts have u = 0.001 mm."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, metavar="N", help="Seed of poses and noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_INTEGER, metavar="N", help="Seed of poses and noise.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Make a capture with a simulated arm."""
@@ -145,8 +145,9 @@ def simulate(
             ),
         )
         recording = Recording(capture, nominal, true, seed)
-    save_capture(output, recording)
-    show_summary(capture_summary(recording) | {"written": str(output)}, as_json, calibration_display.capture)
+    summary = capture_summary(recording)
+    save_capture(output, recording, summary)
+    show_summary(summary | {"written": str(output)}, as_json, calibration_display.capture)
 
 
 @app.command(name="import", epilog=examples("aacmm import capture.toml -o capture.h5"))
@@ -168,8 +169,9 @@ def import_(
 
     check_outputs([output], [manifest])
     recording = read_manifest(manifest)
-    save_capture(output, recording)
-    show_summary(capture_summary(recording) | {"written": str(output)}, as_json, calibration_display.capture)
+    summary = capture_summary(recording)
+    save_capture(output, recording, summary)
+    show_summary(summary | {"written": str(output)}, as_json, calibration_display.capture)
 
 
 def _poses_option(texts: Sequence[str], sockets: Iterable[str]) -> dict[str, int]:

@@ -18,7 +18,7 @@ from ..files.calibrations import save_calibration
 from ..files.captures import save_capture
 from ..files.whole_file import fingerprint
 from ..kinematics.parameters import perturbed_arm
-from ..summaries.calibration import calibration_summary
+from ..summaries.calibration import calibration_summary, capture_summary
 
 _DEVIATION_MM, _DEVIATION_DEG = 1.0, 0.1
 _ENCODER_ARCSEC, _SEATING_MM, _LENGTH_U_MM = 2.0, 0.005, 0.002
@@ -50,14 +50,15 @@ def run(folder: Path, seed: int) -> dict[str, Any]:
         seed=seed,
     )
     recording = Recording(capture, nominal, true, seed)
-    save_capture(folder / "capture.h5", recording)
+    save_capture(folder / "capture.h5", recording, capture_summary(recording))
     recording = recording._replace(sources=(fingerprint(folder / "capture.h5"),))
     record = record_of(calibrate(nominal.arm, capture, bounds), recording)
-    save_calibration(folder / "calibration.h5", record)
+    whole = calibration_summary(record)
+    save_calibration(folder / "calibration.h5", record, whole)
     save_arm(nominal.arm, folder / "nominal.toml", name=nominal.name)
     save_arm(true.arm, folder / "true.toml", name=true.name)
     save_arm(record.calibrated.arm, folder / "calibrated.toml", name=record.calibrated.name)
-    summary = _summary(record, _checks(record, seed))
+    summary = _summary(record, whole, _checks(record, seed))
     from ..plot import save_calibration_figure
 
     save_calibration_figure(record, folder / "calibration.png")
@@ -92,8 +93,7 @@ def _checks(record: CalibrationRecord, seed: int) -> dict[str, float]:
     }
 
 
-def _summary(record: CalibrationRecord, checks: dict[str, float]) -> dict[str, Any]:
-    whole = calibration_summary(record)
+def _summary(record: CalibrationRecord, whole: dict[str, Any], checks: dict[str, float]) -> dict[str, Any]:
     length = record.recording.capture.lengths[0]
     return {
         "kind": "demo",

@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from ..core.arrays import LARGEST_SEED
 from ..core.errors import InputError
 from ..core.units import DEG
+from ..core.x64 import LARGEST_INTEGER
 from .app import (
     EncoderNoise,
     Json,
@@ -115,7 +115,7 @@ def plan(
             metavar="FILE.toml", help="Of an acceptance test: manifest to write, for the import of its readings."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, metavar="N", help="Seed of the random choices.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_INTEGER, metavar="N", help="Seed of the random choices.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Choose the poses to take, before measuring.

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ..core.errors import InputError
-from ..files.hdf5 import read_tables
+from ..files.hdf5 import read_summary, read_tables
 from ..files.whole_file import fingerprint, write_text
 from .app import CalibrationFile, Json, Only, Without, app, check_outputs, examples, show_summary, with_spinner
 
@@ -149,7 +149,7 @@ def _evaluated(
     found = evaluation_of(record, recording, limits=limits, u_test=u_test, maxima=maxima)
     summary = with_spinner("Evaluating", lambda: evaluation_summary(found))
     if output is not None:
-        save_evaluation(output, found)
+        save_evaluation(output, found, summary)
         summary["written"] = str(output)
     return summary
 
@@ -168,7 +168,7 @@ def _evaluated_points(manifest: Path, output: Path | None, limits: Any, u_test: 
     record = PointsRecord(read_points(manifest), limits, u_test)
     summary = points_summary(record)
     if output is not None:
-        save_points(output, record)
+        save_points(output, record, summary)
         summary["written"] = str(output)
     return summary
 
@@ -268,18 +268,12 @@ def show(
     as_json: Json = False,
 ) -> None:
     """Print the content of a file."""
-    from ..files.arms import load_specification
-    from ..files.calibrations import load_calibration
-    from ..files.captures import load_capture
-    from ..summaries.calibration import arm_summary, calibration_summary, capture_summary
-    from . import calibration_display
-
     path = Path(file)
     if path.suffix in ("", ".toml") and not (path.is_file() and path.suffix == ""):
-        show_summary(arm_summary(load_specification(file)), as_json, calibration_display.arm)
+        _show_arm(file, as_json)
         return
-    stored = read_tables(path, ("capture", "calibration", "evaluation", "study"), without=("trials",))
-    kind = stored.attributes["kind"]
+    attributes, summary = read_summary(path, ("capture", "calibration", "evaluation", "study"))
+    kind = attributes["kind"]
     if kind == "study":
         from .study_commands import show_study
 
@@ -287,21 +281,39 @@ def show(
         return
     if cell is not None or figures is not None:
         raise InputError(f"{file} holds a {kind}; --cell and --figures are for studies.")
-    if kind == "evaluation":
-        _show_evaluation(path, stored.attributes.get("of") == "points", as_json)
-    elif kind == "capture":
-        show_summary(capture_summary(load_capture(path)), as_json, calibration_display.capture)
-    else:
-        show_summary(calibration_summary(load_calibration(path)), as_json, calibration_display.calibration)
+    from . import acceptance_display, calibration_display
+
+    if kind == "evaluation" and attributes.get("of") == "points":
+        kind = "points"
+    display = {
+        "capture": calibration_display.capture,
+        "calibration": calibration_display.calibration,
+        "evaluation": acceptance_display.evaluation,
+        "points": acceptance_display.points,
+    }[kind]
+    show_summary(_summary_of(path, kind) if summary is None else summary, as_json, display)
 
 
-def _show_evaluation(file: Path, of_points: bool, as_json: bool) -> None:
-    """Print the content of an evaluation's file."""
+def _show_arm(file: str, as_json: bool) -> None:
+    from ..files.arms import load_specification
+    from ..summaries.calibration import arm_summary
+    from . import calibration_display
+
+    show_summary(arm_summary(load_specification(file)), as_json, calibration_display.arm)
+
+
+def _summary_of(file: Path, kind: str) -> dict[str, Any]:
+    """The summary of a file that holds none: one written through Python, or by another version."""
+    from ..files.calibrations import load_calibration
+    from ..files.captures import load_capture
     from ..files.evaluations import load_evaluation, load_points
+    from ..summaries.calibration import calibration_summary, capture_summary
     from ..summaries.evaluation import evaluation_summary, points_summary
-    from . import acceptance_display
 
-    if of_points:
-        show_summary(points_summary(load_points(file)), as_json, acceptance_display.points)
-    else:
-        show_summary(evaluation_summary(load_evaluation(file)), as_json, acceptance_display.evaluation)
+    load, summarise = {
+        "capture": (load_capture, capture_summary),
+        "calibration": (load_calibration, calibration_summary),
+        "evaluation": (load_evaluation, evaluation_summary),
+        "points": (load_points, points_summary),
+    }[kind]
+    return summarise(load(file))

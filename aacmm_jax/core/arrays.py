@@ -12,12 +12,11 @@ from jaxtyping import Array, ArrayLike
 from . import _compat
 from .errors import InputError
 from .namespace import AnyArray, namespace
-from .x64 import check_x64
+from .x64 import LARGEST_INTEGER, check_x64
 
 # What people pass for an array of numbers; lists are converted and checked.
 Numbers = ArrayLike | Sequence[Any]
 
-LARGEST_SEED = 2**63 - 1
 _CHUNK = 256  # rows of a block
 _KINDS = {"U": "text", "S": "text", "b": "true or false", "c": "complex numbers"}
 
@@ -60,7 +59,7 @@ def joined(rows: Sequence[Array | np.ndarray], axis: int = 0, new: bool = False)
 
 def random_key(seed: int) -> Array:
     """The key of JAX for a seed, or `InputError`."""
-    if not isinstance(seed, int | np.integer) or not -LARGEST_SEED <= seed <= LARGEST_SEED:
+    if not isinstance(seed, int | np.integer) or not -LARGEST_INTEGER <= seed <= LARGEST_INTEGER:
         raise InputError(f"the seed is {seed!r}; give a whole number of at most 63 bits.")
     return jax.random.key(seed)
 

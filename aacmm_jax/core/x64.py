@@ -8,6 +8,8 @@ import sys
 
 from .errors import InputError
 
+LARGEST_INTEGER = 2**63 - 1  # of 64 bits; no seed may be larger
+
 _setting = os.environ.get("JAX_ENABLE_X64")
 if _setting is not None and _setting.strip().lower() in {"0", "false", "off", "no"}:
     raise ImportError(

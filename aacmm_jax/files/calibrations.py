@@ -1,6 +1,8 @@
 """Calibrations in HDF5: the capture, the arms of each stage, parameters with their covariance, and cross-validation."""
 
 import os
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -15,12 +17,15 @@ from .captures import arm_table, recording_attributes, recording_of, recording_t
 from .hdf5 import Stored, Table, Variable, axes, columns, names_in, need, read_tables, undamaged, write_tables
 
 
-def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None:
+def save_calibration(
+    path: str | os.PathLike, record: CalibrationRecord, summary: Mapping[str, Any] | None = None
+) -> None:
     """Write a calibration with its capture and arms to HDF5, whole or not at all.
 
     Args:
         path: the file to write.
         record: the calibration, from `calibration.record_of`.
+        summary: what ``aacmm show`` prints of the file; without it, ``show`` computes it, which takes longer.
 
     Raises:
         InputError: the file cannot be written, or a name holds a character that no file can hold.
@@ -56,7 +61,7 @@ def save_calibration(path: str | os.PathLike, record: CalibrationRecord) -> None
         "converged": record.converged,
         "reason": record.reason,
     }
-    write_tables(path, "calibration", tables, attributes)
+    write_tables(path, "calibration", tables, attributes, summary=summary)
 
 
 def load_calibration(path: str | os.PathLike) -> CalibrationRecord:

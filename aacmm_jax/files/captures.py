@@ -35,17 +35,18 @@ _KINDS = {
 }
 
 
-def save_capture(path: str | os.PathLike, recording: Recording) -> None:
+def save_capture(path: str | os.PathLike, recording: Recording, summary: Mapping[str, Any] | None = None) -> None:
     """Write a capture with its arms to HDF5, whole or not at all.
 
     Args:
         path: the file to write.
         recording: the capture, with its nominal arm.
+        summary: what ``aacmm show`` prints of the file; without it, ``show`` computes it, which takes longer.
 
     Raises:
         InputError: the file cannot be written, or a name holds a character that no file can hold.
     """
-    write_tables(path, "capture", recording_tables(recording), recording_attributes(recording))
+    write_tables(path, "capture", recording_tables(recording), recording_attributes(recording), summary=summary)
 
 
 def load_capture(path: str | os.PathLike) -> Recording:

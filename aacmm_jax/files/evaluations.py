@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -25,12 +26,15 @@ from .captures import (
 from .hdf5 import Stored, Table, Variable, axes, columns, need, numbering, read_tables, undamaged, write_tables
 
 
-def save_evaluation(path: str | os.PathLike, record: EvaluationRecord) -> None:
+def save_evaluation(
+    path: str | os.PathLike, record: EvaluationRecord, summary: Mapping[str, Any] | None = None
+) -> None:
     """Write an evaluation of a capture to HDF5, whole or not at all.
 
     Args:
         path: the file to write.
         record: the evaluation, from `acceptance.evaluation_of`.
+        summary: what ``aacmm show`` prints of the file; without it, ``show`` computes it, which takes longer.
 
     Raises:
         InputError: the file cannot be written, or a name holds a character that no file can hold.
@@ -45,7 +49,7 @@ def save_evaluation(path: str | os.PathLike, record: EvaluationRecord) -> None:
         "u_test_mm": record.u_test,
         **{f"most_{name}": value for name, value in record.maxima.items()},
     }
-    write_tables(path, "evaluation", tables, attributes)
+    write_tables(path, "evaluation", tables, attributes, summary=summary)
 
 
 def _limit_table(limits: Mapping[str, Limit | float]) -> Table:
@@ -124,12 +128,13 @@ def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
         )
 
 
-def save_points(path: str | os.PathLike, record: PointsRecord) -> None:
+def save_points(path: str | os.PathLike, record: PointsRecord, summary: Mapping[str, Any] | None = None) -> None:
     """Write an evaluation of points to HDF5, whole or not at all.
 
     Args:
         path: the file to write.
         record: the measured points, the limits and the uncertainty of the test.
+        summary: what ``aacmm show`` prints of the file; without it, ``show`` computes it, which takes longer.
 
     Raises:
         InputError: the file cannot be written, or a name holds a character that no file can hold.
@@ -158,7 +163,7 @@ def save_points(path: str | os.PathLike, record: PointsRecord) -> None:
         "reach_mm": None if reach is None else reach.radius,
         "shoulder_mm": None if reach is None else reach.shoulder,
     }
-    write_tables(path, "evaluation", tables, attributes)
+    write_tables(path, "evaluation", tables, attributes, summary=summary)
 
 
 def load_points(path: str | os.PathLike) -> PointsRecord:

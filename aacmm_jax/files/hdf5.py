@@ -2,6 +2,7 @@
 
 import contextlib
 import datetime
+import json
 import os
 import shlex
 import sys
@@ -60,10 +61,12 @@ def write_tables(
     extend: Callable[[Any], None] | None = None,
     advice: str = ELSEWHERE,
     streamed: bool = False,
+    summary: Mapping[str, Any] | None = None,
 ) -> None:
     """Write an HDF5 file of tables that netCDF-4 readers (xarray) understand. ``kind`` says what the file is.
 
-    ``extend`` is given the open file at the end, to add to it. ``streamed``: more than memory holds.
+    ``summary`` is what `read_summary` returns. ``extend`` is given the open file at the end, to add to it.
+    ``streamed``: more than memory holds.
     """
     import h5py
 
@@ -71,6 +74,8 @@ def write_tables(
         _write_attributes(file, provenance(kind) | dict(attributes))
         for name, table in tables.items():
             _write_group(file.create_group(name, track_order=True), table)
+        if summary is not None:
+            file.create_dataset("summary", data=json.dumps(summary), dtype=h5py.string_dtype())
         if extend is not None:
             extend(file)
 
@@ -207,6 +212,33 @@ def read_tables(path: str | os.PathLike, kinds: Sequence[str], without: Sequence
     """
     import h5py
 
+    with _opened(path, kinds) as (file, attributes):
+        groups = {name: group for name, group in file.items() if isinstance(group, h5py.Group) and name not in without}
+        tables = {name: {key: _values(item) for key, item in group.items()} for name, group in groups.items()}
+        table_attributes = {
+            name: {key: _plain(value) for key, value in group.attrs.items()} for name, group in groups.items()
+        }
+    return Stored(attributes, tables, table_attributes)
+
+
+def read_summary(path: str | os.PathLike, kinds: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """The root attributes of a file, and the summary in it; None where none is stored, or by another version.
+
+    Reading it takes none of the libraries that computing it takes. Raises `InputError` as `read_tables` does.
+    """
+    from importlib import metadata
+
+    with _opened(path, kinds) as (file, attributes):
+        current = attributes["package_version"] == metadata.version("aacmm_jax")
+        text = file["summary"].asstr()[()] if current and "summary" in file else None
+        return attributes, None if text is None else json.loads(text)
+
+
+@contextlib.contextmanager
+def _opened(path: str | os.PathLike, kinds: Sequence[str]) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """The open file and its root attributes, where it is one of aacmm of a kind that is asked for."""
+    import h5py
+
     path = Path(path)
     check_readable(path)
     if not h5py.is_hdf5(path):
@@ -214,12 +246,7 @@ def read_tables(path: str | os.PathLike, kinds: Sequence[str], without: Sequence
     with undamaged(path), h5py.File(path, "r") as file:
         attributes = {key: _plain(value) for key, value in file.attrs.items()}
         _check_kind(path, attributes, kinds)
-        groups = {name: group for name, group in file.items() if isinstance(group, h5py.Group) and name not in without}
-        tables = {name: {key: _values(item) for key, item in group.items()} for name, group in groups.items()}
-        table_attributes = {
-            name: {key: _plain(value) for key, value in group.attrs.items()} for name, group in groups.items()
-        }
-    return Stored(attributes, tables, table_attributes)
+        yield file, attributes
 
 
 @contextlib.contextmanager

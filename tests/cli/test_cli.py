@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 
+import h5py
 import numpy as np
 import pytest
 
@@ -256,3 +257,26 @@ def test_what_cannot_be_determined_is_a_warning_or_with_strict_an_error(aacmm):
 def test_plan_refuses(aacmm, arguments, text):
     refused = aacmm("plan", "cheng2018-simulation", "-o", "plan.csv", *arguments, expect=2)
     assert text in refused.stderr
+
+
+def test_the_stored_summary_is_what_is_computed(aacmm, tmp_path):
+    """``show`` prints the summary in the file; without one, or with that of another version, it computes the same."""
+    aacmm("simulate", "panda", "-o", "p.h5", "--socket", "A=400,0,300", "--socket", "B=300,400,400", "--length", "A,B")
+    aacmm("calibrate", "p.h5", "-o", "c.h5", "--no-cross-validate")
+    aacmm("evaluate", "c.h5", "p.h5", "-o", "e.h5")
+    for name in ("p.h5", "c.h5", "e.h5"):
+        stored = json.loads(aacmm("show", name, "--json").stdout)
+        with h5py.File(tmp_path / name, "a") as file:
+            file.attrs["package_version"] = "0.0.1"
+            del file["summary"]
+            file["summary"] = '{"kind": "of another version"}'
+        assert json.loads(aacmm("show", name, "--json").stdout) == stored
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["calibrate", "--help"], ["show", "capture.h5"]])
+def test_short_commands_import_no_jax(aacmm, tmp_path, arguments):
+    aacmm("simulate", "panda", "-o", "capture.h5", "--socket", "A=400,0,300", "--poses", 2)
+    code = "import sys\nfrom aacmm_jax.cli import main\ntry:\n main()\nfinally:\n assert 'jax' not in sys.modules"
+    command = [sys.executable, "-c", code, *arguments]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
