@@ -1,7 +1,5 @@
 """Cheng et al. 2018: its noise-free simulations from random starts, and its published experiment."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -28,20 +26,10 @@ def test_noise_free_simulation_from_random_starts(paper_arm, paper_capture, numb
     bounds, truth = box(space, number), np.asarray(space.vector(paper_arm))
     fraction = np.random.default_rng(number).uniform(size=(STARTS, len(space.names)))
     lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)
-    starts = jnp.asarray(lower + (upper - lower) * fraction)
-
-    @jax.jit
-    def run(starts):
-        def one(start):
-            result = aj.calibrate(paper_arm, paper_capture, bounds, start=start, hold=hold)
-            return result.stage1.converged, result.stage1.de, result.parameters
-
-        return jax.lax.map(one, starts, batch_size=20)
-
-    converged, de, parameters = run(starts)
-    error = np.abs(np.asarray(parameters) - truth)
-    assert np.all(converged)
-    assert np.max(de) <= 1e-9
+    many = aj.calibrate_many(paper_arm, paper_capture, lower, upper, lower + (upper - lower) * fraction, hold=hold)
+    error = np.abs(many.parameters - truth)
+    assert np.all(many.stage1.converged)
+    assert np.max(many.stage1.de) <= 1e-9
     assert np.max(error[:, space.lengths]) <= 1e-8
     assert np.max(error[:, ~space.lengths]) <= 1e-11
 

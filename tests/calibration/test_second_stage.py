@@ -337,6 +337,7 @@ def test_results_of_one_and_of_many_have_the_same_fields(paper_arm, capture, cut
     assert value_of(one.arm, "d_1") == value_of(paper_arm, "d_1")
 
 
+@pytest.mark.slow  # test_coverage of tests/uncertainty has the paper's arm
 def test_coverage_of_a_shipped_arm_with_a_fixed_length_along_the_probe():
     """100 calibrations of the Panda, which fixes d_7: every 95 % interval holds the truth (probe_z did in 6 of 100
     once).

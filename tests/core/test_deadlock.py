@@ -62,6 +62,7 @@ def two_batches_of_calibrations(method):
     return both, jnp.asarray(starts)
 
 
+@pytest.mark.slow
 def test_independent_factorisations_and_calibrations_in_one_program_end():
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
     done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, timeout=300, capture_output=True, text=True)
