@@ -158,9 +158,10 @@ def central(function, point, direction, step=2e-3):
     return sum(w * (at(n) - at(-n)) for n, w in ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))) / step
 
 
-@pytest.fixture(scope="module")
-def differentiated(paper_arm, noisy_capture, space):
-    """A calibration as a function of angles, bounds, length and start; and its forward and reverse derivative."""
+@pytest.fixture(scope="module", params=["identify", pytest.param("calibrate", marks=pytest.mark.slow)])
+def differentiated(request, paper_arm, noisy_capture, space):
+    """Both stages, or the first, as a function of angles, bounds, length and start; and its derivatives."""
+    solve = {"identify": aj.identify, "calibrate": aj.calibrate}[request.param]
 
     def run(q, box, length, start):
         cut = noisy_capture.sizes[0]
@@ -169,11 +170,11 @@ def differentiated(paper_arm, noisy_capture, space):
         capture = aj.Capture({"A": q[:cut], "B": q[cut:]}, references)
         bounds = aj.Bounds(space, box[0], box[1])
         inside = jnp.clip(start, box[0], box[1])
-        return aj.calibrate(paper_arm, capture, bounds, start=inside, hold="d_3").parameters / space.scale
+        return solve(paper_arm, capture, bounds, start=inside, hold="d_3").parameters / space.scale
 
     forward = jax.jit(lambda point, direction: jax.jvp(run, point, direction)[1])
     reverse = jax.jit(lambda point, cotangent: jax.vjp(run, *point)[1](cotangent))
-    return run, forward, reverse
+    return request.param, run, forward, reverse
 
 
 # Reverse has forward within it, and takes all inputs at once; the suite compiles reverse alone.
@@ -184,7 +185,7 @@ def test_derivatives_of_a_calibration(paper_arm, noisy_capture, space, start, di
     """Forward and reverse against central differences, relative to the largest component, with bounds active and
     not; and repeated from where it ended, so that k = 1 before the scale anchor is adjusted."""
     boxed = case != "inactive"
-    run, forward, reverse = differentiated
+    what, run, forward, reverse = differentiated
     bounds = aj.Bounds.around(paper_arm, space)
     lower, upper = np.array(bounds.lower), np.array(bounds.upper)
     if boxed:  # the box cuts off the minima of a_2 and alpha_3, which then end on a bound
@@ -205,7 +206,8 @@ def test_derivatives_of_a_calibration(paper_arm, noisy_capture, space, start, di
     )
     expected = central(run, point, direction)
     size = float(jnp.max(jnp.abs(expected)))
-    assert (size > 1e-3) == (by != "bounds" or boxed)  # a bound that does not bind has no influence
+    # A bound that does not bind has no influence, and a length none on the first stage.
+    assert (size > 1e-3) == (boxed if by == "bounds" else by == "angles" or what == "calibrate")
     if mode == "forward":
         found = forward(point, direction)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * size + 1e-8)
