@@ -248,12 +248,12 @@ class BatchTask(NamedTuple):
         lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)
         return BatchTask.of(arm, capture, lower, upper, start, self.space, anchor, self.noise, self.effort, sigma)
 
-    def identified_again(self, rows: np.ndarray, start: np.ndarray) -> ManyIdentifications:
-        """Stage 1 of some of the problems, with the adjusted length kept at its start."""
+    def identified_again(self, rows: np.ndarray, start: np.ndarray, hold: str | None) -> ManyIdentifications:
+        """Stage 1 of some of the problems, with another anchor."""
         problems = self.problems
         arm, capture, lower, upper = rows_of(rows, self.arm, self.capture, problems.lower, problems.upper)
         bounds = Bounds(self.space, lower, upper)
-        return self.repeated(arm, capture, bounds, start, self.anchor.adjusted).identified()
+        return self.repeated(arm, capture, bounds, start, hold).identified()
 
     def run(self, chunk: range, device: Any) -> tuple[np.ndarray, ...]:
         """Solve one chunk, filled up to the capacity with copies of its first problem, which are never begun."""
