@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from ..core.arguments import checked_arguments
 from ..core.errors import some
 from ..data.noise import Noise
 from ..data.recording import Recording
@@ -87,6 +88,7 @@ class CalibrationRecord(NamedTuple):
         return {stage: evaluate(arm, self.recording.capture) for stage, arm in arms.items()}
 
 
+@checked_arguments
 def record_of(calibration: Calibration, recording: Recording) -> CalibrationRecord:
     """The record of a calibration.
 
@@ -134,6 +136,7 @@ def _reason(calibration: Calibration) -> str:
     return f"{sentence.rstrip('.')}: {some(sides)}." if bool(result == Reason.scale) and sides else sentence
 
 
+@checked_arguments
 def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> Uncertainty:
     """The uncertainty of a calibration, just made or loaded from a file; of an identification, given its scale anchor.
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..core._compat import inside_trace
+from ..core.arguments import check_finite, checked_arguments
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.namespace import AnyArray, compiled, namespace, to_jax, to_numpy
@@ -33,6 +34,7 @@ from .task import Task, fit, fit_repeatability
 _MAX_STEPS = 300
 
 
+@checked_arguments
 def identify(
     arm: Arm,
     capture: Capture,
@@ -88,6 +90,7 @@ def _checked(
     many: str,
 ) -> Task:
     check_single(arm, capture, bounds, many)
+    check_finite(arm=arm, capture=capture, noise=noise)
     space = based_on(bounds.space, arm)
     bounds = Bounds(space, bounds.lower, bounds.upper)
     vector = space.vector() if start is None else as_array(start, "the start")
@@ -102,6 +105,7 @@ def _checked(
     return Task(Measurement.of(capture), bounds, vector, noise, anchor, noise_model, max_steps)
 
 
+@checked_arguments
 def calibrate(
     arm: Arm,
     capture: Capture,
