@@ -28,12 +28,12 @@ def checked_arguments(function: Function) -> Function:
     function's own business.
     """
     signature = inspect.signature(function)
-    kinds = {name: kinds for name, parameter in signature.parameters.items() if (kinds := _kinds(parameter.annotation))}
+    kinds = {name: _kinds(parameter.annotation) for name, parameter in signature.parameters.items()}
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         for name, value in signature.bind(*args, **kwargs).arguments.items():
-            if name in kinds:
+            if kinds[name]:
                 _check(name, value, kinds[name])
         return function(*args, **kwargs)
 
