@@ -91,7 +91,8 @@ def check_finite(**trees: Any) -> None:
     """Raise `InputError` where a known array in a tree holds a value that is not finite."""
     for what, tree in trees.items():
         for leaf in jax.tree.leaves(tree):
-            if eqx.is_inexact_array_like(leaf) and is_concrete(leaf) and not np.all(np.isfinite(np.asarray(leaf))):
+            known = isinstance(leaf, jax.Array | np.ndarray | np.generic) and is_concrete(leaf)
+            if known and not np.all(np.isfinite(np.asarray(leaf))):
                 raise InputError(f"the {what} holds a value that is not finite; make it anew from finite numbers.")
 
 
