@@ -362,38 +362,193 @@ def test_values_are_not_looked_at_inside_jit(given):
 WRONG_TYPES = {
     "aj.Capture({'A': q, 'B': -q}, [('A', 'B', 100.0)])": "no reference length; give aj.ReferenceLength(",
     "aj.Capture({1: q})": "a socket has the name 1",
-    "aj.identify(arm, capture, bounds, noise=2.0)": "noise is a float; give aj.Noise(",
+    "aj.identify(arm, capture, bounds, noise=2.0)": "noise is a float; give a Noise.",
     "aj.simulate(arm, {'A': (400, 200, 300)}, poses=2.5)": "'A' is given 2.5 poses; give at least one, and a whole",
-    "aj.simulate(arm, {'A': (400, 200, 300)}, poses=1, seed=1.5)": "the seed is 1.5; give a whole number",
+    "aj.simulate(arm, {'A': (400, 200, 300)}, poses=1, seed=1.5)": "seed is 1.5; give a whole number",
     "aj.load_arm(None)": "by its name or from a file, not from None",
     "aj.Arm(alpha=[0.0], a=[1.0], d=[0.0], limits=[0, 1])": "limits must be 1 row of (lowest, highest)",
 }
+
+
+# Refused as well, in one sentence of whatever words.
+REFUSED = """
+aj.Capture({"A": masked(q)})
+aj.Capture({"A": list(masked(q))})
+aj.Capture({"A": q.astype("datetime64[s]")})
+aj.Capture({"A": None})
+aj.Capture("A")
+aj.Capture(q)
+aj.Capture({"A": q}, 5)
+aj.Capture({"A": q, "B": q[:1]}, [None])
+aj.ReferenceLength("A", "B", masked(np.array(200.0)))
+aj.ReferenceLength("A", "B", "200")
+aj.ReferenceLength("A", "B", True)
+aj.ReferenceLength("A", "B", 200 + 1j)
+aj.ReferenceLength("A", "B", 200.0, u=None)
+aj.ReferenceLength(1, 2, 200.0)
+capture.select(5)
+capture.select([5])
+capture.select(without=None)
+aj.stack_captures(None)
+aj.stack_captures(capture)
+aj.stack_captures([capture, 5])
+aj.Arm(alpha=masked(np.ones(2)), a=[1.0, 2.0], d=[1.0, 2.0])
+arm.position(masked(q))
+aj.Noise(seating=masked(np.array(0.1)))
+aj.Noise(encoder_arcsec=True)
+aj.Bounds(5, bounds.lower, bounds.upper)
+aj.Bounds(space, masked(np.asarray(bounds.lower)), bounds.upper)
+aj.Bounds.around(arm, 5)
+aj.Bounds.around(arm, space, length="x")
+aj.Bounds.around(arm, space, override=5)
+aj.Bounds.around(arm, space, override={"d_3": "x"})
+aj.Parameters(5, ("d_3",))
+aj.Parameters(arm, "d_3")
+aj.Parameters(arm, ("d_99",))
+aj.Parameters(arm, ())
+aj.Parameters.free_of(5)
+aj.Parameters.free_of(arm, held=5)
+aj.perturbed_arm(space, length="x", angle=0.0)
+aj.perturbed_arm(space, length=1.0, angle=0.0, seed=True)
+aj.simulate(arm, {"A": (400, 200, 300)}, poses=True)
+aj.simulate(arm, {"A": (400, 200, 300)}, poses=2, seed=True)
+aj.simulate(arm, {"A": (400, 200, 300)}, poses=2, lengths=5)
+aj.simulate(arm, {"A": masked(np.array([400.0, 200.0, 300.0]))}, poses=2)
+aj.simulate(arm, 5, poses=2)
+aj.simulate(arm, {"A": (400, 200, 300)}, poses=2, noise={"seating": 0.1})
+aj.simulate(put_nan(arm, lambda x: x.d), {"A": (400, 200, 300)}, poses=2)
+aj.fix_scale(5, capture)
+aj.fix_scale(arm, 5)
+aj.fix_scale(arm, capture, sigma="x")
+aj.fix_scale(arm, capture, sigma=np.nan)
+aj.fix_scale(arm, capture, sigma=-1.0)
+aj.fix_scale(arm, capture, sigma=[1.0, 2.0])
+aj.fix_scale(put_nan(arm, lambda x: x.d), capture)
+aj.fix_scale(batch(arm), capture)
+aj.scale_from_lengths(masked(np.array([200.0, 999.0])), 200.0)
+aj.scale_from_lengths([200.0], 200.0, u=-1.0)
+aj.scale_from_lengths([200.0], 200.0, u="x")
+aj.identify(5, capture, bounds)
+aj.identify(arm, 5, bounds)
+aj.identify(arm, capture, None)
+aj.identify(arm, put_nan(capture, lambda x: x.q), bounds)
+aj.identify(arm, put_nan(capture, lambda x: x.lengths[0].value), bounds)
+aj.identify(arm, capture, put_nan(bounds, lambda x: x.lower))
+aj.identify(arm, capture, bounds, noise=put_nan(aj.Noise(seating=0.1), lambda x: x.seating))
+aj.identify(arm, capture, bounds, start=masked(np.asarray(space.vector())))
+aj.identify(arm, capture, bounds, max_steps=2.5)
+aj.identify(arm, capture, bounds, max_steps=None)
+aj.calibrate(arm, put_nan(capture, lambda x: x.q), bounds)
+aj.calibrate(put_nan(arm, lambda x: x.d), capture, bounds)
+aj.evaluate(5, capture)
+aj.evaluate(arm, None)
+aj.uncertainty_of(capture)
+aj.monte_carlo(5, capture)
+aj.monte_carlo(result, 5)
+aj.monte_carlo(result, capture, level="x")
+aj.monte_carlo(result, capture, level=np.nan)
+aj.monte_carlo(result, capture, most=np.nan)
+aj.monte_carlo(result, capture, digits=1.5)
+aj.monte_carlo(result, capture, seed=1.5)
+aj.monte_carlo(result, capture, seed=-1)
+aj.monte_carlo(result, capture, lengths=5)
+aj.bootstrap(5, capture)
+aj.bootstrap(result, capture, trials=100.5)
+aj.bootstrap(result, capture, level=2.0)
+aj.bootstrap(result, capture, seed=-1)
+aj.cross_validate(arm, capture, 5)
+aj.observability(arm, 5)
+aj.observability(put_nan(arm, lambda x: x.d), capture)
+aj.observability(arm, capture, sigma="x")
+aj.volumetric_uncertainty(result)
+aj.volumetric_uncertainty(aj.uncertainty_of(result), points=2.5)
+aj.volumetric_uncertainty(aj.uncertainty_of(result), seed=1.5)
+aj.calibration.record_of(result, 5)
+aj.model.repeatability(5, (1,))
+aj.model.repeatability(np.zeros((0, 3)), ())
+aj.model.repeatability(np.zeros((3, 3)), (1, 1))
+aj.model.repeatability(np.zeros((3, 3)), (2.5, 0.5))
+aj.model.repeatability(np.zeros((3, 3)), (4, -1))
+aj.model.repeatability(np.zeros((3, 2)), (3,))
+aj.model.repeatability(masked(np.zeros((3, 3))), (3,))
+jax.jit(aj.model.repeatability)(jnp.zeros((3, 3)), (2, 1))
+jax.vmap(aj.model.repeatability)(jnp.zeros((2, 3, 3)), (jnp.asarray([2, 2]), jnp.asarray([1, 1])))
+aj.least_squares(lambda y, _: jnp.zeros(0), jnp.ones(2))
+aj.least_squares(lambda y, _: y + 1j, jnp.ones(2))
+aj.least_squares(lambda y, _: y, "x")
+aj.least_squares(lambda y, _: y, jnp.zeros(0))
+aj.least_squares(lambda y, _: y, masked(np.ones(2)))
+aj.least_squares(lambda y, _: y, jnp.ones(2), max_steps=2.5)
+aj.identify_many(5, capture, bounds, start=start)
+aj.identify_many(arm, capture, bounds, start=start, slots=2.5)
+aj.identify_many(arm, capture, bounds, start=start, devices=5)
+aj.identify_many(arm, capture, bounds, start=start, devices=[])
+aj.identify_many(arm, capture, bounds, start=start, noise=5)
+jax.jit(lambda x: aj.identify_many(arm, capture, bounds, start=x).de)(start)
+jax.vmap(lambda x: aj.calibrate_many(arm, capture, bounds, start=x).de)(start[None])
+batch(result).active_names()
+batch(result.stage1).implausible_residual
+""".strip().splitlines()
+
+# Lengths that overflow, or no arm can have: data, and never called converged.
+NOT_CONVERGED = """
+aj.calibrate(arm, length(1e300), bounds)
+aj.calibrate(arm, length(1e-300), bounds)
+aj.calibrate(arm, length(1e7), bounds)
+aj.calibrate(arm, length(100.0, 1e300), bounds)
+aj.calibrate(arm, length(1e7), bounds, method="joint")
+""".strip().splitlines()
 
 
 def test_what_has_another_type():
     """In one process without that checker."""
     program = """
 import json, sys
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import aacmm_jax as aj
+
+def masked(values):
+    return np.ma.masked_array(values, mask=np.arange(values.size).reshape(values.shape) == 0)
+
+def put_nan(tree, where):
+    return eqx.tree_at(where, tree, jnp.full_like(where(tree), jnp.nan))
+
+def batch(tree):
+    return jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), tree)
+
+def length(*values):
+    return aj.Capture({"A": q, "B": q[:1]}, [aj.ReferenceLength("A", "B", *values)])
+
 q = np.random.default_rng(0).uniform(-1, 1, (10, 6))
 arm = aj.load_arm("cheng2018-simulation")
 space = aj.Parameters.free_of(arm)
 bounds = aj.Bounds.around(arm, space)
-capture = aj.Capture({"A": q, "B": q[:1]}, [aj.ReferenceLength("A", "B", 100.0)])
+capture = length(100.0)
+start = space.vector()[None]
+result = aj.calibrate(arm, capture, bounds, check_identifiability=False)
 said = []
 for call in json.load(sys.stdin):
     try:
-        said.append(repr(eval(call)))
+        found = eval(call)
+        said.append(f"returned, converged: {getattr(found, 'converged', None)}")
     except aj.InputError as error:
-        said.append(str(error))
+        said.append(f"InputError: {error}")
     except Exception as error:
         said.append(repr(error))
 print(json.dumps(said))
 """
     done = subprocess.run(
-        [sys.executable, "-c", program], input=json.dumps(list(WRONG_TYPES)), capture_output=True, text=True, check=True
+        [sys.executable, "-W", "ignore", "-c", program],
+        input=json.dumps([*WRONG_TYPES, *REFUSED, *NOT_CONVERGED]),
+        capture_output=True,
+        text=True,
+        check=True,
     )
-    said = dict(zip(WRONG_TYPES, json.loads(done.stdout), strict=True))
-    wrong = {call: said[call] for call, part in WRONG_TYPES.items() if part not in said[call] or "\n" in said[call]}
+    said = dict(zip([*WRONG_TYPES, *REFUSED, *NOT_CONVERGED], json.loads(done.stdout), strict=True))
+    expected = WRONG_TYPES | dict.fromkeys(REFUSED, "InputError: ")
+    expected |= dict.fromkeys(NOT_CONVERGED, "returned, converged: False")
+    wrong = {call: said[call] for call, part in expected.items() if part not in said[call] or "\n" in said[call]}
     assert not wrong

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arrays import Numbers, as_array
+from ..core.arguments import check_finite, checked_arguments, items_of
+from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.noise import Noise
@@ -37,6 +38,7 @@ _SLOTS_ELSEWHERE = 4096
 _ROUNDS = 64  # problems that a slot of one chunk takes at most, one after the other
 
 
+@checked_arguments
 def identify_many(
     arm: Arm,
     capture: Capture,
@@ -79,11 +81,13 @@ def identify_many(
     Raises:
         InputError: For shapes that do not fit, a lower bound above its upper one, and too few poses.
     """
+    _check_known("identify", arm, capture, lower, upper, start)
     lower, upper, space = _bounds_and_space(arm, lower, upper, space)
     effort = Effort(max_steps, chunk, slots, devices, workers)
     return BatchTask.of(arm, capture, lower, upper, start, space, hold, noise, effort).identified()
 
 
+@checked_arguments
 def calibrate_many(
     arm: Arm,
     capture: Capture,
@@ -120,6 +124,7 @@ def calibrate_many(
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many."
         )
+    _check_known("calibrate", arm, capture, lower, upper, start)
     lower, upper, space = _bounds_and_space(arm, lower, upper, space)
     effort = Effort(max_steps, chunk, slots, devices, workers)
     return calibrated(BatchTask.of(arm, capture, lower, upper, start, space, hold, noise, effort), method)
@@ -145,6 +150,15 @@ def calibrated(task: "BatchTask", method: str) -> ManyCalibrations:
         stage1=stage1,
         method=method,
     )
+
+
+def _check_known(single: str, *trees: Any) -> None:
+    """Raise `InputError` inside jit, vmap and derivatives: a batch is distributed over threads by its values."""
+    if not is_concrete(*jax.tree.leaves(trees)):
+        raise InputError(
+            f"{single}_many needs known values, but is called inside jit, vmap or a derivative; call it outside, "
+            f"or use jax.vmap of {single} there."
+        )
 
 
 def _bounds_and_space(
@@ -210,13 +224,16 @@ class BatchTask(NamedTuple):
         anchor = hold if isinstance(hold, ScaleAnchor) else scale_anchor(space, arm, hold, noise)
         check_joints(capture, space)
         if noise is not None:
+            check_finite(noise=noise)
             noise.check(arm.joints)
         check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
         for what in ("max_steps", "chunk", "slots", "workers"):
             number = getattr(effort, what)
             if number is not None and number < 1:
                 raise InputError(f"{what} is {number}; give at least 1, or leave it out.")
-        devices = jax.local_devices() if effort.devices is None else list(effort.devices)
+        devices = jax.local_devices() if effort.devices is None else items_of(effort.devices, "devices")
+        if not devices:
+            raise InputError("devices is empty; name at least one, or leave it out.")
         slots = effort.slots or _slots(devices, sum(capture.sizes))
         workers = effort.workers or _workers(devices)
         chunks = _chunks(size, slots, workers, effort.chunk)
@@ -248,12 +265,12 @@ class BatchTask(NamedTuple):
         lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)
         return BatchTask.of(arm, capture, lower, upper, start, self.space, anchor, self.noise, self.effort, sigma)
 
-    def identified_again(self, rows: np.ndarray, start: np.ndarray) -> ManyIdentifications:
-        """Stage 1 of some of the problems, with the adjusted length kept at its start."""
+    def identified_again(self, rows: np.ndarray, start: np.ndarray, hold: str | None) -> ManyIdentifications:
+        """Stage 1 of some of the problems, with another anchor."""
         problems = self.problems
         arm, capture, lower, upper = rows_of(rows, self.arm, self.capture, problems.lower, problems.upper)
         bounds = Bounds(self.space, lower, upper)
-        return self.repeated(arm, capture, bounds, start, self.anchor.adjusted).identified()
+        return self.repeated(arm, capture, bounds, start, hold).identified()
 
     def run(self, chunk: range, device: Any) -> tuple[np.ndarray, ...]:
         """Solve one chunk, filled up to the capacity with copies of its first problem, which are never begun."""

@@ -9,13 +9,13 @@ from ..core.arrays import is_concrete
 from ..core.errors import InputError
 from ..core.namespace import AnyArray
 from ..data.capture import Capture
-from ..data.noise import Noise, check_noise
+from ..data.noise import Noise
 from ..kinematics.arm import Arm, is_single
 from ..kinematics.parameters import Bounds, Parameters
 from ..kinematics.workspace import total_link_length
 from ..uncertainty.covariance import NOISE_MODELS, NoiseModel
 
-_PLAUSIBLE_SCALE = (0.5, 2.0)
+PLAUSIBLE_SCALE = (0.5, 2.0)
 # Repeatability of an arm or robot relative to the sum of its links: the paper's arm reaches 1e-5 (0.026 mm on 2.5 m).
 _RELATIVE_REPEATABILITY = 1e-5
 _IMPLAUSIBLE = 100.0  # residuals larger than that by this factor come from wrong data, not from an arm
@@ -75,7 +75,6 @@ def check_enough(sizes: tuple[int, ...], unknowns: int) -> None:
 def check_noise_model(noise_model: NoiseModel | None, noise: Noise | None, joints: int) -> NoiseModel:
     """The model of the tips' errors: by default the noise that is given, else one estimated from the residuals."""
     if noise is not None:
-        check_noise(noise)
         noise.check(joints)
     if noise_model is None:
         return "estimated" if noise is None else "given"
@@ -90,7 +89,7 @@ def check_noise_model(noise_model: NoiseModel | None, noise: Noise | None, joint
 
 def plausible(k: float) -> bool:
     """Whether a scale can be a calibration's at all, and not a mistaken unit or socket."""
-    return _PLAUSIBLE_SCALE[0] <= k <= _PLAUSIBLE_SCALE[1]
+    return PLAUSIBLE_SCALE[0] <= k <= PLAUSIBLE_SCALE[1]
 
 
 def largest_plausible_residual(arm: Arm, noise: Noise | None = None) -> float:

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from ..core.arguments import checked_arguments
 from ..core.errors import InputError
 from ..core.namespace import to_numpy
 from ..data.capture import Capture
@@ -43,6 +44,7 @@ def can_cross_validate(capture: Capture, parameters: int) -> bool:
     return 3 * (sum(poses.values()) - max(poses.values())) >= parameters
 
 
+@checked_arguments
 def cross_validate(
     arm: Arm,
     capture: Capture,

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..core.arguments import checked_arguments
 from ..core.errors import InputError
 from ..core.namespace import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
@@ -25,6 +26,7 @@ class Evaluation(eqx.Module):
     distances: Float[AnyArray, "*batch N"]  # of every pose's tip from its socket's centroid
 
 
+@checked_arguments
 def evaluate(arm: Arm, capture: Capture) -> Evaluation:
     """Repeatability and length errors of an arm on a capture; nothing is fitted but the sockets' positions.
 

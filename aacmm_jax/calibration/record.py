@@ -6,6 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from ..core.arguments import checked_arguments
+from ..core.errors import some
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..kinematics.parameters import ArmSpecification, Parameters
@@ -86,6 +88,7 @@ class CalibrationRecord(NamedTuple):
         return {stage: evaluate(arm, self.recording.capture) for stage, arm in arms.items()}
 
 
+@checked_arguments
 def record_of(calibration: Calibration, recording: Recording) -> CalibrationRecord:
     """The record of a calibration.
 
@@ -97,7 +100,6 @@ def record_of(calibration: Calibration, recording: Recording) -> CalibrationReco
         What a calibration file holds, as NumPy arrays.
     """
     nominal, stage1 = recording.nominal, calibration.stage1
-    result = calibration.result if bool(stage1.converged) else stage1.result
     return CalibrationRecord(
         recording=recording,
         stage1=nominal._replace(arm=stage1.arm, name=f"{nominal.name}, after stage 1"),
@@ -122,10 +124,19 @@ def record_of(calibration: Calibration, recording: Recording) -> CalibrationReco
         method=calibration.method,
         steps=int(calibration.steps),
         converged=bool(calibration.converged),
-        reason=Reason[result],
+        reason=_reason(calibration),
     )
 
 
+def _reason(calibration: Calibration) -> str:
+    """Why the calibration ended, in words; where bounds set the scale, with their names."""
+    result = calibration.result if bool(calibration.stage1.converged) else calibration.stage1.result
+    sides = [f"{name} ({side})" for name, side in calibration.active_names().items()]
+    sentence = Reason[result]
+    return f"{sentence.rstrip('.')}: {some(sides)}." if bool(result == Reason.scale) and sides else sentence
+
+
+@checked_arguments
 def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> Uncertainty:
     """The uncertainty of a calibration, just made or loaded from a file; of an identification, given its scale anchor.
 

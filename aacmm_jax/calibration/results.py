@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int
 from ..core._compat import member_numbers
 from ..core.arrays import Numbers, is_concrete
 from ..core.distributions import chi_square_quantile
-from ..core.namespace import AnyArray
+from ..core.errors import InputError
+from ..core.namespace import AnyArray, namespace
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
@@ -21,7 +22,7 @@ from ..model.metrics import Repeatability
 from ..model.scale import Scale
 from ..solver.reason import Reason, numbers_of
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance
-from .checks import largest_plausible_residual
+from .checks import PLAUSIBLE_SCALE, largest_plausible_residual
 from .scale_anchor import ScaleAnchor
 
 _GOOD = [int(member_numbers(reason)) for reason in (Reason.gradient, Reason.step, Reason.rounding)]
@@ -31,6 +32,7 @@ class AbstractResult(eqx.Module):
     """What the results of stage 1 and of a calibration have in common, of one problem and of many."""
 
     result: eqx.AbstractVar[Reason]
+    parameters: eqx.AbstractVar[Float[AnyArray, "*batch p"]]
 
     @property
     @abc.abstractmethod
@@ -54,9 +56,12 @@ class AbstractResult(eqx.Module):
 
     @property
     def converged(self) -> Bool[AnyArray, "*batch"]:
-        """Whether every solve ended at a minimum."""
-        both = converged(self._stage1.result) & converged(self.result)
-        return np.asarray(both) if is_concrete(both) else both
+        """Whether every solve ended at a minimum, with finite parameters and, in a calibration, a plausible k."""
+        k, xp = self._stage1.k, namespace(self.parameters)
+        good = converged(self._stage1.result) & converged(self.result) & xp.all(xp.isfinite(self.parameters), axis=-1)
+        if k is not None and self._stage1 is not self:
+            good = good & (k >= PLAUSIBLE_SCALE[0]) & (k <= PLAUSIBLE_SCALE[1])
+        return np.asarray(good) if is_concrete(good) else good
 
 
 class AbstractSingleResult(AbstractResult):
@@ -95,11 +100,20 @@ class AbstractSingleResult(AbstractResult):
     @property
     def implausible_residual(self) -> bool:
         """Whether the residual is a hundred times what an arm of this size can be, so that data and arm do not fit."""
+        self._check_single()
         return float(self.after.rms) > largest_plausible_residual(self.arm, self.given_noise)
 
     def active_names(self) -> dict[str, str]:
         """Parameters on a bound: name -> 'lower' or 'upper'."""
+        self._check_single()
         return active_names(self.space, self.active)
+
+    def _check_single(self) -> None:
+        if self.active.ndim != 1 or not is_concrete(self.active):
+            raise InputError(
+                "this result is a batch, or inside jit or vmap, where its values are not known; take one result of it "
+                "outside: jax.tree.map(lambda leaf: leaf[0], results)."
+            )
 
 
 class Identification(AbstractSingleResult):

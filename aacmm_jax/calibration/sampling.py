@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..core.arguments import checked_arguments
+from ..core.arrays import random_generator
 from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.noise import Noise
@@ -81,6 +83,7 @@ class Sampled(NamedTuple):
         return found
 
 
+@checked_arguments
 def monte_carlo(
     result: Calibration,
     capture: Capture,
@@ -118,10 +121,8 @@ def monte_carlo(
     """
     if digits not in (1, 2):
         raise InputError(f"digits is {digits}; give 1 or 2 significant digits of the uncertainty.")
-    if not 0 < level <= 0.9999:
-        raise InputError(f"level is {level:g}; give a probability between 0 and 0.9999, for example 0.95.")
-    if not isinstance(result, Calibration):
-        raise InputError("monte_carlo repeats a whole calibration; give the result of aj.calibrate.")
+    _check_level(level)
+    random_generator(seed)
     if noise is not None:
         noise.check(result.arm.joints)
     noise = result.noise if noise is None else noise
@@ -167,6 +168,7 @@ def monte_carlo(
     return task.sampled(result, np.concatenate(drawn), stable, failed, level, digits)
 
 
+@checked_arguments
 def bootstrap(
     result: Calibration, capture: Capture, *, trials: int = 2000, level: float = 0.95, seed: int = 0
 ) -> Sampled:
@@ -190,7 +192,8 @@ def bootstrap(
     """
     if trials < 100:
         raise InputError(f"{trials} trials show no distribution; ask for at least 100.")
-    random = np.random.default_rng(seed)
+    _check_level(level)
+    random = random_generator(seed)
     starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
     task = _RepeatedTask.of(result, capture, None)
     rows = np.concatenate(
@@ -204,6 +207,11 @@ def bootstrap(
     if len(found) < 10:
         raise InputError("hardly any bootstrap trial converges: too few poses a socket for this; record more.")
     return task.sampled(result, found, True, failed, level, 1)
+
+
+def _check_level(level: float) -> None:
+    if not 0 < level <= 0.9999:
+        raise InputError(f"level is {level:g}; give a probability between 0 and 0.9999, for example 0.95.")
 
 
 def numerical_tolerance(u: Float[np.ndarray, " q"], digits: int) -> Float[np.ndarray, " q"]:
@@ -255,7 +263,10 @@ class _RepeatedTask(NamedTuple):
         cls, result: Calibration, capture: Capture, lengths: tuple[np.ndarray, np.ndarray] | None
     ) -> "_RepeatedTask":
         if lengths is not None and (
-            len(lengths) != 2 or np.ndim(lengths[0]) != 2 or np.shape(lengths[0]) != np.shape(lengths[1])
+            not isinstance(lengths, tuple | list)
+            or len(lengths) != 2
+            or np.ndim(lengths[0]) != 2
+            or np.shape(lengths[0]) != np.shape(lengths[1])
         ):
             raise InputError(
                 "lengths must be two arrays of poses, (v, n) each: where each length starts, and where it ends."

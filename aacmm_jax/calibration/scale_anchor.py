@@ -74,11 +74,14 @@ def scale_anchor(space: Parameters, arm: Arm, hold: str | None, noise: Noise | N
         )
     fixed = fixed_lengths(arm, space)
     one = _first(arm) if known and fixed else None
-    set_by = fixed if one is not None and hold in (None, "longest") and _sets_scale(one, space, fixed, noise) else ()
+    columns = None if one is None else _columns_of_both(one, space, fixed)
+    set_by = ()
+    if one is not None and columns is not None and hold in (None, "longest"):
+        set_by = fixed if _sets_scale(one, columns, space, fixed, noise) else ()
     longest = _longest_link(lengths, arm if known else None)
     if hold == "longest":
         hold = None if set_by else longest
-    partners = _partners(arm, one, space, fixed) if one is not None else None if fixed else ((), ())
+    partners = _partners(arm, columns, space, fixed) if columns is not None else None if fixed else ((), ())
     adjusted = hold if hold is not None and _carries_scale(hold, longest, arm if known else None) else longest
     return ScaleAnchor(hold, None if hold is None and not known else adjusted, set_by, partners)
 
@@ -120,14 +123,21 @@ def _first(arm: Arm) -> Arm:
         return jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1])[0], arm)
 
 
-def _columns(arm: Arm, names: tuple[str, ...]) -> Float[np.ndarray, "rows k"]:
-    """Derivatives of the tips by named parameters at random configurations, less what they have in common."""
+def _columns_of_both(arm: Arm, space: Parameters, fixed: tuple[str, ...]) -> list[Float[np.ndarray, "rows k"]]:
+    """Derivatives of the tips by free parameters and fixed lengths at random configurations, less what they have in
+    common: of the nominal arm and of a neighbouring one, which has no special position."""
+    names, found = (*space.names, *fixed), []
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_CONFIGURATIONS, arm.joints))
-    columns = jacobian_at(arm, q, names)
-    return (columns - columns.mean(axis=0)).reshape(-1, len(names))
+    with jax.ensure_compile_time_eval():
+        for one in (arm, neighbouring_arm(arm, space.names)):
+            columns = jacobian_at(one, q, names)
+            found.append((columns - columns.mean(axis=0)).reshape(-1, len(names)))
+    return found
 
 
-def _sets_scale(arm: Arm, space: Parameters, fixed: tuple[str, ...], noise: Noise | None) -> bool:
+def _sets_scale(
+    arm: Arm, columns: list[np.ndarray], space: Parameters, fixed: tuple[str, ...], noise: Noise | None
+) -> bool:
     """Whether repeatability determines the scale well, given the fixed lengths.
 
     A common relative change of the fixed lengths is imitated by the free parameters as well as they can; the residual,
@@ -135,13 +145,12 @@ def _sets_scale(arm: Arm, space: Parameters, fixed: tuple[str, ...], noise: Nois
     real one does not share, so the smaller of two residuals counts: at the nominal arm, and at a neighbouring one.
     """
     sizes = []
-    with jax.ensure_compile_time_eval():
-        for one in (arm, neighbouring_arm(arm, space.names)):
-            columns = _columns(one, (*space.names, *fixed))
-            free = columns[:, : len(space.names)] * natural_steps(space.names)
-            scaling = columns[:, len(space.names) :] @ np.array([value_of(arm, name) for name in fixed])
-            residual = scaling - free @ np.linalg.lstsq(free, scaling, rcond=1e-10)[0]
-            sizes.append(float(np.sqrt(np.mean(residual**2))))
+    values = np.array([value_of(arm, name) for name in fixed])
+    for rows in columns:
+        free = rows[:, : len(space.names)] * natural_steps(space.names)
+        scaling = rows[:, len(space.names) :] @ values
+        residual = scaling - free @ np.linalg.lstsq(free, scaling, rcond=1e-10)[0]
+        sizes.append(float(np.sqrt(np.mean(residual**2))))
     return _scatter(arm, noise) <= _LARGEST_UNCERTAINTY * math.sqrt(_EQUATIONS) * min(sizes)
 
 
@@ -153,7 +162,7 @@ def _scatter(arm: Arm, noise: Noise | None) -> float:
     return math.hypot(encoder * total_link_length(arm) / 2, float(noise.seating))
 
 
-def _partners(arm: Arm, one: Arm, space: Parameters, fixed: tuple[str, ...]) -> Partners | None:
+def _partners(arm: Arm, columns: list[np.ndarray], space: Parameters, fixed: tuple[str, ...]) -> Partners | None:
     """Free lengths that replace the fixed ones exactly, whatever the free angles are.
 
     Tips are linear in the lengths, so the weights are a linear least squares; that they serve two arms with different
@@ -163,9 +172,9 @@ def _partners(arm: Arm, one: Arm, space: Parameters, fixed: tuple[str, ...]) -> 
     if any(np.ptp(value_of(arm, name)) > 0 for name in angles):
         return None  # the arms of this batch have different fixed angles
     free = tuple(name for name in space.names if is_length(name) and name != "d_1")
-    with jax.ensure_compile_time_eval():
-        rows = np.concatenate([_columns(other, (*free, *fixed)) for other in (one, neighbouring_arm(one, space.names))])
-    replaceable, wanted = rows[:, : len(free)], rows[:, len(free) :]
+    rows = np.concatenate(columns)
+    replaceable = rows[:, [space.names.index(name) for name in free]]
+    wanted = rows[:, len(space.names) :]
     weights = np.linalg.lstsq(replaceable, wanted, rcond=1e-10)[0] if free else np.zeros((0, len(fixed)))
     if np.any(np.linalg.norm(wanted - replaceable @ weights, axis=0) > _EXACT * np.linalg.norm(wanted, axis=0) + 1e-12):
         return None

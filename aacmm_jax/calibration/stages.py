@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..core._compat import inside_trace
+from ..core.arguments import check_finite, checked_arguments
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.namespace import AnyArray, compiled, namespace, to_jax, to_numpy
@@ -33,6 +34,7 @@ from .task import Task, fit, fit_repeatability
 _MAX_STEPS = 300
 
 
+@checked_arguments
 def identify(
     arm: Arm,
     capture: Capture,
@@ -88,6 +90,7 @@ def _checked(
     many: str,
 ) -> Task:
     check_single(arm, capture, bounds, many)
+    check_finite(arm=arm, capture=capture, noise=noise)
     space = based_on(bounds.space, arm)
     bounds = Bounds(space, bounds.lower, bounds.upper)
     vector = space.vector() if start is None else as_array(start, "the start")
@@ -102,6 +105,7 @@ def _checked(
     return Task(Measurement.of(capture), bounds, vector, noise, anchor, noise_model, max_steps)
 
 
+@checked_arguments
 def calibrate(
     arm: Arm,
     capture: Capture,
@@ -258,10 +262,12 @@ def _calibration(
     steps: Int[AnyArray, ""],
     result: Reason,
     parameter_covariance: ParameterCovariance,
+    sigma: Float[AnyArray, ""],
     conditional_on: Int[AnyArray, " p"] | None = None,
 ) -> Calibration:
-    """The result of a calibration that ended with these parameters. ``conditional_on`` are the active bounds that its
-    covariance takes as exact; by default ``active``."""
+    """The result of a calibration that ended with these parameters, and with tips that scatter by ``sigma`` (mm).
+
+    ``conditional_on`` are the active bounds that its covariance takes as exact; by default ``active``."""
     assert stage1.scale is not None
     space = task.space
     start, calibrated = space.arm(task.start), space.arm(parameters)
@@ -275,7 +281,7 @@ def _calibration(
         measurement,
         active if conditional_on is None else conditional_on,
         task.bounds,
-        stage1.after.sigma,
+        sigma,
     )
     return Calibration(
         arm=calibrated,
@@ -316,7 +322,16 @@ def _divided(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]:
     # Divided, a length may have left its bound, which stage 1's covariance takes as exact all the same.
     conditional_on = xp.where(active != 0, active, stage1.active)
     result = _calibration(
-        task, stage1, "two-stage", scaled, active, stage1.steps, stage1.result, parameter_covariance, conditional_on
+        task,
+        stage1,
+        "two-stage",
+        scaled,
+        active,
+        stage1.steps,
+        stage1.result,
+        parameter_covariance,
+        stage1.after.sigma,
+        conditional_on,
     )
     return result, adjust
 
@@ -326,13 +341,12 @@ def _adjusted(task: Task, by_division: Calibration) -> Calibration:
     """Stage 2 where the division leaves the box, or would need a fixed length to move."""
     xp = namespace(task, by_division)
     stage1, space, name = by_division.stage1, task.space, task.anchor.adjusted
-    assert stage1.scale is not None
     assert name is not None
-    scaled = space.arm(by_division.parameters)
-    sigma = stage1.after.sigma / stage1.scale.value
-    measurement = task.measurement.weighted(scaled.geometry, task.noise)
-    adjusted = adjust_anchor(task, measurement, by_division.parameters, sigma)
+    measurement = task.measurement.weighted(space.arm(by_division.parameters).geometry, task.noise)
+    adjusted = adjust_anchor(task, measurement, by_division.parameters)
     arm, active = space.arm(adjusted.parameters), task.bounds.active(adjusted.parameters)
+    # Stage 1's own does not do: bounds that do not act on this solution may have acted on that one.
+    sigma = repeatability(arm.position(measurement.q), measurement.sizes, fitted=len(space.names) - 1).sigma
     is_anchor = xp.asarray([other == name for other in space.names])
     solved = propagation.propagate_solve(
         arm, space, measurement, (active != 0) | is_anchor, sigma, task.noise_model, task.noise
@@ -342,7 +356,7 @@ def _adjusted(task: Task, by_division: Calibration) -> Calibration:
     ).parameter_covariance
     steps = stage1.steps + adjusted.steps
     return _calibration(
-        task, stage1, "two-stage", adjusted.parameters, active, steps, adjusted.result, parameter_covariance
+        task, stage1, "two-stage", adjusted.parameters, active, steps, adjusted.result, parameter_covariance, sigma
     )
 
 
@@ -365,4 +379,14 @@ def _joint(task: Task) -> Calibration:
         space.arm(found.parameters), space, measurement, active != 0, sigma, task.noise_model, task.noise, joint_weights
     ).parameter_covariance
     steps = stage1.steps + found.steps
-    return _calibration(task, stage1, "joint", found.parameters, active, steps, found.result, parameter_covariance)
+    return _calibration(
+        task,
+        stage1,
+        "joint",
+        found.parameters,
+        active,
+        steps,
+        found.result,
+        parameter_covariance,
+        stage1.after.sigma,
+    )

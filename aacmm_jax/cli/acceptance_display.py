@@ -103,7 +103,8 @@ def _acceptance(console: Console, summary: dict[str, Any]) -> None:
     console.print(
         "U: the uncertainty of the artefacts"
         + (" and --test-u-mm" if summary["u_test_mm"] else "")
-        + ". Decisions by ISO 14253-1."
+        + "."
+        + (" Decisions by ISO 14253-1." if limited else "")
         + (" As found: the nominal arm; as left: the calibrated one." if before else "")
     )
 

@@ -110,15 +110,13 @@ def _identified(console: Console, cells: list[dict[str, Any]], names: list[str])
         last = [parameter] if any(often) else []
         table.add_row(str(cell["cell"]), *levels, f"{cell['trials_run']:,}", *rates, *last)
     print_table(console, table)
-    failed = {}
-    for cell in cells:
-        for reason in ("max_steps", "stalled", "nonfinite"):
-            failed[reason] = failed.get(reason, 0) + cell["reasons"][reason]
     words = {
         "max_steps": "reached the step limit",
         "stalled": "stalled",
         "nonfinite": "had a pose that the true arm cannot take",
+        "scale": "could not reach k = 1 because of active bounds",
     }
+    failed = {reason: sum(cell["reasons"][reason] for cell in cells) for reason in words}
     for reason, count in failed.items():
         if count:
             console.print(

@@ -31,8 +31,10 @@ def as_array(value: Any, what: str, like: Any = ()) -> AnyArray:
 
     It is NumPy's where ``value`` and ``like``, an array or a tree with at least one, are NumPy's; else JAX's.
     """
+    if _is_masked(value):
+        raise InputError(f"{what} holds masked values, which would count as if they were not; remove them.")
     if isinstance(value, np.ndarray) and value.dtype == np.float64 and jax.tree.leaves(like) and namespace(like) is np:
-        return value
+        return np.asarray(value)
     check_x64()
     try:
         array = value if isinstance(value, jax.Array) else np.asarray(value)
@@ -43,6 +45,13 @@ def as_array(value: Any, what: str, like: Any = ()) -> AnyArray:
     if not jnp.issubdtype(array.dtype, jnp.number) or jnp.issubdtype(array.dtype, jnp.complexfloating):
         raise InputError(f"{what} must be real numbers, but holds {_KINDS.get(array.dtype.kind, 'something else')}.")
     return jnp.asarray(array, dtype=jnp.float64)
+
+
+def _is_masked(value: Any) -> bool:
+    """Whether an array, or a list of arrays, hides values behind a mask, which NumPy and JAX drop without a word."""
+    if isinstance(value, list | tuple):
+        return any(_is_masked(item) for item in value if isinstance(item, list | tuple | np.ma.MaskedArray))
+    return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))
 
 
 def joined(rows: Sequence[Array | np.ndarray], axis: int = 0, new: bool = False) -> Array:
@@ -59,9 +68,17 @@ def joined(rows: Sequence[Array | np.ndarray], axis: int = 0, new: bool = False)
 
 def random_key(seed: int) -> Array:
     """The key of JAX for a seed, or `InputError`."""
-    if not isinstance(seed, int | np.integer) or not -LARGEST_INTEGER <= seed <= LARGEST_INTEGER:
+    whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
+    if not whole or not -LARGEST_INTEGER <= seed <= LARGEST_INTEGER:
         raise InputError(f"the seed is {seed!r}; give a whole number of at most 63 bits.")
     return jax.random.key(seed)
+
+
+def random_generator(seed: int) -> np.random.Generator:
+    """The generator of NumPy for a seed, or `InputError`."""
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise InputError(f"the seed is {seed!r}; give a whole number, zero or positive.")
+    return np.random.default_rng(seed)
 
 
 def random_numbers(kind: Literal["normal", "uniform"], key: Array, shape: tuple[int, ...]) -> np.ndarray:

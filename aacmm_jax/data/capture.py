@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..core.arguments import items_of
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError, nearest
 from ..core.namespace import AnyArray
@@ -36,6 +37,9 @@ class ReferenceLength(eqx.Module):
     u: Float[AnyArray, ""]
 
     def __init__(self, start: str, end: str, value: Numbers, u: Numbers = 0.0):
+        for name in (start, end):
+            if not isinstance(name, str):
+                raise InputError(f"an end of a reference length is {name!r}; give the name of a socket.")
         self.start, self.end = start, end
         where = f"reference length '{start}' to '{end}'"
         self.value, self.u = as_array(value, where), as_array(u, f"u of {where}")
@@ -74,6 +78,11 @@ class Capture(eqx.Module):
     sizes: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, sockets: Mapping[str, Numbers], lengths: Iterable[ReferenceLength] | ReferenceLength = ()):
+        if not isinstance(sockets, Mapping):
+            raise InputError(
+                f"the sockets are a {type(sockets).__name__}; give a dictionary of names and readings: "
+                '{"A": q}, q of shape (poses, joints).'
+            )
         if not sockets:
             raise InputError("a capture needs at least one socket with poses.")
         blocks = {name: _checked_angles(name, angles) for name, angles in sockets.items()}
@@ -88,7 +97,7 @@ class Capture(eqx.Module):
         self.q = joined(list(blocks.values()))
         self.names = tuple(blocks)
         self.sizes = tuple(block.shape[0] for block in blocks.values())
-        self.lengths = (lengths,) if isinstance(lengths, ReferenceLength) else tuple(lengths)
+        self.lengths = (lengths,) if isinstance(lengths, ReferenceLength) else tuple(items_of(lengths, "lengths"))
         for length in self.lengths:
             if not isinstance(length, ReferenceLength):
                 raise InputError(f"{length!r} is no reference length; give aj.ReferenceLength(start, end, value, u).")
@@ -136,7 +145,8 @@ class Capture(eqx.Module):
         """
         check_one_capture(self)
         only = [only] if isinstance(only, str) else only
-        without = [without] if isinstance(without, str) else list(without)
+        only = None if only is None else items_of(only, "only")
+        without = [without] if isinstance(without, str) else items_of(without, "without")
         kept = list(self.names) if only is None else _matching(self.names, only)
         dropped = _matching(self.names, without)
         kept = [name for name in kept if name not in dropped]
@@ -158,6 +168,8 @@ def check_one_capture(capture: Capture) -> None:
 def _matching(names: Sequence[str], patterns: Iterable[str]) -> list[str]:
     chosen: set[str] = set()
     for pattern in patterns:
+        if not isinstance(pattern, str):
+            raise InputError(f"a pattern is {pattern!r}; give names of sockets, or shell patterns.")
         found = {name for name in names if name == pattern or fnmatch.fnmatchcase(name, pattern)}
         if not found:
             raise InputError(f"no socket matches '{pattern}'{nearest(pattern, names)}")
@@ -217,7 +229,10 @@ def stack_captures(captures: Iterable[Capture]) -> Capture:
     Raises:
         InputError: Where there is none, one is a batch, or they differ in shape.
     """
-    captures = list(captures)
+    captures = items_of(captures, "captures")
+    for capture in captures:
+        if not isinstance(capture, Capture):
+            raise InputError(f"a capture to stack is a {type(capture).__name__}; give a list of aj.Capture.")
     if not captures:
         raise InputError("there is no capture to stack; give at least one.")
     for capture in captures:

@@ -82,12 +82,6 @@ class Noise(eqx.Module):
             )
 
 
-def check_noise(noise: object) -> None:
-    """Raise `InputError` for what is no `Noise`, such as a number."""
-    if not isinstance(noise, Noise):
-        raise InputError(f"noise is a {type(noise).__name__}; give aj.Noise(encoder_arcsec=..., seating=...).")
-
-
 def noise_of(encoder: Float[AnyArray, "..."], seating: Float[AnyArray, ""]) -> Noise:
     """Noise of these standard deviations, rad and mm, as computed: nothing is converted or checked."""
     return eqx.tree_at(lambda noise: (noise.encoder, noise.seating), Noise(), (encoder, seating))

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..core.arguments import check_finite, checked_arguments, items_of
 from ..core.arrays import Numbers, as_floats, random_key, random_numbers
 from ..core.errors import InputError, nearest
 from ..core.namespace import AnyArray, to_numpy
@@ -15,9 +16,10 @@ from ..core.units import ARCSEC
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture, ReferenceLength
-from .noise import Noise, check_noise
+from .noise import Noise
 
 
+@checked_arguments
 def simulate(
     arm: Arm,
     sockets: Mapping[str, Numbers],
@@ -58,8 +60,9 @@ def simulate(
     noise = _noise(noise, encoder_arcsec, seating, resolution_arcsec)
     if not is_single(arm):
         raise InputError("simulate takes one arm, not a batch; take one of it first.")
+    check_finite(arm=arm, noise=noise)
     noise.check_joints(arm.joints)
-    if not sockets:
+    if not isinstance(sockets, Mapping) or not sockets:
         raise InputError("simulate needs at least one socket with its position.")
     limits_array = np.asarray(joint_limits(arm, limits))
     arm, noise = to_numpy((arm, noise))
@@ -94,7 +97,6 @@ def _noise(noise: Any, encoder_arcsec: Any, seating: Any, resolution_arcsec: Any
             raise InputError(f"{what} is {value:g}; noise must be zero or positive.")
     if noise is None:
         return Noise(**given)
-    check_noise(noise)
     if given:
         raise InputError(f"simulate is given noise and {' and '.join(given)}; put all of it into noise.")
     return noise
@@ -116,18 +118,18 @@ def _counts(points: Mapping[str, AnyArray], poses: int | Mapping[str, int]) -> d
         if name not in points:
             raise InputError(f"poses are given for the unknown socket '{name}'{nearest(name, points)}")
     for name, count in counts.items():
-        if not isinstance(count, int | np.integer) or count < 1:
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise InputError(f"socket '{name}' is given {count} poses; give at least one, and a whole number.")
     return counts
 
 
 def _reference_lengths(points: Mapping[str, AnyArray], lengths: Iterable, key: Array) -> list[ReferenceLength]:
     drawn = []
-    for number, length in enumerate(lengths):
+    for number, length in enumerate(items_of(lengths, "lengths")):
         if isinstance(length, ReferenceLength):
             drawn.append(length)
             continue
-        if isinstance(length, str) or len(length) not in (2, 3):
+        if not isinstance(length, tuple | list) or len(length) not in (2, 3):
             raise InputError(f"reference length {length!r} must be (socket, socket) or (socket, socket, u), u in mm.")
         start, end = length[:2]
         for name in (start, end):

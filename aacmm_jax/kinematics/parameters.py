@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..core.arguments import checked_arguments, items_of, real_number
 from ..core.arrays import Numbers, as_array, is_concrete, joined, random_key
 from ..core.errors import InputError
 from ..core.namespace import AnyArray, namespace
@@ -38,10 +39,14 @@ class Parameters(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     def __check_init__(self):
+        if not isinstance(self.base, Arm) or not isinstance(self.names, tuple) or not self.names:
+            raise InputError("Parameters takes an arm and a tuple of the names of its free parameters, at least one.")
+        _indices(self.base.joints, self.names)
         if len(set(self.names)) != len(self.names):
             _unique_names(self.base, self.names, "names")
 
     @classmethod
+    @checked_arguments
     def free_of(cls, arm: Arm, *, held: Iterable[str] | None = None, free: Iterable[str] = ()) -> "Parameters":
         """Free parameters by name: by default the 4n - 3 of Cheng et al. 2018, in their order.
 
@@ -181,7 +186,7 @@ def _indices(joints: int, names: tuple[str, ...]) -> tuple[tuple[str, int], ...]
 def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
     if isinstance(names, str):
         names = (names,)
-    names = tuple(names)
+    names = tuple(items_of(names, what))
     for name in names:
         locate(arm.joints, name)
         if names.count(name) > 1:
@@ -206,6 +211,8 @@ class Bounds(eqx.Module):
     upper: Float[AnyArray, " p"]
 
     def __init__(self, space: Parameters, lower: Numbers, upper: Numbers):
+        if not isinstance(space, Parameters):
+            raise InputError(f"the space is a {type(space).__name__}; give aj.Parameters.")
         self.space = space
         self.lower = as_array(lower, "lower", like=space)
         self.upper = as_array(upper, "upper", like=space)
@@ -225,6 +232,7 @@ class Bounds(eqx.Module):
                 )
 
     @classmethod
+    @checked_arguments
     def around(
         cls,
         arm: Arm,
@@ -247,7 +255,10 @@ class Bounds(eqx.Module):
             InputError: A half-width is negative, a name is not free, or the arm does not fit the parameters.
         """
         widths = np.where(space.lengths, float(length), float(angle))
+        if not isinstance(override, Mapping | None):
+            raise InputError("override is no dictionary; give half-widths by name, such as {'d_3': 20.0}.")
         for name, width in (override or {}).items():
+            real_number(width, f"the half-width of {name}")
             widths[space.index(name)] = float(width)
         if not np.all(widths >= 0):
             i = int(np.argmin(widths >= 0))
@@ -262,6 +273,7 @@ class Bounds(eqx.Module):
         return xp.where(on_lower, -1, xp.where(on_upper, 1, 0))
 
 
+@checked_arguments
 def perturbed_arm(space: Parameters, *, length: float, angle: float, seed: int = 0) -> Arm:
     """The space's base arm with random errors of its free parameters, uniform and independent, as of manufacture.
 

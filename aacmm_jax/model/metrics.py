@@ -6,6 +6,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ..core.arguments import items_of
+from ..core.arrays import as_array, is_concrete
+from ..core.errors import InputError
 from ..core.namespace import AnyArray, namespace
 from .socket_sums import largest_of_sockets, means_over_sockets, to_poses
 
@@ -39,8 +42,18 @@ def repeatability(tips: Float[AnyArray, "N 3"], sizes: Sequence[int], *, fitted:
 
     Returns:
         Metrics over all sockets and socket by socket, mm; NaN where no socket has two poses.
+
+    Raises:
+        InputError: Sizes and tips do not fit, or sizes are traced.
     """
-    sizes, counts, rows, xp = tuple(sizes), np.asarray(sizes), tips.T, namespace(tips)
+    tips, sizes = as_array(tips, "tips", like=np.zeros(0)), tuple(items_of(sizes, "sizes"))
+    if not is_concrete(*sizes):
+        raise InputError("sizes must be known numbers; under jit or vmap close over them, or make them static.")
+    if not sizes or not all(isinstance(size, int | np.integer) and size > 0 for size in sizes):
+        raise InputError(f"sizes are {sizes}; give the number of tips of each socket, whole and positive.")
+    if tips.shape != (sum(sizes), 3):
+        raise InputError(f"tips has shape {tips.shape}, but sizes add up to {sum(sizes)}; give ({sum(sizes)}, 3).")
+    counts, rows, xp = np.asarray(sizes), tips.T, namespace(tips)
     centroids = means_over_sockets(rows, sizes)
     squared = xp.sum((rows - to_poses(centroids, sizes)) ** 2, axis=0)
     distances = _root(squared)

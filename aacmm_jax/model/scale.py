@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..core.arguments import check_finite, checked_arguments
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
 from ..core.namespace import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
-from ..kinematics.arm import Arm, with_arrays
+from ..kinematics.arm import Arm, is_single, with_arrays
 from ..kinematics.parameters import Parameters
 from .measurement import Measurement, length_covariance
 from .metrics import repeatability
@@ -80,6 +81,7 @@ def replaced_lengths(space: Parameters, arm: Arm, partners: Partners) -> Float[A
     return fixed @ np.array(weights).T
 
 
+@checked_arguments
 def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> ScaleFix:
     """Stage 2: k from every reference length of a capture, and the arm divided by it.
 
@@ -104,6 +106,11 @@ def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> Scal
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one between two of its sockets."
         )
+    check_finite(arm=arm, capture=capture)
+    if not is_single(arm):
+        raise InputError("the arm is a batch, but one scale is fixed here; map over its arms with jax.vmap.")
+    if sigma is not None and is_concrete(sigma) and sigma < 0:
+        raise InputError(f"sigma is {float(sigma):g} mm; a standard deviation must be zero or positive.")
     scatter = None if sigma is None else as_array(sigma, "sigma", like=np.zeros(0))
     return to_jax(_fixed(*to_numpy((arm, Measurement.of(capture), scatter))))
 
@@ -140,6 +147,7 @@ def scale_and_weights(
     return Scale(value, xp.sqrt(xp.maximum(predicted, observed)), measured, measurement.nominal), relative
 
 
+@checked_arguments
 def scale_from_lengths(measured: Numbers, nominal: Numbers, u: float = 0.0) -> Scale:
     """k from repeated measurements of a length, measured / nominal (Cheng et al. 2018, section 2.3).
 
@@ -168,6 +176,8 @@ def scale_from_lengths(measured: Numbers, nominal: Numbers, u: float = 0.0) -> S
             raise InputError(f"{what} must be a list of at least one length, in mm.")
         if is_concrete(values) and not np.all(np.isfinite(np.asarray(values)) & (np.asarray(values) > 0)):
             raise InputError(f"{what} holds {np.asarray(values).min():g} mm; a length must be positive and finite.")
+    if is_concrete(u) and not 0 <= float(u) < np.inf:
+        raise InputError(f"u is {float(u):g} mm; a standard uncertainty must be zero or positive, and finite.")
     ratio = measured / nominal
     count = ratio.shape[0]
     value = jnp.mean(ratio)

@@ -4,9 +4,8 @@ An unknown on a bound with the gradient pushing outwards is pinned: it is left o
 step of the others is clipped to the box, and what the model predicts is computed for the *clipped* step.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +21,7 @@ Number = Float[AnyArray, "*slots"]
 _MAX_RAISES = 200  # of the damping, for one step
 
 
-class QuadraticModel(eqx.Module):
+class QuadraticModel(NamedTuple):
     """The quadratic model of the cost at one point: all that a step needs from one evaluation of f and its Jacobian
     J."""
 
@@ -37,7 +36,7 @@ class QuadraticModel(eqx.Module):
         return xp.isfinite(self.cost) & xp.isfinite(sums)
 
 
-class Box(eqx.Module):
+class Box(NamedTuple):
     """The bounds as flat vectors, and the natural step of each unknown (None: the columns of J decide, as in
     MINPACK)."""
 
@@ -73,7 +72,7 @@ class Box(eqx.Module):
         return xp.max(step, axis=-1) / xp.sqrt(2 * xp.maximum(model.cost, np.finfo(np.float64).tiny))
 
 
-class Step(eqx.Module):
+class Step(NamedTuple):
     """What is tried next."""
 
     trial: Flat

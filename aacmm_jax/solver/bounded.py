@@ -11,7 +11,8 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ..core.arrays import is_concrete
+from ..core.arguments import whole_number
+from ..core.arrays import as_array, is_concrete
 from ..core.errors import InputError
 from ..core.namespace import AnyArray
 from ..core.x64 import check_x64
@@ -80,6 +81,8 @@ def _evaluate(fn: Callable, unravel: Callable, flat: Flat, args: PyTree) -> tupl
     def residual(point: Flat) -> tuple[Array, tuple[Array, PyTree]]:
         out, aux = fn(unravel(point), args)
         value = ravel_pytree(out)[0]
+        if not value.size or jnp.iscomplexobj(value):
+            raise InputError("the residual must be real numbers, at least one; look at what the function returns.")
         return value, (value, aux)
 
     jacobian, (value, aux) = jax.jacfwd(residual, has_aux=True)(flat)
@@ -123,7 +126,12 @@ def least_squares(
         InputError: Where a lower bound is above its upper one, or bounds do not fit the start.
     """
     check_x64()
-    y0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.float64), y0)
+    y0 = jax.tree.map(lambda leaf: jnp.asarray(as_array(leaf, "the start")), y0)
+    if not sum(leaf.size for leaf in jax.tree.leaves(y0)):
+        raise InputError("the start holds no number, so nothing is unknown; give at least one.")
+    whole_number(max_steps, "max_steps")
+    if max_steps < 1:
+        raise InputError(f"max_steps is {max_steps}; give at least 1.")
     given = {"lower": (lower, -jnp.inf), "upper": (upper, jnp.inf), "scale": (scale, 1.0)}
     options = {
         what: tree if tree is None else _expanded(y0, tree, absent, what) for what, (tree, absent) in given.items()

@@ -52,6 +52,8 @@ def with_active_bounds(
     xp = namespace(known, arm, space, measurement, active, bounds, sigma, anchor)
     if anchor is None and not measurement.ends:
         return known  # nothing determines the scale: it cannot be distinguished from a near-degenerate direction
+    if xp is np and not np.any(active):
+        return known
     fixed = xp.asarray(np.array([name == anchor for name in space.names]))
     sigma = xp.maximum(sigma, LEAST_SIGMA)
     plain = dataclasses.replace(measurement, weights=None)

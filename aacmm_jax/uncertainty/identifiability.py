@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ..core.arguments import check_finite, checked_arguments
 from ..core.namespace import AnyArray, compiled, namespace, to_numpy
 from ..data.capture import Capture, ReferenceLength, check_one_capture
 from ..data.noise import Noise, tip_covariances
@@ -94,6 +95,7 @@ class Observability(NamedTuple):
         return found
 
 
+@checked_arguments
 def observability(
     arm: Arm,
     capture: Capture,
@@ -125,6 +127,7 @@ def observability(
     if space is None:
         space = Parameters.free_of(arm) if bounds is None else bounds.space
     check_one_capture(capture)
+    check_finite(arm=arm, capture=capture, noise=noise)
     check_joints(capture, space)
     arm, capture, space, noise, bounds = to_numpy((arm, capture, space, noise, bounds))
     if noise is not None:

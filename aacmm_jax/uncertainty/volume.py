@@ -6,6 +6,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ..core.arguments import checked_arguments
+from ..core.arrays import random_generator
 from ..core.errors import InputError
 from ..core.linear_algebra import semidefinite_eigen
 from ..core.namespace import AnyArray, compiled, namespace, to_numpy
@@ -48,6 +50,7 @@ class VolumetricUncertainty(NamedTuple):
         return found
 
 
+@checked_arguments
 def volumetric_uncertainty(
     uncertainty: Uncertainty, *, points: int = 400, length: float | None = None, limits: Any = None, seed: int = 0
 ) -> VolumetricUncertainty:
@@ -66,10 +69,6 @@ def volumetric_uncertainty(
     Raises:
         InputError: no length of this size can be placed within the joint limits.
     """
-    if not isinstance(uncertainty, Uncertainty):
-        raise InputError(
-            "volumetric_uncertainty takes an uncertainty; make one of a calibration with aj.uncertainty_of(result)."
-        )
     length = default_length(uncertainty.arm) if length is None else length
     start, end = sample_lengths(uncertainty.arm, points, length=length, limits=limits, seed=seed)
     tips, covariance, plain, read = _volume(to_numpy(uncertainty), start, end)
@@ -104,7 +103,7 @@ def sample_lengths(
     if count < 1:
         raise InputError(f"points is {count}; give at least one.")
     random, allowed = (
-        np.random.default_rng(seed),
+        random_generator(seed),
         np.asarray(joint_limits(arm, None if limits is None else np.asarray(limits).tolist())),
     )
     draw = lambda m: random.uniform(allowed[:, 0], allowed[:, 1], (m, arm.joints))  # noqa: E731

@@ -227,6 +227,59 @@ def test_a_bound_on_the_adjusted_length(too_long, capture, cut):
     assert [record.converged for record in records] == [True, True]
 
 
+def tight(paper_arm, width: float, **nominal: float) -> tuple[aj.Arm, aj.Bounds]:
+    """A nominal arm and bounds that leave room for a wrong scale to the longest link alone."""
+    arm = with_values(paper_arm, **nominal)
+    space = aj.Parameters.free_of(arm)
+    others = [name for name, length in zip(space.names, space.lengths, strict=True) if length and name != "d_3"]
+    return arm, aj.Bounds.around(arm, space, length=15.0, override=dict.fromkeys(others, width))
+
+
+# Where bounds act, log k changes less than the anchor, or against it, and crosses zero more than once.
+@pytest.mark.parametrize("width", [0.05, 0.2, 1.0])
+@pytest.mark.parametrize("d_3", [753.0, 745.0])
+def test_the_anchor_is_adjusted_however_much_bounds_act_from_the_start(paper_arm, capture, width, d_3):
+    """The arm lies in the box, so that it is found, and with the covariance of a start at the arm itself."""
+    arm, bounds = tight(paper_arm, width, d_3=d_3)
+    result = aj.calibrate(arm, capture, bounds)
+    assert bool(result.converged)
+    assert float(result.length_after[0]) == pytest.approx(float(capture.lengths[0].value), abs=1e-8)
+    near = aj.calibrate(arm, capture, bounds, start=bounds.space.vector(paper_arm))
+    np.testing.assert_allclose(result.parameters, near.parameters, atol=1e-7)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(result.covariance)), np.sqrt(np.diag(near.covariance)), rtol=1e-3, atol=1e-12
+    )
+    many = aj.calibrate_many(arm, capture, bounds, start=bounds.space.vector(arm)[None])
+    assert bool(many.converged[0])
+    np.testing.assert_allclose(many.parameters[0], result.parameters, atol=1e-7)
+
+
+def test_covariance_depends_on_the_solution_and_not_on_the_start(paper_arm, capture):
+    """A bound that only the scaled arm is on: stage 1 leaves small residuals from one start, and large ones from the
+    other."""
+    arm, bounds = tight(paper_arm, 15.0, d_3=753.0)
+    i = bounds.space.index("probe_z")
+    bounds = aj.Bounds(bounds.space, bounds.lower.at[i].set(float(paper_arm.probe[2]) + 0.3), bounds.upper)
+    starts = [np.clip(bounds.space.vector(one), bounds.lower, bounds.upper) for one in (arm, paper_arm)]
+    far, near = (aj.calibrate(arm, capture, bounds, start=start) for start in starts)
+    assert float(near.stage1.after.sigma) > 2 * float(far.stage1.after.sigma)
+    np.testing.assert_allclose(far.parameters, near.parameters, atol=1e-7)
+    u = [np.sqrt(np.diag(result.covariance)) for result in (far, near)]
+    np.testing.assert_allclose(u[0], u[1], rtol=1e-5, atol=1e-12)
+
+
+def test_bounds_that_allow_no_scale_are_named(paper_arm, capture):
+    """a_2 is 2 mm too long and cannot be shortened, so the anchor alone would have to bring k to 1."""
+    arm, bounds = tight(paper_arm, 0.05, d_3=745.0, a_2=float(paper_arm.a[1]) + 2.0)
+    result = aj.calibrate(arm, capture, bounds)
+    record = aj.calibration.record_of(result, aj.Recording(capture, aj.kinematics.ArmSpecification(arm, "arm")))
+    assert (bool(result.converged), record.converged) == (False, False)
+    assert "because active bounds set the scale; widen these bounds: " in record.reason
+    assert "a_2 (lower)" in record.reason
+    many = aj.calibrate_many(arm, capture, bounds, start=bounds.space.vector(arm)[None])
+    assert (bool(many.converged[0]), bool((many.result == aj.Reason.scale)[0])) == (False, True)
+
+
 def test_many_start_inside_their_boxes(too_long, capture, cut):
     """The scale anchor too, which no step of stage 1 would bring back inside."""
     start = np.array(cut.space.vector(too_long))

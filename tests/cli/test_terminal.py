@@ -111,6 +111,17 @@ def test_acceptance_at_80_columns(monkeypatch, capsys):
     assert "…" not in shown
 
 
+@pytest.mark.parametrize(("limit", "decision", "said"), [(0.0415, "conforms", True), (None, None, False)])
+def test_a_decision_rule_is_named_only_where_there_is_a_limit(monkeypatch, capsys, limit, decision, said):
+    monkeypatch.setenv("COLUMNS", "200")
+    metric = {"name": "E_Uni", "value_mm": 0.03, "as_found_mm": None, "expanded_mm": 0.002, "limit_mm": limit}
+    metric |= {"decision": decision, "failing": 0, "parts": [], "where": ""}
+    test = {"standard": "ISO 10360-12:2016", "title": "articulated arms", "missing": [], "figures": [metric]}
+    summary = {"points": 9, "sockets": 2, "lengths": 1, "spheres": 0, "warnings": [], "u_test_mm": 0.0}
+    acceptance_display.points(summary | {"acceptance": [test]})
+    assert ("ISO 14253-1" in capsys.readouterr().out) == said
+
+
 @pytest.mark.filterwarnings("ignore::aacmm_jax.core.errors.IdentifiabilityWarning")
 def test_a_residual_that_no_arm_has_is_not_called_converged():
     """Positions and quaternions read as joint readings: every solve ends, and nothing was calibrated."""

@@ -55,11 +55,10 @@ def test_every_encoder_has_its_own_noise(paper_arm):
             ["simulate is given noise and seating", "put all of it into"],
         ),
         ({"noise": aj.Noise(), "encoder_arcsec": 0.0, "seating": 0.0}, ["noise and encoder_arcsec and seating"]),
-        ({"noise": {"seating": 0.1}}, ["noise is a dict", "aj.Noise("]),
         ({"noise": aj.Noise(encoder_arcsec=[1.0, 2.0])}, ["encoder_arcsec has 2 values", "6 joints"]),
         ({"encoder_arcsec": [1.0] * 6}, ["encoder_arcsec has shape (6,)", "noise=aj.Noise("]),
     ],
-    ids=["both", "both, zero", "a table", "two encoders", "short form a joint"],
+    ids=["both", "both, zero", "two encoders", "short form a joint"],
 )
 def test_noise_is_refused(paper_arm, noise, parts):
     assert_refused(lambda: recorded(paper_arm, **noise), *parts)
