@@ -28,13 +28,20 @@ if TYPE_CHECKING:
 else:
     AnyArray = Array | np.ndarray | np.generic
 
+_NUMPY = {np.ndarray, np.float64, np.bool_, float, int, bool, str, type(None)}
+
 Tree = TypeVar("Tree")
 Function = TypeVar("Function", bound=Callable)
 
 
 def namespace(*trees: Any) -> Any:
     """``numpy`` where every array in these trees is NumPy's, else ``jax.numpy``."""
-    return jnp if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(trees)) else np
+    for tree in trees:
+        if type(tree) in _NUMPY:  # most arguments, and ten times as fast
+            continue
+        if isinstance(tree, jax.Array) or any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(tree)):
+            return jnp
+    return np
 
 
 def to_numpy(tree: Tree) -> Tree:

@@ -197,6 +197,7 @@ def test_many_equal_single_ones_on_bounds_and_with_fixed_lengths(too_long, paper
     assert many.steps[1] == many.stage1.steps[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["two-stage", "joint"])
 def test_many_equal_single_ones_where_a_fixed_length_has_no_partner(paper_arm, method):
     """Divided by k such an arm is no smaller copy of stage 1's, so that its tips scatter more. Two lengths that
