@@ -104,7 +104,7 @@ def calibrate(
     from ..calibration.stages import calibrate as run
     from ..files.calibrations import save_calibration
     from ..files.captures import load_capture
-    from ..files.whole_file import fingerprint
+    from ..files.inputs import InputFile, fingerprint
     from ..summaries.calibration import calibration_summary
     from . import calibration_display
 
@@ -113,10 +113,10 @@ def calibrate(
         from ..plot.style import check_format
 
         check_format(figure)
-    recording = load_capture(capture)
+    recording = load_capture(read := InputFile(capture))
     recording = recording._replace(
         capture=recording.capture.select(only or None, without or ()),
-        sources=(fingerprint(capture), *recording.sources),
+        sources=(fingerprint(read), *recording.sources),
     )
     bounds = _bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])
     recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))

@@ -16,7 +16,7 @@ from ..data.simulation import simulate
 from ..files.arms import load_specification, save_arm
 from ..files.calibrations import save_calibration
 from ..files.captures import save_capture
-from ..files.whole_file import fingerprint
+from ..files.inputs import fingerprint
 from ..kinematics.parameters import perturbed_arm
 from ..summaries.calibration import calibration_summary, capture_summary
 

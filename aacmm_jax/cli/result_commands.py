@@ -8,7 +8,8 @@ import typer
 
 from ..core.errors import InputError
 from ..files.hdf5 import read_summary, read_tables
-from ..files.whole_file import fingerprint, write_text
+from ..files.inputs import InputFile, fingerprint
+from ..files.whole_file import write_text
 from .app import CalibrationFile, Json, Only, Without, app, check_outputs, examples, show_summary, with_spinner
 
 About = Annotated[
@@ -137,14 +138,15 @@ def _evaluated(
     from ..files.calibrations import load_calibration
     from ..files.captures import load_capture
     from ..files.evaluations import save_evaluation
-    from ..files.whole_file import fingerprint
+    from ..files.inputs import InputFile, fingerprint
     from ..summaries.evaluation import evaluation_summary
 
     check_outputs([output], [calibration, capture])
-    record, recording = load_calibration(calibration), load_capture(capture)
+    read = InputFile(calibration), InputFile(capture)
+    record, recording = load_calibration(read[0]), load_capture(read[1])
     recording = recording._replace(
         capture=recording.capture.select(choice[0] or None, choice[1] or ()),
-        sources=(fingerprint(calibration), fingerprint(capture), *recording.sources),
+        sources=(*map(fingerprint, read), *recording.sources),
     )
     found = evaluation_of(record, recording, limits=limits, u_test=u_test, maxima=maxima)
     summary = with_spinner("Evaluating", lambda: evaluation_summary(found))
@@ -210,7 +212,7 @@ def export(
     from ..files.calibrations import load_calibration
     from ..summaries.calibration import calibration_summary, parameters_csv
 
-    record = load_calibration(calibration)
+    record = load_calibration(read := InputFile(calibration))
     arms = {"calibrated": record.calibrated, "nominal": record.recording.nominal, "true": record.recording.true}
     arm = arms[which]
     if arm is None:
@@ -227,7 +229,7 @@ def export(
         "toml": lambda: specification_toml(arm, source=source),
         "json": lambda: json.dumps(calibration_summary(record), indent=2) + "\n",
         "csv": lambda: parameters_csv(record),
-        "dcc": lambda: _certificate(calibration, record, about),
+        "dcc": lambda: _certificate(read, record, about),
     }[form]()
     if output is None:
         typer.echo(text, nl=False)
@@ -236,7 +238,7 @@ def export(
         typer.echo(f"Written: {output}")
 
 
-def _certificate(calibration: Path, record: Any, about: Path | None) -> str:
+def _certificate(calibration: InputFile, record: Any, about: Path | None) -> str:
     from ..certificate import dcc_xml
     from ..files.administrative_data import AdministrativeData as Stated
     from ..files.administrative_data import read_administrative_data

@@ -1,5 +1,6 @@
 """Captures in HDF5: poses, reference lengths, touched spheres, the nominal arm and, for a simulation, the true arm."""
 
+import datetime
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,6 +18,7 @@ from .hdf5 import (
     Table,
     Variable,
     axes,
+    check_sense,
     columns,
     names_in,
     need,
@@ -174,7 +176,23 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     sources = tuple(stored.attributes.get("sources") or ())
     attributes = stored.attributes
     nominal = specification_of(path, stored, "nominal_arm")
+    arms = [nominal] if true is None else [nominal, true]
+    check_sense(
+        path,
+        {
+            "its arm has another number of joints than its readings": any(x.arm.joints != capture.joints for x in arms),
+            "the day of measurement is no date": not _is_date(attributes.get("measured", "")),
+            "its seed is no whole number": not isinstance(attributes.get("seed", 0), int),
+        },
+    )
     return Recording(capture, nominal, true, attributes.get("seed"), spheres, sources, attributes.get("measured", ""))
+
+
+def _is_date(text: str) -> bool:
+    try:
+        return not text or bool(datetime.date.fromisoformat(text[:10]))
+    except ValueError:
+        return False
 
 
 def arm_table(specification: ArmSpecification) -> Table:
@@ -224,6 +242,9 @@ def specification_of(path: str | os.PathLike, stored: Stored, table: str) -> Arm
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    widths = attributes.get("override_half_widths") or []
+    widths = [attributes.get("half_width_length_mm", 10.0), attributes.get("half_width_angle_rad", 0.0175), *widths]
+    check_sense(path, {"a half width is not positive and finite": not all(0 < width < np.inf for width in widths)})
     override = zip(attributes.get("override_names") or [], attributes.get("override_half_widths") or [], strict=True)
     return ArmSpecification(
         arm=arm,

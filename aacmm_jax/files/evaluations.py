@@ -23,7 +23,19 @@ from .captures import (
     sphere_table,
     spheres_of,
 )
-from .hdf5 import Stored, Table, Variable, axes, columns, need, numbering, read_tables, undamaged, write_tables
+from .hdf5 import (
+    Stored,
+    Table,
+    Variable,
+    axes,
+    check_sense,
+    columns,
+    need,
+    numbering,
+    read_tables,
+    undamaged,
+    write_tables,
+)
 
 
 def save_evaluation(
@@ -112,14 +124,24 @@ def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
     need(path, stored.tables, "calibrated_arm", "used", "limits")
     with undamaged(path):
         attributes = stored.attributes
-        maxima = {
+        given = {
             name.removeprefix("most_"): float(value) for name, value in attributes.items() if name.startswith("most_")
         }
-        if not set(maxima) <= set(MAXIMA) or not all(0 <= value < math.inf for value in maxima.values()):
-            raise ValueError("a limit that this package would not have written")
+        maxima = {name: given[name] for name in MAXIMA if name in given}
+        recording, calibrated = recording_of(path, stored), specification_of(path, stored, "calibrated_arm")
+        check_sense(
+            path,
+            {
+                "a limit is unknown": len(maxima) != len(given),
+                "a limit is negative or not finite": not all(0 <= value < math.inf for value in maxima.values()),
+                "its arm has another number of joints than its readings": calibrated.arm.joints
+                != recording.capture.joints,
+                "the uncertainty of the test is negative or not finite": not 0 <= attributes["u_test_mm"] < math.inf,
+            },
+        )
         return EvaluationRecord(
-            recording_of(path, stored),
-            specification_of(path, stored, "calibrated_arm"),
+            recording,
+            calibrated,
             frozenset(str(name) for name in stored.tables["used"]["used"]),
             tuple(map(str, np.atleast_1d(attributes.get("warnings") or []))),
             _limits_in(stored),
@@ -184,6 +206,19 @@ def load_points(path: str | os.PathLike) -> PointsRecord:
         table, attributes = stored.tables["points"], stored.attributes
         owner = np.asarray(table["socket"]).astype(str)
         sockets = {name: table["position"][owner == name] for name in dict.fromkeys(owner.tolist())}
+        check_sense(
+            path,
+            {
+                "a position is not three finite numbers": table["position"].shape != (len(owner), 3)
+                or not np.all(np.isfinite(table["position"])),
+                "the uncertainty of the test is negative or not finite": not 0 <= attributes["u_test_mm"] < math.inf,
+                "the reach is not positive and finite": not 0 < attributes.get("reach_mm", 1.0) < math.inf,
+                "the shoulder is not three finite numbers": not np.all(
+                    np.isfinite(attributes.get("shoulder_mm", [0.0] * 3))
+                )
+                or len(attributes.get("shoulder_mm", [0.0] * 3)) != 3,
+            },
+        )
         reach = None
         if attributes.get("reach_mm") is not None:
             reach = Reach(np.array(attributes["shoulder_mm"]), float(attributes["reach_mm"]))

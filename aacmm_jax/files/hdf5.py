@@ -2,6 +2,7 @@
 
 import contextlib
 import datetime
+import io
 import json
 import os
 import shlex
@@ -9,17 +10,22 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..core.errors import InputError
-from .whole_file import ELSEWHERE, check_readable, storable, storable_name, whole_file
+from .inputs import STREAMED, largest_file, open_input, storable_name
+from .whole_file import ELSEWHERE, storable, whole_file
+
+if TYPE_CHECKING:
+    from .hdf5_content import Content
 
 FORMAT = "aacmm_jax"
-
-
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+DIGESTS_SINCE = 2  # the first format version whose files contain a SHA-256 of their content
+BLOCK = "block"  # kind of the files of a study's blocks, which carry no provenance of their own
+_IN_MEMORY = 64 * 2**20  # bytes up to which a file is read at once, not in parts
 
 
 class Variable(NamedTuple):
@@ -70,6 +76,8 @@ def write_tables(
     """
     import h5py
 
+    from .hdf5_content import seal
+
     def fill(file: Any) -> None:
         _write_attributes(file, provenance(kind) | dict(attributes))
         for name, table in tables.items():
@@ -80,18 +88,40 @@ def write_tables(
             extend(file)
 
     with whole_file(path, advice) as temporary:
-        if streamed:
-            with _FailureKeepingFile(temporary) as stream:
-                with h5py.File(stream, "w", track_order=True) as file:
-                    fill(file)
-                stream.check()
+        if not streamed:
+            temporary.write_bytes(file_image(fill))
             return
-        # HDF5 builds the file in memory and Python writes it: on a full disk the HDF5 library crashes the process.
-        with h5py.File(temporary.name, "w", driver="core", backing_store=False, track_order=True) as file:
-            fill(file)
-            file.flush()
-            image = file.id.get_file_image()
-        temporary.write_bytes(image)
+        with _FailureKeepingFile(temporary) as stream:
+            with h5py.File(stream, "w", track_order=True) as file:
+                fill(file)
+                stream.check()
+                _add_digest(file)
+            stream.check()
+        with open(temporary, "rb+") as whole:
+            seal(whole)
+
+
+def file_image(fill: Callable[[Any], None]) -> bytes:
+    """The bytes of an HDF5 file that ``fill`` fills, with their digests.
+
+    HDF5 builds it in memory and Python writes it: on a full disk the HDF5 library crashes the process.
+    """
+    import h5py
+
+    from .hdf5_content import sealed
+
+    with h5py.File("image", "w", driver="core", backing_store=False, track_order=True) as file:
+        fill(file)
+        _add_digest(file)
+        file.flush()
+        return sealed(file.id.get_file_image())
+
+
+def _add_digest(file: Any) -> None:
+    from .hdf5_content import DIGEST, Content
+
+    own = 2**50  # no limit to what has just been written
+    file.attrs[DIGEST] = Content("the new file", file, own, own, file.attrs.get("parts")).digest()
 
 
 class _FailureKeepingFile:
@@ -210,13 +240,13 @@ def read_tables(path: str | os.PathLike, kinds: Sequence[str], without: Sequence
 
     Raises `InputError` where the file is missing, damaged, of another program or kind, or of a newer version.
     """
-    import h5py
-
-    with _opened(path, kinds) as (file, attributes):
-        groups = {name: group for name, group in file.items() if isinstance(group, h5py.Group) and name not in without}
-        tables = {name: {key: _values(item) for key, item in group.items()} for name, group in groups.items()}
+    with opened(path, kinds) as (content, attributes):
+        groups = {name: group for name, group in content.groups() if name not in without}
+        tables = {
+            name: {key: content.values(group, key) for key in content.names(group)} for name, group in groups.items()
+        }
         table_attributes = {
-            name: {key: _plain(value) for key, value in group.attrs.items()} for name, group in groups.items()
+            name: {key: _plain(value) for key, value in content.file[name].attrs.items()} for name in groups
         }
     return Stored(attributes, tables, table_attributes)
 
@@ -228,25 +258,55 @@ def read_summary(path: str | os.PathLike, kinds: Sequence[str]) -> tuple[dict[st
     """
     from importlib import metadata
 
-    with _opened(path, kinds) as (file, attributes):
+    with opened(path, kinds) as (content, attributes):
         current = attributes["package_version"] == metadata.version("aacmm_jax")
-        text = file["summary"].asstr()[()] if current and "summary" in file else None
-        return attributes, None if text is None else json.loads(text)
+        root = content.file.id
+        text = content.values(root, "summary") if current and "summary" in content.names(root) else None
+        return attributes, None if text is None else json.loads(str(text))
 
 
 @contextlib.contextmanager
-def _opened(path: str | os.PathLike, kinds: Sequence[str]) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """The open file and its root attributes, where it is one of aacmm of a kind that is asked for."""
+def opened(
+    path: str | os.PathLike, kinds: Sequence[str], *, verify: bool = True, bare: bool = False
+) -> Iterator[tuple["Content", dict[str, Any]]]:
+    """The content of a file and its root attributes, where it is one of aacmm of a kind that is asked for.
+
+    ``verify=False``: its digest has been verified before. ``bare``: a file without attributes is taken as it is.
+    Raises `InputError` where it is damaged.
+    """
     import h5py
 
-    path = Path(path)
-    check_readable(path)
-    if not h5py.is_hdf5(path):
-        raise InputError(f"{path} is not an HDF5 file, or it is damaged; name a file written by aacmm.")
-    with undamaged(path), h5py.File(path, "r") as file:
-        attributes = {key: _plain(value) for key, value in file.attrs.items()}
-        _check_kind(path, attributes, kinds)
-        yield file, attributes
+    from .hdf5_content import Content, is_sealed
+
+    study = "study" in kinds
+    with open_input(path, STREAMED if study else 1) as stream, undamaged(path):
+        size = stream.seek(0, os.SEEK_END)
+        stream.seek(0)
+        if stream.read(8) != b"\x89HDF\r\n\x1a\n":
+            raise InputError(f"{path} is not an HDF5 file, or it is damaged; name a file written by aacmm.")
+        stream.seek(0)
+        image = stream.read() if size <= _IN_MEMORY else None
+        untouched = verify and is_sealed(stream if image is None else io.BytesIO(image))
+        with h5py.File(stream if image is None else h5py.h5f.open_file_image(image), "r") as file:
+            attributes = {key: _plain(value) for key, value in file.attrs.items()}
+            parts = attributes.get("parts") if study else None
+            content = Content(path, file, size, largest_file(), parts)
+            if attributes or not bare:
+                _check_kind(path, attributes, kinds)
+                if verify:
+                    _verify(path, content, attributes, untouched)
+            yield content, attributes
+
+
+def _verify(path: str | os.PathLike, content: "Content", attributes: Mapping[str, Any], untouched: bool) -> None:
+    """Raise `InputError` where the content is not what was written; files of earlier versions carry no digest."""
+    from .hdf5_content import DIGEST
+
+    digest = attributes.get(DIGEST)
+    if digest is None and attributes["format_version"] < DIGESTS_SINCE:
+        return
+    if digest is None or not (untouched or content.digest() == digest):
+        raise InputError(f"{path} is damaged or was edited: its content does not match its SHA-256; make it again.")
 
 
 @contextlib.contextmanager
@@ -260,21 +320,38 @@ def undamaged(path: str | os.PathLike) -> Iterator[None]:
         raise InputError(f"{path} is damaged, cut short or was edited; make it again.") from error
 
 
-def _check_kind(path: Path, attributes: Mapping[str, Any], kinds: Sequence[str]) -> None:
+def _check_kind(path: str | os.PathLike, attributes: Mapping[str, Any], kinds: Sequence[str]) -> None:
     wanted = " or ".join(kinds)
     if attributes.get("format") != FORMAT:
         raise InputError(f"{path} is HDF5, but was not written by aacmm; name a {wanted} file.")
-    for name in ("created", "command", "package_version", "kind"):
+    for name in ("kind",) if kinds == (BLOCK,) else ("created", "command", "package_version", "kind"):
         if not isinstance(attributes.get(name), str):
             raise InputError(f"{path} lacks the attribute '{name}'; it is damaged or was edited; make it again.")
     version = attributes["format_version"]
+    if not isinstance(version, int) or version < 1:
+        raise InputError(f"{path} has the format version {version!r}; it is damaged or was edited; make it again.")
     if version > FORMAT_VERSION:
         raise InputError(
             f"{path} has format version {version}, newer than this package reads ({FORMAT_VERSION}); update aacmm_jax."
         )
+    check_sense(path, {"the time of writing is no date": not _is_time(attributes.get("created"))})
     if attributes["kind"] not in kinds:
         article = "an" if attributes["kind"][:1] in "aeiou" else "a"
         raise InputError(f"{path} holds {article} {attributes['kind']}; name a {wanted} file.")
+
+
+def _is_time(text: str | None) -> bool:
+    try:
+        return text is None or bool(datetime.datetime.fromisoformat(text))
+    except ValueError:
+        return False
+
+
+def check_sense(path: str | os.PathLike, problems: Mapping[str, Any]) -> None:
+    """Raise `InputError` where values of a file make no sense: with the first of ``problems`` that is true."""
+    for problem, found in problems.items():
+        if found:
+            raise InputError(f"{path} is damaged or was edited: {problem}; make it again.")
 
 
 def need(path: str | os.PathLike, names: Mapping[str, Any], *needed: str, of: str = "table") -> None:
@@ -289,10 +366,6 @@ def names_in(attribute: str | Sequence[str] | None) -> tuple[str, ...]:
     if isinstance(attribute, str):
         return tuple(name for name in attribute.split(",") if name)
     return tuple(attribute or ())
-
-
-def _values(dataset: Any) -> np.ndarray:
-    return dataset.asstr()[()] if dataset.dtype.kind == "O" else dataset[()]
 
 
 def _plain(value: Any) -> Any:

@@ -25,10 +25,10 @@ from ..data.capture import Capture, ReferenceLength
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
 from .arms import load_specification
+from .inputs import InputFile, fingerprint
 from .patterns import fields_of, fill, in_braces, matches
 from .text_table import read_numbers
 from .toml import Strict, each_once, read_toml
-from .whole_file import fingerprint
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _UNITS = {"rad": 1.0, "deg": DEG, "arcsec": ARCSEC}
@@ -154,7 +154,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         InputError: names the file, the place in it and what to do.
     """
     path = Path(path)
-    model = read_toml(path, _Manifest)
+    model = read_toml(manifest := InputFile(path), _Manifest)
     try:
         nominal = load_specification(_arm_source(path, model.arm))
         joints = nominal.arm.joints
@@ -163,11 +163,11 @@ def read_manifest(path: str | os.PathLike) -> Recording:
                 f"angles.columns picks {len(model.angles.columns)} columns, but the arm has {joints} joints; "
                 "pick one a joint."
             )
-        files = [path]
+        files = [manifest]
 
         def angles(file: Path) -> np.ndarray:
-            files.append(file)
-            table = read_numbers(file, model.angles.columns)
+            files.append(read := InputFile(file))
+            table = read_numbers(read, model.angles.columns)
             if table.shape[1] != joints:
                 raise InputError(
                     f"{file} has {table.shape[1]} columns, but the arm has {joints} joints; give one column a joint, "

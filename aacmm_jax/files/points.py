@@ -9,10 +9,10 @@ from ..acceptance.results import Measured
 from ..core.errors import InputError, nearest
 from ..core.units import INCH, UM, M
 from ..kinematics.workspace import Reach
+from .inputs import InputFile, fingerprint
 from .manifest import PointsManifest, recorded
 from .text_table import read_numbers
 from .toml import read_toml
-from .whole_file import fingerprint
 
 _UNITS = {"mm": 1.0, "m": M, "um": UM, "inch": INCH}
 
@@ -34,13 +34,13 @@ def read_points(path: str | os.PathLike) -> Measured:
         InputError: names the file, the place in it and what to do.
     """
     path = Path(path)
-    model = read_toml(path, PointsManifest)
+    model = read_toml(manifest := InputFile(path), PointsManifest)
     try:
-        files = [path]
+        files = [manifest]
 
         def points(file: Path) -> np.ndarray:
-            files.append(file)
-            table = read_numbers(file, model.points.columns)
+            files.append(read := InputFile(file))
+            table = read_numbers(read, model.points.columns)
             if table.shape[1] != 3:
                 raise InputError(
                     f"{file} has {table.shape[1]} columns; give x, y and z, or pick three with columns = [...] in "

@@ -4,12 +4,11 @@ import csv
 import math
 import os
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from ..core.errors import InputError
-from .whole_file import check_readable
+from .inputs import InputFile
 
 
 def read_numbers(path: str | os.PathLike, columns: Sequence[int] | None = None) -> np.ndarray:
@@ -17,10 +16,8 @@ def read_numbers(path: str | os.PathLike, columns: Sequence[int] | None = None) 
 
     ``columns`` picks columns, counted from 1. Raises `InputError` that names the file, the line and the column.
     """
-    path = Path(path)
-    check_readable(path)
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = InputFile(path).text.splitlines()
     except UnicodeDecodeError as error:
         raise InputError(f"{path} cannot be read as text; give a text file of numbers, in UTF-8.") from error
     rows: list[list[float]] = []

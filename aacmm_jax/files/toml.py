@@ -3,13 +3,12 @@
 import os
 import tomllib
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from ..core.errors import InputError, nearest
-from .whole_file import check_readable
+from .inputs import InputFile
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -31,10 +30,8 @@ class Strict(BaseModel):
 
 def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
     """Read a TOML file into a pydantic model. Raises `InputError` that names the file and the place in it."""
-    path = Path(path)
-    check_readable(path)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        content = tomllib.loads(InputFile(path).text)
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text in UTF-8, as TOML is; name a TOML file.") from error
     except tomllib.TOMLDecodeError as error:

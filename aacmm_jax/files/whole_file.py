@@ -1,4 +1,4 @@
-"""Files written whole or not at all, their names and fingerprints."""
+"""Files written whole or not at all, and names that a file can hold."""
 
 import contextlib
 import os
@@ -46,37 +46,8 @@ def write_text(path: str | os.PathLike, text: str) -> None:
         temporary.write_bytes(text.encode())
 
 
-def check_readable(path: Path) -> None:
-    """Raise `InputError` where a file is missing, a folder, or may not be read."""
-    try:
-        open(path, "rb").close()
-    except FileNotFoundError as error:
-        raise InputError(f"{path} does not exist; check the path.") from error
-    except IsADirectoryError as error:
-        raise InputError(f"{path} is a folder; name a file.") from error
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{str(path)!r} cannot be read: {reason.lower()}; name another file.") from error
-
-
-def fingerprint(path: str | os.PathLike, folder: str | os.PathLike | None = None) -> str:
-    """A file's name and SHA-256, which identify it; the name is relative to ``folder`` where the file is below it."""
-    import hashlib
-
-    path = Path(path)
-    check_readable(path)
-    below = folder is not None and path.is_relative_to(folder)
-    name = path.relative_to(folder).as_posix() if below and folder is not None else path.name
-    return storable_name(f"{name} (SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()})")
-
-
 def storable(text: str) -> str:
     """The same text, or `InputError` where HDF5 and TOML cannot hold it (NUL, or a file name that is not UTF-8)."""
     if "\0" in text or text.encode(errors="ignore").decode() != text:
         raise InputError(f"the name {text!r} holds a character that no file can hold; rename it.")
     return text
-
-
-def storable_name(text: str) -> str:
-    """A name in a form that HDF5 can hold: bytes that are not UTF-8 are written as escapes."""
-    return text.encode(errors="backslashreplace").decode()

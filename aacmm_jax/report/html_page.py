@@ -10,8 +10,9 @@ from typing import Any
 from ..acceptance.record import SIMULATED
 from ..core.errors import InputError
 from ..files.administrative_data import AdministrativeData, check_conformity
-from ..files.hdf5 import read_tables
-from ..files.whole_file import fingerprint, write_text
+from ..files.hdf5 import read_summary, read_tables
+from ..files.inputs import InputFile, fingerprint
+from ..files.whole_file import write_text
 from .administrative_data import administrative_section
 from .elements import ArmView, Chart, Report, ReportTable
 
@@ -39,9 +40,10 @@ def write_report(
     source, target = Path(source), Path(target)
     if target.exists() and source.exists() and target.samefile(source):
         raise InputError(f"{target} is the file that the report is of; choose another output.")
-    stored = read_tables(source, KINDS, without=("trials",))
-    kind = stored.attributes["kind"]
-    report, simulated, decision = _REPORTS[kind](source, stored.attributes)
+    kind = read_summary(source, KINDS)[0]["kind"]
+    read = source if kind == "study" else InputFile(source)  # a study is read in parts
+    stored = read_tables(read, (kind,), without=("trials",))
+    report, simulated, decision = _REPORTS[kind](read, stored.attributes)
     if simulated:
         warnings = list(dict.fromkeys([SIMULATED, *report.warnings]))
         mark = "unsure" if decision == "conforms" else report.verdict_mark  # no real arm conforms
@@ -51,7 +53,7 @@ def write_report(
         check_conformity(administrative_data, simulated=simulated, decision=decision, tested=tested)
         section = administrative_section(administrative_data, tested)
         report = report._replace(sections=[section, *report.sections])
-    page = _render(report, _origin(source, stored.attributes))
+    page = _render(report, _origin(read, stored.attributes))
     write_text(target, page)
     return {
         "kind": "report",
@@ -64,7 +66,7 @@ def write_report(
     }
 
 
-def _calibration(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+def _calibration(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
     from ..files.calibrations import load_calibration
     from .calibration import calibration_report
 
@@ -72,7 +74,7 @@ def _calibration(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool
     return calibration_report(record)[0], record.recording.true is not None, None
 
 
-def _evaluation(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+def _evaluation(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
     from .evaluation import evaluation_report, overall_decision, points_report
 
     if attributes.get("of") == "points":
@@ -87,7 +89,7 @@ def _evaluation(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool,
     return report, record.recording.true is not None, overall_decision(summary)
 
 
-def _study(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+def _study(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
     from ..study.results import Results
     from .study import study_report
 
@@ -95,14 +97,14 @@ def _study(source: Path, attributes: dict[str, Any]) -> tuple[Report, bool, str 
 
 
 # By the kind of file: the report, whether it is of a simulation, and the overall decision of its acceptance tests.
-_REPORTS: dict[str, Callable[[Path, dict[str, Any]], tuple[Report, bool, str | None]]] = {
+_REPORTS: dict[str, Callable[[str | os.PathLike, dict[str, Any]], tuple[Report, bool, str | None]]] = {
     "calibration": _calibration,
     "evaluation": _evaluation,
     "study": _study,
 }
 
 
-def _origin(source: Path, attributes: dict[str, Any]) -> list[tuple[str, list[str]]]:
+def _origin(source: str | os.PathLike, attributes: dict[str, Any]) -> list[tuple[str, list[str]]]:
     """How the file was made, and how to reproduce it."""
     return [
         ("File", [fingerprint(source)]),

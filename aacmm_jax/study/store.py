@@ -22,10 +22,26 @@ from ..core._compat import named_members
 from ..core.errors import InputError
 from ..data.recording import Recording
 from ..files.captures import arm_table, recording_of, recording_tables, specification_of
-from ..files.hdf5 import Table, Variable, columns, need, numbering, read_tables, undamaged, write_tables
+from ..files.hdf5 import (
+    BLOCK,
+    DIGESTS_SINCE,
+    FORMAT,
+    FORMAT_VERSION,
+    Table,
+    Variable,
+    check_sense,
+    columns,
+    file_image,
+    need,
+    numbering,
+    opened,
+    read_tables,
+    undamaged,
+    write_tables,
+)
 from ..files.whole_file import ELSEWHERE, whole_file
 from ..kinematics.arm import is_length
-from .blocks import VARIABLES, Block, Layout, fill_of, part_of, parts_of
+from .blocks import NOT_RUN, VARIABLES, Block, Layout, fill_of, part_of, parts_of
 from .definition import Study
 from .specification import Specification, unit
 
@@ -53,16 +69,25 @@ def pack(results: Mapping[str, np.ndarray], layout: Layout) -> Packed:
 
 def write_part(path: Path, block: Block, packed: Packed, layout: Layout) -> None:
     """Write a finished block: its file appears complete, or not at all."""
-    import h5py
+    target = part_of(path, block, layout)
 
-    with whole_file(part_of(path, block, layout), _ADVICE) as temporary:
-        with h5py.File(temporary.name, "w", driver="core", backing_store=False) as file:
-            for name, content in packed.items():
-                dataset = _dataset(file, name, layout, layout.shape(name, *block.shape))
-                dataset.id.write_direct_chunk((0,) * dataset.ndim, content)
-            file.flush()
-            image = file.id.get_file_image()
-        temporary.write_bytes(image)
+    def fill(file: Any) -> None:
+        file.attrs.update(format=FORMAT, kind=BLOCK, format_version=FORMAT_VERSION, block=target.name)
+        for name, content in packed.items():
+            dataset = _dataset(file, name, layout, layout.shape(name, *block.shape))
+            dataset.id.write_direct_chunk((0,) * dataset.ndim, content)
+
+    with whole_file(target, _ADVICE) as temporary:
+        temporary.write_bytes(file_image(fill))
+
+
+@contextlib.contextmanager
+def _block(path: Path, block: Block, layout: Layout, bare: bool = False) -> Iterator[Mapping[str, Any]]:
+    """The arrays of a block, after its digest was verified; ``bare``: it may be of format version 1, without one."""
+    file = part_of(path, block, layout)
+    with opened(file, (BLOCK,), bare=bare) as (content, attributes):
+        check_sense(file, {"it is another block": attributes.get("block", file.name) != file.name})
+        yield {name: content.dataset(content.file.id, name) for name in VARIABLES}
 
 
 def _dataset(group: Any, name: str, layout: Layout, shape: tuple[int, ...]) -> Any:
@@ -109,8 +134,6 @@ def _add_virtual(path: Path, layout: Layout, group: Any, name: str) -> Any:
 
 def finish(path: Path, study: Study, layout: Layout, chunk: int, keep_parts: bool = False) -> None:
     """Copy all blocks into one plain file and remove their folder; with ``keep_parts``, leave them as they are."""
-    import h5py
-
     if keep_parts:
         _write(path, study, chunk, partial(_add_virtual, path, layout), finished=True)
         return
@@ -120,9 +143,8 @@ def finish(path: Path, study: Study, layout: Layout, chunk: int, keep_parts: boo
 
     def fill(group: Any) -> None:
         for block in layout.blocks():
-            with h5py.File(part_of(path, block, layout), "r") as part:
-                for name in VARIABLES:
-                    source: Any = part[name]
+            with _block(path, block, layout) as part:
+                for name, source in part.items():
                     target = group[name]
                     mask, content = source.id.read_direct_chunk((0,) * source.ndim)
                     target.id.write_direct_chunk((block.first_cell, block.first_trial, 0)[: source.ndim], content, mask)
@@ -231,6 +253,7 @@ class StoredStudy(NamedTuple):
     finished: bool
     parts: str | None  # folder of the blocks, where the results are in it
     package_version: str
+    version: int  # of the file's format
 
 
 def read(path: Path) -> StoredStudy:
@@ -248,7 +271,8 @@ def read(path: Path) -> StoredStudy:
                 f"{path} is damaged or was edited: its specification does not match its results; make it again."
             )
         finished, parts = bool(attributes["finished"]), attributes.get("parts")
-        return StoredStudy(study, attributes["chunk"], finished, parts, attributes["package_version"])
+        made_by = attributes["package_version"], attributes["format_version"]
+        return StoredStudy(study, attributes["chunk"], finished, parts, *made_by)
 
 
 def check_parts(path: Path, stored: StoredStudy) -> None:
@@ -274,40 +298,49 @@ def check_parts(path: Path, stored: StoredStudy) -> None:
         )
 
 
+def check_results(path: Path, stored: StoredStudy) -> None:
+    """Raise `InputError` where the results have other shapes, or a finished study has trials that did not run."""
+    layout = Layout.of(stored.study, stored.chunk)
+    with opened(path, ("study",), verify=False) as (content, _):
+        arrays = {name: content.dataset(content.group("trials"), name) for name in VARIABLES}
+        shapes = any(array.shape != layout.shape(name) for name, array in arrays.items())
+        check_sense(path, {"its results have other shapes than its study": shapes})
+        unrun = stored.parts is None and not (stored.finished and (arrays["converged"][()] != NOT_RUN).all())
+        check_sense(path, {"it has trials that did not run": unrun})
+
+
 def rows_of(
     path: Path, stored: StoredStudy, names: Sequence[str], cell: int
 ) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
     """Results of one cell, some trials at a time: which trials, and their arrays. One file is open at a time."""
-    import h5py
-
     layout = Layout.of(stored.study, stored.chunk)
     if stored.parts is None:
-        with h5py.File(path, "r") as file:
-            trials: Any = file["trials"]
+        with opened(path, ("study",), verify=False) as (content, _):
+            trials = {name: content.dataset(content.group("trials"), name) for name in names}
             for first in range(0, layout.trials, _TRIALS_IN_MEMORY):
                 part = slice(first, min(first + _TRIALS_IN_MEMORY, layout.trials))
                 yield part, {name: trials[name][cell, part] for name in names}
         return
     for block in finished_blocks(path, layout):
         if block.first_cell <= cell < block.last_cell:
-            with h5py.File(part_of(path, block, layout), "r") as file:
-                arrays: Any = file
+            with _block(path, block, layout, stored.version < DIGESTS_SINCE) as arrays:
                 found = {name: arrays[name][cell - block.first_cell] for name in names}
             yield block.slices[1], found
 
 
-def is_readable(path: Path, block: Block, layout: Layout) -> bool:
-    """Whether every byte of a block's file can be read (deflated arrays carry a checksum)."""
-    import h5py
+def check_block(path: Path, stored: StoredStudy, block: Block, layout: Layout) -> None:
+    """Raise `InputError` where a block's file is damaged."""
+    with _block(path, block, layout, stored.version < DIGESTS_SINCE):
+        pass
 
+
+def is_readable(path: Path, block: Block, layout: Layout) -> bool:
+    """Whether a block's file is as it was written."""
     try:
-        with h5py.File(part_of(path, block, layout), "r") as file:
-            arrays: Any = file
-            for name in VARIABLES:
-                zlib.decompress(arrays[name].id.read_direct_chunk((0,) * arrays[name].ndim)[1])
-    except Exception:  # a wrong byte surfaces as almost any error
+        with _block(path, block, layout) as arrays:
+            return all(arrays[name].shape == layout.shape(name, *block.shape) for name in VARIABLES)
+    except InputError:
         return False
-    return True
 
 
 def finished_blocks(path: Path, layout: Layout) -> list[Block]:
