@@ -159,7 +159,7 @@ def _is_semidefinite(covariance: np.ndarray) -> bool:
     root = np.sqrt(np.where(variance > 0, variance, 1.0))
     correlation = covariance / root / root[:, None]
     symmetric = np.allclose(correlation, correlation.T, rtol=0, atol=1e-9)
-    return symmetric and (not len(root) or np.linalg.eigvalsh(correlation).min() > -1e-6)
+    return symmetric and bool(np.all(np.linalg.eigvalsh(correlation) > -1e-6))
 
 
 def _divided_fixed_lengths(path: str | os.PathLike, stored: Stored) -> bool:

@@ -194,10 +194,11 @@ class Content:
     def _add_attributes(self, found: "_Digest", item: Any) -> None:
         attributes = (h5py.h5a.open(item, index=index) for index in range(h5py.h5a.get_num_attrs(item)))
         for name, attribute in sorted({attribute.name.decode(): attribute for attribute in attributes}.items()):
-            if name == DIGEST and item == self.file.id:
+            # HDF5 itself keeps REFERENCE_LIST of a scale: the inverse of DIMENSION_LIST.
+            if name == "REFERENCE_LIST" or (name == DIGEST and item == self.file.id):
                 continue
-            if name in ("DIMENSION_LIST", "REFERENCE_LIST"):  # netCDF's dimension scales, by the names they refer to
-                found.add("attribute", name, *sorted(self._referred(attribute)))
+            if name == "DIMENSION_LIST":
+                found.add("attribute", name, *self._scales(attribute))
                 continue
             _check_type(name, self._refuse, attribute.get_type())
             found.add("attribute", name, _type_name(attribute.dtype), _sizes(attribute.shape))
@@ -206,12 +207,11 @@ class Content:
                 attribute.read(values)
             found.add_values(values)
 
-    def _referred(self, attribute: Any) -> Iterator[str]:
+    def _scales(self, attribute: Any) -> Iterator[str]:
+        """The names of the scales that are attached to each dimension of an array."""
         values: Any = np.empty(attribute.shape, attribute.dtype)
         attribute.read(values)
-        for place, value in enumerate(values.tolist()):
-            # Of DIMENSION_LIST an array of references for each dimension, of REFERENCE_LIST (reference, dimension).
-            references, axis = (value[:1], value[1]) if isinstance(value, tuple) else (value, place)
+        for axis, references in enumerate(values.tolist()):
             for reference in references:
                 yield f"{axis} {(h5py.h5r.get_name(reference, self.file.id) or b'').decode()}"
 
