@@ -3,6 +3,7 @@
 # make check        lint, types and import contracts
 # make test-newest  a selection of the tests with the newest versions that pyproject.toml allows, installed from scratch
 # make test-lowest  the same with the lowest
+# make audit        known vulnerabilities of the environment; skipped where their service cannot be reached
 # make bench        identifications a second, against every contender that is installed
 # make reproduce    Cheng et al. 2018, recomputed: benchmarks/cheng2018/REPRODUCTION.md (two minutes on 2 cores)
 # make peers        install the contenders that need a Python environment of their own
@@ -19,7 +20,7 @@ SELECTION := tests/test_package.py tests/kinematics tests/solver tests/calibrati
 	tests/files/test_storage.py tests/test_real_captures.py
 PANDA := aacmm-demo/panda
 
-.PHONY: demo test test-slow test-newest test-lowest check bench peers reproduce clean
+.PHONY: demo test test-slow test-newest test-lowest check audit bench peers reproduce clean
 
 demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
@@ -55,6 +56,13 @@ check: .venv/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports --no-cache
+
+# Known vulnerabilities of what the tests run on. Their service is asked over the network; without one, this is skipped.
+audit: .venv/.dev
+	@if ! $(BIN)/python -c "import pip_audit" 2>/dev/null; then echo "audit skipped: pip-audit is not installed"; \
+	elif ! $(BIN)/python -c "import urllib.request as u; u.urlopen('https://pypi.org/pypi/pip-audit/json', timeout=10)" \
+	2>/dev/null; then echo "audit skipped: pypi.org cannot be reached"; \
+	else timeout 300 $(BIN)/python -m pip_audit --progress-spinner off --skip-editable --timeout 15; fi
 
 bench: .venv/.test
 	$(BIN)/python benchmarks/throughput.py

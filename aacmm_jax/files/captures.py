@@ -244,7 +244,7 @@ def specification_of(path: str | os.PathLike, stored: Stored, table: str) -> Arm
         raise InputError(f"{path}: {error}") from error
     widths = attributes.get("override_half_widths") or []
     widths = [attributes.get("half_width_length_mm", 10.0), attributes.get("half_width_angle_rad", 0.0175), *widths]
-    check_sense(path, {"a half width is not positive and finite": not all(0 < width < np.inf for width in widths)})
+    check_sense(path, {"a half-width is not positive and finite": not all(0 < width < np.inf for width in widths)})
     override = zip(attributes.get("override_names") or [], attributes.get("override_half_widths") or [], strict=True)
     return ArmSpecification(
         arm=arm,

@@ -141,7 +141,7 @@ class Content:
         """Some at a time: many may refer to the same bytes of the file."""
         texts: Any = h5py.Dataset(item).asstr()
         if len(item.shape) != 1:
-            return texts[()]
+            return np.asarray(texts[()], dtype=object)
         step, found = max(1, self._credible // self._size), []
         for first in range(0, item.shape[0], step):
             part = texts[first : first + step]
@@ -183,9 +183,9 @@ class Content:
             if declared > self._credible:
                 raise self._too_large(name, item)
             if h5py.check_string_dtype(item.dtype):
-                found.add_values(np.asarray(self._texts(item, name)))
+                found.add_values(self._texts(item, name))
             elif declared <= _BUFFER:
-                found.add_values(np.asarray(_numbers(item)))
+                found.add_values(_numbers(item))
             else:
                 for rows in _parts(item.shape, item.dtype.itemsize):
                     found.add_values(np.asarray(h5py.Dataset(item)[rows]))
@@ -232,7 +232,7 @@ class _Digest:
         self._sha256.update(piece)
 
     def add_values(self, values: np.ndarray) -> None:
-        if values.dtype.kind in "OU":
+        if values.dtype.kind == "O":
             for value in values.reshape(-1).tolist():
                 self._add(value.encode() if isinstance(value, str) else bytes(value))
             return
@@ -243,7 +243,7 @@ def _numbers(item: Any) -> np.ndarray:
     values = np.empty(item.shape, item.dtype)
     if values.size:
         item.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
-    return values if values.ndim else values[()]
+    return values
 
 
 def _check_type(name: str, refuse: Any, kind: Any) -> None:

@@ -110,7 +110,7 @@ BAD = {
     "text for numbers": (replace("reference/value", "long"), ["damaged", "make it again"]),
     "group for numbers": (
         edit(lambda file: (file.pop("capture/angle"), file.create_group("capture/angle"))),
-        ["damaged"],
+        ["'angle' is no array"],
     ),
     "no partner": (remove("nominal_arm/highest"), ["damaged", "make it again"]),
     "not finite": (replace("nominal_arm/alpha", [0.0, np.nan, 0.0]), ["alpha holds a value that is not finite"]),
@@ -143,7 +143,8 @@ def test_a_capture_is_no_calibration(tmp_path, good):
 def test_cut_short(tmp_path, good, kind):
     content = good.files[kind].read_bytes()
     path = tmp_path / "cut.h5"
-    for size in (1, 7, 8, 40, 96, 1000, *np.linspace(2000, len(content) - 1, 12).astype(int)):
+    # Without the last bytes alone, the seal, the file is complete for HDF5, and its content decides.
+    for size in (1, 7, 8, 40, 96, 1000, *np.linspace(2000, len(content) - 200, 12).astype(int)):
         path.write_bytes(content[:size])
         assert_refused(lambda: LOAD[kind](path), path, "damaged", "name a file" if size < 8 else "make it again")
 
@@ -414,7 +415,7 @@ def test_round_trip_of_a_calibration(tmp_path, good):
 def test_names_with_a_comma(tmp_path, good, held, earlier):
     """Lists of names are lists in the file; those that were one string with commas between are still read."""
     names = ("A", "B") if earlier else ("plate, left", "B")
-    lengths = [aj.ReferenceLength(*names, 230.0, 0.01)]
+    lengths = [aj.ReferenceLength(*names, good.recording.capture.lengths[0].value, 0.01)]
     capture = aj.Capture(dict(zip(names, good.recording.capture.sockets.values(), strict=True)), lengths)
     group = LeftOut(names, 15, 0.1, 0.1, np.array([0.2]), np.array([0.1]), True)
     recording = good.recording._replace(capture=capture, nominal=good.recording.nominal._replace(held=held))

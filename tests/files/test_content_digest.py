@@ -1,0 +1,212 @@
+"""The digest of a file's content, and what of HDF5 is not read: links, other files, arrays larger than the file."""
+
+import os
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.files import hdf5
+from aacmm_jax.files.hdf5 import Table, Variable, columns, numbering, read_summary, read_tables, write_tables
+from aacmm_jax.files.inputs import LARGEST_FILE, InputFile, fingerprint
+from tests.refusals import assert_refused
+
+KIND = ("capture",)
+TABLES = {
+    "t": Table(
+        numbering("row", 2000)
+        | columns("row", x=(np.linspace(0, 1, 2000), "mm", "position"))
+        | columns("row", name=(["é"] * 2000, "", "name")),
+        {"note": "text", "pair": [1.0, 2.0]},
+    )
+}
+
+
+@pytest.fixture
+def path(tmp_path):
+    """A file with a table, an attribute of each type and a summary."""
+    write_tables(tmp_path / "f.h5", "capture", TABLES, {"scale": 2.0, "names": ["a", "b"]}, summary={"n": 1})
+    return tmp_path / "f.h5"
+
+
+def changed(path, change):
+    with h5py.File(path, "a") as file:
+        change(file)
+    return path
+
+
+def set_value(name, index, value):
+    def change(file):
+        file[name][index] = value
+
+    return change
+
+
+CHANGES = {
+    "value": set_value("t/x", 3, 7.0),
+    "text": set_value("t/name", 3, "e"),
+    "summary": set_value("summary", (), '{"n": 2}'),
+    "attribute": lambda file: file.attrs.modify("scale", 3.0),
+    "type of an attribute": lambda file: file.attrs.create("scale", 2.0, dtype="f4"),
+    "attribute of a table": lambda file: file["t"].attrs.modify("note", "Text"),
+    "unit": lambda file: file["t/x"].attrs.modify("units", "m"),
+    "attribute added": lambda file: file.attrs.modify("more", 1),
+    "attribute removed": lambda file: file.attrs.pop("scale"),
+    "table removed": lambda file: file.pop("t"),
+    "table added": lambda file: file.create_group("true_arm"),
+    "array renamed": lambda file: file.move("t/x", "t/y"),
+    "no scale": lambda file: file["t/x"].dims[0].detach_scale(file["t/row"]),
+    "digest removed": lambda file: file.attrs.pop("content_sha256"),
+    "kind": lambda file: file.attrs.modify("seed", 4),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+def test_changed_content_is_refused(path, change):
+    changed(path, change)
+    for read in (read_tables, read_summary):
+        assert_refused(lambda read=read: read(path, KIND), path, "does not match its SHA-256", "make it again")
+
+
+def test_another_layout_is_the_same_content(path, tmp_path, monkeypatch):
+    """Bytes that only HDF5 uses do not matter: another order, no compression, and a file opened for writing."""
+    before = read_tables(path, KIND)
+    size = path.stat().st_size
+    assert changed(path, lambda file: None).stat().st_size < size  # HDF5 has cut off the seal
+    after = read_tables(path, KIND)
+    np.testing.assert_array_equal(after.tables["t"]["x"], before.tables["t"]["x"])
+    other = tmp_path / "other.h5"
+    with h5py.File(path) as source, h5py.File(other, "w") as target:  # no order is kept
+        for name in reversed(list(source.attrs)):
+            target.attrs[name] = source.attrs[name]
+        target.create_dataset("summary", data=source["summary"][()], dtype=h5py.string_dtype())
+        group = target.create_group("t")
+        for name in ("x", "row", "name"):
+            array = source["t"][name]
+            group.create_dataset(name, data=array[()], dtype=array.dtype)
+            for key in ("long_name", "units"):
+                if key in array.attrs:
+                    group[name].attrs[key] = array.attrs[key]
+        group["row"].make_scale("row")
+        for name in ("x", "name"):
+            group[name].dims[0].attach_scale(group["row"])
+        for name, value in source["t"].attrs.items():
+            group.attrs[name] = value
+    np.testing.assert_array_equal(read_tables(other, KIND).tables["t"]["name"], before.tables["t"]["name"])
+
+
+def test_earlier_files_have_no_digest(path):
+    def as_earlier(file):
+        del file.attrs["content_sha256"]
+        file.attrs.modify("format_version", 1)
+
+    assert read_tables(changed(path, as_earlier), KIND).attributes["scale"] == 2.0
+    for version in (0, -1, 1.0, "2"):
+        changed(path, lambda file, version=version: file.attrs.create("format_version", version))
+        assert_refused(lambda: read_tables(path, KIND), path, "format version", "make it again")
+
+
+def link_to(kind):
+    def change(file):
+        del file["t/x"]
+        file["t/x"] = h5py.ExternalLink("other.h5", "/x") if kind == "external" else h5py.SoftLink("/t/row")
+
+    return change
+
+
+def external_storage(file):
+    del file["t/x"]
+    file["t"].create_dataset("x", (3,), "u1", external=[("/etc/passwd", 0, 3)])
+
+
+def virtual(file):
+    del file["t/x"]
+    layout = h5py.VirtualLayout((3,), "f8")
+    layout[:] = h5py.VirtualSource("other.h5", "x", (3,))
+    file["t"].create_virtual_dataset("x", layout)
+
+
+def replaced(*arguments, **keywords):
+    def change(file):
+        del file["t/x"]
+        file["t"].create_dataset("x", *arguments, **keywords)
+
+    return change
+
+
+HOSTILE = {
+    "external link": (link_to("external"), "a link to something else"),
+    "soft link": (link_to("soft"), "a link to something else"),
+    "external storage": (external_storage, "stored in another file"),
+    "virtual": (virtual, "made of other files"),
+    "nothing stored": (replaced((2**33,), "f8"), "far more than the file contains"),
+    "nothing stored, chunks": (replaced((2**17, 2**16), "f8", chunks=(2, 2**16)), "far more than the file contains"),
+    "compressed": (replaced(data=np.zeros(2**25), compression="gzip"), "far more than the file contains"),
+    "compound": (replaced((3,), [("a", "f8"), ("b", "i4")]), "of a type that no file of aacmm has"),
+    "reference": (replaced((3,), h5py.ref_dtype), "of a type that no file of aacmm has"),
+    "lists": (replaced((3,), h5py.vlen_dtype("f8")), "of a type that no file of aacmm has"),
+    "group": (lambda file: (file.pop("t/x"), file.create_group("t/x")), "is no array"),
+    "itself": (lambda file: file.__setitem__("t/t", file["t"]), "is no array"),
+}
+
+
+@pytest.mark.parametrize("digest", [True, False], ids=["seal recomputed", "no digest"])
+@pytest.mark.parametrize(("change", "part"), HOSTILE.values(), ids=HOSTILE.keys())
+def test_nothing_leads_out_of_a_file(path, change, part, digest):
+    """Whoever makes such a file on purpose can seal it, too."""
+    from aacmm_jax.files.hdf5_content import seal
+
+    changed(path, change)
+    if digest:
+        with open(path, "rb+") as file:
+            seal(file)
+    else:
+        changed(path, lambda file: (file.attrs.modify("format_version", 1), file.attrs.pop("content_sha256")))
+    assert_refused(lambda: read_tables(path, KIND), path, part, "name a file written by aacmm")
+
+
+def test_many_texts_that_are_one(path, monkeypatch):
+    """Text is counted while it is read: a thousand elements may refer to the same long text."""
+    from aacmm_jax.files import hdf5_content
+
+    monkeypatch.setattr(hdf5_content, "_ALWAYS_READ", 65_000 - 100 * path.stat().st_size)
+    assert_refused(lambda: read_tables(path, KIND), path, "'name' is an array of 2000", "far more than the file")
+
+
+def test_large_files_are_read_in_parts(path, monkeypatch):
+    before = read_tables(path, KIND)
+    monkeypatch.setattr(hdf5, "_IN_MEMORY", 100)
+    after = read_tables(path, KIND)
+    np.testing.assert_array_equal(after.tables["t"]["x"], before.tables["t"]["x"])
+    content = bytearray(path.read_bytes())
+    content[content.index(b"mm")] ^= 1
+    path.write_bytes(content)
+    assert_refused(lambda: read_tables(path, KIND), path, "make it again")
+
+
+def test_only_ordinary_files_of_limited_size(path, tmp_path, monkeypatch):
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "link").symlink_to("/dev/zero")
+    for name in (tmp_path / "fifo", tmp_path / "link", "/dev/zero"):
+        for read in (InputFile, fingerprint, aj.files.load_capture, aj.files.read_manifest):
+            assert_refused(lambda name=name, read=read: read(name), name, "a pipe or a device", "name an ordinary file")
+    with open(tmp_path / "long", "wb") as file:
+        file.truncate(3 * 2**20)
+    monkeypatch.setenv(LARGEST_FILE, "2")
+    assert_refused(lambda: InputFile(tmp_path / "long"), "has 3 MiB, more than the 2 MiB", LARGEST_FILE)
+    assert_refused(lambda: aj.files.load_capture(tmp_path / "long"), LARGEST_FILE)
+    for wrong in ("much", "0", "-1", ""):
+        monkeypatch.setenv(LARGEST_FILE, wrong)
+        assert_refused(lambda: InputFile(path), LARGEST_FILE, "give a whole number of MiB")
+
+
+def test_the_fingerprint_is_of_what_was_read(path, tmp_path):
+    """Also where the file changes meanwhile."""
+    before, read = fingerprint(path), InputFile(path)
+    table = {"t": Table({"row": Variable(("row",), np.arange(3), "1", "row number")})}
+    write_tables(tmp_path / "new.h5", "capture", table, {"scale": 1.0})
+    shutil.move(tmp_path / "new.h5", path)
+    assert read_tables(read, KIND).attributes["scale"] == 2.0
+    assert fingerprint(read) == before != fingerprint(path)
