@@ -220,6 +220,7 @@ def attack_files(
                 counter[result] += 1
                 if result in (SILENT, UNEXPECTED, HANG):
                     print(f"{kind}: byte {position} bit {bit}: {result} {message}", file=sys.stderr, flush=True)
+            print(f"{kind}{way}: {dict(counter)}", file=sys.stderr, flush=True)
     return found
 
 

@@ -171,7 +171,7 @@ def test_many_texts_that_are_one(path, monkeypatch):
     """Text is counted while it is read: a thousand elements may refer to the same long text."""
     from aacmm_jax.files import hdf5_content
 
-    monkeypatch.setattr(hdf5_content, "_ALWAYS_READ", 65_000 - 100 * path.stat().st_size)
+    monkeypatch.setattr(hdf5_content, "_ALWAYS_READ", 49_000 - 100 * path.stat().st_size)
     assert_refused(lambda: read_tables(path, KIND), path, "'name' is an array of 2000", "far more than the file")
 
 
