@@ -78,7 +78,7 @@ def write_part(path: Path, block: Block, packed: Packed, layout: Layout) -> None
             dataset.id.write_direct_chunk((0,) * dataset.ndim, content)
 
     with whole_file(target, _ADVICE) as temporary:
-        temporary.write_bytes(file_image(fill))
+        temporary.write_bytes(file_image(fill, digest=False))
 
 
 @contextlib.contextmanager
