@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -108,17 +108,6 @@ def show_summary(summary: dict[str, Any], as_json: bool, display: Callable[[dict
         typer.echo(json.dumps(summary, indent=2))
     else:
         display(summary)
-
-
-def check_outputs(outputs: Sequence[Path | None], inputs: Iterable[str | Path | None]) -> None:
-    """Refuse an output that is one of the files to read, or that is named twice. Inputs need not exist."""
-    given = [Path(path) for path in inputs if path is not None]
-    written = [path for path in outputs if path is not None]
-    for number, output in enumerate(written):
-        if output.exists() and any(path.exists() and output.samefile(path) for path in given):
-            raise InputError(f"{output} is one of the files that this command reads; choose another output.")
-        if any(output.resolve() == other.resolve() for other in written[:number]):
-            raise InputError(f"{output} is named for two outputs; choose another for one of them.")
 
 
 def sockets_option(texts: Sequence[str] | None) -> dict[str, tuple[float, ...]]:

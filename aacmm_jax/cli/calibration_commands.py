@@ -9,7 +9,8 @@ import typer
 
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.units import DEG
-from .app import CaptureFile, Json, Only, Without, app, check_outputs, examples, show_summary, with_spinner
+from ..files.outputs import together
+from .app import CaptureFile, Json, Only, Without, app, examples, show_summary, with_spinner
 
 
 @app.command(
@@ -108,51 +109,51 @@ def calibrate(
     from ..summaries.calibration import calibration_summary
     from . import calibration_display
 
-    check_outputs([output, figure], [capture])
     if figure is not None:
         from ..plot.style import check_format
 
         check_format(figure)
-    recording = load_capture(capture)
-    recording = recording._replace(
-        capture=recording.capture.select(only or None, without or ()),
-        sources=(fingerprint(capture), *recording.sources),
-    )
-    bounds = _bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])
-    recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
-    solving = {
-        "method": method,
-        "hold": None if hold == "none" else hold,
-        "noise": _noise(encoder_arcsec, seating_mm),
-    }
-    capture_used = recording.capture
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", IdentifiabilityWarning)  # the summary says it
-        result = with_spinner(
-            "Calibrating",
-            lambda: run(bounds.space.base, capture_used, bounds, **solving, max_steps=max_steps, strict=strict),
+    with together(output, figure):
+        recording = load_capture(capture)
+        recording = recording._replace(
+            capture=recording.capture.select(only or None, without or ()),
+            sources=(fingerprint(capture), *recording.sources),
         )
-        record = record_of(result, recording)
-        if cross_validate or (
-            cross_validate is None and recording.true is None and _several(capture_used, len(bounds.space.names))
-        ):
-            from ..calibration.cross_validation import cross_validate as validated
-
-            found = with_spinner(
-                "Cross-validating", lambda: validated(bounds.space.base, capture_used, bounds, **solving)
+        bounds = _bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])
+        recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
+        solving = {
+            "method": method,
+            "hold": None if hold == "none" else hold,
+            "noise": _noise(encoder_arcsec, seating_mm),
+        }
+        capture_used = recording.capture
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", IdentifiabilityWarning)  # the summary says it
+            result = with_spinner(
+                "Calibrating",
+                lambda: run(bounds.space.base, capture_used, bounds, **solving, max_steps=max_steps, strict=strict),
             )
-            record = record._replace(validation=found)
-    if monte_carlo:
-        from ..calibration.sampling import monte_carlo as sample
+            record = record_of(result, recording)
+            if cross_validate or (
+                cross_validate is None and recording.true is None and _several(capture_used, len(bounds.space.names))
+            ):
+                from ..calibration.cross_validation import cross_validate as validated
 
-        sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))
-        record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
-    summary = calibration_summary(record)
-    save_calibration(output, record, summary)
-    if figure is not None:
-        from ..plot import save_calibration_figure
+                found = with_spinner(
+                    "Cross-validating", lambda: validated(bounds.space.base, capture_used, bounds, **solving)
+                )
+                record = record._replace(validation=found)
+        if monte_carlo:
+            from ..calibration.sampling import monte_carlo as sample
 
-        save_calibration_figure(record, figure)
+            sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))
+            record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
+        summary = calibration_summary(record)
+        save_calibration(output, record, summary)
+        if figure is not None:
+            from ..plot import save_calibration_figure
+
+            save_calibration_figure(record, figure)
     show_summary(summary | {"written": str(output)}, as_json, calibration_display.calibration)
     if not record.converged or not plausible(record.k) or record.implausible_residual:
         raise typer.Exit(1)

@@ -10,6 +10,7 @@ import typer
 from ..core.errors import InputError
 from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
+from ..files.outputs import together
 from .app import (
     EncoderNoise,
     Json,
@@ -17,7 +18,6 @@ from .app import (
     ReferenceLengths,
     SeatingNoise,
     app,
-    check_outputs,
     examples,
     length_option,
     show_summary,
@@ -129,8 +129,8 @@ def plan(
     from ..summaries.planning import plan_summary
     from . import acceptance_display, plan_display
 
-    check_outputs([output, manifest], [arm])
-    specification = load_specification(arm)
+    with together(output, manifest):  # refuses outputs that are inputs or cannot be written, before the work
+        specification = load_specification(arm)
     if socket and sockets is not None:
         raise InputError("--sockets has sockets positioned and --socket gives their positions; give one of the two.")
     if length and not socket:
@@ -144,7 +144,6 @@ def plan(
             raise InputError(
                 "--acceptance has its own sockets and bars; leave out --socket, --sockets, --length and --region."
             )
-        _check_folder(output)
         options = {
             "above": above_mm,
             "margin": margin_deg * DEG,
@@ -162,7 +161,6 @@ def plan(
     axes = [_axis(text) for text in region or ()]
     if len(dict(axes)) < len(axes):
         raise InputError("an axis is named twice in --region; give each one range.")
-    _check_folder(output)
     points = sockets_option(socket)
     with plan_display.progress() as report_progress:
         found = run(
@@ -197,14 +195,13 @@ def _procedure(
     from ..files.whole_file import write_text
     from ..summaries.planning import procedure_summary
 
-    if manifest is not None:
-        _check_folder(manifest)
     found = with_spinner("Planning", lambda: plan_procedure(specification.arm, standard, **options))
-    write_text(output, procedure_csv(found))
     written = str(output)
-    if manifest is not None:
-        write_text(manifest, procedure_manifest(found, _arm_for(manifest, arm)))
-        written += f", {manifest}"
+    with together(output, manifest):
+        write_text(output, procedure_csv(found))
+        if manifest is not None:
+            write_text(manifest, procedure_manifest(found, _arm_for(manifest, arm)))
+            written += f", {manifest}"
     return procedure_summary(found, specification.name) | {"written": written}
 
 
@@ -212,15 +209,6 @@ def _arm_for(manifest: Path, arm: str) -> str:
     """An arm as a manifest names it: a shipped name, or the path of a file relative to the manifest."""
     file = Path(arm)
     return Path(os.path.relpath(file, manifest.parent)).as_posix() if file.is_file() else arm
-
-
-def _check_folder(output: Path) -> None:
-    """Raise `InputError` for an output that could not be written, before half a minute of work."""
-    folder = output.parent
-    if output.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise InputError(
-            f"{output} cannot be written: it is a folder, or its folder is missing or protected; name another file."
-        )
 
 
 def _range(option: str, text: str) -> tuple[float, float]:

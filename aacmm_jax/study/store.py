@@ -55,7 +55,7 @@ def write_part(path: Path, block: Block, packed: Packed, layout: Layout) -> None
     """Write a finished block: its file appears complete, or not at all."""
     import h5py
 
-    with whole_file(part_of(path, block, layout), _ADVICE) as temporary:
+    with whole_file(part_of(path, block, layout), _ADVICE, leftovers=False) as temporary:
         with h5py.File(temporary.name, "w", driver="core", backing_store=False) as file:
             for name, content in packed.items():
                 dataset = _dataset(file, name, layout, layout.shape(name, *block.shape))
