@@ -11,6 +11,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.data.recording import Recording
 from aacmm_jax.files import whole_file
+from aacmm_jax.files.arms import specification_toml
 from tests.refusals import assert_refused
 
 POINTS = '[points]\nunit = "mm"\n[[socket]]\nfile = "PA.csv"\n'
@@ -22,8 +23,8 @@ STUDY = 'arm = "arm.toml"\ntrials = 1\n[capture]\nfile = "c.h5"\n'
 def inputs(tmp_path, paper_capture):
     """One file of every kind that a command reads."""
     arm = aj.files.load_specification("cheng2018-simulation")
-    aj.files.save_arm(arm.arm, tmp_path / "arm.toml")
-    aj.files.save_arm(arm.arm, tmp_path / "other.toml")
+    for name in ("arm.toml", "other.toml"):
+        (tmp_path / name).write_text(specification_toml(arm))
     (tmp_path / "A.csv").write_text("0.1,0.2,0.3,0.4,0.5,0.6\n0.2,0.3,0.4,0.5,0.6,0.7\n")
     (tmp_path / "PA.csv").write_text("100.0,0.5,0.25\n100.5,0.5,0.5\n100.5,0.25,0.125\n")
     (tmp_path / "m.toml").write_text(MANIFEST)
