@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ..core.errors import IdentifiabilityWarning, InputError
+from ..core.text import number
 from ..core.units import DEG
 from ..files.outputs import together
 from .app import CaptureFile, Json, Only, Without, app, examples, show_summary, with_spinner
@@ -93,7 +94,9 @@ def calibrate(
     figure: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Plot the residual of every pose: PNG, SVG or PDF by the name.")
     ] = None,
-    max_steps: Annotated[int, typer.Option(min=1, metavar="N", help="Largest number of steps of each solve.")] = 300,
+    max_steps: Annotated[
+        int, typer.Option(min=1, max=1_000_000, metavar="N", help="Largest number of steps of each solve.")
+    ] = 300,
     as_json: Json = False,
 ) -> None:
     """Identify the parameters of an arm from a capture.
@@ -181,7 +184,7 @@ def _bounds(
             raise InputError(f"--bound gives {name} two half-widths; give it one.")
         seen.add(name)
         try:
-            value = float(width)
+            value = number(width.strip())
         except ValueError as error:
             raise InputError(f"--bound '{text}' is not of the form NAME=WIDTH, in mm or deg.") from error
         override[name] = value if is_length(name) else value * DEG

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from ..core.errors import InputError
+from ..core.text import quoted
 from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import together
@@ -27,6 +28,8 @@ from .app import (
 )
 
 _U_ARTEFACT = 0.001  # mm
+MOST_POSES = 100_000  # in a socket, as in a study
+_DIGITS = 9
 
 
 @app.command(epilog=examples("aacmm demo my-demo --seed 7"))
@@ -178,8 +181,10 @@ def _poses_option(texts: Sequence[str], sockets: Iterable[str]) -> dict[str, int
     counts = dict.fromkeys(sockets, 70)
     for text in texts:
         name, equals, count = text.rpartition("=")
-        if not count.isdecimal():
+        if not (count.isascii() and count.isdecimal()):
             bad_option("--poses", text, "N, or NAME=N for one socket")
+        if len(count) > _DIGITS or int(count) > MOST_POSES:
+            raise InputError(f"--poses {quoted(text)} is more than {MOST_POSES:,} in one socket; give fewer.")
         if not equals:
             counts = dict.fromkeys(counts, int(count))
         elif name not in counts:

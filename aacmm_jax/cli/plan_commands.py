@@ -1,6 +1,5 @@
 """The command ``plan``."""
 
-import math
 import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -8,6 +7,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ..core.errors import InputError
+from ..core.text import number
 from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import together
@@ -42,11 +42,14 @@ def plan(
             "--output", "-o", metavar="FILE.csv", help="Plan to write: one row a pose, joint readings in degrees."
         ),
     ],
-    poses: Annotated[int, typer.Option(min=2, metavar="N", help="Number of poses, all sockets together.")] = 30,
+    poses: Annotated[
+        int, typer.Option(min=2, max=10_000, metavar="N", help="Number of poses, all sockets together.")
+    ] = 30,
     sockets: Annotated[
         int | None,
         typer.Option(
             min=1,
+            max=1000,
             metavar="N",
             help="Number of sockets to position, in pairs at the ends of the reference length. Default 4.",
         ),
@@ -84,7 +87,9 @@ def plan(
         float,
         typer.Option(metavar="MM", help="Height of the table in the base frame: every joint and tip stays above it."),
     ] = 0.0,
-    candidates: Annotated[int, typer.Option(min=100, metavar="N", help="Number of poses to choose from.")] = 3000,
+    candidates: Annotated[
+        int, typer.Option(min=100, max=1_000_000, metavar="N", help="Number of poses to choose from.")
+    ] = 3000,
     check_length_mm: Annotated[
         float | None,
         typer.Option(
@@ -214,7 +219,7 @@ def _arm_for(manifest: Path, arm: str) -> str:
 def _range(option: str, text: str) -> tuple[float, float]:
     low, colon, high = text.partition(":")
     try:
-        return float(low), float(high if colon else low)
+        return number(low.strip()), number((high if colon else low).strip())
     except ValueError as error:
         raise InputError(f"{option} '{text}' is not of the form L or L:M, in mm.") from error
 
@@ -225,6 +230,6 @@ def _axis(text: str) -> tuple[str, tuple[float, float]]:
     try:
         if not colon:
             raise ValueError
-        return axis, (float(low or -math.inf), float(high or math.inf))
+        return axis, (number(low.strip() or "-inf"), number(high.strip() or "inf"))
     except ValueError as error:
         raise InputError(f"--region '{text}' is not of the form AXIS=LOW:HIGH, in mm; for example z=0:800.") from error
