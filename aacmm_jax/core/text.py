@@ -6,8 +6,8 @@ import unicodedata
 # What Python's ``float`` takes besides is no number to people: 1_0, digits of other scripts, blanks around it.
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
 _LONGEST = 60  # characters of a text that a message quotes
-# Marks that change the direction of what follows, so that a text reads otherwise than it is.
-_DIRECTION = frozenset("\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
+# Marks that are not seen, or change the direction of what follows, so that a text reads otherwise than it is.
+_MARKS = frozenset("\ufeff\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
 
 def number(text: str) -> float:
@@ -25,7 +25,7 @@ def is_number(text: str) -> bool:
 def is_control(character: str) -> bool:
     """Whether a character acts on a terminal instead of being shown: ESC, NUL, marks of direction; not a line's end."""
     return character not in "\n\r\t" and (
-        unicodedata.category(character) in ("Cc", "Zl", "Zp") or character in _DIRECTION
+        unicodedata.category(character) in ("Cc", "Zl", "Zp") or character in _MARKS
     )
 
 

@@ -17,6 +17,7 @@ _WHOLE = re.compile(r"\{\w+\}(?:\.\w+)?")
 _ANYTHING = "[^/]+"
 _WORD = r"(?:[^\W_]|-)+"
 _MOST_FIELDS = 8  # each more multiplies the ways in which a name can match
+_LONGEST_NAME = 200  # characters
 _NAMED = 3  # near misses that a message names
 
 
@@ -37,9 +38,11 @@ def check_fields(text: str) -> None:
 
 
 def check_name(name: str) -> None:
-    """Refuse a name with characters that act on a terminal or end a text: NUL, ESC."""
+    """Refuse a name with characters that act on a terminal or end a text (NUL, ESC), and one longer than a line."""
     if any(is_control(character) for character in name):
         raise InputError(f"the name {quoted(name)} holds a control character; rename it.")
+    if len(name) > _LONGEST_NAME:
+        raise InputError(f"the name {quoted(name)} has {len(name):,} characters, over {_LONGEST_NAME}; shorten it.")
 
 
 def in_braces(fields: Iterable[str]) -> str:
