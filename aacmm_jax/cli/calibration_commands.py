@@ -110,6 +110,7 @@ def calibrate(
     from ..files.captures import load_capture
     from ..files.whole_file import fingerprint
     from ..summaries.calibration import calibration_summary
+    from ..summaries.warnings import does_not_fit
     from . import calibration_display
 
     if figure is not None:
@@ -158,7 +159,7 @@ def calibrate(
 
             save_calibration_figure(record, figure)
     show_summary(summary | {"written": str(output)}, as_json, calibration_display.calibration)
-    if not record.converged or not plausible(record.k) or record.implausible_residual:
+    if not record.converged or not plausible(record.k) or record.implausible_residual or does_not_fit(record):
         raise typer.Exit(1)
 
 

@@ -24,9 +24,7 @@ def is_number(text: str) -> bool:
 
 def is_control(character: str) -> bool:
     """Whether a character acts on a terminal instead of being shown: ESC, NUL, marks of direction; not a line's end."""
-    return character not in "\n\r\t" and (
-        unicodedata.category(character) in ("Cc", "Zl", "Zp") or character in _MARKS
-    )
+    return character not in "\n\r\t" and (unicodedata.category(character) in ("Cc", "Zl", "Zp") or character in _MARKS)
 
 
 def printable(text: str) -> str:
