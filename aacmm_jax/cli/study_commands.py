@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import typer
 
 from ..core.errors import InputError
-from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import together
 from .app import Json, Stopped, app, examples, show_summary, with_spinner
 
@@ -34,9 +33,7 @@ def study(
     trials: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Trials in each cell, instead of the specification's.")
     ] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, max=LARGEST_INTEGER, metavar="N", help="Seed, instead of the specification's.")
-    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, metavar="N", help="Seed, instead of the specification's.")] = None,
     chunk: Annotated[
         int | None,
         typer.Option(min=1, metavar="N", help="Trials computed at a time; no result depends on it. Default 1000."),
