@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Literal, NamedTuple, get_args
 
 from ..core.errors import InputError, nearest
+from ..core.text import number
 
 Decision = Literal["fails", "undecided", "conforms"]
 DECISIONS: tuple[Decision, ...] = get_args(Decision)  # the worst first
@@ -84,7 +85,7 @@ def read_limits(texts: list[str], known: Mapping[str, str]) -> dict[str, Limit]:
         if name in found:
             raise InputError(f"--mpe gives {name} two limits; give it one.")
         try:
-            limit = Limit(float(match["fixed"]), float(match["divisor"]) if match["divisor"] else math.inf)
+            limit = Limit(number(match["fixed"]), number(match["divisor"]) if match["divisor"] else math.inf)
         except ValueError as error:
             raise InputError(f"--mpe '{text}': '{value}' is not A or A+L/K with numbers in mm.") from error
         if not (0 <= limit.fixed <= MOST and limit.divisor >= LEAST_DIVISOR):

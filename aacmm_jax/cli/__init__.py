@@ -36,7 +36,7 @@ def main() -> None:
     gc.set_threshold(200_000, 20, 20)
     try:
         from ..core.errors import InputError
-        from .app import Stopped, app
+        from .app import Stopped, app, check_numbers
 
         for family in _FAMILIES:
             import_module(f".{family}", __name__)
@@ -47,6 +47,7 @@ def main() -> None:
     except KeyboardInterrupt:
         _interrupted()
     try:
+        check_numbers(sys.argv[1:])
         app(prog_name="aacmm")
     except SystemExit as done:
         if done.code == _INTERRUPTED:
@@ -89,5 +90,7 @@ def _discard_output() -> None:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    print(f"Error: {message}", file=sys.stderr)
+    from ..core.text import printable
+
+    print(f"Error: {printable(message)}", file=sys.stderr)
     sys.exit(code)

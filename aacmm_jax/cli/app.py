@@ -2,13 +2,15 @@
 
 import csv
 import json
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, get_args, get_type_hints
 
 import typer
 
 from ..core.errors import InputError
+from ..core.text import is_control, is_number, number, printable, quoted
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -107,18 +109,46 @@ def show_summary(summary: dict[str, Any], as_json: bool, display: Callable[[dict
     if as_json:
         typer.echo(json.dumps(summary, indent=2))
     else:
-        display(summary)
+        display(_printable(summary))
 
 
-def check_outputs(outputs: Sequence[Path | None], inputs: Iterable[str | Path | None]) -> None:
-    """Refuse an output that is one of the files to read, or that is named twice. Inputs need not exist."""
-    given = [Path(path) for path in inputs if path is not None]
-    written = [path for path in outputs if path is not None]
-    for number, output in enumerate(written):
-        if output.exists() and any(path.exists() and output.samefile(path) for path in given):
-            raise InputError(f"{output} is one of the files that this command reads; choose another output.")
-        if any(output.resolve() == other.resolve() for other in written[:number]):
-            raise InputError(f"{output} is named for two outputs; choose another for one of them.")
+def _printable(item: Any) -> Any:
+    """The same with every text printable: names from a file reach a terminal only through here."""
+    if isinstance(item, str):
+        return printable(item)
+    if isinstance(item, dict):
+        return {_printable(key): _printable(value) for key, value in item.items()}
+    return [_printable(value) for value in item] if isinstance(item, list | tuple) else item
+
+
+def check_numbers(arguments: Sequence[str]) -> None:
+    """Refuse values of numeric options that only Python takes for numbers (1_0, digits of other scripts), and NaN."""
+    command = next((info.callback for info in app.registered_commands if arguments[:1] == [_name(info)]), None)
+    if command is None:
+        return
+    numeric = set()
+    for name, hint in get_type_hints(command, include_extras=True).items():
+        inner = {kind for part in (hint, *get_args(hint)) for kind in (part, *get_args(part))}
+        if inner & {int, float} or any({int, float} & set(get_args(kind)) for kind in inner):
+            named = [text for item in inner for text in getattr(item, "param_decls", None) or ()]
+            numeric |= set(named or [f"--{name.replace('_', '-')}"])
+    for option, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        name, equals, value = option.partition("=")
+        value = value if equals else following
+        if name in numeric and _is_pythons(value) and not (is_number(value) and math.isfinite(float(value))):
+            raise InputError(f"{name} {quoted(value)} is not a finite number; write plain decimal digits.")
+
+
+def _name(info: Any) -> str:
+    return info.name or info.callback.__name__.replace("_", "-")
+
+
+def _is_pythons(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def sockets_option(texts: Sequence[str] | None) -> dict[str, tuple[float, ...]]:
@@ -127,9 +157,11 @@ def sockets_option(texts: Sequence[str] | None) -> dict[str, tuple[float, ...]]:
     for text in texts or ():
         name, _, point = text.rpartition("=")
         try:
-            x, y, z = (float(part) for part in point.split(","))
+            x, y, z = (number(part.strip()) for part in point.split(","))
         except ValueError:
             bad_option("--socket", text, "NAME=X,Y,Z in mm, for example A=400,200,300")
+        if any(is_control(character) for character in name):
+            raise InputError(f"--socket {quoted(text)} has a control character in its name; leave it out.")
         if name in points:
             raise InputError(f"socket '{name}' is given twice in --socket; give each its own name.")
         points[name] = (x, y, z)
@@ -143,7 +175,7 @@ def length_option(text: str) -> tuple:
     try:
         if not start or not end or len(u) > 1:
             raise ValueError
-        return (start, end, *map(float, u))
+        return (start, end, *(number(part.strip()) for part in u))
     except ValueError:
         bad_option("--length", text, "A,B or A,B,U with u in mm")
 

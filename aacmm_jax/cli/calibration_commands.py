@@ -8,8 +8,10 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ..core.errors import IdentifiabilityWarning, InputError
+from ..core.text import number
 from ..core.units import DEG
-from .app import CaptureFile, Json, Only, Without, app, check_outputs, examples, show_summary, with_spinner
+from ..files.outputs import together
+from .app import CaptureFile, Json, Only, Without, app, examples, show_summary, with_spinner
 
 
 @app.command(
@@ -92,7 +94,9 @@ def calibrate(
     figure: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Plot the residual of every pose: PNG, SVG or PDF by the name.")
     ] = None,
-    max_steps: Annotated[int, typer.Option(min=1, metavar="N", help="Largest number of steps of each solve.")] = 300,
+    max_steps: Annotated[
+        int, typer.Option(min=1, max=1_000_000, metavar="N", help="Largest number of steps of each solve.")
+    ] = 300,
     as_json: Json = False,
 ) -> None:
     """Identify the parameters of an arm from a capture.
@@ -106,55 +110,56 @@ def calibrate(
     from ..files.captures import load_capture
     from ..files.inputs import InputFile, fingerprint
     from ..summaries.calibration import calibration_summary
+    from ..summaries.warnings import does_not_fit
     from . import calibration_display
 
-    check_outputs([output, figure], [capture])
     if figure is not None:
         from ..plot.style import check_format
 
         check_format(figure)
-    recording = load_capture(read := InputFile(capture))
-    recording = recording._replace(
-        capture=recording.capture.select(only or None, without or ()),
-        sources=(fingerprint(read), *recording.sources),
-    )
-    bounds = _bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])
-    recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
-    solving = {
-        "method": method,
-        "hold": None if hold == "none" else hold,
-        "noise": _noise(encoder_arcsec, seating_mm),
-    }
-    capture_used = recording.capture
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", IdentifiabilityWarning)  # the summary says it
-        result = with_spinner(
-            "Calibrating",
-            lambda: run(bounds.space.base, capture_used, bounds, **solving, max_steps=max_steps, strict=strict),
+    with together(output, figure):
+        recording = load_capture(read := InputFile(capture))
+        recording = recording._replace(
+            capture=recording.capture.select(only or None, without or ()),
+            sources=(fingerprint(read), *recording.sources),
         )
-        record = record_of(result, recording)
-        if cross_validate or (
-            cross_validate is None and recording.true is None and _several(capture_used, len(bounds.space.names))
-        ):
-            from ..calibration.cross_validation import cross_validate as validated
-
-            found = with_spinner(
-                "Cross-validating", lambda: validated(bounds.space.base, capture_used, bounds, **solving)
+        bounds = _bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])
+        recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
+        solving = {
+            "method": method,
+            "hold": None if hold == "none" else hold,
+            "noise": _noise(encoder_arcsec, seating_mm),
+        }
+        capture_used = recording.capture
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", IdentifiabilityWarning)  # the summary says it
+            result = with_spinner(
+                "Calibrating",
+                lambda: run(bounds.space.base, capture_used, bounds, **solving, max_steps=max_steps, strict=strict),
             )
-            record = record._replace(validation=found)
-    if monte_carlo:
-        from ..calibration.sampling import monte_carlo as sample
+            record = record_of(result, recording)
+            if cross_validate or (
+                cross_validate is None and recording.true is None and _several(capture_used, len(bounds.space.names))
+            ):
+                from ..calibration.cross_validation import cross_validate as validated
 
-        sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))
-        record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
-    summary = calibration_summary(record)
-    save_calibration(output, record, summary)
-    if figure is not None:
-        from ..plot import save_calibration_figure
+                found = with_spinner(
+                    "Cross-validating", lambda: validated(bounds.space.base, capture_used, bounds, **solving)
+                )
+                record = record._replace(validation=found)
+        if monte_carlo:
+            from ..calibration.sampling import monte_carlo as sample
 
-        save_calibration_figure(record, figure)
+            sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))
+            record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
+        summary = calibration_summary(record)
+        save_calibration(output, record, summary)
+        if figure is not None:
+            from ..plot import save_calibration_figure
+
+            save_calibration_figure(record, figure)
     show_summary(summary | {"written": str(output)}, as_json, calibration_display.calibration)
-    if not record.converged or not plausible(record.k) or record.implausible_residual:
+    if not record.converged or not plausible(record.k) or record.implausible_residual or does_not_fit(record):
         raise typer.Exit(1)
 
 
@@ -180,7 +185,7 @@ def _bounds(
             raise InputError(f"--bound gives {name} two half-widths; give it one.")
         seen.add(name)
         try:
-            value = float(width)
+            value = number(width.strip())
         except ValueError as error:
             raise InputError(f"--bound '{text}' is not of the form NAME=WIDTH, in mm or deg.") from error
         override[name] = value if is_length(name) else value * DEG

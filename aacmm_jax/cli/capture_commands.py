@@ -7,8 +7,10 @@ from typing import Annotated, Literal
 import typer
 
 from ..core.errors import InputError
+from ..core.text import quoted
 from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
+from ..files.outputs import together
 from .app import (
     CaptureOutput,
     EncoderNoise,
@@ -18,7 +20,6 @@ from .app import (
     SeatingNoise,
     app,
     bad_option,
-    check_outputs,
     examples,
     length_option,
     show_summary,
@@ -27,6 +28,8 @@ from .app import (
 )
 
 _U_ARTEFACT = 0.001  # mm
+MOST_POSES = 100_000  # in a socket, as in a study
+_DIGITS = 9
 
 
 @app.command(epilog=examples("aacmm demo my-demo --seed 7"))
@@ -100,53 +103,53 @@ def simulate(
     from ..summaries.calibration import capture_summary
     from . import calibration_display
 
-    check_outputs([output], [arm, true_arm])
-    nominal = load_specification(arm)
-    true = load_specification(true_arm) if true_arm else nominal
-    if true.arm.joints != nominal.arm.joints:
-        raise InputError(
-            f"the true arm {true_arm} has {true.arm.joints} joints, but {arm} has {nominal.arm.joints}; "
-            "choose a true arm with as many."
-        )
-    if deviate_length_mm or deviate_angle_deg:
-        space = true.space()
-        drawn = perturbed_arm(space, length=deviate_length_mm, angle=deviate_angle_deg * DEG, seed=seed)
-        true = true._replace(arm=drawn, name=f"{true.name}, deviated")
-    if acceptance is not None:
-        if socket or poses or length or resolution_arcsec:
+    with together(output):
+        nominal = load_specification(arm)
+        true = load_specification(true_arm) if true_arm else nominal
+        if true.arm.joints != nominal.arm.joints:
             raise InputError(
-                "--acceptance brings its own sockets, poses and lengths; leave out --socket, --poses, --length and "
-                "--resolution-arcsec."
+                f"the true arm {true_arm} has {true.arm.joints} joints, but {arm} has {nominal.arm.joints}; "
+                "choose a true arm with as many."
             )
-        noise = {"encoder_arcsec": encoder_arcsec, "seating": seating_mm}
-        noise |= {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
+        if deviate_length_mm or deviate_angle_deg:
+            space = true.space()
+            drawn = perturbed_arm(space, length=deviate_length_mm, angle=deviate_angle_deg * DEG, seed=seed)
+            true = true._replace(arm=drawn, name=f"{true.name}, deviated")
+        if acceptance is not None:
+            if socket or poses or length or resolution_arcsec:
+                raise InputError(
+                    "--acceptance brings its own sockets, poses and lengths; leave out --socket, --poses, --length and "
+                    "--resolution-arcsec."
+                )
+            noise = {"encoder_arcsec": encoder_arcsec, "seating": seating_mm}
+            noise |= {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
 
-        def taken() -> Recording:
-            from ..acceptance.procedure import plan_procedure, simulate_procedure
+            def taken() -> Recording:
+                from ..acceptance.procedure import plan_procedure, simulate_procedure
 
-            return simulate_procedure(plan_procedure(nominal.arm, acceptance), nominal, true, **noise, seed=seed)
+                return simulate_procedure(plan_procedure(nominal.arm, acceptance), nominal, true, **noise, seed=seed)
 
-        recording = with_spinner("Simulating", taken)
-    else:
-        points = sockets_option(socket)
-        if not points:
-            raise InputError("there is no socket; give --socket NAME=X,Y,Z, or --acceptance.")
-        capture = with_spinner(
-            "Simulating",
-            lambda: run(
-                true.arm,
-                points,
-                poses=_poses_option(poses or ["70"], points),
-                lengths=[length_option(text) for text in length or ()],
-                encoder_arcsec=encoder_arcsec,
-                resolution_arcsec=resolution_arcsec,
-                seating=seating_mm,
-                seed=seed,
-            ),
-        )
-        recording = Recording(capture, nominal, true, seed)
-    summary = capture_summary(recording)
-    save_capture(output, recording, summary)
+            recording = with_spinner("Simulating", taken)
+        else:
+            points = sockets_option(socket)
+            if not points:
+                raise InputError("there is no socket; give --socket NAME=X,Y,Z, or --acceptance.")
+            capture = with_spinner(
+                "Simulating",
+                lambda: run(
+                    true.arm,
+                    points,
+                    poses=_poses_option(poses or ["70"], points),
+                    lengths=[length_option(text) for text in length or ()],
+                    encoder_arcsec=encoder_arcsec,
+                    resolution_arcsec=resolution_arcsec,
+                    seating=seating_mm,
+                    seed=seed,
+                ),
+            )
+            recording = Recording(capture, nominal, true, seed)
+        summary = capture_summary(recording)
+        save_capture(output, recording, summary)
     show_summary(summary | {"written": str(output)}, as_json, calibration_display.capture)
 
 
@@ -167,10 +170,10 @@ def import_(
     from ..summaries.calibration import capture_summary
     from . import calibration_display
 
-    check_outputs([output], [manifest])
-    recording = read_manifest(manifest)
-    summary = capture_summary(recording)
-    save_capture(output, recording, summary)
+    with together(output):
+        recording = read_manifest(manifest)
+        summary = capture_summary(recording)
+        save_capture(output, recording, summary)
     show_summary(summary | {"written": str(output)}, as_json, calibration_display.capture)
 
 
@@ -178,8 +181,10 @@ def _poses_option(texts: Sequence[str], sockets: Iterable[str]) -> dict[str, int
     counts = dict.fromkeys(sockets, 70)
     for text in texts:
         name, equals, count = text.rpartition("=")
-        if not count.isdecimal():
+        if not (count.isascii() and count.isdecimal()):
             bad_option("--poses", text, "N, or NAME=N for one socket")
+        if len(count) > _DIGITS or int(count) > MOST_POSES:
+            raise InputError(f"--poses {quoted(text)} is more than {MOST_POSES:,} in one socket; give fewer.")
         if not equals:
             counts = dict.fromkeys(counts, int(count))
         elif name not in counts:

@@ -7,8 +7,9 @@ import typer
 
 from ..core.errors import InputError
 from ..files.hdf5 import need, read_tables
+from ..files.outputs import together
 from ..files.whole_file import write_text
-from .app import Json, app, check_outputs, examples, show_summary, with_spinner
+from .app import Json, app, examples, show_summary, with_spinner
 
 
 @app.command(
@@ -63,23 +64,27 @@ def compare(
 
     if len(files) < 2:
         raise InputError(f"{files[0]} alone cannot be compared; name at least two calibrations.")
-    _check_outputs(files, figure, csv)
-    records = [load_calibration(file) for file in files]
-    created = [record.recording.measured or _created(file) for record, file in zip(records, files, strict=True)]
-    labels = [str(file) for file in files]
-    found = with_spinner("Comparing", lambda: _compared(records, created, labels, level, length_mm))
-    found = found._replace(dated_by_file=tuple(not records[i].recording.measured for i in found.order))
-    summary: dict[str, Any] = compared_summary(found, labels, records[0].recording.nominal.name)
-    summary["kept"], summary["failed"] = change_exceeded(found.drifts[-1].lengths, max_length_change_mm)
-    written = []
     if figure is not None:
-        from ..plot import save_drift_trend
+        from ..plot.style import check_format
 
-        save_drift_trend(found, figure)
-        written.append(str(figure))
-    if csv is not None:
-        write_text(csv, drift_csv(found, labels))
-        written.append(str(csv))
+        check_format(figure)
+    with together(figure, csv):
+        records = [load_calibration(file) for file in files]
+        created = [record.recording.measured or _created(file) for record, file in zip(records, files, strict=True)]
+        labels = [str(file) for file in files]
+        found = with_spinner("Comparing", lambda: _compared(records, created, labels, level, length_mm))
+        found = found._replace(dated_by_file=tuple(not records[i].recording.measured for i in found.order))
+        summary: dict[str, Any] = compared_summary(found, labels, records[0].recording.nominal.name)
+        summary["kept"], summary["failed"] = change_exceeded(found.drifts[-1].lengths, max_length_change_mm)
+        written = []
+        if figure is not None:
+            from ..plot import save_drift_trend
+
+            save_drift_trend(found, figure)
+            written.append(str(figure))
+        if csv is not None:
+            write_text(csv, drift_csv(found, labels))
+            written.append(str(csv))
     show_summary(summary | ({"written": ", ".join(written)} if written else {}), as_json, compare_display.comparison)
     if summary["failed"]:
         raise typer.Exit(1)
@@ -117,11 +122,3 @@ def _created(file: Path) -> str:
     attributes = read_tables(file, ("calibration",)).attributes
     need(file, attributes, "created", of="attribute")
     return attributes["created"]
-
-
-def _check_outputs(files: list[Path], figure: Path | None, csv: Path | None) -> None:
-    if figure is not None:
-        from ..plot.style import check_format
-
-        check_format(figure)
-    check_outputs([figure, csv], files)

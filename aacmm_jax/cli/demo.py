@@ -9,19 +9,22 @@ import numpy as np
 from ..calibration.evaluation import evaluate
 from ..calibration.record import CalibrationRecord, record_of
 from ..calibration.stages import calibrate
-from ..core.errors import InputError
+from ..core.errors import InputError, some
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..data.simulation import simulate
 from ..files.arms import load_specification, save_arm
 from ..files.calibrations import save_calibration
-from ..files.captures import save_capture
+from ..files.captures import load_capture, save_capture
 from ..files.inputs import fingerprint
-from ..kinematics.parameters import perturbed_arm
+from ..files.outputs import together
+from ..kinematics.parameters import ArmSpecification, perturbed_arm
 from ..summaries.calibration import calibration_summary, capture_summary
 
 _DEVIATION_MM, _DEVIATION_DEG = 1.0, 0.1
 _ENCODER_ARCSEC, _SEATING_MM, _LENGTH_U_MM = 2.0, 0.005, 0.002
+_FILES = ("capture.h5", "calibration.h5", "nominal.toml", "true.toml", "calibrated.toml", "calibration.png")
+_TRUE = ", true"  # what the name of the true arm ends in
 _CHECKS, _CHECK_MM = 30, 300.0
 _START, _END = (400.0, 200.0, 300.0), (700.0, 500.0, 500.0)
 
@@ -29,16 +32,38 @@ _START, _END = (400.0, 200.0, 300.0), (700.0, 500.0, 500.0)
 def run(folder: Path, seed: int) -> dict[str, Any]:
     """Simulate, calibrate, compare, and leave capture, calibration, arms and a figure in ``folder``."""
     nominal = load_specification("cheng2018-simulation")
+    _prepare(folder, nominal.name + _TRUE)
+    with together(*(folder / name for name in _FILES)):
+        return _made(folder, nominal, seed)
+
+
+def _prepare(folder: Path, true_name: str) -> None:
+    """Make the folder, or make sure that all that is in it was left by an earlier demonstration."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        found = {item.name for item in folder.iterdir() if not item.name.endswith(".part")}
     except OSError as error:
         raise InputError(
             f"{folder} cannot be used as a folder: {(error.strerror or str(error)).lower()}; name another."
         ) from error
+    foreign = sorted(found - set(_FILES))
+    if not foreign and found:
+        try:
+            true = load_capture(folder / _FILES[0]).true
+        except InputError:
+            true = None
+        foreign = [] if true is not None and true.name == true_name else sorted(found)
+    if foreign:
+        raise InputError(
+            f"{folder} holds files that are not of a demonstration ({some(foreign)}); name a new or an empty folder."
+        )
+
+
+def _made(folder: Path, nominal: ArmSpecification, seed: int) -> dict[str, Any]:
     bounds = nominal.bounds()
     true = nominal._replace(
         arm=perturbed_arm(bounds.space, length=_DEVIATION_MM, angle=math.radians(_DEVIATION_DEG), seed=seed),
-        name=f"{nominal.name}, true",
+        name=nominal.name + _TRUE,
     )
     capture = simulate(
         true.arm,
@@ -62,8 +87,7 @@ def run(folder: Path, seed: int) -> dict[str, Any]:
     from ..plot import save_calibration_figure
 
     save_calibration_figure(record, folder / "calibration.png")
-    files = ["capture.h5", "calibration.h5", "nominal.toml", "true.toml", "calibrated.toml", "calibration.png"]
-    return summary | {"folder": str(folder), "files": files}
+    return summary | {"folder": str(folder), "files": list(_FILES)}
 
 
 def _checks(record: CalibrationRecord, seed: int) -> dict[str, float]:

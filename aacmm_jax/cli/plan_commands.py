@@ -1,6 +1,5 @@
 """The command ``plan``."""
 
-import math
 import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -8,8 +7,10 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ..core.errors import InputError
+from ..core.text import number
 from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
+from ..files.outputs import together
 from .app import (
     EncoderNoise,
     Json,
@@ -17,7 +18,6 @@ from .app import (
     ReferenceLengths,
     SeatingNoise,
     app,
-    check_outputs,
     examples,
     length_option,
     show_summary,
@@ -42,11 +42,14 @@ def plan(
             "--output", "-o", metavar="FILE.csv", help="Plan to write: one row a pose, joint readings in degrees."
         ),
     ],
-    poses: Annotated[int, typer.Option(min=2, metavar="N", help="Number of poses, all sockets together.")] = 30,
+    poses: Annotated[
+        int, typer.Option(min=2, max=10_000, metavar="N", help="Number of poses, all sockets together.")
+    ] = 30,
     sockets: Annotated[
         int | None,
         typer.Option(
             min=1,
+            max=1000,
             metavar="N",
             help="Number of sockets to position, in pairs at the ends of the reference length. Default 4.",
         ),
@@ -84,7 +87,9 @@ def plan(
         float,
         typer.Option(metavar="MM", help="Height of the table in the base frame: every joint and tip stays above it."),
     ] = 0.0,
-    candidates: Annotated[int, typer.Option(min=100, metavar="N", help="Number of poses to choose from.")] = 3000,
+    candidates: Annotated[
+        int, typer.Option(min=100, max=1_000_000, metavar="N", help="Number of poses to choose from.")
+    ] = 3000,
     check_length_mm: Annotated[
         float | None,
         typer.Option(
@@ -129,8 +134,8 @@ def plan(
     from ..summaries.planning import plan_summary
     from . import acceptance_display, plan_display
 
-    check_outputs([output, manifest], [arm])
-    specification = load_specification(arm)
+    with together(output, manifest):  # refuses outputs that are inputs or cannot be written, before the work
+        specification = load_specification(arm)
     if socket and sockets is not None:
         raise InputError("--sockets has sockets positioned and --socket gives their positions; give one of the two.")
     if length and not socket:
@@ -144,7 +149,6 @@ def plan(
             raise InputError(
                 "--acceptance has its own sockets and bars; leave out --socket, --sockets, --length and --region."
             )
-        _check_folder(output)
         options = {
             "above": above_mm,
             "margin": margin_deg * DEG,
@@ -162,7 +166,6 @@ def plan(
     axes = [_axis(text) for text in region or ()]
     if len(dict(axes)) < len(axes):
         raise InputError("an axis is named twice in --region; give each one range.")
-    _check_folder(output)
     points = sockets_option(socket)
     with plan_display.progress() as report_progress:
         found = run(
@@ -197,14 +200,13 @@ def _procedure(
     from ..files.whole_file import write_text
     from ..summaries.planning import procedure_summary
 
-    if manifest is not None:
-        _check_folder(manifest)
     found = with_spinner("Planning", lambda: plan_procedure(specification.arm, standard, **options))
-    write_text(output, procedure_csv(found))
     written = str(output)
-    if manifest is not None:
-        write_text(manifest, procedure_manifest(found, _arm_for(manifest, arm)))
-        written += f", {manifest}"
+    with together(output, manifest):
+        write_text(output, procedure_csv(found))
+        if manifest is not None:
+            write_text(manifest, procedure_manifest(found, _arm_for(manifest, arm)))
+            written += f", {manifest}"
     return procedure_summary(found, specification.name) | {"written": written}
 
 
@@ -214,19 +216,10 @@ def _arm_for(manifest: Path, arm: str) -> str:
     return Path(os.path.relpath(file, manifest.parent)).as_posix() if file.is_file() else arm
 
 
-def _check_folder(output: Path) -> None:
-    """Raise `InputError` for an output that could not be written, before half a minute of work."""
-    folder = output.parent
-    if output.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise InputError(
-            f"{output} cannot be written: it is a folder, or its folder is missing or protected; name another file."
-        )
-
-
 def _range(option: str, text: str) -> tuple[float, float]:
     low, colon, high = text.partition(":")
     try:
-        return float(low), float(high if colon else low)
+        return number(low.strip()), number((high if colon else low).strip())
     except ValueError as error:
         raise InputError(f"{option} '{text}' is not of the form L or L:M, in mm.") from error
 
@@ -237,6 +230,6 @@ def _axis(text: str) -> tuple[str, tuple[float, float]]:
     try:
         if not colon:
             raise ValueError
-        return axis, (float(low or -math.inf), float(high or math.inf))
+        return axis, (number(low.strip() or "-inf"), number(high.strip() or "inf"))
     except ValueError as error:
         raise InputError(f"--region '{text}' is not of the form AXIS=LOW:HIGH, in mm; for example z=0:800.") from error

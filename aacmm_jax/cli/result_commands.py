@@ -9,8 +9,9 @@ import typer
 from ..core.errors import InputError
 from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
+from ..files.outputs import together
 from ..files.whole_file import write_text
-from .app import CalibrationFile, Json, Only, Without, app, check_outputs, examples, show_summary, with_spinner
+from .app import CalibrationFile, Json, Only, Without, app, examples, show_summary, with_spinner
 
 About = Annotated[
     Path | None,
@@ -119,9 +120,9 @@ def report(
     from ..report import write_report
     from . import acceptance_display
 
-    check_outputs([output], [file, about])
-    stated = None if about is None else read_administrative_data(about)
-    summary = with_spinner("Writing the report", lambda: write_report(file, output, stated))
+    with together(output):
+        stated = None if about is None else read_administrative_data(about)
+        summary = with_spinner("Writing the report", lambda: write_report(file, output, stated))
     show_summary(summary, as_json, acceptance_display.report)
 
 
@@ -141,18 +142,18 @@ def _evaluated(
     from ..files.inputs import InputFile, fingerprint
     from ..summaries.evaluation import evaluation_summary
 
-    check_outputs([output], [calibration, capture])
-    read = InputFile(calibration), InputFile(capture)
-    record, recording = load_calibration(read[0]), load_capture(read[1])
-    recording = recording._replace(
-        capture=recording.capture.select(choice[0] or None, choice[1] or ()),
-        sources=(*map(fingerprint, read), *recording.sources),
-    )
-    found = evaluation_of(record, recording, limits=limits, u_test=u_test, maxima=maxima)
-    summary = with_spinner("Evaluating", lambda: evaluation_summary(found))
-    if output is not None:
-        save_evaluation(output, found, summary)
-        summary["written"] = str(output)
+    with together(output):
+        read = InputFile(calibration), InputFile(capture)
+        record, recording = load_calibration(read[0]), load_capture(read[1])
+        recording = recording._replace(
+            capture=recording.capture.select(choice[0] or None, choice[1] or ()),
+            sources=(*map(fingerprint, read), *recording.sources),
+        )
+        found = evaluation_of(record, recording, limits=limits, u_test=u_test, maxima=maxima)
+        summary = with_spinner("Evaluating", lambda: evaluation_summary(found))
+        if output is not None:
+            save_evaluation(output, found, summary)
+            summary["written"] = str(output)
     return summary
 
 
@@ -166,12 +167,12 @@ def _evaluated_points(manifest: Path, output: Path | None, limits: Any, u_test: 
         raise InputError(
             f"{manifest} alone cannot be evaluated; name a capture as well, or a manifest of points (TOML)."
         )
-    check_outputs([output], [manifest])
-    record = PointsRecord(read_points(manifest), limits, u_test)
-    summary = points_summary(record)
-    if output is not None:
-        save_points(output, record, summary)
-        summary["written"] = str(output)
+    with together(output):
+        record = PointsRecord(read_points(manifest), limits, u_test)
+        summary = points_summary(record)
+        if output is not None:
+            save_points(output, record, summary)
+            summary["written"] = str(output)
     return summary
 
 
@@ -207,35 +208,33 @@ def export(
     if which is not None and form != "toml":
         raise InputError("--arm is for --format toml; leave it out, since the other formats hold all arms.")
     which = which or "calibrated"
-    check_outputs([output], [calibration, about])
     from ..files.arms import specification_toml
     from ..files.calibrations import load_calibration
     from ..summaries.calibration import calibration_summary, parameters_csv
 
-    record = load_calibration(read := InputFile(calibration))
-    arms = {"calibrated": record.calibrated, "nominal": record.recording.nominal, "true": record.recording.true}
-    arm = arms[which]
-    if arm is None:
-        raise InputError(f"{calibration} is not of a simulation, so it has no true arm; choose another --arm.")
-    if not record.converged or record.implausible_residual:
-        reason = "the residual is that of no arm; see aacmm show." if record.converged else record.reason
-        typer.echo(f"Warning: {calibration} is not a calibration that can be used: {reason}", err=True)
-    source = (
-        f"calibrated from {sum(record.recording.capture.sizes)} poses, {record.method}, k = {record.k:.8f}"
-        if which == "calibrated"
-        else ""
-    )
-    text = {
-        "toml": lambda: specification_toml(arm, source=source),
-        "json": lambda: json.dumps(calibration_summary(record), indent=2) + "\n",
-        "csv": lambda: parameters_csv(record),
-        "dcc": lambda: _certificate(read, record, about),
-    }[form]()
-    if output is None:
-        typer.echo(text, nl=False)
-    else:
-        write_text(output, text)
-        typer.echo(f"Written: {output}")
+    with together(output):
+        record = load_calibration(read := InputFile(calibration))
+        arms = {"calibrated": record.calibrated, "nominal": record.recording.nominal, "true": record.recording.true}
+        arm = arms[which]
+        if arm is None:
+            raise InputError(f"{calibration} is not of a simulation, so it has no true arm; choose another --arm.")
+        if not record.converged or record.implausible_residual:
+            reason = "the residual is that of no arm; see aacmm show." if record.converged else record.reason
+            typer.echo(f"Warning: {calibration} is not a calibration that can be used: {reason}", err=True)
+        source = (
+            f"calibrated from {sum(record.recording.capture.sizes)} poses, {record.method}, k = {record.k:.8f}"
+            if which == "calibrated"
+            else ""
+        )
+        text = {
+            "toml": lambda: specification_toml(arm, source=source),
+            "json": lambda: json.dumps(calibration_summary(record), indent=2) + "\n",
+            "csv": lambda: parameters_csv(record),
+            "dcc": lambda: _certificate(read, record, about),
+        }[form]()
+        if output is not None:
+            write_text(output, text)
+    typer.echo(text, nl=False) if output is None else typer.echo(f"Written: {output}")
 
 
 def _certificate(calibration: InputFile, record: Any, about: Path | None) -> str:

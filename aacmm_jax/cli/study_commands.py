@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from ..core.errors import InputError
+from ..files.outputs import together
 from .app import Json, Stopped, app, examples, show_summary, with_spinner
 
 
@@ -79,7 +80,8 @@ def study(
             raise InputError("--trials and --seed stay those of the study; leave them out with --resume.")
         asked = read(output).study
     else:
-        asked = _asked(specification, trials, seed)
+        with together(output):  # refuses an output that the specification reads
+            asked = _asked(specification, trials, seed)
     if shards and dask is None:
         raise InputError("--shards is for the workers of --dask; leave it out, or name a cluster.")
 
@@ -186,6 +188,7 @@ def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool
         raise InputError(f"{file} has {len(results.study.cells)} cells, so there is no cell {cell}; name another.")
     summary = with_spinner("Reading", lambda: study_summary(results, cell))
     if figures is not None:
-        paths = with_spinner("Drawing", lambda: save_study_figures(results, figures))
+        with together():
+            paths = with_spinner("Drawing", lambda: save_study_figures(results, figures))
         summary["figures_written"] = [str(path) for path in paths]
     show_summary(summary, as_json, study_display.study if cell is None else study_display.one_cell)

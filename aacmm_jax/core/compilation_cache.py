@@ -1,41 +1,84 @@
 """Compiled programs are kept between processes, in the user's own cache folder; set up when the package is imported.
 
-AACMM_JAX_CACHE=0 leaves JAX's setting alone, and so does whoever has set a folder (JAX_COMPILATION_CACHE_DIR).
+They are native code, which is run as it is read. So a folder that anybody else can write to is not used, be it the
+default one or one that JAX_COMPILATION_CACHE_DIR names. AACMM_JAX_CACHE=0 leaves JAX's setting alone, unchecked.
 """
 
 import os
+import stat
 import sys
+import warnings
 from pathlib import Path
 
 _LEAST_SECONDS = "0.1"  # shorter compilations are not kept: reading them would take as long
-
-
-def cache_folder() -> Path | None:
-    """The folder, or None where it is turned off or anybody else could write to it: what is read there is run."""
-    if os.environ.get("AACMM_JAX_CACHE", "").strip().lower() in {"0", "false", "off", "no"}:
-        return None
-    try:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aacmm_jax"
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.stat()
-    except (OSError, RuntimeError):  # no home, or none to write to
-        return None
-    private = os.name != "posix" or (found.st_uid == os.getuid() and not found.st_mode & 0o022)
-    return folder if private else None
+_FOLDER, _TURNED_OFF = "JAX_COMPILATION_CACHE_DIR", "AACMM_JAX_CACHE"
 
 
 def set_up() -> None:
     """Tell JAX, by its environment where it is not imported yet, so that processes started from here have it too."""
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+    if os.environ.get(_TURNED_OFF, "").strip().lower() in {"0", "false", "off", "no"}:
         return
-    imported = sys.modules.get("jax")
-    if imported is not None and imported.config.jax_compilation_cache_dir is not None:
+    jax = sys.modules.get("jax")
+    given = os.environ.get(_FOLDER)
+    if jax is not None:
+        given = jax.config.jax_compilation_cache_dir or given
+    if given == "" or (given is not None and "://" in given):  # turned off, or in a bucket with rules of its own
         return
-    folder = cache_folder()
+    folder = _default_folder() if given is None else Path(given)
     if folder is None:
         return
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", _LEAST_SECONDS)
-    if imported is not None:
-        imported.config.update("jax_compilation_cache_dir", str(folder))
-        imported.config.update("jax_persistent_cache_min_compile_time_secs", float(_LEAST_SECONDS))
+    try:
+        unsafe = _unsafe(folder)
+    except OSError:  # there is none, and it cannot be made
+        return
+    if unsafe:
+        os.environ.pop(_FOLDER, None)
+        os.environ[_TURNED_OFF] = "0"  # for processes started from here
+        folder_set = None
+        warnings.warn_explicit(
+            f"the compilation cache {folder} is not used, because {unsafe}, and what is read there is run; remove the "
+            f"folder, which is then made anew, or set {_FOLDER} to one that only you can write to.",
+            UserWarning,
+            "aacmm_jax",
+            1,
+        )
+    else:
+        folder_set = str(folder)
+        os.environ[_FOLDER] = folder_set
+    if given is None and not unsafe:
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", _LEAST_SECONDS)
+        if jax is not None:
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", float(_LEAST_SECONDS))
+    if jax is not None:
+        jax.config.update("jax_compilation_cache_dir", folder_set)
+
+
+def _default_folder() -> Path | None:
+    """The package's folder in the user's cache folder; None for a user without a home."""
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aacmm_jax"
+    except RuntimeError:
+        return None
+
+
+def _unsafe(folder: Path) -> str:
+    """Why others could put programs into a folder, which is made if there is none; empty where only the user can."""
+    if not folder.is_absolute():
+        return "its path is relative, so it depends on where a program is started"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if os.name != "posix":
+        return ""
+    folder = folder.resolve()
+    found = folder.stat()
+    if found.st_uid != os.getuid():
+        return "it belongs to another user"
+    if found.st_mode & 0o022:
+        return f"others may write to it (mode {stat.S_IMODE(found.st_mode):04o})"
+    # Whoever can rename a folder above can put another one there. Groups of one user write to many a home folder.
+    for above in folder.parents:
+        found = above.stat()
+        if found.st_uid not in (0, os.getuid()):
+            return f"{above} belongs to another user"
+        if found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX:
+            return f"others may write to {above} (mode {stat.S_IMODE(found.st_mode):04o})"
+    return ""

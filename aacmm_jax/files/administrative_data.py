@@ -48,6 +48,9 @@ def _country(code: str) -> str:
 Country = Annotated[str, AfterValidator(_country)]
 
 
+Date = Annotated[datetime.date, Field(strict=False)]  # also in quotes
+
+
 class Contact(Strict):
     """A laboratory's or a customer's name and address. ``country`` is a code of ISO 3166-1: two capital letters."""
 
@@ -99,10 +102,10 @@ class Certificate(Strict):
 
     number: Text | None = None
     country: Country | None = None  # where it is issued; by default the laboratory's
-    received: datetime.date | None = None  # when the arm came in
-    begin: datetime.date | None = None
-    end: datetime.date | None = None
-    issued: datetime.date | None = None
+    received: Date | None = None  # when the arm came in
+    begin: Date | None = None
+    end: Date | None = None
+    issued: Date | None = None
     place: Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"] = "other"
     remarks: Text | None = None
     temperature_celsius: FiniteFloat | None = None

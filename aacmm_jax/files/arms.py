@@ -1,5 +1,6 @@
 """Arms in TOML files, one row per joint, and the arms that ship with the package."""
 
+import math
 import os
 from importlib import resources
 from pathlib import Path
@@ -55,6 +56,24 @@ class _ArmModel(Strict):
     probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3, default_factory=lambda: [0.0, 0.0, 0.0])]
     joint: Annotated[list[_Joint], Field(min_length=1)]
     identification: _Identification | None = None
+
+    @model_validator(mode="after")
+    def _unit_of_angles(self) -> "_ArmModel":
+        """Refuse twists that can only be in the other unit."""
+        twists = [joint.alpha for joint in self.joint if joint.alpha]
+        for number, joint in enumerate(self.joint, start=1):
+            if self.angle_unit == "rad" and abs(joint.alpha) > 2 * math.pi:
+                raise ValueError(
+                    f"joint {number} has alpha = {joint.alpha:g} rad, more than a revolution; is it in degrees? "
+                    "Correct angle_unit or alpha."
+                )
+        quarters = [twist / (math.pi / 2) for twist in twists]
+        if self.angle_unit == "deg" and twists and all(abs(x - round(x)) < 1e-3 and 1 <= abs(x) < 3 for x in quarters):
+            raise ValueError(
+                f"every alpha is a multiple of pi/2, such as {twists[0]:g}, which is no common twist in degrees; is it "
+                "in rad? Correct angle_unit or alpha."
+            )
+        return self
 
     @model_validator(mode="after")
     def _all_or_none(self) -> "_ArmModel":

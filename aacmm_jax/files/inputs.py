@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError
+from .outputs import reading, waiting
 
 LARGEST_FILE = "AACMM_LARGEST_FILE_MB"  # environment variable: size limit of inputs, MiB
 STREAMED = 100  # a study's file, which is read in parts, may be larger than the limit by this factor
@@ -48,8 +49,9 @@ class InputFile(os.PathLike):
 
     @property
     def text(self) -> str:
-        """The content as text in UTF-8, with or without a byte order mark. Raises `UnicodeDecodeError`."""
-        return self.content.decode("utf-8-sig")
+        """The content as text in UTF-8, with or without a byte order mark; lines end with a line feed. Raises
+        `UnicodeDecodeError`."""
+        return self.content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
 
 
 @contextlib.contextmanager
@@ -61,6 +63,7 @@ def open_input(path: str | os.PathLike, times: int = 1) -> Iterator[Any]:
     if isinstance(path, InputFile):
         yield io.BytesIO(path.content)
         return
+    reading(path)
     limit = times * largest_file()
     try:
         # Before it is opened, as opening a device may have effects; and again, as it may have been replaced.
@@ -104,9 +107,10 @@ def check_readable(path: str | os.PathLike) -> None:
 def fingerprint(path: str | os.PathLike, folder: str | os.PathLike | None = None) -> str:
     """A file's name and SHA-256, which identify it; the name is relative to ``folder`` where the file is below it.
 
-    Of an `InputFile`, the SHA-256 is that of the bytes that were read from it.
+    Of an `InputFile`, the SHA-256 is that of the bytes that were read from it; of an output that waits for the others
+    of its command, that of what was written.
     """
-    with open_input(path, STREAMED) as stream:
+    with open_input(path if isinstance(path, InputFile) else waiting(path), STREAMED) as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     path = Path(path)
     below = folder is not None and path.is_relative_to(folder)

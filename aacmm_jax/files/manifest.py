@@ -26,7 +26,7 @@ from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
 from .arms import load_specification
 from .inputs import InputFile, fingerprint
-from .patterns import fields_of, fill, in_braces, matches
+from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
 from .text_table import read_numbers
 from .toml import Strict, each_once, read_toml
 
@@ -116,7 +116,7 @@ def _day(value: Any) -> Any:
 class _Recorded(Strict):
     """What manifests of poses and of points have in common."""
 
-    date: Annotated[datetime.date, BeforeValidator(_day)] | None = None  # when it was recorded
+    date: Annotated[datetime.date, Field(strict=False), BeforeValidator(_day)] | None = None  # when it was recorded
     socket: list[_Socket] = Field(default_factory=list)
     length: list[_Length] = Field(default_factory=list)
     sphere: list[_Sphere] = Field(default_factory=list)
@@ -192,6 +192,7 @@ def recorded(
     fields: list[dict[str, str]] = []
     for entry in model.socket:
         for name, files, values in _expand(folder, entry):
+            check_name(name)
             if name in sockets:
                 raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
             sockets[name] = np.concatenate([read(file) for file in files])
@@ -233,6 +234,8 @@ def _radians(readings: np.ndarray, angles: _Angles) -> np.ndarray:
 def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dict[str, str]]]:
     """Sockets of one entry: name, files and the values of its fields in braces."""
     first = entry.paths[0]
+    for text in (entry.name or "", *entry.paths):
+        check_fields(text)
     fields = fields_of(first)
     for what, text in (("name", entry.name or ""), *(("file", file) for file in entry.paths[1:])):
         if fields_of(text) != fields:
@@ -256,7 +259,9 @@ def _lengths(
     """Reference lengths; one with fields in braces gives every combination that the sockets' files have."""
     lengths = []
     for entry in entries:
-        names = fields_of(entry.start + entry.end)
+        check_fields(entry.start)
+        check_fields(entry.end)
+        names = fields_of(entry.start) | fields_of(entry.end)
         if not names:
             lengths.append(ReferenceLength(entry.start, entry.end, entry.value, entry.u))
             continue

@@ -9,18 +9,40 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ..core.errors import InputError
+from ..core.text import is_control, quoted
 
 _FIELD = re.compile(r"\{(\w+)\}")
 # A folder's or file's name that is one field, perhaps with an extension.
 _WHOLE = re.compile(r"\{\w+\}(?:\.\w+)?")
 _ANYTHING = "[^/]+"
 _WORD = r"(?:[^\W_]|-)+"
+_MOST_FIELDS = 8  # each more multiplies the ways in which a name can match
+_LONGEST_NAME = 200  # characters
 _NAMED = 3  # near misses that a message names
 
 
 def fields_of(text: str) -> set[str]:
     """Names of the fields in braces."""
     return set(_FIELD.findall(text))
+
+
+def check_fields(text: str) -> None:
+    """Refuse fields without a name, more of them than a path has folders, and fields with nothing between them."""
+    for name in _FIELD.findall(text):
+        if not name[0].isalpha():
+            raise InputError(f"the field {{{name}}} in {quoted(text)} has no name; begin it with a letter.")
+    if len(_FIELD.findall(text)) > _MOST_FIELDS:
+        raise InputError(f"{quoted(text)} has more than {_MOST_FIELDS} fields; write more of it out.")
+    if re.search(r"\{\w+\}\{\w+\}", text):
+        raise InputError(f"{quoted(text)} has two fields with nothing between them; write what divides them.")
+
+
+def check_name(name: str) -> None:
+    """Refuse a name with characters that act on a terminal or end a text (NUL, ESC), and one longer than a line."""
+    if any(is_control(character) for character in name):
+        raise InputError(f"the name {quoted(name)} holds a control character; rename it.")
+    if len(name) > _LONGEST_NAME:
+        raise InputError(f"the name {quoted(name)} has {len(name):,} characters, over {_LONGEST_NAME}; shorten it.")
 
 
 def in_braces(fields: Iterable[str]) -> str:
@@ -79,7 +101,6 @@ def _expression(pattern: str, partial: str) -> str:
         name = field.group(1)
         value = partial if name in shared else _ANYTHING
         parts += re.escape(pattern[last : field.start()])
-        # Groups have numbers: the name of a field, such as {1}, may be none that a group can have.
         if name in seen:
             parts += f"(?:\\{seen.index(name) + 1})"
         else:

@@ -1,6 +1,8 @@
 """TOML files, and tables passed from Python, read into pydantic models; errors in one sentence."""
 
+import math
 import os
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
@@ -8,20 +10,30 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from ..core.errors import InputError, nearest
+from ..core.text import is_control, quoted
 from .inputs import InputFile
 
 Model = TypeVar("Model", bound=BaseModel)
+_MOST_CHARACTERS = 4_000_000  # a manifest of ten thousand sockets has less than a tenth of them
+_DEEPEST = 16  # levels of tables and lists, and parts of a dotted key
+_LARGEST = 1e20  # numbers whose squares are far from the limits of a float, and all seeds
+_LONG_KEY = re.compile(
+    rf"""(?<![\w."'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{_DEEPEST},}}"""  # possessive: linear
+)
 
 
 class Strict(BaseModel):
-    """A table whose keys are all known: any other key is refused. Values cannot be assigned to."""
+    """A table whose keys are all known: any other key is refused. Values cannot be assigned to.
 
-    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+    Numbers are finite numbers: neither quoted ones nor true and false are taken for them.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, strict=True, allow_inf_nan=False)
 
     @field_validator("*", mode="before")
     @classmethod
     def _no_booleans(cls, value: Any, info: Any) -> Any:
-        """Refuse true and false where a number is wanted; pydantic takes them for 1 and 0."""
+        """Refuse true and false where a number is wanted, in one sentence for all kinds of numbers."""
         wanted = cls.model_fields[str(info.field_name)].annotation
         if wanted is not bool and any(isinstance(x, bool) for x in (value if isinstance(value, list) else [value])):
             raise ValueError("true and false are no numbers; give a number.")
@@ -31,12 +43,59 @@ class Strict(BaseModel):
 def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
     """Read a TOML file into a pydantic model. Raises `InputError` that names the file and the place in it."""
     try:
-        content = tomllib.loads(InputFile(path).text)
+        text = InputFile(path).text
+        _check_text(path, text)
+        content = tomllib.loads(text)
+    except InputError:
+        raise
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text in UTF-8, as TOML is; name a TOML file.") from error
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} is not valid TOML: {error}; correct it there.") from error
+    except RecursionError as error:
+        raise InputError(f"{path} nests tables or lists too deeply; no such file has more than {_DEEPEST}.") from error
+    except ValueError as error:  # digits beyond those that Python converts
+        raise InputError(f"{path} holds a number of thousands of digits; correct it.") from error
+    _check_content(path, content)
     return validated(model, content, str(path))
+
+
+def _check_text(path: str | os.PathLike, text: str) -> None:
+    """Refuse what would take a parser gigabytes or minutes."""
+    if len(text) > _MOST_CHARACTERS:
+        raise InputError(f"{path} has {len(text):,} characters, and {_MOST_CHARACTERS:,} are the most; name a shorter.")
+    long_key = _LONG_KEY.search(text)
+    if long_key:
+        line = text.count("\n", 0, long_key.start()) + 1
+        raise InputError(f"{path} line {line} has a key of more than {_DEEPEST} parts; correct it.")
+
+
+def _check_content(path: str | os.PathLike, content: dict[str, Any]) -> None:
+    """Refuse depth, numbers and characters that no file of this package has, with the key at which they are."""
+    waiting: list[tuple[str, Any]] = [("", content)]
+    depths = [0]
+    while waiting:
+        (place, value), depth = waiting.pop(), depths.pop()
+        if depth > _DEEPEST:
+            raise InputError(f"{path} nests tables or lists too deeply; no such file has more than {_DEEPEST}.")
+        if isinstance(value, Mapping | list):
+            pairs = value.items() if isinstance(value, Mapping) else enumerate(value, start=1)
+            for key, item in pairs:
+                inside = f"{place} {key}" if isinstance(key, int) else f"{place}.{key}" if place else key
+                _check_characters(path, inside, str(key))
+                waiting.append((inside, item))
+                depths.append(depth + 1)
+        elif isinstance(value, str):
+            _check_characters(path, place, value)
+        elif isinstance(value, int | float) and _LARGEST < abs(value) < math.inf:
+            raise InputError(f"{path}: '{place}' is larger than any number that is meant; correct it.")
+
+
+def _check_characters(path: str | os.PathLike, place: str, text: str) -> None:
+    for character in text:
+        if is_control(character):
+            code = f"U+{ord(character):04X}"
+            raise InputError(f"{path}: {quoted(place)} holds the control character {code}; take it out.")
 
 
 def validated(model: type[Model], content: Mapping[str, Any], where: str) -> Model:
@@ -91,7 +150,7 @@ def _explain(error: Any, model: Any, content: Any) -> str:
     if kind in ("too_short", "too_long"):
         limit = f"at least {context['min_length']}" if kind == "too_short" else f"at most {context['max_length']}"
         return f"'{place}' has {len(given) or 'no'} entries; give {limit}."
-    shown = "a table" if isinstance(given, dict) else "a list" if isinstance(given, list) else repr(given)
+    shown = "a table" if isinstance(given, dict) else "a list" if isinstance(given, list) else _short(given)
     advice = f"; write [[{place}]]" if kind == "list_type" and isinstance(given, dict) else ""
     wanted = {
         "tuple_type": "must be a list of numbers",
@@ -102,6 +161,10 @@ def _explain(error: Any, model: Any, content: Any) -> str:
         wanted = "must be a number, { uniform = ... } or { normal = ... }"
     wanted = wanted or error["msg"].replace("Input should", "must").partition(", unable")[0]
     return f"'{place}' {wanted}, not {shown}{advice}."
+
+
+def _short(given: Any) -> str:
+    return quoted(given) if isinstance(given, str) else repr(given)
 
 
 def _known_keys(model: Any, steps: Sequence[Any]) -> list[str]:

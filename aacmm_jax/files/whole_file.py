@@ -2,42 +2,39 @@
 
 import contextlib
 import os
-import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
 from ..core.errors import InputError
-
-ELSEWHERE = "choose another output path"
+from .outputs import ELSEWHERE, OutputFile, hand_over, put_in_place, remove_leftovers
 
 
 @contextlib.contextmanager
-def whole_file(path: str | os.PathLike, advice: str = ELSEWHERE) -> Iterator[Path]:
+def whole_file(path: str | os.PathLike, advice: str = ELSEWHERE, *, leftovers: bool = True) -> Iterator[Path]:
     """Write a file whole or not at all: yields a temporary path in the same folder, renamed onto it at the end.
 
-    A symbolic link is followed: the file that it points to is written. Whatever goes wrong (Ctrl-C included), the
-    temporary file is removed and an existing target stays as it was. Raises `InputError` where the path cannot be
-    written, or is a folder, a device or a pipe.
+    Inside `together`, the end is that of all outputs. A symbolic link is followed: the file that it points to is
+    written. A file that is replaced leaves its permissions to the new one. Whatever goes wrong (Ctrl-C included), the
+    temporary file is removed and an existing target stays as it was; ``leftovers``: those of killed processes are
+    removed as well. Raises `InputError` where the path cannot be written, or is a folder, a device, a pipe or
+    read-only.
     """
-    named = Path(path)
-    target = Path(os.path.realpath(named))
-    # Named before it is made: an interrupt between the two must not leave a file behind.
-    temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
+    file = OutputFile(path, advice)
+    waits = False
     try:
-        # A link in /proc (/dev/stdout) leads to what has no path, and one that leads to itself remains a link.
-        if (named.exists() or target.exists() or target.is_symlink()) and not target.is_file():
-            raise OSError(None, "it is a folder" if target.is_dir() else "it is not an ordinary file")
-        open(temporary, "xb").close()
-        yield temporary
-        with open(temporary, "rb+") as written:
-            os.fsync(written.fileno())
-        os.replace(temporary, target)
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise InputError(f"{named} cannot be written: {reason}; {advice}.") from error
+        with file.refusing():
+            file.check()
+            if leftovers:
+                remove_leftovers(file.target)
+            file.create()
+            yield file.temporary
+            file.finish()
+            waits = hand_over(file)
+            if not waits:
+                put_in_place([file])
     finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
+        if not waits:
+            file.discard()
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from ..core.errors import InputError
 from .definition import Setting, Study
 
-MOST_BLOCKS = 1_000_000
+MOST_BLOCKS = 10_000  # each takes 80 kB of memory when the study's file is made
 NOT_RUN = -1  # of whole numbers; NaN of others, and -128 of active, where -1 is a bound
 
 

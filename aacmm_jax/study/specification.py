@@ -12,7 +12,6 @@ from pydantic import (
     AfterValidator,
     BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     FiniteFloat,
     NonNegativeFloat,
@@ -21,7 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from ..files.toml import validated
+from ..files.toml import Strict, validated
 
 # More cells than a grid of four factors with ten levels each are a mistake.
 MOST_CELLS = 10_000
@@ -50,14 +49,14 @@ def _different(levels: list) -> list:
 
 Level = TypeVar("Level")
 Levels = Annotated[list[Level], _levels_of(0), Field(min_length=1), AfterValidator(_different)]
-Finite = Annotated[FiniteFloat, Field(strict=False)]
+Finite = FiniteFloat
 Amount = Annotated[NonNegativeFloat, Field(allow_inf_nan=False)]
 Positive = Annotated[PositiveFloat, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
-Pair = Annotated[tuple[Finite, Finite], AfterValidator(lambda pair: _ordered(pair))]
-Point = tuple[Finite, Finite, Finite]
+Pair = Annotated[tuple[Finite, Finite], Field(strict=False), AfterValidator(lambda pair: _ordered(pair))]
+Point = Annotated[tuple[Finite, Finite, Finite], Field(strict=False)]
 Points = Annotated[list[Point], Field(min_length=1)]
-Ends = tuple[Point, Point]
+Ends = Annotated[tuple[Point, Point], Field(strict=False)]
 
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
@@ -67,7 +66,7 @@ def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = Strict.model_config
 
 
 class Distribution(_Table):

@@ -77,7 +77,7 @@ def write_part(path: Path, block: Block, packed: Packed, layout: Layout) -> None
             dataset = _dataset(file, name, layout, layout.shape(name, *block.shape))
             dataset.id.write_direct_chunk((0,) * dataset.ndim, content)
 
-    with whole_file(target, _ADVICE) as temporary:
+    with whole_file(target, _ADVICE, leftovers=False) as temporary:
         temporary.write_bytes(file_image(fill, digest=False))
 
 

@@ -16,6 +16,7 @@ from ..data.recording import Recording
 from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Bounds, Parameters
 from ..uncertainty.identifiability import Observability, observability
+from .likely_cause import likely_cause
 
 _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a reference length is wrong
 _LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 through errors outside the D-H model
@@ -49,10 +50,24 @@ def of_capture(recording: Recording) -> list[str]:
                 f"Joint {joint + 1}: {outside} of {len(q)} readings lie outside its limits, {low} to {high} deg; "
                 "is the unit right, and the order of the columns?"
             )
+    found += _repeated(recording)
     exact = [f"{length.start} - {length.end}" for length in recording.capture.lengths if float(length.u) == 0]
     if exact and recording.true is None:
         found.append(f"Taken as exact, because u is 0: {some(exact)}; give the standard uncertainty of each length.")
     return found
+
+
+def _repeated(recording: Recording) -> list[str]:
+    """Poses that are in a socket twice, which is one measurement and counts as two."""
+    sockets = recording.capture.sockets.items()
+    twice = {name: len(q) - len(np.unique(np.asarray(q), axis=0)) for name, q in sockets}
+    repeated = [f"{name} ({count})" for name, count in twice.items() if count]
+    if not repeated:
+        return []
+    return [
+        f"Poses that repeat another one of their socket in every digit: {some(repeated)}; each counts as a measurement "
+        "of its own, which makes every uncertainty too small. Take the copies out."
+    ]
 
 
 def of_calibration(record: CalibrationRecord, seen: Observability | None = None) -> list[str]:
@@ -84,7 +99,18 @@ def _implausible(record: CalibrationRecord) -> list[str]:
     return [
         f"The poses of a socket disagree by {rms:.3g} mm RMS, over a hundred times what an arm of this size can be, "
         "so data and arm do not belong together: check the files, their columns and unit, the sockets and the arm."
+        + _cause(record)
     ]
+
+
+def does_not_fit(record: CalibrationRecord) -> bool:
+    """Whether so many parameters are on a bound that the arm is not that of the data."""
+    return len(_sides(record)) >= len(record.names) / 3 and record.hold is not None
+
+
+def _cause(record: CalibrationRecord) -> str:
+    cause = likely_cause(record.recording.nominal.arm, record.recording.capture)
+    return f" {cause}" if cause else ""
 
 
 def _validation(record: CalibrationRecord) -> list[str]:
@@ -152,7 +178,7 @@ def _bounds(record: CalibrationRecord, seen: Observability) -> list[str]:
     if len(sides) >= len(record.names) / 3:
         return [
             f"{len(sides)} of {len(record.names)} parameters are on a bound, so the arm does not fit the data: "
-            "check unit, order of columns, sockets and arm."
+            "check unit, order of columns, sockets and arm." + _cause(record)
         ]
     traded = {name for trade_off in seen.trade_offs for name in trade_off.names}
     weak = [side for side in sides if side.split(" ")[0] in traded]

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.data.recording import Recording
 
 COMMANDS = ("demo", "simulate", "import", "calibrate", "evaluate", "export", "show", "plan", "compare", "report")
 SIMULATE = (
@@ -282,3 +283,22 @@ def test_short_commands_import_no_jax(aacmm, tmp_path, arguments):
     command = [sys.executable, "-c", code, *arguments]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("mistake", "cause"),
+    [
+        (lambda q: q * [1, 1, -1, 1, 1, 1], "joint 3 read with the wrong sign."),
+        (lambda q: q[:, [0, 2, 1, 3, 4, 5]], "the columns of joints 2 and 3 are exchanged."),
+        (lambda q: q / 0.9, "readings in gon are taken for degrees."),
+    ],
+    ids=["sign", "order", "gon"],
+)
+def test_data_of_another_arm_are_no_calibration(aacmm, tmp_path, noisy_capture, mistake, cause):
+    """Exit code 1, and what would make the data fit."""
+    sockets = {name: mistake(np.asarray(q)) for name, q in noisy_capture.sockets.items()}
+    capture = aj.Capture(sockets, noisy_capture.lengths)
+    nominal = aj.files.load_specification("cheng2018-simulation")
+    aj.files.save_capture(tmp_path / "c.h5", Recording(capture, nominal))
+    shown = aacmm("calibrate", "c.h5", "-o", "k.h5", expect=1).stdout
+    assert f"Likely cause: {cause}" in " ".join(shown.split())

@@ -1,4 +1,4 @@
-"""Compiled programs are kept in the user's own folder, from Python as from the command line."""
+"""Compiled programs are kept in a folder that nobody else can write to, and damaged ones are replaced."""
 
 import os
 import stat
@@ -8,29 +8,94 @@ import sys
 import pytest
 
 PRINT = "print(jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64)"
+COMPILE = """
+import jax, jax.numpy as jnp
+from aacmm_jax.core import namespace
+print(float(jax.jit(lambda x: jnp.sin(x) @ jnp.cos(x))(jnp.arange(9.0))))
+"""
+
+
+def python(program, folder, *before, **settings):
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "XDG_"))}
+    environment = inherited | {"XDG_CACHE_HOME": str(folder)} | settings
+    command = [*before, sys.executable, "-c", program]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
 
 
 @pytest.mark.parametrize("imports", ["import aacmm_jax, jax", "import jax, aacmm_jax"])
 @pytest.mark.parametrize(
-    ("settings", "mode", "expected"),
+    ("settings", "expected"),
     [
-        ({}, None, "{home}/aacmm_jax True"),
-        ({}, 0o700, "{home}/aacmm_jax True"),
-        ({}, 0o777, "None True"),  # anybody could put a program there
-        ({"AACMM_JAX_CACHE": "0"}, None, "None True"),
-        ({"JAX_COMPILATION_CACHE_DIR": "/elsewhere"}, None, "/elsewhere True"),
+        ({}, "{home}/aacmm_jax True"),
+        ({"AACMM_JAX_CACHE": "0"}, "None True"),
+        ({"AACMM_JAX_CACHE": "0", "JAX_COMPILATION_CACHE_DIR": "/elsewhere"}, "/elsewhere True"),
+        ({"JAX_COMPILATION_CACHE_DIR": "{home}/other"}, "{home}/other True"),
+        ({"JAX_COMPILATION_CACHE_DIR": "gs://bucket/x"}, "gs://bucket/x True"),
     ],
 )
-def test_folder(tmp_path, imports, settings, mode, expected):
-    folder = tmp_path / "aacmm_jax"
-    if mode is not None:
-        folder.mkdir()
-        folder.chmod(mode)
-    inherited = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
-    environment = inherited | {"XDG_CACHE_HOME": str(tmp_path)} | settings
-    done = subprocess.run(
-        [sys.executable, "-c", f"{imports}; {PRINT}"], env=environment, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == expected.format(home=tmp_path)
-    if mode is None and not settings:
+def test_folder(tmp_path, imports, settings, expected):
+    settings = {name: value.format(home=tmp_path) for name, value in settings.items()}
+    done = python(f"{imports}; {PRINT}", tmp_path, **settings)
+    assert (done.stdout.strip(), done.stderr) == (expected.format(home=tmp_path), "")
+    for folder in tmp_path.iterdir():
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+@pytest.mark.parametrize(
+    ("mode", "above", "settings", "reason"),
+    [
+        (0o777, 0o700, {}, "others may write to it (mode 0777)"),
+        (0o720, 0o700, {}, "others may write to it (mode 0720)"),
+        (0o700, 0o777, {}, "(mode 0777)"),
+        (0o777, 0o700, {"JAX_COMPILATION_CACHE_DIR": "{home}/aacmm_jax"}, "others may write to it (mode 0777)"),
+        (0o700, 0o700, {"XDG_CACHE_HOME": "."}, "its path is relative"),
+        (0o700, 0o700, {"XDG_CACHE_HOME": "", "HOME": "."}, "its path is relative"),
+        (0o700, 0o700, {"JAX_COMPILATION_CACHE_DIR": "aacmm_jax"}, "its path is relative"),
+    ],
+    ids=[
+        "mode",
+        "mode for the group",
+        "mode above",
+        "JAX's own",
+        "relative XDG",
+        "relative HOME",
+        "JAX's own relative",
+    ],
+)
+def test_a_folder_of_others_is_not_used(tmp_path, mode, above, settings, reason):
+    """One sentence says so; processes that are started from this one do not use it either."""
+    folder = tmp_path / "aacmm_jax"
+    folder.mkdir()
+    folder.chmod(mode)
+    tmp_path.chmod(above)
+    settings = {name: value.format(home=tmp_path) for name, value in settings.items()}
+    imports = "import jax, aacmm_jax" if mode == 0o720 else "import aacmm_jax, jax"
+    done = python(f"{imports}, os; {PRINT}; print(os.environ.get('JAX_COMPILATION_CACHE_DIR'))", tmp_path, **settings)
+    assert done.stdout.split() == ["None", "True", "None"]
+    assert done.stderr.count("\n") == 1
+    assert "is not used, because" in done.stderr
+    assert reason in done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only the superuser can act for two users")
+def test_a_folder_of_another_user_is_not_used(tmp_path):
+    folder = tmp_path / "aacmm_jax"
+    folder.mkdir(mode=0o700)
+    os.chown(folder, 65534, 65534)
+    done = python(f"import aacmm_jax, jax; {PRINT}", tmp_path)
+    assert done.stdout.split() == ["None", "True"]
+    assert "it belongs to another user" in done.stderr
+
+
+def test_a_truncated_program_is_replaced(tmp_path):
+    """It is compiled again without a warning, and the next process reads it."""
+    settings = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    first = python(COMPILE, tmp_path, **settings)
+    entries = {path: path.read_bytes() for path in (tmp_path / "aacmm_jax").glob("*-cache")}
+    assert entries
+    for path, content in entries.items():
+        path.write_bytes(content[: len(content) // 2])
+    second = python(COMPILE, tmp_path, **settings)
+    assert (second.stdout, second.stderr) == (first.stdout, "")
+    for path, content in entries.items():
+        assert len(path.read_bytes()) > len(content) // 2

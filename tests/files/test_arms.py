@@ -172,6 +172,9 @@ def test_saved_arm_reads_back_the_same_numbers(tmp_path):
         ("[-101.0, 10.0]", "[10.0]", ["'joint 2.limits' has 1 entries", "give at least 2"]),
         ("[-101.0, 10.0]", "[10.0, -101.0]", ["joint 2: the limits are 10 to -101", "lower must be below"]),
         ("45.0", '"forty-five"', ["'joint 2.alpha' must be a valid number, not 'forty-five'"]),
+        ("45.0", '"45.0"', ["'joint 2.alpha' must be a valid number, not '45.0'"]),
+        ("45.0", "1e300", ["'joint 2.alpha' is larger than any number that is meant"]),
+        ('"deg"', '"rad"', ["joint 1 has alpha = ", "rad, more than a revolution; is it in degrees?"]),
         ("45.0", "nan", ["'joint 2.alpha' must be a finite number, not nan"]),
         ("45.0", "", ["not valid TOML", "line 10"]),
         ("130.0]", "]", ["'probe' has 2 entries", "give at least 3"]),
@@ -183,7 +186,8 @@ def test_saved_arm_reads_back_the_same_numbers(tmp_path):
     ],
     ids=[
         *("misspelt in a row", "misspelt at the top", "misspelt in identification", "length unit", "angle unit"),
-        *("convention", "no unit", "no key in a row", "limits of some", "one limit", "limits reversed", "text", "nan"),
+        *("convention", "no unit", "no key in a row", "limits of some", "one limit", "limits reversed", "text"),
+        *("quoted", "too large", "degrees stated as radians", "nan"),
         *("not TOML", "probe", "craig before joint 1", "override unknown", "override held"),
         *("override negative", "held unknown"),
     ],
@@ -192,6 +196,17 @@ def test_bad_file(tmp_path, old, new, parts):
     assert SMALL.count(old) == 1
     path = written(tmp_path, SMALL.replace(old, new))
     assert_refused(lambda: aj.load_arm(path), path, *parts)
+
+
+def test_radians_stated_as_degrees(tmp_path):
+    """Twists of a quarter turn in radians are refused; small ones in degrees are not."""
+    head = 'length_unit = "mm"\nangle_unit = "deg"\njoint = ['
+    rows = "{{ alpha = {}, a = 0, d = 1 }}, {{ alpha = 0, a = 1, d = 0 }}, {{ alpha = {}, a = 0, d = 1 }}]"
+    for twists in ((-1.5708, 1.5708), (1.570796326794897, 3.141592653589793)):
+        path = written(tmp_path, head + rows.format(*twists))
+        assert_refused(lambda path=path: aj.load_arm(path), path, "multiple of pi/2", "is it in rad?")
+    for twists in ((-90, 1.5708), (0.01, -0.02), (1.5, -1.5)):
+        aj.load_arm(written(tmp_path, head + rows.format(*twists)))
 
 
 def test_what_is_not_an_arm_file(tmp_path):

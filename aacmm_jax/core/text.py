@@ -1,0 +1,42 @@
+"""Text from outside: what is a number, and what may be printed."""
+
+import re
+import unicodedata
+
+# What Python's ``float`` takes besides is no number to people: 1_0, digits of other scripts, blanks around it.
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
+_LONGEST = 60  # characters of a text that a message quotes
+# Marks that are not seen, or change the direction of what follows, so that a text reads otherwise than it is.
+_MARKS = frozenset("\ufeff\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
+
+
+def number(text: str) -> float:
+    """The number that a text is in plain decimal digits; ``ValueError`` for any other text."""
+    if _NUMBER.fullmatch(text) is None:
+        raise ValueError(f"{text!r} is not a number")
+    return float(text)
+
+
+def is_number(text: str) -> bool:
+    """Whether `number` takes the text."""
+    return _NUMBER.fullmatch(text) is not None
+
+
+def is_control(character: str) -> bool:
+    """Whether a character acts on a terminal instead of being shown: ESC, NUL, marks of direction; not a line's end."""
+    return character not in "\n\r\t" and (unicodedata.category(character) in ("Cc", "Zl", "Zp") or character in _MARKS)
+
+
+def printable(text: str) -> str:
+    """The text with escapes such as ``\\x1b`` instead of characters that act on a terminal."""
+    if text.isprintable():
+        return text
+    return "".join(
+        character.encode("unicode_escape").decode() if is_control(character) or character == "\r" else character
+        for character in text
+    )
+
+
+def quoted(text: str) -> str:
+    """The text in quotes as a message shows it: printable, and cut where it is long."""
+    return f"'{printable(text if len(text) <= _LONGEST else text[:_LONGEST] + '...')}'"

@@ -1,0 +1,248 @@
+"""The files that a command writes: none of them is a file that it reads, and all of them appear together or not at all.
+
+Whatever is written goes to a temporary file in the same folder, which is locked while its writer lives and is renamed
+at the end. So a temporary file that nobody has locked was left by a process that was killed, and is removed.
+"""
+
+import contextlib
+import os
+import re
+import secrets
+import shutil
+import stat
+from collections.abc import Iterator
+from contextvars import ContextVar
+from pathlib import Path
+
+from ..core.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # Windows, where an open file cannot be removed, which serves as the lock
+    fcntl = None
+
+ELSEWHERE = "choose another output path"
+
+
+class OutputFile:
+    """A file that is being written under a temporary name; a symbolic link is followed to the file it points to."""
+
+    def __init__(self, path: str | os.PathLike, advice: str = ELSEWHERE):
+        self.named, self._advice = Path(path), advice
+        with self.refusing():
+            if "\0" in str(path):
+                raise OSError(None, "its name holds a NUL")
+            self.target = Path(os.path.realpath(self.named))
+        self.temporary = self._sibling()
+        self._lock: int | None = None
+        self._backup: Path | None = None
+
+    def _sibling(self) -> Path:
+        return self.target.parent / f".{self.target.name}.{secrets.token_hex(4)}.part"
+
+    @contextlib.contextmanager
+    def refusing(self) -> Iterator[None]:
+        """Whatever the operating system refuses is an `InputError` that names the file."""
+        try:
+            yield
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            raise InputError(f"{self.named} cannot be written: {reason}; {self._advice}.") from error
+
+    def check(self) -> None:
+        """Raise `OSError` where the file cannot be written: a folder, a device, a read-only file."""
+        named, target = self.named, self.target
+        # A link in /proc (/dev/stdout) leads to what has no path, and one that leads to itself remains a link.
+        if (named.exists() or target.exists() or target.is_symlink()) and not target.is_file():
+            raise OSError(None, "it is a folder" if target.is_dir() else "it is not an ordinary file")
+        # The superuser may write to a file without write permission, which is protected all the same.
+        if target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
+            raise OSError(None, "it is read-only")
+        target.parent.stat()  # which there must be
+        if not target.parent.is_dir():
+            raise OSError(None, "not a directory")
+        if not os.access(target.parent, os.W_OK | os.X_OK):
+            raise OSError(None, "its folder is read-only")
+
+    def create(self) -> None:
+        """Make the temporary file and lock it; whoever removes leftovers may have seen it before it was locked."""
+        while True:
+            mode = stat.S_IMODE(self.target.stat().st_mode) if self.target.exists() else 0o666
+            self._lock = os.open(self.temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, mode)
+            if fcntl is None:
+                return
+            with contextlib.suppress(OSError):  # a file system without locks
+                fcntl.flock(self._lock, fcntl.LOCK_EX)
+            if self.temporary.exists():
+                return
+            self._unlock()
+
+    def finish(self) -> None:
+        """The content is complete: have it stored, with the permissions and the owner of the file it replaces."""
+        with open(self.temporary, "rb+") as written:
+            os.fsync(written.fileno())
+        if self.target.exists():
+            replaced = self.target.stat()
+            if hasattr(os, "chown"):
+                with contextlib.suppress(OSError):
+                    os.chown(self.temporary, replaced.st_uid, replaced.st_gid)
+            os.chmod(self.temporary, stat.S_IMODE(replaced.st_mode))
+
+    def discard(self) -> None:
+        """Remove the temporary files that are left."""
+        self._unlock()
+        for left in (self.temporary, self._backup):
+            with contextlib.suppress(OSError):
+                if left is not None:
+                    left.unlink()
+
+    def keep_old(self) -> None:
+        """Keep the file that will be replaced, under another name."""
+        if not self.target.exists():
+            return
+        self._backup = self._sibling()
+        try:
+            os.link(self.target, self._backup)
+        except OSError:  # a file system without hard links
+            shutil.copy2(self.target, self._backup)
+
+    def replace(self) -> None:
+        """Put the new file in place."""
+        self.check()
+        if fcntl is None:
+            self._unlock()
+        os.replace(self.temporary, self.target)
+
+    def undo(self) -> None:
+        """As it was before `replace`."""
+        with contextlib.suppress(OSError):
+            if self._backup is not None:
+                os.replace(self._backup, self.target)
+            else:
+                self.target.unlink()
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+
+def put_in_place(files: list[OutputFile]) -> None:
+    """Rename all files or none: where one cannot be, those before it are undone."""
+    started: list[OutputFile] = []
+    try:
+        for file in files:
+            with file.refusing():
+                if len(files) > 1:
+                    file.keep_old()
+                    started.append(file)
+                file.replace()
+    except BaseException:
+        for file in reversed(started):
+            file.undo()
+        raise
+    finally:
+        for file in files:
+            file.discard()
+
+
+def remove_leftovers(target: Path) -> None:
+    """Remove the temporary files of processes that were killed while they wrote this file."""
+    pattern = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{8}}\.part")
+    with contextlib.suppress(OSError):
+        for item in os.scandir(target.parent):
+            if pattern.fullmatch(item.name) and item.is_file(follow_symlinks=False):
+                with contextlib.suppress(OSError):
+                    _remove_unlocked(item.path)
+
+
+def _remove_unlocked(path: str) -> None:
+    if fcntl is None:
+        os.unlink(path)
+        return
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.unlink(path)
+    finally:
+        os.close(descriptor)
+
+
+class _Outputs:
+    """The outputs of a command: those that are announced, and those that are made and wait."""
+
+    def __init__(self, announced: list[OutputFile]):
+        self.announced = announced
+        self.made: dict[Path, OutputFile] = {}
+        self.read: list[Path] = []
+
+
+_current: ContextVar[_Outputs | None] = ContextVar("outputs", default=None)
+
+
+@contextlib.contextmanager
+def together(*paths: str | os.PathLike | None) -> Iterator[None]:
+    """What is written in this block appears at its end, all files together; after an exception, none.
+
+    ``paths`` are the files that will be written, None those that are not asked for. Raises `InputError`, before any
+    work, where one of them cannot be written or is named twice; and as soon as one of them is read.
+    """
+    outputs = [OutputFile(path) for path in paths if path is not None]
+    for number, output in enumerate(outputs):
+        with output.refusing():
+            output.check()
+        if any(_same(output.target, other.target) for other in outputs[:number]):
+            raise InputError(f"{output.named} is named for two outputs; choose another for one of them.")
+    group = _Outputs(outputs)
+    token = _current.set(group)
+    try:
+        yield
+        put_in_place(list(group.made.values()))
+    finally:
+        _current.reset(token)
+        for file in group.made.values():
+            file.discard()
+
+
+def reading(path: str | os.PathLike) -> None:
+    """A file is about to be read: raise `InputError` where it is one of the outputs of the command."""
+    group = _current.get()
+    if group is not None:
+        group.read.append(Path(path))
+        for output in group.announced:
+            _check_different(output, Path(path))
+
+
+def waiting(path: str | os.PathLike) -> Path:
+    """Where the content of a file is: of an output that is made but not in place yet, its temporary name."""
+    group = _current.get()
+    made = None if group is None else group.made.get(Path(os.path.realpath(path)))
+    return Path(path) if made is None else made.temporary
+
+
+def hand_over(file: OutputFile) -> bool:
+    """Whether a finished file waits for the other outputs of the command."""
+    group = _current.get()
+    if group is None:
+        return False
+    for path in group.read:
+        _check_different(file, path)
+    earlier = group.made.pop(file.target, None)
+    if earlier is not None:
+        earlier.discard()
+    group.made[file.target] = file
+    return True
+
+
+def _check_different(output: OutputFile, path: Path) -> None:
+    if _same(output.target, path):
+        raise InputError(f"{output.named} is one of the files that this command reads; choose another output.")
+
+
+def _same(one: Path, other: Path) -> bool:
+    if os.path.realpath(one) == os.path.realpath(other):
+        return True
+    try:
+        return os.path.samefile(one, other)
+    except (OSError, ValueError):  # one of them does not exist
+        return False

@@ -1,0 +1,280 @@
+"""Mutated text files through every loader: ``python benchmarks/hostile_texts.py [--count 10000] [--seed 1]``.
+
+Prints what became of them. An edit (a digit, a name, a line) is another valid text and may give another result; a
+corruption (digits of another script, quotes, control characters, columns numbered in the first row, ...) never may. A
+mutation that changes neither the result nor raises `InputError` in one sentence is a failure, and so is one that takes
+longer than ten seconds. Exit code 1 where anything failed or a corruption gave another result.
+"""
+
+import argparse
+import collections
+import random
+import re
+import signal
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+import aacmm_jax as aj
+from aacmm_jax.files.administrative_data import read_administrative_data
+from aacmm_jax.files.arms import specification_toml
+from aacmm_jax.study import read_study
+
+SECONDS = 10
+MANIFEST = """date = 2026-01-31
+arm = "arm.toml"
+
+[angles]
+unit = "deg"
+sign = [1, 1, -1, 1, 1, 1]
+offset = 0.5
+columns = [2, 3, 4, 5, 6, 7]
+
+[[socket]]
+name = "plate/{hole}"
+file = "hole_{hole}.csv"
+exclude = ["*_old.csv"]
+
+[[length]]
+from = "plate/0"
+to = "plate/1"
+value = 200.125
+u = 0.002
+"""
+POINTS = """[points]
+unit = "mm"
+reach = 900.0
+shoulder = [0.0, 0.0, 300.0]
+
+[[socket]]
+name = "A"
+file = "points.csv"
+
+[[sphere]]
+name = "S"
+test = "probing"
+files = ["sphere.csv"]
+diameter = 25.0004
+u = 0.0005
+stylus = 6.0
+"""
+STUDY = """name = "Study"
+arm = "arm.toml"
+trials = 10
+seed = 3
+[deviation]
+length_mm = [1.0, { normal = 0.5 }]
+[capture]
+sockets = 2
+region = { x_mm = [200, 600], y_mm = [-300, 300], z_mm = [100, 500] }
+poses = 20
+[noise]
+encoder_arcsec = [1, 2]
+[reference]
+ends_mm = [[[400, 200, 300], [600, 200, 300]]]
+u_mm = 0.001
+[bounds]
+override = { probe_z = 20.0 }
+"""
+ABOUT = """[laboratory]
+name = "Laboratory"
+country = "DE"
+[[person]]
+name = "A. Person"
+main_signer = true
+[certificate]
+number = "42"
+begin = 2026-01-30
+end = 2026-01-31
+temperature_celsius = 20.1
+temperature_u_celsius = 0.2
+"""
+
+
+def originals(folder: Path) -> dict[str, Callable[[], object]]:
+    """Write one file of every kind; name of the file that is mutated -> what it is read by."""
+    random_numbers = np.random.default_rng(0)
+    (folder / "arm.toml").write_text(specification_toml(aj.files.load_specification("cheng2018-simulation")))
+    for name in ("hole_0.csv", "hole_1.csv", "hole_1_old.csv"):
+        rows = random_numbers.uniform(-90, 90, (5, 7))
+        lines = [",".join(f"{x:.4f}" for x in row) for row in rows]
+        (folder / name).write_text("time,q1,q2,q3,q4,q5,q6\n" + "\n".join(lines) + "\n")
+    for name, centre in (("points.csv", 0.0), ("sphere.csv", 15.5)):
+        directions = random_numbers.normal(size=(25, 3))
+        points = centre * directions / np.linalg.norm(directions, axis=1)[:, None] + [400, 200, 300]
+        points += random_numbers.normal(0, 0.01, points.shape)
+        (folder / name).write_text("\n".join(";".join(f"{x:.5f}" for x in row) for row in points) + "\n")
+    for name, text in (("m.toml", MANIFEST), ("p.toml", POINTS), ("s.toml", STUDY), ("l.toml", ABOUT)):
+        (folder / name).write_text(text)
+
+    def manifest() -> object:
+        return aj.files.read_manifest(folder / "m.toml")._replace(sources=())
+
+    def points() -> object:
+        return aj.files.read_points(folder / "p.toml")._replace(sources=())
+
+    return {
+        "m.toml": manifest,
+        "hole_0.csv": manifest,
+        "arm.toml": lambda: aj.files.load_specification(folder / "arm.toml"),
+        "p.toml": points,
+        "points.csv": points,
+        "s.toml": lambda: read_study(folder / "s.toml").specification,
+        "l.toml": lambda: read_administrative_data(folder / "l.toml"),
+    }
+
+
+def content(item: object) -> str:
+    """All numbers and texts of a result, exactly."""
+    import jax
+
+    if isinstance(item, tuple) and not hasattr(item, "_fields"):
+        return repr([content(part) for part in item])
+    leaves, structure = jax.tree.flatten(item)
+    return repr([x.tolist() if hasattr(x, "tolist") else x for x in leaves]) + str(structure)
+
+
+NASTY = ["\0", "\x1b[2J", "\u202e", "\x7f", "\x9b", "\u2028", "\x1c", "\ufeff"]
+NUMBER = re.compile(r"(?<![\w.{])-?\d+(?:\.\d+)?(?![\w.}])")
+
+
+def place(text: str, choose: random.Random) -> int:
+    return choose.randrange(len(text) + 1)
+
+
+def _inside_string(text: str, at: int) -> bool:
+    return text[text.rfind("\n", 0, at) + 1 : at].count('"') % 2 == 1
+
+
+def replaced(pattern: str, text: str, choose: random.Random, by: Callable[[str], str], strings: bool = False) -> str:
+    """One match in another form; ``strings``: only outside quotes, where any text is as good as another."""
+    found = [one for one in re.finditer(pattern, text) if not strings or not _inside_string(text, one.start())]
+    if not found:
+        return text
+    one = choose.choice(found)
+    return text[: one.start()] + by(one.group()) + text[one.end() :]
+
+
+def inserted(text: str, choose: random.Random, what: str) -> str:
+    at = place(text, choose)
+    return text[:at] + what + text[at:]
+
+
+def lines_changed(text: str, choose: random.Random, change: Callable[[list[str], int], None]) -> str:
+    lines = text.split("\n")
+    change(lines, choose.randrange(len(lines)))
+    return "\n".join(lines)
+
+
+def number(text: str, choose: random.Random, by: Callable[[str], str]) -> str:
+    return replaced(NUMBER.pattern, text, choose, by, strings=True)
+
+
+EDITS: dict[str, Callable[[str, random.Random], str]] = {
+    "another character": lambda text, choose: replaced(
+        r"[^\n]", text, choose, lambda _: choose.choice("0123456789abcxyz.,;-+=[]{}\"'# ")
+    ),
+    "character left out": lambda text, choose: replaced(".", text, choose, lambda _: ""),
+    "character twice": lambda text, choose: replaced(".", text, choose, lambda one: 2 * one),
+    "line left out": lambda text, choose: lines_changed(text, choose, lambda lines, i: lines.pop(i)),
+    "line twice": lambda text, choose: lines_changed(text, choose, lambda lines, i: lines.insert(i, lines[i])),
+    "cut short": lambda text, choose: text[: place(text, choose)],
+    "negative": lambda text, choose: number(text, choose, lambda one: "-" + one),
+}
+CORRUPTIONS: dict[str, Callable[[str, random.Random], str]] = {
+    "control character": lambda text, choose: inserted(text, choose, choose.choice(NASTY)),
+    "Arabic digits": lambda text, choose: number(
+        text, choose, lambda one: "".join(chr(0x660 + int(c)) if c.isdigit() else c for c in one)
+    ),
+    "fullwidth digit": lambda text, choose: number(
+        text, choose, lambda one: "".join(chr(0xFF10 + int(c)) if c.isdigit() else c for c in one)
+    ),
+    "quoted number": lambda text, choose: number(text, choose, lambda one: f'"{one}"'),
+    "boolean": lambda text, choose: number(text, choose, lambda _: choose.choice(["true", "True", "false"])),
+    "huge": lambda text, choose: number(
+        text, choose, lambda _: choose.choice(["1e300", "-1e300", "9" * 5001, "1e999"])
+    ),
+    "not finite": lambda text, choose: number(text, choose, lambda _: choose.choice(["nan", "inf", "-inf", "NaN"])),
+    "hexadecimal": lambda text, choose: number(text, choose, lambda one: f"{one}x1"),
+    # In a list, a comma makes two numbers of one.
+    "decimal comma": lambda text, choose: replaced(
+        r"(?m)^[^\[\n]*?\d\.\d", text, choose, lambda one: f"{one[:-2]},{one[-1]}"
+    ),
+    "opening quote": lambda text, choose: lines_changed(
+        text, choose, lambda lines, i: lines.__setitem__(i, '"' + lines[i])
+    ),
+    "deep": lambda text, choose: lines_changed(
+        text,
+        choose,
+        lambda lines, i: lines.insert(i, choose.choice(["a = " + "[" * 900, "a = " + "{a=" * 900, "[" * 900])),
+    ),
+    "dotted": lambda text, choose: "\n" + ".".join(["a"] * 20_000) + " = 1\n" + text,
+    "bytes": lambda text, choose: inserted(text, choose, "\udcff\udcfe"),
+}
+
+
+class Hang(BaseException):
+    """The time limit of one mutation has passed."""
+
+
+def stop(*_: object) -> None:
+    raise Hang
+
+
+def outcome(read: Callable[[], object], expected: str) -> tuple[str, str]:
+    signal.alarm(SECONDS)
+    try:
+        return ("same", "") if content(read()) == expected else ("different", "")
+    except aj.InputError as error:
+        sentence = str(error)
+        return ("refused", "") if "\n" not in sentence and len(sentence) < 2000 else ("failure", sentence[:300])
+    except Hang:
+        return "hang", ""
+    except Exception as error:
+        return "failure", f"{type(error).__name__}: {error}"[:300]
+    finally:
+        signal.alarm(0)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    choose = random.Random(options.seed)
+    signal.signal(signal.SIGALRM, stop)
+    counts: dict[str, collections.Counter[str]] = {"edits": collections.Counter(), "corruptions": collections.Counter()}
+    shown: collections.Counter[str] = collections.Counter()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        readers = originals(folder)
+        expected = {file: content(read()) for file, read in readers.items()}
+        for _ in range(options.count):
+            file = choose.choice(list(readers))
+            kind, mutations = choose.choice([("edits", EDITS), ("corruptions", CORRUPTIONS)])
+            mutation = choose.choice(list(mutations))
+            original = (folder / file).read_text()
+            mutated = mutations[mutation](original, choose)
+            (folder / file).write_bytes(mutated.encode(errors="surrogateescape"))
+            found, detail = outcome(readers[file], expected[file])
+            (folder / file).write_text(original)
+            counts[kind][found] += 1
+            wrong = found in ("failure", "hang") or (found == "different" and kind == "corruptions")
+            if wrong and (shown[mutation] < 4 or found != "different"):
+                shown[mutation] += 1
+                changed = [line for line in mutated.split("\n") if line not in original.split("\n")][:2]
+                print(f"{found}: {file}, {mutation}: {[line[:90] for line in changed]} {detail}")
+    for kind, count in counts.items():
+        print(
+            f"{kind}: "
+            + ", ".join(f"{count[what]:,} {what}" for what in ("refused", "same", "different", "failure", "hang"))
+        )
+    failed = sum(count["failure"] + count["hang"] for count in counts.values()) + counts["corruptions"]["different"]
+    sys.exit(1 if failed else 0)
+
+
+if __name__ == "__main__":
+    main()

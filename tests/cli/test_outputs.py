@@ -1,0 +1,159 @@
+"""What a command writes: never a file that it reads, all files or none, with the permissions of what they replace."""
+
+import os
+import re
+import stat
+import subprocess
+import sys
+
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.data.recording import Recording
+from aacmm_jax.files import whole_file
+from aacmm_jax.files.arms import specification_toml
+from tests.refusals import assert_refused
+
+POINTS = '[points]\nunit = "mm"\n[[socket]]\nfile = "PA.csv"\n'
+MANIFEST = 'arm = "arm.toml"\n[angles]\nunit = "rad"\n[[socket]]\nname = "{h}"\nfile = "{h}.csv"\n'
+STUDY = 'arm = "arm.toml"\ntrials = 1\n[capture]\nfile = "c.h5"\n'
+
+
+@pytest.fixture
+def inputs(tmp_path, paper_capture):
+    """One file of every kind that a command reads."""
+    arm = aj.files.load_specification("cheng2018-simulation")
+    for name in ("arm.toml", "other.toml"):
+        (tmp_path / name).write_text(specification_toml(arm))
+    (tmp_path / "A.csv").write_text("0.1,0.2,0.3,0.4,0.5,0.6\n0.2,0.3,0.4,0.5,0.6,0.7\n")
+    (tmp_path / "PA.csv").write_text("100.0,0.5,0.25\n100.5,0.5,0.5\n100.5,0.25,0.125\n")
+    (tmp_path / "m.toml").write_text(MANIFEST)
+    (tmp_path / "p.toml").write_text(POINTS)
+    (tmp_path / "lab.toml").write_text('[laboratory]\nname = "L"\n')
+    (tmp_path / "study.toml").write_text(STUDY)
+    recording = Recording(paper_capture, arm)
+    aj.files.save_capture(tmp_path / "c.h5", recording)
+    (tmp_path / "link.csv").symlink_to("A.csv")
+    os.link(tmp_path / "arm.toml", tmp_path / "same.toml")
+    return tmp_path
+
+
+def content(folder):
+    return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+SIMULATE = ("simulate", "arm.toml", "--socket", "A=400,200,300", "--poses", 2)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("import", "m.toml", "-o", "m.toml"),
+        ("import", "m.toml", "-o", "A.csv"),
+        ("import", "m.toml", "-o", "link.csv"),
+        ("import", "m.toml", "-o", "arm.toml"),
+        ("import", "m.toml", "-o", "same.toml"),
+        (*SIMULATE, "-o", "arm.toml"),
+        (*SIMULATE, "-o", "./../{folder}/arm.toml"),
+        (*SIMULATE, "--true-arm", "other.toml", "-o", "other.toml"),
+        ("calibrate", "c.h5", "-o", "c.h5"),
+        ("evaluate", "p.toml", "-o", "p.toml"),
+        ("evaluate", "p.toml", "-o", "PA.csv"),
+        ("evaluate", "c.h5", "c.h5", "-o", "c.h5"),
+        ("report", "c.h5", "-o", "c.h5"),
+        ("report", "c.h5", "--about", "lab.toml", "-o", "lab.toml"),
+        ("export", "c.h5", "-o", "c.h5"),
+        ("plan", "arm.toml", "-o", "arm.toml"),
+        ("plan", "arm.toml", "-o", "plan.csv", "--acceptance", "iso", "--manifest", "arm.toml"),
+        ("compare", "c.h5", "c.h5", "--csv", "c.h5"),
+        ("study", "study.toml", "-o", "study.toml"),
+        ("study", "study.toml", "-o", "arm.toml"),
+        ("study", "study.toml", "-o", "c.h5"),
+    ],
+    ids=lambda command: " ".join(map(str, command)),
+)
+def test_an_input_is_no_output(aacmm, inputs, command):
+    before = content(inputs)
+    done = aacmm(*(str(part).format(folder=inputs.name) for part in command), expect=2)
+    assert re.search("is (one of the files that this command reads|the file that the report is of);", done.stderr)
+    assert content(inputs) == before
+
+
+def test_one_path_is_not_two_outputs(aacmm, inputs):
+    before = content(inputs)
+    for first, second in (("x.png", "./x.png"), ("x.png", "link.png")):
+        (inputs / "link.png").unlink(missing_ok=True)
+        (inputs / "link.png").symlink_to("x.png")
+        done = aacmm("calibrate", "c.h5", "-o", first, "--figure", second, expect=2)
+        assert "is named for two outputs" in done.stderr
+    assert content(inputs) == before
+
+
+def test_demo_leaves_other_files_alone(aacmm, inputs):
+    """Neither a folder of other files, nor one that holds a capture of the same name."""
+    before = content(inputs)
+    assert "holds files that are not of a demonstration (A.csv" in aacmm("demo", ".", expect=2).stderr
+    (inputs / "own").mkdir()
+    (inputs / "c.h5").rename(inputs / "own" / "capture.h5")
+    assert "not of a demonstration (capture.h5)" in aacmm("demo", "own", expect=2).stderr
+    assert sorted(content(inputs).values()) == sorted(before.values())
+
+
+@pytest.mark.parametrize("failing", ["figure", "replace"])
+def test_all_outputs_or_none(aacmm, inputs, monkeypatch, failing):
+    """A command that fails at its second output, or while it puts them in place, leaves the first as it was."""
+    (inputs / "old.h5").write_bytes(b"old")
+    before = content(inputs)
+
+    def refused(*_):
+        raise OSError(28, "No space left on device")
+
+    if failing == "figure":
+        monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: refused())
+    else:
+        replace = os.replace
+        monkeypatch.setattr(os, "replace", lambda a, b: refused() if str(b).endswith(".png") else replace(a, b))
+    for output in ("old.h5", "new.h5"):
+        done = aacmm("calibrate", "c.h5", "-o", output, "--figure", "f.png", expect=2)
+        assert "f.png cannot be written: no space left on device" in done.stderr
+        assert content(inputs) == before
+
+
+def test_outputs_are_checked_before_any_work(aacmm, inputs):
+    (inputs / "old.png").touch(0o444)
+    done = aacmm("calibrate", "none.h5", "-o", "c2.h5", "--figure", "old.png", expect=2)
+    assert "old.png cannot be written: it is read-only; choose another output path." in done.stderr
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o644, 0o755])
+@pytest.mark.parametrize("named", ["file", "link"])
+def test_permissions_are_kept(tmp_path, mode, named):
+    (tmp_path / "file").touch()
+    (tmp_path / "file").chmod(mode)
+    (tmp_path / "link").symlink_to("file")
+    whole_file.write_text(tmp_path / named, "after")
+    assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == mode
+    assert (tmp_path / "file").read_text() == "after"
+    assert (tmp_path / "link").is_symlink()
+
+
+def test_a_read_only_file_is_refused(tmp_path):
+    (tmp_path / "file").touch(0o444)
+    assert_refused(lambda: whole_file.write_text(tmp_path / "file", ""), "it is read-only", "another output path")
+
+
+def test_leftovers_of_killed_processes_are_removed(tmp_path):
+    """Those of the same output only, and not that of a process that is still writing."""
+    program = (
+        "import os, signal, sys; from aacmm_jax.files.whole_file import whole_file\n"
+        "with whole_file(sys.argv[1]): os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    for name in ("a.txt", "b.txt"):
+        subprocess.run([sys.executable, "-c", program, tmp_path / name], check=False)
+    assert len(list(tmp_path.glob(".*.part"))) == 2
+    with whole_file.whole_file(tmp_path / "a.txt") as being_written:
+        being_written.write_text("first")
+        whole_file.write_text(tmp_path / "a.txt", "second")
+        assert being_written.exists()
+    assert (tmp_path / "a.txt").read_text() == "first"
+    assert [path.name[:7] for path in tmp_path.glob(".*.part")] == [".b.txt."]

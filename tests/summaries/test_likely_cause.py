@@ -1,0 +1,36 @@
+"""Mistakes of a recording are named by what makes the tips coincide."""
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.data.recording import Recording
+from aacmm_jax.summaries.likely_cause import likely_cause
+from aacmm_jax.summaries.warnings import of_capture
+
+
+@pytest.mark.parametrize(
+    ("mistake", "cause"),
+    [
+        (lambda q: q, ""),
+        (lambda q: q * [1, 1, -1, 1, 1, 1], "Likely cause: joint 3 read with the wrong sign."),
+        (lambda q: q * [1, -1, 1, 1, -1, 1], "Likely cause: joints 2 and 5 read with the wrong sign."),
+        (lambda q: q[:, [0, 1, 3, 2, 4, 5]], "Likely cause: the columns of joints 3 and 4 are exchanged."),
+        (lambda q: q[:, ::-1], "Likely cause: the columns are in reverse order."),
+        (lambda q: q / 0.9, "Likely cause: readings in gon are taken for degrees."),
+        (lambda q: np.random.default_rng(0).uniform(-2, 2, q.shape), ""),
+    ],
+)
+def test_cause(paper_arm, noisy_capture, mistake, cause):
+    q = mistake(np.asarray(noisy_capture.q))
+    capture = aj.Capture({"A": q[:70], "B": q[70:]})
+    assert likely_cause(paper_arm, capture) == cause
+
+
+def test_repeated_poses_are_named(noisy_capture):
+    nominal = aj.files.load_specification("cheng2018-simulation")
+    sockets = {name: np.asarray(q) for name, q in noisy_capture.sockets.items()}
+    assert not any("repeat" in warning for warning in of_capture(Recording(aj.Capture(sockets), nominal)))
+    sockets["A"] = np.concatenate([sockets["A"], sockets["A"][:3]])
+    warnings = of_capture(Recording(aj.Capture(sockets), nominal))
+    assert any("repeat another one of their socket in every digit: A (3);" in warning for warning in warnings)
