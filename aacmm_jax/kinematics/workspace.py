@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
@@ -15,6 +15,7 @@ from .chain import forward_pass, sines_cosines
 from .inverse_kinematics import project_to_targets
 
 _STARTS, _SWEEPS = 256, 30
+_SEARCH_STEPS = 25  # of a random start: seven of ten arrive; with 60 eight would
 
 
 class Reach(NamedTuple):
@@ -121,11 +122,18 @@ def search_region(
     return SearchRegion(arm, allowed + margin * np.array([1.0, -1.0]), above, np.random.default_rng(seed))
 
 
+def reached(
+    region: SearchRegion, starts: Float[np.ndarray, "c n"], targets: Float[np.ndarray, "c 3"], steps: int = 60
+) -> tuple[Float[np.ndarray, "c n"], Bool[np.ndarray, " c"]]:
+    """Configurations moved from their starts to the targets, and which of them arrived and are above the table."""
+    q, arrived = project_to_targets(region.arm, starts, targets, region.limits, steps)
+    return q, arrived & (lowest_point(region.arm, q) >= region.above)
+
+
 def configurations_at(
     region: SearchRegion, points: Float[np.ndarray, "s 3"], each: int
 ) -> tuple[Float[np.ndarray, "c n"], Int[np.ndarray, " c"]]:
     """Configurations that reach the points from ``each`` random starts a point, and the index of each one's point."""
     owner = np.repeat(np.arange(len(points)), each)
-    q, arrived = project_to_targets(region.arm, region.draw(len(owner)), points[owner], region.limits)
-    good = arrived & (lowest_point(region.arm, q) >= region.above)
+    q, good = reached(region, region.draw(len(owner)), points[owner], _SEARCH_STEPS)
     return q[good], owner[good]
