@@ -39,9 +39,7 @@ def jacobian_columns(forward: ForwardPass) -> dict[str, Float[AnyArray, "k ... 3
     return columns
 
 
-def readings_gradient(
-    forward: ForwardPass, cotangents: dict[str, Float[AnyArray, "k 3 N"]]
-) -> Float[AnyArray, "n N"]:
+def readings_gradient(forward: ForwardPass, cotangents: dict[str, Float[AnyArray, "k 3 N"]]) -> Float[AnyArray, "n N"]:
     """Derivative by the joint readings of a function of the Jacobian columns; ``cotangents`` are its derivatives by
     them, by kind.
 

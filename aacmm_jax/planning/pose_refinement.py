@@ -35,7 +35,7 @@ def refined(
     from scipy import optimize
 
     region, targets = problem.region, placement.points[owner]
-    sockets = _Sockets(problem, targets, _tip_columns(_forward(problem, q)))
+    sockets = TangentProjection.at(problem, q, targets)
     done = 0
 
     def iterated(_: np.ndarray) -> None:
@@ -43,13 +43,13 @@ def refined(
         done += 1
         progress(min(done / _ITERATIONS, 1.0))
 
-    def value_and_gradient(flat: np.ndarray) -> tuple[float, np.ndarray]:
+    def of_readings(flat: np.ndarray) -> tuple[float, np.ndarray]:
         at = sockets.projected(flat.reshape(q.shape))
-        value, gradient = _value_and_gradient(problem, placement, at, owner)
+        value, gradient = value_and_gradient(problem, placement, at, owner)
         return value, sockets.pulled_back(at, gradient).ravel()
 
     solution = optimize.minimize(
-        value_and_gradient, q.ravel(), jac=True, method="L-BFGS-B", bounds=np.tile(region.limits, (len(q), 1)),
+        of_readings, q.ravel(), jac=True, method="L-BFGS-B", bounds=np.tile(region.limits, (len(q), 1)),
         callback=iterated, options={"maxiter": _ITERATIONS},
     )  # fmt: skip
     change = sockets.projected(solution.x.reshape(q.shape)) - q
@@ -63,12 +63,19 @@ def refined(
     return best
 
 
-class _Sockets(NamedTuple):
-    """The configurations whose tips are in their sockets, and the directions in which others are projected to them."""
+class TangentProjection(NamedTuple):
+    """Projection to the configurations whose tips are in their sockets, along the normals of these at a start."""
 
     problem: DesignProblem
     targets: Float[np.ndarray, "N 3"]
     normals: Float[np.ndarray, "N 3 n"]  # dtip/dq at the start
+
+    @classmethod
+    def at(
+        cls, problem: DesignProblem, q: Float[np.ndarray, "N n"], targets: Float[np.ndarray, "N 3"]
+    ) -> "TangentProjection":
+        """The projection for the neighbourhood of q."""
+        return cls(problem, targets, _tip_columns(_forward(problem, q)))
 
     def projected(self, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
         """q + normals^T x, with x of each pose such that its tip is in its socket: by Newton's method."""
@@ -77,7 +84,8 @@ class _Sockets(NamedTuple):
             gap = self.targets - forward.tip.T
             if np.abs(gap).max() < _ARRIVED:
                 break
-            q = q + self._applied(np.linalg.solve(self._mixed(forward), gap[:, :, None])[:, :, 0])
+            multipliers = np.linalg.solve(self._mixed(forward), gap[:, :, None])
+            q = q + np.einsum("nc,ncj->nj", multipliers[:, :, 0], self.normals)
         return q
 
     def pulled_back(self, q: Float[np.ndarray, "N n"], gradient: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
@@ -89,9 +97,6 @@ class _Sockets(NamedTuple):
 
     def _mixed(self, forward: ForwardPass) -> Float[np.ndarray, "N 3 3"]:
         return _tip_columns(forward) @ np.swapaxes(self.normals, 1, 2)
-
-    def _applied(self, multipliers: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N n"]:
-        return np.einsum("nc,ncj->nj", multipliers, self.normals)
 
 
 def _forward(problem: DesignProblem, q: Float[np.ndarray, "N n"]) -> ForwardPass:
@@ -107,7 +112,7 @@ def _value(problem: DesignProblem, placement: FixturePlacement, q: np.ndarray, o
     return problem.objective.value(covariance_of(candidates.information(candidates.rows), candidates.parameters))
 
 
-def _value_and_gradient(
+def value_and_gradient(
     problem: DesignProblem, placement: FixturePlacement, q: Float[np.ndarray, "N n"], owner: Int[np.ndarray, " N"]
 ) -> tuple[float, Float[np.ndarray, "N n"]]:
     """The objective of poses in their sockets, and its derivative by the readings.
