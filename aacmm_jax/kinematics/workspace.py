@@ -15,7 +15,7 @@ from .chain import forward_pass, sines_cosines
 from .inverse_kinematics import project_to_targets
 
 _STARTS, _SWEEPS = 256, 30
-_SEARCH_STEPS = 25  # of a random start: seven of ten arrive; with 60 eight would
+_REACHING = 25  # steps: seven of ten random starts arrive, and with 60 eight would
 
 
 class Reach(NamedTuple):
@@ -123,7 +123,7 @@ def search_region(
 
 
 def reached(
-    region: SearchRegion, starts: Float[np.ndarray, "c n"], targets: Float[np.ndarray, "c 3"], steps: int = 60
+    region: SearchRegion, starts: Float[np.ndarray, "c n"], targets: Float[np.ndarray, "c 3"], steps: int = _REACHING
 ) -> tuple[Float[np.ndarray, "c n"], Bool[np.ndarray, " c"]]:
     """Configurations moved from their starts to the targets, and which of them arrived and are above the table."""
     q, arrived = project_to_targets(region.arm, starts, targets, region.limits, steps)
@@ -135,5 +135,5 @@ def configurations_at(
 ) -> tuple[Float[np.ndarray, "c n"], Int[np.ndarray, " c"]]:
     """Configurations that reach the points from ``each`` random starts a point, and the index of each one's point."""
     owner = np.repeat(np.arange(len(points)), each)
-    q, good = reached(region, region.draw(len(owner)), points[owner], _SEARCH_STEPS)
+    q, good = reached(region, region.draw(len(owner)), points[owner])
     return q[good], owner[good]
