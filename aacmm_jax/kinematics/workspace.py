@@ -11,7 +11,7 @@ from ..core.arrays import in_chunks
 from ..core.errors import InputError
 from ..core.namespace import to_numpy
 from .arm import Arm, joint_limits
-from .chain import forward_pass, sines_cosines
+from .chain import ForwardPass, forward_pass, sines_cosines
 from .inverse_kinematics import project_to_targets
 
 _STARTS, _SWEEPS = 256, 30
@@ -28,24 +28,26 @@ class Reach(NamedTuple):
 def arm_reach(arm: Arm) -> Reach:
     """Largest distance of the tip from the shoulder within the joint limits.
 
-    As a function of one joint the squared distance is a constant plus a sinusoid, so its maximum follows from three
-    values. From many random starts, joint after joint is set to its maximum until nothing changes.
+    As a function of one joint the squared distance is a constant plus a sinusoid: with the lever r from a point of the
+    joint's axis z to the tip, and s from the shoulder to that point, of 2 s . (r - (z . r) z) cos t + 2 s . (z x r) sin
+    t. From many random starts, joint after joint is set to its maximum until nothing changes.
     """
     shoulder = np.array([0.0, 0.0, float(arm.d[0])])
     limits = np.asarray(joint_limits(arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_STARTS, arm.joints))
+    geometry = to_numpy(arm.geometry)
 
-    def squared(configurations: np.ndarray) -> np.ndarray:
-        return np.sum((np.asarray(arm.position(configurations)) - shoulder) ** 2, axis=-1)
+    def largest(forward: ForwardPass) -> float:
+        return float(np.linalg.norm(forward.tip.T - shoulder, axis=1).max())
 
-    best = 0.0
+    best = now = 0.0
     for _ in range(_SWEEPS):
         for joint in range(1, arm.joints):  # the first rotates the whole arm about the shoulder's axis
-            three = np.repeat(q[None], 3, axis=0)
-            three[1, :, joint], three[2, :, joint] = q[:, joint] + 2 * np.pi / 3, q[:, joint] - 2 * np.pi / 3
-            middle, after, before = squared(three)
-            # f(t) = c + A cos t + B sin t about the present angle.
-            cosine, sine = (2 * middle - after - before) / 3, (after - before) / np.sqrt(3)
+            forward = forward_pass(geometry, sines_cosines(q))
+            axis, origin = forward.z_before[joint].T, forward.origin_before[joint].T
+            lever, offset = forward.tip.T - origin, origin - shoulder
+            across = np.cross(axis, lever)
+            cosine, sine = np.sum(offset * np.cross(across, axis), axis=1), np.sum(offset * across, axis=1)
             highest = q[:, joint] + np.arctan2(sine, cosine)
             low, high = limits[joint]
             whole = highest + 2 * np.pi * np.ceil((low - highest) / (2 * np.pi))
@@ -56,11 +58,11 @@ def arm_reach(arm: Arm) -> Reach:
                 high,
             )
             q[:, joint] = np.where(whole <= high, whole, ends)
-        now = float(squared(q).max())
+        now = largest(forward_pass(geometry, sines_cosines(q)))
         if now - best <= 1e-12 * now:
             break
         best = now
-    return Reach(shoulder, float(np.sqrt(squared(q).max())))
+    return Reach(shoulder, now)
 
 
 def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"]:
