@@ -11,7 +11,7 @@ from ..core.arrays import in_chunks
 from ..core.errors import InputError
 from ..core.namespace import to_numpy
 from .arm import Arm, joint_limits
-from .chain import ForwardPass, forward_pass, sines_cosines
+from .chain import forward_pass, sines_cosines
 from .inverse_kinematics import project_to_targets
 
 _STARTS, _SWEEPS = 256, 30
@@ -30,35 +30,33 @@ def arm_reach(arm: Arm) -> Reach:
 
     As a function of one joint the squared distance is a constant plus a sinusoid: with the lever r from a point of the
     joint's axis z to the tip, and s from the shoulder to that point, of 2 s . (r - (z . r) z) cos t + 2 s . (z x r) sin
-    t. From many random starts, joint after joint is set to its maximum until nothing changes.
+    t. From many random starts, joint after joint is set to its maximum until nothing changes, the last joint first: a
+    joint moves the tip, but no axis of the joints before it.
     """
     shoulder = np.array([0.0, 0.0, float(arm.d[0])])
     limits = np.asarray(joint_limits(arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_STARTS, arm.joints))
     geometry = to_numpy(arm.geometry)
-
-    def largest(forward: ForwardPass) -> float:
-        return float(np.linalg.norm(forward.tip.T - shoulder, axis=1).max())
-
     best = now = 0.0
     for _ in range(_SWEEPS):
-        for joint in range(1, arm.joints):  # the first rotates the whole arm about the shoulder's axis
-            forward = forward_pass(geometry, sines_cosines(q))
+        forward = forward_pass(geometry, sines_cosines(q))
+        tip = forward.tip.T
+        for joint in range(arm.joints - 1, 0, -1):  # the first rotates the whole arm about the shoulder's axis
             axis, origin = forward.z_before[joint].T, forward.origin_before[joint].T
-            lever, offset = forward.tip.T - origin, origin - shoulder
-            across = np.cross(axis, lever)
-            cosine, sine = np.sum(offset * np.cross(across, axis), axis=1), np.sum(offset * across, axis=1)
+            offset, across = origin - shoulder, np.cross(axis, tip - origin)
+            along = np.cross(across, axis)
+            cosine, sine = np.sum(offset * along, axis=1), np.sum(offset * across, axis=1)
             highest = q[:, joint] + np.arctan2(sine, cosine)
             low, high = limits[joint]
             whole = highest + 2 * np.pi * np.ceil((low - highest) / (2 * np.pi))
-            ends = np.where(
-                cosine * np.cos(low - q[:, joint]) + sine * np.sin(low - q[:, joint])
-                > cosine * np.cos(high - q[:, joint]) + sine * np.sin(high - q[:, joint]),
-                low,
-                high,
+            at_low, at_high = (
+                cosine * np.cos(end) + sine * np.sin(end) for end in (low - q[:, joint], high - q[:, joint])
             )
-            q[:, joint] = np.where(whole <= high, whole, ends)
-        now = largest(forward_pass(geometry, sines_cosines(q)))
+            reading = np.where(whole <= high, whole, np.where(at_low > at_high, low, high))
+            change = (reading - q[:, joint])[:, None]
+            tip = tip + (np.cos(change) - 1) * along + np.sin(change) * across
+            q[:, joint] = reading
+        now = float(np.linalg.norm(tip - shoulder, axis=1).max())
         if now - best <= 1e-12 * now:
             break
         best = now

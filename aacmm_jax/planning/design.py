@@ -47,7 +47,7 @@ _OBJECTIVES: dict[Criterion, tuple[Kind, float]] = {
 }
 _OBJECTIVE_LENGTHS, _PREDICTION_LENGTHS = 300, 400  # predictions use other lengths than the objective
 # Random placements, those of them for which poses are chosen, tried neighbours of the best, and starts for each.
-_PLACEMENTS, _DESIGNED, _NEIGHBOURS, _STARTS = 600, 10, 110, 1000
+_PLACEMENTS, _DESIGNED, _NEIGHBOURS, _STARTS = 600, 10, 200, 1000
 _BLOCK = 25  # placements scored together
 _LEAST_CANDIDATES = 20  # in a socket
 _RANDOM_SETS, _LOOSE_SETS = 50, 10

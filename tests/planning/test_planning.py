@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.files.plans import plan_csv, save_plan
+from aacmm_jax.files.plans import plan_csv, plan_manifest, save_plan
 from aacmm_jax.kinematics.workspace import search_region
 from aacmm_jax.planning import design, pose_refinement
 from aacmm_jax.planning.fedorov_exchange import Candidates, Objective, covariance_of, exchange, relaxed_value
@@ -214,6 +214,18 @@ def test_files(given, tmp_path):
     assert '1,"left, ""low""",1.000' in plan_csv(named)
     summary = plan_summary(given, "an arm")
     assert sum(row["poses"] for row in summary["sockets"]) == 20
+
+
+def test_readings_taken_by_the_plan_come_back_through_its_manifest(paper_arm, given, tmp_path):
+    (tmp_path / "capture.toml").write_text(plan_manifest(given, "cheng2018-simulation"))
+    for name, q in given.capture().sockets.items():
+        np.savetxt(tmp_path / f"{name}.csv", np.degrees(q), delimiter=",")
+    imported = aj.files.read_manifest(tmp_path / "capture.toml").capture
+    assert imported.names == tuple(given.sockets)
+    np.testing.assert_allclose(imported.q, given.q, rtol=1e-12)
+    (length,), (planned,) = imported.lengths, given.lengths
+    assert (length.start, length.end, float(length.u)) == (planned.start, planned.end, float(planned.u))
+    assert float(length.value) == pytest.approx(float(planned.value), abs=1e-6)
 
 
 REFUSED = {
