@@ -10,7 +10,6 @@ from ..core.errors import InputError
 
 Kind = Literal["functions", "trace", "determinant"]
 _RELAXATION = 0.7  # exponent; 0.5 never makes variances larger, 1 never determinants
-_UPPER = ((0, 1), (0, 2), (1, 2))
 
 
 class Candidates(NamedTuple):
@@ -165,23 +164,16 @@ def _best(
     """
     inverse, p = np.linalg.inv(information), candidates.parameters
     moved = components @ inverse
-    inner = _products(moved, components)
-    for i in range(3):
-        inner[i][i] += 1
+    inner = _factors(_products(moved, components))
     if objective.kind == "determinant":
         # The determinant of the parameters' block: that of all unknowns over that of the sockets.
         part = np.ascontiguousarray(components[:, :, p:])
-        of_sockets = _products(part @ np.linalg.inv(information[p:, p:]), part)
-        for i in range(3):
-            of_sockets[i][i] += 1
-        improvement = np.log(_determinant_and_adjugate(inner)[0] / _determinant_and_adjugate(of_sockets)[0])
+        of_sockets = _factors(_products(part @ np.linalg.inv(information[p:, p:]), part))
+        improvement = np.sum(np.log(inner.pivots), axis=0) - np.sum(np.log(of_sockets.pivots), axis=0)
     else:
         moved = np.ascontiguousarray(moved[:, :, :p])
         outer = _products(moved @ objective.gradient(inverse[:p, :p]), moved)
-        determinant, adjugate = _determinant_and_adjugate(inner)
-        # The trace of inner^-1 outer, both symmetric.
-        diagonal = sum(adjugate[i][i] * outer[i][i] for i in range(3))
-        improvement = (diagonal + 2 * sum(adjugate[i][j] * outer[i][j] for i, j in _UPPER)) / determinant
+        improvement = inner.trace_of_quotient(outer)
     if not (allowed.any() and np.all(np.isfinite(improvement))):
         raise InputError(
             "there are fewer candidate poses than poses to choose, or they add no information; give more candidates."
@@ -189,19 +181,38 @@ def _best(
     return int(np.argmax(np.where(allowed, improvement, -np.inf)))
 
 
-def _products(one: Float[np.ndarray, "3 c k"], other: Float[np.ndarray, "3 c k"]) -> list[list[np.ndarray]]:
-    """Symmetric 3 x 3 matrices of scalar products, one of each candidate, by element."""
-    found = [[np.empty(0)] * 3 for _ in range(3)]
+def _products(one: Float[np.ndarray, "3 c k"], other: Float[np.ndarray, "3 c k"]) -> Float[np.ndarray, "3 3 c"]:
+    """Scalar products of each candidate's rows, which make a symmetric matrix."""
+    found = np.empty((3, 3, one.shape[1]))
     for i in range(3):
         for j in range(i, 3):
-            found[i][j] = found[j][i] = np.einsum("ck,ck->c", one[i], other[j])
+            found[i, j] = found[j, i] = np.einsum("ck,ck->c", one[i], other[j])
     return found
 
 
-def _determinant_and_adjugate(m: list[list[np.ndarray]]) -> tuple[np.ndarray, list[list[np.ndarray]]]:
-    """Of symmetric 3 x 3 matrices, by element."""
-    xx, yy, zz, xy, xz, yz = m[0][0], m[1][1], m[2][2], m[0][1], m[0][2], m[1][2]
-    first, second, third = yy * zz - yz * yz, yz * xz - xy * zz, xy * yz - yy * xz
-    fourth = xy * xz - xx * yz
-    adjugate = [[first, second, third], [second, xx * zz - xz * xz, fourth], [third, fourth, xx * yy - xy * xy]]
-    return xx * first + xy * second + xz * third, adjugate
+class _Factors(NamedTuple):
+    """I + A = L D L^T of each candidate's positive semidefinite A: written out, but as stable as LAPACK's."""
+
+    pivots: Float[np.ndarray, "3 c"]
+    yx: Float[np.ndarray, " c"]
+    zx: Float[np.ndarray, " c"]
+    zy: Float[np.ndarray, " c"]
+
+    def trace_of_quotient(self, outer: Float[np.ndarray, "3 3 c"]) -> Float[np.ndarray, " c"]:
+        """The trace of (I + A)^-1 times a symmetric matrix: the diagonal of L^-1 outer L^-T over the pivots."""
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = outer
+        x = self.zx - self.zy * self.yx
+        second = yy - 2 * self.yx * xy + self.yx**2 * xx
+        third = zz + self.zy**2 * yy + x**2 * xx - 2 * self.zy * yz - 2 * x * xz + 2 * self.zy * x * xy
+        return xx / self.pivots[0] + second / self.pivots[1] + third / self.pivots[2]
+
+
+def _factors(products: Float[np.ndarray, "3 3 c"]) -> _Factors:
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = products
+    # Every pivot of I + A is 1 at least; with little information so far, rounding errors of A are larger.
+    first = np.maximum(1 + xx, 1)
+    yx, zx = xy / first, xz / first
+    second = np.maximum(1 + yy - yx * xy, 1)
+    zy = (yz - zx * xy) / second
+    third = np.maximum(1 + zz - zx * xz - zy * zy * second, 1)
+    return _Factors(np.stack([first, second, third]), yx, zx, zy)

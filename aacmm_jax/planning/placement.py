@@ -24,7 +24,7 @@ _STARTS = 24  # random starts in each socket for the first score
 _REACHED = 0.25  # fraction of them that must arrive
 _ROWS = 2048  # configurations computed at once
 _ITERATIONS = 8  # of the relaxed design: as good a ranking as by a sweep of exchange, in a tenth of the time
-_STEPS = 15  # of inverse kinematics, for a neighbour
+_STEPS = 10  # of inverse kinematics, for a neighbour: enough for configurations that are moved along
 _SHIFT, _ROTATION = 0.05, 0.4  # of a neighbour: relative to the sum of the links; rad
 _PRIOR = 1e-4  # parameters are known to 100 mm or 100 mrad in advance: makes the first information matrices invertible
 
@@ -136,7 +136,8 @@ def random_placements(
     pairs = sockets // 2
     ends = tuple((2 * i, 2 * i + 1) for i in range(pairs))
     for _ in range(60):
-        middle = in_chunks(problem.arm.position, problem.region.draw(40 * count * (pairs + 1)), _ROWS)
+        drawn = problem.region.draw(40 * count * (pairs + 1))
+        middle = in_chunks(lambda q: np.asarray(problem.arm.position(q)), drawn, _ROWS)
         direction = random.normal(size=middle.shape)
         size = np.exp(random.uniform(math.log(length[0]), math.log(length[1]), len(middle)))[:, None]
         half = 0.5 * size * direction / np.linalg.norm(direction, axis=1, keepdims=True)

@@ -55,6 +55,16 @@ def test_exchange_finds_nearly_the_best_of_all_sets(candidates, name):
     assert value_of(candidates, objective, found) <= np.quantile(values, 0.01)
 
 
+def test_the_first_poses_are_chosen_right_although_nothing_is_determined_yet(candidates):
+    """Information of 1e11 next to that of 1e-4: determinants written out without pivots would be rounding errors."""
+    precise = candidates._replace(rows=3e5 * candidates.rows)
+    chosen: list[int] = []
+    for _ in range(4):
+        others = [i for i in range(12) if i not in chosen]
+        chosen.append(min(others, key=lambda i: value_of(precise, OBJECTIVES["D"], [*chosen, i])))
+    assert exchange(precise, 4, OBJECTIVES["D"], least=0, sweeps=0).tolist() == chosen
+
+
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_a_relaxed_design_is_a_little_better_than_an_exact_one(candidates, name):
     """Fractions of poses include whole ones, and fewer iterations end at a larger value."""
