@@ -44,12 +44,13 @@ def measured_by(arm: Arm, recording: Recording) -> Measured:
     Returns:
         Points of sockets and spheres in mm, the lengths, and the arm's reach.
     """
-    sockets = {name: np.asarray(arm.position(q)) for name, q in recording.capture.sockets.items()}
-    spheres = tuple(
-        sphere._replace(groups=tuple(np.asarray(arm.position(group)) for group in sphere.groups))
-        for sphere in recording.spheres
-    )
-    return Measured(sockets, recording.capture.lengths, spheres, arm_reach(arm))
+    capture, touched = recording.capture, [group for sphere in recording.spheres for group in sphere.groups]
+    readings = [np.asarray(q) for q in (*capture.sockets.values(), *touched)]
+    ends = np.cumsum([len(q) for q in readings])
+    points = iter(np.split(np.asarray(arm.position(np.concatenate(readings))), ends[:-1]))
+    sockets = {name: next(points) for name in capture.sockets}
+    spheres = tuple(sphere._replace(groups=tuple(next(points) for _ in sphere.groups)) for sphere in recording.spheres)
+    return Measured(sockets, capture.lengths, spheres, arm_reach(arm))
 
 
 def run(

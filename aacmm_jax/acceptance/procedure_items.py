@@ -112,17 +112,17 @@ def bar_items(
     # A direction and its opposite are the same for a bar, so the products of its components are compared.
     directions = np.einsum("ci,cj->cij", between, between).reshape(-1, 9)
     chosen = far_apart(np.hstack([(tips[0] + tips[1]) / (2 * reach.radius), directions]), positions)
+    ends = np.concatenate([tip[chosen] for tip in tips])
+    others, owner = configurations_at(search, ends, _STARTS if repeats > 1 else 0)
     items, pairs = [], []
-    for number, row in enumerate(chosen, start=1):
-        labels = [f"{name}/{number:02d}/{side}" for side in "ab"]
-        for label, q, tip in zip(labels, (start, end), tips, strict=True):
-            poses = q[row : row + 1]
-            if repeats > 1:
-                others, _ = configurations_at(search, tip[row : row + 1], _STARTS)
-                poses = np.concatenate([poses, others])
-                enough = len(poses) >= repeats
-                poses = poses[far_apart(poses, repeats)] if enough else np.resize(poses, (repeats, poses.shape[1]))
-            items.append(ProcedureItem(test, label, 1, np.tile(tip[row], (len(poses), 1)), poses))
+    for number in range(positions):
+        labels = [f"{name}/{number + 1:02d}/{side}" for side in "ab"]
+        for index, (label, q) in enumerate(zip(labels, (start, end), strict=True)):
+            this = index * positions + number
+            poses = np.concatenate([q[chosen[number]][None], others[owner == this]])
+            enough = len(poses) >= repeats
+            poses = poses[far_apart(poses, repeats)] if enough else np.resize(poses, (repeats, poses.shape[1]))
+            items.append(ProcedureItem(test, label, 1, np.tile(ends[this], (len(poses), 1)), poses))
         pairs.append((*labels, float(length)))
     return items, pairs
 

@@ -1,6 +1,7 @@
 """The command ``plan``."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,7 +29,7 @@ from .app import (
 
 @app.command(
     epilog=examples(
-        "aacmm plan my-arm.toml --sockets 4 --poses 30 -o plan.csv",
+        "aacmm plan my-arm.toml --sockets 4 --poses 30 -o plan.csv --manifest capture.toml",
         "aacmm plan my-arm.toml --acceptance iso -o acceptance.csv --manifest acceptance.toml",
         "aacmm plan my-arm.toml -o plan.csv --poses 25 \\\n"
         "  --socket A=400,200,300 --socket B=700,500,500 --length A,B,0.002",
@@ -117,7 +118,7 @@ def plan(
     manifest: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.toml", help="Of an acceptance test: manifest to write, for the import of its readings."
+            metavar="FILE.toml", help="Manifest to write, for the import of the readings once they are recorded."
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_INTEGER, metavar="N", help="Seed of the random choices.")] = 0,
@@ -129,7 +130,7 @@ def plan(
     """
     from ..data.noise import Noise
     from ..files.arms import load_specification
-    from ..files.plans import save_plan
+    from ..files.plans import plan_csv, plan_manifest
     from ..planning.design import plan as run
     from ..summaries.planning import plan_summary
     from . import acceptance_display, plan_display
@@ -161,8 +162,6 @@ def plan(
             _procedure(specification, arm, acceptance, output, manifest, options), as_json, acceptance_display.procedure
         )
         return
-    if manifest is not None:
-        raise InputError("--manifest is for --acceptance; leave it out of the plan of a calibration.")
     axes = [_axis(text) for text in region or ()]
     if len(dict(axes)) < len(axes):
         raise InputError("an axis is named twice in --region; give each one range.")
@@ -186,8 +185,8 @@ def plan(
             seed=seed,
             progress=report_progress,
         )
-    save_plan(output, found)
-    summary: dict[str, Any] = plan_summary(found, specification.name) | {"written": str(output)}
+    written = _written(output, plan_csv(found), manifest, lambda name: plan_manifest(found, name), arm)
+    summary: dict[str, Any] = plan_summary(found, specification.name) | {"written": written}
     show_summary(summary, as_json, plan_display.plan)
 
 
@@ -197,17 +196,23 @@ def _procedure(
     """Plan an acceptance test and write it."""
     from ..acceptance.procedure import plan_procedure
     from ..files.plans import procedure_csv, procedure_manifest
-    from ..files.whole_file import write_text
     from ..summaries.planning import procedure_summary
 
     found = with_spinner("Planning", lambda: plan_procedure(specification.arm, standard, **options))
-    written = str(output)
-    with together(output, manifest):
-        write_text(output, procedure_csv(found))
-        if manifest is not None:
-            write_text(manifest, procedure_manifest(found, _arm_for(manifest, arm)))
-            written += f", {manifest}"
+    written = _written(output, procedure_csv(found), manifest, lambda name: procedure_manifest(found, name), arm)
     return procedure_summary(found, specification.name) | {"written": written}
+
+
+def _written(output: Path, poses: str, manifest: Path | None, manifest_text: Callable[[str], str], arm: str) -> str:
+    """Write the poses and, where it is asked for, the manifest, which names the arm; returns what was written."""
+    from ..files.whole_file import write_text
+
+    with together(output, manifest):
+        write_text(output, poses)
+        if manifest is None:
+            return str(output)
+        write_text(manifest, manifest_text(_arm_for(manifest, arm)))
+        return f"{output}, {manifest}"
 
 
 def _arm_for(manifest: Path, arm: str) -> str:

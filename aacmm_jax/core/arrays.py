@@ -99,7 +99,7 @@ def as_floats(value: Numbers, what: str) -> AnyArray:
     return array
 
 
-def in_chunks(work: Callable[[np.ndarray], np.ndarray], rows: np.ndarray) -> np.ndarray:
+def in_chunks(work: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, size: int = _CHUNK) -> np.ndarray:
     """``work`` on blocks of rows that the processor's cache can hold; an empty array is one block."""
-    starts = range(0, max(len(rows), 1), _CHUNK)
-    return np.concatenate([work(rows[first : first + _CHUNK]) for first in starts])
+    starts = range(0, max(len(rows), 1), size)
+    return np.concatenate([work(rows[first : first + size]) for first in starts])

@@ -42,6 +42,33 @@ def plan_csv(plan: Plan) -> str:
     )
 
 
+def plan_manifest(plan: Plan, arm: str) -> str:
+    """A manifest for the readings of a planned calibration, in which the calibrated lengths are to be filled in."""
+    lines = _manifest_start(
+        arm,
+        "# A calibration, as planned. Fill in the calibrated lengths and uncertainties (k = 1), record a file for each",
+        "# socket (one row a pose, in the order of the plan), then: aacmm import THIS.toml -o capture.h5",
+    )
+    for name in plan.sockets:
+        lines += ["", "[[socket]]", f"name = {_quoted(name)}", f"file = {_quoted(name + '.csv')}"]
+    for length in plan.lengths:
+        lines += [
+            "",
+            "[[length]]",
+            f"from = {_quoted(length.start)}",
+            f"to = {_quoted(length.end)}",
+            f"value = {round(float(length.value), 6)!r}   # mm: the calibrated length",
+            f"u = {float(length.u)!r}   # mm: its standard uncertainty",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _manifest_start(arm: str, *comments: str) -> list[str]:
+    """The first lines of a manifest of readings in degrees."""
+    date = "# date = 2026-01-31   # when it was recorded"
+    return [*comments, f"arm = {_quoted(arm)}", date, "", "[angles]", 'unit = "deg"']
+
+
 def procedure_csv(procedure: Procedure) -> str:
     """A row for each pose of an acceptance test: test, name, file for its reading, position, readings."""
     items = (*procedure.sockets, *procedure.touches)
@@ -76,16 +103,12 @@ def file_of(procedure: Procedure, item: ProcedureItem) -> str:
 
 def procedure_manifest(procedure: Procedure, arm: str) -> str:
     """A manifest for the readings of an acceptance test, in which the calibrated values are to be filled in."""
-    lines = [
+    lines = _manifest_start(
+        arm,
         f"# {PLANNED[procedure.standard]}, as planned. Fill in the calibrated values and uncertainties (k = 1) of your",
         "# artefacts, record a file for each socket and each group of touches (one row a pose, in the order of the",
         "# plan), then: aacmm import THIS.toml -o acceptance.h5",
-        f"arm = {_quoted(arm)}",
-        "# date = 2026-01-31   # when it was recorded",
-        "",
-        "[angles]",
-        'unit = "deg"',
-    ]
+    )
     kinds = dict.fromkeys(item.name.split("/")[0] for item in procedure.sockets)
     for kind in kinds:
         pattern = f"{kind}/{{zone}}" if kind == "spat" else f"{kind}/{{position}}/{{side}}"

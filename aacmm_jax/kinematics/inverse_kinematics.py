@@ -3,7 +3,6 @@
 * `random_configurations`: one at each target, from random starts; for simulation.
 * `project_to_targets`: given ones moved to their targets by least-norm steps within limits, and which of them arrived.
 * `project_to_centroids`: those of a capture moved until each socket's tips coincide.
-* `newton_projection`: a fixed number of steps, differentiable; for optimisers.
 * `solve_to_targets`, `least_norm_inverse`, `damped_inverse`: their parts, for callers with a jit of their own.
 """
 
@@ -18,12 +17,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..core.arrays import in_chunks, random_numbers
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, compiled, namespace, to_numpy, while_loop
+from ..core.namespace import AnyArray, compiled, namespace, to_numpy
 from .arm import Arm
 from .chain import Geometry, forward_pass, sines_cosines
 from .jacobian import jacobian_columns
 
 _BATCH = 256  # candidates per call: one compiled shape for every number of targets
+_ROWS = 2048  # of one call: fewer leave much of the time to Python, more do not fit into the processor's cache
 _ROUNDS = 12
 _STEPS = 60  # of one attempt; five of six random starts converge
 _TOLERANCE, _ARRIVED = 1e-9, 1e-6  # mm
@@ -70,43 +70,37 @@ def solve_to_targets(
 ) -> tuple[Float[AnyArray, "c n"], Float[AnyArray, " c"]]:
     """Damped least-norm steps from ``q`` to the targets, within the limits: configurations and final distances, mm.
 
-    Each joint moves by at most 0.5 rad in a step.
+    Each joint moves by at most 0.5 rad in a step. What becomes of a row does not depend on the other rows: NumPy leaves
+    out rows that have arrived, which ends most of them after a dozen steps.
     """
     xp, low, high = namespace(geometry, q, targets), limits[:, 0, None, None], limits[:, 1, None, None]
-    wanted = targets.T
 
-    def more(state: tuple[Any, Any, Any]) -> Any:
-        count, _, gap = state
-        return (count < steps) & xp.any(xp.abs(gap) > _EXACT)
-
-    def step(state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
-        count, q, _ = state
+    def step(q: Any, wanted: Any) -> tuple[Any, Any]:
         forward = forward_pass(geometry, (xp.cos(q), xp.sin(q)))
         gap = wanted - forward.tip
         # The damping vanishes with the distance, so that the last steps are Newton's.
         damping = 1e-2 * xp.sum(gap**2, axis=0) + 1e-12
         inverse = damped_inverse(jacobian_columns(forward)["theta"], damping)
         change = xp.sum(inverse * gap[None], axis=1, keepdims=True)
-        return count + 1, xp.clip(q + xp.clip(change, -_LARGEST_STEP, _LARGEST_STEP), low, high), gap
+        return xp.clip(q + xp.clip(change, -_LARGEST_STEP, _LARGEST_STEP), low, high), gap
 
     # A step after the gap was seen to be closed takes what Newton's method leaves to rounding.
-    _, q, _ = while_loop(more, step, (xp.zeros((), dtype=np.int32), q.T[:, None, :], xp.ones_like(wanted)))
+    q, wanted = q.T[:, None, :], targets.T
+    if xp is np:
+        q, under_way = q.copy(), np.arange(q.shape[-1])
+        for _ in range(steps):
+            q[..., under_way], gap = step(q[..., under_way], wanted[:, under_way])
+            under_way = under_way[np.any(np.abs(gap) > _EXACT, axis=0)]
+            if not len(under_way):
+                break
+    else:
+        _, q, _ = jax.lax.while_loop(
+            lambda state: (state[0] < steps) & jnp.any(jnp.abs(state[2]) > _EXACT),
+            lambda state: (state[0] + 1, *step(state[1], wanted)),
+            (jnp.zeros((), dtype=np.int32), q, jnp.ones_like(wanted)),
+        )
     tip = forward_pass(geometry, (xp.cos(q), xp.sin(q))).tip
     return q[:, 0].T, xp.linalg.norm(wanted - tip, axis=0)
-
-
-def newton_projection(
-    geometry: Geometry, q: Float[AnyArray, "N n"], targets: Float[AnyArray, "N 3"], steps: int
-) -> Float[AnyArray, "N n"]:
-    """Configurations brought to their targets by a fixed number of least-norm steps: differentiable, without limits."""
-
-    def step(rows: Array, _: None) -> tuple[Array, None]:
-        forward = forward_pass(geometry, sines_cosines(rows))
-        gap = targets.T - forward.tip
-        inverse = damped_inverse(jacobian_columns(forward)["theta"], jnp.full(rows.shape[0], 1e-6))
-        return rows + jnp.sum(inverse * gap[None], axis=1).T, None
-
-    return jax.lax.scan(step, jnp.asarray(q), None, length=steps)[0]
 
 
 def least_norm_inverse(geometry: Geometry, q: Float[AnyArray, "N n"]) -> Float[AnyArray, "n 3 N"]:
@@ -176,16 +170,17 @@ def project_to_targets(
     q: Float[np.ndarray, "N n"],
     targets: Float[np.ndarray, "N 3"],
     limits: Float[np.ndarray, "n 2"] | None = None,
+    steps: int = _STEPS,
 ) -> tuple[Float[np.ndarray, "N n"], Bool[np.ndarray, " N"]]:
     """Configurations moved by least-norm steps to their targets within limits (default: none), and which arrived."""
     allowed = np.tile([-np.inf, np.inf], (arm.joints, 1)) if limits is None else np.asarray(limits)
     geometry = to_numpy(arm.geometry)
 
     def moved(rows: np.ndarray) -> np.ndarray:
-        found, distance = solve_to_targets(geometry, rows[:, :-3], rows[:, -3:], allowed)
+        found, distance = solve_to_targets(geometry, rows[:, :-3], rows[:, -3:], allowed, steps)
         return np.hstack([found, distance[:, None]])
 
-    found = in_chunks(moved, np.hstack([q, targets]))
+    found = in_chunks(moved, np.hstack([q, targets]), _ROWS)
     return found[:, :-1], found[:, -1] <= _ARRIVED
 
 

@@ -39,6 +39,32 @@ def jacobian_columns(forward: ForwardPass) -> dict[str, Float[AnyArray, "k ... 3
     return columns
 
 
+def readings_gradient(forward: ForwardPass, cotangents: dict[str, Float[AnyArray, "k 3 N"]]) -> Float[AnyArray, "n N"]:
+    """Derivative by the joint readings of a function of the Jacobian columns; ``cotangents`` are its derivatives by
+    them, by kind.
+
+    A joint rotates each column that belongs to an axis after it (the change is z x column). Of an axis before it, it
+    moves the tip alone, which changes the column of a rotation about u by u x (dtip/dq). Both sums over the columns
+    are accumulated along the chain, one from the tip, the other from the base.
+    """
+    columns, xp = jacobian_columns(forward), namespace(forward, cotangents)
+    axes = {"alpha": forward.x, "beta": forward.y, "theta": forward.z_before}
+    turned = xp.zeros_like(columns["theta"])
+    levered = turned
+    for kind, cotangent in cotangents.items():
+        moments = _cross(columns[kind], cotangent)
+        if kind == "probe":
+            from_probe = xp.sum(moments, axis=0)
+            turned = xp.concatenate([turned[:-1], turned[-1:] + from_probe[None]])
+        else:
+            turned = turned + moments
+        if kind in axes:
+            levered = levered + _cross(cotangent, axes[kind])
+    after = xp.flip(xp.cumsum(xp.flip(turned, 0), axis=0), 0)  # of this joint and those after it
+    before = xp.cumsum(levered, axis=0) - levered
+    return xp.sum(forward.z_before * after + columns["theta"] * before, axis=1)
+
+
 @compiled(jit=partial(jax.jit, static_argnames=("indices",)))
 def stacked_jacobian_columns(
     forward: ForwardPass, indices: tuple[tuple[str, int], ...]

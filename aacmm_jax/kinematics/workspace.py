@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
@@ -15,6 +15,7 @@ from .chain import forward_pass, sines_cosines
 from .inverse_kinematics import project_to_targets
 
 _STARTS, _SWEEPS = 256, 30
+_REACHING = 25  # steps: seven of ten random starts arrive, and with 60 eight would
 
 
 class Reach(NamedTuple):
@@ -27,39 +28,39 @@ class Reach(NamedTuple):
 def arm_reach(arm: Arm) -> Reach:
     """Largest distance of the tip from the shoulder within the joint limits.
 
-    As a function of one joint the squared distance is a constant plus a sinusoid, so its maximum follows from three
-    values. From many random starts, joint after joint is set to its maximum until nothing changes.
+    As a function of one joint the squared distance is a constant plus a sinusoid: with the lever r from a point of the
+    joint's axis z to the tip, and s from the shoulder to that point, of 2 s . (r - (z . r) z) cos t + 2 s . (z x r) sin
+    t. From many random starts, joint after joint is set to its maximum until nothing changes, the last joint first: a
+    joint moves the tip, but no axis of the joints before it.
     """
     shoulder = np.array([0.0, 0.0, float(arm.d[0])])
     limits = np.asarray(joint_limits(arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_STARTS, arm.joints))
-
-    def squared(configurations: np.ndarray) -> np.ndarray:
-        return np.sum((np.asarray(arm.position(configurations)) - shoulder) ** 2, axis=-1)
-
-    best = 0.0
+    geometry = to_numpy(arm.geometry)
+    best = now = 0.0
     for _ in range(_SWEEPS):
-        for joint in range(1, arm.joints):  # the first rotates the whole arm about the shoulder's axis
-            three = np.repeat(q[None], 3, axis=0)
-            three[1, :, joint], three[2, :, joint] = q[:, joint] + 2 * np.pi / 3, q[:, joint] - 2 * np.pi / 3
-            middle, after, before = squared(three)
-            # f(t) = c + A cos t + B sin t about the present angle.
-            cosine, sine = (2 * middle - after - before) / 3, (after - before) / np.sqrt(3)
+        forward = forward_pass(geometry, sines_cosines(q))
+        tip = forward.tip.T
+        for joint in range(arm.joints - 1, 0, -1):  # the first rotates the whole arm about the shoulder's axis
+            axis, origin = forward.z_before[joint].T, forward.origin_before[joint].T
+            offset, across = origin - shoulder, np.cross(axis, tip - origin)
+            along = np.cross(across, axis)
+            cosine, sine = np.sum(offset * along, axis=1), np.sum(offset * across, axis=1)
             highest = q[:, joint] + np.arctan2(sine, cosine)
             low, high = limits[joint]
             whole = highest + 2 * np.pi * np.ceil((low - highest) / (2 * np.pi))
-            ends = np.where(
-                cosine * np.cos(low - q[:, joint]) + sine * np.sin(low - q[:, joint])
-                > cosine * np.cos(high - q[:, joint]) + sine * np.sin(high - q[:, joint]),
-                low,
-                high,
+            at_low, at_high = (
+                cosine * np.cos(end) + sine * np.sin(end) for end in (low - q[:, joint], high - q[:, joint])
             )
-            q[:, joint] = np.where(whole <= high, whole, ends)
-        now = float(squared(q).max())
+            reading = np.where(whole <= high, whole, np.where(at_low > at_high, low, high))
+            change = (reading - q[:, joint])[:, None]
+            tip = tip + (np.cos(change) - 1) * along + np.sin(change) * across
+            q[:, joint] = reading
+        now = float(np.linalg.norm(tip - shoulder, axis=1).max())
         if now - best <= 1e-12 * now:
             break
         best = now
-    return Reach(shoulder, float(np.sqrt(squared(q).max())))
+    return Reach(shoulder, now)
 
 
 def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"]:
@@ -121,11 +122,18 @@ def search_region(
     return SearchRegion(arm, allowed + margin * np.array([1.0, -1.0]), above, np.random.default_rng(seed))
 
 
+def reached(
+    region: SearchRegion, starts: Float[np.ndarray, "c n"], targets: Float[np.ndarray, "c 3"], steps: int = _REACHING
+) -> tuple[Float[np.ndarray, "c n"], Bool[np.ndarray, " c"]]:
+    """Configurations moved from their starts to the targets, and which of them arrived and are above the table."""
+    q, arrived = project_to_targets(region.arm, starts, targets, region.limits, steps)
+    return q, arrived & (lowest_point(region.arm, q) >= region.above)
+
+
 def configurations_at(
     region: SearchRegion, points: Float[np.ndarray, "s 3"], each: int
 ) -> tuple[Float[np.ndarray, "c n"], Int[np.ndarray, " c"]]:
     """Configurations that reach the points from ``each`` random starts a point, and the index of each one's point."""
     owner = np.repeat(np.arange(len(points)), each)
-    q, arrived = project_to_targets(region.arm, region.draw(len(owner)), points[owner], region.limits)
-    good = arrived & (lowest_point(region.arm, q) >= region.above)
+    q, good = reached(region, region.draw(len(owner)), points[owner])
     return q[good], owner[good]

@@ -2,20 +2,20 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.arrays import Numbers
 from ..core.errors import InputError, nearest
+from ..core.namespace import to_numpy
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
 from ..data.simulation import socket_point
 from ..kinematics.arm import Arm, is_single, jacobian_at, joint_limits
-from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.parameters import Parameters
-from ..kinematics.workspace import configurations_at, lowest_point, search_region, total_link_length
+from ..kinematics.workspace import SearchRegion, reached, search_region, total_link_length
 from ..uncertainty.identifiability import observability
 from ..uncertainty.volume import default_length, sample_lengths
 from .fedorov_exchange import Candidates, Kind, Objective, covariance_of, exchange
@@ -23,12 +23,16 @@ from .placement import (
     LEAST_POSES,
     DesignProblem,
     FixturePlacement,
+    Pool,
     Ranges,
     candidates_of,
     designed_score,
+    moved_pool,
     neighbour,
+    pool_at,
+    pool_of,
     random_placements,
-    random_score,
+    random_scores,
 )
 from .pose_refinement import refined
 
@@ -43,7 +47,8 @@ _OBJECTIVES: dict[Criterion, tuple[Kind, float]] = {
 }
 _OBJECTIVE_LENGTHS, _PREDICTION_LENGTHS = 300, 400  # predictions use other lengths than the objective
 # Random placements, those of them for which poses are chosen, tried neighbours of the best, and starts for each.
-_PLACEMENTS, _DESIGNED, _NEIGHBOURS, _STARTS = 600, 10, 110, 1000
+_PLACEMENTS, _DESIGNED, _NEIGHBOURS, _STARTS = 600, 10, 200, 1000
+_BLOCK = 25  # placements scored together
 _LEAST_CANDIDATES = 20  # in a socket
 _RANDOM_SETS, _LOOSE_SETS = 50, 10
 _LOOSE = math.radians(5)
@@ -136,37 +141,40 @@ def plan(
         InputError: A socket cannot be reached, no poses determine the parameters, or an argument is out of range.
     """
     report = progress or (lambda stage, fraction: None)
-    space = Parameters.free_of(arm) if space is None else space
-    check_length = default_length(arm) if check_length is None else check_length
     if not is_single(arm):
         raise InputError("plan takes one arm, not a batch; give one of its arms.")
+    space = Parameters.free_of(arm) if space is None else space
+    check_length = default_length(arm) if check_length is None else check_length
     if arm.joints < 3 or total_link_length(arm) == 0:
         raise InputError("this arm reaches no volume: it needs three joints and a link; there is nothing to plan.")
-    search = search_region(arm, limits, margin, above, seed)
     if criterion not in _OBJECTIVES:
         raise InputError(f"criterion is '{criterion}'; it must be one of {', '.join(_OBJECTIVES)}.")
     noise.check(arm.joints)
-    allowed = np.asarray(joint_limits(arm, limits))
-    functions, predicted_functions = (
-        _length_derivatives(
-            arm, space, *sample_lengths(arm, count, length=check_length, limits=allowed, seed=seed + offset)
-        )
-        for offset, count in ((1, _OBJECTIVE_LENGTHS), (2, _PREDICTION_LENGTHS))
-    )
-    kind, power = _OBJECTIVES[criterion]
-    problem = DesignProblem(search, space, noise, Objective(kind, functions, power))
     _check_counts(sockets, poses, len(space.names), u, lengths)
+    ranges = {"z": (0.0, np.inf)} if region is None else region
+    own = (length, length) if isinstance(length, int | float) else length
     if isinstance(sockets, Mapping):
         names, placement = _given_placement(sockets, u, lengths)
     else:
-        ranges = {"z": (0.0, np.inf)} if region is None else region
         names = [chr(ord("A") + i) if sockets <= 26 else f"S{i + 1}" for i in range(sockets)]
-        placement = _best_placement(problem, sockets, poses, length, u, lengths, ranges, report)
-    pool, pool_q = _candidates(problem, placement, candidates)
-    rows = exchange(
-        pool, poses, problem.objective, least=LEAST_POSES, progress=lambda done: report("Choosing poses", done)
+        placement = None
+        _check_ranges(arm, own, lengths, ranges)
+    problem, predicted_functions = _problem(
+        search_region(to_numpy(arm), limits, margin, above, seed),
+        to_numpy(space),
+        to_numpy(noise),
+        criterion,
+        dict(length=check_length, limits=joint_limits(arm, limits)),
+        seed,
     )
-    q, owner = _sorted(pool_q[rows], pool.owner[rows])
+    if placement is None:
+        placement = _best_placement(problem, len(names), poses, own, u, ranges, report)
+    pool = _pool(problem, placement, candidates)
+    possible = candidates_of(problem, placement, pool)
+    rows = exchange(
+        possible, poses, problem.objective, least=LEAST_POSES, progress=lambda done: report("Choosing poses", done)
+    )
+    q, owner = _sorted(pool.q[rows], pool.owner[rows])
     q = refined(problem, placement, q, owner, lambda done: report("Moving poses", done))
     found = Plan(
         arm=arm,
@@ -181,12 +189,24 @@ def plan(
         noise=noise,
         criterion=criterion,
         check_length=check_length,
-        **_predictions(problem, placement, pool, q, owner, predicted_functions),
+        **_predictions(problem, placement, possible, q, owner, predicted_functions),
     )
     unseen = observability(arm, found.capture(), space)
     if unseen.rank < len(space.names):
         raise InputError(f"no {poses} poses in these sockets determine the parameters. {' '.join(unseen.sentences())}")
     return found
+
+
+def _problem(
+    region: SearchRegion, space: Parameters, noise: Noise, criterion: Criterion, sampling: dict[str, Any], seed: int
+) -> tuple[DesignProblem, Float[np.ndarray, "v p"]]:
+    """The problem, and derivatives of other lengths than those of its objective, for predictions."""
+    of_objective, of_predictions = (
+        _length_derivatives(region.arm, space, *sample_lengths(region.arm, count, **sampling, seed=seed + offset))
+        for offset, count in ((1, _OBJECTIVE_LENGTHS), (2, _PREDICTION_LENGTHS))
+    )
+    kind, power = _OBJECTIVES[criterion]
+    return DesignProblem(region, space, noise, Objective(kind, of_objective, power)), of_predictions
 
 
 def _length_derivatives(
@@ -244,17 +264,8 @@ def _given_placement(
     return names, FixturePlacement(np.array(list(points.values())), ends, own)
 
 
-def _best_placement(
-    problem: DesignProblem,
-    sockets: int,
-    poses: int,
-    length: float | tuple[float, float],
-    u: float,
-    lengths: Sequence[tuple],
-    ranges: Ranges,
-    report: _Progress,
-) -> FixturePlacement:
-    """The best placement found: random ones scored by random poses, the best few by chosen poses, then neighbours."""
+def _check_ranges(arm: Arm, length: tuple[float, float], lengths: Sequence[tuple], ranges: Ranges) -> None:
+    """Raise `InputError` where the sockets cannot be placed."""
     if lengths:
         raise InputError("lengths are between sockets that are given; with a number of sockets, give length and u.")
     for axis, (low, high) in ranges.items():
@@ -262,50 +273,69 @@ def _best_placement(
             raise InputError(
                 f"the region's {axis} is {low:g} to {high:g} mm, which is no range; give the lower number first."
             )
-    low, high = (length, length) if isinstance(length, int | float) else length
-    if not 0 < low <= high < 2 * total_link_length(problem.arm):
-        raise InputError(
-            f"a reference length of {low:g} to {high:g} mm does not fit this arm; give one shorter than its reach."
-        )
     unknown = sorted(set(ranges) - {"x", "y", "z", "distance"})
     if unknown:
         raise InputError(f"the region has no '{unknown[0]}'; give ranges of x, y, z and distance, in mm.")
+    low, high = length
+    if not 0 < low <= high < 2 * total_link_length(arm):
+        raise InputError(
+            f"a reference length of {low:g} to {high:g} mm does not fit this arm; give one shorter than its reach."
+        )
+
+
+def _best_placement(
+    problem: DesignProblem,
+    sockets: int,
+    poses: int,
+    length: tuple[float, float],
+    u: float,
+    ranges: Ranges,
+    report: _Progress,
+) -> FixturePlacement:
+    """The best placement found: random ones scored by random poses, the best few by chosen poses, then neighbours."""
     stage = "Placing the sockets"
     report(stage, 0.0)
-    placements = random_placements(problem, _PLACEMENTS, sockets, (low, high), u, ranges)
-    scores = []
-    for i, placement in enumerate(placements):
-        scores.append(random_score(problem, placement, poses))
-        report(stage, 0.4 * (i + 1) / len(placements))
+    placements = random_placements(problem, _PLACEMENTS, sockets, length, u, ranges)
+    scores: list[float] = []
+    while len(scores) < len(placements):
+        scores += random_scores(problem, placements[len(scores) : len(scores) + _BLOCK], poses)
+        report(stage, 0.4 * len(scores) / len(placements))
     order = [i for i in np.argsort(scores) if np.isfinite(scores[i])][:_DESIGNED]
     if not order:
         raise InputError(
             "no placement was found that can be reached well; give a region nearer to the arm, or a shorter length."
         )
-    best, best_score = placements[order[0]], np.inf
+    each = _STARTS // sockets
+    best, best_pool, best_score = placements[order[0]], None, np.inf
     tries = len(order) + _NEIGHBOURS
     for number in range(tries):
-        placement = placements[order[number]] if number < len(order) else neighbour(problem, best, ranges)
-        score = np.inf if placement is None else designed_score(problem, placement, poses, _STARTS)
-        if placement is not None and score < best_score:
-            best, best_score = placement, score
-        report(stage, 0.4 + 0.6 * (number + 1) / tries)
+        report(stage, 0.4 + 0.6 * number / tries)
+        if best_pool is None or number < len(order):
+            placement = placements[order[min(number, len(order) - 1)]]
+            pool = pool_at(problem, placement.points, each)
+        else:
+            placement = neighbour(problem, best, ranges)
+            if placement is None:
+                continue
+            pool = moved_pool(problem, best_pool, best, placement, each)
+        score = designed_score(problem, placement, pool, poses)
+        if score < best_score:
+            best, best_pool, best_score = placement, pool, score
+    report(stage, 1.0)
     return best
 
 
-def _candidates(
-    problem: DesignProblem, placement: FixturePlacement, count: int
-) -> tuple[Candidates, Float[np.ndarray, "c n"]]:
-    """Candidates in a placement, and their configurations."""
-    q, owner = configurations_at(problem.region, placement.points, max(count // len(placement.points), 50))
+def _pool(problem: DesignProblem, placement: FixturePlacement, count: int) -> Pool:
+    """Configurations to choose from."""
+    pool = pool_at(problem, placement.points, max(count // len(placement.points), 50))
     for i, point in enumerate(placement.points):
-        if np.sum(owner == i) < _LEAST_CANDIDATES:
+        if np.sum(pool.owner == i) < _LEAST_CANDIDATES:
             where = ", ".join(f"{round(float(x)):.6g}" for x in point)
             raise InputError(
                 f"socket {i + 1} at ({where}) mm cannot be reached in enough poses within the joint limits and their "
                 "margin; move it."
             )
-    return candidates_of(problem, placement, q, owner), q
+    return pool
 
 
 def _sorted(q: Float[np.ndarray, "N n"], owner: Int[np.ndarray, " N"]) -> tuple[np.ndarray, np.ndarray]:
@@ -341,17 +371,18 @@ def _predictions(
     def typical(sets: list[Prediction]) -> Prediction:
         return Prediction(*(float(np.median(column)) for column in zip(*sets, strict=True)))
 
-    planned = candidates_of(problem, placement, q, owner)
+    planned = candidates_of(problem, placement, pool_of(problem, q, owner))
     counts = np.bincount(owner, minlength=len(placement.points))
-    random_sets, loose_sets = [], []
+    random_sets = []
     for _ in range(_RANDOM_SETS):
         rows = [random.choice(np.flatnonzero(pool.owner == i), count) for i, count in enumerate(counts)]
         random_sets.append(predicted(pool.rows[np.concatenate(rows)]))
-    for _ in range(_LOOSE_SETS):
-        start = q + _LOOSE * random.normal(size=q.shape)
-        near, arrived = project_to_targets(problem.arm, start, placement.points[owner], region.limits)
-        near = np.where((arrived & (lowest_point(problem.arm, near) >= region.above))[:, None], near, q)
-        loose_sets.append(predicted(candidates_of(problem, placement, near, owner).rows))
+    starts = np.tile(q, (_LOOSE_SETS, 1)) + _LOOSE * random.normal(size=(_LOOSE_SETS * len(q), q.shape[1]))
+    owners = np.tile(owner, _LOOSE_SETS)
+    near, possible = reached(region, starts, placement.points[owners])
+    near = np.where(possible[:, None], near, np.tile(q, (_LOOSE_SETS, 1)))
+    loose = candidates_of(problem, placement, pool_of(problem, near, owners)).rows
+    loose_sets = [predicted(rows) for rows in np.split(loose, _LOOSE_SETS)]
     base = planned.information(planned.rows)
     added = exchange(pool._replace(base=base), MORE, problem.objective, least=0, sweeps=1)
     return {

@@ -1,34 +1,22 @@
 """The poses of a design improved by a gradient method, their tips kept in their sockets."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
-from ..core.linear_algebra import inverse_positive_definite
-from ..kinematics.arm import Arm
-from ..kinematics.chain import sines_cosines
-from ..kinematics.inverse_kinematics import newton_projection, project_to_targets
-from ..kinematics.parameters import Parameters
-from ..kinematics.workspace import lowest_point
-from ..model.measurement import Measurement
-from ..uncertainty.identifiability import whitened_equations
-from .placement import DesignProblem, FixturePlacement
+from ..core.namespace import to_numpy
+from ..kinematics.arm import locate
+from ..kinematics.chain import ForwardPass, forward_pass, sines_cosines
+from ..kinematics.jacobian import jacobian_columns, readings_gradient
+from ..kinematics.workspace import reached
+from .fedorov_exchange import covariance_of
+from .placement import DesignProblem, FixturePlacement, candidates_of, pool_of
 
 _ITERATIONS = 80
-_NEWTON_STEPS = 4  # that bring a moved pose back into its socket, inside the derivative
-
-
-class _Design(eqx.Module):
-    """What the criterion depends on, except the poses; sockets in order."""
-
-    arm: Arm
-    space: Parameters
-    targets: Float[Array, "N 3"]
-    measurement: Measurement  # of the poses at the start
-    functions: Float[Array, "v p"]
+_NEWTON_STEPS, _ARRIVED = 8, 1e-9  # mm
+_FRACTIONS = (1.0, 0.5, 0.25)  # of the way to the best poses, where some of these cannot be taken
 
 
 def refined(
@@ -40,33 +28,14 @@ def refined(
 ) -> Float[np.ndarray, "N n"]:
     """Configurations within the limits, in their sockets to 1e-6 mm, with an objective no worse than that of ``q``.
 
-    ``q`` is in the order of the sockets; ``progress`` is called with the fraction done.
+    The optimiser (L-BFGS-B) moves the readings freely; each pose is then brought back into its socket by a combination
+    of the directions that are normal to the socket's configurations at ``q``, so the derivative is exact.
+    ``progress`` is called with the fraction done.
     """
     from scipy import optimize
 
-    sizes = tuple(int(n) for n in np.bincount(owner, minlength=len(placement.points)))
-    lengths = [np.linalg.norm(placement.points[b] - placement.points[a]) for a, b in placement.ends]
-    measurement = Measurement(
-        q=jnp.asarray(q),
-        sines_cosines=sines_cosines(jnp.asarray(q)),
-        nominal=jnp.asarray(np.array(lengths)),
-        u=jnp.asarray(np.array(placement.u)),
-        sizes=sizes,
-        ends=placement.ends,
-    )
-    targets = placement.points[owner]
-    functions = jnp.asarray(problem.objective.functions)
-    design = _Design(problem.arm, problem.space, jnp.asarray(targets), measurement, functions)
-
-    @eqx.filter_jit
-    @eqx.filter_value_and_grad
-    def objective(moved: Array, design: _Design) -> Array:
-        at = newton_projection(design.arm.geometry, moved, design.targets, _NEWTON_STEPS)
-        fresh = eqx.tree_at(lambda m: (m.q, m.sines_cosines), design.measurement, (at, sines_cosines(at)))
-        rows = whitened_equations(design.arm, design.space, fresh.weighted(design.arm.geometry, problem.noise))
-        information = rows.T @ rows + 1e-4 * jnp.eye(rows.shape[1])
-        return problem.objective._replace(functions=design.functions).value(inverse_positive_definite(information))
-
+    region, targets = problem.region, placement.points[owner]
+    sockets = TangentProjection.at(problem, q, targets)
     done = 0
 
     def iterated(_: np.ndarray) -> None:
@@ -74,15 +43,100 @@ def refined(
         done += 1
         progress(min(done / _ITERATIONS, 1.0))
 
-    def value_and_gradient(flat: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = objective(jnp.asarray(flat.reshape(q.shape)), design)
-        return float(value), np.asarray(gradient).ravel()
+    def of_readings(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        at = sockets.projected(flat.reshape(q.shape))
+        value, gradient = value_and_gradient(problem, placement, at, owner)
+        return value, sockets.pulled_back(at, gradient).ravel()
 
-    region = problem.region
     solution = optimize.minimize(
-        value_and_gradient, q.ravel(), jac=True, method="L-BFGS-B", bounds=np.tile(region.limits, (len(q), 1)),
+        of_readings, q.ravel(), jac=True, method="L-BFGS-B", bounds=np.tile(region.limits, (len(q), 1)),
         callback=iterated, options={"maxiter": _ITERATIONS},
     )  # fmt: skip
-    better, arrived = project_to_targets(problem.arm, solution.x.reshape(q.shape), targets, region.limits)
-    better = np.where((arrived & (lowest_point(problem.arm, better) >= region.above))[:, None], better, q)
-    return better if value_and_gradient(better.ravel())[0] <= value_and_gradient(q.ravel())[0] else q
+    change = sockets.projected(solution.x.reshape(q.shape)) - q
+    best, best_value = q, _value(problem, placement, q, owner)
+    for fraction in _FRACTIONS:
+        moved, possible = reached(region, q + fraction * change, targets)
+        moved = np.where(possible[:, None], moved, q)
+        value = _value(problem, placement, moved, owner)
+        if value < best_value:
+            best, best_value = moved, value
+    return best
+
+
+class TangentProjection(NamedTuple):
+    """Projection to the configurations whose tips are in their sockets, along the normals of these at a start."""
+
+    problem: DesignProblem
+    targets: Float[np.ndarray, "N 3"]
+    normals: Float[np.ndarray, "N 3 n"]  # dtip/dq at the start
+
+    @classmethod
+    def at(
+        cls, problem: DesignProblem, q: Float[np.ndarray, "N n"], targets: Float[np.ndarray, "N 3"]
+    ) -> "TangentProjection":
+        """The projection for the neighbourhood of q."""
+        return cls(problem, targets, _tip_columns(_forward(problem, q)))
+
+    def projected(self, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
+        """q + normals^T x, with x of each pose such that its tip is in its socket: by Newton's method."""
+        for _ in range(_NEWTON_STEPS):
+            forward = _forward(self.problem, q)
+            gap = self.targets - forward.tip.T
+            if np.abs(gap).max() < _ARRIVED:
+                break
+            multipliers = np.linalg.solve(self._mixed(forward), gap[:, :, None])
+            q = q + np.einsum("nc,ncj->nj", multipliers[:, :, 0], self.normals)
+        return q
+
+    def pulled_back(self, q: Float[np.ndarray, "N n"], gradient: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
+        """The derivative by what was projected, from that by the projection ``q``."""
+        forward = _forward(self.problem, q)
+        normal_part = np.einsum("ncj,nj->nc", self.normals, gradient)
+        multipliers = np.linalg.solve(np.swapaxes(self._mixed(forward), 1, 2), normal_part[:, :, None])
+        return gradient - np.einsum("nc,ncj->nj", multipliers[:, :, 0], _tip_columns(forward))
+
+    def _mixed(self, forward: ForwardPass) -> Float[np.ndarray, "N 3 3"]:
+        return _tip_columns(forward) @ np.swapaxes(self.normals, 1, 2)
+
+
+def _forward(problem: DesignProblem, q: Float[np.ndarray, "N n"]) -> ForwardPass:
+    return forward_pass(to_numpy(problem.arm.geometry), sines_cosines(q))
+
+
+def _tip_columns(forward: ForwardPass) -> Float[np.ndarray, "N 3 n"]:
+    return np.asarray(jacobian_columns(forward)["theta"]).transpose(2, 1, 0)
+
+
+def _value(problem: DesignProblem, placement: FixturePlacement, q: np.ndarray, owner: np.ndarray) -> float:
+    candidates = candidates_of(problem, placement, pool_of(problem, q, owner))
+    return problem.objective.value(covariance_of(candidates.information(candidates.rows), candidates.parameters))
+
+
+def value_and_gradient(
+    problem: DesignProblem, placement: FixturePlacement, q: Float[np.ndarray, "N n"], owner: Int[np.ndarray, " N"]
+) -> tuple[float, Float[np.ndarray, "N n"]]:
+    """The objective of poses in their sockets, and its derivative by the readings.
+
+    With the information sum A_j^T W_j A_j of rows A_j = [J_j, -1] and weights W_j = (K_j S K_j^T + s^2)^-1, where J_j
+    and K_j are derivatives of tip j by parameters and readings, and H = dvalue/d(covariance) between the covariances of
+    all unknowns: dvalue = -2 <W_j A_j H, dA_j> + 2 <W_j A_j H A_j^T W_j K_j S, dK_j>, summed over the poses j.
+    """
+    pool = pool_of(problem, q, owner)
+    candidates = candidates_of(problem, placement, pool)
+    rows, p = candidates.rows, candidates.parameters
+    covariance = np.linalg.inv(candidates.information(rows))
+    of_parameters = covariance[:p, :p]
+    weighted = covariance[:, :p] @ problem.objective.gradient(of_parameters) @ covariance[:p]
+    roots_transposed = np.swapaxes(pool.roots, 1, 2)
+    by_rows = roots_transposed @ (rows @ weighted)  # W_j A_j H
+    by_covariance = by_rows @ np.swapaxes(rows, 1, 2) @ pool.roots
+    forward = _forward(problem, q)
+    readings = np.asarray(jacobian_columns(forward)["theta"])
+    encoder = np.broadcast_to(np.asarray(problem.noise.encoder), readings.shape[:1])
+    cotangents = {"theta": 2 * np.einsum("ncd,kdn->kcn", by_covariance, readings) * encoder[:, None, None] ** 2}
+    for index, (name, scale) in enumerate(zip(problem.space.names, np.asarray(problem.space.scale), strict=True)):
+        kind, i = locate(problem.arm.joints, name)
+        cotangents.setdefault(kind, np.zeros((3 if kind == "probe" else len(readings), *readings.shape[1:])))
+        cotangents[kind][i] -= 2 * scale * by_rows[:, :, index].T
+    gradient = readings_gradient(forward, cotangents)
+    return problem.objective.value(of_parameters), np.asarray(gradient).T

@@ -114,8 +114,10 @@ def sample_lengths(
         q = draw(2 * count)
         direction = random.normal(size=(2 * count, 3))
         targets = np.asarray(arm.position(q)) + length * direction / np.linalg.norm(direction, axis=1, keepdims=True)
-        other, arrived = project_to_targets(arm, draw(2 * count), targets, allowed)
-        starts.append(q[arrived])
+        # Most ends of a long length are farther from the shoulder than the stretched arm reaches: not worth the steps.
+        near = np.linalg.norm(targets - [0.0, 0.0, float(arm.d[0])], axis=1) <= total_link_length(arm)
+        other, arrived = project_to_targets(arm, draw(2 * count)[near], targets[near], allowed)
+        starts.append(q[near][arrived])
         ends.append(other[arrived])
         found += int(arrived.sum())
         if found >= count:

@@ -186,8 +186,9 @@ def test_plan(aacmm, tmp_path):
     assert summary["predicted"]["largest_mm"] < summary["random"]["largest_mm"]
     rows = (tmp_path / "plan.csv").read_text().splitlines()
     assert len(rows) == 13
-    printed = aacmm(*PLAN).stdout
+    printed = aacmm(*PLAN, "--manifest", "capture.toml").stdout
     assert "random poses in the same sockets" in printed
+    assert 'arm = "cheng2018-simulation"' in (tmp_path / "capture.toml").read_text()
     assert "Not checked: obstacles" in " ".join(printed.split())
 
 
