@@ -10,7 +10,7 @@ import typer
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.text import number
 from ..core.units import DEG
-from ..files.outputs import together
+from ..files.outputs import reading, together
 from .app import CaptureFile, Json, Only, Without, app, examples, show_summary, with_spinner
 
 
@@ -113,11 +113,12 @@ def calibrate(
     from ..summaries.warnings import does_not_fit
     from . import calibration_display
 
-    if figure is not None:
-        from ..plot.style import check_format
-
-        check_format(figure)
     with together(output, figure):
+        reading(capture)
+        if figure is not None:
+            from ..plot.style import check_format
+
+            check_format(figure)
         recording = load_capture(read := InputFile(capture))
         recording = recording._replace(
             capture=recording.capture.select(only or None, without or ()),

@@ -1,6 +1,7 @@
 """What is done with results: ``evaluate``, ``report``, ``export``, ``show``."""
 
 import json
+import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -270,7 +271,7 @@ def show(
 ) -> None:
     """Print the content of a file."""
     path = Path(file)
-    if path.suffix in ("", ".toml") and not (path.is_file() and path.suffix == ""):
+    if path.suffix in ("", ".toml") and not (os.path.isfile(path) and path.suffix == ""):
         _show_arm(file, as_json)
         return
     attributes, summary = read_summary(path, ("capture", "calibration", "evaluation", "study"))

@@ -131,7 +131,7 @@ def _read(source: str | os.PathLike, *, choose: bool) -> ArmSpecification:
     if not isinstance(source, str | os.PathLike):
         raise InputError(f"an arm is read by its name or from a file, not from {source!r}; give one of the two.")
     path = Path(source)
-    if not path.exists() and path.suffix != ".toml":
+    if not os.path.exists(path) and path.suffix != ".toml":
         raise InputError(
             f"'{source}' is neither a file nor an arm that ships with the package{nearest(str(source), shipped_arms())}"
         )

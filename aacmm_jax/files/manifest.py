@@ -209,7 +209,7 @@ def recorded(
 
 def _arm_source(manifest: Path, arm: str) -> str | Path:
     file = manifest.parent / arm
-    return file if arm.endswith(".toml") or file.is_file() else arm
+    return file if arm.endswith(".toml") or os.path.isfile(file) else arm
 
 
 def _radians(readings: np.ndarray, angles: _Angles) -> np.ndarray:

@@ -64,6 +64,7 @@ def test_options(aacmm, tmp_path, options, part):
     [
         (("plan", "cheng2018-simulation", "-o", "p.csv", "--poses", "99999999"), "should be less than or equal to"),
         (("plan", "cheng2018-simulation", "-o", "p.csv", "--region", "z=0:8_0"), "is not of the form AXIS=LOW:HIGH"),
+        (("show", "x" * 300), "is neither a file nor an arm"),
         (("evaluate", "x.toml", "--max-rms-mm", "nan"), "--max-rms-mm 'nan' is not a finite number"),
         (("study", "noise", "-o", "s.h5", "--seed", "12345678901234567890"), "'seed' must be less than"),
         (("study", "noise", "-o", "s.h5", "--trials", "32000", "--chunk", "1"), "more than 10,000 blocks"),
