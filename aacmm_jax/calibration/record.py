@@ -11,7 +11,7 @@ from ..core.errors import some
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..kinematics.parameters import ArmSpecification, Parameters
-from ..solver.reason import Reason
+from ..solver.reason import SCALE, Reason, numbers_of
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .checks import largest_plausible_residual
 from .evaluation import Evaluation, evaluate
@@ -133,7 +133,7 @@ def _reason(calibration: Calibration) -> str:
     result = calibration.result if bool(calibration.stage1.converged) else calibration.stage1.result
     sides = [f"{name} ({side})" for name, side in calibration.active_names().items()]
     sentence = Reason[result]
-    return f"{sentence.rstrip('.')}: {some(sides)}." if bool(result == Reason.scale) and sides else sentence
+    return f"{sentence.rstrip('.')}: {some(sides)}." if int(numbers_of(result)) == SCALE and sides else sentence
 
 
 @checked_arguments

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat, PositiveFloat, model_validator
 
 from ..core.errors import InputError, nearest
+from ..core.text import printable
 from ..core.units import DEG
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import ArmSpecification, Parameters, single
@@ -227,7 +228,7 @@ def _document(specification: ArmSpecification, source: str) -> "TOMLDocument":
     arm = single(specification.arm)
     for key, value in (("name", specification.name), ("source", source)):
         if value:
-            document[key] = storable(value)
+            document[key] = printable(storable(value))
     document["convention"] = "standard"
     document["length_unit"] = "mm"
     document["angle_unit"] = "rad"

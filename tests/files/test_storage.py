@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.results import CrossValidation, LeftOut
+from aacmm_jax.core.text import printable
 from aacmm_jax.files.arms import specification_toml
 from aacmm_jax.files.hdf5 import write_tables
 from tests.refusals import assert_refused
@@ -277,10 +278,10 @@ aj.files.save_capture(target, both[0])
 while True:
     struck = False
     try:
-        sys.stdin.readline()
+        first = int(sys.stdin.readline())
         print("started", flush=True)
         # Python swallows an exception that strikes inside a weak reference's callback; the loop must end then, too.
-        for i in itertools.count():
+        for i in itertools.count(first):
             if struck:
                 break
             aj.files.save_capture(target, both[i % 2])
@@ -294,7 +295,7 @@ while True:
     random, seen = np.random.default_rng(0), set()
     try:
         for attempt in range(25):
-            print("go", file=writer.stdin, flush=True)
+            print(attempt % 2, file=writer.stdin, flush=True)
             assert writer.stdout.readline() == "started\n", writer.stderr.read()
             time.sleep(random.uniform(0, 0.03 * (attempt + 1)))  # on a busy machine one file takes longer than 0.1 s
             writer.send_signal(signal.SIGINT)
@@ -310,7 +311,8 @@ while True:
     assert seen == {0, 1}
 
 
-numbers = st.floats(allow_nan=False, allow_infinity=False)
+numbers = st.floats(-1e20, 1e20)  # larger ones are refused in TOML
+twists = st.floats(-2 * np.pi, 2 * np.pi)  # others are refused as meant in degrees
 positive = st.floats(1e-9, 1e9)
 angles = st.floats(-8 * np.pi, 8 * np.pi)
 # Everything that UTF-8 can hold, except NUL.
@@ -323,7 +325,8 @@ def arms(draw) -> dict:
     joints = draw(st.integers(1, 3))
     row = st.lists(numbers, min_size=joints, max_size=joints)
     limits = st.lists(numbers, min_size=2, max_size=2, unique=True).map(sorted)
-    arm = {kind: draw(row) for kind in ("alpha", "a", "d", "theta")}
+    arm = {kind: draw(row) for kind in ("a", "d", "theta")}
+    arm["alpha"] = draw(st.lists(twists, min_size=joints, max_size=joints))
     arm["beta"] = draw(st.none() | row)
     arm["probe"] = draw(st.lists(numbers, min_size=3, max_size=3))
     arm["limits"] = draw(st.none() | st.lists(limits, min_size=joints, max_size=joints))
@@ -333,7 +336,7 @@ def arms(draw) -> dict:
     override = draw(st.dictionaries(st.sampled_from(free), positive, max_size=2))
     return {
         "arm": arm,
-        "name": draw(texts),
+        "name": draw(texts.filter(lambda text: printable(text) == text)),  # a terminal's control characters are escaped
         "held": None if held is None else tuple(held),
         "length": draw(positive),
         "angle": draw(positive),
