@@ -68,7 +68,7 @@ bench: .venv/.test
 	$(BIN)/python benchmarks/throughput.py
 
 reproduce: .venv/.test
-	$(BIN)/python benchmarks/cheng2018/reproduce.py
+	$(BIN)/python benchmarks/cheng2018/reproduce.py $(if $(WRITE),--write)
 
 peers: benchmarks/peers/pybotics/.venv/.done benchmarks/peers/pinocchio/.venv/.done
 

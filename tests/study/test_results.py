@@ -11,24 +11,23 @@ from aacmm_jax.study import store
 from aacmm_jax.study.blocks import Layout
 from aacmm_jax.study.statistics import concise, distribution, level_title, statistic
 
+from .small_study import NOISE, REFERENCE, made
+
 matplotlib.use("Agg")
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    study = aj.study.make_study(
+    study = made(
         name="a study",
-        arm="cheng2018-simulation",
         trials=96,
         seed=1,
-        capture={"positions_mm": [[400, 200, 300]], "poses": 20, "pool": 4096},
-        deviation={"length_mm": 1.0, "angle_deg": 0.1},
-        noise={"encoder_arcsec": 2.0, "seating_mm": 0.005},
-        reference={"length_mm": 300, "poses": 3, "u_mm": 0.002, "region": {"distance_mm": [300, 900]}},
+        noise=NOISE,
+        reference=REFERENCE | {"u_mm": 0.002},
         bounds={"length_mm": [0.5, 5], "length_shift_mm": [0, 1]},
     )
     path = tmp_path_factory.mktemp("results") / "study.h5"
-    aj.study.run_study(study, path)
+    aj.study.run_study(study, path, chunk=16)
     return path
 
 
