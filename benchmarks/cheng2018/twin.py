@@ -203,7 +203,6 @@ def fitted_noise(
 
     ``kinds`` names the parts of `Noise` that are used; the others are zero.
     """
-    wanted = np.array(list(printed_targets().values()))[:targets]
 
     def noise_of(logarithms: np.ndarray) -> Noise:
         parts = np.zeros(3)
@@ -211,10 +210,23 @@ def fitted_noise(
         return Noise(*(float(f"{part:.3g}") for part in parts))
 
     def mismatch(logarithms: np.ndarray) -> float:
-        shown = medians(identified(draw(made, noise_of(logarithms), count, seed), hold="d_3"))
-        return float(np.sum(np.log(np.array(list(shown.values()))[:targets] / wanted) ** 2))
+        return mismatch_of(made, noise_of(logarithms), targets, count, seed)
 
     begin = np.log(np.array([0.8, 0.002, 3.0]))[list(kinds)]
     corners = np.vstack([begin, begin + 0.7 * np.eye(len(begin))])
     options = {"initial_simplex": corners, "xatol": 5e-3, "fatol": 1e-5, "maxfev": 80}
     return noise_of(minimize(mismatch, begin, method="Nelder-Mead", options=options).x)
+
+
+def mismatch_of(made: Pool, noise: Noise, targets: int, count: int = 100, seed: int = 5) -> float:
+    """Sum of the squared logarithms of the median twin's metrics over the printed ones."""
+    wanted = np.array(list(printed_targets().values()))[:targets]
+    shown = medians(identified(draw(made, noise, count, seed), hold="d_3"))
+    return float(np.sum(np.log(np.array(list(shown.values()))[:targets] / wanted) ** 2))
+
+
+def is_fitted(made: Pool, noise: Noise, kinds: tuple[int, ...], targets: int) -> bool:
+    """Whether 10 % more or less of any kind of noise is worse."""
+    least = mismatch_of(made, noise, targets)
+    changed = (noise._replace(**{Noise._fields[kind]: noise[kind] * factor}) for kind in kinds for factor in (0.9, 1.1))
+    return all(mismatch_of(made, other, targets) > least for other in changed)

@@ -18,11 +18,11 @@ CAPTURE = {"positions_mm": [[400, 200, 300], [300, -300, 400]], "poses": 12, "po
 REFERENCE = {"length_mm": 300, "positions": 2, "poses": 3, "u_mm": 0.01, "region": {"distance_mm": [300, 900]}}
 NOISE = {"encoder_arcsec": 2.0, "seating_mm": 0.005}
 DEVIATION = {"length_mm": 1.0, "angle_deg": 0.1}
-CHUNK = 8  # trials in a block: 24 blocks
+CHUNK = 8  # trials in a block: 12 blocks
 SPECIFICATION = """
 name = "small"
 arm = "cheng2018-simulation"
-trials = 48
+trials = 24
 seed = 5
 [deviation]
 length_mm = 1.0

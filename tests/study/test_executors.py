@@ -29,7 +29,7 @@ def processes():
 
 def test_local_processes_write_the_same_study(home, study, tmp_path, processes):
     outcome = aj.study.run_study(study, tmp_path / "s.h5", executor=processes, workers=1, chunk=CHUNK, shards=True)
-    assert outcome.ran == 192
+    assert outcome.ran == 96
     same(home / "whole.h5", tmp_path / "s.h5")
 
 
@@ -120,7 +120,7 @@ def test_an_interrupt_is_answered_while_programs_compile(home, tmp_path, prepare
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
-    expected = f"Stopped; 0 of 192 trials are kept. Continue with: aacmm study --resume -o {path}\n"
+    expected = f"Stopped; 0 of 96 trials are kept. Continue with: aacmm study --resume -o {path}\n"
     assert errors == expected
     assert {item.name for item in tmp_path.iterdir()} == {"s.h5", "s.h5.parts", "started"}
     aj.study.open_study(path).close()
@@ -134,7 +134,8 @@ def test_an_interrupt_is_answered_while_programs_compile(home, tmp_path, prepare
     pytest.fail("worker processes outlive the command")
 
 
-@pytest.mark.parametrize("where", [pytest.param((), marks=pytest.mark.slow), ("--dask", "local")], ids=str)
+@pytest.mark.slow
+@pytest.mark.parametrize("where", [(), ("--dask", "local")], ids=["threads", "processes"])
 def test_an_interrupt_lets_running_blocks_end(home, tmp_path, prepared, where):
     path = tmp_path / "s.h5"
     options = ("--chunk", CHUNK, "--workers", 1, *where)
@@ -143,9 +144,9 @@ def test_an_interrupt_lets_running_blocks_end(home, tmp_path, prepared, where):
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=120)
     kept = len(list(parts_of(path).glob("*.h5")))
-    assert 2 < kept < 24
+    assert 2 < kept < 12
     assert errors == (
-        f"Stopped; {kept * CHUNK} of 192 trials are kept. Continue with: aacmm study --resume -o {path}\n"
+        f"Stopped; {kept * CHUNK} of 96 trials are kept. Continue with: aacmm study --resume -o {path}\n"
     )
     assert process.returncode == 130
 
@@ -160,7 +161,7 @@ def test_an_interrupt_is_answered_in_the_middle_of_xla(home, tmp_path):
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "Finished XLA compilation of jit(_draw)" not in errors
-    assert "Stopped; 0 of 192 trials are kept" in errors
+    assert "Stopped; 0 of 96 trials are kept" in errors
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from .small_study import CHUNK, ROOT, command, interrupted_at, same, until_parts
 
 
 @pytest.mark.parametrize(
-    ("chunk", "trials"), [(1, 3), (7, 48), (500, 16), pytest.param(500, 48, marks=pytest.mark.slow)]
+    ("chunk", "trials"), [(1, 3), (7, 24), (500, 16), pytest.param(500, 48, marks=pytest.mark.slow)]
 )
 def test_the_chunk_changes_no_bit(home, study, tmp_path, chunk, trials):
     study = aj.study.Study(study.specification.model_copy(update={"trials": trials}), study.nominal)
@@ -150,7 +150,7 @@ def test_blocks_of_a_study_whose_file_is_gone_are_not_taken_for_anothers(home, s
     other = aj.study.Study(study.specification.model_copy(update={"seed": 6}), study.nominal)
     aj.study.run_study(other, path, chunk=CHUNK, keep_parts=True)
     path.unlink()
-    assert aj.study.run_study(study, path, chunk=CHUNK).ran == 192
+    assert aj.study.run_study(study, path, chunk=CHUNK).ran == 96
     same(home / "whole.h5", path)
 
 
@@ -172,7 +172,7 @@ def test_killed_and_resumed_it_is_the_same(home, tmp_path, prepared, computed):
     """SIGKILL at random moments of the real command, start-up and finishing included."""
     path, generator = tmp_path / "s.h5", np.random.default_rng(1)
     options = {} if computed else prepared(0.03)
-    blocks = 24
+    blocks = 12
     for count in np.linspace(1, blocks, 6 if computed else 4).astype(int):
         process = command(home, "-o", path, "--chunk", CHUNK, **options)
         until_parts(path, count, process)
@@ -181,7 +181,7 @@ def test_killed_and_resumed_it_is_the_same(home, tmp_path, prepared, computed):
         process.communicate()
         if path.exists():
             shown = aj.study.open_study(path)
-            assert shown.sizes["trial"] == 48
+            assert shown.sizes["trial"] == 24
             shown.close()
     assert aj.study.run_study(aj.study.read_study(home / "spec.toml"), path).finished
     same(home / "whole.h5", path)
@@ -273,7 +273,7 @@ def test_parts_may_stay(home, study, tmp_path):
     same(home / "whole.h5", path)
     assert aj.study.open_study(path).attrs["finished"]
     parts = sorted(parts_of(path).iterdir())
-    assert len(parts) == 24
+    assert len(parts) == 12
     parts[3].unlink()
     with pytest.raises(
         aj.InputError, match=r"1 blocks are missing in s\.h5\.parts; put them there, or run the study again"
@@ -286,7 +286,7 @@ def test_parts_may_stay(home, study, tmp_path):
 def test_a_spoilt_block_runs_again(home, study, tmp_path):
     """Whatever the disk did to it: a bit, the middle, the end, all of it."""
     path = tmp_path / "s.h5"
-    aj.study.run_study(study, path, chunk=CHUNK, watch=interrupted_at(96))
+    aj.study.run_study(study, path, chunk=CHUNK, watch=interrupted_at(56))
     parts = sorted(parts_of(path).glob("*.h5"))
     assert len(parts) >= 6
     whole = parts[0].read_bytes()
@@ -324,7 +324,7 @@ def test_reading_needs_no_more_files_than_one(home, study, tmp_path):
         [sys.executable, "-c", program, str(path)],
         env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=300,
     )  # fmt: skip
-    assert done.stdout.split() == ["192"] * 3
+    assert done.stdout.split() == ["96"] * 3
     assert "more files than this process may open (60)" in done.stderr
 
 
@@ -339,9 +339,9 @@ def test_a_worker_that_fails_stops_the_study_and_keeps_the_rest(study, tmp_path,
     monkeypatch.setattr(runner, "run_block", fails)
     with pytest.raises(RuntimeError, match=r"failed on its worker .MemoryError: no room.; finished blocks are kept"):
         aj.study.run_study(study, tmp_path / "s.h5", chunk=CHUNK, workers=1)
-    assert len(list(parts_of(tmp_path / "s.h5").glob("*.h5"))) == 12
+    assert len(list(parts_of(tmp_path / "s.h5").glob("*.h5"))) == 6
     monkeypatch.setattr(runner, "run_block", real)
-    assert aj.study.run_study(study, tmp_path / "s.h5").ran == 96
+    assert aj.study.run_study(study, tmp_path / "s.h5").ran == 48
 
 
 @pytest.mark.parametrize(

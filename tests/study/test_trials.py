@@ -61,7 +61,7 @@ def test_without_noise_every_true_tip_is_at_its_point(arm, deviation):
 
 def test_no_pose_twice_and_all_within_the_limits():
     limits = [[-170, 170], [-100, 100], [-150, 150], [-120, 120], [-170, 170], [-90, 90]]
-    q = drawn(made(capture=CAPTURE | {"joint_limits_deg": limits})).q
+    q = drawn(made(capture=CAPTURE | {"joint_limits_deg": limits}, deviation=None)).q
     for trial in q:
         assert len(np.unique(trial.round(9), axis=0)) == trial.shape[0]
     low, high = np.radians(limits).T
@@ -77,15 +77,17 @@ def test_no_row_of_the_pool_is_chosen_twice():
     static = trial_simulation._Static(((0, 1, 1, 128, 70),), (), (), False, None, False, False)
     keys = jax.random.split(jax.random.key(0), trial_simulation._WIDTH)
     for first in (0, 16):
-        trials = np.arange(first, first + trial_simulation._WIDTH)
-        for trial, rows in zip(trials, np.asarray(trial_simulation._chosen(static, keys, trials)), strict=True):
+        trials = first + jnp.arange(trial_simulation._WIDTH)
+        for trial, rows in zip(
+            trials.tolist(), np.asarray(trial_simulation._chosen(static, keys, trials)), strict=True
+        ):
             assert len(set(rows)) == 70
             assert set(rows // 128) == {trial % 32}
 
 
 def test_deviations_have_their_distributions():
     study = made(deviation={"length_mm": 1.0, "d_mm": {"normal": 0.3}, "angle_deg": 0.1, "theta_deg": 0.0})
-    trials = drawn(study, 4000)
+    trials = drawn(study, 2048)
     off = (trials.true - np.asarray(study.space.vector())) / np.where(study.space.lengths, 1.0, np.pi / 180)
     kinds = {
         kind: off[:, [n.startswith(kind + "_") for n in study.space.names]] for kind in ("a", "d", "alpha", "theta")
@@ -134,7 +136,7 @@ def test_noise_is_what_was_asked(part):
 
 def test_reference_lengths_err_by_their_u():
     study = made(reference=REFERENCE)
-    trials = drawn(study, 2000)
+    trials = drawn(study, 1024)
     assert (trials.value - 300).std() == pytest.approx(0.01, rel=0.05)
     np.testing.assert_array_equal(trials.u, 0.01)
 
@@ -142,7 +144,7 @@ def test_reference_lengths_err_by_their_u():
 @pytest.mark.slow
 def test_starts_at_random_fill_the_box():
     study = made(identification={"start": "random", "hold": "none"}, bounds={"length_mm": 2.0, "length_shift_mm": 1.0})
-    trials = drawn(study, 2000)
+    trials = drawn(study, 1024)
     share = (trials.start - trials.lower) / (trials.upper - trials.lower)
     assert share.min() >= 0
     assert share.max() <= 1
