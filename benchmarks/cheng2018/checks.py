@@ -7,7 +7,7 @@ from paper import Row, Tolerance
 
 # A number that is no part of a name (d_3), with the thousands' commas and the exponent that Python prints.
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d{1,3}(?:,\d{3})+|(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
-_COMPARED = ("printed", "recomputed", "method", "toolkit", "verdict")
+_COMPARED = ("toolkit", "method", "recomputed", "verdict", "printed")  # computed ones first: those are shown
 
 
 class Check(NamedTuple):
@@ -73,7 +73,7 @@ def table(checks: list[Check]) -> str:
     """The checks for a terminal."""
     lines = [("row", "stored", "now", "tolerance", "verdict")]
     lines += [(*check[:4], "passed" if check.passed else "FAILED") for check in checks]
-    widths = [min(max(len(line[i]) for line in lines), most) for i, most in enumerate((64, 28, 28, 20, 7))]
+    widths = [min(max(len(line[i]) for line in lines), most) for i, most in enumerate((60, 28, 28, 23, 7))]
     return "\n".join(
         "  ".join(cell[:width].ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
         for line in lines

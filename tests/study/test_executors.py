@@ -145,9 +145,7 @@ def test_an_interrupt_lets_running_blocks_end(home, tmp_path, prepared, where):
     _, errors = process.communicate(timeout=120)
     kept = len(list(parts_of(path).glob("*.h5")))
     assert 2 < kept < 12
-    assert errors == (
-        f"Stopped; {kept * CHUNK} of 96 trials are kept. Continue with: aacmm study --resume -o {path}\n"
-    )
+    assert errors == (f"Stopped; {kept * CHUNK} of 96 trials are kept. Continue with: aacmm study --resume -o {path}\n")
     assert process.returncode == 130
 
 

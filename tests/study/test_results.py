@@ -175,8 +175,7 @@ def test_levels_that_differ_little_are_told_apart():
     assert study.factors == {"capture.positions_mm": ["((400, 200, 300))", "((400.0001, 200, 300))"]}
 
 
-def test_a_study_that_has_just_begun_is_shown(aacmm, tmp_path):
-    study = aj.study.read_study("noise")
+def test_a_study_that_has_just_begun_is_shown(aacmm, study, tmp_path):
     store.create(tmp_path / "s.h5", study, Layout.of(study, 1000), 1000)
     assert "No trial has ended yet" in aacmm("show", "s.h5", "--figures", "f").stdout
     assert "No trial of it has ended yet" in aacmm("show", "s.h5", "--cell", 3).stdout
@@ -199,7 +198,7 @@ def test_the_terminal_shows_all_of_it(path, aacmm, tmp_path):
     one = aacmm("show", path, "--cell", 2)
     assert "Parameters: estimate less truth" in one.stdout
     assert "probe_z" in one.stdout
-    machine = json.loads(aacmm("show", path, "--json").stdout)
+    machine = json.loads(aacmm("show", path, "--cell", 1, "--json").stdout)
     assert machine["results"][0]["figures"]["de"]["mean"]["se"] > 0
     assert "no cell 5; name another" in aacmm("show", path, "--cell", 5, expect=2).stderr
 

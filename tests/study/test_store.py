@@ -173,7 +173,7 @@ def test_killed_and_resumed_it_is_the_same(home, tmp_path, prepared, computed):
     path, generator = tmp_path / "s.h5", np.random.default_rng(1)
     options = {} if computed else prepared(0.03)
     blocks = 12
-    for count in np.linspace(1, blocks, 6 if computed else 4).astype(int):
+    for count in np.linspace(1, blocks, 6 if computed else 3).astype(int):
         process = command(home, "-o", path, "--chunk", CHUNK, **options)
         until_parts(path, count, process)
         time.sleep(generator.uniform(0, 0.05))
