@@ -8,6 +8,7 @@ The names below are those that most scripts need; everything else is grouped by 
 import lazy_loader as _lazy_loader
 
 from .core import compilation_cache as _compilation_cache
+from .core import units as _units  # noqa: F401 - a name of a package that does not list it is found once it is imported
 from .core import x64 as _x64  # noqa: F401 - turns on 64-bit floats before anything makes an array
 
 _compilation_cache.set_up()

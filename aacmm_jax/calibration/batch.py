@@ -270,7 +270,9 @@ class BatchTask(NamedTuple):
         problems = self.problems
         arm, capture, lower, upper = rows_of(rows, self.arm, self.capture, problems.lower, problems.upper)
         bounds = Bounds(self.space, lower, upper)
-        return self.repeated(arm, capture, bounds, start, hold).identified()
+        again = self.repeated(arm, capture, bounds, start, hold)
+        # Of the capacity of the whole batch, whatever the number of problems: one compiled program for all of them.
+        return again._replace(capacity=max(again.capacity, self.capacity)).identified()
 
     def run(self, chunk: range, device: Any) -> tuple[np.ndarray, ...]:
         """Solve one chunk, filled up to the capacity with copies of its first problem, which are never begun."""

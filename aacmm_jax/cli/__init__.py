@@ -8,7 +8,8 @@ import sys
 from importlib import import_module
 from typing import NoReturn
 
-_INTERRUPTED = 130
+INTERRUPTED = 130
+INTERRUPTED_SENTENCE = "Interrupted; nothing was written that is not whole."
 _CLOSED_PIPE = 141  # as a shell reports of a program whose output is closed (128 + SIGPIPE)
 # Modules of commands, in the order in which ``--help`` lists them.
 _FAMILIES = (
@@ -54,7 +55,7 @@ def main() -> None:
         check_numbers(sys.argv[1:])
         app(prog_name="aacmm")
     except SystemExit as done:
-        if done.code == _INTERRUPTED:
+        if done.code == INTERRUPTED:
             _interrupted()
         if isinstance(done.__context__, BrokenPipeError):  # typer and rich both exit with 1 while they handle it
             _discard_output()
@@ -64,7 +65,7 @@ def main() -> None:
         _interrupted()
     except Stopped as stopped:
         print(stopped, file=sys.stderr)
-        sys.exit(_INTERRUPTED)
+        sys.exit(INTERRUPTED)
     except InputError as error:
         if debug:
             raise
@@ -84,8 +85,8 @@ def main() -> None:
 
 
 def _interrupted() -> NoReturn:
-    print("Interrupted; nothing was written that is not whole.", file=sys.stderr)
-    sys.exit(_INTERRUPTED)
+    print(INTERRUPTED_SENTENCE, file=sys.stderr)
+    sys.exit(INTERRUPTED)
 
 
 def _discard_output() -> None:

@@ -1,7 +1,12 @@
 """The command ``study``, and what ``show`` does with a study's file."""
 
+import os
 import shlex
+import sys
+import threading
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from datetime import timedelta
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,13 +14,14 @@ import typer
 
 from ..core.errors import InputError
 from ..files.outputs import together
+from . import INTERRUPTED, INTERRUPTED_SENTENCE
 from .app import Json, Stopped, app, examples, show_summary, with_spinner
 
 
 @app.command(
     epilog=examples(
         "aacmm study bound-sensitivity -o study.h5",
-        "aacmm study my-study.toml -o study.h5 --dask tcp://scheduler:8786",
+        "aacmm study my-study.toml -o study.h5 --dask tls://scheduler:8786",
         "aacmm study --resume -o study.h5",
     )
 )
@@ -42,7 +48,9 @@ def study(
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Run on a Dask cluster: the address of its scheduler, or 'local' for processes on this machine.",
+            help="Run on a Dask cluster: the address of its scheduler. tcp:// trusts everybody who can reach its port, "
+            "who can run programs with your rights; tls:// asks for certificates (see docs/scaling.md). 'local' is for "
+            "processes on this machine, which open no port.",
         ),
     ] = None,
     workers: Annotated[
@@ -66,7 +74,6 @@ def study(
 
     The same command continues a study that was interrupted.
     """
-    from ..study.runner import StudyProgress, run_study
     from ..study.store import read
 
     if resume and not output.exists():
@@ -85,27 +92,23 @@ def study(
     if shards and dask is None:
         raise InputError("--shards is for the workers of --dask; leave it out, or name a cluster.")
 
-    def run(watch: Any) -> Any:
-        with _on(dask, workers) as (executor, count):
-            options = {"chunk": chunk, "shards": shards, "keep_parts": keep_parts}
-            return run_study(asked, output, executor=executor, workers=count, watch=watch, **options)
-
-    with _bar(asked) as show_progress:
-        outcome = run(lambda progress: show_progress(progress) if isinstance(progress, StudyProgress) else None)
-    summary = {
-        "kind": "study",
-        "written": str(output),
-        "trials": outcome.total,
-        "trials_done": outcome.done,
-        "trials_this_run": outcome.ran,
-        "finished": outcome.finished,
-    }
-    show_summary(summary, as_json, lambda _: _ended(outcome, output))
-    if not outcome.finished:
-        raise Stopped(
-            f"Stopped; {outcome.done:,} of {outcome.total:,} trials are kept. "
-            f"Continue with: aacmm study --resume -o {shlex.quote(str(output))}"
-        )
+    options = {"chunk": chunk, "shards": shards, "keep_parts": keep_parts}
+    with _leaving_threads():
+        outcome = _run(asked, output, dask, workers, options)
+        summary = {
+            "kind": "study",
+            "written": str(output),
+            "trials": outcome.total,
+            "trials_done": outcome.done,
+            "trials_this_run": outcome.ran,
+            "finished": outcome.finished,
+        }
+        show_summary(summary, as_json, lambda _: _ended(outcome, output))
+        if not outcome.finished:
+            raise Stopped(
+                f"Stopped; {outcome.done:,} of {outcome.total:,} trials are kept. "
+                f"Continue with: aacmm study --resume -o {shlex.quote(str(output))}"
+            )
 
 
 def _asked(specification: str, trials: int | None, seed: int | None) -> Any:
@@ -123,49 +126,66 @@ def _asked(specification: str, trials: int | None, seed: int | None) -> Any:
     return Study(changed, asked.nominal, asked.recording)
 
 
-@contextmanager
-def _on(dask: str | None, workers: int | None) -> Any:
-    if dask is None:
-        yield None, workers
-        return
+def _run(asked: Any, output: Path, dask: str | None, workers: int | None, options: dict[str, Any]) -> Any:
     from ..study.executors import dask_executor
+    from ..study.runner import run_study
 
-    with dask_executor(dask, workers) as (executor, count):
-        yield executor, count
+    here = nullcontext((None, workers))
+    with (
+        _progress_display() as show,
+        here if dask is None else dask_executor(dask, workers) as (executor, count),
+    ):
+        return run_study(asked, output, executor=executor, workers=count, watch=show, **options)
 
 
 @contextmanager
-def _bar(asked: Any) -> Any:
+def _leaving_threads() -> Iterator[None]:
+    """After an interrupt, leave threads that still compute: at its end, Python would wait for them."""
+    try:
+        yield
+    except (KeyboardInterrupt, Stopped) as interrupt:
+        from ..study.local_processes import THREADS
+
+        if not any(thread.name.startswith(THREADS) for thread in threading.enumerate()):
+            raise
+        print(str(interrupt) or INTERRUPTED_SENTENCE, file=sys.stderr, flush=True)
+        sys.stdout.flush()
+        os._exit(INTERRUPTED)
+
+
+@contextmanager
+def _progress_display() -> Iterator[Any]:
     """A progress bar with rate and time left, on standard error, where that is a terminal."""
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
-    total = asked.trials * len(asked.cells)
     if not console.is_terminal:
-        with nullcontext():
-            yield lambda _: None
+        yield None
         return
     columns = (
         *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("trials")),
-        *(TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()),
+        *(TimeElapsedColumn(), TextColumn("{task.fields[left]}")),
     )
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("Compiling", total=total, rate="")
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("Compiling ...", total=None, left="")
 
         def show(state: Any) -> None:
-            running = progress.tasks[0]
-            speed = running.speed
-            progress.update(
-                task, description="Calibrating", completed=state.done, rate=f"{speed:,.0f}/s" if speed else ""
-            )
+            """Rate and time left are of the time after compiling."""
+            if state.compiling:
+                number = state.programs - state.compiling + 1
+                description = f"Compiling program {number} of {state.programs} ..."
+                bar.update(task, description=description, total=state.total, completed=state.done)
+            elif state.stopping:
+                description = "Stopping: running blocks are kept; Ctrl-C again drops them"
+                bar.update(task, description=description, left="")
+            elif bar.tasks[0].description.startswith("Compiling"):
+                bar.reset(task, description="Calibrating", total=state.total, completed=state.done)
+            else:
+                bar.update(task, completed=state.done)
+                speed, seconds = bar.tasks[0].speed, bar.tasks[0].time_remaining
+                if speed and seconds is not None:
+                    bar.update(task, left=f"{speed:,.0f}/s, {timedelta(seconds=int(seconds))} left")
 
         yield show
 

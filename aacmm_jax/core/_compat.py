@@ -15,6 +15,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero as SymbolicZero
+from jax.experimental.compilation_cache.compilation_cache import reset_cache as reset_compilation_cache  # noqa: F401
 from jaxtyping import Array, Int
 from optimistix.internal import implicit_jvp as implicit_jvp
 

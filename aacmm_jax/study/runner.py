@@ -1,11 +1,12 @@
 """Running a study: blocks in an executor, each kept when it ends; a stopped or killed run can be continued."""
 
+import itertools
 import os
 import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -18,7 +19,8 @@ from ..core.errors import InputError
 from . import store
 from .blocks import Block, Layout, parts_of
 from .configuration_pool import check_reach
-from .definition import Study
+from .definition import Setting, Study
+from .local_processes import THREADS
 from .trials import run_block
 
 _CHUNK_CPU, _CHUNK_ELSEWHERE = 1000, 65_536
@@ -31,6 +33,9 @@ class StudyProgress(NamedTuple):
     done: int  # trials kept, those of earlier runs included
     total: int
     before: int  # trials kept by earlier runs
+    programs: int = 0  # compiled programs that this run needs, one for each setting of the study
+    compiling: int = 0  # those that have not computed their first block yet
+    stopping: bool = False  # after an interrupt: the running blocks end
 
 
 class Outcome(NamedTuple):
@@ -60,8 +65,10 @@ def run_study(
 ) -> Outcome:
     """Run a study into an HDF5 file, or continue the one that the file contains.
 
-    An interrupt (Ctrl-C, SIGTERM) lets the running blocks end, keeps them and returns; a second one does not wait for
-    them. A kill at any moment loses only the running blocks.
+    The first block of every setting runs before all others: it takes the time to compile, which then is known to be
+    over. An interrupt (Ctrl-C, SIGTERM) in that time returns at once; later it lets the running blocks end and keeps
+    them, and a second one does not wait for them. What does not end is left to its thread, and its result discarded. A
+    kill at any moment loses only the running blocks.
 
     Args:
         study: The study.
@@ -74,7 +81,7 @@ def run_study(
             number, and stays what it was when the file was begun.
         shards: Let workers write their blocks themselves, into ``FILE.parts`` in a folder that all of them share.
         keep_parts: Leave the blocks in their folder at the end; the file stays virtual. For results too large to copy.
-        watch: Called with a `StudyProgress` after every block.
+        watch: Called with a `StudyProgress` at the beginning, after every block, and when an interrupt has come.
 
     Returns:
         Numbers of trials, and whether the study is ``finished``.
@@ -104,19 +111,25 @@ def run_study(
             return Outcome(path, total, total, 0)
         keep_parts = keep_parts or finished
         before = sum(block.size for block in kept)
-        # Blocks of one setting run consecutively, so that few pools are needed at a time.
-        order = {setting: i for i, setting in enumerate(dict.fromkeys(study.settings))}
-        missing.sort(key=lambda block: order[study.settings[block.first_cell]])
-        done = before
+        first, others = _in_order(study, missing)
+        progress = StudyProgress(before, total, before, len(first), len(first))
+        tell = watch or (lambda _: None)
+        tell(progress)
         with _stop_on_interrupt() as stopped:
             with _executor(executor, workers) as (pool, count, resources):
                 task = partial(_run_and_pack, study, layout, path if shards else None)
-                for block, packed in _completed(pool, task, missing, _QUEUED * count, stopped, resources):
+                submit = lambda block: pool.submit(task, block, next(resources))  # noqa: E731
+                waits_known = isinstance(pool, ThreadPoolExecutor | ProcessPoolExecutor)
+                results = _completed(submit, (first, others), _QUEUED * count, stopped, waits_known)
+                for block, packed in results:
+                    if block is None:
+                        tell(progress := progress._replace(stopping=True))
+                        continue
                     if packed is not None:
                         store.write_part(path, block, packed, layout)
-                    done += block.size
-                    if watch is not None:
-                        watch(StudyProgress(done, total, before))
+                    done, compiling = progress.done + block.size, max(progress.compiling - 1, 0)
+                    tell(progress := progress._replace(done=done, compiling=compiling))
+            done = progress.done
             if done == total:  # interrupts are still caught: one within HDF5 could damage the file
                 store.finish(path, study, layout, chunk, keep_parts)
         return Outcome(path, done, total, done - before)
@@ -141,10 +154,8 @@ class _Resources(NamedTuple):
 
 
 @contextmanager
-def _executor(
-    executor: Executor | None, workers: int | None
-) -> Iterator[tuple[Executor, int, Callable[[int], _Resources]]]:
-    """The executor, its number of workers, and the resources of the block submitted as number i."""
+def _executor(executor: Executor | None, workers: int | None) -> Iterator[tuple[Executor, int, Iterator[_Resources]]]:
+    """The executor, its number of workers, and the resources of one block after another."""
     if executor is not None:
         context = getattr(executor, "_mp_context", None)
         if context is not None and context.get_start_method() == "fork":
@@ -153,56 +164,79 @@ def _executor(
                 "mp_context=multiprocessing.get_context('spawn')."
             )
         count = workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1
-        yield executor, count, lambda _: _Resources()
+        yield executor, count, itertools.repeat(_Resources())
         return
     devices = jax.local_devices()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = workers or (len(devices) if devices[0].platform != "cpu" else max(cores, len(devices)))
-    threads = ThreadPoolExecutor(count)
+    threads = ThreadPoolExecutor(count, thread_name_prefix=THREADS)
     try:
-        yield threads, count, lambda i: _Resources(devices[i % len(devices)], 1)
-    except BaseException:
+        yield threads, count, itertools.cycle(_Resources(device, 1) for device in devices)
+    finally:  # where a block is running still, an interrupt does not wait for it
         threads.shutdown(wait=False, cancel_futures=True)
-        raise
-    threads.shutdown()
+
+
+def _in_order(study: Study, missing: list[Block]) -> tuple[list[Block], list[Block]]:
+    """The first block of every setting, each of which compiles its program; and the others.
+
+    Blocks of one setting run consecutively, so that few pools are needed at a time.
+    """
+    by_setting: dict[Setting, list[Block]] = {setting: [] for setting in study.settings}
+    for block in missing:
+        by_setting[study.settings[block.first_cell]].append(block)
+    groups = [blocks for blocks in by_setting.values() if blocks]
+    return [blocks[0] for blocks in groups], [block for blocks in groups for block in blocks[1:]]
 
 
 def _completed(
-    pool: Executor,
-    task: Callable,
-    blocks: list[Block],
+    submit: Callable[[Block], Future],
+    phases: tuple[list[Block], list[Block]],
     queued: int,
     stopped: threading.Event,
-    resources: Callable[[int], _Resources],
-) -> Iterator[tuple[Block, Any]]:
-    """Results of blocks as they end, at most ``queued`` at a time; once ``stopped``, only of those running."""
-    waiting, submitted = deque(enumerate(blocks)), dict[Future, Block]()
+    waits_known: bool,
+) -> Iterator[tuple[Block | None, Any]]:
+    """Results of blocks as they end: first of those that compile, then of the others, at most ``queued`` at a time.
+
+    ``waits_known``: whether a future can be cancelled only before it has begun. Dask's can always.
+
+    Once ``stopped``, (None, None) and then those of blocks that are running; nothing more where programs compile.
+    """
+    submitted: dict[Future, Block] = {}
     try:
-        while submitted or (waiting and not stopped.is_set()):
-            while waiting and len(submitted) < queued and not stopped.is_set():
-                number, block = waiting.popleft()
-                submitted[pool.submit(task, block, resources(number))] = block
-            if stopped.is_set() and isinstance(pool, ThreadPoolExecutor):
-                # Those that have not begun; a Dask future does not say whether it has.
-                for future in [future for future in submitted if future.cancel()]:
-                    del submitted[future]
-            ended, _ = wait(submitted, timeout=0.2, return_when=FIRST_COMPLETED)
-            # Successful blocks first: they are kept even where another block failed at the same moment.
-            for future in sorted(ended, key=lambda future: future.exception() is not None):
-                block = submitted.pop(future)
-                try:
-                    result = future.result()
-                except InputError:
-                    raise
-                except Exception as error:
-                    raise RuntimeError(
-                        f"block {block} failed on its worker ({type(error).__name__}: {error}); finished blocks are "
-                        "kept, run again to continue"
-                    ) from error
-                yield block, result
+        for blocks, most in zip(phases, (len(phases[0]), queued), strict=True):
+            waiting, told = deque(blocks), False
+            while submitted or (waiting and not stopped.is_set()):
+                while waiting and len(submitted) < most and not stopped.is_set():
+                    block = waiting.popleft()
+                    submitted[submit(block)] = block
+                ended, _ = wait(submitted, timeout=0.2, return_when=FIRST_COMPLETED)
+                # Successful blocks first: they are kept even where another block failed at the same moment.
+                for future in sorted(ended, key=lambda future: future.exception() is not None):
+                    yield (block := submitted.pop(future)), _result(future, block)
+                if not stopped.is_set():
+                    continue
+                if blocks is phases[0]:
+                    return
+                for future in [future for future in submitted if waits_known and future.cancel()]:
+                    del submitted[future]  # those that have not begun
+                if submitted and not told:
+                    told = True
+                    yield None, None
     finally:
         for future in submitted:
             future.cancel()
+
+
+def _result(future: Future, block: Block) -> Any:
+    try:
+        return future.result()
+    except InputError:
+        raise
+    except Exception as error:
+        raise RuntimeError(
+            f"block {block} failed on its worker ({type(error).__name__}: {error}); finished blocks are kept, run "
+            "again to continue"
+        ) from error
 
 
 @contextmanager
@@ -226,6 +260,15 @@ def _stop_on_interrupt() -> Iterator[threading.Event]:
     finally:
         for number, handler in former.items():
             signal.signal(number, handler)
+
+
+def _interruptible(function: Callable, *args: Any) -> Any:
+    """The result of a function that may compile, which Ctrl-C cannot interrupt in the thread that does it."""
+    thread = ThreadPoolExecutor(1, thread_name_prefix=THREADS)
+    try:
+        return thread.submit(function, *args).result()
+    finally:
+        thread.shutdown(wait=False)
 
 
 @contextmanager
@@ -258,7 +301,7 @@ def _opened(study: Study, path: Path, chunk: int | None) -> tuple[Layout, int, b
     from importlib import metadata
 
     if not path.exists():
-        check_reach(study)
+        _interruptible(check_reach, study)
         chunk = chunk or (_CHUNK_CPU if jax.local_devices()[0].platform == "cpu" else _CHUNK_ELSEWHERE)
         layout = Layout.of(study, chunk)
         store.create(path, study, layout, chunk)

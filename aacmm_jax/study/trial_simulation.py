@@ -24,6 +24,7 @@ from .configuration_pool import Pool, pool_of
 from .definition import POOL_PARTS, CellValues, Setting, Study
 
 _WIDTH = 16  # trials at a time: of one width, so that every trial's arithmetic is the same whatever the chunk
+_SIZES = 64, 256  # trials of one call of the compiled program: few sizes, as each takes 10 s to compile
 _TOLERANCE = 1e-9  # mm: how far from its point a tip may end
 _MOST_STEPS = 40  # deviations of a few microns take 3, the paper's tolerances 5 or 6
 
@@ -67,13 +68,20 @@ def draw(
     """Trials ``trials`` of cells ``cells``, all of one setting, as NumPy arrays."""
     static, shared = _prepared(study, setting, device)
     count = len(cells)
-    padded = -(-count // _WIDTH) * _WIDTH
+    size = _SIZES[count > _SIZES[0]]
+    padded = -(-count // size) * size
     cells, trials = (np.resize(numbers, padded) for numbers in (cells, trials))
     values = CellValues(*(column[cells] for column in study.cell_values))
     seed = np.asarray(study.specification.seed)
-    with jax.default_device(device):
-        drawn = _draw(static, shared, *jax.device_put((seed, cells, trials, values), device))
-    return Drawn(*(np.asarray(leaf)[:count] for leaf in drawn))
+
+    def part(first: int) -> Drawn:
+        given = jax.tree.map(lambda column: column[first : first + size], (cells, trials, values))
+        with jax.default_device(device):
+            drawn = _draw(static, shared, *jax.device_put((seed, *given), device))
+        return jax.tree.map(np.asarray, drawn)
+
+    parts = [part(first) for first in range(0, padded, size)]
+    return Drawn(*(np.concatenate(column)[:count] for column in zip(*parts, strict=True)))
 
 
 @lru_cache(maxsize=16)

@@ -1,21 +1,35 @@
 """Table 3, figure 8 and the 93 %: where the printed numbers lie among a thousand twins of the experiment."""
 
+import csv
+
 import numpy as np
 import paper_method
 import twin
-from paper import PUBLISHED, Row, box, number, position_in, random_starts, row, vector
+from paper import FITTED, HERE, PUBLISHED, STORED, Row, box, number, position_in, random_starts, read_table, row, vector
 
 TWINS = 1_000
 SEED = 6
-METHODS = 24  # twins that the paper's method is also run on
+METHODS, AGAIN = 24, 2  # twins that the paper's method is also run on, and of these run again each time
 KINDS = {"encoder noise alone": (0,), "seating alone": (1,), "eccentricity alone": (2,), "all three": (0, 1, 2)}
 
 
-def noise_models(made: twin.Pool, rows: list[Row]) -> tuple[twin.Noise, list[dict[str, float | str]]]:
-    """Which noise explains the printed metrics: each kind fitted to DE of Data1, and all three fitted to more."""
+def noise_models(made: twin.Pool, rows: list[Row], search: bool) -> tuple[twin.Noise, list[dict[str, float | str]]]:
+    """Which noise explains the printed metrics: each kind fitted to DE of Data1, and all three fitted to more.
+
+    Fits are run again only with ``search``; otherwise it is checked that those stored are minima.
+    """
     wanted, table, chosen = twin.printed_targets(), [], twin.Noise(0.0, 0.0, 0.0)
+    stored, minima = {}, 0
+    if not search:
+        with (HERE / "results" / "noise_models.csv").open(newline="") as file:
+            stored = {line["noise"]: line for line in csv.DictReader(file)}
     for name, kinds in KINDS.items():
-        noise = twin.fitted_noise(made, kinds=kinds, targets=1 if len(kinds) == 1 else 3)
+        targets = 1 if len(kinds) == 1 else 3
+        if search:
+            noise = twin.fitted_noise(made, kinds=kinds, targets=targets)
+        else:
+            noise = twin.Noise(*(float(stored[name][key]) for key in twin.Noise._fields))
+        minima += twin.is_fitted(made, noise, kinds, targets)
         shown = twin.medians(twin.identified(twin.draw(made, noise, 400, SEED + 1), hold="d_3"))
         table.append({"noise": name} | noise._asdict() | shown)
         chosen = noise if len(kinds) > 1 else chosen
@@ -31,8 +45,10 @@ def noise_models(made: twin.Pool, rows: list[Row]) -> tuple[twin.Noise, list[dic
                 f"nearest: {nearest}; seating alone gives the least ({min(ratios.values()):.2f}), since angle errors "
                 "grow with the distance from the joints and the twins' Data2 and Data3 are farther out. "
                 f"The twins have {chosen.encoder_arcsec:.1g} arcsec, {1e3 * chosen.seating_mm:.1g} um and "
-                f"{chosen.eccentricity_arcsec:.1g} arcsec, fitted to all three printed Deltam and to DE"
+                f"{chosen.eccentricity_arcsec:.1g} arcsec, fitted to all three printed Deltam and to DE; {minima} of "
+                f"{len(KINDS)} fits are minima: 10 % more or less of any kind is worse"
             ),
+            tolerance=FITTED,
         )
     )
     return chosen, table
@@ -52,6 +68,7 @@ def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
                 method=f"all lengths free: median {number(np.median(theirs))}",
                 toolkit=f"median {number(np.median(mine))}",
                 verdict=note + position_in(printed, mine),
+                tolerance=FITTED,
             )
         )
 
@@ -117,6 +134,7 @@ def compared(rows: list[Row], result: twin.Outcome, own: twin.Outcome) -> None:
             "and the former is as large as the error of k that the search leaves. "
             f"With the printed {before} mm as the former, {printed} is "
             + position_in(printed, 100 * (1 - np.abs(own.plate).max(axis=1) / before)),
+            tolerance=FITTED,
         )
     )
 
@@ -127,35 +145,51 @@ def improvement(result: twin.Outcome) -> np.ndarray:
     return 100 * (1 - np.abs(result.plate).max(axis=1) / before)
 
 
-def scale_of_experiment(rows: list[Row], twins: twin.Twins, free: twin.Outcome, own: twin.Outcome) -> None:
-    """k of the experiment against k of identifications with noise and every length free."""
+def scale_of_experiment(
+    rows: list[Row], twins: twin.Twins, free: twin.Outcome, own: twin.Outcome, search: bool
+) -> list[dict[str, float]]:
+    """k of the experiment against k of identifications with noise and every length free.
+
+    The paper's method is run on all its twins only with ``search``; otherwise their k are those stored.
+    """
     reference = PUBLISHED["experiment"]["length_reference"]
     printed = reference["mean"] / reference["nominal"]
     lower, upper = box("experiment")
     starts = random_starts(lower, upper, METHODS, SEED)
-    found = paper_method.many_in_boxes(
-        [(q, lower, upper, start) for q, start in zip(twins.sockets[:METHODS, 0], starts, strict=True)]
-    )
-    k = twin.lengths_of(found, twins.reference[:METHODS]).mean(axis=1) / twin.REFERENCE
+    problems = [(q, lower, upper, start) for q, start in zip(twins.sockets[:METHODS, 0], starts, strict=True)]
     width = upper - lower
 
     def edge(values: np.ndarray) -> np.ndarray:
         return np.any((values - lower < 1e-6 * width) | (upper - values < 1e-6 * width), axis=-1)
 
+    again = np.array([paper_method.one_in_box(problem) for problem in problems[:AGAIN]])
+    if search:
+        found = paper_method.many_in_boxes(problems)
+        ks = twin.lengths_of(found, twins.reference[:METHODS]).mean(axis=1) / twin.REFERENCE
+        runs = [{"twin": float(i), "k": float(ks[i]), "on_a_bound": float(edge(found)[i])} for i in range(METHODS)]
+    else:
+        runs = read_table(HERE / "results" / "paper_method_twins.csv")
+    k, on_a_bound = (np.array([run[key] for run in runs]) for key in ("k", "on_a_bound"))
+    # The noise, not the search, determines DE: every search, wherever it ends, comes as close as squared distances do.
+    de = [twin.metrics_of(twin.tips_of(again[i : i + 1], problems[i][0][None]))[0][0] for i in range(AGAIN)]
+    close = sum(abs(de[i] / (free.de[i, 0] * free.k[i]) - 1) < 0.05 for i in range(AGAIN))
     inside = "inside its box" if not edge(vector("experiment", "identified")) else "on a bound of its box"
     rows.append(
         row(
             "4.2 k of the identified arm",
             f"{printed:.5f}",
             method=f"interior point from random starts, {METHODS} twins: {k.min():.4f} to {k.max():.4f}, "
-            f"{100 * np.mean(edge(found)):.0f} % on a bound",
+            f"{100 * np.mean(on_a_bound):.0f} % on a bound; {close} of {AGAIN} run again come within 5 % of the DE of "
+            "squared distances",
             toolkit=f"all free, squared distances: median {np.median(free.k):.4f}, "
             f"{100 * np.mean(free.on_a_bound):.0f} % on a bound; "
             f"scale anchor d_3 at its nominal value: {np.median(own.k):.5f}, standard deviation {np.std(own.k):.1e}",
             verdict=f"eq. 18 lies {inside}; its k is {position_in(printed, k)} (interior point, whose end "
             f"depends on its start and on its limit of {paper_method.ITERATIONS} iterations)",
+            tolerance=STORED,
         )
     )
+    return runs
 
 
 def stages(rows: list[Row], twins: twin.Twins, free: twin.Outcome, own: twin.Outcome) -> list[dict[str, float]]:
@@ -183,19 +217,20 @@ def stages(rows: list[Row], twins: twin.Twins, free: twin.Outcome, own: twin.Out
                 f"{at_printed / two:.0f} times at the printed k. With one length in one position the joint solve "
                 f"changes the median by {100 * (middle['joint'] / two - 1):+.1f} %"
             ),
+            tolerance=FITTED,
         )
     )
     return [{"twin": float(i)} | {name: float(values[i]) for name, values in rms.items()} for i in range(len(joint))]
 
 
-def run() -> tuple[list[Row], dict[str, list[dict]]]:
+def run(search: bool = False) -> tuple[list[Row], dict[str, list[dict]]]:
     rows: list[Row] = []
     made = twin.pool()
-    noise, models = noise_models(made, rows)
+    noise, models = noise_models(made, rows, search)
     twins = twin.draw(made, noise, TWINS, SEED)
     free, own = (twin.identified(twins, hold) for hold in (None, "d_3"))
     compared(rows, free, own)
-    scale_of_experiment(rows, twins, free, own)
+    runs = scale_of_experiment(rows, twins, free, own, search)
     by_stage = stages(rows, twins, free, own)
     figures = [
         {
@@ -216,7 +251,14 @@ def run() -> tuple[list[Row], dict[str, list[dict]]]:
     stage1 = np.where(twin.is_length(), own.parameters[typical] * own.k[typical], own.parameters[typical])
     tips = twin.tips_of(stage1[None], twins.sockets[typical, :1])[0]
     centred = [dict(zip(("x_mm", "y_mm", "z_mm"), map(float, tip - tips.mean(axis=0)), strict=True)) for tip in tips]
-    return rows, {"noise_models": models, "twins": figures, "stages": by_stage, "figure8": plate, "figure6": centred}
+    return rows, {
+        "noise_models": models,
+        "paper_method_twins": runs,
+        "twins": figures,
+        "stages": by_stage,
+        "figure8": plate,
+        "figure6": centred,
+    }
 
 
 if __name__ == "__main__":

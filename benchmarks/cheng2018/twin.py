@@ -103,41 +103,36 @@ def recorded(q: np.ndarray, noise: Noise, harmonics: np.ndarray, generator: np.r
     """What the encoders read in exact poses ``(t, ..., 6)``."""
     shift = noise.seating_mm * generator.normal(size=(*q.shape[:-1], 3))
     sine, cosine = (part.reshape(part.shape[0], *(1,) * (q.ndim - 2), part.shape[1]) for part in harmonics)
-    seated = q + np.asarray(
-        _least_move(jnp.asarray(q.reshape(-1, q.shape[-1])), jnp.asarray(shift.reshape(-1, 3)))
-    ).reshape(q.shape)
+    seated = q + _least_move(q.reshape(-1, q.shape[-1]), shift.reshape(-1, 3)).reshape(q.shape)
     return (
         seated + sine * np.sin(q) + cosine * np.cos(q) + noise.encoder_arcsec * ARCSEC * generator.normal(size=q.shape)
     )
 
 
-@jax.jit
-def _least_move(q: jax.Array, shift: jax.Array) -> jax.Array:
+def _least_move(q: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """Least change of the joints that moves the tip by a few micrometres (to first order: picometres are left)."""
-    jacobian = true_arm().jacobian(q, [f"q_{i + 1}" for i in range(q.shape[-1])])
-    square = jacobian @ jnp.swapaxes(jacobian, -1, -2)
-    # One batched LAPACK call at a time cannot deadlock, and another factorisation would change the last digits.
-    solved = jnp.linalg.solve(square, shift[..., None])[..., 0]
-    return jnp.einsum("bci,bc->bi", jacobian, solved)
+    jacobian = np.asarray(true_arm().jacobian(q, [f"q_{i + 1}" for i in range(q.shape[-1])]))
+    square = jacobian @ np.swapaxes(jacobian, -1, -2)
+    return np.einsum("bci,bc->bi", jacobian, np.linalg.solve(square, shift[..., None])[..., 0])
 
 
 def joint(twins: Twins, u: float = 0.001) -> np.ndarray:
     """Parameters by the joint solve of poses and the four lengths (standard uncertainty ``u``), ``(t, 21)``."""
     lower, upper = box("experiment")
     nominal = arm_of((lower + upper) / 2)
-    bounds = aj.Bounds(aj.Parameters(nominal, NAMES), lower, upper)
     ends = [(f"{i}a", f"{i}b") for i in range(REPEATS)]
     lengths = [aj.ReferenceLength(*pair, value=REFERENCE, u=u) for pair in ends]
-
-    def one(given: tuple[jax.Array, jax.Array]) -> jax.Array:
-        poses, reference = given
-        bars = {name: reference[i, side][None] for i, pair in enumerate(ends) for side, name in enumerate(pair)}
-        return aj.calibrate(
-            nominal, aj.Capture({"Data1": poses, **bars}, lengths), bounds, method="joint", hold="d_3"
-        ).parameters
-
-    run = jax.jit(lambda *given: jax.lax.map(one, given, batch_size=8))
-    return np.asarray(run(jnp.asarray(twins.sockets[:, 0]), jnp.asarray(twins.reference)))
+    names = [name for pair in ends for name in pair]
+    bars = twins.reference.reshape(len(twins.reference), len(names), -1)
+    captures = [
+        aj.Capture({"Data1": poses} | {name: bar[i : i + 1] for i, name in enumerate(names)}, lengths)
+        for poses, bar in zip(twins.sockets[:, 0], bars, strict=True)
+    ]
+    space = aj.Parameters(nominal, NAMES)
+    many = aj.calibrate_many(
+        nominal, aj.stack_captures(captures), lower, upper, method="joint", space=space, hold="d_3"
+    )
+    return np.asarray(many.parameters)
 
 
 class Outcome(NamedTuple):
@@ -208,7 +203,6 @@ def fitted_noise(
 
     ``kinds`` names the parts of `Noise` that are used; the others are zero.
     """
-    wanted = np.array(list(printed_targets().values()))[:targets]
 
     def noise_of(logarithms: np.ndarray) -> Noise:
         parts = np.zeros(3)
@@ -216,10 +210,23 @@ def fitted_noise(
         return Noise(*(float(f"{part:.3g}") for part in parts))
 
     def mismatch(logarithms: np.ndarray) -> float:
-        shown = medians(identified(draw(made, noise_of(logarithms), count, seed), hold="d_3"))
-        return float(np.sum(np.log(np.array(list(shown.values()))[:targets] / wanted) ** 2))
+        return mismatch_of(made, noise_of(logarithms), targets, count, seed)
 
     begin = np.log(np.array([0.8, 0.002, 3.0]))[list(kinds)]
     corners = np.vstack([begin, begin + 0.7 * np.eye(len(begin))])
     options = {"initial_simplex": corners, "xatol": 5e-3, "fatol": 1e-5, "maxfev": 80}
     return noise_of(minimize(mismatch, begin, method="Nelder-Mead", options=options).x)
+
+
+def mismatch_of(made: Pool, noise: Noise, targets: int, count: int = 100, seed: int = 5) -> float:
+    """Sum of the squared logarithms of the median twin's metrics over the printed ones."""
+    wanted = np.array(list(printed_targets().values()))[:targets]
+    shown = medians(identified(draw(made, noise, count, seed), hold="d_3"))
+    return float(np.sum(np.log(np.array(list(shown.values()))[:targets] / wanted) ** 2))
+
+
+def is_fitted(made: Pool, noise: Noise, kinds: tuple[int, ...], targets: int) -> bool:
+    """Whether 10 % more or less of any kind of noise is worse."""
+    least = mismatch_of(made, noise, targets)
+    changed = (noise._replace(**{Noise._fields[kind]: noise[kind] * factor}) for kind in kinds for factor in (0.9, 1.1))
+    return all(mismatch_of(made, other, targets) > least for other in changed)

@@ -11,24 +11,23 @@ from aacmm_jax.study import store
 from aacmm_jax.study.blocks import Layout
 from aacmm_jax.study.statistics import concise, distribution, level_title, statistic
 
+from .small_study import NOISE, REFERENCE, made
+
 matplotlib.use("Agg")
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    study = aj.study.make_study(
+    study = made(
         name="a study",
-        arm="cheng2018-simulation",
         trials=96,
         seed=1,
-        capture={"positions_mm": [[400, 200, 300]], "poses": 20, "pool": 4096},
-        deviation={"length_mm": 1.0, "angle_deg": 0.1},
-        noise={"encoder_arcsec": 2.0, "seating_mm": 0.005},
-        reference={"length_mm": 300, "poses": 3, "u_mm": 0.002, "region": {"distance_mm": [300, 900]}},
+        noise=NOISE,
+        reference=REFERENCE | {"u_mm": 0.002},
         bounds={"length_mm": [0.5, 5], "length_shift_mm": [0, 1]},
     )
     path = tmp_path_factory.mktemp("results") / "study.h5"
-    aj.study.run_study(study, path)
+    aj.study.run_study(study, path, chunk=16)
     return path
 
 
@@ -176,8 +175,7 @@ def test_levels_that_differ_little_are_told_apart():
     assert study.factors == {"capture.positions_mm": ["((400, 200, 300))", "((400.0001, 200, 300))"]}
 
 
-def test_a_study_that_has_just_begun_is_shown(aacmm, tmp_path):
-    study = aj.study.read_study("noise")
+def test_a_study_that_has_just_begun_is_shown(aacmm, study, tmp_path):
     store.create(tmp_path / "s.h5", study, Layout.of(study, 1000), 1000)
     assert "No trial has ended yet" in aacmm("show", "s.h5", "--figures", "f").stdout
     assert "No trial of it has ended yet" in aacmm("show", "s.h5", "--cell", 3).stdout
@@ -200,7 +198,7 @@ def test_the_terminal_shows_all_of_it(path, aacmm, tmp_path):
     one = aacmm("show", path, "--cell", 2)
     assert "Parameters: estimate less truth" in one.stdout
     assert "probe_z" in one.stdout
-    machine = json.loads(aacmm("show", path, "--json").stdout)
+    machine = json.loads(aacmm("show", path, "--cell", 1, "--json").stdout)
     assert machine["results"][0]["figures"]["de"]["mean"]["se"] > 0
     assert "no cell 5; name another" in aacmm("show", path, "--cell", 5, expect=2).stderr
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.study import configuration_pool
 
 CAPTURE = {"positions_mm": [[400, 200, 300]]}
 
@@ -190,7 +191,8 @@ def test_a_narrow_region_is_found(tmp_path):
     ],
     ids=str,
 )
-def test_out_of_reach_is_refused_before_work(tmp_path, tables, message):
+def test_out_of_reach_is_refused_before_work(tmp_path, monkeypatch, tables, message):
+    monkeypatch.setattr(configuration_pool, "_ROUNDS", 10)  # none of a hundred would find a placement
     with pytest.raises(aj.InputError, match=message):
         aj.study.run_study(made(**tables), tmp_path / "s.h5")
     assert not list(tmp_path.glob("*.h5*"))

@@ -11,19 +11,18 @@ from aacmm_jax.study import configuration_pool, trial_simulation
 from aacmm_jax.study.blocks import Block
 from aacmm_jax.study.trials import run_block
 
+from .small_study import CAPTURE, DEVIATION, NOISE, REFERENCE, made
+
 DEVICE = jax.devices()[0]
-REFERENCE = {"length_mm": 500, "positions": 2, "poses": 3, "u_mm": 0.01, "region": {"distance_mm": [300, 1000]}}
-NOISE = {"encoder_arcsec": 2.0, "seating_mm": 0.005}
-OFF = {"length_mm": 1.0, "angle_deg": 0.1}
+AT_A_TIME = 64  # trials of one call: more are drawn by several, since another number would be compiled anew
 
 
-def made(**tables) -> "aj.study.Study":
-    capture = {"positions_mm": [[400, 200, 300]], "poses": 30, "pool": 4096}
-    return aj.study.make_study(**{"arm": "cheng2018-simulation", "trials": 64, "seed": 3, "capture": capture} | tables)
-
-
-def drawn(study: "aj.study.Study", count: int = 64, cell: int = 0) -> trial_simulation.Drawn:
-    return trial_simulation.draw(study, study.settings[cell], np.full(count, cell), np.arange(count), DEVICE)
+def drawn(study: "aj.study.Study", count: int = AT_A_TIME, cell: int = 0) -> trial_simulation.Drawn:
+    numbers = np.split(np.arange(count), range(AT_A_TIME, count, AT_A_TIME))
+    parts = [
+        trial_simulation.draw(study, study.settings[cell], np.full(len(part), cell), part, DEVICE) for part in numbers
+    ]
+    return trial_simulation.Drawn(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def tips(study: "aj.study.Study", trials: trial_simulation.Drawn) -> np.ndarray:
@@ -39,34 +38,32 @@ def hayati() -> "aj.Arm":
 @pytest.mark.parametrize(
     ("arm", "deviation"),
     [
-        ("cheng2018-simulation", OFF),
+        ("cheng2018-simulation", DEVIATION),
         ("cheng2018-simulation", {"length_mm": 10.0, "angle_deg": 1.0}),
-        pytest.param("panda", OFF, marks=pytest.mark.slow),
-        pytest.param(hayati(), OFF, marks=pytest.mark.slow),
+        pytest.param("panda", DEVIATION, marks=pytest.mark.slow),
+        pytest.param(hayati(), DEVIATION, marks=pytest.mark.slow),
     ],
     ids=["paper", "far off", "panda", "beta"],
 )
 def test_without_noise_every_true_tip_is_at_its_point(arm, deviation):
-    capture = {"positions_mm": [[400, 200, 300], [300, -300, 400]], "poses": 20, "pool": 4096}
-    study = made(arm=arm, deviation=deviation, reference=REFERENCE | {"u_mm": 0.0, "length_mm": 200}, capture=capture)
+    study = made(arm=arm, deviation=deviation, reference=REFERENCE | {"u_mm": 0.0})
     trials = drawn(study)
     found = tips(study, trials)
-    assert np.abs(found[:, :20] - [400, 200, 300]).max() < 1e-8
-    assert np.abs(found[:, 20:40] - [300, -300, 400]).max() < 1e-8
-    ends = found[:, 40:].reshape(64, 2, 2, 3, 3)
+    assert np.abs(found[:, :12] - [400, 200, 300]).max() < 1e-8
+    assert np.abs(found[:, 12:24] - [300, -300, 400]).max() < 1e-8
+    ends = found[:, 24:].reshape(64, 2, 2, 3, 3)
     assert np.abs(np.ptp(ends, axis=3)).max() < 1e-8  # the poses of one end agree
     length = np.linalg.norm(ends[:, :, 0, 0] - ends[:, :, 1, 0], axis=-1)
-    np.testing.assert_allclose(length, 200, atol=1e-8)
-    np.testing.assert_allclose(trials.value, 200, atol=1e-8)
+    np.testing.assert_allclose(length, 300, atol=1e-8)
+    np.testing.assert_allclose(trials.value, 300, atol=1e-8)
     assert np.ptp(trials.true, axis=0).min() > 0.5 * 2 * study.cell_values.width[0].min()
 
 
-def test_no_pose_twice_and_all_within_the_limits(paper_arm):
+def test_no_pose_twice_and_all_within_the_limits():
     limits = [[-170, 170], [-100, 100], [-150, 150], [-120, 120], [-170, 170], [-90, 90]]
-    study = made(capture={"positions_mm": [[400, 200, 300]], "poses": 70, "pool": 4096, "joint_limits_deg": limits})
-    q = drawn(study).q
+    q = drawn(made(capture=CAPTURE | {"joint_limits_deg": limits}, deviation=None)).q
     for trial in q:
-        assert len(np.unique(trial.round(9), axis=0)) == 70
+        assert len(np.unique(trial.round(9), axis=0)) == trial.shape[0]
     low, high = np.radians(limits).T
     assert (q >= low).all()
     assert (q <= high).all()
@@ -75,9 +72,22 @@ def test_no_pose_twice_and_all_within_the_limits(paper_arm):
     assert not first & second
 
 
+def test_no_row_of_the_pool_is_chosen_twice():
+    """Most of a small pool: 70 of the 128 poses of each part."""
+    static = trial_simulation._Static(((0, 1, 1, 128, 70),), (), (), False, None, False, False)
+    keys = jax.random.split(jax.random.key(0), trial_simulation._WIDTH)
+    for first in (0, 16):
+        trials = first + jnp.arange(trial_simulation._WIDTH)
+        for trial, rows in zip(
+            trials.tolist(), np.asarray(trial_simulation._chosen(static, keys, trials)), strict=True
+        ):
+            assert len(set(rows)) == 70
+            assert set(rows // 128) == {trial % 32}
+
+
 def test_deviations_have_their_distributions():
     study = made(deviation={"length_mm": 1.0, "d_mm": {"normal": 0.3}, "angle_deg": 0.1, "theta_deg": 0.0})
-    trials = drawn(study, 4000)
+    trials = drawn(study, 2048)
     off = (trials.true - np.asarray(study.space.vector())) / np.where(study.space.lengths, 1.0, np.pi / 180)
     kinds = {
         kind: off[:, [n.startswith(kind + "_") for n in study.space.names]] for kind in ("a", "d", "alpha", "theta")
@@ -99,7 +109,7 @@ def test_deviations_have_their_distributions():
 def test_noise_is_what_was_asked(part):
     """The same keys with and without one part of the noise differ by that part."""
     level = {"encoder_arcsec": 2.0, "seating_mm": 0.005, "resolution_arcsec": 20.0, "eccentricity_arcsec": 5.0}[part]
-    without, with_it = (made(deviation=OFF, noise={part: value}) for value in (0.0, level))
+    without, with_it = (made(deviation=DEVIATION, noise={part: value}) for value in (0.0, level))
     exact, noisy = drawn(without), drawn(with_it)
     np.testing.assert_array_equal(exact.true, noisy.true)
     change = noisy.q - exact.q
@@ -126,15 +136,15 @@ def test_noise_is_what_was_asked(part):
 
 def test_reference_lengths_err_by_their_u():
     study = made(reference=REFERENCE)
-    trials = drawn(study, 2000)
-    assert (trials.value - 500).std() == pytest.approx(0.01, rel=0.05)
+    trials = drawn(study, 1024)
+    assert (trials.value - 300).std() == pytest.approx(0.01, rel=0.05)
     np.testing.assert_array_equal(trials.u, 0.01)
 
 
 @pytest.mark.slow
 def test_starts_at_random_fill_the_box():
     study = made(identification={"start": "random", "hold": "none"}, bounds={"length_mm": 2.0, "length_shift_mm": 1.0})
-    trials = drawn(study, 2000)
+    trials = drawn(study, 1024)
     share = (trials.start - trials.lower) / (trials.upper - trials.lower)
     assert share.min() >= 0
     assert share.max() <= 1
@@ -147,7 +157,7 @@ def test_starts_at_random_fill_the_box():
 
 
 def test_a_recording_gives_its_poses(noisy_capture):
-    study = made(arm=aj.load_arm("cheng2018-simulation"), capture=noisy_capture, deviation=OFF)
+    study = made(arm=aj.load_arm("cheng2018-simulation"), capture=noisy_capture, reference=None)
     trials = drawn(study, 20)
     assert np.abs(trials.q - np.asarray(noisy_capture.q)).max() < 0.03
     centres = tips(study, trials)[:, :70].mean(axis=1)
@@ -162,17 +172,26 @@ STUDIES = {
 }
 
 
-@pytest.fixture(scope="module", params=["two-stage", "joint", pytest.param("stage1", marks=pytest.mark.slow)])
+@pytest.fixture(
+    scope="module",
+    params=[
+        ("two-stage", 8),
+        ("joint", 8),
+        *(pytest.param((method, 40), marks=pytest.mark.slow) for method in STUDIES),  # another size of program
+    ],
+    ids=str,
+)
 def whole(request):
-    reference = {} if request.param == "stage1" else {"reference": REFERENCE}
-    study = made(
-        deviation=OFF, noise=NOISE, bounds={"length_mm": [3, 10]}, identification=STUDIES[request.param], **reference
-    )
-    return study, run_block(study, Block(0, 2, 0, 40))
+    method, count = request.param
+    tables = {"noise": NOISE, "bounds": {"length_mm": [3, 10]}, "identification": STUDIES[method]}
+    if method == "stage1":
+        tables["reference"] = None
+    study = made(**tables)
+    return study, count, run_block(study, Block(0, 2, 0, count))
 
 
 def test_equals_one_by_one(whole):
-    study, results = whole
+    study, _, results = whole
     method = study.settings[0].method
     trials = drawn(study, 3, cell=1)
     names, sizes = [], study.settings[1].sizes
@@ -204,8 +223,8 @@ def test_equals_one_by_one(whole):
 
 def test_a_trial_depends_on_its_key_alone(whole):
     """To the bit, whatever block a trial is in."""
-    study, results = whole
-    for block in (Block(1, 2, 0, 40), Block(0, 1, 13, 29), Block(1, 2, 39, 40)):
+    study, count, results = whole
+    for block in (Block(1, 2, 0, count), Block(0, 1, 3, 7), Block(1, 2, count - 1, count)):
         part = run_block(study, block, workers=1)
         for name, values in part.items():
             cells, trials = slice(block.first_cell, block.last_cell), slice(block.first_trial, block.last_trial)

@@ -1,0 +1,29 @@
+"""``aacmm`` with blocks that are not computed but read, or that never end: what is tested is how a study is kept.
+
+WHOLE is the file of the same study, run before; SECONDS what a block takes; STARTED a file that the first block makes.
+"""
+
+import os
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from aacmm_jax.study import runner
+
+
+def prepared(study, block, **_) -> dict[str, np.ndarray]:
+    Path(os.environ["STARTED"]).touch()
+    time.sleep(float(os.environ["SECONDS"]))
+    with h5py.File(os.environ["WHOLE"]) as whole:
+        return {name: whole["trials"][name][block.slices] for name in runner.store.VARIABLES}
+
+
+runner.run_block = prepared
+runner.check_reach = lambda study: None
+
+if __name__ == "__main__":
+    from aacmm_jax.cli import main
+
+    main()
