@@ -1,6 +1,5 @@
 """The command ``study``, and what ``show`` does with a study's file."""
 
-import os
 import shlex
 import sys
 import threading
@@ -144,13 +143,14 @@ def _leaving_threads() -> Iterator[None]:
     try:
         yield
     except (KeyboardInterrupt, Stopped) as interrupt:
+        from ..core._compat import end_process
         from ..study.local_processes import THREADS
 
         if not any(thread.name.startswith(THREADS) for thread in threading.enumerate()):
             raise
         print(str(interrupt) or INTERRUPTED_SENTENCE, file=sys.stderr, flush=True)
         sys.stdout.flush()
-        os._exit(INTERRUPTED)
+        end_process(INTERRUPTED)
 
 
 @contextmanager

@@ -27,10 +27,8 @@ def use_compilation_cache(settings: CacheSettings | None = None) -> None:
     if settings is None:
         set_up()
         known = CacheSettings.current()
-        folder = known.folder or os.environ.get("JAX_COMPILATION_CACHE_DIR") or None
-        seconds = os.environ.get("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
-        settings = CacheSettings(folder, known.least_seconds if seconds is None else float(seconds))
-    if settings != CacheSettings.current():
-        jax.config.update("jax_compilation_cache_dir", settings.folder)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", settings.least_seconds)
-        reset_compilation_cache()  # a process that has compiled without a cache would never look for one again
+        seconds = os.environ.get("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", known.least_seconds)
+        settings = CacheSettings(known.folder, float(seconds))
+    jax.config.update("jax_compilation_cache_dir", settings.folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", settings.least_seconds)
+    reset_compilation_cache()  # a process that has compiled without a cache would never look for one again
