@@ -3,13 +3,11 @@
 import itertools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import twin
-from paper import CONVERGED, NAMES, Row, box, is_length, random_starts, row
+from paper import CONVERGED, NAMES, Row, box, configurations, is_length, random_starts, row, simulated
 
 import aacmm_jax as aj
-from aacmm_jax.kinematics.inverse_kinematics import random_configurations
 
 TRIALS = 200
 NOISES = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)  # arcsec, of a reading
@@ -58,7 +56,7 @@ def sockets_poses_lengths() -> list[dict[str, float]]:
     arm = twin.true_arm()
     points = [(400, 200, 300), (-350, 500, 150), (600, -450, 550), (-300, -600, 700)]
     names = [f"S{i}" for i in range(len(points))]
-    pooled = aj.simulate(arm, dict(zip(names, points, strict=True)), poses=3_000, seed=31).sockets
+    pooled = simulated(arm, dict(zip(names, points, strict=True)), 3_000, seed=31)
     bars, plates = twin.placed(arm, twin.REFERENCE, 400, 32), twin.placed(arm, twin.PLATE, 400, 33)
     lower, upper = box("experiment")
     space = aj.Parameters(arm, NAMES)
@@ -116,10 +114,7 @@ def references() -> list[dict[str, float | str]]:
     for place, (distance, direction) in POSITIONS.items():
         for length in BARS:
             ends = _bar(distance, direction, length)
-            limits = jnp.array([(-np.pi, np.pi)] * 6)
-            targets = jnp.asarray(np.repeat(ends, 100, axis=0))
-            poses = random_configurations(twin.true_arm(), targets, jax.random.key(43), limits)
-            poses = np.asarray(poses).reshape(2, 100, 6)
+            poses = configurations(twin.true_arm(), np.repeat(ends, 100, axis=0), jax.random.key(43)).reshape(2, 100, 6)
             pick = generator.integers(100, size=(TRIALS, 2))
             exact = np.stack([poses[0][pick[:, 0]], poses[1][pick[:, 1]]], axis=1)[:, None]
             read = twin.recorded(exact, NOISE, np.zeros((2, TRIALS, 6)), generator)

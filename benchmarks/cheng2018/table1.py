@@ -12,6 +12,7 @@ from paper import (
     PUBLISHED,
     ROUNDING,
     SETS,
+    SOCKET,
     STORED,
     Row,
     arm_of,
@@ -24,6 +25,7 @@ from paper import (
     read_table,
     row,
     scale_to,
+    simulated,
     simulated_arm,
     tips_of,
     vector,
@@ -142,7 +144,7 @@ def simulation(number: int, rows: list[Row], methods: list[dict[str, float]]) ->
 def two_stages(q: np.ndarray, lower: np.ndarray, upper: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """Parameters after both stages: `d_3` as scale anchor, the scale fixed with one exact length of 200 mm."""
     found = many_of(q, lower, upper, starts, hold="d_3").parameters
-    ends = np.asarray(aj.simulate(simulated_arm(), {"A": (400, 200, 300), "B": (600, 200, 300)}, poses=1, seed=2).q)
+    ends = np.concatenate(list(simulated(simulated_arm(), {"A": SOCKET, "B": (600, 200, 300)}, 1, seed=2).values()))
     tips = tips_of(found, np.broadcast_to(ends, (len(found), *ends.shape)))
     k = np.linalg.norm(tips[:, 1] - tips[:, 0], axis=-1) / 200
     return np.where(is_length(), found / k[:, None], found)

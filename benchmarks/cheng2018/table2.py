@@ -1,7 +1,20 @@
 """Table 2 and section 4.2: the scale fix on the printed numbers, and the angles that do not follow from eq. 18."""
 
 import numpy as np
-from paper import ARITHMETIC, CONVERGED, NAMES, PUBLISHED, Row, arm_of, is_length, row, tips_of, vector
+from paper import (
+    ARITHMETIC,
+    CONVERGED,
+    NAMES,
+    PUBLISHED,
+    SOCKET,
+    Row,
+    arm_of,
+    is_length,
+    row,
+    simulated,
+    tips_of,
+    vector,
+)
 
 import aacmm_jax as aj
 
@@ -120,7 +133,7 @@ def angles(rows: list[Row]) -> list[dict[str, float]]:
     table, given = printed_table(), vector("experiment", "identified")
     mixed = np.where(is_length(), table, given)
     # Poses with one tip position for the arm with eq. 18's angles: its Deltam is 0, that of Table 2's is not.
-    q = np.asarray(aj.simulate(arm_of(mixed), {"A": (400, 200, 300)}, poses=2_000, seed=3).q)
+    q = simulated(arm_of(mixed), {"A": SOCKET}, 2_000, seed=3)["A"]
     both = tips_of(np.stack([mixed, table]), np.stack([q, q]))
     moved = np.linalg.norm(both[1] - both[0], axis=-1)
     sets = both[1][: 28 * 70].reshape(28, 70, 3)

@@ -10,13 +10,11 @@ from functools import cache
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from paper import NAMES, POSES, PUBLISHED, arm_of, box, is_length, metrics_of, tips_of
+from paper import NAMES, POSES, PUBLISHED, arm_of, box, configurations, is_length, metrics_of, simulated, tips_of
 from scipy.optimize import minimize
 
 import aacmm_jax as aj
-from aacmm_jax.kinematics.inverse_kinematics import random_configurations
 
 # mm: three sockets well within the reach of 1.4 m; the paper does not print the positions of its own.
 SOCKETS = {"Data1": (400.0, 200.0, 300.0), "Data2": (-350.0, 500.0, 150.0), "Data3": (600.0, -450.0, 550.0)}
@@ -62,7 +60,7 @@ def true_arm() -> aj.Arm:
 def pool() -> Pool:
     arm = true_arm()
     count = POSES * _POOL
-    sockets = aj.simulate(arm, SOCKETS, poses=count, seed=11).sockets
+    sockets = simulated(arm, SOCKETS, count, seed=11)
     bars = {}
     for seed, (name, length, wanted) in enumerate(
         (("reference", REFERENCE, 400), ("plate", PLATE, PLACEMENTS * _POOL))
@@ -80,10 +78,7 @@ def placed(arm: aj.Arm, length: float, count: int, seed: int) -> np.ndarray:
     direction = generator.normal(size=(count, 3))
     direction *= length / 2 / np.linalg.norm(direction, axis=1, keepdims=True)
     ends = np.stack([centre - direction, centre + direction], axis=1)
-    limits = jnp.array([(-np.pi, np.pi)] * arm.joints)
-    return np.asarray(
-        random_configurations(arm, jnp.asarray(ends.reshape(-1, 3)), jax.random.key(seed), limits)
-    ).reshape(count, 2, -1)
+    return configurations(arm, ends.reshape(-1, 3), jax.random.key(seed)).reshape(count, 2, -1)
 
 
 def draw(made: Pool, noise: Noise, count: int, seed: int) -> Twins:
