@@ -14,6 +14,7 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
 
 
+@pytest.mark.slow
 def test_python_runs(capsys, tmp_path, monkeypatch):
     """The blocks continue one another, so they run as one program."""
     monkeypatch.chdir(tmp_path)

@@ -73,6 +73,7 @@ def test_two_stages_with_fixed_lengths(arm, capture, bounds):
     np.testing.assert_allclose(sampled.u, sampled.linear_u, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_monte_carlo_says_where_the_linear_result_fails(arm, capture, bounds):
     """A bound a third of a standard uncertainty beside a parameter cuts its distribution off."""
     free = aj.calibrate(arm, capture, bounds, method="joint", noise=NOISE)

@@ -294,6 +294,7 @@ def test_many_start_inside_their_boxes(too_long, capture, cut):
     assert many.parameters[0, cut.space.index("d_3")] == float(cut.upper[cut.space.index("d_3")])
 
 
+@pytest.mark.slow
 def test_covariance_on_a_bound_is_what_trials_show(too_long, paper_arm, capture, cut):
     """300 recordings of the same poses; the bound is active in all of them, and the other parameters scatter as
     predicted."""
