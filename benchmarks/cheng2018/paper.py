@@ -158,8 +158,8 @@ def configurations(arm: aj.Arm, targets: np.ndarray, key: jax.Array) -> np.ndarr
     for number in itertools.count():
         tried = np.resize(missing, size)
         uniform = jax.random.uniform(jax.random.fold_in(key, number), (2048,))[: size * arm.joints]
-        start = limits[:, 0] + 2 * np.pi * np.asarray(uniform).reshape(size, arm.joints)
-        solved, distance = solve_to_targets(geometry, start, jnp.asarray(targets[tried]), limits)
+        start = 2 * np.pi * np.asarray(uniform).reshape(size, arm.joints) - np.pi
+        solved, distance = solve_to_targets(geometry, jnp.asarray(start), jnp.asarray(targets[tried]), limits)
         good = np.flatnonzero(np.asarray(distance) <= 1e-9)[::-1]
         found[tried[good]] = np.asarray(solved)[good]
         missing = np.setdiff1d(missing, tried[good])

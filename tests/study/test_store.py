@@ -20,7 +20,7 @@ from .small_study import CHUNK, ROOT, command, interrupted_at, same, until_parts
 
 
 @pytest.mark.parametrize(
-    ("chunk", "trials"), [(1, 3), (7, 24), (500, 16), pytest.param(500, 48, marks=pytest.mark.slow)]
+    ("chunk", "trials"), [(1, 3), (7, 24), (500, 16), pytest.param(500, 24, marks=pytest.mark.slow)]
 )
 def test_the_chunk_changes_no_bit(home, study, tmp_path, chunk, trials):
     study = aj.study.Study(study.specification.model_copy(update={"trials": trials}), study.nominal)
@@ -248,7 +248,7 @@ import jax
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
 import aacmm_jax as aj
 assert len(jax.devices()) == int(sys.argv[1])
-aj.study.run_study(aj.study.read_study(sys.argv[2]), sys.argv[3], chunk=CHUNK)
+aj.study.run_study(aj.study.read_study(sys.argv[2]), sys.argv[3], chunk=8)
 """
 
 
