@@ -12,6 +12,7 @@ from pathlib import Path
 
 _LEAST_SECONDS = "0.1"  # shorter compilations are not kept: reading them would take as long
 _FOLDER, _TURNED_OFF = "JAX_COMPILATION_CACHE_DIR", "AACMM_JAX_CACHE"
+_SHORTEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 
 
 def set_up() -> None:
@@ -46,9 +47,9 @@ def set_up() -> None:
         folder_set = str(folder)
         os.environ[_FOLDER] = folder_set
     if given is None and not unsafe:
-        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", _LEAST_SECONDS)
-        if jax is not None:
+        if jax is not None and _SHORTEST not in os.environ:
             jax.config.update("jax_persistent_cache_min_compile_time_secs", float(_LEAST_SECONDS))
+        os.environ.setdefault(_SHORTEST, _LEAST_SECONDS)
     if jax is not None:
         jax.config.update("jax_compilation_cache_dir", folder_set)
 
