@@ -116,6 +116,20 @@ class AbstractSingleResult(AbstractResult):
             )
 
 
+class ObservedMetrics(eqx.Module):
+    """How the observations of a capture agree with their geometry, and that geometry; in their order, sockets first."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    kinds: tuple[str, ...] = eqx.field(static=True)
+    rms_before: Float[AnyArray, " k"]  # root mean square distance from the geometry at the start, mm
+    rms_after: Float[AnyArray, " k"]  # by the arm found, mm
+    reduced_chi: Float[AnyArray, " k"]  # root mean square in standard deviations of a residual
+    reduced_chi_of_all: Float[AnyArray, ""]  # over the degrees of freedom of all
+    sigma: Float[AnyArray, ""]  # standard deviation of a tip coordinate, mm, estimated from the residuals
+    geometry: dict[str, Float[AnyArray, " n"]]  # part of the unknown geometry -> its numbers, mm and rad
+    weights: tuple[Float[AnyArray, " m"], ...]  # of every pose; less than 1 where a robust loss takes weight from it
+
+
 class Identification(AbstractSingleResult):
     """Result of stage 1. A PyTree: under ``eqx.filter_vmap`` every array has the batch axis first.
 
@@ -141,6 +155,7 @@ class Identification(AbstractSingleResult):
     anchor: ScaleAnchor = eqx.field(static=True)  # what sets the scale
     noise_model: NoiseModel = eqx.field(static=True)  # model of the tips' errors
     degrees_of_freedom: float = eqx.field(static=True)  # of the covariance; infinite where the noise was given
+    observed: ObservedMetrics | None = None  # where the capture has observations besides sockets, or a robust loss
 
     @property
     def _stage1(self) -> "Identification":
@@ -157,7 +172,7 @@ class Calibration(AbstractSingleResult):
 
     arm: Arm
     parameters: Float[AnyArray, " p"]
-    scale: Scale  # k of stage 1
+    scale: Scale | None  # k of stage 1; None where observations fix the scale and there is no reference length
     de: Float[AnyArray, ""]  # mean distance from the centroid, mm
     deltam: Float[AnyArray, ""]  # largest half range, mm
     active: Int[AnyArray, " p"]  # -1 on the lower bound, +1 on the upper, 0 inside
@@ -176,9 +191,14 @@ class Calibration(AbstractSingleResult):
         return self.stage1
 
     @property
-    def k(self) -> Float[AnyArray, "*batch"]:
+    def k(self) -> Float[AnyArray, "*batch"] | None:
         """k = measured / nominal of stage 1."""
-        return self.scale.value
+        return None if self.scale is None else self.scale.value
+
+    @property
+    def observed(self) -> ObservedMetrics | None:
+        """How the observations agree, where the capture has others than sockets, or a robust loss."""
+        return self.stage1.observed
 
     @property
     def noise_model(self) -> NoiseModel:

@@ -20,12 +20,14 @@ from ..kinematics.parameters import Bounds
 from ..model.measurement import Measurement, check_joints
 from ..model.metrics import repeatability
 from ..model.residuals import JointWeights, joint_model, joint_residual
+from ..model.robust import LossName
 from ..solver.reason import Reason
 from ..uncertainty import propagation, scale_uncertainty
 from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
 from ..uncertainty.identifiability import observability
 from .checks import based_on, check_enough, check_noise_model, check_single, check_start
+from .observed import ObservedTask, identify_observed, observed_task
 from .results import Calibration, Identification
 from .scale_anchor import scale_anchor, scale_set_by_clause
 from .second_stage import adjust_anchor, can_scale, divided, must_adjust, replaced, within_bounds
@@ -44,6 +46,7 @@ def identify(
     start: Numbers | None = None,
     noise: Noise | None = None,
     noise_model: NoiseModel | None = None,
+    robust: LossName | None = None,
     max_steps: int = _MAX_STEPS,
 ) -> Identification:
     """Stage 1: the parameters that make the poses of every socket agree, within bounds.
@@ -66,6 +69,7 @@ def identify(
         noise: standard deviations of readings and seat. Where given, every pose is weighted by the inverse covariance
             of its tip, and the covariance of the result follows from it; else both are estimated from the residuals.
         noise_model: another model of the tips' errors, one of `uncertainty.covariance.NOISE_MODELS`.
+        robust: a robust loss, "huber", "cauchy" or "tukey", of each pose's whitened residual; None, least squares.
         max_steps: most evaluations of the residual.
 
     Returns:
@@ -74,6 +78,12 @@ def identify(
     Raises:
         InputError: too few poses, a start outside the box, names that do not fit, or a batch (see `identify_many`).
     """
+    if capture.observations or robust is not None:
+        check_single(arm, capture, bounds, "identify_many")
+        check_finite(arm=arm, capture=capture, noise=noise)
+        alone = eqx.tree_at(lambda c: c.lengths, capture, (), is_leaf=lambda leaf: isinstance(leaf, tuple))
+        task = observed_task(arm, alone, bounds, start, noise, hold, noise_model, max_steps, robust)
+        return to_jax(identify_observed(to_numpy(task)))
     task = _checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many")
     return to_jax(_identify(to_numpy(task)))
 
@@ -111,11 +121,12 @@ def calibrate(
     capture: Capture,
     bounds: Bounds,
     *,
-    method: Literal["two-stage", "joint"] = "two-stage",
+    method: Literal["two-stage", "joint"] | None = None,
     hold: str | None = "longest",
     start: Numbers | None = None,
     noise: Noise | None = None,
     noise_model: NoiseModel | None = None,
+    robust: LossName | None = None,
     check_identifiability: bool = True,
     strict: bool = False,
     max_steps: int = _MAX_STEPS,
@@ -135,11 +146,13 @@ def calibrate(
         arm: as for `identify`, like all arguments that are not named here.
         capture: sockets, and at least one reference length, mm.
         bounds: box of the free parameters ``(p,)``, mm and rad.
-        method: "two-stage" or "joint".
+        method: "two-stage" or "joint"; by default two-stage, but joint where the capture has observations besides
+            sockets and lengths, or the loss is robust.
         hold: the scale anchor of stage 1.
         start: free parameters ``(p,)`` to start from, mm and rad.
         noise: standard deviations of readings and seat.
         noise_model: another model of the tips' errors.
+        robust: a robust loss, as for `identify`.
         check_identifiability: warn where free parameters are not determined by these data; the check takes about as
             long as the calibration.
         strict: raise instead of warn where free parameters are not determined by these data.
@@ -151,13 +164,24 @@ def calibrate(
     Raises:
         InputError: as `identify` does, and without a reference length.
     """
+    general = bool(capture.observations) or robust is not None
+    method = ("joint" if general else "two-stage") if method is None else method
     if method not in ("two-stage", "joint"):
         raise InputError(f"method is '{method}'; it must be 'two-stage' or 'joint'.")
-    if not capture.lengths:
+    if method == "two-stage" and general:
+        raise InputError(
+            "method='two-stage' is for sockets and reference lengths, without a robust loss; use method='joint'."
+        )
+    if not capture.lengths and not any(observation.fixes_scale for observation in capture.observations):
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, "
             "from Python, identify for stage 1 alone)."
         )
+    if general:
+        check_single(arm, capture, bounds, "calibrate_many")
+        check_finite(arm=arm, capture=capture, noise=noise)
+        task = observed_task(arm, capture, bounds, start, noise, None, noise_model, max_steps, robust)
+        return _as_calibration(task, identify_observed(to_numpy(task)))
     task = _checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
     if hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
         raise InputError(
@@ -176,6 +200,36 @@ def calibrate(
     if is_concrete(adjust):
         return to_jax(_adjusted(task, result))
     return jax.lax.cond(adjust, lambda: _adjusted(task, result), lambda: result)
+
+
+def _as_calibration(task: ObservedTask, found: Identification) -> Calibration:
+    """The one solve of all observations as the result of a calibration."""
+    observed, geometry = task.observed, found.observed
+    assert geometry is not None
+    xp = namespace(found)
+
+    def lengths(parts: dict[str, AnyArray]) -> Float[AnyArray, " l"]:
+        vectors = [parts[end] - parts[start] for start, end in observed.ends]
+        return xp.linalg.norm(xp.stack(vectors), axis=1) if vectors else xp.zeros(0)
+
+    result = Calibration(
+        arm=found.arm,
+        parameters=found.parameters,
+        scale=None,
+        de=found.de,
+        deltam=found.deltam,
+        active=found.active,
+        steps=found.steps,
+        result=found.result,
+        parameter_covariance=found.parameter_covariance,
+        before=found.before,
+        after=found.after,
+        length_before=lengths(observed.split(observed.start(to_numpy(task).bounds.space, to_numpy(task).start))),
+        length_after=lengths(geometry.geometry),
+        stage1=found,
+        method="joint",
+    )
+    return to_jax(result)
 
 
 def _check_identifiable(capture: Capture, task: Task, strict: bool) -> None:

@@ -136,6 +136,15 @@ def set_at(array: AnyArray, index: Any, value: Any) -> Any:
     return changed
 
 
+def add_at(array: AnyArray, index: Any, value: Any) -> Any:
+    """A copy of the array with values added at an index, which names no element twice."""
+    if namespace(array, value) is jnp:
+        return jnp.asarray(array).at[index].add(value)
+    changed = np.array(array)
+    changed[index] += value
+    return changed
+
+
 def stop_gradient(tree: Tree) -> Tree:
     """The tree as a constant of differentiation."""
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf, tree)

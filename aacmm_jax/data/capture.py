@@ -13,9 +13,7 @@ from ..core.arguments import items_of
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError, nearest
 from ..core.namespace import AnyArray
-
-# Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
-_MOST_RADIANS = 8 * np.pi
+from .observations.observation import AbstractObservation, checked_name, checked_readings
 
 
 class ReferenceLength(eqx.Module):
@@ -57,7 +55,7 @@ class ReferenceLength(eqx.Module):
 
 
 class Capture(eqx.Module):
-    """Poses grouped by the socket in which the tip rested, and reference lengths between sockets.
+    """Poses grouped by the socket in which the tip rested, reference lengths between sockets, and other observations.
 
     A socket's position is unknown and is eliminated by the centroid of its poses; one pose at an end is enough for a
     length. All poses are kept in one array ``q`` of shape ``(N, n)``, socket after socket, so that they are evaluated
@@ -66,6 +64,7 @@ class Capture(eqx.Module):
     Args:
         sockets: Socket name -> joint readings, shape ``(m, n)``, rad; m poses may differ from socket to socket.
         lengths: Reference lengths between these sockets, or one.
+        observations: What else ties the tip down (`data.observations`): measured points, spheres, planes, artefacts.
 
     Raises:
         InputError: For names that are empty or longer than a line, readings that are not finite or look like degrees,
@@ -74,27 +73,38 @@ class Capture(eqx.Module):
 
     q: Float[AnyArray, "N n"]
     lengths: tuple[ReferenceLength, ...]
+    observations: tuple[AbstractObservation, ...]
     names: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, sockets: Mapping[str, Numbers], lengths: Iterable[ReferenceLength] | ReferenceLength = ()):
+    def __init__(
+        self,
+        sockets: Mapping[str, Numbers],
+        lengths: Iterable[ReferenceLength] | ReferenceLength = (),
+        observations: Iterable[AbstractObservation] | AbstractObservation = (),
+    ):
         if not isinstance(sockets, Mapping):
             raise InputError(
                 f"the sockets are a {type(sockets).__name__}; give a dictionary of names and readings: "
                 '{"A": q}, q of shape (poses, joints).'
             )
-        if not sockets:
-            raise InputError("a capture needs at least one socket with poses.")
-        blocks = {name: _checked_angles(name, angles) for name, angles in sockets.items()}
-        first, width = next((name, block.shape[1]) for name, block in blocks.items())
-        for name, block in blocks.items():
-            if block.shape[1] != width:
+        self.observations = _checked_observations(observations)
+        if not sockets and not self.observations:
+            raise InputError("a capture needs at least one socket with poses, or another observation.")
+        blocks = {
+            checked_name(name, "a socket"): checked_readings(f"socket '{name}'", angles)
+            for name, angles in sockets.items()
+        }
+        of_all = {f"socket '{name}'": block for name, block in blocks.items()}
+        of_all |= {f"observation '{observation.name}'": observation.q for observation in self.observations}
+        first, width = next((where, block.shape[-1]) for where, block in of_all.items())
+        for where, block in of_all.items():
+            if block.shape[-1] != width:
                 raise InputError(
-                    f"socket '{name}' has {block.shape[1]} columns, but socket '{first}' has {width}; give one "
-                    "column a joint."
+                    f"{where} has {block.shape[-1]} columns, but {first} has {width}; give one column a joint."
                 )
         _check_different(blocks)
-        self.q = joined(list(blocks.values()))
+        self.q = joined(list(blocks.values())) if blocks else jnp.zeros((0, width))
         self.names = tuple(blocks)
         self.sizes = tuple(block.shape[0] for block in blocks.values())
         self.lengths = (lengths,) if isinstance(lengths, ReferenceLength) else tuple(items_of(lengths, "lengths"))
@@ -154,7 +164,7 @@ class Capture(eqx.Module):
             raise InputError("no socket is left after the selection; widen it.")
         sockets = self.sockets
         lengths = [length for length in self.lengths if length.start in kept and length.end in kept]
-        return Capture({name: sockets[name] for name in kept}, lengths)
+        return Capture({name: sockets[name] for name in kept}, lengths, self.observations)
 
 
 def check_one_capture(capture: Capture) -> None:
@@ -177,18 +187,19 @@ def _matching(names: Sequence[str], patterns: Iterable[str]) -> list[str]:
     return [name for name in names if name in chosen]
 
 
-def _checked_angles(name: str, angles: Numbers) -> AnyArray:
-    if not isinstance(name, str) or not name.strip() or name.splitlines() != [name]:
-        raise InputError(f"a socket has the name {name!r}; give it a name of one line.")
-    array = as_array(angles, f"socket '{name}'", like=np.zeros(0))
-    if array.ndim != 2 or 0 in array.shape:
-        raise InputError(
-            f"socket '{name}' has shape {array.shape}; give one row a pose and one column a joint, at least one of "
-            "each."
-        )
-    if is_concrete(array):
-        _check_values(name, np.asarray(array))
-    return array
+def _checked_observations(
+    observations: Iterable[AbstractObservation] | AbstractObservation,
+) -> tuple[AbstractObservation, ...]:
+    single = isinstance(observations, AbstractObservation)
+    checked = (observations,) if single else tuple(items_of(observations, "observations"))
+    for observation in checked:
+        if not isinstance(observation, AbstractObservation):
+            raise InputError(f"{observation!r} is no observation; give one of aj.data.observations, such as a Sphere.")
+    names = [observation.name for observation in checked]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two observations have the name '{name}'; give each a name of its own.")
+    return checked
 
 
 def _check_different(blocks: Mapping[str, Array | np.ndarray]) -> None:
@@ -199,22 +210,6 @@ def _check_different(blocks: Mapping[str, Array | np.ndarray]) -> None:
             twin = seen.setdefault(np.asarray(block).tobytes(), name)
             if twin != name:
                 raise InputError(f"sockets '{twin}' and '{name}' have exactly the same poses; is one file given twice?")
-
-
-def _check_values(name: str, array: np.ndarray) -> None:
-    bad = np.argwhere(~np.isfinite(array))
-    if len(bad):
-        row, column = bad[0] + 1
-        raise InputError(
-            f"socket '{name}' pose {row} joint {column} is {array[row - 1, column - 1]}; every angle must be finite."
-        )
-    largest = float(np.abs(array).max())
-    if largest > _MOST_RADIANS:
-        row, column = np.argwhere(np.abs(array) == largest)[0] + 1
-        raise InputError(
-            f"socket '{name}' pose {row} joint {column} is {largest:g} rad, more than four revolutions: these look "
-            "like degrees; convert with numpy.deg2rad, or state the unit in the manifest."
-        )
 
 
 def stack_captures(captures: Iterable[Capture]) -> Capture:

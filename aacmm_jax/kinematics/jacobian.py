@@ -75,6 +75,17 @@ def stacked_jacobian_columns(
     return xp.stack(chosen, axis=-3) if chosen else xp.zeros((*forward.tip.shape[:-2], 0, *forward.tip.shape[-2:]))
 
 
+def rotation_columns(forward: ForwardPass, indices: tuple[tuple[str, int], ...]) -> Float[AnyArray, "... p 3 N"]:
+    """Derivative of the last frame's orientation, as a rotation vector, by some parameters; 0 for lengths."""
+    axes, xp = (
+        {"alpha": forward.x, "beta": forward.y, "theta": forward.z_before, "q": forward.z_before},
+        namespace(forward),
+    )
+    still = xp.zeros_like(forward.tip)
+    chosen = [still if axes.get(kind) is None else axes[kind][i] for kind, i in indices]
+    return xp.stack(chosen, axis=-3) if chosen else xp.zeros((*still.shape[:-2], 0, *still.shape[-2:]))
+
+
 def _plain_tip_position(geometry: Geometry, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3"]:
     return components_last(forward_pass(geometry, sines_cosines(q)).tip, geometry, q)
 

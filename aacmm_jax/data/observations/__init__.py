@@ -1,0 +1,1 @@
+"""Kinds of observations, one file each: what ties the tip down."""

@@ -1,0 +1,171 @@
+"""Artefacts of certified points: ball bars, plates of balls or holes, tetrahedra; in each of their placements."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ...core.arrays import Numbers, is_concrete
+from ...core.errors import InputError, nearest
+from ...core.namespace import AnyArray, namespace
+from ...core.rotations import fitted_frame, rotation_matrix
+from .frames import placed
+from .measured_points import check_spread
+from .observation import (
+    FRAME,
+    AbstractObservation,
+    Rows,
+    Tips,
+    Unknowns,
+    checked_name,
+    checked_readings,
+    checked_scalar,
+    checked_target,
+    checked_values,
+    each_pose,
+    no_covariance,
+)
+
+
+class Artefact(AbstractObservation):
+    """Poses with the tip in the points of an artefact, whose coordinates are certified and whose placement is unknown.
+
+    Args:
+        name: Name of the observation, and of its placement where that has none.
+        points: Name of a point -> its certified coordinates ``(3,)``, mm, in the artefact's frame.
+        q: Name of a point -> joint readings in it ``(m, n)``, rad.
+        u: Standard uncertainty (k = 1) of each coordinate, mm. Its error is the same in every placement.
+        artefact: Name of the artefact; observations of one artefact share the errors of its coordinates.
+        placement: Name of the placement; observations of one placement share its frame.
+        index: Name of the index of an indexed platform that carries the artefact. The placement is then one on the
+            platform, and the platform has a frame for each index, shared by all that stands on it.
+        target: Name of the tip, by default the arm's own probe.
+
+    Raises:
+        InputError: A point with poses has no coordinates, or shapes do not fit.
+    """
+
+    kind: ClassVar[str] = "artefact"
+    rows: ClassVar[int] = 3
+    q: Float[AnyArray, "m n"]
+    coordinates: Float[AnyArray, "c 3"]
+    u: Float[AnyArray, ""]
+    name: str = eqx.field(static=True)
+    artefact: str = eqx.field(static=True)
+    placement: str = eqx.field(static=True)
+    index: str | None = eqx.field(static=True)
+    target: str = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)  # of the points, all of the artefact
+    owner: tuple[int, ...] = eqx.field(static=True)  # point of each pose
+    free: bool = eqx.field(static=True)  # whether the coordinates are unknowns with certified values
+
+    def __init__(
+        self,
+        name: str,
+        points: Mapping[str, Numbers],
+        q: Mapping[str, Numbers],
+        *,
+        u: Numbers = 0.0,
+        artefact: str | None = None,
+        placement: str | None = None,
+        index: str | None = None,
+        target: str = "",
+    ):
+        self.name = checked_name(name, "an artefact")
+        where = f"artefact '{name}'"
+        if not isinstance(points, Mapping) or not isinstance(q, Mapping) or not points or not q:
+            raise InputError(f"{where} needs two dictionaries: its points' coordinates, and the readings in them.")
+        for point in q:
+            if point not in points:
+                raise InputError(f"{where} has poses in '{point}', which has no coordinates{nearest(point, points)}")
+        blocks = {point: checked_readings(f"{where} point '{point}'", readings) for point, readings in q.items()}
+        widths = {block.shape[1] for block in blocks.values()}
+        if len(widths) > 1:
+            raise InputError(f"{where} has readings of {sorted(widths)} columns; give one column a joint.")
+        self.names = tuple(points)
+        rows = [checked_values(f"{where} point '{point}'", value, (3,)) for point, value in points.items()]
+        self.coordinates = namespace(*rows).stack(rows)
+        self.q = namespace(*blocks.values()).concatenate(list(blocks.values()))
+        self.owner = tuple(self.names.index(point) for point, block in blocks.items() for _ in range(block.shape[0]))
+        self.u = checked_scalar(f"u of {where}", u)
+        self.artefact = checked_name(name if artefact is None else artefact, "an artefact")
+        self.placement = checked_name(name if placement is None else placement, "a placement")
+        self.index = None if index is None else checked_name(index, "an index")
+        self.target = checked_target(target)
+        self.free = not (is_concrete(self.u) and float(self.u) == 0)
+
+    @property
+    def frame(self) -> str:
+        """Name of the frame of its placement."""
+        return f"placement {self.placement}"
+
+    @property
+    def platform(self) -> str:
+        """Name of the platform's frame at this index."""
+        return f"index {self.index}"
+
+    @property
+    def shape(self) -> str:
+        """Name of the coordinates, where they are unknowns with certified values."""
+        return f"coordinates of {self.artefact}"
+
+    @property
+    def unknowns(self) -> dict[str, tuple[str, ...]]:
+        found = {self.frame: FRAME}
+        if self.index is not None:
+            found[self.platform] = FRAME
+        if self.free:
+            found[self.shape] = ("mm",) * self.coordinates.size
+        return found
+
+    @property
+    def fixes_scale(self) -> bool:
+        return len(set(self.owner)) > 1
+
+    @property
+    def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
+        if not self.free:
+            return {}
+        values = self.coordinates.reshape(-1)
+        return {self.shape: (values, namespace(values, self.u).broadcast_to(self.u, values.shape))}
+
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+        xp = namespace(tips, self.coordinates)
+        frame = fitted_frame(self.coordinates[np.array(self.owner)].T, tips.position)
+        # Where the platform's frames are unknown too, the placement carries all of it at first.
+        found = {self.frame: frame}
+        if self.index is not None:
+            found[self.platform] = xp.zeros(6)
+        if self.free:
+            found[self.shape] = self.coordinates.reshape(-1)
+        return found
+
+    def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
+        xp, owner, m = namespace(tips, unknowns, self.coordinates), np.array(self.owner), self.q.shape[0]
+        coordinates = unknowns[self.shape].reshape(-1, 3) if self.free else self.coordinates
+        points, by_frame = placed(unknowns[self.frame], coordinates[owner].T)
+        outer = xp.asarray(np.eye(3))
+        by_unknowns = {}
+        if self.index is not None:
+            outer = rotation_matrix(unknowns[self.platform][:3])
+            points, by_platform = placed(unknowns[self.platform], points)
+            by_frame = xp.einsum("cd,kdm->kcm", outer, by_frame)
+            by_unknowns[self.platform] = -by_platform
+        by_unknowns[self.frame] = -by_frame
+        if self.free:
+            rotation = outer @ rotation_matrix(unknowns[self.frame][:3])
+            chosen = xp.asarray((owner[None, :] == np.arange(len(self.names))[:, None]).astype(float))
+            each = -chosen[:, None, None, :] * rotation.T[None, :, :, None]
+            by_unknowns[self.shape] = each.reshape(-1, 3, m)
+        return Rows(
+            values=tips.position - points,
+            by_tip=each_pose(xp.asarray(np.eye(3)), m),
+            by_unknowns=by_unknowns,
+            measured=no_covariance(3, m),
+        )
+
+    def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
+        if len(set(self.owner)) > 2:
+            check_spread(f"artefact '{self.name}'", np.asarray(self.coordinates)[np.array(self.owner)].T)

@@ -1,0 +1,117 @@
+"""Distances of the tip from an unknown pivot: a telescoping ball bar, a draw wire."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ...core.arrays import Numbers
+from ...core.errors import InputError
+from ...core.linear_algebra import solve_positive_definite
+from ...core.namespace import AnyArray, namespace
+from .observation import (
+    POINT,
+    AbstractObservation,
+    Rows,
+    Tips,
+    Unknowns,
+    checked_name,
+    checked_readings,
+    checked_scalar,
+    checked_target,
+    checked_values,
+)
+
+
+class Distances(AbstractObservation):
+    """Measured distances of the tip from a pivot whose position is unknown.
+
+    Args:
+        name: Name of the observation.
+        q: Joint readings ``(m, n)``, rad.
+        values: Measured distances ``(m,)``, mm.
+        u: Standard uncertainty (k = 1) of each distance, mm.
+        constant: Whether an unknown constant is added to all distances (a bar of unknown zero).
+        target: Name of the tip, by default the arm's own probe.
+
+    Raises:
+        InputError: Shapes do not fit, or a distance is not positive.
+    """
+
+    kind: ClassVar[str] = "distances"
+    rows: ClassVar[int] = 1
+    q: Float[AnyArray, "m n"]
+    values: Float[AnyArray, " m"]
+    u: Float[AnyArray, ""]
+    name: str = eqx.field(static=True)
+    target: str = eqx.field(static=True)
+    constant: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        name: str,
+        q: Numbers,
+        values: Numbers,
+        *,
+        u: Numbers = 0.0,
+        constant: bool = False,
+        target: str = "",
+    ):
+        self.name = checked_name(name, "an observation")
+        where = f"observation '{name}'"
+        self.q = checked_readings(where, q)
+        self.values = checked_values(f"distances of {where}", values, (self.q.shape[0],))
+        self.u = checked_scalar(f"u of {where}", u)
+        self.target = checked_target(target)
+        self.constant = bool(constant)
+
+    @property
+    def pivot(self) -> str:
+        """Name of the unknown pivot."""
+        return f"pivot of {self.name}"
+
+    @property
+    def zero(self) -> str:
+        """Name of the unknown constant."""
+        return f"constant of {self.name}"
+
+    @property
+    def unknowns(self) -> dict[str, tuple[str, ...]]:
+        return {self.pivot: POINT} | ({self.zero: ("mm",)} if self.constant else {})
+
+    @property
+    def fixes_scale(self) -> bool:
+        return True
+
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+        xp = namespace(tips, self.values)
+        middle = xp.mean(tips.position, axis=1, keepdims=True)
+        size = xp.sqrt(xp.mean((tips.position - middle) ** 2)) + 1e-12
+        centred, values = (tips.position - middle) / size, self.values / size
+        # |t - p|^2 = (v + c)^2: linear in p, in |p|^2 - c^2 and, with the constant, in c.
+        columns = [2 * centred, xp.ones_like(centred[:1])] + ([2 * values[None]] if self.constant else [])
+        design = xp.concatenate(columns)
+        normal = design @ design.T + 1e-12 * centred.shape[1] * xp.asarray(np.eye(len(design)))
+        solution = solve_positive_definite(normal, design @ (xp.sum(centred**2, axis=0) - values**2))
+        found = {self.pivot: middle[:, 0] + size * solution[:3]}
+        return found | ({self.zero: size * solution[4:]} if self.constant else {})
+
+    def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
+        xp, m = namespace(tips, unknowns, self.values), self.q.shape[0]
+        between = tips.position - unknowns[self.pivot][:, None]
+        distance = xp.sqrt(xp.sum(between**2, axis=0))
+        direction = (between / distance)[None]
+        by_unknowns = {self.pivot: -direction.swapaxes(0, 1)}
+        values = self.values
+        if self.constant:
+            values = values + unknowns[self.zero][0]
+            by_unknowns[self.zero] = -xp.ones((1, 1, m))
+        measured = xp.broadcast_to(xp.asarray(self.u**2), (m, 1, 1))
+        return Rows((distance - values)[None], direction, by_unknowns, measured)
+
+    def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
+        if tips.shape[1] < 4:
+            raise InputError(
+                f"observation '{self.name}' has {tips.shape[1]} distances, but its pivot needs four; measure more."
+            )

@@ -1,0 +1,49 @@
+"""Residuals of tips from points that are known in an unknown frame, which several kinds of observations share."""
+
+import numpy as np
+from jaxtyping import Float
+
+from ...core.linear_algebra import solve_positive_definite
+from ...core.namespace import AnyArray, namespace
+from ...core.rotations import cross, fitted_frame, rotation_derivative, rotation_matrix
+from .observation import Tips
+
+
+def placed(
+    frame: Float[AnyArray, " 6"], coordinates: Float[AnyArray, "3 m"]
+) -> tuple[Float[AnyArray, "3 m"], Float[AnyArray, "6 3 m"]]:
+    """Points of a frame in the frame around it, mm, and their derivatives by the six numbers of the frame."""
+    xp = namespace(frame, coordinates)
+    turned = rotation_matrix(frame[:3]) @ coordinates
+    axes = rotation_derivative(frame[:3])
+    identity = xp.broadcast_to(xp.asarray(np.eye(3))[:, :, None], (3, 3, coordinates.shape[1]))
+    by_rotation = [cross(axes[:, i : i + 1] + xp.zeros_like(turned), turned) for i in range(3)]
+    return turned + frame[3:, None], xp.concatenate([xp.stack(by_rotation), identity])
+
+
+def frame_and_offset(
+    coordinates: Float[AnyArray, "3 m"], tips: Tips, offset: Float[AnyArray, " 3"]
+) -> tuple[Float[AnyArray, " 6"], Float[AnyArray, " 3"]]:
+    """A station's frame and the place of its target in the last frame, from points that the station measured.
+
+    The tips are o + A p, with A the axes of the last frame; in the station's frame, whose rotation in the base frame is
+    R, the points y are R y + c = o + A p. In R, c and p this is linear, so R is found as a matrix first, which then
+    becomes the nearest rotation.
+    """
+    xp = namespace(coordinates, tips, offset)
+    axes = xp.stack(tips.axes, axis=1)  # (3, 3, m): columns are axes
+    origin = tips.position - xp.einsum("cpm,p->cm", axes, offset)
+    size = xp.sqrt(xp.mean((coordinates - xp.mean(coordinates, axis=1, keepdims=True)) ** 2)) + 1e-9
+    centred = (coordinates - xp.mean(coordinates, axis=1, keepdims=True)) / size
+    m = coordinates.shape[1]
+    identity = xp.asarray(np.eye(3))
+    # Unknowns: R by rows (9, times the size), the station's centre (3), minus p (3).
+    by_matrix = (identity[:, :, None, None] * centred[None, None]).reshape(3, 9, m)
+    by_centre = xp.broadcast_to(identity[:, :, None], (3, 3, m))
+    design = xp.concatenate([by_matrix, by_centre, -axes], axis=1)
+    normal = xp.einsum("cum,cvm->uv", design, design)
+    right = xp.einsum("cum,cm->u", design, origin)
+    solution = solve_positive_definite(normal + 1e-9 * m * xp.asarray(np.eye(15)), right)
+    found = solution[12:]
+    target = origin + xp.einsum("cpm,p->cm", axes, found)
+    return fitted_frame(coordinates, target), found

@@ -1,0 +1,123 @@
+"""Points of the tip as an instrument saw them: a laser tracker, a coordinate measuring machine, a camera."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ...core.arrays import Numbers
+from ...core.errors import InputError
+from ...core.namespace import AnyArray, namespace
+from ...core.rotations import fitted_frame, rotation_matrix
+from .frames import frame_and_offset, placed
+from .observation import (
+    FRAME,
+    AbstractObservation,
+    Rows,
+    Tips,
+    Unknowns,
+    checked_covariances,
+    checked_name,
+    checked_readings,
+    checked_target,
+    checked_values,
+    each_pose,
+    offset_of,
+)
+
+_FLAT = 1e-6  # second singular value of points on a line, of the first
+_SAME = 1e-9  # mm
+
+
+class MeasuredPoints(AbstractObservation):
+    """Points of the tip, measured by an instrument in a frame of its own, which is unknown.
+
+    Args:
+        name: Name of the observation, and of its station where that has none.
+        q: Joint readings ``(m, n)``, rad.
+        points: Measured points ``(m, 3)``, mm, in the instrument's frame.
+        u: Standard uncertainty (k = 1) of the points, mm: one number, one a coordinate, or one each ``(m, 3)``.
+        covariance: Instead of ``u``, the covariance of all points ``(3, 3)``, or of each ``(m, 3, 3)``, mm^2.
+        station: Name of the instrument's station; observations of one station share its frame.
+        target: Name of the tip that was seen, such as a reflector on the flange, whose place in the last frame is then
+            unknown; by default the arm's own probe.
+
+    Raises:
+        InputError: Shapes do not fit, a value is not finite, or a covariance is not positive.
+    """
+
+    kind: ClassVar[str] = "points"
+    rows: ClassVar[int] = 3
+    q: Float[AnyArray, "m n"]
+    points: Float[AnyArray, "m 3"]
+    covariance: Float[AnyArray, "m 3 3"]
+    name: str = eqx.field(static=True)
+    station: str = eqx.field(static=True)
+    target: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        name: str,
+        q: Numbers,
+        points: Numbers,
+        *,
+        u: Numbers | None = None,
+        covariance: Numbers | None = None,
+        station: str | None = None,
+        target: str = "",
+    ):
+        self.name = checked_name(name, "an observation")
+        where = f"observation '{name}'"
+        self.q = checked_readings(where, q)
+        poses = self.q.shape[0]
+        self.points = checked_values(f"points of {where}", points, (poses, 3))
+        self.covariance = checked_covariances(where, u, covariance, poses)
+        self.station = checked_name(name if station is None else station, "a station")
+        self.target = checked_target(target)
+
+    @property
+    def frame(self) -> str:
+        """Name of the unknown frame."""
+        return f"frame of {self.station}"
+
+    @property
+    def unknowns(self) -> dict[str, tuple[str, ...]]:
+        return {self.frame: FRAME}
+
+    @property
+    def fixes_scale(self) -> bool:
+        return True
+
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+        if not self.target:
+            return {self.frame: fitted_frame(self.points.T, tips.position)}
+        frame, found = frame_and_offset(self.points.T, tips, offset)
+        return {self.frame: frame, offset_of(self.target): found}
+
+    def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
+        xp, frame = namespace(tips, unknowns, self.points), unknowns[self.frame]
+        points, by_frame = placed(frame, self.points.T)
+        rotation = rotation_matrix(frame[:3])
+        return Rows(
+            values=tips.position - points,
+            by_tip=each_pose(xp.asarray(np.eye(3)), self.q.shape[0]),
+            by_unknowns={self.frame: -by_frame},
+            measured=rotation @ self.covariance @ rotation.T,
+        )
+
+    def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
+        check_spread(f"observation '{self.name}'", np.asarray(self.points).T)
+
+
+def check_spread(where: str, points: Float[np.ndarray, "3 m"]) -> None:
+    """Raise `InputError` for points on a line, which leave a rotation about it open."""
+    if points.shape[1] < 3:
+        raise InputError(f"{where} has {points.shape[1]} points, but its frame needs three at least; measure more.")
+    sizes = np.linalg.svd(points - points.mean(axis=1, keepdims=True), compute_uv=False)
+    if sizes[0] < _SAME:  # one point, such as a socket, whose frame's rotation is of no consequence
+        return
+    if sizes[1] <= _FLAT * sizes[0]:
+        raise InputError(
+            f"the points of {where} are on one line, about which its frame can turn; measure points beside the line."
+        )

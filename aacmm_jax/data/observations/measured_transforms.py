@@ -1,0 +1,173 @@
+"""Transforms of a target on the last frame, positions and orientations, as an instrument saw them."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ...core.arrays import Numbers, is_concrete
+from ...core.errors import InputError
+from ...core.namespace import AnyArray, namespace
+from ...core.rotations import cross, rotation_derivative, rotation_matrix, rotation_vector
+from .frames import frame_and_offset, placed
+from .measured_points import check_spread
+from .observation import (
+    FRAME,
+    AbstractObservation,
+    Rows,
+    Tips,
+    Unknowns,
+    checked_covariances,
+    checked_name,
+    checked_readings,
+    checked_scalar,
+    checked_values,
+    offset_of,
+)
+
+
+class MeasuredTransforms(AbstractObservation):
+    """Positions and orientations of a target that is fixed to the last frame, measured by an instrument (6-D probe).
+
+    Both frames are unknown: the instrument's in the base frame, and the target's in the last frame.
+
+    Args:
+        name: Name of the observation, and of its station where that has none.
+        q: Joint readings ``(m, n)``, rad.
+        points: Measured positions ``(m, 3)``, mm, in the instrument's frame.
+        rotations: Measured orientations ``(m, 3, 3)``: the target's axes as columns, in the instrument's frame.
+        u_angle: Standard uncertainty (k = 1) of the orientation about each axis, rad.
+        u: Standard uncertainty (k = 1) of the positions, mm: one number, one a coordinate, or one each ``(m, 3)``.
+        covariance: Instead of ``u``, the covariance of all positions ``(3, 3)``, or of each ``(m, 3, 3)``, mm^2.
+        station: Name of the instrument's station; observations of one station share its frame.
+        target: Name of the target; by default that of the observation.
+
+    Raises:
+        InputError: Shapes do not fit, a matrix is no rotation, or a covariance is not positive.
+    """
+
+    kind: ClassVar[str] = "transforms"
+    rows: ClassVar[int] = 6
+    q: Float[AnyArray, "m n"]
+    points: Float[AnyArray, "m 3"]
+    rotations: Float[AnyArray, "m 3 3"]
+    covariance: Float[AnyArray, "m 3 3"]
+    u_angle: Float[AnyArray, ""]
+    name: str = eqx.field(static=True)
+    station: str = eqx.field(static=True)
+    target: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        name: str,
+        q: Numbers,
+        points: Numbers,
+        rotations: Numbers,
+        *,
+        u_angle: Numbers,
+        u: Numbers | None = None,
+        covariance: Numbers | None = None,
+        station: str | None = None,
+        target: str | None = None,
+    ):
+        self.name = checked_name(name, "an observation")
+        where = f"observation '{name}'"
+        self.q = checked_readings(where, q)
+        poses = self.q.shape[0]
+        self.points = checked_values(f"points of {where}", points, (poses, 3))
+        self.rotations = checked_values(f"rotations of {where}", rotations, (poses, 3, 3))
+        if is_concrete(self.rotations):
+            known = np.asarray(self.rotations)
+            proper = np.allclose(known @ known.swapaxes(-1, -2), np.eye(3), atol=1e-6)
+            if not proper or np.any(np.linalg.det(known) < 0):
+                raise InputError(f"{where} has a matrix that is no rotation; give right-handed unit axes as columns.")
+        self.covariance = checked_covariances(where, u, covariance, poses)
+        self.u_angle = checked_scalar(f"u_angle of {where}", u_angle, positive=True)
+        self.station = checked_name(name if station is None else station, "a station")
+        self.target = checked_name(name if target is None else target, "a target")
+
+    @property
+    def frame(self) -> str:
+        """Name of the instrument's frame."""
+        return f"frame of {self.station}"
+
+    @property
+    def orientation(self) -> str:
+        """Name of the rotation of the target in the last frame."""
+        return f"orientation of {self.target}"
+
+    @property
+    def unknowns(self) -> dict[str, tuple[str, ...]]:
+        return {self.frame: FRAME, self.orientation: ("rad",) * 3}
+
+    @property
+    def fixes_scale(self) -> bool:
+        return True
+
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+        xp = namespace(tips, self.points)
+        frame, found = frame_and_offset(self.points.T, tips, offset)
+        # The first pose says how the target is turned in the last frame; the fit does the rest.
+        axes = xp.stack(tips.axes, axis=1)[:, :, 0]
+        turned = axes.T @ rotation_matrix(frame[:3]) @ self.rotations[0]
+        return {self.frame: frame, offset_of(self.target): found, self.orientation: rotation_vector(turned)}
+
+    def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
+        xp, frame, m = namespace(tips, unknowns, self.points), unknowns[self.frame], self.q.shape[0]
+        points, by_frame = placed(frame, self.points.T)
+        station, target = rotation_matrix(frame[:3]), rotation_matrix(unknowns[self.orientation])
+        axes = xp.stack(tips.axes, axis=1)  # (3, 3, m)
+        predicted = xp.einsum("cim,ij->cjm", axes, target)
+        seen = xp.einsum("ci,mij->cjm", station, self.rotations)
+        angle, left, right = _logarithm(xp.einsum("cjm,djm->cdm", predicted, seen))
+        by_station = -xp.einsum("cdm,dk->kcm", right, rotation_derivative(frame[:3]))
+        inside = xp.einsum("cim,ik->ckm", axes, rotation_derivative(unknowns[self.orientation]))
+        by_orientation = xp.einsum("cdm,dkm->kcm", left, inside)
+        none = xp.zeros((3, 3, m))
+        identity = xp.broadcast_to(xp.asarray(np.eye(3))[:, :, None], (3, 3, m))
+        covariance = station @ self.covariance @ station.T
+        angular = xp.broadcast_to(self.u_angle**2 * xp.asarray(np.eye(3)), (m, 3, 3))
+        square = xp.zeros((m, 3, 3))
+        return Rows(
+            values=xp.concatenate([tips.position - points, angle]),
+            by_tip=xp.concatenate([identity, none]),
+            by_unknowns={
+                self.frame: xp.concatenate([-by_frame, xp.concatenate([by_station, none])], axis=1),
+                self.orientation: xp.concatenate([none, by_orientation], axis=1),
+            },
+            measured=xp.concatenate(
+                [xp.concatenate([covariance, square], axis=2), xp.concatenate([square, angular], axis=2)], axis=1
+            ),
+            by_rotation=xp.concatenate([none, left]),
+        )
+
+    def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
+        check_spread(f"observation '{self.name}'", np.asarray(self.points).T)
+
+
+def _logarithm(
+    matrix: Float[AnyArray, "3 3 m"],
+) -> tuple[Float[AnyArray, "3 m"], Float[AnyArray, "3 3 m"], Float[AnyArray, "3 3 m"]]:
+    """Vectors of rotations well below a right angle, and their derivatives by a small rotation before and after.
+
+    With w the vector: log(exp(e) exp(w)) = w + J^-1(w) e, J^-1(w) = I - W / 2 + c W^2, and after: J^-1(-w).
+    """
+    xp = namespace(matrix)
+    half = [matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]
+    sine_axis = xp.stack(half) / 2
+    square = xp.sum(sine_axis**2, axis=0)
+    cosine = (matrix[0, 0] + matrix[1, 1] + matrix[2, 2] - 1) / 2
+    small = square < 1e-12
+    sine = xp.sqrt(xp.where(small, 1.0, square))
+    angle = xp.arctan2(sine, cosine)
+    w = xp.where(small, 1 + square / 6, angle / sine) * sine_axis
+    t2 = xp.sum(w**2, axis=0)
+    near = t2 < 1e-6
+    t = xp.sqrt(xp.where(near, 1.0, t2))
+    c = xp.where(near, 1 / 12 + t2 / 720, 1 / t**2 - (1 + xp.cos(t)) / (2 * t * xp.sin(t)))
+    identity = xp.asarray(np.eye(3))[:, :, None]
+    columns = [cross(w, xp.broadcast_to(identity[:, i], w.shape)) for i in range(3)]
+    skew = xp.stack(columns, axis=1)
+    twice = xp.einsum("ijm,jkm->ikm", skew, skew)
+    return w, identity - skew / 2 + c * twice, identity + skew / 2 + c * twice

@@ -1,0 +1,183 @@
+"""What every kind of observation says: what its poses owe to an unknown geometry, and how both are found.
+
+A kind is one file of this folder: its data, the unknowns of its geometry, a start for them from nearly right tips, and
+its residuals with their derivatives. What it does not say (weights, covariance, robust losses, derivatives of a whole
+calibration) is the same for all kinds.
+"""
+
+import abc
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ...core.arrays import Numbers, as_array, as_floats, is_concrete
+from ...core.errors import InputError
+from ...core.namespace import AnyArray, namespace
+
+# Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
+_MOST_RADIANS = 8 * np.pi
+
+POINT = ("mm",) * 3
+FRAME = ("rad",) * 3 + POINT
+
+Unknowns = Mapping[str, Float[AnyArray, " k"]]
+
+
+class Tips(NamedTuple):
+    """The tips of an observation's poses, mm, and the axes of the last frame, all in the base frame."""
+
+    position: Float[AnyArray, "3 m"]
+    axes: tuple[Float[AnyArray, "3 m"], Float[AnyArray, "3 m"], Float[AnyArray, "3 m"]]
+
+
+class Rows(NamedTuple):
+    """Residuals of an observation, r for each of its m poses, mm (orientations: rad), and their derivatives."""
+
+    values: Float[AnyArray, "r m"]
+    by_tip: Float[AnyArray, "r 3 m"]
+    by_unknowns: dict[str, Float[AnyArray, "k r m"]]
+    measured: Float[AnyArray, "m r r"]  # covariance of what was measured, without the arm's own errors
+    by_rotation: Float[AnyArray, "r 3 m"] | None = None  # by a small rotation of the last frame, rad
+
+
+class AbstractObservation(eqx.Module):
+    """Poses in which the tip owes something to an unknown geometry.
+
+    ``target`` names the tip that the poses held: "" is the arm's own probe, any other name a tip at an unknown place in
+    the last frame, shared by all observations that name it (a reflector, a remounted probe).
+    """
+
+    kind: ClassVar[str]
+    rows: eqx.AbstractClassVar[int]
+    name: eqx.AbstractVar[str]
+    target: eqx.AbstractVar[str]
+    q: eqx.AbstractVar[Float[AnyArray, "m n"]]
+
+    @property
+    @abc.abstractmethod
+    def unknowns(self) -> dict[str, tuple[str, ...]]:
+        """Names of the parts of the unknown geometry, and the unit, mm or rad, of each of its numbers. A name that
+        several observations use is one geometry."""
+
+    @property
+    def fixes_scale(self) -> bool:
+        """Whether the observation determines the scale of the arm."""
+        return False
+
+    @property
+    def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
+        """Unknowns that have a certified value: the values, and their standard uncertainties."""
+        return {}
+
+    @abc.abstractmethod
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+        """The unknowns from nearly right tips; ``offset`` is the arm's own probe in the last frame, mm."""
+
+    @abc.abstractmethod
+    def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
+        """The residuals at these tips and this geometry."""
+
+    def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
+        """Raise `InputError` where nearly right tips (mm) cannot determine the unknown geometry."""
+
+
+def offset_of(target: str) -> str:
+    """Name of the unknown place of a target in the last frame."""
+    return f"offset of {target}"
+
+
+def checked_name(name: object, what: str) -> str:
+    """A name of one line, or `InputError`."""
+    if not isinstance(name, str) or not name.strip() or name.splitlines() != [name]:
+        raise InputError(f"{what} has the name {name!r}; give it a name of one line.")
+    return name
+
+
+def checked_target(target: object) -> str:
+    """The name of a target, which may be empty, or `InputError`."""
+    return "" if target == "" else checked_name(target, "a target")
+
+
+def checked_readings(where: str, readings: Numbers) -> AnyArray:
+    """Joint readings ``(m, n)``, rad, or `InputError` that says what is wrong with them."""
+    array = as_array(readings, where, like=np.zeros(0))
+    if array.ndim != 2 or 0 in array.shape:
+        raise InputError(
+            f"{where} has shape {array.shape}; give one row a pose and one column a joint, at least one of each."
+        )
+    if is_concrete(array):
+        _check_values(where, np.asarray(array))
+    return array
+
+
+def _check_values(where: str, array: np.ndarray) -> None:
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        row, column = bad[0] + 1
+        raise InputError(
+            f"{where} pose {row} joint {column} is {array[row - 1, column - 1]}; every angle must be finite."
+        )
+    largest = float(np.abs(array).max())
+    if largest > _MOST_RADIANS:
+        row, column = np.argwhere(np.abs(array) == largest)[0] + 1
+        raise InputError(
+            f"{where} pose {row} joint {column} is {largest:g} rad, more than four revolutions: these look like "
+            "degrees; convert with numpy.deg2rad, or state the unit in the manifest."
+        )
+
+
+def checked_values(where: str, values: Numbers, shape: tuple[int, ...]) -> AnyArray:
+    """Measured values of a shape, or `InputError`."""
+    array = as_floats(values, where)
+    if array.shape != shape:
+        raise InputError(f"{where} has shape {array.shape}; give {shape}, one row a pose.")
+    return array
+
+
+def checked_scalar(where: str, value: Numbers, *, positive: bool = False) -> AnyArray:
+    """One number, zero or positive, or `InputError`."""
+    array = as_floats(value, where)
+    if array.ndim:
+        raise InputError(f"{where} has shape {array.shape}; give one number.")
+    if is_concrete(array) and (float(array) < 0 or (positive and float(array) == 0)):
+        raise InputError(f"{where} is {float(array):g}; it must be {'positive' if positive else 'zero or positive'}.")
+    return array
+
+
+def checked_covariances(where: str, u: Numbers | None, covariance: Numbers | None, poses: int) -> AnyArray:
+    """Covariances ``(m, 3, 3)`` of measured points, mm^2, from one of both statements: ``u`` a number, one a coordinate
+    or one a coordinate and pose; ``covariance`` one for all poses or one each."""
+    if u is not None and covariance is not None:
+        raise InputError(f"{where}: u and covariance are both given; give one of them.")
+    if covariance is None:
+        array = as_floats(0.0 if u is None else u, f"u of {where}")
+        if array.shape not in ((), (3,), (poses, 3)):
+            raise InputError(f"u of {where} has shape {array.shape}; give one number, three, or ({poses}, 3).")
+        if is_concrete(array) and np.any(np.asarray(array) < 0):
+            raise InputError(f"u of {where} is negative; a standard uncertainty must be zero or positive.")
+        xp = namespace(array)
+        array = xp.broadcast_to(array if array.ndim else array[None], (poses, 3))
+        return array[:, :, None] ** 2 * np.eye(3)
+    array = as_floats(covariance, f"covariance of {where}")
+    if array.shape not in ((3, 3), (poses, 3, 3)):
+        raise InputError(f"covariance of {where} has shape {array.shape}; give (3, 3) or ({poses}, 3, 3).")
+    array = namespace(array).broadcast_to(array, (poses, 3, 3))
+    if is_concrete(array):
+        known = np.asarray(array)
+        symmetric = np.allclose(known, known.swapaxes(-1, -2), rtol=1e-6, atol=1e-15)
+        if not symmetric or np.linalg.eigvalsh(known).min() < -1e-12 * max(np.abs(known).max(), 1e-300):
+            raise InputError(f"covariance of {where} is not symmetric and positive; give variances in mm^2.")
+    return array
+
+
+def each_pose(matrix: Float[AnyArray, "r c"], poses: int) -> Float[AnyArray, "r c m"]:
+    """The same matrix for every pose."""
+    return namespace(matrix).broadcast_to(matrix[:, :, None], (*matrix.shape, poses))
+
+
+def no_covariance(rows: int, poses: int) -> Float[np.ndarray, "m r r"]:
+    """Of observations in which nothing was measured but the poses."""
+    return np.zeros((poses, rows, rows))

@@ -1,0 +1,221 @@
+"""Planes: the tip touches one, or two parallel ones at a certified distance."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ...core.arrays import Numbers, is_concrete
+from ...core.errors import InputError
+from ...core.linear_algebra import semidefinite_eigen
+from ...core.namespace import AnyArray, namespace
+from ...core.rotations import cross, rotation_derivative, rotation_matrix
+from .observation import (
+    AbstractObservation,
+    Rows,
+    Tips,
+    Unknowns,
+    checked_name,
+    checked_readings,
+    checked_scalar,
+    checked_target,
+)
+
+PLANE = ("rad", "rad", "mm")
+
+
+class Plane(AbstractObservation):
+    """Touches of a plane whose position and direction are unknown.
+
+    Args:
+        name: Name of the plane.
+        q: Joint readings ``(m, n)``, rad; all from one side, so that the ball's radius is part of the unknown position.
+        form: Standard deviation of the surface about its plane, mm.
+        target: Name of the tip, by default the arm's own probe.
+
+    Raises:
+        InputError: Readings are not finite, or ``form`` is negative.
+    """
+
+    kind: ClassVar[str] = "plane"
+    rows: ClassVar[int] = 1
+    q: Float[AnyArray, "m n"]
+    form: Float[AnyArray, ""]
+    name: str = eqx.field(static=True)
+    target: str = eqx.field(static=True)
+
+    def __init__(self, name: str, q: Numbers, *, form: Numbers = 0.0, target: str = ""):
+        self.name = checked_name(name, "a plane")
+        self.q = checked_readings(f"plane '{name}'", q)
+        self.form = checked_scalar(f"form of plane '{name}'", form)
+        self.target = checked_target(target)
+
+    @property
+    def place(self) -> str:
+        """Name of the unknown plane: two components of the rotation vector that turns z to its normal, and its distance
+        from the origin."""
+        return f"plane {self.name}"
+
+    @property
+    def unknowns(self) -> dict[str, tuple[str, ...]]:
+        return {self.place: PLANE}
+
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+        return {self.place: fitted_plane(tips.position)}
+
+    def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
+        distance, normal, by_plane = heights(tips.position, unknowns[self.place])
+        xp = namespace(distance, self.form)
+        measured = xp.broadcast_to(xp.asarray(self.form**2), (self.q.shape[0], 1, 1))
+        return Rows(distance[None], _each(normal, self.q.shape[0]), {self.place: by_plane[:, None]}, measured)
+
+    def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
+        check_plane(f"plane '{self.name}'", tips)
+
+
+class ParallelPlanes(AbstractObservation):
+    """Touches of two parallel planes at a certified distance, such as the faces of a gauge block or a step.
+
+    Args:
+        name: Name of the pair.
+        one: Joint readings on one plane ``(m, n)``, rad.
+        other: Joint readings on the other plane ``(k, n)``, rad.
+        distance: Certified distance between the planes, mm.
+        u: Standard uncertainty (k = 1) of the distance, mm.
+        stylus: Diameter of the tip's ball, mm.
+        inside: Whether the ball was between the planes (a gap), and not outside them (a block).
+        form: Standard deviation of the surfaces about their planes, mm.
+        target: Name of the tip, by default the arm's own probe.
+
+    Raises:
+        InputError: The planes have different numbers of joints, or a value is negative.
+    """
+
+    kind: ClassVar[str] = "parallel planes"
+    rows: ClassVar[int] = 1
+    q: Float[AnyArray, "m n"]
+    distance: Float[AnyArray, ""]  # of the tip's centres, mm
+    u: Float[AnyArray, ""]
+    form: Float[AnyArray, ""]
+    name: str = eqx.field(static=True)
+    target: str = eqx.field(static=True)
+    first: int = eqx.field(static=True)  # number of poses on the first plane
+    free: bool = eqx.field(static=True)  # whether the distance is an unknown with a certified value
+
+    def __init__(
+        self,
+        name: str,
+        one: Numbers,
+        other: Numbers,
+        distance: Numbers,
+        *,
+        u: Numbers = 0.0,
+        stylus: Numbers = 0.0,
+        inside: bool = False,
+        form: Numbers = 0.0,
+        target: str = "",
+    ):
+        self.name = checked_name(name, "a pair of planes")
+        where = f"planes '{name}'"
+        sides = checked_readings(f"{where}, one side,", one), checked_readings(f"{where}, other side,", other)
+        if sides[0].shape[1] != sides[1].shape[1]:
+            raise InputError(f"{where} have {sides[0].shape[1]} and {sides[1].shape[1]} columns; give one a joint.")
+        self.q = namespace(*sides).concatenate(sides)
+        self.first = sides[0].shape[0]
+        ball = checked_scalar(f"stylus of {where}", stylus)
+        between = checked_scalar(f"distance of {where}", distance, positive=True)
+        self.distance = between - ball if inside else between + ball
+        self.u = checked_scalar(f"u of {where}", u)
+        self.form = checked_scalar(f"form of {where}", form)
+        self.target = checked_target(target)
+        self.free = not (is_concrete(self.u) and float(self.u) == 0)
+
+    @property
+    def place(self) -> str:
+        """Name of the first of the unknown planes."""
+        return f"plane {self.name}"
+
+    @property
+    def separation(self) -> str:
+        """Name of the distance."""
+        return f"distance of {self.name}"
+
+    @property
+    def unknowns(self) -> dict[str, tuple[str, ...]]:
+        return {self.place: PLANE} | ({self.separation: ("mm",)} if self.free else {})
+
+    @property
+    def fixes_scale(self) -> bool:
+        return True
+
+    @property
+    def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
+        return {self.separation: (self.distance[None], self.u[None])} if self.free else {}
+
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+        xp, k = namespace(tips), self.first
+        sides = tips.position[:, :k], tips.position[:, k:]
+        centres = [xp.mean(side, axis=1, keepdims=True) for side in sides]
+        both = xp.concatenate([side - centre for side, centre in zip(sides, centres, strict=True)], axis=1)
+        start = fitted_plane(both + centres[0])
+        return {self.place: start} | ({self.separation: self.distance[None]} if self.free else {})
+
+    def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
+        height, normal, by_plane = heights(tips.position, unknowns[self.place])
+        m, k = self.q.shape[0], self.first
+        xp = namespace(height, self.form)
+        other = np.arange(m) >= k
+        # The normal may point either way; which way the other plane is follows from the tips.
+        side = xp.where(xp.mean(height[k:]) >= xp.mean(height[:k]), 1.0, -1.0) * xp.asarray(other.astype(float))
+        distance = unknowns[self.separation][0] if self.free else self.distance
+        by_unknowns = {self.place: by_plane[:, None]}
+        if self.free:
+            by_unknowns[self.separation] = -side[None, None]
+        measured = xp.broadcast_to(xp.asarray(self.form**2), (m, 1, 1))
+        return Rows((height - side * distance)[None], _each(normal, m), by_unknowns, measured)
+
+    def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
+        k = self.first
+        sides = [tips[:, :k], tips[:, k:]]
+        both = np.concatenate([side - side.mean(axis=1, keepdims=True) for side in sides], axis=1)
+        check_plane(f"planes '{self.name}'", both)
+
+
+def _each(normal: Float[AnyArray, " 3"], poses: int) -> Float[AnyArray, "1 3 m"]:
+    return namespace(normal).broadcast_to(normal[None, :, None], (1, 3, poses))
+
+
+def heights(
+    tips: Float[AnyArray, "3 m"], plane: Float[AnyArray, " 3"]
+) -> tuple[Float[AnyArray, " m"], Float[AnyArray, " 3"], Float[AnyArray, "3 m"]]:
+    """Heights of tips over a plane, mm, its unit normal, and the derivatives of the heights by the plane's numbers."""
+    xp = namespace(tips, plane)
+    w = xp.concatenate([plane[:2], xp.zeros_like(plane[:1])])
+    normal = rotation_matrix(w)[:, 2]
+    turned = cross(rotation_derivative(w)[:, :2], xp.stack([normal, normal], axis=1))  # (3, 2)
+    return normal @ tips - plane[2], normal, xp.concatenate([turned.T @ tips, -xp.ones_like(tips[:1])])
+
+
+def fitted_plane(tips: Float[AnyArray, "3 m"]) -> Float[AnyArray, " 3"]:
+    """The plane that points are closest to: its numbers as `Plane` has them, with the normal upwards."""
+    xp = namespace(tips)
+    middle = xp.mean(tips, axis=1)
+    centred = tips - middle[:, None]
+    scatter = centred @ centred.T
+    _, vectors = semidefinite_eigen(scatter / (xp.trace(scatter) + 1e-300))
+    normal = vectors[:, 2] / xp.sqrt(xp.sum(vectors[:, 2] ** 2))
+    normal = xp.where(normal[2] < 0, -normal, normal)
+    sine = xp.sqrt(normal[0] ** 2 + normal[1] ** 2)
+    level = sine < 1e-12
+    factor = xp.where(level, 1.0, xp.arctan2(sine, normal[2]) / xp.where(level, 1.0, sine))
+    return xp.stack([-normal[1] * factor, normal[0] * factor, normal @ middle])
+
+
+def check_plane(where: str, tips: Float[np.ndarray, "3 m"]) -> None:
+    """Raise `InputError` for points that determine no plane."""
+    if tips.shape[1] < 3:
+        raise InputError(f"{where} has {tips.shape[1]} touches, but a plane needs three at least; touch it more often.")
+    sizes = np.linalg.svd(tips - tips.mean(axis=1, keepdims=True), compute_uv=False)
+    if sizes[1] <= 0.02 * sizes[0]:
+        raise InputError(f"the touches of {where} are on one line, about which it can tilt; touch it beside the line.")

@@ -1,0 +1,73 @@
+"""A socket: the tip is at one point, whose position is unknown."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ...core.arrays import Numbers
+from ...core.namespace import AnyArray, namespace
+from .observation import (
+    POINT,
+    AbstractObservation,
+    Rows,
+    Tips,
+    Unknowns,
+    checked_name,
+    checked_readings,
+    checked_target,
+    each_pose,
+    no_covariance,
+)
+
+
+class Socket(AbstractObservation):
+    """Poses with the tip at one point. The sockets of a `Capture` are the same, with their positions eliminated.
+
+    Args:
+        name: Name of the socket.
+        q: Joint readings ``(m, n)``, rad.
+        target: Name of the tip, by default the arm's own probe.
+
+    Raises:
+        InputError: Readings are not finite, or not ``(m, n)``.
+    """
+
+    kind: ClassVar[str] = "socket"
+    rows: ClassVar[int] = 3
+    q: Float[AnyArray, "m n"]
+    name: str = eqx.field(static=True)
+    target: str = eqx.field(static=True)
+
+    def __init__(self, name: str, q: Numbers, *, target: str = ""):
+        self.name = checked_name(name, "a socket")
+        self.q = checked_readings(f"socket '{name}'", q)
+        self.target = checked_target(target)
+
+    @property
+    def position(self) -> str:
+        """Name of the unknown position."""
+        return position_of(self.name)
+
+    @property
+    def unknowns(self) -> dict[str, tuple[str, ...]]:
+        return {self.position: POINT}
+
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+        return {self.position: namespace(tips).mean(tips.position, axis=1)}
+
+    def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
+        identity = each_pose(namespace(tips, unknowns).asarray(np.eye(3)), self.q.shape[0])
+        position = unknowns[self.position]
+        return Rows(
+            values=tips.position - position[:, None],
+            by_tip=identity,
+            by_unknowns={self.position: -identity},
+            measured=no_covariance(3, self.q.shape[0]),
+        )
+
+
+def position_of(socket: str) -> str:
+    """Name of the unknown position of a socket."""
+    return f"position of {socket}"

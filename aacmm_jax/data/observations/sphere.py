@@ -1,0 +1,158 @@
+"""A sphere: the tip touches it, so it is at one distance from an unknown centre."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ...core.arrays import Numbers, is_concrete
+from ...core.errors import InputError
+from ...core.linear_algebra import solve_positive_definite
+from ...core.namespace import AnyArray, namespace
+from .observation import (
+    POINT,
+    AbstractObservation,
+    Rows,
+    Tips,
+    Unknowns,
+    checked_name,
+    checked_readings,
+    checked_scalar,
+    checked_target,
+    each_pose,
+    no_covariance,
+)
+
+_SMALLEST_CAP = 20.0  # degrees from its middle: below it, centre and radius can hardly be told apart
+
+
+class Sphere(AbstractObservation):
+    """Touches of a sphere: the tip's centre is at (diameter + stylus) / 2 from an unknown centre.
+
+    Args:
+        name: Name of the sphere.
+        q: Joint readings ``(m, n)``, rad.
+        diameter: Certified diameter, mm; None where it is unknown.
+        u: Standard uncertainty (k = 1) of the diameter, mm.
+        stylus: Diameter of the tip's ball, mm; 0 where the tip itself is on the sphere, or where the diameter is
+            unknown, which then includes it.
+        target: Name of the tip, by default the arm's own probe.
+
+    Raises:
+        InputError: Shapes do not fit, or a diameter or uncertainty is negative.
+    """
+
+    kind: ClassVar[str] = "sphere"
+    q: Float[AnyArray, "m n"]
+    radius: Float[AnyArray, ""] | None  # of the tip's centre, mm
+    u: Float[AnyArray, ""]  # of the radius, mm
+    name: str = eqx.field(static=True)
+    target: str = eqx.field(static=True)
+    point: bool = eqx.field(static=True)  # whether the radius is exactly 0: a socket
+    free: bool = eqx.field(static=True)  # whether the radius is an unknown
+
+    def __init__(
+        self,
+        name: str,
+        q: Numbers,
+        *,
+        diameter: Numbers | None = None,
+        u: Numbers = 0.0,
+        stylus: Numbers = 0.0,
+        target: str = "",
+    ):
+        self.name = checked_name(name, "a sphere")
+        where = f"sphere '{name}'"
+        self.q = checked_readings(where, q)
+        self.target = checked_target(target)
+        self.u = checked_scalar(f"u of {where}", u) / 2
+        ball = checked_scalar(f"stylus of {where}", stylus)
+        self.radius = None if diameter is None else (checked_scalar(f"diameter of {where}", diameter) + ball) / 2
+        exact = is_concrete(self.u) and float(self.u) == 0
+        known = self.radius is not None and is_concrete(self.radius)
+        self.point = known and exact and float(self.radius) == 0  # pyright: ignore[reportArgumentType]
+        self.free = self.radius is None or not exact
+
+    @property
+    def rows(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Residuals of each pose: of a sphere of radius 0 all three coordinates, else the distance."""
+        return 3 if self.point else 1
+
+    @property
+    def centre(self) -> str:
+        """Name of the unknown centre."""
+        return f"centre of {self.name}"
+
+    @property
+    def size(self) -> str:
+        """Name of the unknown radius."""
+        return f"radius of {self.name}"
+
+    @property
+    def unknowns(self) -> dict[str, tuple[str, ...]]:
+        return {self.centre: POINT} | ({self.size: ("mm",)} if self.free else {})
+
+    @property
+    def fixes_scale(self) -> bool:
+        return self.radius is not None and not self.point
+
+    @property
+    def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
+        return {self.size: (self.radius[None], self.u[None])} if self.free and self.radius is not None else {}
+
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+        xp = namespace(tips)
+        if self.point:
+            return {self.centre: xp.mean(tips.position, axis=1)}
+        centre, radius = fitted_sphere(tips.position)
+        found = {self.centre: centre}
+        if self.free:
+            found[self.size] = (radius if self.radius is None else self.radius)[None]
+        return found
+
+    def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
+        xp, m = namespace(tips, unknowns, self.u), self.q.shape[0]
+        between = tips.position - unknowns[self.centre][:, None]
+        if self.point:
+            identity = each_pose(xp.asarray(np.eye(3)), m)
+            return Rows(between, identity, {self.centre: -identity}, no_covariance(3, m))
+        distance = xp.sqrt(xp.sum(between**2, axis=0))
+        direction = (between / distance)[None]
+        radius = unknowns[self.size][0] if self.free else self.radius
+        by_unknowns = {self.centre: -direction.swapaxes(0, 1)}
+        if self.free:
+            by_unknowns[self.size] = -xp.ones((1, 1, m))
+        return Rows((distance - radius)[None], direction, by_unknowns, no_covariance(1, m))
+
+    def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
+        where = f"sphere '{self.name}'"
+        if self.point:
+            return
+        needed = 4 if self.radius is None else 3
+        if tips.shape[1] < needed:
+            raise InputError(f"{where} has {tips.shape[1]} touches, but {needed} unknowns; touch it more often.")
+        centre, _ = fitted_sphere(tips)
+        directions = tips - np.asarray(centre)[:, None]
+        directions = directions / np.linalg.norm(directions, axis=0)
+        middle = directions.mean(axis=1)
+        middle = middle / max(np.linalg.norm(middle), 1e-300)
+        cap = float(np.degrees(np.arccos(np.clip((middle @ directions).min(), -1, 1))))
+        if self.radius is None and cap < _SMALLEST_CAP:
+            raise InputError(
+                f"the touches of {where} cover a cap of {cap:.0f} degrees about its middle, which hardly separates "
+                "centre and radius; touch it all over, or give its diameter."
+            )
+
+
+def fitted_sphere(tips: Float[AnyArray, "3 m"]) -> tuple[Float[AnyArray, " 3"], Float[AnyArray, ""]]:
+    """Centre and radius of the sphere through points, by linear least squares: |t|^2 = 2 c.t + r^2 - |c|^2."""
+    xp = namespace(tips)
+    middle = xp.mean(tips, axis=1, keepdims=True)
+    size = xp.sqrt(xp.mean((tips - middle) ** 2)) + 1e-12
+    centred = (tips - middle) / size
+    design = xp.concatenate([2 * centred, xp.ones_like(centred[:1])])
+    normal = design @ design.T + 1e-12 * tips.shape[1] * xp.asarray(np.eye(4))
+    solution = solve_positive_definite(normal, design @ xp.sum(centred**2, axis=0))
+    radius = xp.sqrt(xp.maximum(solution[3] + xp.sum(solution[:3] ** 2), 0.0))
+    return middle[:, 0] + size * solution[:3], size * radius

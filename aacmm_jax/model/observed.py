@@ -1,0 +1,273 @@
+"""Observations of all kinds as one least squares: the free parameters and every unknown geometry, and their rows.
+
+The unknowns z are the p free parameters of the arm, then the numbers of each unknown geometry. Sockets are observations
+here like any other. A reference length is a relation between the positions of two sockets, a certified value one of a
+geometry with itself.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..core.linear_algebra import inverse_cholesky
+from ..core.namespace import AnyArray, add_at, namespace, to_numpy
+from ..data.capture import Capture, check_one_capture
+from ..data.observations.observation import POINT, AbstractObservation, Rows, Tips, offset_of
+from ..data.observations.socket import Socket, position_of
+from ..kinematics.chain import ForwardPass, SinesCosines, forward_pass, sines_cosines
+from ..kinematics.jacobian import rotation_columns, stacked_jacobian_columns
+from ..kinematics.parameters import Parameters
+from ..solver.active_set import QuadraticModel
+from .robust import Loss
+
+_STEPS = {"mm": 1.0, "rad": 1e-3}  # natural steps, as those of the arm's parameters
+
+
+class Observed(eqx.Module):
+    """Everything that a capture observed, as arrays: sockets first, then its other observations."""
+
+    observations: tuple[AbstractObservation, ...]
+    q: Float[AnyArray, "M n"]
+    sines_cosines: SinesCosines
+    nominal: Float[AnyArray, " l"]  # reference lengths, mm
+    u: Float[AnyArray, " l"]
+    ends: tuple[tuple[str, str], ...] = eqx.field(static=True)  # names of the positions at their ends
+
+    @classmethod
+    def of(cls, capture: Capture) -> "Observed":
+        """What a capture observed. Raises `InputError` for a batch of captures."""
+        check_one_capture(capture)
+        capture = to_numpy(capture)
+        xp = namespace(capture)
+        sockets = tuple(Socket(name, readings) for name, readings in capture.sockets.items())
+        observations = to_numpy((*sockets, *capture.observations))
+        q = xp.concatenate([observation.q for observation in observations])
+        lengths = capture.lengths
+        return cls(
+            observations=observations,
+            q=q,
+            sines_cosines=sines_cosines(q),
+            nominal=xp.stack([length.value for length in lengths]) if lengths else np.zeros(0),
+            u=xp.stack([length.u for length in lengths]) if lengths else np.zeros(0),
+            ends=tuple((position_of(length.start), position_of(length.end)) for length in lengths),
+        )
+
+    @property
+    def blocks(self) -> dict[str, tuple[str, ...]]:
+        """The parts of the unknown geometry, and the unit of each of their numbers."""
+        found: dict[str, tuple[str, ...]] = {}
+        for observation in self.observations:
+            found |= observation.unknowns
+            if observation.target:
+                found[offset_of(observation.target)] = POINT
+        return found
+
+    @property
+    def positions(self) -> dict[str, np.ndarray]:
+        """Indices of the numbers of each part among all of them."""
+        ends = np.cumsum([len(units) for units in self.blocks.values()])
+        return {
+            name: np.arange(end - len(units), end) for (name, units), end in zip(self.blocks.items(), ends, strict=True)
+        }
+
+    @property
+    def steps(self) -> np.ndarray:
+        """Natural step of each number: 1 mm, 1 mrad."""
+        return np.array([_STEPS[unit] for units in self.blocks.values() for unit in units])
+
+    @property
+    def slices(self) -> list[slice]:
+        """The poses of each observation."""
+        ends = np.cumsum([observation.q.shape[0] for observation in self.observations])
+        return [
+            slice(end - observation.q.shape[0], end) for observation, end in zip(self.observations, ends, strict=True)
+        ]
+
+    def split(self, geometry: Float[AnyArray, " g"]) -> dict[str, Float[AnyArray, " k"]]:
+        """The numbers of each part."""
+        return {name: geometry[rows[0] : rows[-1] + 1] for name, rows in self.positions.items()}
+
+    def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
+        """Parts that have certified values: the values and their standard uncertainties."""
+        found: dict[str, Any] = {}
+        for observation in self.observations:
+            found |= observation.certified
+        return found
+
+    def forward(self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]) -> ForwardPass:
+        """All poses by an arm, each with the tip that it held."""
+        arm, parts = space.geometry(vector), self.split(geometry)
+        if any(observation.target for observation in self.observations):
+            xp = namespace(arm, geometry)
+            offsets = [
+                xp.broadcast_to(
+                    parts[offset_of(observation.target)] if observation.target else arm.probe,
+                    (observation.q.shape[0], 3),
+                )
+                for observation in self.observations
+            ]
+            arm = arm._replace(probe=xp.concatenate(offsets))
+        return forward_pass(arm, self.sines_cosines)
+
+    def start(self, space: Parameters, vector: Float[AnyArray, " p"]) -> Float[AnyArray, " g"]:
+        """The unknown geometry as the observations say, one after the other, by an arm that is nearly right."""
+        arm = space.geometry(vector)
+        forward = forward_pass(arm, self.sines_cosines)
+        found: dict[str, Any] = {}
+        for observation, rows in zip(self.observations, self.slices, strict=True):
+            new = observation.start(_tips(forward, rows), arm.probe)
+            if observation.target:
+                new = {offset_of(observation.target): arm.probe} | new
+            found = new | found  # what another observation has found stays
+        return namespace(arm, forward).concatenate([found[name] for name in self.blocks])
+
+
+def _tips(forward: ForwardPass, rows: slice) -> Tips:
+    x, y, z = (axis[:, rows] for axis in forward.frame)
+    return Tips(forward.tip[:, rows], (x, y, z))
+
+
+class Linear(NamedTuple):
+    """One observation's rows at a point, with the derivatives by the numbers that they depend on."""
+
+    rows: Rows
+    jacobian: Float[AnyArray, "k r m"]
+    indices: np.ndarray  # of those numbers in z
+
+
+class Whitening(NamedTuple):
+    """What makes rows of standard deviation 1 of the residuals."""
+
+    roots: tuple[Float[AnyArray, "m r r"], ...]  # of each observation, inverse Cholesky factors
+    lengths: Float[AnyArray, " l"]  # one over a standard deviation
+    certified: dict[str, Float[AnyArray, " k"]]
+
+
+def linear_rows(space: Parameters, observed: Observed, z: Float[AnyArray, " z"]) -> list[Linear]:
+    """The rows of every observation and their analytic derivatives."""
+    p = len(space.names)
+    forward = observed.forward(space, z[:p], z[p:])
+    xp, parts, positions = namespace(forward, z), observed.split(z[p:]), observed.positions
+    columns = stacked_jacobian_columns(forward, space.indices())
+    own_probe = np.array([kind == "probe" for kind, _ in space.indices()])
+    turned = None
+    found = []
+    for observation, rows in zip(observed.observations, observed.slices, strict=True):
+        residual = observation.residual(_tips(forward, rows), parts)
+        mine = columns[..., rows]
+        blocks, indices = [], [np.arange(p)]
+        if observation.target:
+            mine = xp.where(own_probe[:, None, None], 0.0, mine)
+        by_parameters = xp.einsum("rcm,kcm->krm", residual.by_tip, mine)
+        if residual.by_rotation is not None:
+            turned = rotation_columns(forward, space.indices()) if turned is None else turned
+            by_parameters = by_parameters + xp.einsum("rcm,kcm->krm", residual.by_rotation, turned[..., rows])
+        if observation.target:
+            axes = xp.stack([axis[:, rows] for axis in forward.frame])
+            blocks.append(xp.einsum("rcm,kcm->krm", residual.by_tip, axes))
+            indices.append(p + positions[offset_of(observation.target)])
+        for name, derivative in residual.by_unknowns.items():
+            blocks.append(derivative)
+            indices.append(p + positions[name])
+        found.append(Linear(residual, xp.concatenate([by_parameters, *blocks]), np.concatenate(indices)))
+    return found
+
+
+def observed_rows(
+    z: Float[AnyArray, " z"], args: tuple[Parameters, Observed, Whitening, Loss | None]
+) -> tuple[AnyArray, ...]:
+    """Whitened residuals of observations, lengths and certified values; half their sum of squares is what is
+    minimised."""
+    space, observed, whitening, loss = args
+    p = len(space.names)
+    forward, parts = observed.forward(space, z[:p], z[p:]), observed.split(z[p:])
+    found = []
+    for observation, rows, root in zip(observed.observations, observed.slices, whitening.roots, strict=True):
+        values = observation.residual(_tips(forward, rows), parts).values
+        white = namespace(values, root).einsum("mab,bm->am", root, values)
+        found.append(white if loss is None else loss.transformed(white))
+    length, certified = _relations(observed, whitening, parts)
+    return (*found, length, *certified.values())
+
+
+def _relations(
+    observed: Observed, whitening: Whitening, parts: dict[str, AnyArray]
+) -> tuple[Float[AnyArray, " l"], dict[str, Float[AnyArray, " k"]]]:
+    """Whitened residuals of reference lengths and of certified values."""
+    xp = namespace(parts, whitening)
+    vectors = _vectors(observed, parts)
+    lengths = whitening.lengths * (xp.sqrt(xp.sum(vectors**2, axis=1)) - observed.nominal)
+    certified = {
+        name: whitening.certified[name] * (parts[name] - value) for name, (value, _) in observed.certified().items()
+    }
+    return lengths, certified
+
+
+def _vectors(observed: Observed, parts: dict[str, AnyArray]) -> Float[AnyArray, "l 3"]:
+    xp = namespace(parts)
+    if not observed.ends:
+        return xp.zeros((0, 3))
+    return xp.stack([parts[end] - parts[start] for start, end in observed.ends])
+
+
+def observed_model(
+    z: Float[AnyArray, " z"], args: tuple[Parameters, Observed, Whitening, Loss | None]
+) -> QuadraticModel:
+    """Cost, gradient and Gram matrix of `observed_rows`, block by block of the unknowns."""
+    space, observed, whitening, loss = args
+    xp = namespace(z, args)
+    cost, gradient, gram = xp.zeros(()), xp.zeros_like(z), xp.zeros((z.shape[0], z.shape[0]))
+    for linear, root in zip(linear_rows(space, observed, z), whitening.roots, strict=True):
+        white, jacobian = whitened(linear, root)
+        if loss is not None:
+            each, weight = loss.cost_and_weight(white)
+            cost = cost + xp.sum(each)
+            white, jacobian = xp.sqrt(weight) * white, xp.sqrt(weight) * jacobian
+        else:
+            cost = cost + 0.5 * xp.sum(white**2)
+        flat, indices = jacobian.reshape(jacobian.shape[0], -1), linear.indices
+        gradient = add_at(gradient, indices, flat @ white.reshape(-1))
+        gram = add_at(gram, np.ix_(indices, indices), flat @ flat.T)
+    p = len(space.names)
+    parts, positions = observed.split(z[p:]), observed.positions
+    lengths, certified = _relations(observed, whitening, parts)
+    vectors = _vectors(observed, parts)
+    for i, (start, end) in enumerate(observed.ends):
+        direction = vectors[i] / xp.sqrt(xp.sum(vectors[i] ** 2)) * whitening.lengths[i]
+        row, indices = xp.concatenate([-direction, direction]), p + np.concatenate([positions[start], positions[end]])
+        cost = cost + 0.5 * lengths[i] ** 2
+        gradient = add_at(gradient, indices, row * lengths[i])
+        gram = add_at(gram, np.ix_(indices, indices), row[:, None] * row[None, :])
+    for name, residual in certified.items():
+        indices = p + positions[name]
+        cost = cost + 0.5 * xp.sum(residual**2)
+        gradient = add_at(gradient, indices, whitening.certified[name] * residual)
+        gram = add_at(gram, (indices, indices), whitening.certified[name] ** 2)
+    return QuadraticModel(cost, gradient, gram)
+
+
+def whitened(linear: Linear, root: Float[AnyArray, "m r r"]) -> tuple[Float[AnyArray, "r m"], Float[AnyArray, "k r m"]]:
+    """An observation's residuals and derivatives in standard deviations."""
+    xp = namespace(linear.jacobian, root)
+    if root.shape[-1] == 1:
+        return root[:, 0, 0] * linear.rows.values, root[:, 0, 0] * linear.jacobian
+    return xp.einsum("mab,bm->am", root, linear.rows.values), xp.einsum("mab,kbm->kam", root, linear.jacobian)
+
+
+def whitening_of(
+    linear: list[Linear],
+    observed: Observed,
+    of_arm: list[Float[AnyArray, "m r r"]],
+    least: Float[AnyArray, ""],
+) -> Whitening:
+    """From the covariance of every row: what was measured, plus what the arm's own errors make of it (``of_arm``).
+
+    ``least`` (mm) is the smallest standard uncertainty of a certified value or length that counts as such: an exact one
+    would be a row of infinite weight.
+    """
+    xp = namespace([part.rows.values for part in linear], of_arm, least)
+    roots = tuple(inverse_cholesky(part.rows.measured + arm) for part, arm in zip(linear, of_arm, strict=True))
+    certified = {name: 1 / xp.maximum(u, least) for name, (_, u) in observed.certified().items()}
+    return Whitening(roots, 1 / xp.maximum(observed.u, least), certified)

@@ -1,0 +1,56 @@
+"""Robust losses: how much less than its square a large residual counts.
+
+They act on the norm of a pose's whitened residual, so that a bad pose loses weight as a whole. With s = |r|^2 / c^2 and
+c the tuning constant of `Loss`, the cost of a pose is c^2 / 2 rho(s), and its weight rho'(s).
+Sources: Huber 1964; Holland and Welsch 1977 (Cauchy); Beaton and Tukey 1974; Triggs et al. 2000.
+"""
+
+from typing import Literal, get_args
+
+import equinox as eqx
+from jaxtyping import Float
+
+from ..core.namespace import AnyArray, namespace
+
+LossName = Literal["huber", "cauchy", "tukey"]
+LOSSES = get_args(LossName)
+
+# Constants of 95 % efficiency for normal residuals of r rows a pose (tests/model/test_robust.py integrates them).
+TUNING = {
+    "huber": {1: 1.345, 3: 1.7, 6: 2.1},
+    "cauchy": {1: 2.385, 3: 2.8, 6: 3.4},
+    "tukey": {1: 4.685, 3: 5.5, 6: 6.6},
+}
+
+
+class Loss(eqx.Module):
+    """A robust loss by its name."""
+
+    name: LossName = eqx.field(static=True)
+
+    def _constant(self, rows: int) -> float:
+        table = TUNING[self.name]
+        return table.get(rows) or table[3]
+
+    def cost_and_weight(self, white: Float[AnyArray, "r m"]) -> tuple[Float[AnyArray, " m"], Float[AnyArray, " m"]]:
+        """Cost and weight of every pose."""
+        xp, c2 = namespace(white), self._constant(white.shape[0]) ** 2
+        s = xp.sum(white**2, axis=0) / c2
+        if self.name == "huber":
+            inside = s <= 1
+            root = xp.sqrt(xp.where(inside, 1.0, s))
+            rho, weight = xp.where(inside, s, 2 * root - 1), 1 / root
+        elif self.name == "cauchy":
+            rho, weight = xp.log1p(s), 1 / (1 + s)
+        else:
+            inside = xp.minimum(s, 1.0)
+            rho, weight = (1 - (1 - inside) ** 3) / 3, (1 - inside) ** 2
+        return 0.5 * c2 * rho, weight
+
+    def transformed(self, white: Float[AnyArray, "r m"]) -> Float[AnyArray, "r m"]:
+        """Residuals whose squares are twice the cost."""
+        xp, c2 = namespace(white), self._constant(white.shape[0]) ** 2
+        square = xp.sum(white**2, axis=0)
+        small = square < 1e-12 * c2
+        cost, _ = self.cost_and_weight(white)
+        return white * xp.where(small, 1.0, xp.sqrt(2 * xp.where(small, 0.5, cost) / xp.where(small, 1.0, square)))

@@ -1,0 +1,237 @@
+"""Covariance of a calibration from observations of all kinds, by the law of propagation (JCGM 100).
+
+Rows are whitened residuals w = R e of the errors e: of the readings and of the seat, which reach them through the arm,
+and of what was measured. The estimate follows them as dz = -G A w, with A the whitened derivatives (z, rows) and G the
+inverse of the information A A^T, so its covariance is G A C A^T G, with C that of the rows.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.linear_algebra import inverse_positive_definite
+from ..core.namespace import AnyArray, namespace, while_loop
+from ..core.units import ARCSEC
+from ..data.noise import Noise, noise_of
+from ..kinematics.chain import ForwardPass
+from ..kinematics.jacobian import jacobian_columns
+from ..model.observed import Linear, Observed, Whitening, whitened
+
+_LEAST_SIGMA = 1e-9  # mm
+_ROUNDS = 100
+
+
+class ArmErrors(NamedTuple):
+    """How errors of one observation's poses reach its rows."""
+
+    by_readings: Float[AnyArray, "r n m"]  # mm (or rad) a rad
+    by_seat: Float[AnyArray, "r c m"]  # of the tip's position, and of its orientation as far as the tip's lever goes
+
+
+def arm_errors(forward: ForwardPass, linear: list[Linear], observed: Observed) -> list[ArmErrors]:
+    """Of every observation."""
+    xp = namespace(forward, [part.jacobian for part in linear])
+    theta = jacobian_columns(forward)["theta"]  # (n, 3, N)
+    # An arm whose tips err by s turns them by about s over its size.
+    size = xp.sqrt(xp.mean(xp.sum(forward.tip**2, axis=0)))
+    found = []
+    for part, rows in zip(linear, observed.slices, strict=True):
+        by_tip, by_rotation = part.rows.by_tip, part.rows.by_rotation
+        by_readings = xp.einsum("rcm,ncm->rnm", by_tip, theta[..., rows])
+        by_seat = by_tip
+        if by_rotation is not None:
+            by_readings = by_readings + xp.einsum("rcm,ncm->rnm", by_rotation, forward.z_before[..., rows])
+            by_seat = xp.concatenate([by_tip, by_rotation / size], axis=1)
+        found.append(ArmErrors(by_readings, by_seat))
+    return found
+
+
+def covariance_of_noise(errors: ArmErrors, noise: Noise) -> Float[AnyArray, "m r r"]:
+    """Of one observation's rows by the noise of readings and seat."""
+    xp = namespace(errors, noise)
+    moved = errors.by_readings * xp.broadcast_to(noise.encoder, (errors.by_readings.shape[1],))[None, :, None]
+    tip = errors.by_seat[:, :3]
+    return _squares(moved) + (noise.seating**2 + 1e-12) * _squares(tip)
+
+
+def covariance_of_sigma(errors: ArmErrors, sigma: Float[AnyArray, ""]) -> Float[AnyArray, "m r r"]:
+    """Of one observation's rows, where every coordinate of a tip scatters by ``sigma``, mm."""
+    return namespace(errors, sigma).maximum(sigma, _LEAST_SIGMA) ** 2 * _squares(errors.by_seat)
+
+
+def _squares(rows: Float[AnyArray, "r c m"]) -> Float[AnyArray, "m r r"]:
+    return namespace(rows).einsum("rcm,scm->mrs", rows, rows)
+
+
+def scatter_of(linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom: int) -> Float[AnyArray, ""]:
+    """Standard deviation of a tip coordinate, mm, with which the residuals are as large as they should be.
+
+    The sum of w.w over all rows equals its degrees of freedom (Paule and Mandel 1982); 0 where what was measured
+    explains more than all. Its derivative is that of the implicit equation.
+    """
+    xp = namespace([part.jacobian for part in linear], errors)
+
+    def excess(log_sigma: Any) -> Any:
+        """Of the weighted sum over its expectation, and the derivative by the logarithm of sigma."""
+        total, slope = -float(degrees_of_freedom), 0.0
+        for part, error in zip(linear, errors, strict=True):
+            of_arm = covariance_of_sigma(error, xp.exp(log_sigma))
+            inverse = inverse_positive_definite(part.rows.measured + of_arm)
+            solved = xp.einsum("mrs,sm->rm", inverse, part.rows.values)
+            total = total + xp.sum(solved * part.rows.values)
+            slope = slope - 2 * xp.einsum("rm,mrs,sm->", solved, of_arm, solved)
+        return total, slope
+
+    def refine(state: tuple[Any, Any]) -> tuple[Any, Any]:
+        count, log_sigma = state
+        total, slope = excess(log_sigma)
+        step = (
+            -total
+            / xp.where(slope < 0, slope, -1.0)
+            * xp.where(total > 0, (total + degrees_of_freedom) / degrees_of_freedom, 1.0)
+        )
+        step = xp.clip(step, -2.0, 2.0)
+        done = xp.abs(step) < 1e-12
+        return xp.where(done, _ROUNDS, count + 1), xp.maximum(log_sigma + step, np.log(_LEAST_SIGMA))
+
+    values = xp.concatenate([xp.reshape(part.rows.values, (-1,)) for part in linear])
+    first = xp.log(xp.sqrt(xp.mean(values**2)) + _LEAST_SIGMA)
+    _, found = while_loop(lambda state: state[0] < _ROUNDS, refine, (xp.asarray(0), first))
+    return xp.exp(found)
+
+
+class Moments(NamedTuple):
+    """Estimated variances of the noise: of readings, arcsec^2, and of the seat, mm^2."""
+
+    encoder: Float[AnyArray, ""]
+    seat: Float[AnyArray, ""]
+
+
+def stacked(
+    linear: list[Linear], observed: Observed, whitening: Whitening, size: int
+) -> list[Float[AnyArray, "z r m"]]:
+    """The whitened derivatives of each observation by all unknowns."""
+    found = []
+    for part, root in zip(linear, whitening.roots, strict=True):
+        _, jacobian = whitened(part, root)
+        xp = namespace(jacobian)
+        chosen = (np.arange(size)[:, None] == part.indices[None, :]).astype(float)
+        found.append(xp.einsum("zk,krm->zrm", xp.asarray(chosen), jacobian))
+    return found
+
+
+def moments(
+    linear: list[Linear],
+    errors: list[ArmErrors],
+    rows: list[Float[AnyArray, "z r m"]],
+    whitening: Whitening,
+    inverse: Float[AnyArray, "z z"],
+    sigma: Float[AnyArray, ""],
+) -> Moments:
+    """Both variances from two moments of the whitened residuals w = M e, M = I - A^T G A a projector.
+
+    With D and T the parts of a row's covariance for 1 arcsec and 1 mm, and S that of what was measured,
+    E[w.Dw] = v tr(MDMD) + s tr(MDMT) + tr(MDMS), and likewise with T (Henderson 1953). A negative variance is set to 0
+    and the other taken from the total scatter ``sigma``.
+    """
+    xp = namespace(inverse, sigma, rows)
+    parts: dict[str, list[Any]] = {"D": [], "T": [], "S": []}
+    white = []
+    for part, error, root in zip(linear, errors, whitening.roots, strict=True):
+        readings = xp.einsum("mab,bnm->anm", root, error.by_readings * ARCSEC)
+        seat = xp.einsum("mab,bnm->anm", root, error.by_seat)
+        parts["D"].append(xp.einsum("anm,bnm->abm", readings, readings))
+        parts["T"].append(xp.einsum("anm,bnm->abm", seat, seat))
+        parts["S"].append(xp.einsum("mab,mbc,mdc->adm", root, part.rows.measured, root))
+        white.append(xp.einsum("mab,bm->am", root, part.rows.values))
+
+    def product(a: str, b: str) -> Any:
+        """tr(MAMB)."""
+        both, ka, kb, kab = 0.0, 0.0, 0.0, 0.0
+        for x, y, j in zip(parts[a], parts[b], rows, strict=True):
+            both = both + xp.sum(x * y)
+            jx, jy = xp.einsum("zam,abm->zbm", j, x), xp.einsum("zam,abm->zbm", j, y)
+            ka = ka + _outer(jx, j)
+            kb = kb + _outer(jy, j)
+            kab = kab + _outer(jx, jy)
+        return both - 2 * xp.sum(inverse * kab) + xp.sum((inverse @ ka) * (inverse @ kb).T)
+
+    def seen(a: str) -> Any:
+        return sum(xp.einsum("am,abm,bm->", w, x, w) for w, x in zip(white, parts[a], strict=True))
+
+    dd, dt, tt = product("D", "D"), product("D", "T"), product("T", "T")
+    right_d, right_t = seen("D") - product("D", "S"), seen("T") - product("T", "S")
+    determinant = dd * tt - dt * dt
+    apart = determinant > 1e-9 * dd * tt
+    safe = xp.where(apart, determinant, 1.0)
+    encoder, seat = (tt * right_d - dt * right_t) / safe, (dd * right_t - dt * right_d) / safe
+    alone = xp.maximum(right_d / xp.where(dd > 0, dd, 1.0), 0.0)
+    positive = apart & (encoder > 0)
+    return Moments(
+        xp.where(positive, xp.where(seat > 0, encoder, alone), 0.0),
+        xp.where(positive, xp.maximum(seat, 0.0), sigma**2),
+    )
+
+
+def alone(
+    linear: list[Linear],
+    rows: list[Float[AnyArray, "z r m"]],
+    whitening: Whitening,
+    inverse: Float[AnyArray, "z z"],
+) -> list[Float[AnyArray, "m r r"]]:
+    """Covariance of every pose's whitened rows from its own residual, as it were without the pose in the fit."""
+    found = []
+    for part, root, j in zip(linear, whitening.roots, rows, strict=True):
+        xp = namespace(inverse, j)
+        leverage = xp.einsum("zam,zbm->mab", j, xp.einsum("zy,ybm->zbm", inverse, j))
+        redundancy = inverse_positive_definite(xp.asarray(np.eye(j.shape[1])) * 1.05 - leverage)
+        white = xp.einsum("mab,bm->am", root, part.rows.values)
+        left = xp.einsum("mab,bm->ma", redundancy, white)
+        found.append(left[:, :, None] * left[:, None, :])
+    return found
+
+
+def _outer(one: Float[AnyArray, "z r m"], other: Float[AnyArray, "z r m"]) -> Float[AnyArray, "z z"]:
+    return one.reshape(one.shape[0], -1) @ other.reshape(other.shape[0], -1).T
+
+
+def propagated(
+    linear: list[Linear],
+    errors: list[ArmErrors],
+    rows: list[Float[AnyArray, "z r m"]],
+    whitening: Whitening,
+    inverse: Float[AnyArray, "z z"],
+    relations: Float[AnyArray, "z z"],
+    noise: Noise,
+    pose: np.ndarray,
+) -> Float[AnyArray, "z z"]:
+    """Covariance of the unknowns by the noise; ``relations`` is the information of lengths and certified values.
+
+    Rows with one number in ``pose`` were read at once, so they share the errors of their readings.
+    """
+    xp = namespace(inverse, relations, noise, rows)
+    total, by_readings = relations, []
+    for part, error, root, j in zip(linear, errors, whitening.roots, rows, strict=True):
+        moved = xp.einsum("zam,mab->zbm", j, root)  # by the unwhitened rows
+        measured = xp.einsum("zam,mab->zbm", moved, part.rows.measured)
+        seat = xp.einsum("zam,acm->zcm", moved, error.by_seat)
+        total = total + _outer(measured, moved) + noise.seating**2 * _outer(seat, seat)
+        by_readings.append(xp.einsum("zam,anm->znm", moved, error.by_readings))
+    readings = xp.concatenate(by_readings, axis=2)
+    if len(np.unique(pose)) < len(pose):
+        readings = readings @ xp.asarray((pose[:, None] == np.unique(pose)[None, :]).astype(float))
+    each = xp.broadcast_to(noise.encoder, (readings.shape[1],))
+    readings = readings * each[None, :, None]
+    return inverse @ (total + _outer(readings, readings)) @ inverse
+
+
+def noise_from(found: Moments) -> Noise:
+    """The noise of both variances, one encoder for all."""
+    return noise_of(ARCSEC * _root(found.encoder), _root(found.seat))
+
+
+def _root(value: Float[AnyArray, ""]) -> Float[AnyArray, ""]:
+    # The square root has no derivative at 0, the value of a variance whose estimate is negative.
+    xp = namespace(value)
+    return xp.where(value > 0, xp.sqrt(xp.where(value > 0, value, 1.0)), 0.0)
