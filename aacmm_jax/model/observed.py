@@ -59,7 +59,7 @@ class Observed(eqx.Module):
         """The parts of the unknown geometry, and the unit of each of their numbers."""
         found: dict[str, tuple[str, ...]] = {}
         for observation in self.observations:
-            found |= observation.unknowns
+            found.update(observation.unknowns)
             if observation.target:
                 found[offset_of(observation.target)] = POINT
         return found

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_positive_definite
-from ..core.namespace import AnyArray, namespace, while_loop
+from ..core.namespace import AnyArray, namespace, stop_gradient, while_loop
 from ..core.units import ARCSEC
 from ..data.noise import Noise, noise_of
 from ..kinematics.chain import ForwardPass
@@ -72,8 +72,8 @@ def scatter_of(linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom
     """
     xp = namespace([part.jacobian for part in linear], errors)
 
-    def excess(log_sigma: Any) -> Any:
-        """Of the weighted sum over its expectation, and the derivative by the logarithm of sigma."""
+    def excess(log_sigma: Any, linear: list[Linear], errors: list[ArmErrors]) -> tuple[Any, Any]:
+        """Of the weighted sum over its expectation, and its derivative by the logarithm of sigma."""
         total, slope = -float(degrees_of_freedom), 0.0
         for part, error in zip(linear, errors, strict=True):
             of_arm = covariance_of_sigma(error, xp.exp(log_sigma))
@@ -81,24 +81,26 @@ def scatter_of(linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom
             solved = xp.einsum("mrs,sm->rm", inverse, part.rows.values)
             total = total + xp.sum(solved * part.rows.values)
             slope = slope - 2 * xp.einsum("rm,mrs,sm->", solved, of_arm, solved)
-        return total, slope
+        return total, xp.where(slope < 0, slope, -1.0)
+
+    known = stop_gradient((linear, errors))
 
     def refine(state: tuple[Any, Any]) -> tuple[Any, Any]:
         count, log_sigma = state
-        total, slope = excess(log_sigma)
-        step = (
-            -total
-            / xp.where(slope < 0, slope, -1.0)
-            * xp.where(total > 0, (total + degrees_of_freedom) / degrees_of_freedom, 1.0)
-        )
-        step = xp.clip(step, -2.0, 2.0)
+        total, slope = excess(log_sigma, *known)
+        # Newton's step in the logarithm; far above the root, where the sum falls as a power of sigma, a longer one.
+        longer = xp.where(total > 0, (total + degrees_of_freedom) / degrees_of_freedom, 1.0)
+        step = xp.clip(-total / slope * longer, -2.0, 2.0)
         done = xp.abs(step) < 1e-12
         return xp.where(done, _ROUNDS, count + 1), xp.maximum(log_sigma + step, np.log(_LEAST_SIGMA))
 
-    values = xp.concatenate([xp.reshape(part.rows.values, (-1,)) for part in linear])
+    values = xp.concatenate([xp.reshape(part.rows.values, (-1,)) for part in known[0]])
     first = xp.log(xp.sqrt(xp.mean(values**2)) + _LEAST_SIGMA)
-    _, found = while_loop(lambda state: state[0] < _ROUNDS, refine, (xp.asarray(0), first))
-    return xp.exp(found)
+    _, root = while_loop(lambda state: state[0] < _ROUNDS, refine, (xp.asarray(0), first))
+    # One more step, which is nothing, but carries the derivatives of the implicit equation.
+    total, slope = excess(root, linear, errors)
+    step = xp.where(root > np.log(_LEAST_SIGMA), -total / stop_gradient(slope), 0.0)
+    return xp.exp(root + xp.clip(step, -0.1, 0.1))
 
 
 class Moments(NamedTuple):

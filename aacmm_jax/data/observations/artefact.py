@@ -112,7 +112,7 @@ class Artefact(AbstractObservation):
         return f"coordinates of {self.artefact}"
 
     @property
-    def unknowns(self) -> dict[str, tuple[str, ...]]:
+    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         found = {self.frame: FRAME}
         if self.index is not None:
             found[self.platform] = FRAME

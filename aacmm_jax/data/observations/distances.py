@@ -1,5 +1,6 @@
 """Distances of the tip from an unknown pivot: a telescoping ball bar, a draw wire."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -77,7 +78,7 @@ class Distances(AbstractObservation):
         return f"constant of {self.name}"
 
     @property
-    def unknowns(self) -> dict[str, tuple[str, ...]]:
+    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.pivot: POINT} | ({self.zero: ("mm",)} if self.constant else {})
 
     @property

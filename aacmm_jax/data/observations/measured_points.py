@@ -1,5 +1,6 @@
 """Points of the tip as an instrument saw them: a laser tracker, a coordinate measuring machine, a camera."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -82,7 +83,7 @@ class MeasuredPoints(AbstractObservation):
         return f"frame of {self.station}"
 
     @property
-    def unknowns(self) -> dict[str, tuple[str, ...]]:
+    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.frame: FRAME}
 
     @property

@@ -1,5 +1,6 @@
 """Transforms of a target on the last frame, positions and orientations, as an instrument saw them."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -98,7 +99,7 @@ class MeasuredTransforms(AbstractObservation):
         return f"orientation of {self.target}"
 
     @property
-    def unknowns(self) -> dict[str, tuple[str, ...]]:
+    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.frame: FRAME, self.orientation: ("rad",) * 3}
 
     @property

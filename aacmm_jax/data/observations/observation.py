@@ -58,7 +58,7 @@ class AbstractObservation(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def unknowns(self) -> dict[str, tuple[str, ...]]:
+    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         """Names of the parts of the unknown geometry, and the unit, mm or rad, of each of its numbers. A name that
         several observations use is one geometry."""
 

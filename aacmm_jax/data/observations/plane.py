@@ -1,5 +1,6 @@
 """Planes: the tip touches one, or two parallel ones at a certified distance."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -58,7 +59,7 @@ class Plane(AbstractObservation):
         return f"plane {self.name}"
 
     @property
-    def unknowns(self) -> dict[str, tuple[str, ...]]:
+    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.place: PLANE}
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
@@ -142,7 +143,7 @@ class ParallelPlanes(AbstractObservation):
         return f"distance of {self.name}"
 
     @property
-    def unknowns(self) -> dict[str, tuple[str, ...]]:
+    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.place: PLANE} | ({self.separation: ("mm",)} if self.free else {})
 
     @property

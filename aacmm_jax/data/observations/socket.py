@@ -1,5 +1,6 @@
 """A socket: the tip is at one point, whose position is unknown."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -51,7 +52,7 @@ class Socket(AbstractObservation):
         return position_of(self.name)
 
     @property
-    def unknowns(self) -> dict[str, tuple[str, ...]]:
+    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.position: POINT}
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:

@@ -1,5 +1,6 @@
 """A sphere: the tip touches it, so it is at one distance from an unknown centre."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -90,7 +91,7 @@ class Sphere(AbstractObservation):
         return f"radius of {self.name}"
 
     @property
-    def unknowns(self) -> dict[str, tuple[str, ...]]:
+    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.centre: POINT} | ({self.size: ("mm",)} if self.free else {})
 
     @property
