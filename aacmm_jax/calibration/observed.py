@@ -331,7 +331,7 @@ def _metrics(
         weights=tuple(weights),
     )
     sockets = [i for i, kind in enumerate(metrics.kinds) if kind == "socket"]
-    return (*(_repeatability(state, sockets) for state in (before, after)), metrics)
+    return _repeatability(before, sockets), _repeatability(after, sockets), metrics
 
 
 def _repeatability(state: State, sockets: list[int]) -> Repeatability:

@@ -17,6 +17,7 @@ from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture, ReferenceLength
 from .noise import Noise
+from .observations.observation import AbstractObservation, AbstractSimulated
 
 
 @checked_arguments
@@ -31,6 +32,7 @@ def simulate(
     seating: float | None = None,
     resolution_arcsec: float = 0.0,
     limits: Sequence[Sequence[float]] | None = None,
+    observations: Iterable[AbstractSimulated] = (),
     seed: int = 0,
 ) -> Capture:
     """Record a capture with a simulated arm; without noise unless asked for.
@@ -49,6 +51,7 @@ def simulate(
         seating: Short form of ``Noise(seating=...)``, mm.
         resolution_arcsec: Readings are rounded to multiples of it; 0 for none.
         limits: Lowest and highest reading of each joint, ``(n, 2)``, rad; by default the arm's own, else +-pi.
+        observations: Other observations to record (`data.observations`), with their true geometry.
         seed: Seed of poses and noise.
 
     Returns:
@@ -62,7 +65,8 @@ def simulate(
         raise InputError("simulate takes one arm, not a batch; take one of it first.")
     check_finite(arm=arm, noise=noise)
     noise.check_joints(arm.joints)
-    if not isinstance(sockets, Mapping) or not sockets:
+    simulated = items_of(observations, "observations")
+    if not isinstance(sockets, Mapping) or not (sockets or simulated):
         raise InputError("simulate needs at least one socket with its position.")
     limits_array = np.asarray(joint_limits(arm, limits))
     arm, noise = to_numpy((arm, noise))
@@ -70,18 +74,54 @@ def simulate(
     counts = _counts(points, poses)
     reach_key, seat_key, encoder_key, length_key = jax.random.split(random_key(seed), 4)
     owner = [name for name, count in counts.items() for _ in range(count)]
-    rows = np.stack([np.asarray(point) for point in points.values()])
+    rows = np.array([np.asarray(point) for point in points.values()]).reshape(-1, 3)
     exact = np.repeat(rows, list(counts.values()), axis=0)
     targets = exact + noise.seating * random_numbers("normal", seat_key, exact.shape)
     references = _reference_lengths(points, lengths, length_key)
     labels = [f"socket '{name}'" for name in owner]
     angles = random_configurations(arm, targets, reach_key, limits_array, labels=labels)
-    angles = angles + noise.encoder * random_numbers("normal", encoder_key, angles.shape)
-    if resolution_arcsec > 0:
-        angles = np.round(angles / (resolution_arcsec * ARCSEC)) * (resolution_arcsec * ARCSEC)
+    angles = _read(angles, noise, encoder_key, resolution_arcsec)
+    others = [
+        _recorded(arm, one, noise, jax.random.fold_in(random_key(seed), number), limits_array, resolution_arcsec)
+        for number, one in enumerate(simulated)
+    ]
     ends = np.cumsum(list(counts.values()))
     readings = {name: angles[end - count : end] for (name, count), end in zip(counts.items(), ends, strict=True)}
-    return Capture(readings, references)
+    return Capture(readings, references, others)
+
+
+def _read(angles: np.ndarray, noise: Noise, key: Array, resolution_arcsec: float) -> np.ndarray:
+    """What the encoders show."""
+    angles = angles + noise.encoder * random_numbers("normal", key, angles.shape)
+    if resolution_arcsec > 0:
+        angles = np.round(angles / (resolution_arcsec * ARCSEC)) * (resolution_arcsec * ARCSEC)
+    return angles
+
+
+def _recorded(
+    arm: Arm,
+    simulated: AbstractSimulated,
+    noise: Noise,
+    key: Array,
+    limits: np.ndarray,
+    resolution_arcsec: float,
+) -> AbstractObservation:
+    """One simulated observation."""
+    if not isinstance(simulated, AbstractSimulated):
+        raise InputError(
+            f"{simulated!r} cannot be simulated; give one of aj.data.observations, such as SimulatedSphere."
+        )
+    reach_key, seat_key, encoder_key, own_key = jax.random.split(key, 4)
+    random = np.random.default_rng(np.asarray(jax.random.key_data(own_key)))
+    holding = arm if simulated.offset is None else to_numpy(arm.replace(probe=simulated.offset))
+    exact = simulated.tips(random)
+    seated = exact + noise.seating * random_numbers("normal", seat_key, exact.shape)
+    labels = [f"observation '{simulated.name}'"] * len(exact)
+    angles = random_configurations(holding, seated, reach_key, limits, labels=labels)
+    transforms = np.asarray(holding.pose(angles)).copy()
+    # An instrument sees the tip where it is; what is owed to the seat moves the tip, and not what it is compared with.
+    transforms[:, :3, 3] = exact
+    return simulated.recorded(_read(angles, noise, encoder_key, resolution_arcsec), transforms, random)
 
 
 def _noise(noise: Any, encoder_arcsec: Any, seating: Any, resolution_arcsec: Any) -> Noise:

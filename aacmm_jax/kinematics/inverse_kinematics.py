@@ -145,7 +145,7 @@ def random_configurations(
     wanted = targets.shape[0]
     angles = np.zeros((wanted, arm.joints))
     missing = np.arange(wanted)
-    for round_number in range(_ROUNDS * (1 + wanted // _BATCH)):
+    for round_number in range(_ROUNDS * (1 + wanted // _BATCH) if wanted else 0):
         # Every missing target is tried, several times at once if they are few; the first success counts.
         tried = np.resize(missing, _BATCH)
         key_of_round = jax.random.fold_in(key, round_number)
@@ -156,6 +156,8 @@ def random_configurations(
         missing = np.setdiff1d(missing, tried[successes])
         if not len(missing):
             return angles
+    if not wanted:
+        return angles
     links = float(np.abs(arm.a).sum() + np.abs(arm.d).sum() + np.linalg.norm(arm.probe))
     point = ", ".join(f"{round(float(x)):.6g}" for x in np.asarray(targets[missing[0]]))
     what = labels[missing[0]] if labels else "the target"

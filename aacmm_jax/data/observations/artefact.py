@@ -16,6 +16,7 @@ from .measured_points import check_spread
 from .observation import (
     FRAME,
     AbstractObservation,
+    AbstractSimulated,
     Rows,
     Tips,
     Unknowns,
@@ -169,3 +170,48 @@ class Artefact(AbstractObservation):
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         if len(set(self.owner)) > 2:
             check_spread(f"artefact '{self.name}'", np.asarray(self.coordinates)[np.array(self.owner)].T)
+
+
+class SimulatedArtefact(AbstractSimulated):
+    """Poses in every point of an artefact.
+
+    Args:
+        name: Name of the observation.
+        points: Name of a point -> its true coordinates in the artefact's frame ``(3,)``, mm.
+        poses: Number of poses in each point.
+        frame: The artefact's frame in the base frame: rotation vector (rad) and origin (mm), ``(6,)``.
+        errors: Errors of the certified coordinates ``(c, 3)``, mm, which all placements share.
+        u: Their standard uncertainty, mm.
+        artefact: Name of the artefact, by default that of the observation.
+        placement: Name of the placement, likewise.
+        index: Name of the index of a platform.
+    """
+
+    name: str = eqx.field(static=True)
+    points: dict[str, tuple[float, float, float]] = eqx.field(static=True)
+    poses: int = eqx.field(static=True)
+    frame: np.ndarray = eqx.field(converter=np.asarray, default=(0.0,) * 6)
+    errors: np.ndarray | None = None
+    u: float = 0.0
+    artefact: str | None = eqx.field(static=True, default=None)
+    placement: str | None = eqx.field(static=True, default=None)
+    index: str | None = eqx.field(static=True, default=None)
+
+    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+        coordinates = np.repeat(np.array(list(self.points.values())), self.poses, axis=0)
+        return coordinates @ rotation_matrix(self.frame[:3]).T + self.frame[3:]
+
+    def recorded(
+        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
+    ) -> Artefact:
+        certified = np.array(list(self.points.values())) + (0.0 if self.errors is None else self.errors)
+        blocks = q.reshape(len(self.points), self.poses, -1)
+        return Artefact(
+            self.name,
+            dict(zip(self.points, certified, strict=True)),
+            dict(zip(self.points, blocks, strict=True)),
+            u=self.u,
+            artefact=self.artefact,
+            placement=self.placement,
+            index=self.index,
+        )

@@ -14,6 +14,7 @@ from ...core.namespace import AnyArray, namespace
 from .observation import (
     POINT,
     AbstractObservation,
+    AbstractSimulated,
     Rows,
     Tips,
     Unknowns,
@@ -116,3 +117,30 @@ class Distances(AbstractObservation):
             raise InputError(
                 f"observation '{self.name}' has {tips.shape[1]} distances, but its pivot needs four; measure more."
             )
+
+
+class SimulatedDistances(AbstractSimulated):
+    """Distances from a pivot to random places in a box.
+
+    Args:
+        name: Name of the observation.
+        box: Lowest and highest coordinates of the tip ``(2, 3)`` in the base frame, mm.
+        poses: Number of distances.
+        pivot: The pivot in the base frame ``(3,)``, mm.
+        u: Standard uncertainty of each distance, mm.
+    """
+
+    name: str = eqx.field(static=True)
+    box: np.ndarray = eqx.field(converter=np.asarray)
+    poses: int = eqx.field(static=True)
+    pivot: np.ndarray = eqx.field(converter=np.asarray)
+    u: float = 0.0
+
+    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+        return random.uniform(*self.box, (self.poses, 3))
+
+    def recorded(
+        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
+    ) -> Distances:
+        true = np.linalg.norm(transforms[:, :3, 3] - self.pivot, axis=1)
+        return Distances(self.name, q, true + self.u * random.normal(size=len(q)), u=self.u)

@@ -15,6 +15,7 @@ from .frames import frame_and_offset, placed
 from .observation import (
     FRAME,
     AbstractObservation,
+    AbstractSimulated,
     Rows,
     Tips,
     Unknowns,
@@ -122,3 +123,38 @@ def check_spread(where: str, points: Float[np.ndarray, "3 m"]) -> None:
         raise InputError(
             f"the points of {where} are on one line, about which its frame can turn; measure points beside the line."
         )
+
+
+class SimulatedPoints(AbstractSimulated):
+    """Points that an instrument measures at random places in a box.
+
+    Args:
+        name: Name of the observation.
+        box: Lowest and highest coordinates of the tip ``(2, 3)`` in the base frame, mm.
+        poses: Number of points.
+        frame: The instrument's frame in the base frame: rotation vector (rad) and origin (mm), ``(6,)``.
+        u: Standard uncertainty of each coordinate, mm.
+        target: Name of the target, and ``offset``, its true place in the last frame, mm; by default the arm's probe.
+    """
+
+    name: str = eqx.field(static=True)
+    box: np.ndarray = eqx.field(converter=np.asarray)
+    poses: int = eqx.field(static=True)
+    frame: np.ndarray = eqx.field(converter=np.asarray, default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    u: float = 0.0
+    target: str = eqx.field(static=True, default="")
+    place: tuple[float, float, float] | None = eqx.field(static=True, default=None)
+
+    @property
+    def offset(self) -> Float[np.ndarray, " 3"] | None:
+        return None if self.place is None else np.asarray(self.place)
+
+    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+        return random.uniform(*self.box, (self.poses, 3))
+
+    def recorded(
+        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
+    ) -> MeasuredPoints:
+        rotation = rotation_matrix(self.frame[:3])
+        points = (transforms[:, :3, 3] - self.frame[3:]) @ rotation + self.u * random.normal(size=(len(q), 3))
+        return MeasuredPoints(self.name, q, points, u=self.u, target=self.target)

@@ -16,6 +16,7 @@ from .measured_points import check_spread
 from .observation import (
     FRAME,
     AbstractObservation,
+    AbstractSimulated,
     Rows,
     Tips,
     Unknowns,
@@ -172,3 +173,46 @@ def _logarithm(
     skew = xp.stack(columns, axis=1)
     twice = xp.einsum("ijm,jkm->ikm", skew, skew)
     return w, identity - skew / 2 + c * twice, identity + skew / 2 + c * twice
+
+
+class SimulatedTransforms(AbstractSimulated):
+    """Transforms of a target that an instrument measures at random places in a box.
+
+    Args:
+        name: Name of the observation, and of the target.
+        box: Lowest and highest coordinates of the target ``(2, 3)`` in the base frame, mm.
+        poses: Number of transforms.
+        offset_and_orientation: True place (mm) and rotation vector (rad) of the target in the last frame ``(6,)``.
+        frame: The instrument's frame in the base frame: rotation vector (rad) and origin (mm), ``(6,)``.
+        u: Standard uncertainty of each coordinate, mm.
+        u_angle: Standard uncertainty about each axis, rad.
+    """
+
+    name: str = eqx.field(static=True)
+    box: np.ndarray = eqx.field(converter=np.asarray)
+    poses: int = eqx.field(static=True)
+    offset_and_orientation: np.ndarray = eqx.field(converter=np.asarray, default=(0.0,) * 6)
+    frame: np.ndarray = eqx.field(converter=np.asarray, default=(0.0,) * 6)
+    u: float = 0.0
+    u_angle: float = 1e-4
+
+    @property
+    def offset(self) -> Float[np.ndarray, " 3"] | None:
+        return self.offset_and_orientation[:3]
+
+    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+        return random.uniform(*self.box, (self.poses, 3))
+
+    def recorded(
+        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
+    ) -> MeasuredTransforms:
+        station, target = rotation_matrix(self.frame[:3]), rotation_matrix(self.offset_and_orientation[3:])
+        points = (transforms[:, :3, 3] - self.frame[3:]) @ station + self.u * random.normal(size=(len(q), 3))
+        errors = self.u_angle * random.normal(size=(len(q), 3))
+        rotations = np.stack(
+            [
+                rotation_matrix(error) @ station.T @ transform[:3, :3] @ target
+                for error, transform in zip(errors, transforms, strict=True)
+            ]
+        )
+        return MeasuredTransforms(self.name, q, points, rotations, u=self.u, u_angle=self.u_angle)

@@ -181,3 +181,24 @@ def each_pose(matrix: Float[AnyArray, "r c"], poses: int) -> Float[AnyArray, "r 
 def no_covariance(rows: int, poses: int) -> Float[np.ndarray, "m r r"]:
     """Of observations in which nothing was measured but the poses."""
     return np.zeros((poses, rows, rows))
+
+
+class AbstractSimulated(eqx.Module):
+    """An observation to simulate: the true geometry, where the tip goes, and what is then recorded."""
+
+    name: eqx.AbstractVar[str]
+
+    @property
+    def offset(self) -> Float[np.ndarray, " 3"] | None:
+        """The true place of the target in the last frame, mm; None for the arm's own probe."""
+        return None
+
+    @abc.abstractmethod
+    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+        """Where the tip is, mm, without the noise of the seat."""
+
+    @abc.abstractmethod
+    def recorded(
+        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
+    ) -> AbstractObservation:
+        """The observation from the readings, and from the true transforms of the tip."""

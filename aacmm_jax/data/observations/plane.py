@@ -14,6 +14,7 @@ from ...core.namespace import AnyArray, namespace
 from ...core.rotations import cross, rotation_derivative, rotation_matrix
 from .observation import (
     AbstractObservation,
+    AbstractSimulated,
     Rows,
     Tips,
     Unknowns,
@@ -220,3 +221,39 @@ def check_plane(where: str, tips: Float[np.ndarray, "3 m"]) -> None:
     sizes = np.linalg.svd(tips - tips.mean(axis=1, keepdims=True), compute_uv=False)
     if sizes[1] <= 0.02 * sizes[0]:
         raise InputError(f"the touches of {where} are on one line, about which it can tilt; touch it beside the line.")
+
+
+class SimulatedPlanes(AbstractSimulated):
+    """Touches at random places of a rectangle, or of two that face each other.
+
+    Args:
+        name: Name of the plane, or of the pair.
+        corner: A corner of the (first) rectangle in the base frame ``(3,)``, mm.
+        sides: Its two sides as vectors ``(2, 3)``, mm.
+        poses: Number of touches of each plane.
+        distance: True distance to the second plane, along the cross product of the sides; None for one plane.
+        u: Standard uncertainty of the certified distance, mm.
+    """
+
+    name: str = eqx.field(static=True)
+    corner: np.ndarray = eqx.field(converter=np.asarray)
+    sides: np.ndarray = eqx.field(converter=np.asarray)
+    poses: int = eqx.field(static=True)
+    distance: float | None = None
+    u: float = 0.0
+
+    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+        planes = 1 if self.distance is None else 2
+        places = self.corner + random.uniform(size=(planes * self.poses, 2)) @ self.sides
+        if self.distance is not None:
+            normal = np.cross(*self.sides)
+            places[self.poses :] += self.distance * normal / np.linalg.norm(normal)
+        return places
+
+    def recorded(
+        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
+    ) -> Plane | ParallelPlanes:
+        if self.distance is None:
+            return Plane(self.name, q)
+        distance = self.distance + self.u * random.normal()
+        return ParallelPlanes(self.name, q[: self.poses], q[self.poses :], distance, u=self.u)

@@ -14,6 +14,7 @@ from ...core.namespace import AnyArray, namespace
 from .observation import (
     POINT,
     AbstractObservation,
+    AbstractSimulated,
     Rows,
     Tips,
     Unknowns,
@@ -157,3 +158,38 @@ def fitted_sphere(tips: Float[AnyArray, "3 m"]) -> tuple[Float[AnyArray, " 3"], 
     solution = solve_positive_definite(normal, design @ xp.sum(centred**2, axis=0))
     radius = xp.sqrt(xp.maximum(solution[3] + xp.sum(solution[:3] ** 2), 0.0))
     return middle[:, 0] + size * solution[:3], size * radius
+
+
+class SimulatedSphere(AbstractSimulated):
+    """Touches all over a sphere, or over a cap of it.
+
+    Args:
+        name: Name of the sphere.
+        centre: Its centre in the base frame ``(3,)``, mm.
+        diameter: Its true diameter, mm.
+        poses: Number of touches.
+        certified: Whether the diameter is certified.
+        u: Standard uncertainty of the certified diameter, mm.
+        stylus: Diameter of the tip's ball, mm.
+    """
+
+    name: str = eqx.field(static=True)
+    centre: np.ndarray = eqx.field(converter=np.asarray)
+    diameter: float
+    poses: int = eqx.field(static=True)
+    certified: bool = eqx.field(static=True, default=True)
+    u: float = 0.0
+    stylus: float = 0.0
+
+    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+        directions = random.normal(size=(self.poses, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        return self.centre + (self.diameter + self.stylus) / 2 * directions
+
+    def recorded(
+        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
+    ) -> Sphere:
+        if not self.certified:
+            return Sphere(self.name, q)
+        diameter = self.diameter + self.u * random.normal()
+        return Sphere(self.name, q, diameter=diameter, u=self.u, stylus=self.stylus)

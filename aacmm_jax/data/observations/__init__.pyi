@@ -1,0 +1,14 @@
+from .artefact import Artefact as Artefact
+from .artefact import SimulatedArtefact as SimulatedArtefact
+from .distances import Distances as Distances
+from .distances import SimulatedDistances as SimulatedDistances
+from .measured_points import MeasuredPoints as MeasuredPoints
+from .measured_points import SimulatedPoints as SimulatedPoints
+from .measured_transforms import MeasuredTransforms as MeasuredTransforms
+from .measured_transforms import SimulatedTransforms as SimulatedTransforms
+from .plane import ParallelPlanes as ParallelPlanes
+from .plane import Plane as Plane
+from .plane import SimulatedPlanes as SimulatedPlanes
+from .socket import Socket as Socket
+from .sphere import SimulatedSphere as SimulatedSphere
+from .sphere import Sphere as Sphere
