@@ -151,7 +151,8 @@ def _state(task: ObservedTask, space: Parameters, z: Float[AnyArray, " z"], sigm
     errors = propagation.arm_errors(forward, linear, task.observed)
     if sigma is None:
         freedom = max(_equations(task.observed) - z.shape[0], 1)
-        sigma = propagation.scatter_of(linear, errors, freedom)
+        scatter = propagation.scatter_of if task.loss is None else propagation.robust_scatter_of
+        sigma = scatter(linear, errors, freedom)
     return State(linear, errors, sigma)
 
 
@@ -187,7 +188,8 @@ def identify_observed(task: ObservedTask) -> Identification:
     before = _state(task, space, first, _scatter(task, space, first))
     z, evaluations = first, xp.zeros((), dtype=int)
     state, found = before, None
-    for _ in range(2):  # the second with the weights of a nearly right arm
+    # Once more with the weights of a nearly right arm; where the scale of a robust loss comes from the data, twice.
+    for _ in range(2 if task.loss is None or task.noise is not None else 3):
         whitening = _whitening(task, state)
         args = (space, task.observed, whitening, task.loss)
         found = fit(observed_rows, observed_model, z, args, sides, steps, task.max_steps)

@@ -17,10 +17,12 @@ LOSSES = get_args(LossName)
 
 # Constants of 95 % efficiency for normal residuals of r rows a pose (tests/model/test_robust.py integrates them).
 TUNING = {
-    "huber": {1: 1.345, 3: 1.7, 6: 2.1},
-    "cauchy": {1: 2.385, 3: 2.8, 6: 3.4},
-    "tukey": {1: 4.685, 3: 5.5, 6: 6.6},
+    "huber": {1: 1.345, 3: 1.628, 6: 1.869},
+    "cauchy": {1: 2.385, 3: 2.666, 6: 2.862},
+    "tukey": {1: 4.685, 3: 5.490, 6: 6.356},
 }
+# Medians of the chi-square distribution: of the square of a pose's whitened residual.
+MEDIANS = {1: 0.454936, 3: 2.365974, 6: 5.348121}
 
 
 class Loss(eqx.Module):
@@ -29,8 +31,7 @@ class Loss(eqx.Module):
     name: LossName = eqx.field(static=True)
 
     def _constant(self, rows: int) -> float:
-        table = TUNING[self.name]
-        return table.get(rows) or table[3]
+        return TUNING[self.name][rows]
 
     def cost_and_weight(self, white: Float[AnyArray, "r m"]) -> tuple[Float[AnyArray, " m"], Float[AnyArray, " m"]]:
         """Cost and weight of every pose."""

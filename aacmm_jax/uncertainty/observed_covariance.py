@@ -11,15 +11,16 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_positive_definite
-from ..core.namespace import AnyArray, namespace, stop_gradient, while_loop
+from ..core.namespace import AnyArray, namespace, scan, stop_gradient, while_loop
 from ..core.units import ARCSEC
 from ..data.noise import Noise, noise_of
 from ..kinematics.chain import ForwardPass
 from ..kinematics.jacobian import jacobian_columns
 from ..model.observed import Linear, Observed, Whitening, whitened
+from ..model.robust import MEDIANS
 
 _LEAST_SIGMA = 1e-9  # mm
-_ROUNDS = 100
+_ROUNDS, _MEDIAN_ROUNDS = 100, 20
 
 
 class ArmErrors(NamedTuple):
@@ -101,6 +102,25 @@ def scatter_of(linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom
     total, slope = excess(root, linear, errors)
     step = xp.where(root > np.log(_LEAST_SIGMA), -total / stop_gradient(slope), 0.0)
     return xp.exp(root + xp.clip(step, -0.1, 0.1))
+
+
+def robust_scatter_of(linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom: int) -> Float[AnyArray, ""]:
+    """The same from the median of the poses' squared residuals, each over its median for normal errors: a few bad poses
+    do not change it much."""
+    xp = namespace([part.jacobian for part in linear], errors)
+    known = stop_gradient((linear, errors))
+    count = sum(part.rows.values.size for part in linear)
+
+    def rescale(log_sigma: Any, _: Any) -> tuple[Any, Any]:
+        squares = []
+        for part, error in zip(*known, strict=True):
+            inverse = inverse_positive_definite(part.rows.measured + covariance_of_sigma(error, xp.exp(log_sigma)))
+            square = xp.einsum("rm,mrs,sm->m", part.rows.values, inverse, part.rows.values)
+            squares.append(square / MEDIANS[part.rows.values.shape[0]])
+        ratio = xp.median(xp.concatenate(squares)) * count / degrees_of_freedom
+        return xp.maximum(log_sigma + 0.5 * xp.log(ratio + 1e-300), np.log(_LEAST_SIGMA)), xp.zeros(())
+
+    return xp.exp(scan(rescale, xp.log(scatter_of(linear, errors, degrees_of_freedom)), length=_MEDIAN_ROUNDS)[0])
 
 
 class Moments(NamedTuple):
