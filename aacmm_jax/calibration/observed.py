@@ -169,7 +169,7 @@ def _whitening(task: ObservedTask, state: State) -> Whitening:
 def identify_observed(task: ObservedTask) -> Identification:
     """The parameters and the unknown geometry that agree best with everything observed.
 
-    Solved twice: with the weights of the start, and with those of that solution. Where the noise is not given, tips are
+    Solved at least twice: with the weights of the start, and with those of that solution. Where the noise is not given, tips are
     taken to scatter as much as the residuals then do (`observed_covariance.scatter_of`).
     """
     xp = namespace(task)
@@ -188,10 +188,12 @@ def identify_observed(task: ObservedTask) -> Identification:
     before = _state(task, space, first, _scatter(task, space, first))
     z, evaluations = first, xp.zeros((), dtype=int)
     state, found = before, None
-    # Once more with the weights of a nearly right arm; where the scale of a robust loss comes from the data, twice.
-    for _ in range(2 if task.loss is None or task.noise is not None else 3):
+    # Once more with the weights of a nearly right arm. Far from the solution a robust loss would see nothing but bad
+    # poses, so it begins where least squares ends, and one with several minima where Huber's, which has one, ends.
+    losses = [None, None] if task.loss is None else [None, Loss("huber"), task.loss, task.loss]
+    for loss in losses:
         whitening = _whitening(task, state)
-        args = (space, task.observed, whitening, task.loss)
+        args = (space, task.observed, whitening, loss)
         found = fit(observed_rows, observed_model, z, args, sides, steps, task.max_steps)
         z, evaluations = found.parameters, evaluations + found.steps
         state = _state(task, space, z, None)
@@ -287,7 +289,7 @@ def _weighted_rows(loss: Loss, state: State, whitening: Whitening, rows: list[An
     for part, root, row in zip(state.linear, whitening.roots, rows, strict=True):
         xp = namespace(row)
         white = xp.einsum("mab,bm->am", root, part.rows.values)
-        found.append(row * loss.cost_and_weight(white)[1])
+        found.append(row * loss.cost_and_weight(white)[1][None, None])
     return found
 
 

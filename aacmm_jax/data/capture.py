@@ -14,6 +14,7 @@ from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError, nearest
 from ..core.namespace import AnyArray
 from .observations.observation import AbstractObservation, checked_name, checked_readings
+from .observations.socket import Socket
 
 
 class ReferenceLength(eqx.Module):
@@ -111,11 +112,12 @@ class Capture(eqx.Module):
         for length in self.lengths:
             if not isinstance(length, ReferenceLength):
                 raise InputError(f"{length!r} is no reference length; give aj.ReferenceLength(start, end, value, u).")
+            known = (*self.names, *(o.name for o in self.observations if isinstance(o, Socket)))
             for end in (length.start, length.end):
-                if end not in self.names:
+                if end not in known:
                     raise InputError(
                         f"reference length '{length.start}' to '{length.end}' names the unknown socket '{end}'"
-                        f"{nearest(end, self.names)}"
+                        f"{nearest(end, known)}"
                     )
 
     @property
@@ -210,6 +212,46 @@ def _check_different(blocks: Mapping[str, Array | np.ndarray]) -> None:
             twin = seen.setdefault(np.asarray(block).tobytes(), name)
             if twin != name:
                 raise InputError(f"sockets '{twin}' and '{name}' have exactly the same poses; is one file given twice?")
+
+
+def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) -> Capture:
+    """Join captures that one arm took in several sessions, with its probe remounted in between, or on another base.
+
+    Sockets, artefacts and stations of different sessions are different ones; what is unknown of the arm is the same.
+
+    Args:
+        captures: Name of a session -> its capture. Names of sockets and observations become ``session/name``.
+        own_probe: Whether every session after the first has a probe of its own, whose place in the last frame is
+            unknown; False where the probe stayed as it was.
+
+    Returns:
+        One capture of all sessions, to calibrate as a whole.
+
+    Raises:
+        InputError: A capture is a batch, or one has targets in more than one session.
+    """
+    if not isinstance(captures, Mapping) or not captures:
+        raise InputError("the sessions are no dictionary; give the captures by name: {'Monday': capture, ...}.")
+    sockets: dict[str, Numbers] = {}
+    lengths: list[ReferenceLength] = []
+    observations: list[AbstractObservation] = []
+    for number, (session, capture) in enumerate(captures.items()):
+        if not isinstance(capture, Capture):
+            raise InputError(f"session '{session}' is a {type(capture).__name__}; give an aj.Capture.")
+        check_one_capture(capture)
+        checked_name(session, "a session")
+        for name, readings in capture.sockets.items():
+            if number and own_probe:
+                observations.append(Socket(f"{session}/{name}", readings, target=f"probe of {session}"))
+            else:
+                sockets[f"{session}/{name}"] = readings
+        lengths += [
+            ReferenceLength(f"{session}/{length.start}", f"{session}/{length.end}", length.value, length.u)
+            for length in capture.lengths
+        ]
+        own = f"probe of {session}" if number and own_probe else ""
+        observations += [observation.in_session(session, own) for observation in capture.observations]
+    return Capture(sockets, lengths, observations)
 
 
 def stack_captures(captures: Iterable[Capture]) -> Capture:

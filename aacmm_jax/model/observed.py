@@ -140,7 +140,7 @@ class Linear(NamedTuple):
 class Whitening(NamedTuple):
     """What makes rows of standard deviation 1 of the residuals."""
 
-    roots: tuple[Float[AnyArray, "m r r"], ...]  # of each observation, inverse Cholesky factors
+    roots: tuple[Float[AnyArray, "_ _ _"], ...]  # of each observation, inverse Cholesky factors
     lengths: Float[AnyArray, " l"]  # one over a standard deviation
     certified: dict[str, Float[AnyArray, " k"]]
 
@@ -224,7 +224,7 @@ def observed_model(
         if loss is not None:
             each, weight = loss.cost_and_weight(white)
             cost = cost + xp.sum(each)
-            white, jacobian = xp.sqrt(weight) * white, xp.sqrt(weight) * jacobian
+            white, jacobian = xp.sqrt(weight)[None] * white, xp.sqrt(weight)[None, None] * jacobian
         else:
             cost = cost + 0.5 * xp.sum(white**2)
         flat, indices = jacobian.reshape(jacobian.shape[0], -1), linear.indices
@@ -252,14 +252,14 @@ def whitened(linear: Linear, root: Float[AnyArray, "m r r"]) -> tuple[Float[AnyA
     """An observation's residuals and derivatives in standard deviations."""
     xp = namespace(linear.jacobian, root)
     if root.shape[-1] == 1:
-        return root[:, 0, 0] * linear.rows.values, root[:, 0, 0] * linear.jacobian
+        return root[None, :, 0, 0] * linear.rows.values, root[None, None, :, 0, 0] * linear.jacobian
     return xp.einsum("mab,bm->am", root, linear.rows.values), xp.einsum("mab,kbm->kam", root, linear.jacobian)
 
 
 def whitening_of(
     linear: list[Linear],
     observed: Observed,
-    of_arm: list[Float[AnyArray, "m r r"]],
+    of_arm: list[Float[AnyArray, "_ _ _"]],
     least: Float[AnyArray, ""],
 ) -> Whitening:
     """From the covariance of every row: what was measured, plus what the arm's own errors make of it (``of_arm``).

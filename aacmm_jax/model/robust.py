@@ -45,7 +45,7 @@ class Loss(eqx.Module):
             rho, weight = xp.log1p(s), 1 / (1 + s)
         else:
             inside = xp.minimum(s, 1.0)
-            rho, weight = (1 - (1 - inside) ** 3) / 3, (1 - inside) ** 2
+            rho, weight = inside * (1 - inside + inside**2 / 3), (1 - inside) ** 2
         return 0.5 * c2 * rho, weight
 
     def transformed(self, white: Float[AnyArray, "r m"]) -> Float[AnyArray, "r m"]:
@@ -54,4 +54,5 @@ class Loss(eqx.Module):
         square = xp.sum(white**2, axis=0)
         small = square < 1e-12 * c2
         cost, _ = self.cost_and_weight(white)
-        return white * xp.where(small, 1.0, xp.sqrt(2 * xp.where(small, 0.5, cost) / xp.where(small, 1.0, square)))
+        factor = xp.sqrt(2 * xp.where(small, 0.5, cost) / xp.where(small, 1.0, square))
+        return xp.where(small, 1.0, factor)[None] * white

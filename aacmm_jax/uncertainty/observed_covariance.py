@@ -132,7 +132,7 @@ class Moments(NamedTuple):
 
 def stacked(
     linear: list[Linear], observed: Observed, whitening: Whitening, size: int
-) -> list[Float[AnyArray, "z r m"]]:
+) -> list[Float[AnyArray, "_ _ _"]]:
     """The whitened derivatives of each observation by all unknowns."""
     found = []
     for part, root in zip(linear, whitening.roots, strict=True):
@@ -146,7 +146,7 @@ def stacked(
 def moments(
     linear: list[Linear],
     errors: list[ArmErrors],
-    rows: list[Float[AnyArray, "z r m"]],
+    rows: list[Float[AnyArray, "_ _ _"]],
     whitening: Whitening,
     inverse: Float[AnyArray, "z z"],
     sigma: Float[AnyArray, ""],
@@ -198,16 +198,16 @@ def moments(
 
 def alone(
     linear: list[Linear],
-    rows: list[Float[AnyArray, "z r m"]],
+    rows: list[Float[AnyArray, "_ _ _"]],
     whitening: Whitening,
     inverse: Float[AnyArray, "z z"],
-) -> list[Float[AnyArray, "m r r"]]:
+) -> list[Float[AnyArray, "_ _ _"]]:
     """Covariance of every pose's whitened rows from its own residual, as it were without the pose in the fit."""
     found = []
     for part, root, j in zip(linear, whitening.roots, rows, strict=True):
         xp = namespace(inverse, j)
         leverage = xp.einsum("zam,zbm->mab", j, xp.einsum("zy,ybm->zbm", inverse, j))
-        redundancy = inverse_positive_definite(xp.asarray(np.eye(j.shape[1])) * 1.05 - leverage)
+        redundancy = inverse_positive_definite(1.05 * xp.asarray(np.eye(j.shape[1]))[None] - leverage)
         white = xp.einsum("mab,bm->am", root, part.rows.values)
         left = xp.einsum("mab,bm->ma", redundancy, white)
         found.append(left[:, :, None] * left[:, None, :])
@@ -221,7 +221,7 @@ def _outer(one: Float[AnyArray, "z r m"], other: Float[AnyArray, "z r m"]) -> Fl
 def propagated(
     linear: list[Linear],
     errors: list[ArmErrors],
-    rows: list[Float[AnyArray, "z r m"]],
+    rows: list[Float[AnyArray, "_ _ _"]],
     whitening: Whitening,
     inverse: Float[AnyArray, "z z"],
     relations: Float[AnyArray, "z z"],

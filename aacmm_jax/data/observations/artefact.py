@@ -20,6 +20,7 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
+    as_numbers,
     checked_name,
     checked_readings,
     checked_scalar,
@@ -113,6 +114,10 @@ class Artefact(AbstractObservation):
         return f"coordinates of {self.artefact}"
 
     @property
+    def labels(self) -> tuple[str, ...]:
+        return ("name", "placement", "index")
+
+    @property
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         found = {self.frame: FRAME}
         if self.index is not None:
@@ -190,7 +195,7 @@ class SimulatedArtefact(AbstractSimulated):
     name: str = eqx.field(static=True)
     points: dict[str, tuple[float, float, float]] = eqx.field(static=True)
     poses: int = eqx.field(static=True)
-    frame: np.ndarray = eqx.field(converter=np.asarray, default=(0.0,) * 6)
+    frame: np.ndarray = eqx.field(converter=as_numbers, default=(0.0,) * 6)
     errors: np.ndarray | None = None
     u: float = 0.0
     artefact: str | None = eqx.field(static=True, default=None)

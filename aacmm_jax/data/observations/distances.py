@@ -18,6 +18,7 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
+    as_numbers,
     checked_name,
     checked_readings,
     checked_scalar,
@@ -103,7 +104,7 @@ class Distances(AbstractObservation):
         xp, m = namespace(tips, unknowns, self.values), self.q.shape[0]
         between = tips.position - unknowns[self.pivot][:, None]
         distance = xp.sqrt(xp.sum(between**2, axis=0))
-        direction = (between / distance)[None]
+        direction = (between / distance[None])[None]
         by_unknowns = {self.pivot: -direction.swapaxes(0, 1)}
         values = self.values
         if self.constant:
@@ -131,9 +132,9 @@ class SimulatedDistances(AbstractSimulated):
     """
 
     name: str = eqx.field(static=True)
-    box: np.ndarray = eqx.field(converter=np.asarray)
+    box: np.ndarray = eqx.field(converter=as_numbers)
     poses: int = eqx.field(static=True)
-    pivot: np.ndarray = eqx.field(converter=np.asarray)
+    pivot: np.ndarray = eqx.field(converter=as_numbers)
     u: float = 0.0
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:

@@ -19,6 +19,7 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
+    as_numbers,
     checked_covariances,
     checked_name,
     checked_readings,
@@ -84,6 +85,10 @@ class MeasuredPoints(AbstractObservation):
         return f"frame of {self.station}"
 
     @property
+    def labels(self) -> tuple[str, ...]:
+        return ("name", "station")
+
+    @property
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.frame: FRAME}
 
@@ -138,16 +143,16 @@ class SimulatedPoints(AbstractSimulated):
     """
 
     name: str = eqx.field(static=True)
-    box: np.ndarray = eqx.field(converter=np.asarray)
+    box: np.ndarray = eqx.field(converter=as_numbers)
     poses: int = eqx.field(static=True)
-    frame: np.ndarray = eqx.field(converter=np.asarray, default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    frame: np.ndarray = eqx.field(converter=as_numbers, default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     u: float = 0.0
     target: str = eqx.field(static=True, default="")
     place: tuple[float, float, float] | None = eqx.field(static=True, default=None)
 
     @property
     def offset(self) -> Float[np.ndarray, " 3"] | None:
-        return None if self.place is None else np.asarray(self.place)
+        return None if self.place is None else as_numbers(self.place)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         return random.uniform(*self.box, (self.poses, 3))

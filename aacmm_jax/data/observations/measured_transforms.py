@@ -20,6 +20,7 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
+    as_numbers,
     checked_covariances,
     checked_name,
     checked_readings,
@@ -100,6 +101,10 @@ class MeasuredTransforms(AbstractObservation):
         return f"orientation of {self.target}"
 
     @property
+    def labels(self) -> tuple[str, ...]:
+        return ("name", "station")
+
+    @property
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.frame: FRAME, self.orientation: ("rad",) * 3}
 
@@ -163,7 +168,7 @@ def _logarithm(
     small = square < 1e-12
     sine = xp.sqrt(xp.where(small, 1.0, square))
     angle = xp.arctan2(sine, cosine)
-    w = xp.where(small, 1 + square / 6, angle / sine) * sine_axis
+    w = xp.where(small, 1 + square / 6, angle / sine)[None] * sine_axis
     t2 = xp.sum(w**2, axis=0)
     near = t2 < 1e-6
     t = xp.sqrt(xp.where(near, 1.0, t2))
@@ -172,7 +177,7 @@ def _logarithm(
     columns = [cross(w, xp.broadcast_to(identity[:, i], w.shape)) for i in range(3)]
     skew = xp.stack(columns, axis=1)
     twice = xp.einsum("ijm,jkm->ikm", skew, skew)
-    return w, identity - skew / 2 + c * twice, identity + skew / 2 + c * twice
+    return w, identity - skew / 2 + c[None, None] * twice, identity + skew / 2 + c[None, None] * twice
 
 
 class SimulatedTransforms(AbstractSimulated):
@@ -189,10 +194,10 @@ class SimulatedTransforms(AbstractSimulated):
     """
 
     name: str = eqx.field(static=True)
-    box: np.ndarray = eqx.field(converter=np.asarray)
+    box: np.ndarray = eqx.field(converter=as_numbers)
     poses: int = eqx.field(static=True)
-    offset_and_orientation: np.ndarray = eqx.field(converter=np.asarray, default=(0.0,) * 6)
-    frame: np.ndarray = eqx.field(converter=np.asarray, default=(0.0,) * 6)
+    offset_and_orientation: np.ndarray = eqx.field(converter=as_numbers, default=(0.0,) * 6)
+    frame: np.ndarray = eqx.field(converter=as_numbers, default=(0.0,) * 6)
     u: float = 0.0
     u_angle: float = 1e-4
 

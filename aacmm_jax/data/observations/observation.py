@@ -6,8 +6,9 @@ calibration) is the same for all kinds.
 """
 
 import abc
+import copy
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -79,6 +80,22 @@ class AbstractObservation(eqx.Module):
     @abc.abstractmethod
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         """The residuals at these tips and this geometry."""
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Fields that name something of this observation; in another session it is another one."""
+        return ("name",)
+
+    def in_session(self, session: str, probe: str) -> "AbstractObservation":
+        """The same observation in a session of several: with its name, and its own probe where there is one."""
+        names = {
+            label: f"{session}/{getattr(self, label)}" for label in self.labels if getattr(self, label) is not None
+        }
+        target = f"{session}/{self.target}" if self.target else probe
+        changed = copy.copy(self)
+        for field, value in {**names, "target": target}.items():
+            object.__setattr__(changed, field, value)
+        return changed
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         """Raise `InputError` where nearly right tips (mm) cannot determine the unknown geometry."""
@@ -160,7 +177,7 @@ def checked_covariances(where: str, u: Numbers | None, covariance: Numbers | Non
             raise InputError(f"u of {where} is negative; a standard uncertainty must be zero or positive.")
         xp = namespace(array)
         array = xp.broadcast_to(array if array.ndim else array[None], (poses, 3))
-        return array[:, :, None] ** 2 * np.eye(3)
+        return array[:, :, None] ** 2 * np.eye(3)[None]
     array = as_floats(covariance, f"covariance of {where}")
     if array.shape not in ((3, 3), (poses, 3, 3)):
         raise InputError(f"covariance of {where} has shape {array.shape}; give (3, 3) or ({poses}, 3, 3).")
@@ -181,6 +198,11 @@ def each_pose(matrix: Float[AnyArray, "r c"], poses: int) -> Float[AnyArray, "r 
 def no_covariance(rows: int, poses: int) -> Float[np.ndarray, "m r r"]:
     """Of observations in which nothing was measured but the poses."""
     return np.zeros((poses, rows, rows))
+
+
+def as_numbers(values: Any) -> np.ndarray:
+    """True values of a simulation."""
+    return np.asarray(values, dtype=float)
 
 
 class AbstractSimulated(eqx.Module):

@@ -18,6 +18,7 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
+    as_numbers,
     checked_name,
     checked_readings,
     checked_scalar,
@@ -236,8 +237,8 @@ class SimulatedPlanes(AbstractSimulated):
     """
 
     name: str = eqx.field(static=True)
-    corner: np.ndarray = eqx.field(converter=np.asarray)
-    sides: np.ndarray = eqx.field(converter=np.asarray)
+    corner: np.ndarray = eqx.field(converter=as_numbers)
+    sides: np.ndarray = eqx.field(converter=as_numbers)
     poses: int = eqx.field(static=True)
     distance: float | None = None
     u: float = 0.0

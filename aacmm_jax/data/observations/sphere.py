@@ -18,6 +18,7 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
+    as_numbers,
     checked_name,
     checked_readings,
     checked_scalar,
@@ -120,7 +121,7 @@ class Sphere(AbstractObservation):
             identity = each_pose(xp.asarray(np.eye(3)), m)
             return Rows(between, identity, {self.centre: -identity}, no_covariance(3, m))
         distance = xp.sqrt(xp.sum(between**2, axis=0))
-        direction = (between / distance)[None]
+        direction = (between / distance[None])[None]
         radius = unknowns[self.size][0] if self.free else self.radius
         by_unknowns = {self.centre: -direction.swapaxes(0, 1)}
         if self.free:
@@ -174,7 +175,7 @@ class SimulatedSphere(AbstractSimulated):
     """
 
     name: str = eqx.field(static=True)
-    centre: np.ndarray = eqx.field(converter=np.asarray)
+    centre: np.ndarray = eqx.field(converter=as_numbers)
     diameter: float
     poses: int = eqx.field(static=True)
     certified: bool = eqx.field(static=True, default=True)

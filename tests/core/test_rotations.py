@@ -1,0 +1,46 @@
+"""Rotation vectors, their derivatives and fitted frames, against SciPy's rotations and finite differences."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from aacmm_jax.core.rotations import fitted_frame, rotation_derivative, rotation_matrix, rotation_vector
+
+
+@pytest.fixture(params=[1e-9, 1e-4, 0.5, 3.1, np.pi - 1e-7])
+def vectors(request):
+    directions = np.random.default_rng(0).normal(size=(10, 3))
+    return request.param * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def test_matrix_and_vector(vectors):
+    for w in vectors:
+        matrix = rotation_matrix(w)
+        np.testing.assert_allclose(matrix, Rotation.from_rotvec(w).as_matrix(), atol=1e-13)
+        np.testing.assert_allclose(rotation_matrix(rotation_vector(matrix)), matrix, atol=1e-12)
+        assert np.linalg.norm(rotation_vector(matrix)) <= np.pi + 1e-12
+        np.testing.assert_allclose(rotation_vector(jnp.asarray(matrix)), rotation_vector(matrix), atol=1e-9)
+
+
+def test_derivative(vectors):
+    step = 1e-6
+    for w in vectors:
+        for k in range(3):
+            shift = step * np.eye(3)[k]
+            change = rotation_matrix(w + shift) @ rotation_matrix(w - shift).T
+            numerical = Rotation.from_matrix(change).as_rotvec() / (2 * step)
+            np.testing.assert_allclose(rotation_derivative(w)[:, k], numerical, atol=1e-8)
+
+
+@pytest.mark.parametrize("plane", [False, True])
+def test_fitted_frame(vectors, plane):
+    """Exact where there is an exact frame, also of points in a plane; never a mirror image."""
+    points = np.random.default_rng(1).normal(size=(3, 7)) * 100
+    points[2] *= not plane
+    for w in vectors:
+        target = rotation_matrix(w) @ points + np.array([[10.0], [-2000.0], [30.0]])
+        for frame in (fitted_frame(points, target), np.asarray(fitted_frame(jnp.asarray(points), jnp.asarray(target)))):
+            np.testing.assert_allclose(rotation_matrix(frame[:3]) @ points + frame[3:, None], target, atol=1e-8)
+    mirrored = fitted_frame(points, points * np.array([[1.0], [1.0], [-1.0]]) if not plane else -points)
+    assert np.linalg.det(rotation_matrix(mirrored[:3])) > 0

@@ -1,0 +1,137 @@
+"""Every kind of observation: derivatives of its residuals, its start, and what it refuses."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import aacmm_jax as aj
+from aacmm_jax.core.namespace import to_numpy
+from aacmm_jax.data import observations as kinds
+from aacmm_jax.data.observations.observation import Tips
+
+RANDOM = np.random.default_rng(1)
+POSES = 12
+Q = RANDOM.normal(size=(POSES, 6))
+AXES = Rotation.random(POSES, random_state=1).as_matrix()
+TIPS = Tips(RANDOM.normal(size=(3, POSES)) * 300, tuple(AXES[:, :, i].T for i in range(3)))
+STATION, ORIGIN = Rotation.from_rotvec([0.3, -1.0, 2.0]), np.array([100.0, 200.0, -50.0])
+POINTS = STATION.inv().apply(TIPS.position.T - ORIGIN) + RANDOM.normal(size=(POSES, 3))
+TURNED = STATION.inv() * Rotation.from_matrix(AXES) * Rotation.from_rotvec([0.5, 0.2, -0.7])
+MEASURED = (TURNED * Rotation.from_rotvec(0.01 * RANDOM.normal(size=(POSES, 3)))).as_matrix()
+CORNERS = {"a": [0, 0, 0], "b": [100, 0, 0], "c": [3, 4, 100]}
+IN_CORNERS = {"a": Q[:4], "b": Q[4:8], "c": Q[8:]}
+ALL = {
+    "socket": kinds.Socket("A", Q),
+    "points": kinds.MeasuredPoints("p", Q, POINTS, u=[0.1, 0.2, 0.3]),
+    "target": kinds.MeasuredPoints("p", Q, POINTS, covariance=np.diag([1.0, 2.0, 3.0]), target="smr"),
+    "transforms": kinds.MeasuredTransforms("x", Q, POINTS, MEASURED, u_angle=1e-3, u=0.1),
+    "sphere": kinds.Sphere("s", Q),
+    "certified sphere": kinds.Sphere("s", Q, diameter=100, u=0.1, stylus=4),
+    "exact sphere": kinds.Sphere("s", Q, diameter=100),
+    "point": kinds.Sphere("s", Q, diameter=0),
+    "plane": kinds.Plane("f", Q, form=0.01),
+    "planes": kinds.ParallelPlanes("f", Q[:6], Q[6:], 50.0, u=0.1, stylus=3.0),
+    "exact planes": kinds.ParallelPlanes("f", Q[:6], Q[6:], 50.0, inside=True, stylus=3.0),
+    "artefact": kinds.Artefact("t", CORNERS, IN_CORNERS),
+    "indexed artefact": kinds.Artefact("t", CORNERS, IN_CORNERS, u=0.1, index="1"),
+    "distances": kinds.Distances("d", Q, np.linalg.norm(TIPS.position, axis=0), u=0.1),
+    "distances with a constant": kinds.Distances("d", Q, np.linalg.norm(TIPS.position, axis=0), constant=True),
+}
+
+
+def unknowns_of(observation):
+    found = observation.start(TIPS, np.zeros(3))
+    random = np.random.default_rng(2)
+    return {name: np.asarray(value) + 1e-2 * random.normal(size=np.shape(value)) for name, value in found.items()}
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_shapes_and_derivatives(name):
+    """Analytic derivatives by the tips, their orientation and every unknown agree with central differences."""
+    observation = to_numpy(ALL[name])
+    unknowns = unknowns_of(observation)
+    rows = observation.residual(TIPS, unknowns)
+    assert rows.values.shape == (observation.rows, POSES)
+    assert rows.measured.shape == (POSES, observation.rows, observation.rows)
+    assert set(rows.by_unknowns) == set(observation.unknowns)
+    for part, units in observation.unknowns.items():
+        assert unknowns[part].shape == (len(units),)
+        for i in range(len(units)):
+            step = 1e-6 * max(1.0, abs(unknowns[part][i])) * np.eye(len(units))[i]
+            plus, minus = (
+                observation.residual(TIPS, unknowns | {part: unknowns[part] + s * step}).values for s in (1, -1)
+            )
+            numerical = (plus - minus) / (2 * np.sum(step))
+            tolerance = 1e-6 * max(1.0, np.abs(numerical).max())
+            np.testing.assert_allclose(rows.by_unknowns[part][i], numerical, atol=tolerance)
+    for c in range(3):
+        shift = 1e-4 * np.eye(3)[c][:, None]
+        plus, minus = (
+            observation.residual(TIPS._replace(position=TIPS.position + s * shift), unknowns).values for s in (1, -1)
+        )
+        np.testing.assert_allclose(rows.by_tip[:, c], (plus - minus) / 2e-4, atol=1e-6)
+        if rows.by_rotation is not None:
+            turns = [Rotation.from_rotvec(s * 1e-5 * np.eye(3)[c]).as_matrix() for s in (1, -1)]
+            plus, minus = (
+                observation.residual(TIPS._replace(axes=tuple(turn @ axis for axis in TIPS.axes)), unknowns).values
+                for turn in turns
+            )
+            np.testing.assert_allclose(rows.by_rotation[:, c], (plus - minus) / 2e-5, atol=1e-8)
+
+
+def test_starts_are_exact_for_exact_data(paper_arm):
+    """Without noise and by the true arm, the closed forms find the geometry, also of targets at an unknown place."""
+    box = [[200, -300, 100], [600, 300, 500]]
+    frame = (0.1, 0.2, 3.0, 1000.0, 2000.0, -300.0)
+    bar = {"a": (0, 0, 0), "b": (300, 0, 0), "c": (0, 200, 0)}
+    simulated = [
+        kinds.SimulatedPoints("T", box, 12, frame, target="smr", place=(10, 20, 80)),
+        kinds.SimulatedTransforms("T6", box, 12, (10, 20, 80, 0.1, 0.2, 0.3), frame, u_angle=1e-12),
+        kinds.SimulatedSphere("s", (400, 0, 300), 50.0, 12, certified=False),
+        kinds.SimulatedPlanes("p", (300, -100, 200), [(0, 200, 0), (150, 0, 60)], 6, distance=40.0),
+        kinds.SimulatedArtefact("bar", bar, 4, (0.3, 0, 1.5, 350, -100, 250)),
+        kinds.SimulatedDistances("d", box, 12, (900, 300, 100)),
+    ]
+    capture = aj.simulate(paper_arm, {}, observations=simulated, seed=3)
+    for observation in to_numpy(capture.observations):
+        arm = paper_arm
+        probe = np.asarray(arm.probe)
+        poses = np.asarray(arm.pose(observation.q))
+        axes = tuple(poses[:, :3, i].T for i in range(3))
+        tips = Tips(poses[:, :3, 3].T, axes)
+        found = {name: np.asarray(value) for name, value in observation.start(tips, probe).items()}
+        if observation.target:
+            offset = found[f"offset of {observation.target}"]
+            np.testing.assert_allclose(offset, (10, 20, 80), atol=1e-3)
+            moved = tips.position + np.einsum("pcm,p->cm", np.stack(axes), offset - probe)
+            tips = tips._replace(position=moved)
+        assert np.abs(observation.residual(tips, found).values).max() < 1e-3, observation.kind
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: kinds.MeasuredPoints("p", Q, POINTS[:5]), "shape (5, 3)"),
+        (lambda: kinds.MeasuredPoints("p", Q, POINTS, u=-1), "negative"),
+        (lambda: kinds.MeasuredPoints("p", Q, POINTS, u=1, covariance=np.eye(3)), "both given"),
+        (lambda: kinds.MeasuredPoints("p", Q, POINTS, covariance=-np.eye(3)), "not symmetric and positive"),
+        (lambda: kinds.MeasuredPoints("", Q, POINTS), "name of one line"),
+        (lambda: kinds.MeasuredPoints("p", np.degrees(Q) * 10, POINTS), "look like degrees"),
+        (lambda: kinds.MeasuredTransforms("p", Q, POINTS, 2 * MEASURED, u_angle=1e-3), "no rotation"),
+        (lambda: kinds.MeasuredTransforms("p", Q, POINTS, MEASURED, u_angle=0.0), "must be positive"),
+        (lambda: kinds.Sphere("s", Q, diameter=-1), "zero or positive"),
+        (lambda: kinds.ParallelPlanes("f", Q, Q[:, :5], 10.0), "6 and 5 columns"),
+        (lambda: kinds.ParallelPlanes("f", Q, Q, 0.0), "must be positive"),
+        (lambda: kinds.Artefact("t", CORNERS, {"d": Q}), "has no coordinates"),
+        (lambda: kinds.Artefact("t", CORNERS, {}), "two dictionaries"),
+        (lambda: kinds.Distances("d", Q, np.ones(3)), "shape (3,)"),
+        (lambda: aj.Capture({}, [], [kinds.Sphere("s", Q), kinds.Sphere("s", Q)]), "two observations have the name"),
+        (lambda: aj.Capture({"A": Q[:, :5]}, [], [kinds.Sphere("s", Q)]), "6 columns"),
+        (lambda: aj.Capture({}), "at least one socket"),
+    ],
+)
+def test_bad_input(make, message):
+    with pytest.raises(aj.InputError) as caught:
+        make()
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)

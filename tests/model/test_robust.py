@@ -1,0 +1,40 @@
+"""Robust losses: their efficiency for normal residuals, and the relations between cost, weight and residual."""
+
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+from aacmm_jax.model.robust import LOSSES, MEDIANS, TUNING, Loss
+
+
+@pytest.mark.parametrize("rows", [1, 3, 6])
+@pytest.mark.parametrize("name", LOSSES)
+def test_tuning_constants_give_95_percent(name, rows):
+    """Efficiency of the estimate of a shift, A^2 / B with A = E[w + 2/r w' |x|^2] and B = E[w^2 |x|^2] / r."""
+    loss = Loss(name)
+    root = np.linspace(1e-6, 9.0, 200_001)
+    square = root**2
+    density = stats.chi(rows).pdf(root)
+    white = np.zeros((rows, len(root)))
+    white[0] = root
+    weight = loss.cost_and_weight(white)[1]
+    slope = np.gradient(weight, square)
+    a = np.trapezoid((weight + 2 / rows * slope * square) * density, root)
+    b = np.trapezoid(weight**2 * square * density, root) / rows
+    assert a**2 / b == pytest.approx(0.95, abs=2e-3)
+    assert MEDIANS[rows] == pytest.approx(stats.chi2(rows).median(), abs=1e-5)
+    assert rows in TUNING[name]
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_cost_weight_and_transformed_residual(name):
+    """The weight is the derivative of the cost by half the square; transformed residuals have that cost."""
+    loss, white = Loss(name), np.random.default_rng(0).normal(size=(3, 50)) * np.geomspace(1e-9, 30, 50)
+    cost, weight = loss.cost_and_weight(white)
+    gradient = jax.grad(lambda x: loss.cost_and_weight(x)[0].sum())(jax.numpy.asarray(white))
+    np.testing.assert_allclose(gradient, weight * white, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(np.sum(loss.transformed(white) ** 2, axis=0), 2 * cost, rtol=1e-8)
+    by_transformed = jax.grad(lambda x: 0.5 * (loss.transformed(x) ** 2).sum())(jax.numpy.asarray(white))
+    np.testing.assert_allclose(by_transformed, gradient, rtol=1e-6, atol=1e-12)
+    assert np.all(np.diff(weight[np.argsort(np.sum(white**2, axis=0))]) <= 1e-12)
