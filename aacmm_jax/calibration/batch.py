@@ -29,7 +29,7 @@ from .batch_kernel import Problems, Shape, solve_chunk
 from .checks import based_on, check_enough
 from .results import ManyCalibrations, ManyIdentifications
 from .scale_anchor import ScaleAnchor, scale_anchor
-from .second_stage import divided, rows_of, second_stage_many
+from .second_stage import divide_by_k, rows_of, second_stage_many
 
 # Slots per loop. On a CPU the Jacobian columns of all slots should fit the second-level cache (measured from 20 to
 # 7,000 poses: five times slower where they do not); a GPU needs thousands.
@@ -137,7 +137,7 @@ def calibrated(task: "BatchTask", method: str) -> ManyCalibrations:
     if method == "two-stage":
         found = second_stage_many(task.anchor, stage1, task.identified_again)
         return ManyCalibrations(k=stage1.k, stage1=stage1, method=method, **found)
-    scaled = divided(task.anchor, stage1.space, stage1.parameters, stage1.k)
+    scaled = divide_by_k(task.anchor, stage1.space, stage1.parameters, stage1.k)
     joint = task.repeated(task.arm, task.capture, stage1.bounds, scaled, None, stage1.sigma / stage1.k).identified()
     return ManyCalibrations(
         parameters=joint.parameters,

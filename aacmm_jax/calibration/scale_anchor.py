@@ -46,6 +46,11 @@ class ScaleAnchor(NamedTuple):
     # Fixed lengths that free ones replace exactly in stage 2; None where some have no such partner, or are not known.
     partners: Partners | None
 
+    @property
+    def can_scale(self) -> bool:
+        """Whether stage 2 changes the arm: not where fixed lengths set the scale, or no length is free."""
+        return not self.set_by and self.adjusted is not None
+
 
 def scale_anchor(space: Parameters, arm: Arm, hold: str | None, noise: Noise | None = None) -> ScaleAnchor:
     """What sets the scale of stage 1.

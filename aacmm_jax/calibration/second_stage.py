@@ -25,7 +25,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement
 from ..model.metrics import repeatability
-from ..model.scale import divide_free_lengths, divisible, replaced_lengths, scale_of
+from ..model.scale import divide_lengths, divisible, scale_of
 from ..solver.reason import SCALE, Reason, numbers_of, reasons
 from .results import ManyIdentifications
 from .scale_anchor import ScaleAnchor
@@ -39,26 +39,11 @@ LARGEST_LOG_K = 1e-7  # |log k| up to which k = 1 counts as reached
 _ROUNDING = 1e-9  # mm: how far from a bound the division may leave a length by rounding
 
 
-def can_scale(anchor: ScaleAnchor) -> bool:
-    """Whether stage 2 changes the arm: not where fixed lengths set the scale, or no length is free."""
-    return not anchor.set_by and anchor.adjusted is not None
-
-
-def divided(
-    anchor: ScaleAnchor,
-    space: Parameters,
-    parameters: Any,
-    k: Any,
-) -> Any:
+def divide_by_k(anchor: ScaleAnchor, space: Parameters, parameters: Any, k: Any) -> Any:
     """The parameters of stage 1 divided by k; the base of ``space`` is the arm, or a batch of arms."""
-    if not can_scale(anchor):
+    if not anchor.can_scale:
         return parameters
-    return divide_free_lengths(space, parameters, k, replaced(anchor, space))
-
-
-def replaced(anchor: ScaleAnchor, space: Parameters) -> Float[AnyArray, "... p"]:
-    """Fixed lengths that the free ones replace in the division, mm."""
-    return replaced_lengths(space, space.base, ((), ()) if anchor.partners is None else anchor.partners)
+    return divide_lengths(space, parameters, k, anchor.partners)
 
 
 def within_bounds(
@@ -92,7 +77,7 @@ def must_adjust(
     if anchor.partners is None:
         concerned = xp.ones_like(concerned)
     needed = xp.any(concerned & lengths, axis=-1) & xp.all(xp.isfinite(scaled), axis=-1)
-    return needed if can_scale(anchor) else xp.zeros_like(needed)
+    return needed if anchor.can_scale else xp.zeros_like(needed)
 
 
 class Adjusted(NamedTuple):
@@ -249,13 +234,13 @@ def second_stage_many(
     assert stage1.k is not None
     lower, upper = (np.broadcast_to(side, stage1.parameters.shape) for side in sides)
     bounds = Bounds(space, lower, upper)
-    scaled = np.array(divided(anchor, space, stage1.parameters, stage1.k))
+    scaled = np.array(divide_by_k(anchor, space, stage1.parameters, stage1.k))
     # Divided by k, the whole arm shrinks about the base, and so do the distances between its tips.
-    factor = stage1.k if can_scale(anchor) else np.ones_like(stage1.k)
+    factor = stage1.k if anchor.can_scale else np.ones_like(stage1.k)
     de, deltam, steps, reason = stage1.de / factor, stage1.deltam / factor, stage1.steps, numbers_of(stage1.result)
     rows = np.flatnonzero(must_adjust(anchor, bounds, stage1.active, scaled))
     active = stage1.active
-    if can_scale(anchor):
+    if anchor.can_scale:
         # Rows are contiguous, so that what is summed over one is summed in the same order in every batch.
         scaled = np.array(within_bounds(space, lower, upper, scaled), order="C")
         active = np.asarray(bounds.active(scaled))

@@ -28,7 +28,7 @@ from ..uncertainty.identifiability import observability
 from .checks import based_on, check_enough, check_noise_model, check_single, check_start
 from .results import Calibration, Identification
 from .scale_anchor import scale_anchor, scale_set_by_clause
-from .second_stage import adjust_anchor, can_scale, divided, must_adjust, replaced, within_bounds
+from .second_stage import adjust_anchor, divide_by_k, must_adjust, within_bounds
 from .task import Task, fit, fit_repeatability
 
 _MAX_STEPS = 300
@@ -171,7 +171,7 @@ def calibrate(
     if method == "joint":
         return to_jax(_joint(task))
     result, adjust = _divided(task)
-    if not can_scale(task.anchor) or (is_concrete(adjust) and not bool(adjust)):
+    if not task.anchor.can_scale or (is_concrete(adjust) and not bool(adjust)):
         return to_jax(result)
     if is_concrete(adjust):
         return to_jax(_adjusted(task, result))
@@ -309,15 +309,15 @@ def _divided(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]:
     stage1, propagated = _stage1(task)
     assert stage1.scale is not None
     space, bounds, anchor = task.space, task.bounds, task.anchor
-    scaled = divided(anchor, space, stage1.parameters, stage1.scale.value)
+    scaled = divide_by_k(anchor, space, stage1.parameters, stage1.scale.value)
     adjust = must_adjust(anchor, bounds, stage1.active, scaled)
     active, parameter_covariance = stage1.active, propagated.parameter_covariance
-    if can_scale(anchor):
+    if anchor.can_scale:
         scaled = within_bounds(space, bounds.lower, bounds.upper, scaled)
         active = bounds.active(scaled)
         measurement = task.measurement.weighted(space.arm(task.start).geometry, task.noise)
         parameter_covariance = scale_uncertainty.propagate_division(
-            propagated, stage1.arm, space, measurement, stage1.after.sigma, scaled, replaced(anchor, space)
+            propagated, stage1.arm, space, measurement, stage1.after.sigma, scaled, anchor.partners
         ).parameter_covariance
     # Divided, a length may have left its bound, which stage 1's covariance takes as exact all the same.
     conditional_on = xp.where(active != 0, active, stage1.active)
@@ -366,7 +366,7 @@ def _joint(task: Task) -> Calibration:
     stage1, _ = _stage1(task)
     assert stage1.scale is not None
     space, k = task.space, stage1.scale.value
-    parameters = divided(task.anchor, space, stage1.parameters, k)
+    parameters = divide_by_k(task.anchor, space, stage1.parameters, k)
     scaled = space.arm(parameters)
     measurement = task.measurement.weighted(scaled.geometry, task.noise)
     sigma = stage1.after.sigma / k

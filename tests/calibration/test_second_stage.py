@@ -17,7 +17,7 @@ from aacmm_jax.calibration.sampling import batch_of
 from aacmm_jax.calibration.scale_anchor import scale_anchor
 from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.kinematics.arm import value_of
-from aacmm_jax.model.scale import divide_lengths
+from aacmm_jax.model.scale import divided_arm
 from aacmm_jax.summaries import warnings as cautions
 
 SOCKETS = {"A": (400, 200, 300), "B": (600, 200, 300)}
@@ -99,7 +99,7 @@ def test_a_free_partner_moves_in_place_of_a_fixed_length(panda, method):
     assert abs(float(result.k) - 1) > 1e-3
     if method == "two-stage":
         q = np.random.default_rng(0).uniform(-2, 2, (20, 7))
-        every_length = divide_lengths(result.stage1.arm, result.k).position(q)
+        every_length = divided_arm(result.stage1.arm, result.k).position(q)
         np.testing.assert_allclose(result.arm.position(q), every_length, atol=1e-9)
     i = result.space.index("probe_z")
     assert abs(float(result.parameters[i]) - 130.0) < 4 * np.sqrt(float(result.covariance[i, i]))

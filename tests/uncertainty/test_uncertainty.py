@@ -16,7 +16,7 @@ from aacmm_jax.data.noise import tip_covariances
 from aacmm_jax.kinematics.inverse_kinematics import project_to_centroids
 from aacmm_jax.model.measurement import Measurement
 from aacmm_jax.model.residuals import JointWeights
-from aacmm_jax.model.scale import divide_lengths
+from aacmm_jax.model.scale import divided_arm
 from aacmm_jax.model.weights import Weights, inverse_root
 from aacmm_jax.uncertainty import propagation, scale_uncertainty
 
@@ -119,7 +119,7 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
     found = aj.calibrate(paper_arm, capture, bounds, method=method, noise=noise)
     stage1, noise_model = found.stage1, "common" if noise is None else "given"
     if method == "joint":
-        scaled, sigma = divide_lengths(stage1.arm, stage1.scale.value), stage1.after.sigma / stage1.scale.value
+        scaled, sigma = divided_arm(stage1.arm, stage1.scale.value), stage1.after.sigma / stage1.scale.value
         measurement = Measurement.of(capture).weighted(scaled.geometry, noise)
         weights = JointWeights.of(scaled.position(measurement.q), measurement, sigma)
         none = jnp.zeros(21, dtype=bool)
