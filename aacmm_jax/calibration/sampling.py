@@ -18,7 +18,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..uncertainty.volume import default_length, sample_lengths
-from .batch import BatchTask, Effort, calibrated
+from .batch import BatchOptions, BatchTask
 from .record import uncertainty_of
 from .results import Calibration
 
@@ -283,15 +283,13 @@ class _RepeatedTask(NamedTuple):
         task = BatchTask.of(
             stage1.arm,
             batch_of(self.capture, q, values),
-            bounds.lower,
-            bounds.upper,
+            (bounds.lower, bounds.upper),
             stage1.parameters,
             result.space,
+            BatchOptions(noise=result.given_noise),
             stage1.anchor,
-            result.given_noise,
-            Effort(),
         )
-        many = calibrated(task, result.method)
+        many = task.calibrate(result.method)
         good = many.converged
         ends = (jnp.asarray(self.start), jnp.asarray(self.end))
         lengths = _lengths_of(Parameters(result.arm, result.space.names), jnp.asarray(many.parameters), ends)

@@ -46,7 +46,7 @@ def divide_by_k(anchor: ScaleAnchor, space: Parameters, parameters: Any, k: Any)
     return divide_lengths(space, parameters, k, anchor.partners)
 
 
-def within_bounds(
+def clip_to_bounds(
     space: Parameters,
     lower: Float[AnyArray, "... p"],
     upper: Float[AnyArray, "... p"],
@@ -62,7 +62,7 @@ def within_bounds(
     return xp.where(np.broadcast_to(space.lengths, scaled.shape), inside, scaled)
 
 
-def must_adjust(
+def must_adjust_anchor(
     anchor: ScaleAnchor,
     bounds: Bounds,
     active: Int[AnyArray, "... p"],
@@ -114,7 +114,7 @@ def adjust_anchor(task: Task, measurement: Measurement, scaled: Float[AnyArray, 
         log_k, found = identify_again(x, search.length)
         improved = xp.abs(log_k) < xp.abs(search.best_log_k)
         best = xp.where(improved, found.parameters, best)
-        return search.following(log_k), found.parameters, best, steps + found.steps
+        return search.advance(log_k), found.parameters, best, steps + found.steps
 
     def solve(_: Any, length: Float[AnyArray, ""]) -> tuple[Any, tuple[Any, Any]]:
         first = (ScaleSearch.of(length, *stop_gradient((lower, upper))), start, start, free.steps)
@@ -175,7 +175,7 @@ class ScaleSearch(NamedTuple):
         rounds, done = xp.zeros(length.shape, dtype=np.int32), xp.zeros(length.shape, dtype=bool)
         return cls(length, lower, upper, known, length, none, length, none, rounds, done)
 
-    def following(self, log_k: Any) -> "ScaleSearch":
+    def advance(self, log_k: Any) -> "ScaleSearch":
         """After log k was found at the length."""
         xp, length = namespace(self, log_k), self.length
         size = xp.abs(log_k)
@@ -221,7 +221,7 @@ def _number_of_reason(numbers: Any, log_k: Any, on_bound: Any) -> Int[AnyArray, 
     return xp.where((xp.abs(log_k) > LARGEST_LOG_K) & ~on_bound, SCALE, numbers)
 
 
-def second_stage_many(
+def fix_scale_many(
     anchor: ScaleAnchor,
     stage1: ManyIdentifications,
     identify_again: Callable[[np.ndarray, np.ndarray, str | None], ManyIdentifications],
@@ -238,11 +238,11 @@ def second_stage_many(
     # Divided by k, the whole arm shrinks about the base, and so do the distances between its tips.
     factor = stage1.k if anchor.can_scale else np.ones_like(stage1.k)
     de, deltam, steps, reason = stage1.de / factor, stage1.deltam / factor, stage1.steps, numbers_of(stage1.result)
-    rows = np.flatnonzero(must_adjust(anchor, bounds, stage1.active, scaled))
+    rows = np.flatnonzero(must_adjust_anchor(anchor, bounds, stage1.active, scaled))
     active = stage1.active
     if anchor.can_scale:
         # Rows are contiguous, so that what is summed over one is summed in the same order in every batch.
-        scaled = np.array(within_bounds(space, lower, upper, scaled), order="C")
+        scaled = np.array(clip_to_bounds(space, lower, upper, scaled), order="C")
         active = np.asarray(bounds.active(scaled))
     if len(rows):
         adjusted = _adjust_many(
@@ -290,7 +290,7 @@ def _adjust_many(
         improved = np.abs(log_k) < np.abs(part.best_log_k)
         best[rows[improved]] = found.parameters[improved]
         x[rows], steps[rows] = found.parameters, steps[rows] + found.steps
-        search = ScaleSearch(*(set_at(old, rows, new) for old, new in zip(search, part.following(log_k), strict=True)))
+        search = ScaleSearch(*(set_at(old, rows, new) for old, new in zip(search, part.advance(log_k), strict=True)))
     best[:, i] = search.best
     found = identify_again(everything, best, anchor.adjusted)
     assert found.k is not None
@@ -304,7 +304,7 @@ def _adjust_many(
     }
 
 
-def rows_of(rows: np.ndarray, arm: Arm, capture: Capture, *boxes: np.ndarray) -> tuple[Any, ...]:
+def select_problems(rows: np.ndarray, arm: Arm, capture: Capture, *boxes: np.ndarray) -> tuple[Any, ...]:
     """Some problems of a batch: of the arm, the capture and each side of the box, where these are a batch."""
 
     def chosen(single: int, leaf: Any) -> Any:

@@ -28,7 +28,7 @@ from ..uncertainty.identifiability import observability
 from .checks import based_on, check_enough, check_noise_model, check_single, check_start
 from .results import Calibration, Identification
 from .scale_anchor import scale_anchor, scale_set_by_clause
-from .second_stage import adjust_anchor, divide_by_k, must_adjust, within_bounds
+from .second_stage import adjust_anchor, clip_to_bounds, divide_by_k, must_adjust_anchor
 from .task import Task, fit, fit_repeatability
 
 _MAX_STEPS = 300
@@ -74,11 +74,11 @@ def identify(
     Raises:
         InputError: too few poses, a start outside the box, names that do not fit, or a batch (see `identify_many`).
     """
-    task = _checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many")
+    task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many")
     return to_jax(_identify(to_numpy(task)))
 
 
-def _checked(
+def _prepare_task(
     arm: Arm,
     capture: Capture,
     bounds: Bounds,
@@ -158,7 +158,7 @@ def calibrate(
             "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, "
             "from Python, identify for stage 1 alone)."
         )
-    task = _checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
+    task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
     if hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
         raise InputError(
             "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
@@ -169,13 +169,13 @@ def calibrate(
     _check_scale(task, method)
     task = to_numpy(task)
     if method == "joint":
-        return to_jax(_joint(task))
-    result, adjust = _divided(task)
+        return to_jax(_calibrate_jointly(task))
+    result, adjust = _calibrate_by_division(task)
     if not task.anchor.can_scale or (is_concrete(adjust) and not bool(adjust)):
         return to_jax(result)
     if is_concrete(adjust):
-        return to_jax(_adjusted(task, result))
-    return jax.lax.cond(adjust, lambda: _adjusted(task, result), lambda: result)
+        return to_jax(_calibrate_by_adjustment(task, result))
+    return jax.lax.cond(adjust, lambda: _calibrate_by_adjustment(task, result), lambda: result)
 
 
 def _check_identifiable(capture: Capture, task: Task, strict: bool) -> None:
@@ -201,10 +201,10 @@ def _check_scale(task: Task, method: str) -> None:
 
 @compiled(jit=eqx.filter_jit)
 def _identify(task: Task) -> Identification:
-    return _stage1(task)[0]
+    return _solve_stage1(task)[0]
 
 
-def _stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
+def _solve_stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
     xp = namespace(task)
     space, start, hold = task.space, task.start, task.anchor.hold
     measurement = task.measurement.weighted(space.arm(start).geometry, task.noise)
@@ -253,7 +253,7 @@ def _reduced_chi(measurement: Measurement, tips: Float[AnyArray, "N 3"], fitted:
     return xp.sqrt(xp.sum(measurement.whitened(measurement.centred(tips)) ** 2) / degrees_of_freedom)
 
 
-def _calibration(
+def _make_calibration(
     task: Task,
     stage1: Identification,
     method: str,
@@ -303,17 +303,17 @@ def _calibration(
 
 
 @compiled(jit=eqx.filter_jit)
-def _divided(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]:
+def _calibrate_by_division(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]:
     """Stage 1 and the division by k; and whether the anchor must be adjusted instead."""
     xp = namespace(task)
-    stage1, propagated = _stage1(task)
+    stage1, propagated = _solve_stage1(task)
     assert stage1.scale is not None
     space, bounds, anchor = task.space, task.bounds, task.anchor
     scaled = divide_by_k(anchor, space, stage1.parameters, stage1.scale.value)
-    adjust = must_adjust(anchor, bounds, stage1.active, scaled)
+    adjust = must_adjust_anchor(anchor, bounds, stage1.active, scaled)
     active, parameter_covariance = stage1.active, propagated.parameter_covariance
     if anchor.can_scale:
-        scaled = within_bounds(space, bounds.lower, bounds.upper, scaled)
+        scaled = clip_to_bounds(space, bounds.lower, bounds.upper, scaled)
         active = bounds.active(scaled)
         measurement = task.measurement.weighted(space.arm(task.start).geometry, task.noise)
         parameter_covariance = scale_uncertainty.propagate_division(
@@ -321,7 +321,7 @@ def _divided(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]:
         ).parameter_covariance
     # Divided, a length may have left its bound, which stage 1's covariance takes as exact all the same.
     conditional_on = xp.where(active != 0, active, stage1.active)
-    result = _calibration(
+    result = _make_calibration(
         task,
         stage1,
         "two-stage",
@@ -337,7 +337,7 @@ def _divided(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]:
 
 
 @compiled(jit=eqx.filter_jit)
-def _adjusted(task: Task, by_division: Calibration) -> Calibration:
+def _calibrate_by_adjustment(task: Task, by_division: Calibration) -> Calibration:
     """Stage 2 where the division leaves the box, or would need a fixed length to move."""
     xp = namespace(task, by_division)
     stage1, space, name = by_division.stage1, task.space, task.anchor.adjusted
@@ -355,15 +355,15 @@ def _adjusted(task: Task, by_division: Calibration) -> Calibration:
         solved, arm, space, measurement, sigma, name, xp.any((active != 0) & is_anchor)
     ).parameter_covariance
     steps = stage1.steps + adjusted.steps
-    return _calibration(
+    return _make_calibration(
         task, stage1, "two-stage", adjusted.parameters, active, steps, adjusted.result, parameter_covariance, sigma
     )
 
 
 @compiled(jit=eqx.filter_jit)
-def _joint(task: Task) -> Calibration:
+def _calibrate_jointly(task: Task) -> Calibration:
     """One weighted least squares of poses and lengths, from the arm of stage 1 divided by k."""
-    stage1, _ = _stage1(task)
+    stage1, _ = _solve_stage1(task)
     assert stage1.scale is not None
     space, k = task.space, stage1.scale.value
     parameters = divide_by_k(task.anchor, space, stage1.parameters, k)
@@ -379,7 +379,7 @@ def _joint(task: Task) -> Calibration:
         space.arm(found.parameters), space, measurement, active != 0, sigma, task.noise_model, task.noise, joint_weights
     ).parameter_covariance
     steps = stage1.steps + found.steps
-    return _calibration(
+    return _make_calibration(
         task,
         stage1,
         "joint",
