@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.sampling import batch_of
 from aacmm_jax.calibration.scale_anchor import scale_anchor
 from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.kinematics.arm import value_of
@@ -303,7 +302,8 @@ def test_covariance_on_a_bound_is_what_trials_show(too_long, paper_arm, capture,
     random = np.random.default_rng(1)
     q = np.asarray(capture.q) + 2 * ARCSEC * random.normal(size=(300, *capture.q.shape))
     values = float(capture.lengths[0].value) + 0.002 * random.normal(size=(300, 1))
-    many = aj.calibrate_many(too_long, batch_of(capture, q, values), cut.lower, cut.upper, start, noise=noise)
+    captures = aj.calibration.batch_of_captures(capture, q, values)
+    many = aj.calibrate_many(too_long, captures, cut, start=start, noise=noise)
     i = cut.space.index("probe_z")
     assert np.all(many.active[:, i] == -1)
     predicted = np.sqrt(np.diag(aj.calibrate(too_long, capture, cut, start=start, noise=noise).covariance))

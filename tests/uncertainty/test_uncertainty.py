@@ -10,7 +10,6 @@ import pytest
 from scipy import stats
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.sampling import batch_of
 from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.data.noise import tip_covariances
 from aacmm_jax.kinematics.inverse_kinematics import project_to_centroids
@@ -145,9 +144,8 @@ def test_many_weighted_calibrations_equal_single_ones(paper_arm, bounds, capture
     shifts = 1e-6 * np.random.default_rng(0).normal(size=(3, *capture.q.shape))
     readings = np.asarray(capture.q) + shifts
     values = np.tile([float(length.value) for length in capture.lengths], (3, 1))
-    many = aj.calibrate_many(
-        paper_arm, batch_of(capture, readings, values), bounds.lower, bounds.upper, method=method, noise=UNEVEN
-    )
+    captures = aj.calibration.batch_of_captures(capture, readings, values)
+    many = aj.calibrate_many(paper_arm, captures, bounds, method=method, noise=UNEVEN)
     for i, q in enumerate(readings):
         blocks = {name: q[capture.owner == j] for j, name in enumerate(capture.names)}
         one = aj.calibrate(paper_arm, aj.Capture(blocks, capture.lengths), bounds, method=method, noise=UNEVEN)
