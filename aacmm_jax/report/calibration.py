@@ -275,7 +275,7 @@ def _residuals(record: CalibrationRecord, evaluation: Evaluation) -> Section:
         "residuals", "Residuals of the calibrated arm", capture, {"calibrated": evaluation}, mark=True
     )
     introduction = (
-        "The distance of each pose's tip from the centroid of its socket, by the calibrated arm. Poses more than four "
+        "The distance of each pose's tip from the centroid of its socket, by the calibrated arm. Poses more than eight "
         "times as far as the median are marked: check how the tip was seated there."
     )
     return Section(

@@ -15,12 +15,12 @@ from ..data.noise import tip_covariances
 from ..data.recording import Recording
 from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Bounds, Parameters
+from ..model.metrics import pose_outliers
 from ..uncertainty.identifiability import Observability, observability
 from .likely_cause import likely_cause
 
 _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a reference length is wrong
 _LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 through errors outside the D-H model
-_POSE_OUTLIER = 8.0  # in median distances
 _TOLERANCE = math.radians(0.01)  # beyond a limit: more than the noise of any encoder
 _EXCESS = 1.5  # ratio of errors to their prediction that is reported
 _NAMED = 5  # items of a list that are named
@@ -204,8 +204,7 @@ def _data(record: CalibrationRecord) -> list[str]:
     distances, owner = np.asarray(evaluation.distances), capture.owner
     first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
     found = []
-    typical = float(np.median(distances))
-    far = np.flatnonzero(distances > _POSE_OUTLIER * typical) if typical > 1e-6 else []
+    far, typical = pose_outliers(distances, capture.sizes)
     if len(far):
         worst = sorted(far, key=lambda i: -distances[i])
         names = [f"{capture.names[owner[i]]} pose {i - first[owner[i]] + 1} ({distances[i]:.3g} mm)" for i in worst]

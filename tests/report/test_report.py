@@ -12,7 +12,6 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.report import charts, elements, write_report
-from aacmm_jax.report.residuals import outliers
 from tests.refusals import assert_refused
 
 HOSTILE = '<script>document.title="taken"</script><img src=x onerror=alert(1)> & "B" <b>bold</b>'
@@ -329,14 +328,6 @@ def test_a_verdict_is_marked_as_what_it_is(written):
     assert (failed.verdict[:14], failed.verdict_mark) == ("Not to be used", "bad")
     measured = points_report(PointsRecord(aj.acceptance.Measured({"A": np.eye(3)})))[0]
     assert (measured.verdict, measured.verdict_mark) == ("Measured; no limit was given", "neutral")
-
-
-def test_outliers_by_hand():
-    assert (
-        outliers(np.array([0.01, 0.012, 0.009, 0.041, 0.0439, 0.011, 0.0461])).tolist() == []
-    )  # median 0.012: four times is 0.048
-    assert outliers(np.array([0.01, 0.012, 0.009, 0.049, 0.011])).tolist() == [3]
-    assert outliers(np.full(5, 1e-12)).tolist() == []
 
 
 @pytest.mark.parametrize(
