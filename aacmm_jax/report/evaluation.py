@@ -134,16 +134,19 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
     )
     blocks: list = [
         "Every metric is of single readings. U, with coverage factor 2, is what the tester contributes: the artefacts' "
-        f"uncertainty; {stated}. The arm's own scatter is what is tested (ISO 14253-5). A metric conforms if "
-        "|value| ≤ MPE − U, fails if |value| ≥ MPE + U, and is undecided in between (ISO 14253-1, with U as guard band "
-        "as in its editions up to 2013). What standards allow about repeating a reading is not applied, and the "
-        "distribution of positions and directions is not checked. Procedures and formulas follow secondary sources of "
-        "the editions named.",
+        f"uncertainty; {stated}. The arm's own scatter is what is tested (ISO 14253-5). What standards allow about "
+        "repeating a reading is not applied, and the distribution of positions and directions is not checked. "
+        "Procedures and formulas follow secondary sources of the editions named.",
     ]
+    limited = any(metric["limit_mm"] is not None for test in rows for metric in test["figures"])
+    if limited:
+        blocks.append(
+            "A metric conforms if |value| ≤ MPE − U, fails if |value| ≥ MPE + U, and is undecided in between (ISO "
+            "14253-1, with U as guard band as in its editions up to 2013)."
+        )
     before = any(metric["as_found_mm"] is not None for test in rows for metric in test["figures"])
     if before:
         blocks.append("As found is the nominal arm, as left the calibrated one.")
-    limited = any(metric["limit_mm"] is not None for test in rows for metric in test["figures"])
     for test in rows:
         blocks.append(_test_table(test, before, limited))
         if test["missing"]:

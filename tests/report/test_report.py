@@ -330,6 +330,18 @@ def test_a_verdict_is_marked_as_what_it_is(written):
     assert (measured.verdict, measured.verdict_mark) == ("Measured; no limit was given", "neutral")
 
 
+@pytest.mark.parametrize("limits", [{}, {"Deltam": aj.acceptance.Limit(0.05)}])
+def test_the_decision_rule_is_explained_only_where_there_is_a_limit(limits):
+    from aacmm_jax.acceptance.record import PointsRecord
+    from aacmm_jax.report.evaluation import points_report
+
+    points = aj.acceptance.Measured({"A": 0.01 * np.random.default_rng(0).normal(size=(10, 3))})
+    (acceptance, *_) = points_report(PointsRecord(points, limits))[0].sections
+    text = " ".join(block for block in acceptance.blocks if isinstance(block, str))
+    assert ("ISO 14253-1" in text) == bool(limits)
+    assert "ISO 14253-5" in text
+
+
 @pytest.mark.parametrize(
     ("value", "decimals", "signed", "expected"),
     [
