@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..core.namespace import AnyArray
+from ..core.numpy_or_jax import AnyArray
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import with_values
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass, sines_cosines

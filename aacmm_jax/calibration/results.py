@@ -14,7 +14,7 @@ from ..core._compat import member_numbers
 from ..core.arrays import Numbers, is_concrete
 from ..core.distributions import chi_square_quantile
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..core._compat import member_numbers
-from ..core.namespace import AnyArray, namespace, set_at, stop_gradient, to_jax, while_loop
+from ..core.numpy_or_jax import AnyArray, namespace, set_at, stop_gradient, to_jax, while_loop
 from ..data.capture import Capture
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters

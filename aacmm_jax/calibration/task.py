@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.namespace import AnyArray, namespace, set_at
+from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from ..data.noise import Noise
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..calibration.evaluation import evaluate
 from ..calibration.record import CalibrationRecord, record_of
-from ..calibration.stages import calibrate
+from ..calibration.single import calibrate
 from ..core.errors import InputError, some
 from ..data.capture import Capture
 from ..data.recording import Recording

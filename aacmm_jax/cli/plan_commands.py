@@ -205,7 +205,7 @@ def _procedure(
 
 def _written(output: Path, poses: str, manifest: Path | None, manifest_text: Callable[[str], str], arm: str) -> str:
     """Write the poses and, where it is asked for, the manifest, which names the arm; returns what was written."""
-    from ..files.whole_file import write_text
+    from ..files.atomic_write import write_text
 
     with together(output, manifest):
         write_text(output, poses)

@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ..core.errors import InputError
+from ..files.atomic_write import write_text
 from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
-from ..files.whole_file import write_text
 from .app import CalibrationFile, Json, Only, Without, app, examples, show_summary, with_spinner
 
 About = Annotated[

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from ..core.arguments import items_of
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError, nearest
-from ..core.namespace import AnyArray
+from ..core.numpy_or_jax import AnyArray
 
 # Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
 _MOST_RADIANS = 8 * np.pi

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..core.errors import InputError
+from .atomic_write import ELSEWHERE, storable, whole_file
 from .inputs import STREAMED, largest_file, open_input, storable_name
-from .whole_file import ELSEWHERE, storable, whole_file
 
 if TYPE_CHECKING:
     from .hdf5_content import Content

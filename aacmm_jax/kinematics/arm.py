@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_array, as_floats, in_chunks
 from ..core.errors import InputError, counted, nearest
-from ..core.namespace import AnyArray, namespace, to_jax, to_numpy
+from ..core.numpy_or_jax import AnyArray, namespace, to_jax, to_numpy
 from .chain import Geometry, tip_pose
 from .jacobian import tip_jacobian, tip_position
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..core.arrays import in_chunks, random_numbers
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, compiled, namespace, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from .arm import Arm
 from .chain import Geometry, forward_pass, sines_cosines
 from .jacobian import jacobian_columns

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from ..core.arguments import items_of
 from ..core.arrays import as_array, is_concrete
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace
 from .socket_sums import largest_of_sockets, means_over_sockets, to_poses
 
 _OUTLIER = 8.0  # median distances; see `pose_outliers`

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ..core.arguments import check_finite, checked_arguments
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, compiled, namespace, to_jax, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
 from ..kinematics.arm import Arm, is_length, is_single, parameter_names
 from ..kinematics.parameters import Parameters

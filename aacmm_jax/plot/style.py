@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError
-from ..files.whole_file import whole_file
+from ..files.atomic_write import whole_file
 
 _FORMATS = ("png", "svg", "pdf")
 DARK, ACCENT, LIGHT = "#1b3a6b", "#d95f02", "0.65"

@@ -10,9 +10,9 @@ from typing import Any
 from ..acceptance.record import SIMULATED
 from ..core.errors import InputError
 from ..files.administrative_data import AdministrativeData, check_conformity
+from ..files.atomic_write import write_text
 from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
-from ..files.whole_file import write_text
 from .administrative_data import administrative_section
 from .elements import ArmView, Chart, Report, ReportTable
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PyTree
 from ..core.arguments import whole_number
 from ..core.arrays import as_array, is_concrete
 from ..core.errors import InputError
-from ..core.namespace import AnyArray
+from ..core.numpy_or_jax import AnyArray
 from ..core.x64 import check_x64
 from .active_set import Box, Flat, QuadraticModel, expand
 from .adjoint import BoundedAdjoint, box_of

@@ -10,9 +10,9 @@ from ..core.errors import InputError, nearest
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..files.arms import load_specification
+from ..files.atomic_write import storable
 from ..files.captures import load_capture
 from ..files.toml import read_toml
-from ..files.whole_file import storable
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import ArmSpecification
 from .definition import Study

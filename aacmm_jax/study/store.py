@@ -21,6 +21,7 @@ import numpy as np
 from ..core._compat import named_members
 from ..core.errors import InputError
 from ..data.recording import Recording
+from ..files.atomic_write import ELSEWHERE, whole_file
 from ..files.captures import arm_table, recording_of, recording_tables, specification_of
 from ..files.hdf5 import (
     BLOCK,
@@ -39,7 +40,6 @@ from ..files.hdf5 import (
     undamaged,
     write_tables,
 )
-from ..files.whole_file import ELSEWHERE, whole_file
 from ..kinematics.arm import is_length
 from .blocks import NOT_RUN, VARIABLES, Block, Layout, fill_of, part_of, parts_of
 from .definition import Study

@@ -9,7 +9,7 @@ from ..calibration.record import CalibrationRecord
 from ..calibration.results import active_names
 from ..calibration.scale_anchor import scale_set_by_clause
 from ..core.errors import some
-from ..core.namespace import to_numpy
+from ..core.numpy_or_jax import to_numpy
 from ..core.units import INCH, M
 from ..data.noise import tip_covariances
 from ..data.recording import Recording

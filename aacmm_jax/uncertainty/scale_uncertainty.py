@@ -9,7 +9,7 @@ from typing import NamedTuple
 import equinox as eqx
 from jaxtyping import Bool, Float
 
-from ..core.namespace import AnyArray, namespace, set_at
+from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
 from ..model.measurement import Measurement, length_covariance

@@ -12,7 +12,7 @@ from ..core._compat import inside_trace
 from ..core.arguments import check_finite, checked_arguments
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
-from ..core.namespace import AnyArray, compiled, namespace, to_jax, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
