@@ -19,7 +19,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
 from ..model.measurement import Measurement, check_joints
 from ..model.metrics import repeatability
-from ..model.residuals import JointWeights, joint_model, joint_residual
+from ..model.residuals import JointWeights, joint_normal_equations, joint_residual
 from ..solver.reason import Reason
 from ..uncertainty import propagation, scale_uncertainty
 from ..uncertainty.active_bounds import with_active_bounds
@@ -373,7 +373,7 @@ def _calibrate_jointly(task: Task) -> Calibration:
     joint_weights = JointWeights.of(scaled.position(measurement.q), measurement, sigma)
     args = (space, measurement, joint_weights.sigma, joint_weights.whitening)
     bounds = task.bounds.lower, task.bounds.upper
-    found = fit(joint_residual, joint_model, parameters, args, bounds, space.scale, task.max_steps)
+    found = fit(joint_residual, joint_normal_equations, parameters, args, bounds, space.scale, task.max_steps)
     active = task.bounds.active(found.parameters)
     parameter_covariance = propagation.propagate_solve(
         space.arm(found.parameters), space, measurement, active != 0, sigma, task.noise_model, task.noise, joint_weights

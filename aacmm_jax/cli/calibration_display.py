@@ -6,7 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from ..core.errors import counted
+from ..core.text import pluralise
 from ..core.units import ARCSEC, DEG
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
@@ -47,9 +47,9 @@ def capture(summary: dict[str, Any]) -> None:
     """One capture."""
     console = new_console()
     console.print(
-        f"[bold]{escape(summary['arm'])}[/bold]: {counted(summary['poses'], 'pose')} of "
-        f"{counted(summary['joints'], 'joint')} in {counted(len(summary['sockets']), 'socket')}, "
-        f"{counted(len(summary['lengths']), 'reference length')}" + (", simulated" if summary["simulated"] else "")
+        f"[bold]{escape(summary['arm'])}[/bold]: {pluralise(summary['poses'], 'pose')} of "
+        f"{pluralise(summary['joints'], 'joint')} in {pluralise(len(summary['sockets']), 'socket')}, "
+        f"{pluralise(len(summary['lengths']), 'reference length')}" + (", simulated" if summary["simulated"] else "")
     )
     print_warnings(console, summary)
     table = new_table("", "socket", "poses")
@@ -98,8 +98,8 @@ def print_verdict(console: Console, summary: dict[str, Any]) -> None:
         verdict = "[red]ended with a residual that no arm has[/red],"
     console.print(
         f"[bold]{escape(summary['arm'])}[/bold], {summary['method']}: {verdict} in "
-        f"{counted(summary['steps'], 'step')} on {counted(summary['poses'], 'pose')} in "
-        f"{counted(len(summary['sockets_used']), 'socket')}"
+        f"{pluralise(summary['steps'], 'step')} on {pluralise(summary['poses'], 'pose')} in "
+        f"{pluralise(len(summary['sockets_used']), 'socket')}"
     )
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..core.errors import InputError
-from .atomic_write import ELSEWHERE, storable, whole_file
+from .atomic_write import ELSEWHERE, storable, write_atomically
 from .inputs import STREAMED, largest_file, open_input, storable_name
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def write_tables(
         if extend is not None:
             extend(file)
 
-    with whole_file(path, advice) as temporary:
+    with write_atomically(path, advice) as temporary:
         if not streamed:
             temporary.write_bytes(file_image(fill))
             return

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_array, as_floats, in_chunks
-from ..core.errors import InputError, counted, nearest
+from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace, to_jax, to_numpy
+from ..core.text import pluralise
 from .chain import Geometry, tip_pose
 from .jacobian import tip_jacobian, tip_position
 
@@ -178,7 +179,7 @@ def checked_limits(limits: Sequence[Sequence[float]], joints: int) -> tuple[tupl
     except (TypeError, ValueError):
         rows = []  # no rows of numbers
     if len(rows) != joints or any(len(row) != 2 for row in rows):
-        raise InputError(f"limits must be {counted(joints, 'row')} of (lowest, highest) in rad, one per joint.")
+        raise InputError(f"limits must be {pluralise(joints, 'row')} of (lowest, highest) in rad, one per joint.")
     for i, (low, high) in enumerate(rows, start=1):
         if not -math.inf < low < high < math.inf:
             raise InputError(

@@ -10,7 +10,7 @@ from ..acceptance.record import EvaluationRecord, PointsRecord
 from ..acceptance.results import METRICS, AcceptanceTest, Metric
 from ..acceptance.standards import EDITIONS
 from ..calibration.evaluation import Evaluation, evaluate
-from ..core.errors import counted
+from ..core.text import pluralise
 from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
 from ..summaries.evaluation import evaluation_summary, points_summary
@@ -37,9 +37,9 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
     )
     report = Report(
         title="Evaluation of " + (record.recording.nominal.name or "an arm"),
-        subtitle=f"{counted(sum(capture.sizes), 'pose')} in {counted(len(capture.names), 'socket')}, "
-        f"{counted(len(capture.lengths), 'reference length')}, "
-        f"{counted(len(record.recording.spheres), 'touched sphere')}",
+        subtitle=f"{pluralise(sum(capture.sizes), 'pose')} in {pluralise(len(capture.names), 'socket')}, "
+        f"{pluralise(len(capture.lengths), 'reference length')}, "
+        f"{pluralise(len(record.recording.spheres), 'touched sphere')}",
         verdict=verdict,
         verdict_mark=mark,
         warnings=summary["warnings"] + [f"Over the limit: {sentence}" for sentence in summary["failed"]],
@@ -66,8 +66,8 @@ def points_report(record: PointsRecord) -> tuple[Report, dict[str, Any]]:
         *([] if chart is None else [Section("lengths", "Lengths", [chart])]),
     ]
     subtitle = (
-        f"{counted(summary['points'], 'point')} as recorded: {counted(summary['sockets'], 'socket')}, "
-        f"{counted(summary['lengths'], 'length')}, {counted(summary['spheres'], 'sphere')}"
+        f"{pluralise(summary['points'], 'point')} as recorded: {pluralise(summary['sockets'], 'socket')}, "
+        f"{pluralise(summary['lengths'], 'length')}, {pluralise(summary['spheres'], 'sphere')}"
     )
     report = Report("Acceptance test of points", subtitle, verdict, mark, summary["warnings"], [], sections)
     return report, summary

@@ -145,13 +145,13 @@ def test_a_read_only_file_is_refused(tmp_path):
 def test_leftovers_of_killed_processes_are_removed(tmp_path):
     """Those of the same output only, and not that of a process that is still writing."""
     program = (
-        "import os, signal, sys; from aacmm_jax.files.atomic_write import whole_file\n"
-        "with whole_file(sys.argv[1]): os.kill(os.getpid(), signal.SIGKILL)"
+        "import os, signal, sys; from aacmm_jax.files.atomic_write import write_atomically\n"
+        "with write_atomically(sys.argv[1]): os.kill(os.getpid(), signal.SIGKILL)"
     )
     for name in ("a.txt", "b.txt"):
         subprocess.run([sys.executable, "-c", program, tmp_path / name], check=False)
     assert len(list(tmp_path.glob(".*.part"))) == 2
-    with atomic_write.whole_file(tmp_path / "a.txt") as being_written:
+    with atomic_write.write_atomically(tmp_path / "a.txt") as being_written:
         being_written.write_text("first")
         atomic_write.write_text(tmp_path / "a.txt", "second")
         assert being_written.exists()
