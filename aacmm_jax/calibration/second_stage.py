@@ -26,7 +26,7 @@ from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement
 from ..model.metrics import repeatability
 from ..model.scale import divide_lengths, divisible, scale_of
-from ..solver.reason import SCALE, Reason, numbers_of, reasons
+from ..solver.reason import SCALE, numbers_of, reasons
 from .results import ManyIdentifications
 from .scale_anchor import ScaleAnchor
 from .task import Fit, Task, fit_repeatability
@@ -80,15 +80,7 @@ def must_adjust_anchor(
     return needed if anchor.can_scale else xp.zeros_like(needed)
 
 
-class Adjusted(NamedTuple):
-    """The parameters for which k = 1."""
-
-    parameters: Float[AnyArray, " p"]
-    steps: Int[AnyArray, ""]
-    result: Reason
-
-
-def adjust_anchor(task: Task, measurement: Measurement, scaled: Float[AnyArray, " p"]) -> Adjusted:
+def adjust_anchor(task: Task, measurement: Measurement, scaled: Float[AnyArray, " p"]) -> Fit:
     """Stage 1 repeated with its anchor adjusted until k = 1 (`ScaleSearch`), from the divided parameters.
 
     The search begins where all lengths are free, so that it does not depend on where stage 1 had its anchor: far from
@@ -141,7 +133,7 @@ def adjust_anchor(task: Task, measurement: Measurement, scaled: Float[AnyArray, 
         length, (x, steps) = jax.lax.custom_root(difference, start[i], solve, divide_by_slope, has_aux=True)
     log_k, found = identify_again(x, length)
     number = _number_of_reason(member_numbers(found.result), log_k, _on_bound(length, lower, upper))
-    return Adjusted(found.parameters, steps.astype(int) + found.steps, reasons(number))
+    return found._replace(steps=steps.astype(int) + found.steps, result=reasons(number))
 
 
 class ScaleSearch(NamedTuple):

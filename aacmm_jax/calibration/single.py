@@ -20,7 +20,6 @@ from ..kinematics.parameters import Bounds
 from ..model.measurement import Measurement, check_joints
 from ..model.metrics import repeatability
 from ..model.residuals import JointWeights, joint_normal_equations, joint_residual
-from ..solver.reason import Reason
 from ..uncertainty import propagation, scale_uncertainty
 from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
@@ -29,7 +28,7 @@ from .checks import based_on, check_enough, check_noise_model, check_single, che
 from .results import Calibration, Identification
 from .scale_anchor import scale_anchor, scale_set_by_clause
 from .second_stage import adjust_anchor, clip_to_bounds, divide_by_k, must_adjust_anchor
-from .task import Task, fit, fit_repeatability
+from .task import Fit, Task, fit, fit_repeatability
 
 _MAX_STEPS = 300
 
@@ -257,42 +256,34 @@ def _make_calibration(
     task: Task,
     stage1: Identification,
     method: str,
-    parameters: Float[AnyArray, " p"],
-    active: Int[AnyArray, " p"],
-    steps: Int[AnyArray, ""],
-    result: Reason,
+    found: Fit,
     parameter_covariance: ParameterCovariance,
     sigma: Float[AnyArray, ""],
     conditional_on: Int[AnyArray, " p"] | None = None,
 ) -> Calibration:
-    """The result of a calibration that ended with these parameters, and with tips that scatter by ``sigma`` (mm).
+    """The result of a calibration, of which ``found`` is what came after stage 1; tips scatter by ``sigma`` (mm).
 
-    ``conditional_on`` are the active bounds that its covariance takes as exact; by default ``active``."""
+    ``conditional_on`` are the active bounds that its covariance takes as exact; by default those that are active.
+    """
     assert stage1.scale is not None
     space = task.space
-    start, calibrated = space.arm(task.start), space.arm(parameters)
+    start, calibrated, active = space.arm(task.start), space.arm(found.parameters), task.bounds.active(found.parameters)
     measurement = task.measurement.weighted(start.geometry, task.noise)
     tips = calibrated.position(measurement.q)
     after = repeatability(tips, measurement.sizes, fitted=len(space.names))
-    parameter_covariance = with_active_bounds(
-        parameter_covariance,
-        calibrated,
-        space,
-        measurement,
-        active if conditional_on is None else conditional_on,
-        task.bounds,
-        sigma,
-    )
+    exact = active if conditional_on is None else conditional_on
     return Calibration(
         arm=calibrated,
-        parameters=parameters,
+        parameters=found.parameters,
         scale=stage1.scale,
         de=after.de,
         deltam=after.deltam,
         active=active,
-        steps=steps,
-        result=result,
-        parameter_covariance=parameter_covariance,
+        steps=stage1.steps + found.steps,
+        result=found.result,
+        parameter_covariance=with_active_bounds(
+            parameter_covariance, calibrated, space, measurement, exact, task.bounds, sigma
+        ),
         before=stage1.before,
         after=after,
         length_before=measurement.distances(start.position(measurement.q)),
@@ -311,29 +302,20 @@ def _calibrate_by_division(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]
     space, bounds, anchor = task.space, task.bounds, task.anchor
     scaled = divide_by_k(anchor, space, stage1.parameters, stage1.scale.value)
     adjust = must_adjust_anchor(anchor, bounds, stage1.active, scaled)
-    active, parameter_covariance = stage1.active, propagated.parameter_covariance
+    parameter_covariance = propagated.parameter_covariance
     if anchor.can_scale:
         scaled = clip_to_bounds(space, bounds.lower, bounds.upper, scaled)
-        active = bounds.active(scaled)
         measurement = task.measurement.weighted(space.arm(task.start).geometry, task.noise)
         parameter_covariance = scale_uncertainty.propagate_division(
             propagated, stage1.arm, space, measurement, stage1.after.sigma, scaled, anchor.partners
         ).parameter_covariance
     # Divided, a length may have left its bound, which stage 1's covariance takes as exact all the same.
-    conditional_on = xp.where(active != 0, active, stage1.active)
-    result = _make_calibration(
-        task,
-        stage1,
-        "two-stage",
-        scaled,
-        active,
-        stage1.steps,
-        stage1.result,
-        parameter_covariance,
-        stage1.after.sigma,
-        conditional_on,
-    )
-    return result, adjust
+    active = bounds.active(scaled)
+    exact = xp.where(active != 0, active, stage1.active)
+    divided = Fit(scaled, xp.zeros_like(stage1.steps), stage1.result, stage1.optimality)
+    return _make_calibration(
+        task, stage1, "two-stage", divided, parameter_covariance, stage1.after.sigma, exact
+    ), adjust
 
 
 @compiled(jit=eqx.filter_jit)
@@ -354,10 +336,7 @@ def _calibrate_by_adjustment(task: Task, by_division: Calibration) -> Calibratio
     parameter_covariance = scale_uncertainty.propagate_adjustment(
         solved, arm, space, measurement, sigma, name, xp.any((active != 0) & is_anchor)
     ).parameter_covariance
-    steps = stage1.steps + adjusted.steps
-    return _make_calibration(
-        task, stage1, "two-stage", adjusted.parameters, active, steps, adjusted.result, parameter_covariance, sigma
-    )
+    return _make_calibration(task, stage1, "two-stage", adjusted, parameter_covariance, sigma)
 
 
 @compiled(jit=eqx.filter_jit)
@@ -378,15 +357,4 @@ def _calibrate_jointly(task: Task) -> Calibration:
     parameter_covariance = propagation.propagate_solve(
         space.arm(found.parameters), space, measurement, active != 0, sigma, task.noise_model, task.noise, joint_weights
     ).parameter_covariance
-    steps = stage1.steps + found.steps
-    return _make_calibration(
-        task,
-        stage1,
-        "joint",
-        found.parameters,
-        active,
-        steps,
-        found.result,
-        parameter_covariance,
-        stage1.after.sigma,
-    )
+    return _make_calibration(task, stage1, "joint", found, parameter_covariance, stage1.after.sigma)

@@ -8,15 +8,9 @@ from rich.markup import escape
 
 from ..core.text import pluralise
 from ..core.units import ARCSEC, DEG
+from ..summaries.tables import METRICS, volume_rows
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
-_METRICS = (
-    ("de_mm", "DE, mean distance of poses from their socket's centroid"),
-    ("deltam_mm", "Deltam, largest half range of a coordinate in a socket"),
-    ("rms_mm", "RMS distance of poses from their socket's centroid"),
-    ("length_error_mean_absolute_mm", "length error, mean absolute"),
-    ("length_error_largest_mm", "length error, largest"),
-)
 _TRUTH = (
     ("length_error_largest_mm", "largest error of a length parameter [mm]", 1.0),
     ("angle_error_largest_rad", "largest error of an angle parameter [arcsec]", 1 / ARCSEC),
@@ -126,14 +120,8 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
     volume, factor = found["volume"], found["coverage_factor_95"]
     title = f"\nExpanded uncertainty U over the working volume (95 %, coverage factor {factor:.2f}) [mm]"
     table = new_table(title, "", "median", "95th percentile", "largest")
-    length = f"{volume['length_mm']:g} mm length"
-    for key, text in (
-        ("u_tip", "tip position, along its worst direction: from the calibration"),
-        ("u_length", f"{length}: from the calibration"),
-        ("u_length_reading", f"{length}: with the noise of both readings"),
-    ):
-        values = [volume[f"{key}_{which}_mm"] for which in ("median", "95", "largest")]
-        table.add_row(text, *("not determined" if value is None else formatted(factor * value) for value in values))
+    for text, values in volume_rows(volume, factor):
+        table.add_row(text, *("not determined" if value is None else formatted(value) for value in values))
     print_table(console, table)
     console.print(
         "Propagated from u of the parameters to 400 positions that random poses within the joint limits reach."
@@ -193,7 +181,7 @@ def print_stages(
     """Repeatability and length errors by stage; ``fitted``: the scale makes the last length error zero."""
     names = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
     table = new_table(title, "", *(names[stage] for stage in stages))
-    for key, text in _METRICS:
+    for key, text in METRICS:
         if key in metrics[stages[0]]:
             cells = [formatted(metrics[stage][key]) for stage in stages]
             table.add_row(

@@ -20,7 +20,6 @@ from .jacobian import tip_jacobian, tip_position
 # Steps of about 1 mm and 1 mrad are comparable at the tip of an arm of about 1 m.
 _LENGTH_STEP, _ANGLE_STEP = 1.0, 1e-3
 LENGTHS = ("a", "d", "probe")
-ANGLES = ("alpha", "theta", "beta")
 _PROBE_AXES = ("x", "y", "z")
 _LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a compiler
 

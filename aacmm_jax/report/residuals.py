@@ -8,16 +8,10 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..data.capture import Capture
 from ..model.metrics import pose_outliers
+from ..summaries.tables import METRICS
 from . import charts
 from .elements import Cell, Chart, ReportTable, format_number, number_cell, text_cell
 
-_METRICS = (
-    ("de_mm", "DE, mean distance of poses from their socket's centroid"),
-    ("deltam_mm", "Deltam, largest half range of a coordinate in a socket"),
-    ("rms_mm", "RMS distance of poses from their socket's centroid"),
-    ("length_error_mean_absolute_mm", "length error, mean absolute"),
-    ("length_error_largest_mm", "length error, largest"),
-)
 _DRAWN, _LISTED = 2000, 1000  # most poses in a chart, and in its table
 _LEAST = 1e-5  # mm: a distance of zero on a logarithmic axis
 
@@ -37,7 +31,7 @@ def metrics_table(
         return number_cell(summary[stage].get(key))
 
     rows = [
-        [text_cell(title), *(cell(stage, key) for stage in stages)] for key, title in _METRICS if key in summary[first]
+        [text_cell(title), *(cell(stage, key) for stage in stages)] for key, title in METRICS if key in summary[first]
     ]
     return ReportTable(caption, ("", *stages.values()), rows)
 
