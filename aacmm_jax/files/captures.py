@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..data.capture import Capture, ReferenceLength, check_one_capture
+from ..data.capture import Capture, ReferenceLength, Repeated, check_one_capture
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm
@@ -78,14 +78,18 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     capture = recording.capture
     check_one_capture(capture)
     owner = [capture.names[i] for i in capture.owner]
+    poses, lengths = capture.repeated
     tables = {
         "capture": Table(
             numbering("pose", len(owner))
             | numbering("joint", capture.joints)
             | {"angle": Variable(("pose", "joint"), np.asarray(capture.q), "rad", "joint angle as read")}
-            | columns("pose", socket=(owner, "", "socket that held the tip"))
+            | columns("pose", socket=(owner, "", "socket that held the tip")),
+            {"repeated_sockets": [n for n, _ in poses] or None, "repeated_poses": [n for _, n in poses] or None},
         ),
-        "reference": reference_table(capture.lengths),
+        "reference": reference_table(capture.lengths)._replace(
+            attributes={"repeated_start": [a for a, _ in lengths] or None, "repeated_end": [b for _, b in lengths] or None}
+        ),
         "nominal_arm": arm_table(recording.nominal),
     }
     if recording.true is not None:
@@ -165,7 +169,8 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     owner = np.asarray(poses["socket"]).astype(str)
     names = list(dict.fromkeys(owner.tolist()))
     try:
-        capture = Capture({name: poses["angle"][owner == name] for name in names}, lengths_of(path, stored))
+        sockets = {name: poses["angle"][owner == name] for name in names}
+        capture = Capture(sockets, lengths_of(path, stored), _repeated_of(stored))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     true = specification_of(path, stored, "true_arm") if "true_arm" in stored.tables else None
@@ -186,6 +191,15 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         },
     )
     return Recording(capture, nominal, true, attributes.get("seed"), spheres, sources, attributes.get("measured", ""))
+
+
+def _repeated_of(stored: Stored) -> Repeated:
+    """Copies that were left out before the file was written; files of version 0.1 do not say."""
+    poses, lengths = (stored.table_attributes[table] for table in ("capture", "reference"))
+    return Repeated(
+        tuple(zip(poses.get("repeated_sockets", ()), poses.get("repeated_poses", ()), strict=True)),
+        tuple(zip(lengths.get("repeated_start", ()), lengths.get("repeated_end", ()), strict=True)),
+    )
 
 
 def _is_date(text: str) -> bool:
