@@ -81,6 +81,9 @@ class Repeated(NamedTuple):
         return found
 
 
+NOTHING_REPEATED = Repeated()
+
+
 class Capture(eqx.Module):
     """Poses grouped by the socket in which the tip rested, and reference lengths between sockets.
 
@@ -112,7 +115,7 @@ class Capture(eqx.Module):
         self,
         sockets: Mapping[str, Numbers],
         lengths: Iterable[ReferenceLength] | ReferenceLength = (),
-        repeated: Repeated = Repeated(),
+        repeated: Repeated = NOTHING_REPEATED,
     ):
         if not isinstance(sockets, Mapping):
             raise InputError(

@@ -88,7 +88,10 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
             {"repeated_sockets": [n for n, _ in poses] or None, "repeated_poses": [n for _, n in poses] or None},
         ),
         "reference": reference_table(capture.lengths)._replace(
-            attributes={"repeated_start": [a for a, _ in lengths] or None, "repeated_end": [b for _, b in lengths] or None}
+            attributes={
+                "repeated_start": [a for a, _ in lengths] or None,
+                "repeated_end": [b for _, b in lengths] or None,
+            }
         ),
         "nominal_arm": arm_table(recording.nominal),
     }

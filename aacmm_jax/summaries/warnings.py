@@ -16,6 +16,7 @@ from ..data.recording import Recording
 from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Bounds, Parameters
 from ..uncertainty.identifiability import Observability, observability
+from .contradictions import contradictions
 from .likely_cause import likely_cause
 
 _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a reference length is wrong
@@ -62,6 +63,7 @@ def of_calibration(record: CalibrationRecord, seen: Observability | None = None)
     seen = observed(record) if seen is None else seen
     found = [] if record.converged else [record.reason]
     found += _implausible(record)
+    found += contradictions(record)
     found += _validation(record)
     found += [*_scale(record), *of_capture(record.recording)]
     if record.implausible_residual:
