@@ -1,6 +1,5 @@
 """Captures in HDF5: poses, reference lengths, touched spheres, the nominal arm and, for a simulation, the true arm."""
 
-import datetime
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -27,6 +26,7 @@ from .hdf5 import (
     undamaged,
     write_tables,
 )
+from .sense import check_recording
 
 _KINDS = {
     "alpha": "link twist",
@@ -184,15 +184,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     sources = tuple(stored.attributes.get("sources") or ())
     attributes = stored.attributes
     nominal = specification_of(path, stored, "nominal_arm")
-    arms = [nominal] if true is None else [nominal, true]
-    check_sense(
-        path,
-        {
-            "its arm has another number of joints than its readings": any(x.arm.joints != capture.joints for x in arms),
-            "the day of measurement is no date": not _is_date(attributes.get("measured", "")),
-            "its seed is no whole number": not isinstance(attributes.get("seed", 0), int),
-        },
-    )
+    check_recording(path, stored)
     return Recording(capture, nominal, true, attributes.get("seed"), spheres, sources, attributes.get("measured", ""))
 
 
@@ -203,13 +195,6 @@ def _repeated_of(stored: Stored) -> Repeated:
         tuple(zip(poses.get("repeated_sockets", ()), poses.get("repeated_poses", ()), strict=True)),
         tuple(zip(lengths.get("repeated_start", ()), lengths.get("repeated_end", ()), strict=True)),
     )
-
-
-def _is_date(text: str) -> bool:
-    try:
-        return not text or bool(datetime.date.fromisoformat(text[:10]))
-    except ValueError:
-        return False
 
 
 def arm_table(specification: ArmSpecification) -> Table:
