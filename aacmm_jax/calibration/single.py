@@ -89,6 +89,8 @@ def _prepare_task(
     many: str,
 ) -> Task:
     check_single(arm, capture, bounds, many)
+    for sentence in () if inside_trace() else capture.repeated.sentences():
+        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
     check_finite(arm=arm, capture=capture, noise=noise)
     space = based_on(bounds.space, arm)
     bounds = Bounds(space, bounds.lower, bounds.upper)

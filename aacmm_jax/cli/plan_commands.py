@@ -218,7 +218,7 @@ def _written(output: Path, poses: str, manifest: Path | None, manifest_text: Cal
 def _arm_for(manifest: Path, arm: str) -> str:
     """An arm as a manifest names it: a shipped name, or the path of a file relative to the manifest."""
     file = Path(arm)
-    return Path(os.path.relpath(file, manifest.parent)).as_posix() if file.is_file() else arm
+    return Path(os.path.relpath(file, manifest.parent)).as_posix() if os.path.isfile(file) else arm
 
 
 def _range(option: str, text: str) -> tuple[float, float]:

@@ -12,8 +12,10 @@ class InputError(ValueError):
 
 
 class IdentifiabilityWarning(UserWarning):
-    """The data that are given cannot determine some of the free parameters, or change nothing in the scale; the message
-    names the parameters."""
+    """The data determine less than they seem to: some free parameters or the scale not at all, or copies count once.
+
+    The message names the parameters, sockets or lengths.
+    """
 
 
 def nearest(word: str, known: Iterable[str], most: int = 12) -> str:

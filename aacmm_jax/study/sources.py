@@ -93,11 +93,7 @@ def read_study(source: str | os.PathLike) -> Study:
     if isinstance(source, str) and source in shipped_studies():
         with resources.as_file(_shipped() / f"{source}.toml") as path:
             return _study_of_file(path)
-    try:
-        exists = Path(source).exists()
-    except OSError:  # a name too long to be one
-        exists = False
-    if not exists and Path(source).suffix != ".toml":
+    if not os.path.exists(source) and Path(source).suffix != ".toml":
         known = nearest(str(source), shipped_studies())
         raise InputError(f"'{source}' is neither a file nor a study that ships with the package{known}")
     return _study_of_file(Path(source))
@@ -124,4 +120,4 @@ def _study_of_file(path: Path) -> Study:
 
 def _arm(folder: Path, name: str) -> ArmSpecification:
     neighbour = folder / name
-    return load_specification(neighbour if name.endswith(".toml") or neighbour.is_file() else name)
+    return load_specification(neighbour if name.endswith(".toml") or os.path.isfile(neighbour) else name)

@@ -17,6 +17,7 @@ from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import pose_outliers
 from ..uncertainty.identifiability import Observability, observability
+from .contradictions import contradictions
 from .likely_cause import likely_cause
 
 _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a reference length is wrong
@@ -49,24 +50,11 @@ def of_capture(recording: Recording) -> list[str]:
                 f"Joint {joint + 1}: {outside} of {len(q)} readings lie outside its limits, {low} to {high} deg; "
                 "is the unit right, and the order of the columns?"
             )
-    found += _repeated(recording)
+    found += recording.capture.repeated.sentences()
     exact = [f"{length.start} - {length.end}" for length in recording.capture.lengths if float(length.u) == 0]
     if exact and recording.true is None:
         found.append(f"Taken as exact, because u is 0: {shorten(exact)}; give the standard uncertainty of each length.")
     return found
-
-
-def _repeated(recording: Recording) -> list[str]:
-    """Poses that are in a socket twice, which is one measurement and counts as two."""
-    sockets = recording.capture.sockets.items()
-    twice = {name: len(q) - len(np.unique(np.asarray(q), axis=0)) for name, q in sockets}
-    repeated = [f"{name} ({count})" for name, count in twice.items() if count]
-    if not repeated:
-        return []
-    return [
-        f"Poses that repeat another one of their socket in every digit: {shorten(repeated)}; each counts as a "
-        "measurement of its own, which makes every uncertainty too small. Take the copies out."
-    ]
 
 
 def of_calibration(record: CalibrationRecord, seen: Observability | None = None) -> list[str]:
@@ -74,6 +62,7 @@ def of_calibration(record: CalibrationRecord, seen: Observability | None = None)
     seen = observed(record) if seen is None else seen
     found = [] if record.converged else [record.reason]
     found += _implausible(record)
+    found += contradictions(record)
     found += _validation(record)
     found += [*_scale(record), *of_capture(record.recording)]
     if record.implausible_residual:

@@ -78,6 +78,12 @@ class Page(HTMLParser):
             self.text += data
 
 
+def test_a_target_that_cannot_be_written_is_refused(written):
+    source = written.folder / "calibration.h5"
+    assert_refused(lambda: write_report(source, written.folder / f"{'x' * 300}.html"), "name too long")
+    assert_refused(lambda: write_report(source, source), "one of the files that this command reads")
+
+
 @pytest.fixture(scope="module", params=["calibration", "evaluation", "study"])
 def page(request, written):
     found = Page(written.pages[request.param].read_text(encoding="utf-8"))
