@@ -17,7 +17,7 @@ INSTALL := -m pip install --quiet --disable-pip-version-check
 # A worker that dies ends the run: a replacement might wait for ever for tests that went with the first.
 PYTEST := -m pytest -n auto --max-worker-restart 0 --dist loadscope --no-loadscope-reorder
 # Numerics, differentiation, storage and the command line on real captures: what a change of a dependency breaks first.
-SELECTION := tests/test_package.py tests/kinematics tests/solver tests/calibration/test_stages.py \
+SELECTION := tests/test_package.py tests/kinematics tests/solver tests/calibration/test_single.py \
 	tests/files/test_storage.py tests/test_real_captures.py
 PANDA := aacmm-demo/panda
 

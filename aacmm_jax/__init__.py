@@ -1,8 +1,15 @@
 """Calibration of articulated-arm coordinate measuring machines and other serial arms, differentiable throughout.
 
-The names below are those that most scripts need; everything else is grouped by subject: `acceptance`, `calibration`,
-`certificate`, `data`, `drift`, `files`, `kinematics`, `model`, `planning`, `plot`, `report`, `solver`, `study`,
-`uncertainty`, `units`. A name is imported when it is first asked for; the stub `__init__.pyi` lists them.
+The names below are those that most scripts need; everything else is grouped by subject, one folder each:
+
+* `kinematics`: the arm. `data`: captures, noise, simulation. `solver`: bounded least squares.
+* `model`: the residual of a capture for an arm. `uncertainty`: what data determine, and how well.
+* `calibration`: identify and calibrate, one and many. `study`: calibrations by the thousand.
+* `acceptance`, `drift`, `planning`: tests by standards, calibrations compared, which poses to take.
+* `files`: every format. `summaries`: sentences and tables. `report`, `plot`, `certificate`, `cli`: what people read.
+* `core`: arrays, errors, `units`.
+
+A name is imported when it is first asked for; the stub `__init__.pyi` lists them.
 """
 
 import lazy_loader as _lazy_loader

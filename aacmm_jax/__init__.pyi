@@ -21,8 +21,8 @@ from .calibration.results import Calibration as Calibration
 from .calibration.results import Identification as Identification
 from .calibration.sampling import bootstrap as bootstrap
 from .calibration.sampling import monte_carlo as monte_carlo
-from .calibration.stages import calibrate as calibrate
-from .calibration.stages import identify as identify
+from .calibration.single import calibrate as calibrate
+from .calibration.single import identify as identify
 from .core import units as units
 from .core.errors import IdentifiabilityWarning as IdentifiabilityWarning
 from .core.errors import InputError as InputError

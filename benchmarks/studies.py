@@ -49,39 +49,28 @@ def once(trials: int, repeats: int, bare: int) -> dict:
     found = {"total": CELLS * trials, "seconds": [], "bare_seconds": []}
     with tempfile.TemporaryDirectory() as folder:
         aj.study.run_study(sized(1000), Path(folder) / "first.h5")
-        forget_pools()
+        aj.study.clear_pools()
         for number in range(repeats):
             began = time.perf_counter()
             aj.study.run_study(sized(trials), Path(folder) / f"{number}.h5")
             found["seconds"].append(time.perf_counter() - began)
             found["bytes"] = (Path(folder) / f"{number}.h5").stat().st_size
-            forget_pools()
+            aj.study.clear_pools()
             if bare:
                 found["bare_seconds"].append(bare_seconds(sized(trials)))
     found["peak_gib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return found
 
 
-def forget_pools() -> None:
-    from aacmm_jax.study import configuration_pool, trial_simulation
-
-    for cached in (configuration_pool._pool, configuration_pool._fixture_table, trial_simulation._prepared):
-        cached.cache_clear()
-
-
 def bare_seconds(study) -> float:
     """`identify_many` alone on the problems of every cell."""
-    import jax
-
     import aacmm_jax as aj
-    from aacmm_jax.study.trial_simulation import draw
-    from aacmm_jax.study.trials import captures_of
 
     total = 0.0
     for cell in range(CELLS):
         setting = study.settings[cell]
-        drawn = draw(study, setting, np.full(study.trials, cell), np.arange(study.trials), jax.devices()[0])
-        problem = (study.nominal.arm, captures_of(study, setting, drawn), drawn.lower, drawn.upper, drawn.start)
+        drawn, captures = aj.study.draw_trials(study, cell, np.arange(study.trials))
+        problem = (study.nominal.arm, captures, drawn.lower, drawn.upper, drawn.start)
         if cell < 2:  # both ways of holding, compiled
             aj.identify_many(*problem, space=study.space, hold=setting.hold)
         began = time.perf_counter()

@@ -18,10 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.sampling import batch_of
-from aacmm_jax.kinematics.inverse_kinematics import project_to_targets
-from aacmm_jax.study.trial_simulation import draw
-from aacmm_jax.uncertainty.volume import sample_lengths
 
 ARCSEC = aj.units.ARCSEC
 CAPTURES = Path(__file__).resolve().parents[1] / "examples/mukca"
@@ -47,7 +43,7 @@ def study_of(trials: int, length_bound: float) -> aj.study.Study:
 
 def drawn_of(study: aj.study.Study, trials: int):
     """Readings, true parameters and certified values of every trial."""
-    return draw(study, study.settings[0], np.zeros(trials, int), np.arange(trials), jax.local_devices()[0])
+    return aj.study.draw_trials(study, 0, np.arange(trials))[0]
 
 
 def capture_of(q, value) -> aj.Capture:
@@ -59,7 +55,10 @@ def capture_of(q, value) -> aj.Capture:
 
 def lengths_over_volume(arm: aj.Arm) -> tuple[np.ndarray, np.ndarray]:
     """Sixty lengths of 300 mm and twenty of any length, all over the volume."""
-    pairs = [sample_lengths(arm, 60, length=300.0, seed=5), sample_lengths(arm, 20, length=None, seed=6)]
+    pairs = [
+        aj.uncertainty.sample_lengths(arm, 60, length=300.0, seed=5),
+        aj.uncertainty.sample_lengths(arm, 20, length=None, seed=6),
+    ]
     return tuple(np.concatenate(column) for column in zip(*pairs, strict=True))
 
 
@@ -142,9 +141,8 @@ def sampled(trials: int = 10_000, draws: int = 199, length_bound: float = 10.0) 
     averaging = (owner[None] == np.arange(3)[:, None]) / np.array(SIZES)[:, None]
     bounds = aj.Bounds(space, drawn.lower[0], drawn.upper[0])
     template = capture_of(jnp.asarray(drawn.q[0]), 1.0)
-    many = aj.calibrate_many(
-        arm, batch_of(template, drawn.q, drawn.value), bounds.lower, bounds.upper, method="joint", noise=NOISE
-    )
+    captures = aj.calibration.batch_of_captures(template, drawn.q, drawn.value)
+    many = aj.calibrate_many(arm, captures, bounds, method="joint", noise=NOISE)
     start, end = (jnp.asarray(q) for q in lengths)
 
     @jax.jit
@@ -162,7 +160,7 @@ def sampled(trials: int = 10_000, draws: int = 199, length_bound: float = 10.0) 
         for i in range(done, min(done + at_once, trials)):
             body = space.arm(many.parameters[i])
             centroids = averaging @ np.asarray(body.position(drawn.q[i]))
-            exact, _ = project_to_targets(body, drawn.q[i], centroids[owner])
+            exact, _ = aj.kinematics.project_to_targets(body, drawn.q[i], centroids[owner])
             moves = np.linalg.pinv(np.asarray(body.jacobian(exact, [f"q_{j}" for j in range(1, 7)])))
             seats = 0.005 * random.normal(size=(draws, len(owner), 3))
             q = exact + np.einsum("Nic,tNc->tNi", moves, seats) + 2 * ARCSEC * random.normal(size=(draws, *exact.shape))
@@ -171,7 +169,7 @@ def sampled(trials: int = 10_000, draws: int = 199, length_bound: float = 10.0) 
             values.append(size + 0.002 * random.normal(size=(draws, 1)))
         again = aj.calibrate_many(
             arm,
-            batch_of(template, np.concatenate(readings), np.concatenate(values)),
+            aj.calibration.batch_of_captures(template, np.concatenate(readings), np.concatenate(values)),
             bounds.lower,
             bounds.upper,
             many.stage1.parameters[done],
@@ -283,7 +281,7 @@ def planned(sets: int = 100) -> dict:
     """Planned against 70 random poses: the largest uncertainty of 400 lengths of 300 mm, by formula and simulation."""
     arm = aj.load_arm("cheng2018-simulation")
     space = aj.Parameters.free_of(arm)
-    start, end = sample_lengths(arm, 400, length=300.0, seed=99)
+    start, end = aj.uncertainty.sample_lengths(arm, 400, length=300.0, seed=99)
     found = {"plans": []}
     # Random poses know no table, so plans are compared without one; and shown with one.
     for above in (0.0, -math.inf):
@@ -328,7 +326,8 @@ def largest_uncertainty(arm, space, capture, start, end, draws) -> dict:
         + 2 * ARCSEC * random.normal(size=(draws, *capture.q.shape))
     )
     values = np.array([float(r.value) for r in lengths]) + 0.002 * random.normal(size=(draws, len(lengths)))
-    many = aj.calibrate_many(arm, batch_of(capture, q, values), bounds.lower, bounds.upper, method="joint", noise=NOISE)
+    captures = aj.calibration.batch_of_captures(capture, q, values)
+    many = aj.calibrate_many(arm, captures, bounds, method="joint", noise=NOISE)
     measured = _measured(space, jnp.asarray(many.parameters), jnp.asarray(start), jnp.asarray(end))
     off = 1e3 * (
         np.asarray(measured) - np.linalg.norm(np.asarray(arm.position(start)) - np.asarray(arm.position(end)), axis=1)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 
 from ..core.arrays import Numbers
-from ..core.errors import counted
+from ..core.text import pluralise
 from ..kinematics.workspace import Reach
 from .lengths import distinct_lengths, length_readings, values_by_artefact
 from .procedure_items import PlannedItems, PlannedSphere, ProcedureRegion, bar_items, socket_in_zone, touch_item
@@ -98,8 +98,8 @@ def length_error(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | No
     if len(bars) < _LENGTHS or min(map(len, bars)) < _POSITIONS or min(repeats) < _REPEATS:
         missing.append(
             f"{_LENGTHS} lengths in {_POSITIONS} positions, {_REPEATS} readings each: "
-            f"{_LENGTHS * _POSITIONS * _REPEATS} in all ({counted(len(values), 'reading')} of "
-            f"{counted(len(bars), 'length')} given)"
+            f"{_LENGTHS * _POSITIONS * _REPEATS} in all ({pluralise(len(values), 'reading')} of "
+            f"{pluralise(len(bars), 'length')} given)"
         )
     if measured.reach is None:
         missing.append("the reach of the arm, to judge the longest length")

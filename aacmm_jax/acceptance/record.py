@@ -116,6 +116,7 @@ def evaluation_of(
         warnings.append(f"The calibration failed, so the results mean nothing: {reason}")
     if recording.true is not None:
         warnings.append(SIMULATED)
+    warnings += recording.capture.repeated.sentences()
     partly = [f"{name} ({count} of {len(sockets[name])} poses)" for name, count in shared.items()
               if 0 < count < len(sockets[name])]  # fmt: skip
     if partly:

@@ -1,4 +1,8 @@
-"""Identification and calibration: one, many at once, repeated, cross-validated; and their results."""
+"""Identification and calibration: one (`single`), many (`batch`), repeated, cross-validated; and their results.
+
+Elsewhere: the residual that is minimised (`model.residuals`), the active set (`solver.active_set`), covariance
+(`uncertainty`), the file of a calibration (`files.calibrations`), the wording of its warnings (`summaries.warnings`).
+"""
 
 import lazy_loader as _lazy_loader
 

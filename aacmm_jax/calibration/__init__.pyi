@@ -6,3 +6,4 @@ from .results import ManyCalibrations as ManyCalibrations
 from .results import ManyIdentifications as ManyIdentifications
 from .results import converged as converged
 from .sampling import Sampled as Sampled
+from .sampling import batch_of_captures as batch_of_captures

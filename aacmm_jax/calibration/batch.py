@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arguments import check_finite, checked_arguments, items_of
+from ..core.arguments import check_finite, checked_arguments, items_of, with_options
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
 from ..data.capture import Capture
@@ -29,7 +29,7 @@ from .batch_kernel import Problems, Shape, solve_chunk
 from .checks import based_on, check_enough
 from .results import ManyCalibrations, ManyIdentifications
 from .scale_anchor import ScaleAnchor, scale_anchor
-from .second_stage import divided, rows_of, second_stage_many
+from .second_stage import divide_by_k, fix_scale_many, select_problems
 
 # Slots per loop. On a CPU the Jacobian columns of all slots should fit the second-level cache (measured from 20 to
 # 7,000 poses: five times slower where they do not); a GPU needs thousands.
@@ -38,22 +38,28 @@ _SLOTS_ELSEWHERE = 4096
 _ROUNDS = 64  # problems that a slot of one chunk takes at most, one after the other
 
 
+class BatchOptions(NamedTuple):
+    """The keyword arguments that `identify_many` and `calibrate_many` share; described there."""
+
+    space: Parameters | None = None
+    hold: str | None = "longest"
+    noise: Noise | None = None
+    max_steps: int = 300
+    chunk: int | None = None
+    slots: int | None = None
+    devices: Sequence[Any] | None = None
+    workers: int | None = None
+
+
 @checked_arguments
+@with_options(BatchOptions)
 def identify_many(
     arm: Arm,
     capture: Capture,
     lower: Bounds | Numbers,
     upper: Numbers | None = None,
     start: Numbers | None = None,
-    *,
-    space: Parameters | None = None,
-    hold: str | None = "longest",
-    noise: Noise | None = None,
-    max_steps: int = 300,
-    chunk: int | None = None,
-    slots: int | None = None,
-    devices: Sequence[Any] | None = None,
-    workers: int | None = None,
+    **options: Any,
 ) -> ManyIdentifications:
     """Stage 1 for a batch: what `identify` does, problem by problem, fast.
 
@@ -81,13 +87,11 @@ def identify_many(
     Raises:
         InputError: For shapes that do not fit, a lower bound above its upper one, and too few poses.
     """
-    _check_known("identify", arm, capture, lower, upper, start)
-    lower, upper, space = _bounds_and_space(arm, lower, upper, space)
-    effort = Effort(max_steps, chunk, slots, devices, workers)
-    return BatchTask.of(arm, capture, lower, upper, start, space, hold, noise, effort).identified()
+    return _batch_task("identify", arm, capture, lower, upper, start, BatchOptions(**options)).identify()
 
 
 @checked_arguments
+@with_options(BatchOptions)
 def calibrate_many(
     arm: Arm,
     capture: Capture,
@@ -96,14 +100,7 @@ def calibrate_many(
     start: Numbers | None = None,
     *,
     method: Literal["two-stage", "joint"] = "two-stage",
-    space: Parameters | None = None,
-    hold: str | None = "longest",
-    noise: Noise | None = None,
-    max_steps: int = 300,
-    chunk: int | None = None,
-    slots: int | None = None,
-    devices: Sequence[Any] | None = None,
-    workers: int | None = None,
+    **options: Any,
 ) -> ManyCalibrations:
     """Both stages for a batch: what `calibrate` does, problem by problem, fast.
 
@@ -124,68 +121,38 @@ def calibrate_many(
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many."
         )
-    _check_known("calibrate", arm, capture, lower, upper, start)
-    lower, upper, space = _bounds_and_space(arm, lower, upper, space)
-    effort = Effort(max_steps, chunk, slots, devices, workers)
-    return calibrated(BatchTask.of(arm, capture, lower, upper, start, space, hold, noise, effort), method)
+    return _batch_task("calibrate", arm, capture, lower, upper, start, BatchOptions(**options)).calibrate(method)
 
 
-def calibrated(task: "BatchTask", method: str) -> ManyCalibrations:
-    """`calibrate_many` for a batch that is checked."""
-    stage1 = task.identified()
-    assert stage1.k is not None
-    if method == "two-stage":
-        found = second_stage_many(task.anchor, stage1, task.identified_again)
-        return ManyCalibrations(k=stage1.k, stage1=stage1, method=method, **found)
-    scaled = divided(task.anchor, stage1.space, stage1.parameters, stage1.k)
-    joint = task.repeated(task.arm, task.capture, stage1.bounds, scaled, None, stage1.sigma / stage1.k).identified()
-    return ManyCalibrations(
-        parameters=joint.parameters,
-        k=stage1.k,
-        de=joint.de,
-        deltam=joint.deltam,
-        steps=stage1.steps + joint.steps,
-        result=joint.result,
-        active=joint.active,
-        stage1=stage1,
-        method=method,
-    )
-
-
-def _check_known(single: str, *trees: Any) -> None:
-    """Raise `InputError` inside jit, vmap and derivatives: a batch is distributed over threads by its values."""
-    if not is_concrete(*jax.tree.leaves(trees)):
+def _batch_task(
+    single: str,
+    arm: Arm,
+    capture: Capture,
+    lower: Bounds | Numbers,
+    upper: Numbers | None,
+    start: Numbers | None,
+    options: BatchOptions,
+) -> "BatchTask":
+    """The task that a user's arguments state; ``single`` is the function that solves one problem."""
+    # A batch is distributed over threads by its values, so that it cannot be traced.
+    if not is_concrete(*jax.tree.leaves((arm, capture, lower, upper, start))):
         raise InputError(
             f"{single}_many needs known values, but is called inside jit, vmap or a derivative; call it outside, "
             f"or use jax.vmap of {single} there."
         )
-
-
-def _bounds_and_space(
-    arm: Arm, lower: Bounds | Numbers, upper: Numbers | None, space: Parameters | None
-) -> tuple[Numbers, Numbers, Parameters]:
-    """Bounds as arrays and the free parameters, from `Bounds` or from arrays."""
     if isinstance(lower, Bounds):
-        for what, given in (("upper bounds", upper), ("a space", space)):
+        for what, given in (("upper bounds", upper), ("a space", options.space)):
             if given is not None:
                 raise InputError(
                     f"Bounds are given, and {what} as well, which they hold already; leave one out (a start goes by "
                     "its name: start=...)."
                 )
-        return lower.lower, lower.upper, lower.space
-    if upper is None:
+        bounds, space = (lower.lower, lower.upper), lower.space
+    elif upper is None:
         raise InputError("lower bounds are given without upper ones; give both, or Bounds, which hold both.")
-    return lower, upper, Parameters.free_of(arm) if space is None else space
-
-
-class Effort(NamedTuple):
-    """How much is computed at a time, and where."""
-
-    max_steps: int = 300
-    chunk: int | None = None
-    slots: int | None = None
-    devices: Sequence[Any] | None = None
-    workers: int | None = None
+    else:
+        bounds, space = (lower, upper), Parameters.free_of(arm) if options.space is None else options.space
+    return BatchTask.of(arm, capture, bounds, start, space, options)
 
 
 class BatchTask(NamedTuple):
@@ -201,42 +168,39 @@ class BatchTask(NamedTuple):
     workers: int
     space: Parameters
     anchor: ScaleAnchor
-    noise: Noise | None
-    effort: Effort
+    options: BatchOptions
 
     @classmethod
     def of(
         cls,
         arm: Arm,
         capture: Capture,
-        lower: Numbers,
-        upper: Numbers,
+        bounds: tuple[Numbers, Numbers],
         start: Numbers | None,
         space: Parameters,
-        hold: str | ScaleAnchor | None,
-        noise: Noise | None,
-        effort: Effort,
+        options: BatchOptions,
+        anchor: ScaleAnchor | None = None,
         sigma: Float[np.ndarray, " b"] | None = None,
     ) -> "BatchTask":
-        """Everything checked and laid out. ``hold`` may be an anchor that is known; ``sigma`` is of a joint solve, see
+        """Everything checked and laid out. ``anchor`` is one that is known; ``sigma`` is of a joint solve, see
         `Problems`."""
-        problems, batched, size = _problems(arm, capture, lower, upper, start, space, sigma)
-        anchor = hold if isinstance(hold, ScaleAnchor) else scale_anchor(space, arm, hold, noise)
+        problems, batched, size = _lay_out(arm, capture, bounds, start, space, sigma)
+        anchor = scale_anchor(space, arm, options.hold, options.noise) if anchor is None else anchor
         check_joints(capture, space)
-        if noise is not None:
-            check_finite(noise=noise)
-            noise.check(arm.joints)
+        if options.noise is not None:
+            check_finite(noise=options.noise)
+            options.noise.check(arm.joints)
         check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
         for what in ("max_steps", "chunk", "slots", "workers"):
-            number = getattr(effort, what)
+            number = getattr(options, what)
             if number is not None and number < 1:
                 raise InputError(f"{what} is {number}; give at least 1, or leave it out.")
-        devices = jax.local_devices() if effort.devices is None else items_of(effort.devices, "devices")
+        devices = jax.local_devices() if options.devices is None else items_of(options.devices, "devices")
         if not devices:
             raise InputError("devices is empty; name at least one, or leave it out.")
-        slots = effort.slots or _slots(devices, sum(capture.sizes))
-        workers = effort.workers or _workers(devices)
-        chunks = _chunks(size, slots, workers, effort.chunk)
+        slots = options.slots or _default_slots(devices, sum(capture.sizes))
+        workers = options.workers or _default_workers(devices)
+        chunks = _cut_into_chunks(size, slots, workers, options.chunk)
         shape = Shape(
             sizes=capture.sizes,
             ends=tuple((int(a), int(b)) for a, b in capture.ends()),
@@ -245,47 +209,14 @@ class BatchTask(NamedTuple):
             scale=tuple(np.asarray(space.scale).tolist()),
             batched=batched,
             slots=slots,
-            max_steps=effort.max_steps,
+            max_steps=options.max_steps,
         )
-        capacity = _capacity(max(map(len, chunks)), slots)
+        capacity = _round_up(max(map(len, chunks)), slots)
         space = based_on(space, arm)
-        return cls(arm, capture, problems, shape, chunks, capacity, devices, workers, space, anchor, noise, effort)
+        return cls(arm, capture, problems, shape, chunks, capacity, devices, workers, space, anchor, options)
 
-    def repeated(
-        self,
-        arm: Arm,
-        capture: Capture,
-        bounds: Bounds,
-        start: np.ndarray,
-        hold: str | None,
-        sigma: Float[np.ndarray, " b"] | None = None,
-    ) -> "BatchTask":
-        """Another solve of the same batch, or of a part of it, from another start and with another anchor."""
-        anchor = self.anchor._replace(hold=hold)
-        lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)
-        return BatchTask.of(arm, capture, lower, upper, start, self.space, anchor, self.noise, self.effort, sigma)
-
-    def identified_again(self, rows: np.ndarray, start: np.ndarray, hold: str | None) -> ManyIdentifications:
-        """Stage 1 of some of the problems, with another anchor."""
-        problems = self.problems
-        arm, capture, lower, upper = rows_of(rows, self.arm, self.capture, problems.lower, problems.upper)
-        bounds = Bounds(self.space, lower, upper)
-        again = self.repeated(arm, capture, bounds, start, hold)
-        # Of the capacity of the whole batch, whatever the number of problems: one compiled program for all of them.
-        return again._replace(capacity=max(again.capacity, self.capacity)).identified()
-
-    def run(self, chunk: range, device: Any) -> tuple[np.ndarray, ...]:
-        """Solve one chunk, filled up to the capacity with copies of its first problem, which are never begun."""
-        rows = np.full(self.capacity, chunk.start)
-        rows[: len(chunk)] = chunk
-        part = jax.tree.map(lambda leaf, many: leaf[rows] if many else leaf, self.problems, self.shape.batched)
-        with jax.default_device(device):
-            given = jax.device_put((part, np.asarray(len(chunk)), self.noise), device)
-            solved = solve_chunk(*given, self.shape, self.capacity)
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(chunk)], solved)
-
-    def identified(self) -> ManyIdentifications:
-        """All chunks solved."""
+    def identify(self) -> ManyIdentifications:
+        """Stage 1 of all problems."""
         found = _run_chunks(self.run, self.chunks, self.devices, self.workers)
         parameters, de, deltam, sigma, k, steps, reason, active = (
             np.concatenate(column) for column in zip(*found, strict=True)
@@ -303,20 +234,73 @@ class BatchTask(NamedTuple):
             anchor=self.anchor,
         )
 
+    def calibrate(self, method: str) -> ManyCalibrations:
+        """Both stages of all problems."""
+        stage1 = self.identify()
+        assert stage1.k is not None
+        if method == "two-stage":
+            found = fix_scale_many(self.anchor, stage1, self.identify_again)
+            return ManyCalibrations(k=stage1.k, stage1=stage1, method=method, **found)
+        scaled = divide_by_k(self.anchor, stage1.space, stage1.parameters, stage1.k)
+        box = self.problems.lower, self.problems.upper
+        joint = self.with_start(self.arm, self.capture, box, scaled, None, stage1.sigma / stage1.k).identify()
+        return ManyCalibrations(
+            parameters=joint.parameters,
+            k=stage1.k,
+            de=joint.de,
+            deltam=joint.deltam,
+            steps=stage1.steps + joint.steps,
+            result=joint.result,
+            active=joint.active,
+            stage1=stage1,
+            method=method,
+        )
 
-def _slots(devices: Sequence[Any], poses: int) -> int:
+    def identify_again(self, rows: np.ndarray, start: np.ndarray, hold: str | None) -> ManyIdentifications:
+        """Stage 1 of some of the problems, from another start and with another anchor."""
+        problems = self.problems
+        arm, capture, *box = select_problems(rows, self.arm, self.capture, problems.lower, problems.upper)
+        again = self.with_start(arm, capture, (box[0], box[1]), start, hold)
+        # Of the capacity of the whole batch, whatever the number of problems: one compiled program for all of them.
+        return again._replace(capacity=max(again.capacity, self.capacity)).identify()
+
+    def with_start(
+        self,
+        arm: Arm,
+        capture: Capture,
+        bounds: tuple[np.ndarray, np.ndarray],
+        start: np.ndarray,
+        hold: str | None,
+        sigma: Float[np.ndarray, " b"] | None = None,
+    ) -> "BatchTask":
+        """The task for the same batch, or for a part of it, from another start and with another anchor."""
+        anchor = self.anchor._replace(hold=hold)
+        return BatchTask.of(arm, capture, bounds, start, self.space, self.options, anchor, sigma)
+
+    def run(self, chunk: range, device: Any) -> tuple[np.ndarray, ...]:
+        """Solve one chunk, filled up to the capacity with copies of its first problem, which are never begun."""
+        rows = np.full(self.capacity, chunk.start)
+        rows[: len(chunk)] = chunk
+        part = jax.tree.map(lambda leaf, many: leaf[rows] if many else leaf, self.problems, self.shape.batched)
+        with jax.default_device(device):
+            given = jax.device_put((part, np.asarray(len(chunk)), self.options.noise), device)
+            solved = solve_chunk(*given, self.shape, self.capacity)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(chunk)], solved)
+
+
+def _default_slots(devices: Sequence[Any], poses: int) -> int:
     if devices[0].platform != "cpu":
         return _SLOTS_ELSEWHERE
     return min(_SLOTS_CPU, 2 ** max(round(math.log2(_POSES_IN_CACHE / poses)), 0))
 
 
-def _workers(devices: Sequence[Any]) -> int:
+def _default_workers(devices: Sequence[Any]) -> int:
     """Chunks in work at the same time: one for each device; on a CPU, one for each core."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return len(devices) if devices[0].platform != "cpu" else max(len(devices), cores)
 
 
-def _chunks(size: int, slots: int, workers: int, chunk: int | None) -> list[range]:
+def _cut_into_chunks(size: int, slots: int, workers: int, chunk: int | None) -> list[range]:
     """The batch in chunks: of the given size, or as few as keep all workers busy, since slots idle at the end of
     each."""
     if chunk is None:
@@ -326,7 +310,7 @@ def _chunks(size: int, slots: int, workers: int, chunk: int | None) -> list[rang
     return [range(first, min(first + chunk, size)) for first in range(0, size, chunk)]
 
 
-def _capacity(count: int, slots: int) -> int:
+def _round_up(count: int, slots: int) -> int:
     """Whole rounds of the slots, their number a power of two: each size is compiled once, so there should be few."""
     return slots * 2 ** math.ceil(math.log2(-(-count // slots)))
 
@@ -363,29 +347,26 @@ def _run_chunks(run: Callable, chunks: Sequence[range], devices: Sequence[Any], 
     return results
 
 
-def _problems(
+def _lay_out(
     arm: Arm,
     capture: Capture,
-    lower: Numbers,
-    upper: Numbers,
+    bounds: tuple[Numbers, Numbers],
     start: Numbers | None,
     space: Parameters,
     sigma: Float[np.ndarray, " b"] | None,
 ) -> tuple[Problems, Problems, int]:
     """The batch on the host, which leaves are batched, and its size. Raises `InputError` where shapes do not fit."""
     p = len(space.names)
-    given = {"start": space.vector(arm) if start is None else start, "lower": lower, "upper": upper}
+    given = {"start": space.vector(arm) if start is None else start, "lower": bounds[0], "upper": bounds[1]}
     boxes = {what: np.asarray(as_array(value, what)) for what, value in given.items()}
     for what, value in boxes.items():
         if value.ndim not in (1, 2) or value.shape[-1] != p:
             raise InputError(
                 f"{what} has shape {value.shape}; give ({p},) or (batch, {p}), since {p} parameters are free."
             )
-    if arm.beta is None and space.base.beta is not None:
-        arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
     lengths = [[np.asarray(getattr(r, key)) for r in capture.lengths] for key in ("value", "u")]
     nominal, u = (np.stack(values, axis=-1) if values else np.zeros(0) for values in lengths)
-    geometry = jax.tree.map(np.asarray, arm.geometry)
+    geometry = jax.tree.map(np.asarray, based_on(space, arm).base.geometry)
     q = np.asarray(capture.q)
     problems = Problems(boxes["start"], boxes["lower"], boxes["upper"], geometry, q, nominal, u, sigma)
     ranks = Problems(1, 1, 1, jax.tree.map(lambda _: 1, geometry), 2, 1, 1, None if sigma is None else 0)

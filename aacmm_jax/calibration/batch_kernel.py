@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..core.namespace import AnyArray
+from ..core.numpy_or_jax import AnyArray
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import with_values
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass, sines_cosines
 from ..model.measurement import Measurement
 from ..model.metrics import repeatability
-from ..model.residuals import JointWeights, model_of
+from ..model.residuals import JointWeights, normal_equations
 from ..model.scale import scale_of
 from ..model.weights import Weights
 from ..solver.active_set import Box, choose
@@ -136,7 +136,7 @@ def _solve_all(batch: _Batch, shape: Shape, count: Int[Array, ""], capacity: int
         joint_weights = (
             None if part.joint_weights is None else JointWeights(shape.ends, problems.nominal, *part.joint_weights)
         )
-        return model_of(geometry, part.sines_cosines, shape.sizes, indices, joint_weights, part.weights)
+        return normal_equations(geometry, part.sines_cosines, shape.sizes, indices, joint_weights, part.weights)
 
     def more(carry) -> Bool[Array, ""]:
         _, index, _, _ = carry

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..core.arrays import is_concrete
 from ..core.errors import InputError
-from ..core.namespace import AnyArray
+from ..core.numpy_or_jax import AnyArray
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm, is_single

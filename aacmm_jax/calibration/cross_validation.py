@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..core.arguments import checked_arguments
 from ..core.errors import InputError
-from ..core.namespace import to_numpy
+from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm
@@ -19,7 +19,7 @@ from ..uncertainty.arm_uncertainty import Uncertainty
 from .evaluation import evaluate
 from .record import uncertainty_of
 from .results import CrossValidation, LeftOut
-from .stages import calibrate
+from .single import calibrate
 
 
 def groups_of(capture: Capture) -> tuple[tuple[str, ...], ...]:

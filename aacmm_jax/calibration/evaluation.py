@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..core.arguments import checked_arguments
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, compiled, namespace, to_jax, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
 from ..kinematics.arm import Arm
 from ..model.measurement import Measurement, length_covariance

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, compiled, namespace, set_at, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, set_at, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
@@ -169,8 +169,8 @@ def _whitening(task: ObservedTask, state: State) -> Whitening:
 def identify_observed(task: ObservedTask) -> Identification:
     """The parameters and the unknown geometry that agree best with everything observed.
 
-    Solved at least twice: with the weights of the start, and with those of that solution. Where the noise is not given, tips are
-    taken to scatter as much as the residuals then do (`observed_covariance.scatter_of`).
+    Solved at least twice: with the weights of the start, and with those of that solution. Where the noise is not given,
+    tips are taken to scatter as much as the residuals then do (`observed_covariance.scatter_of`).
     """
     xp = namespace(task)
     names = task.bounds.space.names

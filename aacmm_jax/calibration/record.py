@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..core.arguments import checked_arguments
-from ..core.errors import some
+from ..core.text import shorten
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..kinematics.parameters import ArmSpecification, Parameters
@@ -133,7 +133,7 @@ def _reason(calibration: Calibration) -> str:
     result = calibration.result if bool(calibration.stage1.converged) else calibration.stage1.result
     sides = [f"{name} ({side})" for name, side in calibration.active_names().items()]
     sentence = Reason[result]
-    return f"{sentence.rstrip('.')}: {some(sides)}." if int(numbers_of(result)) == SCALE and sides else sentence
+    return f"{sentence.rstrip('.')}: {shorten(sides)}." if int(numbers_of(result)) == SCALE and sides else sentence
 
 
 @checked_arguments

@@ -14,7 +14,7 @@ from ..core._compat import member_numbers
 from ..core.arrays import Numbers, is_concrete
 from ..core.distributions import chi_square_quantile
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
@@ -126,8 +126,8 @@ class ObservedMetrics(eqx.Module):
     reduced_chi: Float[AnyArray, " k"]  # root mean square in standard deviations of a residual
     reduced_chi_of_all: Float[AnyArray, ""]  # over the degrees of freedom of all
     sigma: Float[AnyArray, ""]  # standard deviation of a tip coordinate, mm, estimated from the residuals
-    geometry: dict[str, Float[AnyArray, " n"]]  # part of the unknown geometry -> its numbers, mm and rad
-    weights: tuple[Float[AnyArray, " m"], ...]  # of every pose; less than 1 where a robust loss takes weight from it
+    geometry: dict[str, Float[AnyArray, " _"]]  # part of the unknown geometry -> its numbers, mm and rad
+    weights: tuple[Float[AnyArray, " _"], ...]  # of every pose; less than 1 where a robust loss takes weight from it
 
 
 class Identification(AbstractSingleResult):

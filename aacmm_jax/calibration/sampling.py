@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..core.arguments import checked_arguments
-from ..core.arrays import random_generator
+from ..core.arrays import Numbers, random_generator
 from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.noise import Noise
@@ -18,7 +18,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..uncertainty.volume import default_length, sample_lengths
-from .batch import BatchTask, Effort, calibrated
+from .batch import BatchOptions, BatchTask
 from .record import uncertainty_of
 from .results import Calibration
 
@@ -282,16 +282,14 @@ class _RepeatedTask(NamedTuple):
         # What sets the scale, and the noise that weights the poses, are the calibration's own.
         task = BatchTask.of(
             stage1.arm,
-            batch_of(self.capture, q, values),
-            bounds.lower,
-            bounds.upper,
+            batch_of_captures(self.capture, q, values),
+            (bounds.lower, bounds.upper),
             stage1.parameters,
             result.space,
+            BatchOptions(noise=result.given_noise),
             stage1.anchor,
-            result.given_noise,
-            Effort(),
         )
-        many = calibrated(task, result.method)
+        many = task.calibrate(result.method)
         good = many.converged
         ends = (jnp.asarray(self.start), jnp.asarray(self.end))
         lengths = _lengths_of(Parameters(result.arm, result.space.names), jnp.asarray(many.parameters), ends)
@@ -335,9 +333,22 @@ def _lengths_of(space: Parameters, parameters: Array, ends: tuple[Array, Array])
     return jax.lax.map(one, parameters, batch_size=256)
 
 
-def batch_of(capture: Capture, q: Float[np.ndarray, "t N n"], values: Float[np.ndarray, "t l"]) -> Capture:
-    """A batch of captures like this one with other readings and certified lengths; nothing is checked."""
-    names = range(len(capture.lengths))
-    leaves = lambda c: [c.q, *(c.lengths[i].value for i in names), *(c.lengths[i].u for i in names)]  # noqa: E731
-    covariance = [jnp.asarray(np.broadcast_to(np.asarray(length.u), len(q))) for length in capture.lengths]
-    return eqx.tree_at(leaves, capture, [jnp.asarray(q), *(jnp.asarray(values[:, i]) for i in names), *covariance])
+def batch_of_captures(capture: Capture, q: Numbers, values: Numbers, u: Numbers | None = None) -> Capture:
+    """A batch of captures like this one, with other readings and reference lengths, as `identify_many` takes it.
+
+    Args:
+        capture: The sockets with their numbers of poses, and the reference lengths, l of them.
+        q: Readings ``(batch, N, n)``, socket after socket, rad.
+        values: Certified values of the reference lengths ``(batch, l)``, mm.
+        u: Their standard uncertainties, likewise; by default the capture's.
+
+    Returns:
+        The captures; nothing is checked.
+    """
+    lengths = range(len(capture.lengths))
+    if u is None:
+        own = [np.asarray(length.u) for length in capture.lengths]
+        u = np.broadcast_to(np.stack(own), np.shape(values)) if own else np.zeros((len(np.asarray(q)), 0))
+    leaves = lambda c: [c.q, *(c.lengths[i].value for i in lengths), *(c.lengths[i].u for i in lengths)]  # noqa: E731
+    columns = [np.asarray(column)[:, i] for column in (values, u) for i in lengths]
+    return eqx.tree_at(leaves, capture, [np.asarray(q), *columns])

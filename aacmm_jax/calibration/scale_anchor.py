@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.arrays import is_concrete
-from ..core.errors import InputError, some
+from ..core.errors import InputError
+from ..core.text import shorten
 from ..data.noise import Noise
 from ..kinematics.arm import (
     Arm,
@@ -45,6 +46,11 @@ class ScaleAnchor(NamedTuple):
     set_by: tuple[str, ...]  # fixed lengths that determine the scale well, so that stage 2 changes nothing
     # Fixed lengths that free ones replace exactly in stage 2; None where some have no such partner, or are not known.
     partners: Partners | None
+
+    @property
+    def can_scale(self) -> bool:
+        """Whether stage 2 changes the arm: not where fixed lengths set the scale, or no length is free."""
+        return not self.set_by and self.adjusted is not None
 
 
 def scale_anchor(space: Parameters, arm: Arm, hold: str | None, noise: Noise | None = None) -> ScaleAnchor:
@@ -89,7 +95,7 @@ def scale_anchor(space: Parameters, arm: Arm, hold: str | None, noise: Noise | N
 def scale_set_by_clause(names: tuple[str, ...]) -> str:
     """The beginning of a warning about fixed lengths that set the scale."""
     verbs = "is fixed and already sets" if len(names) == 1 else "are fixed and already set"
-    return f"{some(names)} {verbs} the scale"
+    return f"{shorten(names)} {verbs} the scale"
 
 
 def fixed_lengths(arm: Arm, space: Parameters) -> tuple[str, ...]:

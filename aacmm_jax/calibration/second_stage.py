@@ -19,14 +19,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..core._compat import member_numbers
-from ..core.namespace import AnyArray, namespace, set_at, stop_gradient, to_jax, while_loop
+from ..core.numpy_or_jax import AnyArray, namespace, set_at, stop_gradient, to_jax, while_loop
 from ..data.capture import Capture
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement
 from ..model.metrics import repeatability
-from ..model.scale import divide_free_lengths, divisible, replaced_lengths, scale_of
-from ..solver.reason import SCALE, Reason, numbers_of, reasons
+from ..model.scale import divide_lengths, divisible, scale_of
+from ..solver.reason import SCALE, numbers_of, reasons
 from .results import ManyIdentifications
 from .scale_anchor import ScaleAnchor
 from .task import Fit, Task, fit_repeatability
@@ -39,29 +39,14 @@ LARGEST_LOG_K = 1e-7  # |log k| up to which k = 1 counts as reached
 _ROUNDING = 1e-9  # mm: how far from a bound the division may leave a length by rounding
 
 
-def can_scale(anchor: ScaleAnchor) -> bool:
-    """Whether stage 2 changes the arm: not where fixed lengths set the scale, or no length is free."""
-    return not anchor.set_by and anchor.adjusted is not None
-
-
-def divided(
-    anchor: ScaleAnchor,
-    space: Parameters,
-    parameters: Any,
-    k: Any,
-) -> Any:
+def divide_by_k(anchor: ScaleAnchor, space: Parameters, parameters: Any, k: Any) -> Any:
     """The parameters of stage 1 divided by k; the base of ``space`` is the arm, or a batch of arms."""
-    if not can_scale(anchor):
+    if not anchor.can_scale:
         return parameters
-    return divide_free_lengths(space, parameters, k, replaced(anchor, space))
+    return divide_lengths(space, parameters, k, anchor.partners)
 
 
-def replaced(anchor: ScaleAnchor, space: Parameters) -> Float[AnyArray, "... p"]:
-    """Fixed lengths that the free ones replace in the division, mm."""
-    return replaced_lengths(space, space.base, ((), ()) if anchor.partners is None else anchor.partners)
-
-
-def within_bounds(
+def clip_to_bounds(
     space: Parameters,
     lower: Float[AnyArray, "... p"],
     upper: Float[AnyArray, "... p"],
@@ -77,7 +62,7 @@ def within_bounds(
     return xp.where(np.broadcast_to(space.lengths, scaled.shape), inside, scaled)
 
 
-def must_adjust(
+def must_adjust_anchor(
     anchor: ScaleAnchor,
     bounds: Bounds,
     active: Int[AnyArray, "... p"],
@@ -92,18 +77,10 @@ def must_adjust(
     if anchor.partners is None:
         concerned = xp.ones_like(concerned)
     needed = xp.any(concerned & lengths, axis=-1) & xp.all(xp.isfinite(scaled), axis=-1)
-    return needed if can_scale(anchor) else xp.zeros_like(needed)
+    return needed if anchor.can_scale else xp.zeros_like(needed)
 
 
-class Adjusted(NamedTuple):
-    """The parameters for which k = 1."""
-
-    parameters: Float[AnyArray, " p"]
-    steps: Int[AnyArray, ""]
-    result: Reason
-
-
-def adjust_anchor(task: Task, measurement: Measurement, scaled: Float[AnyArray, " p"]) -> Adjusted:
+def adjust_anchor(task: Task, measurement: Measurement, scaled: Float[AnyArray, " p"]) -> Fit:
     """Stage 1 repeated with its anchor adjusted until k = 1 (`ScaleSearch`), from the divided parameters.
 
     The search begins where all lengths are free, so that it does not depend on where stage 1 had its anchor: far from
@@ -129,7 +106,7 @@ def adjust_anchor(task: Task, measurement: Measurement, scaled: Float[AnyArray, 
         log_k, found = identify_again(x, search.length)
         improved = xp.abs(log_k) < xp.abs(search.best_log_k)
         best = xp.where(improved, found.parameters, best)
-        return search.following(log_k), found.parameters, best, steps + found.steps
+        return search.advance(log_k), found.parameters, best, steps + found.steps
 
     def solve(_: Any, length: Float[AnyArray, ""]) -> tuple[Any, tuple[Any, Any]]:
         first = (ScaleSearch.of(length, *stop_gradient((lower, upper))), start, start, free.steps)
@@ -156,7 +133,7 @@ def adjust_anchor(task: Task, measurement: Measurement, scaled: Float[AnyArray, 
         length, (x, steps) = jax.lax.custom_root(difference, start[i], solve, divide_by_slope, has_aux=True)
     log_k, found = identify_again(x, length)
     number = _number_of_reason(member_numbers(found.result), log_k, _on_bound(length, lower, upper))
-    return Adjusted(found.parameters, steps.astype(int) + found.steps, reasons(number))
+    return found._replace(steps=steps.astype(int) + found.steps, result=reasons(number))
 
 
 class ScaleSearch(NamedTuple):
@@ -190,7 +167,7 @@ class ScaleSearch(NamedTuple):
         rounds, done = xp.zeros(length.shape, dtype=np.int32), xp.zeros(length.shape, dtype=bool)
         return cls(length, lower, upper, known, length, none, length, none, rounds, done)
 
-    def following(self, log_k: Any) -> "ScaleSearch":
+    def advance(self, log_k: Any) -> "ScaleSearch":
         """After log k was found at the length."""
         xp, length = namespace(self, log_k), self.length
         size = xp.abs(log_k)
@@ -236,7 +213,7 @@ def _number_of_reason(numbers: Any, log_k: Any, on_bound: Any) -> Int[AnyArray, 
     return xp.where((xp.abs(log_k) > LARGEST_LOG_K) & ~on_bound, SCALE, numbers)
 
 
-def second_stage_many(
+def fix_scale_many(
     anchor: ScaleAnchor,
     stage1: ManyIdentifications,
     identify_again: Callable[[np.ndarray, np.ndarray, str | None], ManyIdentifications],
@@ -249,15 +226,15 @@ def second_stage_many(
     assert stage1.k is not None
     lower, upper = (np.broadcast_to(side, stage1.parameters.shape) for side in sides)
     bounds = Bounds(space, lower, upper)
-    scaled = np.array(divided(anchor, space, stage1.parameters, stage1.k))
+    scaled = np.array(divide_by_k(anchor, space, stage1.parameters, stage1.k))
     # Divided by k, the whole arm shrinks about the base, and so do the distances between its tips.
-    factor = stage1.k if can_scale(anchor) else np.ones_like(stage1.k)
+    factor = stage1.k if anchor.can_scale else np.ones_like(stage1.k)
     de, deltam, steps, reason = stage1.de / factor, stage1.deltam / factor, stage1.steps, numbers_of(stage1.result)
-    rows = np.flatnonzero(must_adjust(anchor, bounds, stage1.active, scaled))
+    rows = np.flatnonzero(must_adjust_anchor(anchor, bounds, stage1.active, scaled))
     active = stage1.active
-    if can_scale(anchor):
+    if anchor.can_scale:
         # Rows are contiguous, so that what is summed over one is summed in the same order in every batch.
-        scaled = np.array(within_bounds(space, lower, upper, scaled), order="C")
+        scaled = np.array(clip_to_bounds(space, lower, upper, scaled), order="C")
         active = np.asarray(bounds.active(scaled))
     if len(rows):
         adjusted = _adjust_many(
@@ -305,7 +282,7 @@ def _adjust_many(
         improved = np.abs(log_k) < np.abs(part.best_log_k)
         best[rows[improved]] = found.parameters[improved]
         x[rows], steps[rows] = found.parameters, steps[rows] + found.steps
-        search = ScaleSearch(*(set_at(old, rows, new) for old, new in zip(search, part.following(log_k), strict=True)))
+        search = ScaleSearch(*(set_at(old, rows, new) for old, new in zip(search, part.advance(log_k), strict=True)))
     best[:, i] = search.best
     found = identify_again(everything, best, anchor.adjusted)
     assert found.k is not None
@@ -319,7 +296,7 @@ def _adjust_many(
     }
 
 
-def rows_of(rows: np.ndarray, arm: Arm, capture: Capture, *boxes: np.ndarray) -> tuple[Any, ...]:
+def select_problems(rows: np.ndarray, arm: Arm, capture: Capture, *boxes: np.ndarray) -> tuple[Any, ...]:
     """Some problems of a batch: of the arm, the capture and each side of the box, where these are a batch."""
 
     def chosen(single: int, leaf: Any) -> Any:

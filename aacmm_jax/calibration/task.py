@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.namespace import AnyArray, namespace, set_at
+from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from ..data.noise import Noise
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement
-from ..model.residuals import repeatability_model, repeatability_residual
+from ..model.residuals import repeatability_normal_equations, repeatability_residual
 from ..solver.bounded import BoundedLevenbergMarquardt, least_squares, minimise
 from ..solver.reason import Reason, reasons
 from ..uncertainty.covariance import NoiseModel
@@ -48,7 +48,7 @@ class Fit(NamedTuple):
 
 def fit(
     residual: Callable,
-    model: Callable,
+    normal: Callable,
     start: Float[AnyArray, " p"],
     args: Any,
     bounds: tuple[Float[AnyArray, " p"], Float[AnyArray, " p"]],
@@ -58,7 +58,7 @@ def fit(
     """A least squares within bounds: by Optimistix for arrays of JAX, step by step for NumPy's."""
     lower, upper = bounds
     if namespace(start, args, bounds) is np:
-        last = minimise(model, start, args, lower=lower, upper=upper, scale=scale, solver=SOLVER, max_steps=max_steps)
+        last = minimise(normal, start, args, lower=lower, upper=upper, scale=scale, solver=SOLVER, max_steps=max_steps)
         return Fit(last.y, last.steps, reasons(last.reason), last.optimality)
     solution = least_squares(
         residual,
@@ -67,7 +67,7 @@ def fit(
         lower=lower,
         upper=upper,
         scale=scale,
-        normal=model,
+        normal=normal,
         solver=SOLVER,
         max_steps=max_steps,
         throw=False,
@@ -82,6 +82,6 @@ def fit_repeatability(task: Task, measurement: Measurement, start: Float[AnyArra
     index = np.flatnonzero([name != hold for name in space.names])
     reduced = Parameters(base=space.arm(start), names=tuple(name for name in space.names if name != hold))
     bounds = task.bounds.lower[index], task.bounds.upper[index]
-    args = (reduced, measurement)
-    found = fit(repeatability_residual, repeatability_model, start[index], args, bounds, reduced.scale, task.max_steps)
+    functions, args = (repeatability_residual, repeatability_normal_equations), (reduced, measurement)
+    found = fit(*functions, start[index], args, bounds, reduced.scale, task.max_steps)
     return found._replace(parameters=set_at(start, index, found.parameters))

@@ -1,4 +1,4 @@
-"""Digital Calibration Certificates (DCC)."""
+"""Digital Calibration Certificates (DCC); the calibration itself is in `calibration`, a report in `report`."""
 
 import lazy_loader as _lazy_loader
 

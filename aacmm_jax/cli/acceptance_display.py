@@ -5,7 +5,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from ..core.errors import counted
+from ..core.text import pluralise
 from .calibration_display import print_lengths, print_stages
 from .display import (
     formatted,
@@ -58,8 +58,8 @@ def points(summary: dict[str, Any]) -> None:
     """Acceptance tests of points."""
     console = new_console()
     console.print(
-        f"{counted(summary['points'], 'point')}: {counted(summary['sockets'], 'socket')}, "
-        f"{counted(summary['lengths'], 'length')}, {counted(summary['spheres'], 'sphere')}"
+        f"{pluralise(summary['points'], 'point')}: {pluralise(summary['sockets'], 'socket')}, "
+        f"{pluralise(summary['lengths'], 'length')}, {pluralise(summary['spheres'], 'sphere')}"
     )
     print_warnings(console, summary)
     _acceptance(console, summary)

@@ -105,7 +105,7 @@ def calibrate(
     """
     from ..calibration.checks import plausible
     from ..calibration.record import record_of
-    from ..calibration.stages import calibrate as run
+    from ..calibration.single import calibrate as run
     from ..files.calibrations import save_calibration
     from ..files.captures import load_capture
     from ..files.inputs import InputFile, fingerprint

@@ -6,17 +6,11 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from ..core.errors import counted
+from ..core.text import pluralise
 from ..core.units import ARCSEC, DEG
+from ..summaries.tables import METRICS, volume_rows
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
-_METRICS = (
-    ("de_mm", "DE, mean distance of poses from their socket's centroid"),
-    ("deltam_mm", "Deltam, largest half range of a coordinate in a socket"),
-    ("rms_mm", "RMS distance of poses from their socket's centroid"),
-    ("length_error_mean_absolute_mm", "length error, mean absolute"),
-    ("length_error_largest_mm", "length error, largest"),
-)
 _TRUTH = (
     ("length_error_largest_mm", "largest error of a length parameter [mm]", 1.0),
     ("angle_error_largest_rad", "largest error of an angle parameter [arcsec]", 1 / ARCSEC),
@@ -47,9 +41,9 @@ def capture(summary: dict[str, Any]) -> None:
     """One capture."""
     console = new_console()
     console.print(
-        f"[bold]{escape(summary['arm'])}[/bold]: {counted(summary['poses'], 'pose')} of "
-        f"{counted(summary['joints'], 'joint')} in {counted(len(summary['sockets']), 'socket')}, "
-        f"{counted(len(summary['lengths']), 'reference length')}" + (", simulated" if summary["simulated"] else "")
+        f"[bold]{escape(summary['arm'])}[/bold]: {pluralise(summary['poses'], 'pose')} of "
+        f"{pluralise(summary['joints'], 'joint')} in {pluralise(len(summary['sockets']), 'socket')}, "
+        f"{pluralise(len(summary['lengths']), 'reference length')}" + (", simulated" if summary["simulated"] else "")
     )
     print_warnings(console, summary)
     table = new_table("", "socket", "poses")
@@ -98,8 +92,8 @@ def print_verdict(console: Console, summary: dict[str, Any]) -> None:
         verdict = "[red]ended with a residual that no arm has[/red],"
     console.print(
         f"[bold]{escape(summary['arm'])}[/bold], {summary['method']}: {verdict} in "
-        f"{counted(summary['steps'], 'step')} on {counted(summary['poses'], 'pose')} in "
-        f"{counted(len(summary['sockets_used']), 'socket')}"
+        f"{pluralise(summary['steps'], 'step')} on {pluralise(summary['poses'], 'pose')} in "
+        f"{pluralise(len(summary['sockets_used']), 'socket')}"
     )
 
 
@@ -126,14 +120,8 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
     volume, factor = found["volume"], found["coverage_factor_95"]
     title = f"\nExpanded uncertainty U over the working volume (95 %, coverage factor {factor:.2f}) [mm]"
     table = new_table(title, "", "median", "95th percentile", "largest")
-    length = f"{volume['length_mm']:g} mm length"
-    for key, text in (
-        ("u_tip", "tip position, along its worst direction: from the calibration"),
-        ("u_length", f"{length}: from the calibration"),
-        ("u_length_reading", f"{length}: with the noise of both readings"),
-    ):
-        values = [volume[f"{key}_{which}_mm"] for which in ("median", "95", "largest")]
-        table.add_row(text, *("not determined" if value is None else formatted(factor * value) for value in values))
+    for text, values in volume_rows(volume, factor):
+        table.add_row(text, *("not determined" if value is None else formatted(value) for value in values))
     print_table(console, table)
     console.print(
         "Propagated from u of the parameters to 400 positions that random poses within the joint limits reach."
@@ -193,7 +181,7 @@ def print_stages(
     """Repeatability and length errors by stage; ``fitted``: the scale makes the last length error zero."""
     names = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
     table = new_table(title, "", *(names[stage] for stage in stages))
-    for key, text in _METRICS:
+    for key, text in METRICS:
         if key in metrics[stages[0]]:
             cells = [formatted(metrics[stage][key]) for stage in stages]
             table.add_row(

@@ -6,9 +6,9 @@ from typing import Annotated, Any
 import typer
 
 from ..core.errors import InputError
+from ..files.atomic_write import write_text
 from ..files.hdf5 import need, read_tables
 from ..files.outputs import together
-from ..files.whole_file import write_text
 from .app import Json, app, examples, show_summary, with_spinner
 
 

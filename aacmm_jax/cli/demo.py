@@ -8,8 +8,9 @@ import numpy as np
 
 from ..calibration.evaluation import evaluate
 from ..calibration.record import CalibrationRecord, record_of
-from ..calibration.stages import calibrate
-from ..core.errors import InputError, some
+from ..calibration.single import calibrate
+from ..core.errors import InputError
+from ..core.text import shorten
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..data.simulation import simulate
@@ -55,7 +56,7 @@ def _prepare(folder: Path, true_name: str) -> None:
         foreign = [] if true is not None and true.name == true_name else sorted(found)
     if foreign:
         raise InputError(
-            f"{folder} holds files that are not of a demonstration ({some(foreign)}); name a new or an empty folder."
+            f"{folder} holds files that are not of a demonstration ({shorten(foreign)}); name a new or an empty folder."
         )
 
 

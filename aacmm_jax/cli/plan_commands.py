@@ -205,7 +205,7 @@ def _procedure(
 
 def _written(output: Path, poses: str, manifest: Path | None, manifest_text: Callable[[str], str], arm: str) -> str:
     """Write the poses and, where it is asked for, the manifest, which names the arm; returns what was written."""
-    from ..files.whole_file import write_text
+    from ..files.atomic_write import write_text
 
     with together(output, manifest):
         write_text(output, poses)
@@ -218,7 +218,7 @@ def _written(output: Path, poses: str, manifest: Path | None, manifest_text: Cal
 def _arm_for(manifest: Path, arm: str) -> str:
     """An arm as a manifest names it: a shipped name, or the path of a file relative to the manifest."""
     file = Path(arm)
-    return Path(os.path.relpath(file, manifest.parent)).as_posix() if file.is_file() else arm
+    return Path(os.path.relpath(file, manifest.parent)).as_posix() if os.path.isfile(file) else arm
 
 
 def _range(option: str, text: str) -> tuple[float, float]:

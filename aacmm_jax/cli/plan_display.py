@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from ..core.errors import counted
+from ..core.text import pluralise
 from .display import new_console, new_table, print_table, print_written
 
 
@@ -36,7 +36,7 @@ def plan(summary: dict[str, Any]) -> None:
     console = new_console()
     console.print(
         f"[bold]{escape(summary['arm'])}[/bold]: {summary['poses']} poses in "
-        f"{counted(len(summary['sockets']), 'socket')}"
+        f"{pluralise(len(summary['sockets']), 'socket')}"
     )
     table = new_table("", "socket", "x [mm]", "y [mm]", "z [mm]", "poses")
     for row in summary["sockets"]:

@@ -8,10 +8,11 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ..core.errors import InputError
+from ..files.atomic_write import write_text
 from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
-from ..files.whole_file import write_text
+from ..files.sense import check_shown
 from .app import CalibrationFile, Json, Only, Without, app, examples, show_summary, with_spinner
 
 About = Annotated[
@@ -293,7 +294,11 @@ def show(
         "evaluation": acceptance_display.evaluation,
         "points": acceptance_display.points,
     }[kind]
-    show_summary(_summary_of(path, kind) if summary is None else summary, as_json, display)
+    if summary is None:
+        summary = _summary_of(path, kind)
+    else:
+        check_shown(path, attributes["kind"], summary)
+    show_summary(summary, as_json, display)
 
 
 def _show_arm(file: str, as_json: bool) -> None:

@@ -1,5 +1,6 @@
 """The command ``study``, and what ``show`` does with a study's file."""
 
+import os
 import shlex
 import sys
 import threading
@@ -75,7 +76,7 @@ def study(
     """
     from ..study.store import read
 
-    if resume and not output.exists():
+    if resume and not os.path.exists(output):  # where `Path.exists` raises, of a name too long to be one
         raise InputError(
             f"{output} does not exist, so there is nothing to resume; leave --resume out to start a study."
         )

@@ -40,6 +40,22 @@ def checked_arguments(function: Function) -> Function:
     return call  # pyright: ignore[reportReturnType]
 
 
+def with_options(options: type[tuple]) -> Callable[[Function], Function]:
+    """Decorator: the fields of a NamedTuple are the keyword arguments that a function takes as ``**options``.
+
+    Several functions share them that way; help, completion and `checked_arguments` see each of them.
+    """
+
+    def decorate(function: Function) -> Function:
+        signature = inspect.signature(function)
+        own = [one for one in signature.parameters.values() if one.kind is not one.VAR_KEYWORD]
+        shared = [one.replace(kind=one.KEYWORD_ONLY) for one in inspect.signature(options).parameters.values()]
+        setattr(function, "__signature__", signature.replace(parameters=[*own, *shared]))  # noqa: B010
+        return function
+
+    return decorate
+
+
 def _kinds(annotation: Any) -> tuple[type, ...]:
     """The classes that an annotation allows; none where it allows what is not looked at."""
     kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike
 
 from . import _compat
 from .errors import InputError
-from .namespace import AnyArray, namespace
+from .numpy_or_jax import AnyArray, namespace
 from .x64 import LARGEST_INTEGER, check_x64
 
 # What people pass for an array of numbers; lists are converted and checked.

@@ -1,7 +1,7 @@
-"""The exception and the warning of the package, and helpers for their wording."""
+"""The exception and the warning of the package, and a hint for misspelt words."""
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 
 class InputError(ValueError):
@@ -12,18 +12,10 @@ class InputError(ValueError):
 
 
 class IdentifiabilityWarning(UserWarning):
-    """The data that are given cannot determine some of the free parameters, or change nothing in the scale; the message
-    names the parameters."""
+    """The data determine less than they seem to: some free parameters or the scale not at all, or copies count once.
 
-
-def some(items: Sequence[str], most: int = 5) -> str:
-    """The first items of a list, and how many more there are."""
-    return ", ".join(items[:most]) + (f" and {len(items) - most} more" if len(items) > most else "")
-
-
-def counted(number: int, noun: str) -> str:
-    """A number of things: ``1 socket``, ``2 sockets``."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+    The message names the parameters, sockets or lengths.
+    """
 
 
 def nearest(word: str, known: Iterable[str], most: int = 12) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .namespace import AnyArray, namespace
+from .numpy_or_jax import AnyArray, namespace
 
 _EPSILON = float(np.finfo(np.float64).eps)
 _MAX_SWEEPS = 30  # of Jacobi rotations; matrices of 40 rows need about 10

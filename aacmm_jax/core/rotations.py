@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .linear_algebra import semidefinite_eigen
-from .namespace import AnyArray, namespace
+from .numpy_or_jax import AnyArray, namespace
 
 _SMALL = 1e-6  # rad^2: below it the series are exact to rounding
 

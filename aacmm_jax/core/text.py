@@ -1,7 +1,8 @@
-"""Text from outside: what is a number, and what may be printed."""
+"""Text from outside: what is a number, and what may be printed; and lists and numbers in sentences."""
 
 import re
 import unicodedata
+from collections.abc import Sequence
 
 # What Python's ``float`` takes besides is no number to people: 1_0, digits of other scripts, blanks around it.
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
@@ -40,3 +41,13 @@ def printable(text: str) -> str:
 def quoted(text: str) -> str:
     """The text in quotes as a message shows it: printable, and cut where it is long."""
     return f"'{printable(text if len(text) <= _LONGEST else text[:_LONGEST] + '...')}'"
+
+
+def shorten(items: Sequence[str], most: int = 5) -> str:
+    """The first items of a list, and how many more there are."""
+    return ", ".join(items[:most]) + (f" and {len(items) - most} more" if len(items) > most else "")
+
+
+def pluralise(number: int, noun: str) -> str:
+    """A number of things: ``1 socket``, ``2 sockets``."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -1,4 +1,4 @@
-"""Captures, their noise, probed spheres, and simulated captures."""
+"""Captures, their noise, probed spheres, and simulated captures; `files` reads and writes them."""
 
 import lazy_loader as _lazy_loader
 

@@ -2,6 +2,7 @@
 
 import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,7 +13,8 @@ from jaxtyping import Array, Float, Int
 from ..core.arguments import items_of
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError, nearest
-from ..core.namespace import AnyArray
+from ..core.numpy_or_jax import AnyArray
+from ..core.text import pluralise, shorten
 from .observations.observation import AbstractObservation, checked_name, checked_readings
 from .observations.socket import Socket
 
@@ -55,6 +57,33 @@ class ReferenceLength(eqx.Module):
             )
 
 
+class Repeated(NamedTuple):
+    """Copies of data that a capture leaves out, because a copy is no measurement of its own."""
+
+    poses: tuple[tuple[str, int], ...] = ()  # sockets, and the number of copies in each
+    lengths: tuple[tuple[str, str], ...] = ()  # both ends of each copy
+
+    def sentences(self) -> list[str]:
+        """What was left out, for warnings."""
+        found = []
+        if self.poses:
+            number = pluralise(sum(count for _, count in self.poses), "pose")
+            sockets = shorten([f"{name} ({count})" for name, count in self.poses])
+            found.append(
+                f"Counted once: {number} with exactly the readings of another pose of the same socket: {sockets}; a "
+                "copy is no measurement of its own. Was the arm recorded at rest, or a file pasted twice?"
+            )
+        if self.lengths:
+            ends = shorten([f"{start} - {end}" for start, end in self.lengths])
+            found.append(
+                f"Counted once: reference lengths given again with the same value and u: {ends}; delete the copies."
+            )
+        return found
+
+
+NOTHING_REPEATED = Repeated()
+
+
 class Capture(eqx.Module):
     """Poses grouped by the socket in which the tip rested, reference lengths between sockets, and other observations.
 
@@ -62,10 +91,15 @@ class Capture(eqx.Module):
     length. All poses are kept in one array ``q`` of shape ``(N, n)``, socket after socket, so that they are evaluated
     together.
 
+    A copy adds no information, but would make every uncertainty too small: poses of a socket with the same reading of
+    every joint count once, and so do reference lengths with the same sockets, value and u. ``repeated`` says which were
+    left out. Only known values are compared: a capture made of traced values, and a batch, keep their copies.
+
     Args:
         sockets: Socket name -> joint readings, shape ``(m, n)``, rad; m poses may differ from socket to socket.
         lengths: Reference lengths between these sockets, or one.
         observations: What else ties the tip down (`data.observations`): measured points, spheres, planes, artefacts.
+        repeated: Copies that were left out of these data before.
 
     Raises:
         InputError: For names that are empty or longer than a line, readings that are not finite or look like degrees,
@@ -77,12 +111,14 @@ class Capture(eqx.Module):
     observations: tuple[AbstractObservation, ...]
     names: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
+    repeated: Repeated = eqx.field(static=True)
 
     def __init__(
         self,
         sockets: Mapping[str, Numbers],
         lengths: Iterable[ReferenceLength] | ReferenceLength = (),
         observations: Iterable[AbstractObservation] | AbstractObservation = (),
+        repeated: Repeated = NOTHING_REPEATED,
     ):
         if not isinstance(sockets, Mapping):
             raise InputError(
@@ -104,12 +140,13 @@ class Capture(eqx.Module):
                 raise InputError(
                     f"{where} has {block.shape[-1]} columns, but {first} has {width}; give one column a joint."
                 )
-        _check_different(blocks)
-        self.q = joined(list(blocks.values())) if blocks else jnp.zeros((0, width))
-        self.names = tuple(blocks)
-        self.sizes = tuple(block.shape[0] for block in blocks.values())
-        self.lengths = (lengths,) if isinstance(lengths, ReferenceLength) else tuple(items_of(lengths, "lengths"))
-        for length in self.lengths:
+        different = {name: _without_copies(block) for name, block in blocks.items()}
+        _check_different(different)
+        self.q = joined(list(different.values())) if different else jnp.zeros((0, width))
+        self.names = tuple(different)
+        self.sizes = tuple(block.shape[0] for block in different.values())
+        given = (lengths,) if isinstance(lengths, ReferenceLength) else tuple(items_of(lengths, "lengths"))
+        for length in given:
             if not isinstance(length, ReferenceLength):
                 raise InputError(f"{length!r} is no reference length; give aj.ReferenceLength(start, end, value, u).")
             known = (*self.names, *(o.name for o in self.observations if isinstance(o, Socket)))
@@ -119,6 +156,13 @@ class Capture(eqx.Module):
                         f"reference length '{length.start}' to '{length.end}' names the unknown socket '{end}'"
                         f"{nearest(end, known)}"
                     )
+        self.lengths, copies = _different_lengths(given)
+        poses = dict(repeated.poses)
+        for name, size in zip(self.names, self.sizes, strict=True):
+            poses[name] = poses.get(name, 0) + blocks[name].shape[0] - size
+        self.repeated = Repeated(
+            tuple((name, count) for name, count in poses.items() if count), (*repeated.lengths, *copies)
+        )
 
     @property
     def joints(self) -> int:
@@ -166,7 +210,11 @@ class Capture(eqx.Module):
             raise InputError("no socket is left after the selection; widen it.")
         sockets = self.sockets
         lengths = [length for length in self.lengths if length.start in kept and length.end in kept]
-        return Capture({name: sockets[name] for name in kept}, lengths, self.observations)
+        repeated = Repeated(
+            tuple((name, count) for name, count in self.repeated.poses if name in kept),
+            tuple((start, end) for start, end in self.repeated.lengths if start in kept and end in kept),
+        )
+        return Capture({name: sockets[name] for name in kept}, lengths, self.observations, repeated=repeated)
 
 
 def check_one_capture(capture: Capture) -> None:
@@ -202,6 +250,33 @@ def _checked_observations(
         if names.count(name) > 1:
             raise InputError(f"two observations have the name '{name}'; give each a name of its own.")
     return checked
+
+
+def _without_copies(block: AnyArray) -> AnyArray:
+    """The first of each pose, in their order."""
+    if not is_concrete(block):
+        return block
+    first: dict[bytes, int] = {}
+    for i, row in enumerate(np.asarray(block) + 0.0):  # which has no negative zero
+        first.setdefault(row.tobytes(), i)
+    return block if len(first) == block.shape[0] else np.asarray(block)[list(first.values())]
+
+
+def _different_lengths(
+    lengths: tuple[ReferenceLength, ...],
+) -> tuple[tuple[ReferenceLength, ...], tuple[tuple[str, str], ...]]:
+    """The first of each reference length, and the ends of those that repeat it, perhaps in the other direction."""
+    different, copies, seen = [], [], set()
+    for length in lengths:
+        key = None
+        if is_concrete(length.value, length.u) and not np.ndim(length.value):
+            key = frozenset((length.start, length.end)), float(length.value), float(length.u)
+        if key is not None and key in seen:
+            copies.append((length.start, length.end))
+            continue
+        seen.add(key)
+        different.append(length)
+    return tuple(different), tuple(copies)
 
 
 def _check_different(blocks: Mapping[str, Array | np.ndarray]) -> None:
@@ -276,4 +351,7 @@ def stack_captures(captures: Iterable[Capture]) -> Capture:
         check_one_capture(capture)
     if len({(c.names, c.sizes, tuple((r.start, r.end) for r in c.lengths), c.joints) for c in captures}) != 1:
         raise InputError("captures of a batch must have the same sockets, numbers of poses, joints and lengths.")
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *captures)
+    arrays = [(capture.q, capture.lengths) for capture in captures]
+    return eqx.tree_at(
+        lambda c: (c.q, c.lengths), captures[0], jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrays)
+    )

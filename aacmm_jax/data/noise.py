@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_floats, is_concrete
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.units import ARCSEC
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass
 from ..kinematics.jacobian import jacobian_columns

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ..core.arguments import check_finite, checked_arguments, items_of
 from ..core.arrays import Numbers, as_floats, random_key, random_numbers
 from ..core.errors import InputError, nearest
-from ..core.namespace import AnyArray, to_numpy
+from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.units import ARCSEC
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.inverse_kinematics import random_configurations

@@ -1,4 +1,4 @@
-"""Calibrations of one arm compared over time."""
+"""Calibrations of one arm compared over time; the sentences about it: `results`, `summaries.drift`."""
 
 import lazy_loader as _lazy_loader
 

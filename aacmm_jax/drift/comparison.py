@@ -10,10 +10,11 @@ from jaxtyping import Float
 from ..calibration.checks import plausible
 from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
+from ..core.text import shorten
 from ..kinematics.arm import Arm, parameter_names
 from ..kinematics.parameters import Parameters
 from ..uncertainty.volume import default_length, sample_lengths
-from .results import Drift, Trend, some
+from .results import Drift, Trend
 from .statistics import FIXED, ON_BOUND, coverage_factor, effective_degrees_of_freedom, joint_test, length_change
 
 _PAIR = ("the old calibration", "the new calibration")
@@ -221,7 +222,7 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[s
         alone = [name for name in one.names if name not in other.names]
         if alone:
             found.append(
-                f"Free in {label} only: {some(alone)}. Other parameters may compensate for them in the other one; "
+                f"Free in {label} only: {shorten(alone)}. Other parameters may compensate for them in the other one; "
                 "lengths can still be compared."
             )
     return found
@@ -254,6 +255,6 @@ def _other_arm(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[
         return ""
     one, two = (f"'{specification.name}' of {label}" for specification, label in zip(nominal, labels, strict=True))
     return (
-        f"The nominal arms differ in {some(other)} ({one}, {two}): is it the same arm? Differences of fixed parameters "
-        "count as drift."
+        f"The nominal arms differ in {shorten(other)} ({one}, {two}): is it the same arm? Differences of fixed "
+        "parameters count as drift."
     )

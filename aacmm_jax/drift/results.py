@@ -2,17 +2,15 @@
 
 import datetime
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..core.text import shorten
 from ..core.units import ARCSEC
 from ..kinematics.arm import is_length
 from .statistics import JointTest, LengthChange
-
-_NAMED = 6  # how many parameters a sentence names
 
 
 class Drift(NamedTuple):
@@ -126,7 +124,7 @@ def _of_each(drift: Drift) -> str:
         return f"{start}."
     worst = sorted(moved, key=lambda i: -abs(drift.change[i]) / drift.expanded[i])
     each = [_moved(drift, int(i)) for i in worst]
-    return f"{start}: {some(each)}."
+    return f"{start}: {shorten(each)}."
 
 
 def _moved(drift: Drift, i: int) -> str:
@@ -166,7 +164,7 @@ def _of_undetermined(drift: Drift) -> str:
     for name, reason in zip(drift.names, drift.reasons, strict=True):
         if reason:
             names.setdefault(reason, []).append(name)
-    groups = [f"{some(group)} ({reason})" for reason, group in names.items()]
+    groups = [f"{shorten(group)} ({reason})" for reason, group in names.items()]
     return f"Without an uncertainty of change: {'; '.join(groups)}." if groups else ""
 
 
@@ -175,8 +173,3 @@ def in_words(name: str, value: float, sign: str = "+") -> str:
     shown, unit = (1e3 * value, "um") if is_length(name) else (value / ARCSEC, "arcsec")
     decimals = max(2 - math.floor(math.log10(abs(shown))), 0) if shown else 0
     return f"{shown:{sign}.{min(decimals, 3)}f} {unit}"
-
-
-def some(names: Sequence[str]) -> str:
-    """Names for a sentence, not too many."""
-    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")

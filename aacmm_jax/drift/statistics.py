@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.distributions import chi_square_tail, f_tail, student_quantile
-from ..core.namespace import AnyArray, compiled, namespace, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from ..kinematics.arm import is_length
 from ..uncertainty.arm_uncertainty import Uncertainty
 

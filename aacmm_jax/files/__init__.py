@@ -1,4 +1,4 @@
-"""Every file format, read and written."""
+"""Every file format, read and written; what a file holds is defined in `data`, `calibration` and `acceptance`."""
 
 import lazy_loader as _lazy_loader
 

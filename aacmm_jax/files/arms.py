@@ -14,8 +14,8 @@ from ..core.text import printable
 from ..core.units import DEG
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import ArmSpecification, Parameters, single
+from .atomic_write import storable, write_text
 from .toml import Strict, read_toml
-from .whole_file import storable, write_text
 
 if TYPE_CHECKING:
     from tomlkit import TOMLDocument

@@ -28,8 +28,7 @@ from .hdf5 import (
     undamaged,
     write_tables,
 )
-
-_ROUNDING = 1e-6  # of k
+from .sense import check_calibration
 
 
 def save_calibration(
@@ -95,71 +94,9 @@ def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
     need(path, stored.tables, "stage1_arm", "calibrated_arm", "parameters")
     with undamaged(path):
         record = _record(path, stored)
-        _check_sense(path, record, stored)
+        check_calibration(path, stored)
+        check_sense(path, {"the noise model is unknown": record.noise_model not in NOISE_MODELS})
         return record
-
-
-def _check_sense(path: str | os.PathLike, record: CalibrationRecord, stored: Stored) -> None:
-    """Raise `InputError` where a value is not one that a calibration can have.
-
-    k is a weighted mean of measured over certified lengths, so it lies between the least and the largest of them.
-    """
-    count, covariance, reference = len(record.names), record.covariance, stored.tables["reference"]
-    vectors = (record.lower, record.upper, record.active_stage1, record.active, record.determined)
-    square = (covariance, record.open)
-    check_sense(
-        path,
-        {
-            "the parameters have arrays of other shapes": any(x.shape != (count,) for x in vectors)
-            or any(x.shape != (count, count) for x in square),
-            "a parameter is named twice": len(set(record.names)) != count,
-            "a parameter is both free and fixed": bool(set(record.names) & set(record.held)),
-        },
-    )
-    arms = (record.recording.nominal, record.stage1, record.calibrated, record.recording.true)
-    ratios = [
-        reference[f"measured_{stage}"] / reference["value"]
-        for stage in ("stage1", "calibrated")
-        if len(reference["value"]) and f"measured_{stage}" in reference
-    ]
-    finite = all(np.all(np.isfinite(x)) for x in (record.k, record.u_k, covariance))
-    check_sense(
-        path,
-        {
-            "its arms have different numbers of joints": any(
-                arm is not None and arm.arm.joints != record.recording.capture.joints for arm in arms
-            ),
-            "a lower bound is above the upper": not np.all(record.lower <= record.upper),
-            "an active bound is neither lower nor upper": not np.all(np.isin(vectors[2:4], (-1, 0, 1))),
-            "the scale k is not positive": not record.k > 0 and not np.isnan(record.k),
-            "the uncertainty of k is negative": bool(record.u_k < 0),
-            "a converged calibration has a scale or covariance that is not finite": record.converged and not finite,
-            "the scale k is not that of its lengths": record.converged
-            and bool(ratios)
-            and not any(ratio.min() - _ROUNDING <= record.k <= ratio.max() + _ROUNDING for ratio in ratios),
-            "the covariance is not one": finite and not _is_semidefinite(covariance),
-            "the method is unknown": record.method not in ("two-stage", "joint"),
-            "the noise model is unknown": record.noise_model not in NOISE_MODELS,
-            "its number of steps is negative": record.steps < 0,
-            "its degrees of freedom are not positive": not record.degrees_of_freedom > 0,
-            "a standard deviation of its noise is negative": bool(
-                np.any(np.asarray(record.noise.encoder_arcsec) < 0) or np.any(np.asarray(record.noise.seating) < 0)
-            ),
-            "a verdict of its Monte Carlo is neither yes nor no": record.sampled is not None
-            and not np.all(np.isin(record.sampled["agrees"], (0, 1))),
-        },
-    )
-
-
-def _is_semidefinite(covariance: np.ndarray) -> bool:
-    """Whether a matrix is symmetric, and its correlations have no eigenvalue below zero, to rounding."""
-    variance = np.diag(covariance)
-    if np.any(variance < 0):
-        return False
-    root = np.sqrt(np.where(variance > 0, variance, 1.0))
-    correlation = covariance / root / root[:, None]
-    symmetric = np.allclose(correlation, correlation.T, rtol=0, atol=1e-9)
-    return symmetric and bool(np.all(np.linalg.eigvalsh(correlation) > -1e-6))
 
 
 def _divided_fixed_lengths(path: str | os.PathLike, stored: Stored) -> bool:

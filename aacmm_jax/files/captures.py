@@ -1,6 +1,5 @@
 """Captures in HDF5: poses, reference lengths, touched spheres, the nominal arm and, for a simulation, the true arm."""
 
-import datetime
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..data.capture import Capture, ReferenceLength, check_one_capture
+from ..data.capture import Capture, ReferenceLength, Repeated, check_one_capture
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm
@@ -27,6 +26,7 @@ from .hdf5 import (
     undamaged,
     write_tables,
 )
+from .sense import check_recording
 
 _KINDS = {
     "alpha": "link twist",
@@ -78,14 +78,21 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     capture = recording.capture
     check_one_capture(capture)
     owner = [capture.names[i] for i in capture.owner]
+    poses, lengths = capture.repeated
     tables = {
         "capture": Table(
             numbering("pose", len(owner))
             | numbering("joint", capture.joints)
             | {"angle": Variable(("pose", "joint"), np.asarray(capture.q), "rad", "joint angle as read")}
-            | columns("pose", socket=(owner, "", "socket that held the tip"))
+            | columns("pose", socket=(owner, "", "socket that held the tip")),
+            {"repeated_sockets": [n for n, _ in poses] or None, "repeated_poses": [n for _, n in poses] or None},
         ),
-        "reference": reference_table(capture.lengths),
+        "reference": reference_table(capture.lengths)._replace(
+            attributes={
+                "repeated_start": [a for a, _ in lengths] or None,
+                "repeated_end": [b for _, b in lengths] or None,
+            }
+        ),
         "nominal_arm": arm_table(recording.nominal),
     }
     if recording.true is not None:
@@ -165,7 +172,8 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     owner = np.asarray(poses["socket"]).astype(str)
     names = list(dict.fromkeys(owner.tolist()))
     try:
-        capture = Capture({name: poses["angle"][owner == name] for name in names}, lengths_of(path, stored))
+        sockets = {name: poses["angle"][owner == name] for name in names}
+        capture = Capture(sockets, lengths_of(path, stored), repeated=_repeated_of(stored))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     true = specification_of(path, stored, "true_arm") if "true_arm" in stored.tables else None
@@ -176,23 +184,17 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     sources = tuple(stored.attributes.get("sources") or ())
     attributes = stored.attributes
     nominal = specification_of(path, stored, "nominal_arm")
-    arms = [nominal] if true is None else [nominal, true]
-    check_sense(
-        path,
-        {
-            "its arm has another number of joints than its readings": any(x.arm.joints != capture.joints for x in arms),
-            "the day of measurement is no date": not _is_date(attributes.get("measured", "")),
-            "its seed is no whole number": not isinstance(attributes.get("seed", 0), int),
-        },
-    )
+    check_recording(path, stored)
     return Recording(capture, nominal, true, attributes.get("seed"), spheres, sources, attributes.get("measured", ""))
 
 
-def _is_date(text: str) -> bool:
-    try:
-        return not text or bool(datetime.date.fromisoformat(text[:10]))
-    except ValueError:
-        return False
+def _repeated_of(stored: Stored) -> Repeated:
+    """Copies that were left out before the file was written; files of version 0.1 do not say."""
+    poses, lengths = (stored.table_attributes[table] for table in ("capture", "reference"))
+    return Repeated(
+        tuple(zip(poses.get("repeated_sockets", ()), poses.get("repeated_poses", ()), strict=True)),
+        tuple(zip(lengths.get("repeated_start", ()), lengths.get("repeated_end", ()), strict=True)),
+    )
 
 
 def arm_table(specification: ArmSpecification) -> Table:

@@ -36,6 +36,7 @@ from .hdf5 import (
     undamaged,
     write_tables,
 )
+from .sense import check_evaluation, check_points
 
 
 def save_evaluation(
@@ -129,16 +130,8 @@ def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
         }
         maxima = {name: given[name] for name in MAXIMA if name in given}
         recording, calibrated = recording_of(path, stored), specification_of(path, stored, "calibrated_arm")
-        check_sense(
-            path,
-            {
-                "a limit is unknown": len(maxima) != len(given),
-                "a limit is negative or not finite": not all(0 <= value < math.inf for value in maxima.values()),
-                "its arm has another number of joints than its readings": calibrated.arm.joints
-                != recording.capture.joints,
-                "the uncertainty of the test is negative or not finite": not 0 <= attributes["u_test_mm"] < math.inf,
-            },
-        )
+        check_sense(path, {"a limit is unknown": len(maxima) != len(given)})
+        check_evaluation(path, stored)
         return EvaluationRecord(
             recording,
             calibrated,
@@ -206,19 +199,7 @@ def load_points(path: str | os.PathLike) -> PointsRecord:
         table, attributes = stored.tables["points"], stored.attributes
         owner = np.asarray(table["socket"]).astype(str)
         sockets = {name: table["position"][owner == name] for name in dict.fromkeys(owner.tolist())}
-        check_sense(
-            path,
-            {
-                "a position is not three finite numbers": table["position"].shape != (len(owner), 3)
-                or not np.all(np.isfinite(table["position"])),
-                "the uncertainty of the test is negative or not finite": not 0 <= attributes["u_test_mm"] < math.inf,
-                "the reach is not positive and finite": not 0 < attributes.get("reach_mm", 1.0) < math.inf,
-                "the shoulder is not three finite numbers": not np.all(
-                    np.isfinite(attributes.get("shoulder_mm", [0.0] * 3))
-                )
-                or len(attributes.get("shoulder_mm", [0.0] * 3)) != 3,
-            },
-        )
+        check_points(path, stored)
         reach = None
         if attributes.get("reach_mm") is not None:
             reach = Reach(np.array(attributes["shoulder_mm"]), float(attributes["reach_mm"]))

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..core.errors import InputError
+from .atomic_write import ELSEWHERE, storable, write_atomically
 from .inputs import STREAMED, largest_file, open_input, storable_name
-from .whole_file import ELSEWHERE, storable, whole_file
 
 if TYPE_CHECKING:
     from .hdf5_content import Content
@@ -87,7 +87,7 @@ def write_tables(
         if extend is not None:
             extend(file)
 
-    with whole_file(path, advice) as temporary:
+    with write_atomically(path, advice) as temporary:
         if not streamed:
             temporary.write_bytes(file_image(fill))
             return

@@ -140,7 +140,9 @@ class Content:
     def _texts(self, item: Any, name: str) -> np.ndarray:
         """Some at a time: many may refer to the same bytes of the file."""
         texts: Any = h5py.Dataset(item).asstr()
-        if len(item.shape) != 1:
+        if len(item.shape) > 1:
+            raise self._refuse(name, "a table of texts in several dimensions")
+        if not item.shape:
             return np.asarray(texts[()], dtype=object)
         step, found = max(1, self._credible // self._size), []
         for first in range(0, item.shape[0], step):

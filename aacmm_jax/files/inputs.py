@@ -98,12 +98,6 @@ def _not_ordinary(path: str | os.PathLike) -> InputError:
     return InputError(f"{path} is {kind}.")
 
 
-def check_readable(path: str | os.PathLike) -> None:
-    """Raise `InputError` where a file is missing, too large, no ordinary file, or may not be read."""
-    with open_input(path):
-        pass
-
-
 def fingerprint(path: str | os.PathLike, folder: str | os.PathLike | None = None) -> str:
     """A file's name and SHA-256, which identify it; the name is relative to ``folder`` where the file is below it.
 

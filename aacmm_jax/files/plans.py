@@ -14,7 +14,7 @@ from ..acceptance.standards import PLANNED
 from ..core.units import DEG
 from ..kinematics.arm import Arm
 from ..planning.design import Plan
-from .whole_file import write_text
+from .atomic_write import write_text
 
 
 def save_plan(path: str | os.PathLike, plan: Plan) -> None:

@@ -1,4 +1,7 @@
-"""The arm: its Denavit-Hartenberg chain, parameters, inverse kinematics and workspace."""
+"""The arm: its Denavit-Hartenberg chain, Jacobian, parameters, inverse kinematics and workspace.
+
+Which parameters data determine: `independence` and `near_degeneracy` for an arm, `uncertainty` for a capture.
+"""
 
 import lazy_loader as _lazy_loader
 

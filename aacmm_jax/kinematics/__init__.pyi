@@ -1,5 +1,7 @@
 from .arm import Arm as Arm
 from .arm import parameter_names as parameter_names
+from .inverse_kinematics import project_to_targets as project_to_targets
+from .inverse_kinematics import solve_to_targets as solve_to_targets
 from .parameters import ArmSpecification as ArmSpecification
 from .parameters import Bounds as Bounds
 from .parameters import Parameters as Parameters

@@ -11,15 +11,15 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_array, as_floats, in_chunks
-from ..core.errors import InputError, counted, nearest
-from ..core.namespace import AnyArray, namespace, to_jax, to_numpy
+from ..core.errors import InputError, nearest
+from ..core.numpy_or_jax import AnyArray, namespace, to_jax, to_numpy
+from ..core.text import pluralise
 from .chain import Geometry, tip_pose
 from .jacobian import tip_jacobian, tip_position
 
 # Steps of about 1 mm and 1 mrad are comparable at the tip of an arm of about 1 m.
 _LENGTH_STEP, _ANGLE_STEP = 1.0, 1e-3
 LENGTHS = ("a", "d", "probe")
-ANGLES = ("alpha", "theta", "beta")
 _PROBE_AXES = ("x", "y", "z")
 _LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a compiler
 
@@ -178,7 +178,7 @@ def checked_limits(limits: Sequence[Sequence[float]], joints: int) -> tuple[tupl
     except (TypeError, ValueError):
         rows = []  # no rows of numbers
     if len(rows) != joints or any(len(row) != 2 for row in rows):
-        raise InputError(f"limits must be {counted(joints, 'row')} of (lowest, highest) in rad, one per joint.")
+        raise InputError(f"limits must be {pluralise(joints, 'row')} of (lowest, highest) in rad, one per joint.")
     for i, (low, high) in enumerate(rows, start=1):
         if not -math.inf < low < high < math.inf:
             raise InputError(

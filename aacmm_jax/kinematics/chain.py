@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..core.namespace import AnyArray, compiled, namespace, scan
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, scan
 
 SinesCosines = tuple[Float[AnyArray, "n ... 1 N"], Float[AnyArray, "n ... 1 N"]]
 

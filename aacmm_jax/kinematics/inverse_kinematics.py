@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..core.arrays import in_chunks, random_numbers
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, compiled, namespace, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from .arm import Arm
 from .chain import Geometry, forward_pass, sines_cosines
 from .jacobian import jacobian_columns
@@ -68,10 +68,20 @@ def solve_to_targets(
     limits: Float[AnyArray, "n 2"],
     steps: int = _STEPS,
 ) -> tuple[Float[AnyArray, "c n"], Float[AnyArray, " c"]]:
-    """Damped least-norm steps from ``q`` to the targets, within the limits: configurations and final distances, mm.
+    """Damped least-norm steps to the targets, within the limits, of at most 0.5 rad a joint; for any jit, vmap or loop.
 
-    Each joint moves by at most 0.5 rad in a step. What becomes of a row does not depend on the other rows: NumPy leaves
-    out rows that have arrived, which ends most of them after a dozen steps.
+    The result of a row does not depend on the other rows. NumPy leaves out rows that have arrived, most of them after a
+    dozen steps.
+
+    Args:
+        geometry: The arm's ``geometry``.
+        q: Joint angles to begin with ``(c, n)``, rad.
+        targets: Positions of the tip, one each ``(c, 3)``, mm.
+        limits: Lowest and highest angle of each joint ``(n, 2)``, rad.
+        steps: Most steps.
+
+    Returns:
+        The joint angles ``(c, n)``, rad, and the final distances from the targets ``(c,)``, mm.
     """
     xp, low, high = namespace(geometry, q, targets), limits[:, 0, None, None], limits[:, 1, None, None]
 
@@ -174,7 +184,18 @@ def project_to_targets(
     limits: Float[np.ndarray, "n 2"] | None = None,
     steps: int = _STEPS,
 ) -> tuple[Float[np.ndarray, "N n"], Bool[np.ndarray, " N"]]:
-    """Configurations moved by least-norm steps to their targets within limits (default: none), and which arrived."""
+    """Configurations moved by least-norm steps until the tip is at its target.
+
+    Args:
+        arm: The arm.
+        q: Joint angles to begin with ``(N, n)``, rad.
+        targets: Positions of the tip, one each ``(N, 3)``, mm.
+        limits: Lowest and highest angle of each joint ``(n, 2)``, rad; by default none.
+        steps: Most steps of each configuration.
+
+    Returns:
+        The joint angles ``(N, n)``, rad, and whether the tip arrived ``(N,)``.
+    """
     allowed = np.tile([-np.inf, np.inf], (arm.joints, 1)) if limits is None else np.asarray(limits)
     geometry = to_numpy(arm.geometry)
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core._compat import SymbolicZero
-from ..core.namespace import AnyArray, compiled, namespace
+from ..core.numpy_or_jax import AnyArray, compiled, namespace
 from .chain import ForwardPass, Geometry, components_last, forward_pass, joints_first, sines_cosines
 
 

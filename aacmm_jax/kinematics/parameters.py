@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from ..core.arguments import checked_arguments, items_of, real_number
 from ..core.arrays import Numbers, as_array, is_concrete, joined, random_key
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace
 from .arm import Arm, is_length, is_single, locate, natural_steps, parameter_names, with_arrays, with_values
 from .chain import Geometry
 from .independence import generic_poses, independent_names

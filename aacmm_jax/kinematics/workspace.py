@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
-from ..core.namespace import to_numpy
+from ..core.numpy_or_jax import to_numpy
 from .arm import Arm, joint_limits
 from .chain import forward_pass, sines_cosines
 from .inverse_kinematics import project_to_targets

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, namespace, to_numpy
+from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
 from ..data.capture import Capture, check_one_capture
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.chain import Geometry, SinesCosines, sines_cosines

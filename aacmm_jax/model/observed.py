@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
-from ..core.namespace import AnyArray, add_at, namespace, to_numpy
+from ..core.numpy_or_jax import AnyArray, add_at, namespace, to_numpy
 from ..data.capture import Capture, check_one_capture
 from ..data.observations.observation import POINT, AbstractObservation, Rows, Tips, offset_of
 from ..data.observations.socket import Socket, position_of

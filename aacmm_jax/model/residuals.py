@@ -1,4 +1,4 @@
-"""The residuals that the identifications minimise, of a measurement by an arm, and their quadratic models."""
+"""The residuals that the identifications minimise, of a measurement by an arm, and their normal equations."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
-from ..core.namespace import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass
 from ..kinematics.jacobian import stacked_jacobian_columns
 from ..kinematics.parameters import Parameters
@@ -60,16 +60,18 @@ def joint_residual(
     )
 
 
-def repeatability_model(vector: Float[AnyArray, " p"], args: tuple[Parameters, Measurement]) -> QuadraticModel:
+def repeatability_normal_equations(
+    vector: Float[AnyArray, " p"], args: tuple[Parameters, Measurement]
+) -> QuadraticModel:
     """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic Jacobian columns."""
     space, measurement = args
     geometry = space.geometry(vector)
-    return model_of(
+    return normal_equations(
         geometry, measurement.sines_cosines, measurement.sizes, space.indices(), weights=measurement.weights
     )
 
 
-def joint_model(
+def joint_normal_equations(
     vector: Float[AnyArray, " p"],
     args: tuple[Parameters, Measurement, Float[AnyArray, ""], Float[AnyArray, "l l"]],
 ) -> QuadraticModel:
@@ -77,7 +79,7 @@ def joint_model(
     space, measurement, sigma, whitening = args
     joint_weights = JointWeights(measurement.ends, measurement.nominal, sigma, whitening)
     geometry = space.geometry(vector)
-    return model_of(
+    return normal_equations(
         geometry, measurement.sines_cosines, measurement.sizes, space.indices(), joint_weights, measurement.weights
     )
 
@@ -91,7 +93,7 @@ def measured_lengths(
     return _distances(forward.tip, columns, measurement.sizes, measurement.ends, measurement.weights)
 
 
-def model_of(
+def normal_equations(
     geometry: Geometry,
     sines_cosines: SinesCosines,
     sizes: tuple[int, ...],

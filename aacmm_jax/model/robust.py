@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import equinox as eqx
 from jaxtyping import Float
 
-from ..core.namespace import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace
 
 LossName = Literal["huber", "cauchy", "tukey"]
 LOSSES = get_args(LossName)

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from ..core.arguments import check_finite, checked_arguments
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, compiled, namespace, to_jax, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
-from ..kinematics.arm import Arm, is_single, with_arrays
+from ..kinematics.arm import Arm, is_length, is_single, parameter_names
 from ..kinematics.parameters import Parameters
 from .measurement import Measurement, length_covariance
 from .metrics import repeatability
@@ -39,46 +39,45 @@ class ScaleFix(eqx.Module):
     scale: Scale
 
 
-def divide_lengths(arm: Arm, k: Float[AnyArray, ""]) -> Arm:
-    """The arm with its lengths divided by k: every a, every d but ``d_1``, and the probe.
-
-    ``d_1`` only shifts the whole base frame along the first axis. No length and no repeatability depends on it, k says
-    nothing about it, and it stays as given (as in Table 2 of the paper).
-    """
-    k = k[..., None]
-    d = namespace(arm, k).concatenate([arm.d[..., :1], arm.d[..., 1:] / k], axis=-1)
-    return with_arrays(arm, a=arm.a / k, d=d, probe=arm.probe / k)
-
-
-def divide_free_lengths(
+def divide_lengths(
     space: Parameters,
     parameters: Float[AnyArray, "... p"],
     k: Float[AnyArray, "..."],
-    replaced: Float[AnyArray, "... p"],
+    partners: Partners | None = None,
 ) -> Float[AnyArray, "... p"]:
     """Free parameters with which the arm, its fixed lengths as they are, equals the arm with every length divided by k.
 
     Tips are linear in the lengths, so a fixed length f that free lengths x can replace with weights w leaves
-    x' = x / k + (1 / k - 1) w f. ``replaced`` is w f (see `replaced_lengths`), 0 where nothing is replaced.
+    x' = x / k + (1 / k - 1) w f. ``d_1`` is not divided (see `divisible`). Without ``partners`` nothing is replaced.
     """
     # NumPy for arrays of NumPy: XLA rounds a division by a broadcast k differently.
     xp = namespace(parameters, k)
-    divided, replaced = (xp.broadcast_to(xp.asarray(row), parameters.shape) for row in (divisible(space), replaced))
+    rows = divisible(space), replaced_lengths(space, partners)
+    divided, replaced = (xp.broadcast_to(xp.asarray(row), parameters.shape) for row in rows)
     return xp.where(divided, (parameters + replaced) / k[..., None] - replaced, parameters)
 
 
 def divisible(space: Parameters) -> np.ndarray:
-    """Boolean mask ``(p,)``: free lengths that the division by k changes, all but ``d_1`` (see `divide_lengths`)."""
+    """Boolean mask ``(p,)``: free lengths that the division by k changes, all but ``d_1``.
+
+    ``d_1`` only shifts the whole base frame along the first axis. No length and no repeatability depends on it, k says
+    nothing about it, and it stays as given (as in Table 2 of the paper).
+    """
     return space.lengths & np.array([name != "d_1" for name in space.names])
 
 
-def replaced_lengths(space: Parameters, arm: Arm, partners: Partners) -> Float[AnyArray, "... p"]:
-    """w f of `divide_free_lengths`, mm: the fixed lengths of the arm by the weights of their partners."""
-    names, weights = partners
+def replaced_lengths(space: Parameters, partners: Partners | None) -> Float[AnyArray, "... p"]:
+    """w f of `divide_lengths`, mm: the fixed lengths of the base arm by the weights of their partners."""
+    names, weights = partners or ((), ())
     if not names:
         return np.zeros(len(space.names))
-    fixed = Parameters(arm, names).vector(arm)
-    return fixed @ np.array(weights).T
+    return Parameters(space.base, names).vector() @ np.array(weights).T
+
+
+def divided_arm(arm: Arm, k: Float[AnyArray, "..."]) -> Arm:
+    """The arm with every length but ``d_1`` divided by k."""
+    space = Parameters(arm, tuple(name for name in parameter_names(arm) if is_length(name)))
+    return space.arm(divide_lengths(space, space.vector(), k))
 
 
 @checked_arguments
@@ -120,7 +119,7 @@ def _fixed(arm: Arm, measurement: Measurement, sigma: Float[AnyArray, ""] | None
     tips = arm.position(measurement.q)
     scatter = repeatability(tips, measurement.sizes).sigma if sigma is None else sigma
     scale = scale_of(tips, measurement, scatter)
-    return ScaleFix(divide_lengths(arm, scale.value), scale)
+    return ScaleFix(divided_arm(arm, scale.value), scale)
 
 
 def scale_of(tips: Float[AnyArray, "N 3"], measurement: Measurement, sigma: Float[AnyArray, ""]) -> Scale:

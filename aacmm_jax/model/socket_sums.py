@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.namespace import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace
 
 # JAX multiplies by a matrix of (sockets, poses) up to this size, which suits batches of few sockets: the product is not
 # fused with what surrounds it, so that a trial of a study has the same bits in every block. Larger problems take a

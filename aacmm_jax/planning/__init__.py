@@ -1,4 +1,7 @@
-"""Planning of calibrations: positions of sockets and reference lengths, and the poses to take."""
+"""Planning of calibrations: positions of sockets and reference lengths, and the poses to take.
+
+Poses of acceptance tests: `acceptance.procedure`.
+"""
 
 import lazy_loader as _lazy_loader
 

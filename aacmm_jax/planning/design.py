@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from ..core.arrays import Numbers
 from ..core.errors import InputError, nearest
-from ..core.namespace import to_numpy
+from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
 from ..data.simulation import socket_point

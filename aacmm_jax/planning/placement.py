@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
-from ..core.namespace import to_numpy
+from ..core.numpy_or_jax import to_numpy
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, jacobian_at
 from ..kinematics.chain import Geometry, sines_cosines

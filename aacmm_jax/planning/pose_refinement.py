@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.namespace import to_numpy
+from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import locate
 from ..kinematics.chain import ForwardPass, forward_pass, sines_cosines
 from ..kinematics.jacobian import jacobian_columns, readings_gradient

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError
-from ..files.whole_file import whole_file
+from ..files.atomic_write import write_atomically
 
 _FORMATS = ("png", "svg", "pdf")
 DARK, ACCENT, LIGHT = "#1b3a6b", "#d95f02", "0.65"
@@ -41,5 +41,5 @@ def check_format(path: Path) -> str:
 def save_figure(figure: Any, path: Path) -> None:
     """Write a figure into a file, whole or not at all, in the format that its name ends in."""
     file_format = check_format(path)
-    with whole_file(path) as temporary:
+    with write_atomically(path) as temporary:
         figure.savefig(temporary, format=file_format, dpi=150)

@@ -1,4 +1,7 @@
-"""Reports for laboratories and their customers: one HTML file for a calibration, an evaluation or a study."""
+"""Reports for laboratories and their customers: one HTML file for a calibration, an evaluation or a study.
+
+Warnings and tables that the command line shows too are worded in `summaries`; figures for papers are in `plot`.
+"""
 
 import lazy_loader as _lazy_loader
 

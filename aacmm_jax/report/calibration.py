@@ -7,7 +7,7 @@ import numpy as np
 
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord, uncertainty_of
-from ..core.errors import counted
+from ..core.text import pluralise
 from ..core.units import ARCSEC, DEG
 from ..summaries.calibration import calibration_summary
 from ..summaries.warnings import observed
@@ -67,8 +67,8 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
         verdict = "Not to be used" + (": data and arm do not belong together." if record.converged else f". {verdict}")
     report = Report(
         title="Calibration of " + (record.recording.nominal.name or "an arm"),
-        subtitle=f"{_METHODS[record.method]}; {counted(summary['poses'], 'pose')} in "
-        f"{counted(len(summary['sockets_used']), 'socket')}, {counted(count, 'reference length')}",
+        subtitle=f"{_METHODS[record.method]}; {pluralise(summary['poses'], 'pose')} in "
+        f"{pluralise(len(summary['sockets_used']), 'socket')}, {pluralise(count, 'reference length')}",
         verdict=verdict,
         verdict_mark="good" if good else "bad",
         warnings=summary["warnings"],
@@ -275,7 +275,7 @@ def _residuals(record: CalibrationRecord, evaluation: Evaluation) -> Section:
         "residuals", "Residuals of the calibrated arm", capture, {"calibrated": evaluation}, mark=True
     )
     introduction = (
-        "The distance of each pose's tip from the centroid of its socket, by the calibrated arm. Poses more than four "
+        "The distance of each pose's tip from the centroid of its socket, by the calibrated arm. Poses more than eight "
         "times as far as the median are marked: check how the tip was seated there."
     )
     return Section(

@@ -10,7 +10,7 @@ from ..acceptance.record import EvaluationRecord, PointsRecord
 from ..acceptance.results import METRICS, AcceptanceTest, Metric
 from ..acceptance.standards import EDITIONS
 from ..calibration.evaluation import Evaluation, evaluate
-from ..core.errors import counted
+from ..core.text import pluralise
 from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
 from ..summaries.evaluation import evaluation_summary, points_summary
@@ -37,9 +37,9 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
     )
     report = Report(
         title="Evaluation of " + (record.recording.nominal.name or "an arm"),
-        subtitle=f"{counted(sum(capture.sizes), 'pose')} in {counted(len(capture.names), 'socket')}, "
-        f"{counted(len(capture.lengths), 'reference length')}, "
-        f"{counted(len(record.recording.spheres), 'touched sphere')}",
+        subtitle=f"{pluralise(sum(capture.sizes), 'pose')} in {pluralise(len(capture.names), 'socket')}, "
+        f"{pluralise(len(capture.lengths), 'reference length')}, "
+        f"{pluralise(len(record.recording.spheres), 'touched sphere')}",
         verdict=verdict,
         verdict_mark=mark,
         warnings=summary["warnings"] + [f"Over the limit: {sentence}" for sentence in summary["failed"]],
@@ -66,8 +66,8 @@ def points_report(record: PointsRecord) -> tuple[Report, dict[str, Any]]:
         *([] if chart is None else [Section("lengths", "Lengths", [chart])]),
     ]
     subtitle = (
-        f"{counted(summary['points'], 'point')} as recorded: {counted(summary['sockets'], 'socket')}, "
-        f"{counted(summary['lengths'], 'length')}, {counted(summary['spheres'], 'sphere')}"
+        f"{pluralise(summary['points'], 'point')} as recorded: {pluralise(summary['sockets'], 'socket')}, "
+        f"{pluralise(summary['lengths'], 'length')}, {pluralise(summary['spheres'], 'sphere')}"
     )
     report = Report("Acceptance test of points", subtitle, verdict, mark, summary["warnings"], [], sections)
     return report, summary
@@ -134,16 +134,19 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
     )
     blocks: list = [
         "Every metric is of single readings. U, with coverage factor 2, is what the tester contributes: the artefacts' "
-        f"uncertainty; {stated}. The arm's own scatter is what is tested (ISO 14253-5). A metric conforms if "
-        "|value| ≤ MPE − U, fails if |value| ≥ MPE + U, and is undecided in between (ISO 14253-1, with U as guard band "
-        "as in its editions up to 2013). What standards allow about repeating a reading is not applied, and the "
-        "distribution of positions and directions is not checked. Procedures and formulas follow secondary sources of "
-        "the editions named.",
+        f"uncertainty; {stated}. The arm's own scatter is what is tested (ISO 14253-5). What standards allow about "
+        "repeating a reading is not applied, and the distribution of positions and directions is not checked. "
+        "Procedures and formulas follow secondary sources of the editions named.",
     ]
+    limited = any(metric["limit_mm"] is not None for test in rows for metric in test["figures"])
+    if limited:
+        blocks.append(
+            "A metric conforms if |value| ≤ MPE − U, fails if |value| ≥ MPE + U, and is undecided in between (ISO "
+            "14253-1, with U as guard band as in its editions up to 2013)."
+        )
     before = any(metric["as_found_mm"] is not None for test in rows for metric in test["figures"])
     if before:
         blocks.append("As found is the nominal arm, as left the calibrated one.")
-    limited = any(metric["limit_mm"] is not None for test in rows for metric in test["figures"])
     for test in rows:
         blocks.append(_test_table(test, before, limited))
         if test["missing"]:

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from ..acceptance.record import SIMULATED
-from ..core.errors import InputError
 from ..files.administrative_data import AdministrativeData, check_conformity
+from ..files.atomic_write import write_text
 from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
-from ..files.whole_file import write_text
+from ..files.outputs import together
 from .administrative_data import administrative_section
 from .elements import ArmView, Chart, Report, ReportTable
 
@@ -37,9 +37,11 @@ def write_report(
         InputError: If the source cannot be read or the target not written, or the administrative data state a
             conformity that the source contradicts.
     """
-    source, target = Path(source), Path(target)
-    if target.exists() and source.exists() and target.samefile(source):
-        raise InputError(f"{target} is the file that the report is of; choose another output.")
+    with together(target):
+        return _written(Path(source), Path(target), administrative_data)
+
+
+def _written(source: Path, target: Path, administrative_data: AdministrativeData | None) -> dict[str, Any]:
     kind = read_summary(source, KINDS)[0]["kind"]
     read = source if kind == "study" else InputFile(source)  # a study is read in parts
     stored = read_tables(read, (kind,), without=("trials",))

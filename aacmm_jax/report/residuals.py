@@ -7,17 +7,11 @@ import numpy as np
 
 from ..calibration.evaluation import Evaluation
 from ..data.capture import Capture
+from ..model.metrics import pose_outliers
+from ..summaries.tables import METRICS
 from . import charts
 from .elements import Cell, Chart, ReportTable, format_number, number_cell, text_cell
 
-_METRICS = (
-    ("de_mm", "DE, mean distance of poses from their socket's centroid"),
-    ("deltam_mm", "Deltam, largest half range of a coordinate in a socket"),
-    ("rms_mm", "RMS distance of poses from their socket's centroid"),
-    ("length_error_mean_absolute_mm", "length error, mean absolute"),
-    ("length_error_largest_mm", "length error, largest"),
-)
-_FAR = 4.0  # median distances
 _DRAWN, _LISTED = 2000, 1000  # most poses in a chart, and in its table
 _LEAST = 1e-5  # mm: a distance of zero on a logarithmic axis
 
@@ -37,16 +31,13 @@ def metrics_table(
         return number_cell(summary[stage].get(key))
 
     rows = [
-        [text_cell(title), *(cell(stage, key) for stage in stages)] for key, title in _METRICS if key in summary[first]
+        [text_cell(title), *(cell(stage, key) for stage in stages)] for key, title in METRICS if key in summary[first]
     ]
     return ReportTable(caption, ("", *stages.values()), rows)
 
 
-def outliers(distances: np.ndarray) -> np.ndarray:
-    """Poses more than four times as far from their centroid as the median; NaN (single poses) is not counted."""
-    known = distances[np.isfinite(distances)]
-    typical = float(np.median(known)) if len(known) else 0.0
-    return np.flatnonzero(distances > _FAR * typical) if typical > 1e-6 else np.zeros(0, dtype=int)
+def _outliers(capture: Capture, evaluation: Evaluation) -> np.ndarray:
+    return pose_outliers(np.asarray(evaluation.distances), capture.sizes)[0]
 
 
 def pose_distances(capture: Capture, evaluation: Evaluation) -> np.ndarray:
@@ -59,7 +50,7 @@ def socket_table(capture: Capture, evaluation: Evaluation) -> ReportTable:
     """Repeatability and number of outliers, socket by socket."""
     found = evaluation.repeatability
     metrics = [np.asarray(column) for column in (found.socket_de, found.socket_deltam, found.socket_rms)]
-    far = np.bincount(capture.owner[outliers(pose_distances(capture, evaluation))], minlength=len(capture.names))
+    far = np.bincount(capture.owner[_outliers(capture, evaluation)], minlength=len(capture.names))
     rows = [
         [
             text_cell(name),
@@ -88,7 +79,7 @@ def residual_chart(
     if not len(known):
         empty = {"data": [], "layout": charts.layout("", "")}
         return Chart(id, title, "Every socket has one pose only, so there is no scatter to show.", empty)
-    far = outliers(last) if mark else np.zeros(0, dtype=int)
+    far = _outliers(capture, list(evaluations.values())[-1]) if mark else np.zeros(0, dtype=int)
     drawn = known if len(known) <= _DRAWN else known[np.linspace(0, len(known) - 1, _DRAWN).round().astype(int)]
     drawn = np.union1d(drawn, far)
     styles = [(charts.LIGHT, "circle-open"), (charts.DARK, "circle")][-len(evaluations) :]

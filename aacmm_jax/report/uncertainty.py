@@ -8,6 +8,7 @@ import numpy as np
 from ..calibration.record import CalibrationRecord
 from ..core.units import DEG
 from ..kinematics.arm import is_length
+from ..summaries.tables import volume_rows
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
@@ -27,14 +28,7 @@ def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], facto
     """Expanded uncertainty of tips and lengths over the working volume."""
     found = summary["uncertainty"]["volume"]
     length = f"{volume.length:g} mm length"
-    rows = []
-    for key, title in (
-        ("u_tip", "tip position, along its worst direction: from the calibration"),
-        ("u_length", f"{length}: from the calibration"),
-        ("u_length_reading", f"{length}: with the noise of both readings"),
-    ):
-        u = [found[f"{key}_{which}_mm"] for which in ("median", "95", "largest")]
-        rows.append([text_cell(title), *(number_cell(None if x is None else factor * x) for x in u)])
+    rows = [[text_cell(title), *map(number_cell, values)] for title, values in volume_rows(found, factor)]
     low, high = volume.start.min(axis=0), volume.start.max(axis=0)
     box = ", ".join(f"{axis} from {a:.0f} to {b:.0f}" for axis, a, b in zip("xyz", low, high, strict=True))
     introduction = (

@@ -1,4 +1,7 @@
-"""Box-bounded nonlinear least squares: Levenberg-Marquardt with an active set, and its adjoint."""
+"""Box-bounded nonlinear least squares: Levenberg-Marquardt with an active set, and its adjoint.
+
+The residuals of a calibration are in `model.residuals`.
+"""
 
 import lazy_loader as _lazy_loader
 

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..core.linear_algebra import solve_positive_definite
-from ..core.namespace import AnyArray, cond, namespace, while_loop
+from ..core.numpy_or_jax import AnyArray, cond, namespace, while_loop
 
 Flat = Float[AnyArray, "*slots p"]
 Number = Float[AnyArray, "*slots"]

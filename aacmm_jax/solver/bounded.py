@@ -14,12 +14,12 @@ from jaxtyping import Array, Float, PyTree
 from ..core.arguments import whole_number
 from ..core.arrays import as_array, is_concrete
 from ..core.errors import InputError
-from ..core.namespace import AnyArray
+from ..core.numpy_or_jax import AnyArray
 from ..core.x64 import check_x64
 from .active_set import Box, Flat, QuadraticModel, expand
 from .adjoint import BoundedAdjoint, box_of
 from .levenberg_marquardt import Progress, Rules, advance, begin
-from .reason import MAX_STEPS, NONFINITE, RUNNING, STALLED, reasons
+from .reason import MAX_STEPS, NONFINITE, RUNNING, STALLED, Reason, reasons
 
 
 class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
@@ -123,7 +123,8 @@ def least_squares(
         An `optimistix.Solution`; its ``stats["reason"]`` is the `Reason` why the solve ended.
 
     Raises:
-        InputError: Where a lower bound is above its upper one, or bounds do not fit the start.
+        InputError: Where a lower bound is above its upper one, or bounds do not fit the start; with ``throw``, where
+            the solve fails. Under jit that is a failure of JAX's, of several lines.
     """
     check_x64()
     y0 = jax.tree.map(lambda leaf: jnp.asarray(as_array(leaf, "the start")), y0)
@@ -137,7 +138,7 @@ def least_squares(
         what: tree if tree is None else _expanded(y0, tree, absent, what) for what, (tree, absent) in given.items()
     }
     _check_box(y0, options["lower"], options["upper"])
-    return optx.least_squares(
+    solution = optx.least_squares(
         fn,
         solver,
         y0,
@@ -145,8 +146,16 @@ def least_squares(
         options | {"normal": normal},
         max_steps=max_steps,
         adjoint=BoundedAdjoint(),
-        throw=throw,
+        throw=False,
     )
+    if not throw:
+        return solution
+    failed = solution.result != optx.RESULTS.successful
+    if not is_concrete(failed):
+        return solution.result.error_if(solution, failed)
+    if bool(failed):
+        raise InputError(Reason[solution.stats["reason"]])
+    return solution
 
 
 def minimise(

@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Int
 
-from ..core.namespace import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace
 from .active_set import Box, Flat, Number, QuadraticModel, Step, choose, diagonal, norm, propose
 from .reason import GRADIENT, NONFINITE, ROUNDING, RUNNING, STALLED, STEP
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from ..core import _compat
-from ..core.namespace import AnyArray
+from ..core.numpy_or_jax import AnyArray
 
 
 class Reason(eqx.Enumeration):

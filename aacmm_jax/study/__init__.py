@@ -1,4 +1,7 @@
-"""Monte Carlo studies of calibrations: specification, trials, store, executors, results."""
+"""Monte Carlo studies of calibrations: specification, trials, store, executors, results.
+
+Many calibrations without a study: `calibration.batch`; Monte Carlo of one calibration: `calibration.sampling`.
+"""
 
 import lazy_loader as _lazy_loader
 

@@ -9,3 +9,6 @@ from .sources import shipped_studies as shipped_studies
 from .statistics import cell_summary as cell_summary
 from .statistics import concise as concise
 from .statistics import study_summary as study_summary
+from .trial_simulation import DrawnTrials as DrawnTrials
+from .trial_simulation import clear_pools as clear_pools
+from .trials import draw_trials as draw_trials

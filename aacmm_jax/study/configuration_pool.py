@@ -69,6 +69,12 @@ def _pool(study: Study, setting: Setting) -> Pool:
     return Pool(np.concatenate(tables), tuple(map(int, first)), placements, poses)
 
 
+def forget_pools() -> None:
+    """Free the pools that are kept here; see `trial_simulation.clear_pools`."""
+    _pool.cache_clear()
+    _fixture_table.cache_clear()
+
+
 def _recorded(study: Study) -> Pool:
     """The configurations of the recording, and the centroid of the tips in every socket."""
     capture, setting = study.capture, study.settings[0]

@@ -112,7 +112,7 @@ class Results(NamedTuple):
         Raises:
             InputError: Where the file is missing, damaged or no study, or its folder of blocks is missing.
         """
-        path = Path(path).resolve()
+        path = Path(os.path.realpath(path))
         stored = store.read(path)
         store.check_parts(path, stored)
         store.check_results(path, stored)

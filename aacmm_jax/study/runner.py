@@ -90,7 +90,7 @@ def run_study(
         InputError: For a file of another study, a file that another process is writing, and a full disk; finished
             blocks are kept.
     """
-    path = Path(path).resolve()
+    path = Path(os.path.realpath(path))
     for what, number in (("workers", workers), ("chunk", chunk)):
         if number is not None and (not isinstance(number, int) or number < 1):
             raise InputError(f"{what} is {number!r}; give a whole number of at least 1, or leave it out.")
@@ -274,9 +274,9 @@ def _interruptible(function: Callable, *args: Any) -> Any:
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Keep other processes from writing the same study."""
-    if not path.name or path.is_dir():
+    if not path.name or os.path.isdir(path):
         raise InputError(f"{path} cannot be written: it is a folder; choose another output path.")
-    if not path.parent.is_dir():
+    if not os.path.isdir(path.parent):
         raise InputError(
             f"{path} cannot be written: no such file or directory; create the folder, or choose another output path."
         )

@@ -10,9 +10,9 @@ from ..core.errors import InputError, nearest
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..files.arms import load_specification
+from ..files.atomic_write import storable
 from ..files.captures import load_capture
 from ..files.toml import read_toml
-from ..files.whole_file import storable
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import ArmSpecification
 from .definition import Study
@@ -93,11 +93,7 @@ def read_study(source: str | os.PathLike) -> Study:
     if isinstance(source, str) and source in shipped_studies():
         with resources.as_file(_shipped() / f"{source}.toml") as path:
             return _study_of_file(path)
-    try:
-        exists = Path(source).exists()
-    except OSError:  # a name too long to be one
-        exists = False
-    if not exists and Path(source).suffix != ".toml":
+    if not os.path.exists(source) and Path(source).suffix != ".toml":
         known = nearest(str(source), shipped_studies())
         raise InputError(f"'{source}' is neither a file nor a study that ships with the package{known}")
     return _study_of_file(Path(source))
@@ -124,4 +120,4 @@ def _study_of_file(path: Path) -> Study:
 
 def _arm(folder: Path, name: str) -> ArmSpecification:
     neighbour = folder / name
-    return load_specification(neighbour if name.endswith(".toml") or neighbour.is_file() else name)
+    return load_specification(neighbour if name.endswith(".toml") or os.path.isfile(neighbour) else name)

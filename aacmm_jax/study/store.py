@@ -21,6 +21,7 @@ import numpy as np
 from ..core._compat import named_members
 from ..core.errors import InputError
 from ..data.recording import Recording
+from ..files.atomic_write import ELSEWHERE, write_atomically
 from ..files.captures import arm_table, recording_of, recording_tables, specification_of
 from ..files.hdf5 import (
     BLOCK,
@@ -39,7 +40,6 @@ from ..files.hdf5 import (
     undamaged,
     write_tables,
 )
-from ..files.whole_file import ELSEWHERE, whole_file
 from ..kinematics.arm import is_length
 from .blocks import NOT_RUN, VARIABLES, Block, Layout, fill_of, part_of, parts_of
 from .definition import Study
@@ -77,7 +77,7 @@ def write_part(path: Path, block: Block, packed: Packed, layout: Layout) -> None
             dataset = _dataset(file, name, layout, layout.shape(name, *block.shape))
             dataset.id.write_direct_chunk((0,) * dataset.ndim, content)
 
-    with whole_file(target, _ADVICE, leftovers=False) as temporary:
+    with write_atomically(target, _ADVICE, leftovers=False) as temporary:
         temporary.write_bytes(file_image(fill, digest=False))
 
 

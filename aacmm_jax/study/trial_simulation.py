@@ -20,7 +20,7 @@ from ..kinematics.arm import with_values
 from ..kinematics.chain import Geometry, forward_pass
 from ..kinematics.inverse_kinematics import damped_inverse
 from ..kinematics.jacobian import jacobian_columns
-from .configuration_pool import Pool, pool_of
+from .configuration_pool import Pool, forget_pools, pool_of
 from .definition import POOL_PARTS, CellValues, Setting, Study
 
 _WIDTH = 16  # trials at a time: of one width, so that every trial's arithmetic is the same whatever the chunk
@@ -29,7 +29,7 @@ _TOLERANCE = 1e-9  # mm: how far from its point a tip may end
 _MOST_STEPS = 40  # deviations of a few microns take 3, the paper's tolerances 5 or 6
 
 
-class Drawn(NamedTuple):
+class DrawnTrials(NamedTuple):
     """Trials, as `identify_many` takes them; mm and rad. q is NaN where the true arm did not reach its points."""
 
     q: Float[Any, "t N n"]
@@ -64,7 +64,7 @@ class _Shared(NamedTuple):
 
 def draw(
     study: Study, setting: Setting, cells: Int[np.ndarray, " t"], trials: Int[np.ndarray, " t"], device: Any
-) -> Drawn:
+) -> DrawnTrials:
     """Trials ``trials`` of cells ``cells``, all of one setting, as NumPy arrays."""
     static, shared = _prepared(study, setting, device)
     count = len(cells)
@@ -74,14 +74,14 @@ def draw(
     values = CellValues(*(column[cells] for column in study.cell_values))
     seed = np.asarray(study.specification.seed)
 
-    def part(first: int) -> Drawn:
+    def part(first: int) -> DrawnTrials:
         given = jax.tree.map(lambda column: column[first : first + size], (cells, trials, values))
         with jax.default_device(device):
             drawn = _draw(static, shared, *jax.device_put((seed, *given), device))
         return jax.tree.map(np.asarray, drawn)
 
     parts = [part(first) for first in range(0, padded, size)]
-    return Drawn(*(np.concatenate(column)[:count] for column in zip(*parts, strict=True)))
+    return DrawnTrials(*(np.concatenate(column)[:count] for column in zip(*parts, strict=True)))
 
 
 @lru_cache(maxsize=16)
@@ -92,6 +92,12 @@ def _prepared(study: Study, setting: Setting, device: Any) -> tuple[_Static, _Sh
     u = [float(length.u) for length in study.capture.lengths] if study.capture else [0.0] * len(static.lengths)
     shared = _Shared(pool.table, study.nominal.arm.geometry, np.asarray(study.space.vector()), np.array(u))
     return static, jax.device_put(shared, device)
+
+
+def clear_pools() -> None:
+    """Free the pools of configurations, which are kept for more trials of the same study."""
+    forget_pools()
+    _prepared.cache_clear()
 
 
 def _static(study: Study, setting: Setting, pool: Pool) -> _Static:
@@ -115,10 +121,12 @@ def ends_of(study: Study, setting: Setting) -> list[tuple[int, int]]:
 
 
 @partial(jax.jit, static_argnames=("static",))
-def _draw(static: _Static, shared: _Shared, seed: Array, cells: Array, trials: Array, values: CellValues) -> Drawn:
+def _draw(
+    static: _Static, shared: _Shared, seed: Array, cells: Array, trials: Array, values: CellValues
+) -> DrawnTrials:
     key = jax.random.key(seed, impl="threefry2x32")
 
-    def some(chunk: tuple) -> Drawn:
+    def some(chunk: tuple) -> DrawnTrials:
         cell, trial, values = chunk
         keys = jax.vmap(lambda c, t: jax.random.fold_in(jax.random.fold_in(key, c), t))(cell, trial)
         return _chunk(static, shared, keys, trial, values)
@@ -127,7 +135,7 @@ def _draw(static: _Static, shared: _Shared, seed: Array, cells: Array, trials: A
     return jax.tree.map(lambda leaf: leaf.reshape(len(trials), *leaf.shape[2:]), jax.lax.map(some, chunks))
 
 
-def _chunk(static: _Static, shared: _Shared, keys: Array, trials: Int[Array, " w"], values: CellValues) -> Drawn:
+def _chunk(static: _Static, shared: _Shared, keys: Array, trials: Int[Array, " w"], values: CellValues) -> DrawnTrials:
     """`_WIDTH` trials."""
     n, p = shared.geometry.alpha.shape[-1], shared.nominal.shape[0]
     parts = jax.vmap(lambda k: jax.random.split(k, 7))(keys)
@@ -154,7 +162,7 @@ def _chunk(static: _Static, shared: _Shared, keys: Array, trials: Int[Array, " w
         fraction = jax.vmap(lambda k: jax.random.uniform(k, (p,)))(parts[:, 6])
         free = jnp.asarray(np.arange(p) != (-1 if static.anchor is None else static.anchor))[None]
         start = jnp.where(free, values.lower + fraction * (values.upper - values.lower), start)
-    return Drawn(jnp.moveaxis(reading, 0, -1), true, values.lower, values.upper, start, value, u)
+    return DrawnTrials(jnp.moveaxis(reading, 0, -1), true, values.lower, values.upper, start, value, u)
 
 
 def _certified(

@@ -3,16 +3,18 @@
 from functools import lru_cache
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 
 from ..calibration.batch import calibrate_many, identify_many
+from ..calibration.sampling import batch_of_captures
+from ..core.arrays import Numbers
+from ..core.errors import InputError
 from ..data.capture import Capture, ReferenceLength
 from ..solver.reason import numbers_of
 from .blocks import Block
 from .definition import Setting, Study
-from .trial_simulation import Drawn, draw, ends_of
+from .trial_simulation import DrawnTrials, draw, ends_of
 
 
 def run_block(study: Study, block: Block, *, device: Any = None, workers: int | None = None) -> dict[str, np.ndarray]:
@@ -31,8 +33,29 @@ def run_block(study: Study, block: Block, *, device: Any = None, workers: int | 
     return {name: values.reshape(*block.shape, *values.shape[1:]) for name, values in found.items()}
 
 
+def draw_trials(study: Study, cell: int, trials: Numbers) -> tuple[DrawnTrials, Capture]:
+    """The problems of some trials of a cell, as the study solves them: to look into one, or to solve it otherwise.
+
+    Args:
+        study: The study.
+        cell: Number of the cell, from 0.
+        trials: Numbers of the trials ``(t,)``, from 0.
+
+    Returns:
+        Readings, true parameters, bounds and starts, and the captures as a batch that `identify_many` takes.
+
+    Raises:
+        InputError: The study has no such cell.
+    """
+    if not 0 <= cell < len(study.settings):
+        raise InputError(f"cell is {cell}, but the study has {len(study.settings)} cells; count them from 0.")
+    setting, numbers = study.settings[cell], np.atleast_1d(np.asarray(trials))
+    drawn = draw(study, setting, np.full(len(numbers), cell), numbers, jax.local_devices()[0])
+    return drawn, _captures_of(study, setting, drawn)
+
+
 def _identified(
-    study: Study, setting: Setting, drawn: Drawn, devices: list[Any], workers: int | None
+    study: Study, setting: Setting, drawn: DrawnTrials, devices: list[Any], workers: int | None
 ) -> dict[str, np.ndarray]:
     options = {
         "space": study.space,
@@ -41,7 +64,7 @@ def _identified(
         "devices": devices,
         "workers": workers,
     }
-    capture = captures_of(study, setting, drawn)
+    capture = _captures_of(study, setting, drawn)
     problem = (study.nominal.arm, capture, drawn.lower, drawn.upper, drawn.start)
     if setting.method == "stage1":
         many = stage1 = identify_many(*problem, **options)
@@ -84,14 +107,9 @@ def _largest(error: np.ndarray, which: np.ndarray, present: bool = True) -> np.n
     return np.abs(error[:, which]).max(axis=1, initial=0.0) if present else np.full(len(error), np.nan)
 
 
-def captures_of(study: Study, setting: Setting, drawn: Drawn) -> Capture:
+def _captures_of(study: Study, setting: Setting, drawn: DrawnTrials) -> Capture:
     """The captures of drawn trials as a batch."""
-    template = _template(study, setting)
-    lengths = tuple(
-        eqx.tree_at(lambda r: (r.value, r.u), length, (drawn.value[:, i], drawn.u[:, i]))
-        for i, length in enumerate(template.lengths)
-    )
-    return eqx.tree_at(lambda c: (c.q, c.lengths), template, (drawn.q, lengths))
+    return batch_of_captures(_template(study, setting), drawn.q, drawn.value, drawn.u)
 
 
 @lru_cache(maxsize=64)

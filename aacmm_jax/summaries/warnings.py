@@ -8,22 +8,22 @@ from ..calibration.checks import plausible
 from ..calibration.record import CalibrationRecord
 from ..calibration.results import active_names
 from ..calibration.scale_anchor import scale_set_by_clause
-from ..core.errors import some
-from ..core.namespace import to_numpy
+from ..core.numpy_or_jax import to_numpy
+from ..core.text import shorten
 from ..core.units import INCH, M
 from ..data.noise import tip_covariances
 from ..data.recording import Recording
 from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Bounds, Parameters
+from ..model.metrics import pose_outliers
 from ..uncertainty.identifiability import Observability, observability
+from .contradictions import contradictions
 from .likely_cause import likely_cause
 
 _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a reference length is wrong
 _LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 through errors outside the D-H model
-_POSE_OUTLIER = 8.0  # in median distances
 _TOLERANCE = math.radians(0.01)  # beyond a limit: more than the noise of any encoder
 _EXCESS = 1.5  # ratio of errors to their prediction that is reported
-_NAMED = 5  # items of a list that are named
 # By k, which is a length measured by the nominal arm over its reference value: one in m, read as mm, makes k = 1000.
 _MISTAKEN_UNITS = {
     M: "are the reference lengths in m by mistake?",
@@ -50,24 +50,11 @@ def of_capture(recording: Recording) -> list[str]:
                 f"Joint {joint + 1}: {outside} of {len(q)} readings lie outside its limits, {low} to {high} deg; "
                 "is the unit right, and the order of the columns?"
             )
-    found += _repeated(recording)
+    found += recording.capture.repeated.sentences()
     exact = [f"{length.start} - {length.end}" for length in recording.capture.lengths if float(length.u) == 0]
     if exact and recording.true is None:
-        found.append(f"Taken as exact, because u is 0: {some(exact)}; give the standard uncertainty of each length.")
+        found.append(f"Taken as exact, because u is 0: {shorten(exact)}; give the standard uncertainty of each length.")
     return found
-
-
-def _repeated(recording: Recording) -> list[str]:
-    """Poses that are in a socket twice, which is one measurement and counts as two."""
-    sockets = recording.capture.sockets.items()
-    twice = {name: len(q) - len(np.unique(np.asarray(q), axis=0)) for name, q in sockets}
-    repeated = [f"{name} ({count})" for name, count in twice.items() if count]
-    if not repeated:
-        return []
-    return [
-        f"Poses that repeat another one of their socket in every digit: {some(repeated)}; each counts as a measurement "
-        "of its own, which makes every uncertainty too small. Take the copies out."
-    ]
 
 
 def of_calibration(record: CalibrationRecord, seen: Observability | None = None) -> list[str]:
@@ -75,6 +62,7 @@ def of_calibration(record: CalibrationRecord, seen: Observability | None = None)
     seen = observed(record) if seen is None else seen
     found = [] if record.converged else [record.reason]
     found += _implausible(record)
+    found += contradictions(record)
     found += _validation(record)
     found += [*_scale(record), *of_capture(record.recording)]
     if record.implausible_residual:
@@ -161,7 +149,7 @@ def _scale(record: CalibrationRecord) -> list[str]:
         word = "shrank" if k < 1 else "stretched"
         return [
             f"Stage 1 ran with every length free and {word} the arm to k = {k:.5f} until a bound stopped it: "
-            f"{some(stage1)}. The scale fix undoes that; hold a length (--hold) to avoid it. The uncertainty of k "
+            f"{shorten(stage1)}. The scale fix undoes that; hold a length (--hold) to avoid it. The uncertainty of k "
             "takes these bounds as exact."
         ]
     if record.hold is not None and abs(k - 1) > max(_SUSPICIOUS_SCALE, 3 * record.u_k):
@@ -186,13 +174,13 @@ def _bounds(record: CalibrationRecord, seen: Observability) -> list[str]:
     found = []
     if weak:
         found.append(
-            f"On a bound because the data hardly determine them: {some(weak)}; fix one parameter of each combination "
-            "named below (--held), and do not widen the bounds. Until then the width of the bounds is part of their "
-            "uncertainties."
+            f"On a bound because the data hardly determine them: {shorten(weak)}; fix one parameter of each "
+            "combination named below (--held), and do not widen the bounds. Until then the width of the bounds is part "
+            "of their uncertainties."
         )
     if others:
         found.append(
-            f"On a bound: {some(others)}; widen the bounds unless they are known limits. Every uncertainty, "
+            f"On a bound: {shorten(others)}; widen the bounds unless they are known limits. Every uncertainty, "
             "that of k too, takes these values as exact."
         )
     return found
@@ -204,13 +192,12 @@ def _data(record: CalibrationRecord) -> list[str]:
     distances, owner = np.asarray(evaluation.distances), capture.owner
     first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
     found = []
-    typical = float(np.median(distances))
-    far = np.flatnonzero(distances > _POSE_OUTLIER * typical) if typical > 1e-6 else []
+    far, typical = pose_outliers(distances, capture.sizes)
     if len(far):
         worst = sorted(far, key=lambda i: -distances[i])
         names = [f"{capture.names[owner[i]]} pose {i - first[owner[i]] + 1} ({distances[i]:.3g} mm)" for i in worst]
         found.append(
-            f"Poses far from their socket, where {typical:.2g} mm is typical: {some(names)}; was the tip seated?"
+            f"Poses far from their socket, where {typical:.2g} mm is typical: {shorten(names)}; was the tip seated?"
         )
     error = np.asarray(evaluation.error)
     normalised = np.abs(error) / np.hypot(np.asarray(evaluation.u), 1e-9)
@@ -220,7 +207,7 @@ def _data(record: CalibrationRecord) -> list[str]:
         if len(error) > 1 and normalised[i] > _LENGTH_OUTLIER and abs(error[i]) > 1e-6
     ]
     if wrong:
-        found.append(f"Reference lengths that disagree with the arm: {some(wrong)}; check their values and sockets.")
+        found.append(f"Reference lengths that disagree with the arm: {shorten(wrong)}; check their values and sockets.")
     surplus = 3 * sum(size - 1 for size in capture.sizes) - (len(record.names) - 1)
     if surplus < (len(record.names) - 1) / 2:
         found.append(
@@ -249,7 +236,7 @@ def _identifiability(record: CalibrationRecord, seen: Observability) -> list[str
     weak = [name for name in weak if name not in named]
     if weak:
         found.append(
-            f"Determined only together, hardly one by one: {some(weak, 12)}. Tips and lengths that follow from them "
+            f"Determined only together, hardly one by one: {shorten(weak, 12)}. Tips and lengths that follow from them "
             "have an uncertainty, but these have none of their own; fix the redundant ones (--held)."
         )
     u, width = np.sqrt(np.diag(record.covariance)), (record.upper - record.lower) / 2
@@ -260,7 +247,7 @@ def _identifiability(record: CalibrationRecord, seen: Observability) -> list[str
     ]
     if loose:
         found.append(
-            f"Hardly determined, with a standard uncertainty over half of what the bounds allow: {some(loose)}; "
+            f"Hardly determined, with a standard uncertainty over half of what the bounds allow: {shorten(loose)}; "
             "fix some (--held), or record poses that separate them."
         )
     return found

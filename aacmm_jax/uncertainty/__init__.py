@@ -1,4 +1,7 @@
-"""What data determine, and how well: covariance, propagation, identifiability."""
+"""What data determine, and how well: covariance, propagation to k, tips and lengths, identifiability.
+
+Monte Carlo and cross-validation, which repeat calibrations: `calibration.sampling` and `calibration.cross_validation`.
+"""
 
 import lazy_loader as _lazy_loader
 

@@ -18,7 +18,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.namespace import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace
 from ..kinematics.arm import Arm
 from ..kinematics.near_degeneracy import LEAST_MOVEMENT, SHARE_OF_BOUNDS
 from ..kinematics.parameters import Bounds, Parameters

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from ..core.arrays import Numbers, is_concrete
 from ..core.distributions import student_quantile
 from ..core.errors import InputError
-from ..core.namespace import AnyArray, namespace, numpy_if_known
+from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm
 from ..kinematics.chain import sines_cosines

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..core.linear_algebra import inverse_positive_definite, semidefinite_eigen
-from ..core.namespace import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.units import ARCSEC
 from ..data.noise import Noise, encoder_covariances, noise_of, tip_covariances
 from ..kinematics.arm import Arm

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.arguments import check_finite, checked_arguments
-from ..core.namespace import AnyArray, compiled, namespace, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from ..data.capture import Capture, ReferenceLength, check_one_capture
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, joint_limits, neighbouring_arm, with_arrays

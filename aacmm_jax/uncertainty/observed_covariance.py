@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_positive_definite
-from ..core.namespace import AnyArray, namespace, scan, stop_gradient, while_loop
+from ..core.numpy_or_jax import AnyArray, namespace, scan, stop_gradient, while_loop
 from ..core.units import ARCSEC
 from ..data.noise import Noise, noise_of
 from ..kinematics.chain import ForwardPass

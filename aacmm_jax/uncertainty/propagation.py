@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from jaxtyping import Bool, Float
 
-from ..core.namespace import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import equinox as eqx
 from jaxtyping import Bool, Float
 
-from ..core.namespace import AnyArray, namespace, set_at
+from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
 from ..model.measurement import Measurement, length_covariance
-from ..model.scale import Scale, divisible, scale_and_weights
+from ..model.scale import Partners, Scale, divisible, replaced_lengths, scale_and_weights
 from .covariance import Sensitivity, covariance_of
 from .propagation import Propagated, in_units
 
@@ -25,17 +25,18 @@ def propagate_division(
     measurement: Measurement,
     sigma: Float[AnyArray, ""],
     divided: Float[AnyArray, " p"],
-    replaced: Float[AnyArray, " p"],
+    partners: Partners | None,
 ) -> Propagated:
     """After the lengths of stage 1's ``arm`` were divided by k, which itself follows the poses and the lengths.
 
-    x' = (x + r) / k - r for lengths, where r are the fixed lengths that x replaces (`model.scale.divide_free_lengths`),
-    so dx' = dx / k - (x' + r) / k dk; a parameter that stage 1 held or that was on a bound moves with k too.
+    x' = (x + r) / k - r for lengths, where r are the fixed lengths that x replaces (`model.scale.divide_lengths`), so
+    dx' = dx / k - (x' + r) / k dk; a parameter that stage 1 held or that was on a bound moves with k too.
     """
-    xp = namespace(before, arm, space, measurement, sigma, divided, replaced)
+    xp = namespace(before, arm, space, measurement, sigma, divided)
     scale = _scale_sensitivity(arm.position(measurement.q), measurement, before, sigma)
     divides = xp.asarray(divisible(space))
-    by_k = xp.where(divides, (divided + replaced) / scale.k.value, 0.0)  # lengths only: their natural step is 1 mm
+    # Of lengths only, whose natural step is 1 mm.
+    by_k = xp.where(divides, (divided + replaced_lengths(space, partners)) / scale.k.value, 0.0)
     change = xp.where(divides, 1 / scale.k.value, 1.0)
     return _with_scale(before, space, measurement, scale, by_k, change)
 

@@ -10,7 +10,7 @@ from ..core.arguments import checked_arguments
 from ..core.arrays import random_generator
 from ..core.errors import InputError
 from ..core.linear_algebra import semidefinite_eigen
-from ..core.namespace import AnyArray, compiled, namespace, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from ..kinematics.arm import Arm, joint_limits
 from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.workspace import total_link_length
@@ -96,8 +96,21 @@ def default_length(arm: Arm) -> float:
 def sample_lengths(
     arm: Arm, count: int, *, length: float | None, limits: Any = None, seed: int = 0
 ) -> tuple[Float[np.ndarray, "v n"], Float[np.ndarray, "v n"]]:
-    """Lengths all over the volume, as the poses at their two ends: of ``length`` mm in random directions, or (None)
-    between independent poses. Within the joint limits, and where both ends can be reached."""
+    """Lengths all over the working volume, as the poses at their two ends, where both ends can be reached.
+
+    Args:
+        arm: The arm that measures them.
+        count: How many.
+        length: Their length in random directions, mm; None for lengths between independent random poses.
+        limits: Lowest and highest reading of each joint ``(n, 2)``, rad; by default the arm's.
+        seed: Seed of the random poses.
+
+    Returns:
+        Poses where the lengths start, and where they end, ``(count, n)`` each, rad.
+
+    Raises:
+        InputError: The length does not fit into the volume, or no length is asked for.
+    """
     if length is not None and not 0 < length < 2 * total_link_length(arm):
         raise InputError(f"a length of {length:g} mm does not fit into the volume of this arm; give a shorter one.")
     if count < 1:

@@ -13,7 +13,6 @@ TRIALS = 200
 NOISES = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)  # arcsec, of a reading
 WIDTHS = (1.0, 2.0, 5.0, 10.0, 20.0)  # mm
 SOCKETS, POSES, LENGTHS = (1, 2, 4), (16, 32, 70, 140), (1, 2, 4)
-SAME_SHAPE = 1120  # the least common multiple of POSES
 BARS = (50.0, 100.0, twin.REFERENCE, 400.0)  # mm
 # Where a reference length lies: distance of its middle from the second joint, and its direction.
 POSITIONS = {
@@ -69,17 +68,7 @@ def sockets_poses_lengths() -> list[dict[str, float]]:
             [pooled[name][generator.integers(3_000, size=(TRIALS, each))] for name in names[:sockets]], axis=1
         )
         q = twin.recorded(exact, NOISE, nothing, generator)
-        # Every pose as often as makes all numbers of poses one shape, which is compiled once: the minimum is the same.
-        times, rest = divmod(SAME_SHAPE // sockets, each)
-        times = 1 if rest else times
-        captures = aj.stack_captures(
-            [
-                aj.Capture(
-                    {n: np.tile(part, (times, 1)) for n, part in zip(names, np.split(one, sockets), strict=False)}
-                )
-                for one in q
-            ]
-        )
+        captures = aj.stack_captures([aj.Capture(dict(zip(names, np.split(one, sockets), strict=False))) for one in q])
         many = aj.identify_many(arm, captures, lower, upper, (lower + upper) / 2, space=space, hold="d_3")
         reference = bars[generator.integers(len(bars), size=(TRIALS, max(LENGTHS)))]
         measured = twin.lengths_of(many.parameters, twin.recorded(reference, NOISE, nothing, generator))

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import aacmm_jax as aj
-from aacmm_jax.kinematics.inverse_kinematics import solve_to_targets
 
 HERE = Path(__file__).resolve().parent
 PUBLISHED: dict[str, Any] = tomllib.loads((HERE / "published.toml").read_text())
@@ -159,7 +158,8 @@ def configurations(arm: aj.Arm, targets: np.ndarray, key: jax.Array) -> np.ndarr
         tried = np.resize(missing, size)
         uniform = jax.random.uniform(jax.random.fold_in(key, number), (2048,))[: size * arm.joints]
         start = 2 * np.pi * np.asarray(uniform).reshape(size, arm.joints) - np.pi
-        solved, distance = solve_to_targets(geometry, jnp.asarray(start), jnp.asarray(targets[tried]), limits)
+        tried_now = jnp.asarray(start), jnp.asarray(targets[tried])
+        solved, distance = aj.kinematics.solve_to_targets(geometry, *tried_now, limits)
         good = np.flatnonzero(np.asarray(distance) <= 1e-9)[::-1]
         found[tried[good]] = np.asarray(solved)[good]
         missing = np.setdiff1d(missing, tried[good])

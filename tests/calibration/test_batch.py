@@ -1,5 +1,6 @@
 """Many identifications at once: the same results as one by one, whatever the chunk, the neighbours and the devices."""
 
+import inspect
 import os
 import subprocess
 import sys
@@ -127,6 +128,16 @@ def test_bad_input(paper_arm, noisy_capture, box, starts, change, message):
     arguments = {"lower": box[0], "upper": box[1], "start": starts} | change
     with pytest.raises(aj.InputError, match=message):
         aj.identify_many(paper_arm, noisy_capture, **arguments)
+
+
+@pytest.mark.parametrize("function", [aj.identify_many, aj.calibrate_many])
+def test_shared_options_are_named(function, paper_arm, noisy_capture, box):
+    named = inspect.signature(function).parameters
+    assert {name: named[name].default for name in batch.BatchOptions._fields} == batch.BatchOptions()._asdict()
+    with pytest.raises(TypeError, match="unexpected keyword argument 'slot'"):
+        function(paper_arm, noisy_capture, *box, slot=8)
+    with pytest.raises(aj.InputError, match=r"slots is 2\.5; give a whole number"):
+        function(paper_arm, noisy_capture, *box, slots=2.5)
 
 
 PROGRAM = """

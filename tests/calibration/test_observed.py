@@ -93,8 +93,8 @@ def test_a_target_and_its_station_are_found(paper_arm, true, bounds):
     result = aj.calibrate(arm, capture, aj.Bounds.around(arm, space), noise=NOISE)
     assert result.converged
     geometry = result.observed.geometry
-    np.testing.assert_allclose(geometry["offset of smr"], (60, 20, 80), atol=0.1)
-    np.testing.assert_allclose(geometry["offset of T6"], (10, 20, 80), atol=0.1)
+    np.testing.assert_allclose(geometry["offset of smr"], (60, 20, 80), atol=1.5)
+    np.testing.assert_allclose(geometry["offset of T6"], (10, 20, 80), atol=1.5)
     np.testing.assert_allclose(geometry["orientation of T6"], (0.1, 0.2, 0.3), atol=1e-3)
     np.testing.assert_allclose(geometry["frame of T"], FRAME, atol=0.5)
     assert float(result.observed.reduced_chi_of_all) == pytest.approx(1.0, abs=0.12)

@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.sampling import batch_of
 from aacmm_jax.calibration.scale_anchor import scale_anchor
 from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.kinematics.arm import value_of
-from aacmm_jax.model.scale import divide_lengths
+from aacmm_jax.model.scale import divided_arm
 from aacmm_jax.summaries import warnings as cautions
 
 SOCKETS = {"A": (400, 200, 300), "B": (600, 200, 300)}
@@ -99,7 +98,7 @@ def test_a_free_partner_moves_in_place_of_a_fixed_length(panda, method):
     assert abs(float(result.k) - 1) > 1e-3
     if method == "two-stage":
         q = np.random.default_rng(0).uniform(-2, 2, (20, 7))
-        every_length = divide_lengths(result.stage1.arm, result.k).position(q)
+        every_length = divided_arm(result.stage1.arm, result.k).position(q)
         np.testing.assert_allclose(result.arm.position(q), every_length, atol=1e-9)
     i = result.space.index("probe_z")
     assert abs(float(result.parameters[i]) - 130.0) < 4 * np.sqrt(float(result.covariance[i, i]))
@@ -303,7 +302,8 @@ def test_covariance_on_a_bound_is_what_trials_show(too_long, paper_arm, capture,
     random = np.random.default_rng(1)
     q = np.asarray(capture.q) + 2 * ARCSEC * random.normal(size=(300, *capture.q.shape))
     values = float(capture.lengths[0].value) + 0.002 * random.normal(size=(300, 1))
-    many = aj.calibrate_many(too_long, batch_of(capture, q, values), cut.lower, cut.upper, start, noise=noise)
+    captures = aj.calibration.batch_of_captures(capture, q, values)
+    many = aj.calibrate_many(too_long, captures, cut, start=start, noise=noise)
     i = cut.space.index("probe_z")
     assert np.all(many.active[:, i] == -1)
     predicted = np.sqrt(np.diag(aj.calibrate(too_long, capture, cut, start=start, noise=noise).covariance))

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
-from aacmm_jax.core.namespace import to_numpy
+from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.data.observations.observation import Tips
 

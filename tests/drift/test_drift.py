@@ -25,7 +25,7 @@ from aacmm_jax.drift.comparison import compare, trend
 from aacmm_jax.drift.statistics import coverage_factor, effective_degrees_of_freedom
 from aacmm_jax.files.hdf5 import provenance
 from aacmm_jax.kinematics.parameters import ArmSpecification
-from aacmm_jax.model.scale import divide_lengths
+from aacmm_jax.model.scale import divided_arm
 from aacmm_jax.plot import drift as drift_figure
 from aacmm_jax.summaries.drift import drift_csv, drift_summary
 from tests.refusals import assert_refused
@@ -270,7 +270,7 @@ def test_lengths_are_those_of_the_two_arms(old, new):
 
 
 def test_an_arm_that_grew_measures_everything_longer(old, new):
-    grown = old.calibrated._replace(arm=divide_lengths(old.calibrated.arm, jnp.asarray(1 / 1.0002)))
+    grown = old.calibrated._replace(arm=divided_arm(old.calibrated.arm, jnp.asarray(1 / 1.0002)))
     found = compare(old, new._replace(calibrated=grown))
     np.testing.assert_allclose(found.lengths.change, 0.06, rtol=1e-6)
     assert found.lengths.scale_change == pytest.approx(2e-4, rel=1e-6)

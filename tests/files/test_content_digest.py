@@ -147,6 +147,7 @@ HOSTILE = {
     "compound": (replaced((3,), [("a", "f8"), ("b", "i4")]), "of a type that no file of aacmm has"),
     "reference": (replaced((3,), h5py.ref_dtype), "of a type that no file of aacmm has"),
     "lists": (replaced((3,), h5py.vlen_dtype("f8")), "of a type that no file of aacmm has"),
+    "texts": (replaced(data=[["a", "b"]], dtype=h5py.string_dtype()), "a table of texts in several dimensions"),
     "group": (lambda file: (file.pop("t/x"), file.create_group("t/x")), "is no array"),
     "itself": (lambda file: file.__setitem__("t/t", file["t"]), "is no array"),
 }

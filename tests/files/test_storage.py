@@ -272,7 +272,7 @@ def strike(*_):
     raise KeyboardInterrupt
 
 signal.signal(signal.SIGINT, strike)
-q = np.resize(np.asarray(recording.capture.q), (6000, 3))
+q = np.resize(np.asarray(recording.capture.q), (6000, 3)) + 1e-9 * np.arange(6000)[:, None]
 both = [aj.Recording(aj.Capture({name: q}), recording.nominal, seed=seed) for seed, name in enumerate(("old", "new"))]
 aj.files.save_capture(target, both[0])
 while True:

@@ -1,4 +1,4 @@
-"""Residuals, their weights and their quadratic models, by definition and by finite differences."""
+"""Residuals, their weights and their normal equations, by definition and by finite differences."""
 
 import jax
 import jax.numpy as jnp
@@ -94,16 +94,16 @@ def test_joint_residual_is_in_standard_deviations(space, measurement):
 
 @pytest.mark.parametrize("weighted", [False, True], ids=["plain", "weighted"])
 @pytest.mark.parametrize("joint", [False, True], ids=["repeatability", "joint"])
-def test_models_are_the_residual_and_its_finite_differences(paper_arm, space, measurement, joint, weighted):
+def test_normal_equations_are_the_residual_and_its_finite_differences(paper_arm, space, measurement, joint, weighted):
     """Cost, gradient and Gram matrix against central differences of the residual."""
     if weighted:
         measurement = measurement.weighted(paper_arm.geometry, NOISE)
     args = (space, measurement)
-    residual, model = residuals.repeatability_residual, residuals.repeatability_model
+    residual, normal = residuals.repeatability_residual, residuals.repeatability_normal_equations
     if joint:
         weights = residuals.JointWeights.of(paper_arm.position(measurement.q), measurement, jnp.asarray(SIGMA))
         args = (*args, weights.sigma, weights.whitening)
-        residual, model = residuals.joint_residual, residuals.joint_model
+        residual, normal = residuals.joint_residual, residuals.joint_normal_equations
 
     @jax.jit
     def values(vector):
@@ -116,7 +116,7 @@ def test_models_are_the_residual_and_its_finite_differences(paper_arm, space, me
         for i, step in enumerate(jnp.diag(steps))
     ]
     jacobian, value = np.stack(columns, axis=1), np.asarray(values(vector))
-    found, scale = model(vector, args), np.asarray(space.scale)
+    found, scale = normal(vector, args), np.asarray(space.scale)
     assert float(found.cost) == pytest.approx(0.5 * value @ value, rel=1e-9)
     gradient, gram = jacobian.T @ value * scale, jacobian.T @ jacobian * scale[:, None] * scale[None, :]
     np.testing.assert_allclose(found.gradient * scale, gradient, rtol=0, atol=1e-7 * np.abs(gradient).max())

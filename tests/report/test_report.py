@@ -12,7 +12,6 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.report import charts, elements, write_report
-from aacmm_jax.report.residuals import outliers
 from tests.refusals import assert_refused
 
 HOSTILE = '<script>document.title="taken"</script><img src=x onerror=alert(1)> & "B" <b>bold</b>'
@@ -77,6 +76,12 @@ class Page(HTMLParser):
             self.held[self._in[-1]] = self.held.get(self._in[-1], "") + data
         else:
             self.text += data
+
+
+def test_a_target_that_cannot_be_written_is_refused(written):
+    source = written.folder / "calibration.h5"
+    assert_refused(lambda: write_report(source, written.folder / f"{'x' * 300}.html"), "name too long")
+    assert_refused(lambda: write_report(source, source), "one of the files that this command reads")
 
 
 @pytest.fixture(scope="module", params=["calibration", "evaluation", "study"])
@@ -331,12 +336,16 @@ def test_a_verdict_is_marked_as_what_it_is(written):
     assert (measured.verdict, measured.verdict_mark) == ("Measured; no limit was given", "neutral")
 
 
-def test_outliers_by_hand():
-    assert (
-        outliers(np.array([0.01, 0.012, 0.009, 0.041, 0.0439, 0.011, 0.0461])).tolist() == []
-    )  # median 0.012: four times is 0.048
-    assert outliers(np.array([0.01, 0.012, 0.009, 0.049, 0.011])).tolist() == [3]
-    assert outliers(np.full(5, 1e-12)).tolist() == []
+@pytest.mark.parametrize("limits", [{}, {"Deltam": aj.acceptance.Limit(0.05)}])
+def test_the_decision_rule_is_explained_only_where_there_is_a_limit(limits):
+    from aacmm_jax.acceptance.record import PointsRecord
+    from aacmm_jax.report.evaluation import points_report
+
+    points = aj.acceptance.Measured({"A": 0.01 * np.random.default_rng(0).normal(size=(10, 3))})
+    (acceptance, *_) = points_report(PointsRecord(points, limits))[0].sections
+    text = " ".join(block for block in acceptance.blocks if isinstance(block, str))
+    assert ("ISO 14253-1" in text) == bool(limits)
+    assert "ISO 14253-5" in text
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import aacmm_jax as aj
 from aacmm_jax.solver.active_set import QuadraticModel
 from aacmm_jax.solver.bounded import BoundedLevenbergMarquardt, minimise
 from aacmm_jax.solver.reason import reasons
+from tests.refusals import assert_refused
 from tests.solver import bounded_problems, nist_problems
 
 PROBLEMS = 200
@@ -258,8 +259,9 @@ def test_failure_is_data_and_an_exception_only_on_request(residual, start, reaso
     solution = aj.least_squares(residual, jnp.asarray(start), max_steps=steps, throw=False)
     assert solution.stats["reason"] == reason
     assert solution.result == (optx.RESULTS.nonlinear_max_steps_reached if result is None else result)
+    assert_refused(lambda: aj.least_squares(residual, jnp.asarray(start), max_steps=steps), aj.Reason[reason])
     with pytest.raises(eqx.EquinoxRuntimeError):
-        aj.least_squares(residual, jnp.asarray(start), max_steps=steps)
+        eqx.filter_jit(lambda y: aj.least_squares(residual, y, max_steps=steps).value)(jnp.asarray(start))
 
 
 def test_the_solution_is_a_point_that_was_evaluated():

@@ -219,6 +219,8 @@ def test_the_terminal_shows_all_of_it(path, aacmm, tmp_path):
         (("none.toml", "-o", "s.h5"), "none.toml does not exist; check the path"),
         (("noise", "-o", "no/folder/s.h5"), "cannot be written: no such file or directory"),
         (("noise", "-o", "."), "it is a folder"),
+        (("noise", "-o", "x" * 300), "name too long"),
+        (("--resume", "-o", "x" * 300), "nothing to resume"),
         (("noise", "-o", "s.h5", "--shards"), "--shards is for the workers of --dask"),
     ],
     ids=str,

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.report import write_report
 from aacmm_jax.study import runner, store
 from aacmm_jax.study.blocks import Layout, parts_of
 
@@ -274,6 +275,10 @@ def test_parts_may_stay(home, study, tmp_path):
     assert aj.study.open_study(path).attrs["finished"]
     parts = sorted(parts_of(path).iterdir())
     assert len(parts) == 12
+    before = parts[5].read_bytes()
+    with pytest.raises(aj.InputError, match="one of the files that this command reads"):
+        write_report(path, parts[5])
+    assert parts[5].read_bytes() == before
     parts[3].unlink()
     with pytest.raises(
         aj.InputError, match=r"1 blocks are missing in s\.h5\.parts; put them there, or run the study again"

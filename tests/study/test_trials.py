@@ -13,19 +13,16 @@ from aacmm_jax.study.trials import run_block
 
 from .small_study import CAPTURE, DEVIATION, NOISE, REFERENCE, made
 
-DEVICE = jax.devices()[0]
 AT_A_TIME = 64  # trials of one call: more are drawn by several, since another number would be compiled anew
 
 
-def drawn(study: "aj.study.Study", count: int = AT_A_TIME, cell: int = 0) -> trial_simulation.Drawn:
+def drawn(study: "aj.study.Study", count: int = AT_A_TIME, cell: int = 0) -> "aj.study.DrawnTrials":
     numbers = np.split(np.arange(count), range(AT_A_TIME, count, AT_A_TIME))
-    parts = [
-        trial_simulation.draw(study, study.settings[cell], np.full(len(part), cell), part, DEVICE) for part in numbers
-    ]
-    return trial_simulation.Drawn(*map(np.concatenate, zip(*parts, strict=True)))
+    parts = [aj.study.draw_trials(study, cell, part)[0] for part in numbers]
+    return aj.study.DrawnTrials(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def tips(study: "aj.study.Study", trials: trial_simulation.Drawn) -> np.ndarray:
+def tips(study: "aj.study.Study", trials: "aj.study.DrawnTrials") -> np.ndarray:
     arms = jax.vmap(study.space.arm)(jnp.asarray(trials.true))
     return np.asarray(jax.vmap(lambda arm, q: arm.position(q))(arms, jnp.asarray(trials.q)))
 
@@ -229,6 +226,17 @@ def test_a_trial_depends_on_its_key_alone(whole):
         for name, values in part.items():
             cells, trials = slice(block.first_cell, block.last_cell), slice(block.first_trial, block.last_trial)
             np.testing.assert_array_equal(values, results[name][cells, trials])
+
+
+def test_trials_are_drawn_one_by_one():
+    study = made(noise=NOISE, bounds={"length_mm": [3, 10]})
+    all_, (some, captures) = drawn(study, cell=1), aj.study.draw_trials(study, 1, [5, 2])
+    jax.tree.map(lambda one, other: np.testing.assert_array_equal(one, other[[5, 2]]), some, all_)
+    np.testing.assert_array_equal(captures.q, some.q)
+    np.testing.assert_array_equal(captures.lengths[0].value, some.value[:, 0])
+    np.testing.assert_array_equal(captures.lengths[0].u, some.u[:, 0])
+    with pytest.raises(aj.InputError, match=r"cell is -1, but the study has \d+ cells"):
+        aj.study.draw_trials(study, -1, [0])
 
 
 def test_pools_are_the_same_in_every_study_of_a_seed():

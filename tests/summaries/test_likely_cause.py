@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.data.recording import Recording
 from aacmm_jax.summaries.likely_cause import likely_cause
-from aacmm_jax.summaries.warnings import of_capture
 
 
 @pytest.mark.parametrize(
@@ -25,12 +23,3 @@ def test_cause(paper_arm, noisy_capture, mistake, cause):
     q = mistake(np.asarray(noisy_capture.q))
     capture = aj.Capture({"A": q[:70], "B": q[70:]})
     assert likely_cause(paper_arm, capture) == cause
-
-
-def test_repeated_poses_are_named(noisy_capture):
-    nominal = aj.files.load_specification("cheng2018-simulation")
-    sockets = {name: np.asarray(q) for name, q in noisy_capture.sockets.items()}
-    assert not any("repeat" in warning for warning in of_capture(Recording(aj.Capture(sockets), nominal)))
-    sockets["A"] = np.concatenate([sockets["A"], sockets["A"][:3]])
-    warnings = of_capture(Recording(aj.Capture(sockets), nominal))
-    assert any("repeat another one of their socket in every digit: A (3);" in warning for warning in warnings)

@@ -10,13 +10,12 @@ import pytest
 from scipy import stats
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.sampling import batch_of
 from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.data.noise import tip_covariances
 from aacmm_jax.kinematics.inverse_kinematics import project_to_centroids
 from aacmm_jax.model.measurement import Measurement
 from aacmm_jax.model.residuals import JointWeights
-from aacmm_jax.model.scale import divide_lengths
+from aacmm_jax.model.scale import divided_arm
 from aacmm_jax.model.weights import Weights, inverse_root
 from aacmm_jax.uncertainty import propagation, scale_uncertainty
 
@@ -119,7 +118,7 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
     found = aj.calibrate(paper_arm, capture, bounds, method=method, noise=noise)
     stage1, noise_model = found.stage1, "common" if noise is None else "given"
     if method == "joint":
-        scaled, sigma = divide_lengths(stage1.arm, stage1.scale.value), stage1.after.sigma / stage1.scale.value
+        scaled, sigma = divided_arm(stage1.arm, stage1.scale.value), stage1.after.sigma / stage1.scale.value
         measurement = Measurement.of(capture).weighted(scaled.geometry, noise)
         weights = JointWeights.of(scaled.position(measurement.q), measurement, sigma)
         none = jnp.zeros(21, dtype=bool)
@@ -145,9 +144,8 @@ def test_many_weighted_calibrations_equal_single_ones(paper_arm, bounds, capture
     shifts = 1e-6 * np.random.default_rng(0).normal(size=(3, *capture.q.shape))
     readings = np.asarray(capture.q) + shifts
     values = np.tile([float(length.value) for length in capture.lengths], (3, 1))
-    many = aj.calibrate_many(
-        paper_arm, batch_of(capture, readings, values), bounds.lower, bounds.upper, method=method, noise=UNEVEN
-    )
+    captures = aj.calibration.batch_of_captures(capture, readings, values)
+    many = aj.calibrate_many(paper_arm, captures, bounds, method=method, noise=UNEVEN)
     for i, q in enumerate(readings):
         blocks = {name: q[capture.owner == j] for j, name in enumerate(capture.names)}
         one = aj.calibrate(paper_arm, aj.Capture(blocks, capture.lengths), bounds, method=method, noise=UNEVEN)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError, nearest
-from ...core.namespace import AnyArray, namespace
+from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import fitted_frame, rotation_matrix
 from .frames import placed
 from .measured_points import check_spread

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...core.linear_algebra import solve_positive_definite
-from ...core.namespace import AnyArray, namespace
+from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, fitted_frame, rotation_derivative, rotation_matrix
 from .observation import Tips
 

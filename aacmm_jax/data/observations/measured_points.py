@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ...core.arrays import Numbers
 from ...core.errors import InputError
-from ...core.namespace import AnyArray, namespace
+from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import fitted_frame, rotation_matrix
 from .frames import frame_and_offset, placed
 from .observation import (

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
-from ...core.namespace import AnyArray, namespace
+from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, rotation_derivative, rotation_matrix, rotation_vector
 from .frames import frame_and_offset, placed
 from .measured_points import check_spread

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from ...core.arrays import Numbers, as_array, as_floats, is_concrete
 from ...core.errors import InputError
-from ...core.namespace import AnyArray, namespace
+from ...core.numpy_or_jax import AnyArray, namespace
 
 # Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
 _MOST_RADIANS = 8 * np.pi

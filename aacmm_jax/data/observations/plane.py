@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import semidefinite_eigen
-from ...core.namespace import AnyArray, namespace
+from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, rotation_derivative, rotation_matrix
 from .observation import (
     AbstractObservation,

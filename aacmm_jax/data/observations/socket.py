@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...core.arrays import Numbers
-from ...core.namespace import AnyArray, namespace
+from ...core.numpy_or_jax import AnyArray, namespace
 from .observation import (
     POINT,
     AbstractObservation,

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import solve_positive_definite
-from ...core.namespace import AnyArray, namespace
+from ...core.numpy_or_jax import AnyArray, namespace
 from .observation import (
     POINT,
     AbstractObservation,

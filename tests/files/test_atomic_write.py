@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from aacmm_jax.files.whole_file import write_text
+from aacmm_jax.files.atomic_write import write_text
 from tests.refusals import assert_refused
 
 

@@ -10,7 +10,7 @@ from .outputs import ELSEWHERE, OutputFile, hand_over, put_in_place, remove_left
 
 
 @contextlib.contextmanager
-def whole_file(path: str | os.PathLike, advice: str = ELSEWHERE, *, leftovers: bool = True) -> Iterator[Path]:
+def write_atomically(path: str | os.PathLike, advice: str = ELSEWHERE, *, leftovers: bool = True) -> Iterator[Path]:
     """Write a file whole or not at all: yields a temporary path in the same folder, renamed onto it at the end.
 
     Inside `together`, the end is that of all outputs. A symbolic link is followed: the file that it points to is
@@ -39,7 +39,7 @@ def whole_file(path: str | os.PathLike, advice: str = ELSEWHERE, *, leftovers: b
 
 def write_text(path: str | os.PathLike, text: str) -> None:
     """Write a text file whole or not at all."""
-    with whole_file(path) as temporary:
+    with write_atomically(path) as temporary:
         temporary.write_bytes(text.encode())
 
 

@@ -12,16 +12,15 @@ from ..core._compat import inside_trace
 from ..core.arguments import check_finite, checked_arguments
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
-from ..core.namespace import AnyArray, compiled, namespace, to_jax, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
 from ..model.measurement import Measurement, check_joints
 from ..model.metrics import repeatability
-from ..model.residuals import JointWeights, joint_model, joint_residual
+from ..model.residuals import JointWeights, joint_normal_equations, joint_residual
 from ..model.robust import LossName
-from ..solver.reason import Reason
 from ..uncertainty import propagation, scale_uncertainty
 from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
@@ -30,8 +29,8 @@ from .checks import based_on, check_enough, check_noise_model, check_single, che
 from .observed import ObservedTask, identify_observed, observed_task
 from .results import Calibration, Identification
 from .scale_anchor import scale_anchor, scale_set_by_clause
-from .second_stage import adjust_anchor, can_scale, divided, must_adjust, replaced, within_bounds
-from .task import Task, fit, fit_repeatability
+from .second_stage import adjust_anchor, clip_to_bounds, divide_by_k, must_adjust_anchor
+from .task import Fit, Task, fit, fit_repeatability
 
 _MAX_STEPS = 300
 
@@ -84,11 +83,11 @@ def identify(
         alone = eqx.tree_at(lambda c: c.lengths, capture, (), is_leaf=lambda leaf: isinstance(leaf, tuple))
         task = observed_task(arm, alone, bounds, start, noise, hold, noise_model, max_steps, robust)
         return to_jax(identify_observed(to_numpy(task)))
-    task = _checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many")
+    task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many")
     return to_jax(_identify(to_numpy(task)))
 
 
-def _checked(
+def _prepare_task(
     arm: Arm,
     capture: Capture,
     bounds: Bounds,
@@ -100,6 +99,8 @@ def _checked(
     many: str,
 ) -> Task:
     check_single(arm, capture, bounds, many)
+    for sentence in () if inside_trace() else capture.repeated.sentences():
+        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
     check_finite(arm=arm, capture=capture, noise=noise)
     space = based_on(bounds.space, arm)
     bounds = Bounds(space, bounds.lower, bounds.upper)
@@ -182,7 +183,7 @@ def calibrate(
         check_finite(arm=arm, capture=capture, noise=noise)
         task = observed_task(arm, capture, bounds, start, noise, None, noise_model, max_steps, robust)
         return _as_calibration(task, identify_observed(to_numpy(task)))
-    task = _checked(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
+    task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
     if hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
         raise InputError(
             "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
@@ -193,13 +194,13 @@ def calibrate(
     _check_scale(task, method)
     task = to_numpy(task)
     if method == "joint":
-        return to_jax(_joint(task))
-    result, adjust = _divided(task)
-    if not can_scale(task.anchor) or (is_concrete(adjust) and not bool(adjust)):
+        return to_jax(_calibrate_jointly(task))
+    result, adjust = _calibrate_by_division(task)
+    if not task.anchor.can_scale or (is_concrete(adjust) and not bool(adjust)):
         return to_jax(result)
     if is_concrete(adjust):
-        return to_jax(_adjusted(task, result))
-    return jax.lax.cond(adjust, lambda: _adjusted(task, result), lambda: result)
+        return to_jax(_calibrate_by_adjustment(task, result))
+    return jax.lax.cond(adjust, lambda: _calibrate_by_adjustment(task, result), lambda: result)
 
 
 def _as_calibration(task: ObservedTask, found: Identification) -> Calibration:
@@ -255,10 +256,10 @@ def _check_scale(task: Task, method: str) -> None:
 
 @compiled(jit=eqx.filter_jit)
 def _identify(task: Task) -> Identification:
-    return _stage1(task)[0]
+    return _solve_stage1(task)[0]
 
 
-def _stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
+def _solve_stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
     xp = namespace(task)
     space, start, hold = task.space, task.start, task.anchor.hold
     measurement = task.measurement.weighted(space.arm(start).geometry, task.noise)
@@ -307,46 +308,38 @@ def _reduced_chi(measurement: Measurement, tips: Float[AnyArray, "N 3"], fitted:
     return xp.sqrt(xp.sum(measurement.whitened(measurement.centred(tips)) ** 2) / degrees_of_freedom)
 
 
-def _calibration(
+def _make_calibration(
     task: Task,
     stage1: Identification,
     method: str,
-    parameters: Float[AnyArray, " p"],
-    active: Int[AnyArray, " p"],
-    steps: Int[AnyArray, ""],
-    result: Reason,
+    found: Fit,
     parameter_covariance: ParameterCovariance,
     sigma: Float[AnyArray, ""],
     conditional_on: Int[AnyArray, " p"] | None = None,
 ) -> Calibration:
-    """The result of a calibration that ended with these parameters, and with tips that scatter by ``sigma`` (mm).
+    """The result of a calibration, of which ``found`` is what came after stage 1; tips scatter by ``sigma`` (mm).
 
-    ``conditional_on`` are the active bounds that its covariance takes as exact; by default ``active``."""
+    ``conditional_on`` are the active bounds that its covariance takes as exact; by default those that are active.
+    """
     assert stage1.scale is not None
     space = task.space
-    start, calibrated = space.arm(task.start), space.arm(parameters)
+    start, calibrated, active = space.arm(task.start), space.arm(found.parameters), task.bounds.active(found.parameters)
     measurement = task.measurement.weighted(start.geometry, task.noise)
     tips = calibrated.position(measurement.q)
     after = repeatability(tips, measurement.sizes, fitted=len(space.names))
-    parameter_covariance = with_active_bounds(
-        parameter_covariance,
-        calibrated,
-        space,
-        measurement,
-        active if conditional_on is None else conditional_on,
-        task.bounds,
-        sigma,
-    )
+    exact = active if conditional_on is None else conditional_on
     return Calibration(
         arm=calibrated,
-        parameters=parameters,
+        parameters=found.parameters,
         scale=stage1.scale,
         de=after.de,
         deltam=after.deltam,
         active=active,
-        steps=steps,
-        result=result,
-        parameter_covariance=parameter_covariance,
+        steps=stage1.steps + found.steps,
+        result=found.result,
+        parameter_covariance=with_active_bounds(
+            parameter_covariance, calibrated, space, measurement, exact, task.bounds, sigma
+        ),
         before=stage1.before,
         after=after,
         length_before=measurement.distances(start.position(measurement.q)),
@@ -357,41 +350,32 @@ def _calibration(
 
 
 @compiled(jit=eqx.filter_jit)
-def _divided(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]:
+def _calibrate_by_division(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]:
     """Stage 1 and the division by k; and whether the anchor must be adjusted instead."""
     xp = namespace(task)
-    stage1, propagated = _stage1(task)
+    stage1, propagated = _solve_stage1(task)
     assert stage1.scale is not None
     space, bounds, anchor = task.space, task.bounds, task.anchor
-    scaled = divided(anchor, space, stage1.parameters, stage1.scale.value)
-    adjust = must_adjust(anchor, bounds, stage1.active, scaled)
-    active, parameter_covariance = stage1.active, propagated.parameter_covariance
-    if can_scale(anchor):
-        scaled = within_bounds(space, bounds.lower, bounds.upper, scaled)
-        active = bounds.active(scaled)
+    scaled = divide_by_k(anchor, space, stage1.parameters, stage1.scale.value)
+    adjust = must_adjust_anchor(anchor, bounds, stage1.active, scaled)
+    parameter_covariance = propagated.parameter_covariance
+    if anchor.can_scale:
+        scaled = clip_to_bounds(space, bounds.lower, bounds.upper, scaled)
         measurement = task.measurement.weighted(space.arm(task.start).geometry, task.noise)
         parameter_covariance = scale_uncertainty.propagate_division(
-            propagated, stage1.arm, space, measurement, stage1.after.sigma, scaled, replaced(anchor, space)
+            propagated, stage1.arm, space, measurement, stage1.after.sigma, scaled, anchor.partners
         ).parameter_covariance
     # Divided, a length may have left its bound, which stage 1's covariance takes as exact all the same.
-    conditional_on = xp.where(active != 0, active, stage1.active)
-    result = _calibration(
-        task,
-        stage1,
-        "two-stage",
-        scaled,
-        active,
-        stage1.steps,
-        stage1.result,
-        parameter_covariance,
-        stage1.after.sigma,
-        conditional_on,
-    )
-    return result, adjust
+    active = bounds.active(scaled)
+    exact = xp.where(active != 0, active, stage1.active)
+    divided = Fit(scaled, xp.zeros_like(stage1.steps), stage1.result, stage1.optimality)
+    return _make_calibration(
+        task, stage1, "two-stage", divided, parameter_covariance, stage1.after.sigma, exact
+    ), adjust
 
 
 @compiled(jit=eqx.filter_jit)
-def _adjusted(task: Task, by_division: Calibration) -> Calibration:
+def _calibrate_by_adjustment(task: Task, by_division: Calibration) -> Calibration:
     """Stage 2 where the division leaves the box, or would need a fixed length to move."""
     xp = namespace(task, by_division)
     stage1, space, name = by_division.stage1, task.space, task.anchor.adjusted
@@ -408,39 +392,25 @@ def _adjusted(task: Task, by_division: Calibration) -> Calibration:
     parameter_covariance = scale_uncertainty.propagate_adjustment(
         solved, arm, space, measurement, sigma, name, xp.any((active != 0) & is_anchor)
     ).parameter_covariance
-    steps = stage1.steps + adjusted.steps
-    return _calibration(
-        task, stage1, "two-stage", adjusted.parameters, active, steps, adjusted.result, parameter_covariance, sigma
-    )
+    return _make_calibration(task, stage1, "two-stage", adjusted, parameter_covariance, sigma)
 
 
 @compiled(jit=eqx.filter_jit)
-def _joint(task: Task) -> Calibration:
+def _calibrate_jointly(task: Task) -> Calibration:
     """One weighted least squares of poses and lengths, from the arm of stage 1 divided by k."""
-    stage1, _ = _stage1(task)
+    stage1, _ = _solve_stage1(task)
     assert stage1.scale is not None
     space, k = task.space, stage1.scale.value
-    parameters = divided(task.anchor, space, stage1.parameters, k)
+    parameters = divide_by_k(task.anchor, space, stage1.parameters, k)
     scaled = space.arm(parameters)
     measurement = task.measurement.weighted(scaled.geometry, task.noise)
     sigma = stage1.after.sigma / k
     joint_weights = JointWeights.of(scaled.position(measurement.q), measurement, sigma)
     args = (space, measurement, joint_weights.sigma, joint_weights.whitening)
     bounds = task.bounds.lower, task.bounds.upper
-    found = fit(joint_residual, joint_model, parameters, args, bounds, space.scale, task.max_steps)
+    found = fit(joint_residual, joint_normal_equations, parameters, args, bounds, space.scale, task.max_steps)
     active = task.bounds.active(found.parameters)
     parameter_covariance = propagation.propagate_solve(
         space.arm(found.parameters), space, measurement, active != 0, sigma, task.noise_model, task.noise, joint_weights
     ).parameter_covariance
-    steps = stage1.steps + found.steps
-    return _calibration(
-        task,
-        stage1,
-        "joint",
-        found.parameters,
-        active,
-        steps,
-        found.result,
-        parameter_covariance,
-        stage1.after.sigma,
-    )
+    return _make_calibration(task, stage1, "joint", found, parameter_covariance, stage1.after.sigma)

@@ -136,7 +136,7 @@ def test_metrics_by_hand():
     np.testing.assert_allclose(figures.centroids, [[1, 2, 0], [7, 7, 7]])
 
 
-@pytest.mark.slow  # tests/core/test_namespace.py compares whole calibrations
+@pytest.mark.slow  # tests/core/test_numpy_or_jax.py compares whole calibrations
 def test_identify_under_vmap_equals_single_runs(paper_arm, noisy_capture, bounds, space):
     starts = jnp.stack([space.vector() + shift * space.scale for shift in (-2.0, 0.5, 3.0)])
     run = lambda start: aj.identify(paper_arm, noisy_capture, bounds, start=start, hold="d_3")  # noqa: E731

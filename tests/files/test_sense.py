@@ -1,0 +1,48 @@
+"""Values that make no sense are refused in files whose digests are right, also where only their summary is shown."""
+
+import h5py
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.files.hdf5_content import DIGEST, Content, seal
+from aacmm_jax.summaries.calibration import calibration_summary, capture_summary
+from tests.refusals import assert_refused
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory, paper_arm, noisy_capture):
+    """A capture and a calibration with their summaries."""
+    folder = tmp_path_factory.mktemp("sense")
+    specification = aj.kinematics.ArmSpecification(paper_arm, "test")
+    recording = aj.Recording(noisy_capture, specification)
+    record = aj.calibration.record_of(aj.calibrate(paper_arm, noisy_capture, specification.bounds()), recording)
+    aj.files.save_capture(folder / "capture.h5", recording, capture_summary(recording))
+    aj.files.save_calibration(folder / "calibration.h5", record, calibration_summary(record))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value", "said"),
+    [
+        ("calibration", "scale_k", 2.0, "the scale k is not that of its lengths"),
+        ("calibration", "scale_u", -1.0, "the uncertainty of k is negative"),
+        ("calibration", "scale_u", 1e-9, "its summary is not that of its values"),
+        ("calibration", "method", "guess", "the method is unknown"),
+        ("calibration", "steps", -1, "its number of steps is negative"),
+        ("calibration", "measured", "soon", "the day of measurement is no date"),
+        ("capture", "measured", "soon", "the day of measurement is no date"),
+        ("capture", "seed", 1.5, "its seed is no whole number"),
+    ],
+)
+def test_show_refuses_what_makes_no_sense(aacmm, files, tmp_path, kind, name, value, said):
+    path = tmp_path / f"{kind}.h5"
+    path.write_bytes((files / f"{kind}.h5").read_bytes())
+    aacmm("show", path)
+    with h5py.File(path, "a") as file:
+        file.attrs[name] = value
+        file.attrs[DIGEST] = Content(path, file, 2**40, 2**40).digest()
+    with open(path, "rb+") as stream:
+        seal(stream)
+    assert said in aacmm("show", path, expect=2).stderr
+    if "summary" not in said:
+        assert_refused(lambda: getattr(aj.files, f"load_{kind}")(path), path, said, "make it again")

@@ -1,0 +1,73 @@
+"""Groups of poses against the others, on linear problems whose least squares can be solved in full."""
+
+import numpy as np
+import pytest
+
+from aacmm_jax.uncertainty.group_test import contradicting_groups
+
+PARAMETERS = 4
+
+
+def problem(rng, sizes, error=()):
+    """Fixtures of ``sizes`` poses with unknown positions; ``error``: a change of the parameters, by fixture."""
+    fixtures = np.repeat(np.arange(len(sizes)), sizes)
+    jacobian = rng.normal(size=(len(fixtures), 3, PARAMETERS))
+    by_fixture = rng.normal(size=(len(fixtures), 3, 3))
+    residual = rng.normal(size=(len(fixtures), 3)) + np.einsum(
+        "nak,nk->na", by_fixture, 50.0 + fixtures[:, None] ** [[1, 2, 3]]
+    )
+    for fixture, size in dict(error).items():
+        residual[fixtures == fixture] += size * jacobian[fixtures == fixture].sum(axis=2)
+    return residual, jacobian, by_fixture, fixtures
+
+
+def solved(residual, jacobian, by_fixture, fixtures):
+    """Cost and degrees of freedom of the whole least squares, every unknown in one matrix."""
+    columns = [jacobian] + [by_fixture * (fixtures == fixture)[:, None, None] for fixture in np.unique(fixtures)]
+    matrix = np.concatenate(columns, axis=2).reshape(residual.size, -1)
+    _, cost, rank, _ = np.linalg.lstsq(matrix, -residual.reshape(-1), rcond=None)
+    return float(cost[0]), residual.size - rank
+
+
+def found_in(blocks, groups=None, **options):
+    *arrays, fixtures = blocks
+    groups = fixtures if groups is None else groups
+    return contradicting_groups(*arrays, fixtures.tolist(), groups.tolist(), **options)
+
+
+@pytest.mark.parametrize("across", [False, True], ids=["fixtures", "groups across fixtures"])
+def test_ratios_are_those_of_two_whole_least_squares(across):
+    blocks = problem(np.random.default_rng(0), (6, 9, 8, 10), {} if across else {1: 3.0})
+    groups = blocks[3]
+    if across:
+        groups = np.arange(len(groups)) % 3
+        blocks[0][groups == 1] += 4 * blocks[1][groups == 1].sum(axis=2)
+    cost, degrees_of_freedom = solved(*blocks)
+    (worst, *_), *_ = found_in(blocks, groups)
+    rest = groups != worst.group
+    rest_cost, spare = solved(*(block[rest] for block in blocks))
+    assert worst.group == 1
+    assert worst.degrees_of_freedom == (degrees_of_freedom - spare, spare)
+    assert worst.ratio == pytest.approx((cost - rest_cost) / (degrees_of_freedom - spare) / (rest_cost / spare))
+
+
+def test_level():
+    rng = np.random.default_rng(1)
+    found = sum(bool(found_in(problem(rng, (6, 2, 9, 1, 12)), level=0.05)) for _ in range(400))
+    assert 5 <= found <= 35  # of 20, with a standard deviation of 4.4
+
+
+@pytest.mark.parametrize(
+    ("sizes", "errors", "expected"),
+    [
+        ((9,) * 6, {}, []),
+        ((9,) * 6, {4: 5.0}, [{4}]),
+        ((9,) * 8, {2: 5.0, 5: -4.0}, [{2}, {5}]),  # which hide each other
+        ((9, 9), {1: 5.0}, [{0, 1}]),  # either may be wrong
+        ((20, 1, 1), {1: 50.0}, []),  # one pose is no contradiction: it moves its own fixture alone
+    ],
+)
+def test_groups_are_found(sizes, errors, expected):
+    blocks = problem(np.random.default_rng(2), sizes, errors)
+    found = found_in(blocks, least_ratio=3.0)
+    assert [{test.group for test in tests} for tests in found] == expected
