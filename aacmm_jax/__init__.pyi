@@ -28,6 +28,7 @@ from .core.errors import IdentifiabilityWarning as IdentifiabilityWarning
 from .core.errors import InputError as InputError
 from .data.capture import Capture as Capture
 from .data.capture import ReferenceLength as ReferenceLength
+from .data.capture import join_sessions as join_sessions
 from .data.capture import stack_captures as stack_captures
 from .data.noise import Noise as Noise
 from .data.recording import Recording as Recording

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from ..core.arguments import check_finite, checked_arguments, items_of, with_options
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
-from ..data.capture import Capture
+from ..data.capture import Capture, check_sockets_only
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
@@ -135,6 +135,7 @@ def _batch_task(
 ) -> "BatchTask":
     """The task that a user's arguments state; ``single`` is the function that solves one problem."""
     # A batch is distributed over threads by its values, so that it cannot be traced.
+    check_sockets_only(capture, "a batch")
     if not is_concrete(*jax.tree.leaves((arm, capture, lower, upper, start))):
         raise InputError(
             f"{single}_many needs known values, but is called inside jit, vmap or a derivative; call it outside, "

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from ..core.arguments import checked_arguments
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
-from ..data.capture import Capture
+from ..data.capture import Capture, check_sockets_only
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm
 from ..kinematics.chain import sines_cosines
@@ -73,6 +73,7 @@ def cross_validate(
     Raises:
         InputError: fewer than two groups hold a reference length, or too few poses are left without one of them.
     """
+    check_sockets_only(capture, "cross-validation")
     if not can_cross_validate(capture, len(bounds.space.names)):
         raise InputError(
             "cross-validation leaves sockets out with their reference lengths, so it needs two groups of sockets that "

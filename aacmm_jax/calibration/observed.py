@@ -102,7 +102,7 @@ def _configurations(q: Any) -> tuple[int, ...]:
     return tuple(int(i) for i in np.unique(np.asarray(q), axis=0, return_inverse=True)[1].ravel())
 
 
-def check_observed(capture: Capture, space: Parameters, vector: np.ndarray, count: int) -> None:
+def check_observed(capture: Capture, space: Parameters, vector: Float[AnyArray, " p"], count: int) -> None:
     """Raise `InputError` where the observations cannot determine their own unknowns, or these parameters."""
     observed = Observed.of(capture)
     geometry = space.geometry(vector)

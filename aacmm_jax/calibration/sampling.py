@@ -306,6 +306,7 @@ class _RepeatedTask(NamedTuple):
         low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
         start, end = (np.asarray(result.arm.position(q)) for q in (self.start, self.end))
         lengths = np.linalg.norm(start - end, axis=1)
+        assert result.scale is not None  # of sockets and lengths
         estimate = np.concatenate([result.parameters, [result.scale.value], lengths])
         return Sampled(
             quantities=(*result.space.names, "k", *(f"length {i + 1}" for i in range(len(self.start)))),

@@ -225,6 +225,16 @@ def check_one_capture(capture: Capture) -> None:
         )
 
 
+def check_sockets_only(capture: Capture, what: str) -> None:
+    """Raise `InputError` for a capture with observations besides sockets and lengths, which ``what`` does not know."""
+    if capture.observations:
+        names = shorten([observation.name for observation in capture.observations])
+        raise InputError(
+            f"{what} takes sockets and reference lengths only, but the capture has other observations ({names}); make "
+            "a capture without them."
+        )
+
+
 def _matching(names: Sequence[str], patterns: Iterable[str]) -> list[str]:
     chosen: set[str] = set()
     for pattern in patterns:

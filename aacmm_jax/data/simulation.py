@@ -90,9 +90,11 @@ def simulate(
     return Capture(readings, references, others)
 
 
-def _read(angles: np.ndarray, noise: Noise, key: Array, resolution_arcsec: float) -> np.ndarray:
+def _read(
+    angles: Float[AnyArray, "m n"], noise: Noise, key: Array, resolution_arcsec: float
+) -> Float[np.ndarray, "m n"]:
     """What the encoders show."""
-    angles = angles + noise.encoder * random_numbers("normal", key, angles.shape)
+    angles = np.asarray(angles + noise.encoder * random_numbers("normal", key, angles.shape))
     if resolution_arcsec > 0:
         angles = np.round(angles / (resolution_arcsec * ARCSEC)) * (resolution_arcsec * ARCSEC)
     return angles

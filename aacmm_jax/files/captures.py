@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..data.capture import Capture, ReferenceLength, Repeated, check_one_capture
+from ..data.capture import Capture, ReferenceLength, Repeated, check_one_capture, check_sockets_only
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm
@@ -77,6 +77,7 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     """The tables of a recording: ``capture``, ``reference``, ``nominal_arm`` and perhaps ``true_arm``."""
     capture = recording.capture
     check_one_capture(capture)
+    check_sockets_only(capture, "a capture file")
     owner = [capture.names[i] for i in capture.owner]
     poses, lengths = capture.repeated
     tables = {

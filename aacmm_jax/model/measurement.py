@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
-from ..data.capture import Capture, check_one_capture
+from ..data.capture import Capture, check_one_capture, check_sockets_only
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.chain import Geometry, SinesCosines, sines_cosines
 from ..kinematics.parameters import Parameters
@@ -37,6 +37,7 @@ class Measurement(eqx.Module):
     def of(cls, capture: Capture) -> "Measurement":
         """The measurement of a capture. Raises `InputError` for a batch of captures."""
         check_one_capture(capture)
+        check_sockets_only(capture, "this function")
         capture = to_numpy(capture)
         xp = namespace(capture)
         return cls(

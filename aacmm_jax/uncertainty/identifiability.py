@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..core.arguments import check_finite, checked_arguments
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
-from ..data.capture import Capture, ReferenceLength, check_one_capture
+from ..data.capture import Capture, ReferenceLength, check_one_capture, check_sockets_only
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, joint_limits, neighbouring_arm, with_arrays
 from ..kinematics.chain import sines_cosines
@@ -127,6 +127,7 @@ def observability(
     if space is None:
         space = Parameters.free_of(arm) if bounds is None else bounds.space
     check_one_capture(capture)
+    check_sockets_only(capture, "observability")
     check_finite(arm=arm, capture=capture, noise=noise)
     check_joints(capture, space)
     arm, capture, space, noise, bounds = to_numpy((arm, capture, space, noise, bounds))

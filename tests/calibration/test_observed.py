@@ -7,7 +7,6 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.data.capture import join_sessions
 
 NOISE = aj.Noise(encoder_arcsec=2, seating=0.005)
 BOX = [[200, -300, 100], [600, 300, 500]]
@@ -195,12 +194,12 @@ def test_sessions_with_a_remounted_probe(paper_arm, true, space, bounds, sockets
     points = {"D": (350, 100, 400), "E": (500, -200, 200)}
     second = aj.simulate(remounted, points, poses=30, lengths=[("D", "E", 0.001)], noise=NOISE, seed=7)
     captures = {"first": sockets, "second": second}
-    result = aj.calibrate(paper_arm, join_sessions(captures), bounds, noise=NOISE)
+    result = aj.calibrate(paper_arm, aj.join_sessions(captures), bounds, noise=NOISE)
     assert result.converged
     assert float(result.observed.reduced_chi_of_all) == pytest.approx(1.0, abs=0.1)
     moved = np.asarray(result.observed.geometry["offset of probe of second"])
     np.testing.assert_allclose(moved, remounted.probe, atol=0.02)
-    together = aj.calibrate(paper_arm, join_sessions(captures, own_probe=False), bounds, method="joint", noise=NOISE)
+    together = aj.calibrate(paper_arm, aj.join_sessions(captures, own_probe=False), bounds, method="joint", noise=NOISE)
     assert float(together.stage1.reduced_chi) > 5
 
 
@@ -263,3 +262,19 @@ def test_derivatives_of_a_calibration(paper_arm, true, bounds, kind, field, nois
         numerical = (np.asarray(run(step)) - np.asarray(run(-step))) / (2 * step)
         exact = jax.jvp(run, (0.0,), (1.0,))[1]
         np.testing.assert_allclose(exact, numerical, atol=2e-5 * np.abs(numerical).max())
+
+
+def test_what_does_not_know_observations_says_so(paper_arm, bounds, sockets, tmp_path):
+    """Nothing is left out without a word."""
+    capture = aj.Capture(sockets.sockets, sockets.lengths, [kinds.Socket("D", sockets.sockets["C"] + 0.1)])
+    recording = aj.Recording(capture, aj.kinematics.ArmSpecification(paper_arm))
+    for function in (
+        lambda: aj.evaluate(paper_arm, capture),
+        lambda: aj.observability(paper_arm, capture),
+        lambda: aj.cross_validate(paper_arm, capture, bounds),
+        lambda: aj.identify_many(paper_arm, capture, np.stack([bounds.lower] * 2), bounds.upper),
+        lambda: aj.fix_scale(paper_arm, capture),
+        lambda: aj.files.save_capture(tmp_path / "c.h5", recording),
+    ):
+        with pytest.raises(aj.InputError, match=r"other observations \(D\)"):
+            function()

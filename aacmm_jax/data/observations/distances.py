@@ -138,7 +138,7 @@ class SimulatedDistances(AbstractSimulated):
     u: float = 0.0
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
-        return random.uniform(*self.box, (self.poses, 3))
+        return random.uniform(self.box[0], self.box[1], (self.poses, 3))
 
     def recorded(
         self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator

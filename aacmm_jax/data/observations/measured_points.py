@@ -155,7 +155,7 @@ class SimulatedPoints(AbstractSimulated):
         return None if self.place is None else as_numbers(self.place)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
-        return random.uniform(*self.box, (self.poses, 3))
+        return random.uniform(self.box[0], self.box[1], (self.poses, 3))
 
     def recorded(
         self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
