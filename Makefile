@@ -1,5 +1,5 @@
 # make demo         set up and run the demonstration: the paper's simulated arm, and a real Franka Panda
-# make test         set up and run the tests (make test-slow: those that take long)
+# make test         set up and run the tests (make test-slow: those that take long, or need optimised programs)
 # make check        lint, types and import contracts
 # make test-newest  a selection of the tests with the newest versions that pyproject.toml allows, installed from scratch
 # make test-lowest  the same with the lowest
@@ -16,6 +16,8 @@ BIN := .venv/bin
 INSTALL := -m pip install --quiet --disable-pip-version-check
 # A worker that dies ends the run: a replacement might wait for ever for tests that went with the first.
 PYTEST := -m pytest -n auto --max-worker-restart 0 --dist loadscope --no-loadscope-reorder
+# Tests compile without XLA's optimisations (see tests/__init__.py), except where the variable is set, be it empty.
+OPTIMISED := XLA_FLAGS=
 # Numerics, differentiation, storage and the command line on real captures: what a change of a dependency breaks first.
 SELECTION := tests/test_package.py tests/kinematics tests/solver tests/calibration/test_single.py \
 	tests/files/test_storage.py tests/test_real_captures.py
@@ -37,20 +39,21 @@ test: .venv/.test
 
 test-slow: .venv/.test
 	$(BIN)/python $(PYTEST) -m slow
+	$(OPTIMISED) $(BIN)/python $(PYTEST) -m "optimised and not slow"
 
 test-newest:
 	rm -rf .venv-newest
 	$(PYTHON) -m venv .venv-newest
 	.venv-newest/bin/python $(INSTALL) --upgrade --upgrade-strategy eager --editable '.[selection]'
 	.venv-newest/bin/python -m pip list --disable-pip-version-check
-	.venv-newest/bin/python $(PYTEST) $(SELECTION)
+	$(OPTIMISED) .venv-newest/bin/python $(PYTEST) $(SELECTION)
 
 # Old releases warn of what newer releases of others deprecate.
 test-lowest:
 	rm -rf .venv-lowest
 	$(PYTHON) -m venv .venv-lowest
 	.venv-lowest/bin/python $(INSTALL) --constraint requirements/lowest.txt --editable '.[selection]'
-	.venv-lowest/bin/python $(PYTEST) -W ignore::DeprecationWarning $(SELECTION)
+	$(OPTIMISED) .venv-lowest/bin/python $(PYTEST) -W ignore::DeprecationWarning $(SELECTION)
 
 check: .venv/.dev
 	$(BIN)/ruff check .

@@ -49,6 +49,7 @@ def test_equals_single_identifications(paper_arm, noisy_capture, box, starts, ho
         assert many.k[i] == pytest.approx(float(single.scale.value), rel=1e-10)
 
 
+@pytest.mark.optimised
 def test_the_chunk_changes_no_bit(paper_arm, noisy_capture, box, starts):
     whole = aj.identify_many(paper_arm, noisy_capture, *box, starts, slots=8)
     for chunk in (20, 24):  # 20 is no multiple of the slots, and neither divides the batch

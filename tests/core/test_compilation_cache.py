@@ -7,7 +7,13 @@ import sys
 
 import pytest
 
-PRINT = "print(jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64)"
+JAX = "print(jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64)"
+IMPORTS = {
+    "aacmm_jax, jax": f"import aacmm_jax, jax; {JAX}",
+    "jax, aacmm_jax": f"import jax, aacmm_jax; {JAX}",
+    # What JAX would read, without waiting a second for its import.
+    "aacmm_jax": "import aacmm_jax, os; print(os.environ.get('JAX_COMPILATION_CACHE_DIR'), os.environ['JAX_ENABLE_X64'])",
+}
 COMPILE = """
 import jax, jax.numpy as jnp
 from aacmm_jax.core import namespace
@@ -22,21 +28,34 @@ def python(program, folder, *before, **settings):
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
 
 
-@pytest.mark.parametrize("imports", ["import aacmm_jax, jax", "import jax, aacmm_jax"])
+FOLDERS = {
+    "default": ({}, "{home}/aacmm_jax True"),
+    "left alone": ({"AACMM_JAX_CACHE": "0"}, "None True"),
+    "left alone, JAX's own": ({"AACMM_JAX_CACHE": "0", "JAX_COMPILATION_CACHE_DIR": "/elsewhere"}, "/elsewhere True"),
+    "JAX's own": ({"JAX_COMPILATION_CACHE_DIR": "{home}/other"}, "{home}/other True"),
+    "bucket": ({"JAX_COMPILATION_CACHE_DIR": "gs://bucket/x"}, "gs://bucket/x True"),
+}
+
+
 @pytest.mark.parametrize(
-    ("settings", "expected"),
+    ("case", "imports"),
     [
-        ({}, "{home}/aacmm_jax True"),
-        ({"AACMM_JAX_CACHE": "0"}, "None True"),
-        ({"AACMM_JAX_CACHE": "0", "JAX_COMPILATION_CACHE_DIR": "/elsewhere"}, "/elsewhere True"),
-        ({"JAX_COMPILATION_CACHE_DIR": "{home}/other"}, "{home}/other True"),
-        ({"JAX_COMPILATION_CACHE_DIR": "gs://bucket/x"}, "gs://bucket/x True"),
+        *((case, "aacmm_jax") for case in FOLDERS),
+        ("default", "aacmm_jax, jax"),
+        ("default", "jax, aacmm_jax"),
+        *(
+            pytest.param(case, imports, marks=pytest.mark.slow)
+            for case in list(FOLDERS)[1:]
+            for imports in ("aacmm_jax, jax", "jax, aacmm_jax")
+        ),
     ],
 )
-def test_folder(tmp_path, imports, settings, expected):
+def test_folder(tmp_path, case, imports):
+    settings, expected = FOLDERS[case]
     settings = {name: value.format(home=tmp_path) for name, value in settings.items()}
-    done = python(f"{imports}; {PRINT}", tmp_path, **settings)
-    assert (done.stdout.strip(), done.stderr) == (expected.format(home=tmp_path), "")
+    done = python(IMPORTS[imports], tmp_path, **settings)
+    found = done.stdout.strip().removesuffix(" 1") + " True" * (imports == "aacmm_jax")
+    assert (found, done.stderr) == (expected.format(home=tmp_path), "")
     for folder in tmp_path.iterdir():
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
@@ -69,9 +88,10 @@ def test_a_folder_of_others_is_not_used(tmp_path, mode, above, settings, reason)
     folder.chmod(mode)
     tmp_path.chmod(above)
     settings = {name: value.format(home=tmp_path) for name, value in settings.items()}
-    imports = "import jax, aacmm_jax" if mode == 0o720 else "import aacmm_jax, jax"
-    done = python(f"{imports}, os; {PRINT}; print(os.environ.get('JAX_COMPILATION_CACHE_DIR'))", tmp_path, **settings)
-    assert done.stdout.split() == ["None", "True", "None"]
+    imports = "jax, aacmm_jax" if mode == 0o720 else "aacmm_jax"
+    kept = "import os; print(os.environ.get('JAX_COMPILATION_CACHE_DIR'), os.environ['AACMM_JAX_CACHE'])"
+    done = python(f"{IMPORTS[imports]}; {kept}", tmp_path, **settings)
+    assert done.stdout.split() == ["None", "True" if mode == 0o720 else "1", "None", "0"]
     assert done.stderr.count("\n") == 1
     assert "is not used, because" in done.stderr
     assert reason in done.stderr
@@ -82,8 +102,8 @@ def test_a_folder_of_another_user_is_not_used(tmp_path):
     folder = tmp_path / "aacmm_jax"
     folder.mkdir(mode=0o700)
     os.chown(folder, 65534, 65534)
-    done = python(f"import aacmm_jax, jax; {PRINT}", tmp_path)
-    assert done.stdout.split() == ["None", "True"]
+    done = python(IMPORTS["aacmm_jax"], tmp_path)
+    assert done.stdout.split() == ["None", "1"]
     assert "it belongs to another user" in done.stderr
 
 

@@ -11,6 +11,7 @@ from jax.test_util import check_grads
 
 from aacmm_jax.core import linear_algebra
 
+pytestmark = pytest.mark.optimised
 EPSILON = np.finfo(float).eps
 SIZES = (1, 3, 21)  # few, so that few programs are compiled
 DECOMPOSED, INVERTED = jax.jit(linear_algebra.singular_values), jax.jit(linear_algebra.inverse_positive_definite)

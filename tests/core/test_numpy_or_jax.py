@@ -37,6 +37,7 @@ CALLS = {
 }
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     ("call", "width"),
     [

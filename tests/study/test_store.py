@@ -20,6 +20,7 @@ from aacmm_jax.study.blocks import Layout, parts_of
 from .small_study import CHUNK, ROOT, command, interrupted_at, same, until_parts
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     ("chunk", "trials"), [(1, 3), (7, 24), (500, 16), pytest.param(500, 24, marks=pytest.mark.slow)]
 )

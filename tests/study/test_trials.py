@@ -187,6 +187,7 @@ def whole(request):
     return study, count, run_block(study, Block(0, 2, 0, count))
 
 
+@pytest.mark.optimised
 def test_equals_one_by_one(whole):
     study, _, results = whole
     method = study.settings[0].method
@@ -218,6 +219,7 @@ def test_equals_one_by_one(whole):
         assert results[there][1, i] == pytest.approx(error, abs=1e-7)
 
 
+@pytest.mark.optimised
 def test_a_trial_depends_on_its_key_alone(whole):
     """To the bit, whatever block a trial is in."""
     study, count, results = whole
