@@ -38,8 +38,8 @@ test: .venv/.test
 	$(BIN)/python $(PYTEST)
 
 test-slow: .venv/.test
-	$(BIN)/python $(PYTEST) -m slow
-	$(OPTIMISED) $(BIN)/python $(PYTEST) -m "optimised and not slow"
+	$(BIN)/python $(PYTEST) -m "slow and not optimised"
+	$(OPTIMISED) $(BIN)/python $(PYTEST) -m optimised
 
 test-newest:
 	rm -rf .venv-newest

@@ -2,8 +2,8 @@
 
 A check costs about 0.1 ms, ten times as much as many of the functions that it checks. A function that is called
 thousands of times in one test sees the same types and shapes again and again, so only its first calls are checked.
-Preparing a function to be checked costs 4 ms, and a function in another one is prepared each time the outer one runs.
-So it is checked in the first runs only, and one without annotations never.
+Preparing a function to be checked costs 4 ms, so it is prepared when it is first called. A function in another one
+would be prepared each time the outer one runs, so it is checked in the first runs only.
 """
 
 import collections
@@ -40,9 +40,9 @@ def _jaxtyped_at_first(function=None, *, typechecker) -> Callable:
             _runs[function.__code__] += 1
             if _runs[function.__code__] > RUNS:
                 return function
-    with_check = _jaxtyped(function, typechecker=typechecker)
     if inspect.isclass(function):
-        return with_check
+        return _jaxtyped(function, typechecker=typechecker)
+    with_check = functools.cache(lambda: _jaxtyped(function, typechecker=typechecker))
     count = [0]
     _counts.append(count)
 
@@ -50,7 +50,7 @@ def _jaxtyped_at_first(function=None, *, typechecker) -> Callable:
     def call(*arguments, **named):
         if count[0] < CALLS:
             count[0] += 1
-            return with_check(*arguments, **named)
+            return with_check()(*arguments, **named)
         return function(*arguments, **named)
 
     return call

@@ -12,7 +12,8 @@ IMPORTS = {
     "aacmm_jax, jax": f"import aacmm_jax, jax; {JAX}",
     "jax, aacmm_jax": f"import jax, aacmm_jax; {JAX}",
     # What JAX would read, without waiting a second for its import.
-    "aacmm_jax": "import aacmm_jax, os; print(os.environ.get('JAX_COMPILATION_CACHE_DIR'), os.environ['JAX_ENABLE_X64'])",
+    "aacmm_jax": "import aacmm_jax; from os import environ as at; "
+    "print(at.get('JAX_COMPILATION_CACHE_DIR'), at['JAX_ENABLE_X64'])",
 }
 COMPILE = """
 import jax, jax.numpy as jnp

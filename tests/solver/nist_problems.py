@@ -1,7 +1,9 @@
 """All NIST StRD nonlinear regression problems (folder nist/): parser of the files, and models written from the formulas
 in them."""
 
+import functools
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -100,9 +102,16 @@ def certified_digits(estimate: np.ndarray, certified: np.ndarray) -> float:
         return float(np.min(np.minimum(-np.log10(np.abs(estimate - certified) / np.abs(certified)), 11)))
 
 
+@functools.cache
+def residual_and_jacobian(name: str) -> Callable:
+    """Compiled, for all who need it."""
+    data = load(name)
+    return jax.jit(lambda b: (data.residual(b), jax.jacfwd(data.residual)(b)))
+
+
 def standard_errors(data: Dataset, estimate) -> np.ndarray:
     """Of every parameter, from the Jacobian at the estimate and the residual variance."""
-    jacobian = np.asarray(jax.jacfwd(data.residual)(estimate))
-    variance = np.sum(np.asarray(data.residual(estimate)) ** 2) / (len(data.y) - len(estimate))
+    residual, jacobian = map(np.asarray, residual_and_jacobian(data.name)(estimate))
+    variance = np.sum(residual**2) / (len(data.y) - len(estimate))
     triangle = np.linalg.qr(jacobian)[1]
     return np.sqrt(variance * np.sum(np.linalg.inv(triangle) ** 2, axis=1))

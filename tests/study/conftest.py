@@ -2,11 +2,31 @@
 
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.study import configuration_pool
 
 from .small_study import CHUNK, SPECIFICATION
+
+
+@pytest.fixture(scope="session", autouse=True)
+def pools_built_once():
+    """Studies of one arm, seed and fixture have the same pool (`test_pools_are_the_same_in_every_study_of_a_seed`)."""
+    build, built = configuration_pool._fixture_table, {}
+
+    def built_once(study, *fixture):
+        arm = tuple(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(study.nominal.arm))
+        key = arm, study.specification.seed, *fixture
+        if key not in built:
+            built[key] = build(study, *fixture)
+        return built[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(configuration_pool, "_fixture_table", built_once)
+        yield build
 
 
 @pytest.fixture(scope="session")

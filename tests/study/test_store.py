@@ -20,9 +20,20 @@ from aacmm_jax.study.blocks import Layout, parts_of
 from .small_study import CHUNK, ROOT, command, interrupted_at, same, until_parts
 
 
+def written_in_blocks(home, study, path, chunk):
+    """A study with the results of the one that was run, each block in a file."""
+    layout = Layout.of(study, chunk)
+    store.create(path, study, layout, chunk)
+    with h5py.File(home / "whole.h5") as whole:
+        for block in layout.blocks():
+            results = {name: whole["trials"][name][block.slices] for name in store.VARIABLES}
+            store.write_part(path, block, store.pack(results, layout), layout)
+
+
 @pytest.mark.optimised
 @pytest.mark.parametrize(
-    ("chunk", "trials"), [(1, 3), (7, 24), (500, 16), pytest.param(500, 24, marks=pytest.mark.slow)]
+    ("chunk", "trials"),
+    [(1, 3), (7, 24), *(pytest.param(500, trials, marks=pytest.mark.slow) for trials in (16, 24))],
 )
 def test_the_chunk_changes_no_bit(home, study, tmp_path, chunk, trials):
     study = aj.study.Study(study.specification.model_copy(update={"trials": trials}), study.nominal)
@@ -150,7 +161,7 @@ def test_results_without_their_parts_are_missed(home, study, tmp_path):
 def test_blocks_of_a_study_whose_file_is_gone_are_not_taken_for_anothers(home, study, tmp_path):
     path = tmp_path / "s.h5"
     other = aj.study.Study(study.specification.model_copy(update={"seed": 6}), study.nominal)
-    aj.study.run_study(other, path, chunk=CHUNK, keep_parts=True)
+    written_in_blocks(home, other, path, CHUNK)
     path.unlink()
     assert aj.study.run_study(study, path, chunk=CHUNK).ran == 96
     same(home / "whole.h5", path)
@@ -310,12 +321,7 @@ def test_a_spoilt_block_runs_again(home, study, tmp_path):
 def test_reading_needs_no_more_files_than_one(home, study, tmp_path):
     """Where a process may open few files, HDF5 would show the others as not run."""
     path = tmp_path / "s.h5"
-    layout = Layout.of(study, 1)
-    store.create(path, study, layout, 1)
-    with h5py.File(home / "whole.h5") as whole:
-        for block in layout.blocks():
-            results = {name: whole["trials"][name][block.slices] for name in store.VARIABLES}
-            store.write_part(path, block, store.pack(results, layout), layout)
+    written_in_blocks(home, study, path, 1)
     program = (
         "import resource, sys\n"
         "import aacmm_jax as aj\n"

@@ -241,13 +241,12 @@ def test_trials_are_drawn_one_by_one():
         aj.study.draw_trials(study, -1, [0])
 
 
-def test_pools_are_the_same_in_every_study_of_a_seed():
-    one, two = (made(noise=noise) for noise in ({}, NOISE))
-    np.testing.assert_array_equal(
-        configuration_pool.pool_of(one, one.settings[0]).table, configuration_pool.pool_of(two, two.settings[0]).table
+def test_pools_are_the_same_in_every_study_of_a_seed(pools_built_once, monkeypatch):
+    monkeypatch.setattr(configuration_pool, "_fixture_table", pools_built_once)
+    one_socket = {"capture": CAPTURE | {"positions_mm": [[400, 200, 300]]}, "reference": None}
+    one, two, other = (
+        configuration_pool.pool_of(study, study.settings[0]).table
+        for study in (made(**one_socket, noise={}), made(**one_socket, noise=NOISE), made(**one_socket, seed=4))
     )
-    other = made(seed=4)
-    assert not np.array_equal(
-        configuration_pool.pool_of(one, one.settings[0]).table,
-        configuration_pool.pool_of(other, other.settings[0]).table,
-    )
+    np.testing.assert_array_equal(one, two)
+    assert not np.array_equal(one, other)
