@@ -260,7 +260,8 @@ except aj.InputError as error:
     assert target.read_bytes() == b"as it was"
 
 
-def test_interrupted_by_a_real_signal(tmp_path, good):
+@pytest.mark.parametrize("attempts", [8, pytest.param(25, marks=pytest.mark.slow)])
+def test_interrupted_by_a_real_signal(tmp_path, good, attempts):
     """Ctrl-C at any moment of writing a larger capture over an old one leaves the old or the new one."""
     script = """
 import itertools
@@ -294,7 +295,7 @@ while True:
     writer = child(script, good.files["capture"], target)
     random, seen = np.random.default_rng(0), set()
     try:
-        for attempt in range(25):
+        for attempt in range(attempts):
             print(attempt % 2, file=writer.stdin, flush=True)
             assert writer.stdout.readline() == "started\n", writer.stderr.read()
             time.sleep(random.uniform(0, 0.03 * (attempt + 1)))  # on a busy machine one file takes longer than 0.1 s

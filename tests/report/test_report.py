@@ -454,8 +454,16 @@ def shown(browser, written):
         context.close()
 
 
-@pytest.mark.parametrize("width", [400, 1600])
-@pytest.mark.parametrize("kind", ["calibration", "evaluation", "study"])
+@pytest.mark.parametrize(
+    ("kind", "width"),
+    [
+        *(("calibration", 400), ("evaluation", 1600), ("study", 400)),
+        *(
+            pytest.param(kind, width, marks=pytest.mark.slow)
+            for kind, width in (("calibration", 1600), ("evaluation", 400), ("study", 1600))
+        ),
+    ],
+)
 def test_a_browser_draws_everything_and_asks_for_nothing(shown, written, kind, width):
     opened = shown(kind, width)
     assert opened.said == []

@@ -186,7 +186,7 @@ def test_killed_and_resumed_it_is_the_same(home, tmp_path, prepared, computed):
     path, generator = tmp_path / "s.h5", np.random.default_rng(1)
     options = {} if computed else prepared(0.03)
     blocks = 12
-    for count in np.linspace(1, blocks, 6 if computed else 3).astype(int):
+    for count in np.linspace(1, blocks, 6 if computed else 2).astype(int):
         process = command(home, "-o", path, "--chunk", CHUNK, **options)
         until_parts(path, count, process)
         time.sleep(generator.uniform(0, 0.05))
@@ -321,14 +321,14 @@ def test_a_spoilt_block_runs_again(home, study, tmp_path):
 def test_reading_needs_no_more_files_than_one(home, study, tmp_path):
     """Where a process may open few files, HDF5 would show the others as not run."""
     path = tmp_path / "s.h5"
-    written_in_blocks(home, study, path, 1)
+    written_in_blocks(home, study, path, 2)  # 48 files
     program = (
         "import resource, sys\n"
         "import aacmm_jax as aj\n"
-        "resource.setrlimit(resource.RLIMIT_NOFILE, (60, 1000))\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (40, 1000))\n"
         "print(aj.study.study_summary(aj.study.Results.of(sys.argv[1]))['trials_run'])\n"
         "print((aj.study.open_study(sys.argv[1]).converged.values >= 0).sum())\n"
-        "resource.setrlimit(resource.RLIMIT_NOFILE, (60, 60))\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))\n"
         "print(aj.study.study_summary(aj.study.Results.of(sys.argv[1]))['trials_run'])\n"
         "aj.study.open_study(sys.argv[1])\n"
     )
@@ -337,7 +337,7 @@ def test_reading_needs_no_more_files_than_one(home, study, tmp_path):
         env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert done.stdout.split() == ["96"] * 3
-    assert "more files than this process may open (60)" in done.stderr
+    assert "more files than this process may open (40)" in done.stderr
 
 
 def test_a_worker_that_fails_stops_the_study_and_keeps_the_rest(study, tmp_path, monkeypatch):
