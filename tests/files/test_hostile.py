@@ -13,7 +13,7 @@ def attacked(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("kind", "count"),
-    {"capture": 40, "calibration": 20, "evaluation": 20, "points": 40, "study": 8, "block": 8}.items(),
+    {"capture": 40, "calibration": 20, "evaluation": 20, "points": 40, "study": 16, "block": 8}.items(),
 )
 def test_a_flipped_bit_is_harmless_or_refused(attacked, kind, count):
     found = [result for _, _, result, _ in hostile.flips(attacked[kind], count, np.random.default_rng(0))]

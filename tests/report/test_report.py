@@ -18,8 +18,8 @@ HOSTILE = '<script>document.title="taken"</script><img src=x onerror=alert(1)> &
 STUDY = {
     "arm": "cheng2018-simulation",
     "trials": 4,
-    "capture": {"positions_mm": [[400, 200, 300]], "poses": [20, 30]},
-    "noise": {"encoder_arcsec": 2},
+    "capture": {"positions_mm": [[400, 200, 300]], "poses": 20},
+    "noise": {"encoder_arcsec": [2, 4]},
     "identification": {"method": "stage1"},
 }
 
