@@ -128,7 +128,7 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
         held, sigma = jnp.asarray([name == "d_3" for name in space.names]), stage1.after.sigma
         whole = propagation.propagate_solve(stage1.arm, space, measurement, held, sigma, noise_model, noise)
         whole = scale_uncertainty.propagate_division(
-            whole, stage1.arm, space, measurement, sigma, found.parameters, jnp.zeros(21)
+            whole, stage1.arm, space, measurement, sigma, found.parameters, None
         )
     by_joints = stage1.arm.jacobian(capture.q, [f"q_{i}" for i in range(1, 7)])
     moved = np.einsum("Nai,tNi->taN", by_joints, turns)
