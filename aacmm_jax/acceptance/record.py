@@ -48,7 +48,7 @@ class EvaluationRecord(NamedTuple):
         known = [i for i in range(len(lengths)) if i not in held_out]
         if len(known) != 1:
             return None
-        error = float(evaluate(self.calibrated.arm, self.recording.capture).error[known[0]])
+        error = float(np.asarray(evaluate(self.calibrated.arm, self.recording.capture).error)[known[0]])
         return known[0] if abs(error) <= LARGEST_LOG_K * float(lengths[known[0]].value) else None
 
     def measured(self, arm: Arm) -> Measured:

@@ -26,7 +26,7 @@ from ..model.weights import Weights
 from ..solver.active_set import Box, choose
 from ..solver.levenberg_marquardt import advance, begin
 from ..solver.reason import MAX_STEPS, RUNNING
-from .task import SOLVER
+from .task import RULES
 
 
 class Problems(NamedTuple):
@@ -146,7 +146,7 @@ def _solve_all(batch: _Batch, shape: Shape, count: Int[Array, ""], capacity: int
         progress, index, upcoming, solutions = carry
         now = jnp.minimum(index, count - 1)  # a slot without a problem repeats the last problem; its result is dropped
         _, box = starts(now)
-        progress = advance(progress, evaluate(progress.step.trial, now), box, SOLVER.rules)
+        progress = advance(progress, evaluate(progress.step.trial, now), box, RULES)
         late = progress.steps >= shape.max_steps
         done = (progress.reason != RUNNING) | late
         reason = jnp.where(late & (progress.reason == RUNNING), MAX_STEPS, progress.reason)

@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..core.arguments import checked_arguments
+from ..core.numpy_or_jax import to_jax
 from ..core.text import shorten
 from ..data.noise import Noise
 from ..data.recording import Recording
@@ -64,7 +64,7 @@ class CalibrationRecord(NamedTuple):
         """
         if self.method != "two-stage" or len(self.recording.capture.lengths) != 1 or self.scale_set_by:
             return False
-        left = evaluate(self.calibrated.arm, self.recording.capture).error
+        left = np.asarray(evaluate(self.calibrated.arm, self.recording.capture).error)
         return bool(np.abs(left[0]) <= LARGEST_LOG_K * float(self.recording.capture.lengths[0].value))
 
     @property
@@ -149,10 +149,10 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
     if isinstance(result, CalibrationRecord):
         return Uncertainty(
             arm=result.calibrated.arm,
-            covariance=jnp.asarray(result.covariance),
-            open=jnp.asarray(result.open),
+            covariance=to_jax(result.covariance),
+            open=to_jax(result.open),
             noise=result.noise,
-            u_k=jnp.asarray(result.u_k),
+            u_k=to_jax(np.asarray(result.u_k)),
             names=result.names,
             degrees_of_freedom=result.degrees_of_freedom,
         )

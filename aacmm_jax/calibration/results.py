@@ -14,7 +14,7 @@ from ..core._compat import member_numbers
 from ..core.arrays import Numbers, is_concrete
 from ..core.distributions import chi_square_quantile
 from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
@@ -57,8 +57,9 @@ class AbstractResult(eqx.Module):
     @property
     def converged(self) -> Bool[AnyArray, "*batch"]:
         """Whether every solve ended at a minimum, with finite parameters and, in a calibration, a plausible k."""
-        k, xp = self._stage1.k, namespace(self.parameters)
-        good = converged(self._stage1.result) & converged(self.result) & xp.all(xp.isfinite(self.parameters), axis=-1)
+        parameters, k = to_numpy((self.parameters, self._stage1.k))
+        xp = namespace(parameters)
+        good = converged(self._stage1.result) & converged(self.result) & xp.all(xp.isfinite(parameters), axis=-1)
         if k is not None and self._stage1 is not self:
             good = good & (k >= PLAUSIBLE_SCALE[0]) & (k <= PLAUSIBLE_SCALE[1])
         return np.asarray(good) if is_concrete(good) else good

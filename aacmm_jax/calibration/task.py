@@ -11,13 +11,13 @@ from ..data.noise import Noise
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement
 from ..model.residuals import repeatability_normal_equations, repeatability_residual
-from ..solver.bounded import BoundedLevenbergMarquardt, least_squares, minimise
+from ..solver.levenberg_marquardt import Rules, minimise
 from ..solver.reason import Reason, reasons
 from ..uncertainty.covariance import NoiseModel
 from .scale_anchor import ScaleAnchor
 
 # The boxes of this problem are small against its curvature, so the first steps can be nearly Gauss-Newton's.
-SOLVER = BoundedLevenbergMarquardt(rtol=1e-13, initial_damping=1e-6)
+RULES = Rules(rtol=1e-13, initial_damping=1e-6)
 
 
 class Task(NamedTuple):
@@ -58,8 +58,11 @@ def fit(
     """A least squares within bounds: by Optimistix for arrays of JAX, step by step for NumPy's."""
     lower, upper = bounds
     if namespace(start, args, bounds) is np:
-        last = minimise(normal, start, args, lower=lower, upper=upper, scale=scale, solver=SOLVER, max_steps=max_steps)
+        last = minimise(normal, start, args, lower=lower, upper=upper, scale=scale, rules=RULES, max_steps=max_steps)
         return Fit(last.y, last.steps, reasons(last.reason), last.optimality)
+    # Optimistix takes 0.2 s to import, and NumPy needs none of it.
+    from ..solver.bounded import BoundedLevenbergMarquardt, least_squares
+
     solution = least_squares(
         residual,
         start,
@@ -68,7 +71,7 @@ def fit(
         upper=upper,
         scale=scale,
         normal=normal,
-        solver=SOLVER,
+        solver=BoundedLevenbergMarquardt(**RULES._asdict()),
         max_steps=max_steps,
         throw=False,
     )

@@ -34,7 +34,7 @@ def main() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # names that the terminal's encoding does not have
     # Tracing makes hundreds of thousands of objects that live until the process ends. Looking for garbage among them
     # would take a sixth of the time of a short command.
-    gc.set_threshold(200_000, 20, 20)
+    gc.set_threshold(500_000, 20, 20)
     # The matrices of one calibration are so small that threads of NumPy's BLAS wait for each other most of the time: a
     # plan took twice the CPU time. It reads this once, when NumPy is imported.
     if "OMP_NUM_THREADS" not in os.environ:

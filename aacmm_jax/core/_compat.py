@@ -13,12 +13,10 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.core
-import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero as SymbolicZero
 from jax.experimental.compilation_cache.compilation_cache import reset_cache as reset_compilation_cache  # noqa: F401
 from jaxtyping import Array, Int
-from optimistix.internal import implicit_jvp as implicit_jvp
 
 Static = eqxi.Static  # a leaf that jit takes as a constant
 
@@ -30,12 +28,19 @@ def is_traced(value: object) -> bool:
 
 def inside_trace() -> bool:
     """Whether this runs inside jit or vmap, where even what is constant becomes a tracer once JAX computes with it."""
-    return is_traced(jnp.negative(0.0))
+    return is_traced(jax.device_put(0.0))  # the cheapest operation: outside jit it compiles nothing
 
 
 def while_loop(cond_fun: Callable, body_fun: Callable, init_val: Any, *, max_steps: int | None) -> Any:
     """XLA's own loop, with Equinox's limit on steps: the form that Optimistix asks of an adjoint."""
     return eqxi.while_loop(cond_fun, body_fun, init_val, max_steps=max_steps, kind="lax")
+
+
+def implicit_jvp(*arguments: Any) -> Any:
+    """Optimistix's implicit differentiation of a root. (Imported late: it takes 0.2 s.)"""
+    from optimistix.internal import implicit_jvp
+
+    return implicit_jvp(*arguments)
 
 
 def member_numbers(member: Any) -> Int[Array | np.ndarray, "*batch"]:

@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_floats, is_concrete
 from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.units import ARCSEC
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass
 from ..kinematics.jacobian import jacobian_columns
@@ -29,7 +29,7 @@ class Noise(eqx.Module):
     seating: Float[AnyArray, ""]  # mm
 
     def __init__(self, *, encoder_arcsec: Numbers = 0.0, seating: Numbers = 0.0):
-        self.encoder = as_floats(encoder_arcsec, "encoder_arcsec") * ARCSEC
+        self.encoder = to_jax(to_numpy(as_floats(encoder_arcsec, "encoder_arcsec")) * ARCSEC)
         self.seating = as_floats(seating, "seating")
         for what, values in (("encoder_arcsec", self.encoder), ("seating", self.seating)):
             if values.ndim > (what == "encoder_arcsec"):
@@ -41,6 +41,7 @@ class Noise(eqx.Module):
                 raise InputError(f"{what} must be a standard deviation: zero or positive.")
 
     @property
+    @numpy_if_known
     def encoder_arcsec(self) -> Float[AnyArray, "..."]:
         """Standard deviation of readings, scalar or ``(n,)``, arcsec."""
         return self.encoder / ARCSEC

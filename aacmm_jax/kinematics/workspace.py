@@ -33,7 +33,7 @@ def arm_reach(arm: Arm) -> Reach:
     t. From many random starts, joint after joint is set to its maximum until nothing changes, the last joint first: a
     joint moves the tip, but no axis of the joints before it.
     """
-    shoulder = np.array([0.0, 0.0, float(arm.d[0])])
+    shoulder = np.array([0.0, 0.0, float(np.asarray(arm.d)[0])])
     limits = np.asarray(joint_limits(arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_STARTS, arm.joints))
     geometry = to_numpy(arm.geometry)

@@ -1,20 +1,17 @@
 """Box-bounded nonlinear least squares: the Optimistix solver, and `least_squares`, which adds the adjoint."""
 
 from collections.abc import Callable
-from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, PyTree
 
 from ..core.arguments import whole_number
 from ..core.arrays import as_array, is_concrete
 from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray
 from ..core.x64 import check_x64
 from .active_set import Box, Flat, QuadraticModel, expand
 from .adjoint import BoundedAdjoint, box_of
@@ -31,12 +28,11 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     Use it through `least_squares`, which also brings the adjoint that takes the bounds into account.
     """
 
-    rtol: float = 1e-14  # on the next step, relative to |y| (both scaled)
-    atol: float = 0.0  # on the step, scaled
-    gtol: float = 1e-10  # on the projected gradient: cosine between the residual and a column of J
-    # Relative to the largest curvature; None: as little as keeps the steps within a trust region, whose first radius is
-    # the scaled length of the start. A value spares the search where a problem is known to need none.
-    initial_damping: float | None = None
+    # As in `Rules`.
+    rtol: float = Rules().rtol
+    atol: float = Rules().atol
+    gtol: float = Rules().gtol
+    initial_damping: float | None = Rules().initial_damping
     # Optimistix asks for a norm; every test here is written out, since it scales by unknowns.
     norm: Callable[[PyTree], Array] = optx.max_norm
 
@@ -156,41 +152,6 @@ def least_squares(
     if bool(failed):
         raise InputError(Reason[solution.stats["reason"]])
     return solution
-
-
-def minimise(
-    model: Callable[[Any, Any], QuadraticModel],
-    start: Float[AnyArray, " p"],
-    args: Any,
-    *,
-    lower: Float[AnyArray, " p"],
-    upper: Float[AnyArray, " p"],
-    scale: Float[AnyArray, " p"] | None,
-    solver: BoundedLevenbergMarquardt,
-    max_steps: int,
-) -> Progress:
-    """The steps of `least_squares` in NumPy, one after the other, with nothing to compile; no derivatives pass.
-
-    Args:
-        model: A function of (y, args): the `QuadraticModel`.
-        start: Where to start ``(p,)``; it is clipped to the box.
-        args: Passed to ``model``.
-        lower: Lower bounds ``(p,)``.
-        upper: Upper bounds ``(p,)``.
-        scale: The natural step of each unknown ``(p,)``; None takes it from the curvature.
-        solver: Tolerances and initial damping.
-        max_steps: The largest number of evaluations.
-
-    Returns:
-        The last state; its reason is the step limit where that was reached.
-    """
-    box = Box(lower, upper, scale)
-    progress = begin(start, box)
-    for _ in range(max_steps):
-        progress = advance(progress, model(progress.step.trial, args), box, solver.rules)
-        if progress.reason != RUNNING:
-            return progress
-    return eqx.tree_at(lambda p: p.reason, progress, np.asarray(MAX_STEPS))
 
 
 def _expanded(y0: PyTree[Array], tree: PyTree, absent: float, what: str) -> PyTree[Array]:

@@ -5,15 +5,16 @@ step can point uphill, and is then refused). f is never evaluated outside the bo
 Sources: Marquardt 1963; More 1978 (scaling, tests); Nielsen 1999 (damping).
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from ..core.numpy_or_jax import AnyArray, namespace
 from .active_set import Box, Flat, Number, QuadraticModel, Step, choose, diagonal, norm, propose
-from .reason import GRADIENT, NONFINITE, ROUNDING, RUNNING, STALLED, STEP
+from .reason import GRADIENT, MAX_STEPS, NONFINITE, ROUNDING, RUNNING, STALLED, STEP
 
 _EPSILON = float(np.finfo(np.float64).eps)
 
@@ -21,10 +22,12 @@ _EPSILON = float(np.finfo(np.float64).eps)
 class Rules(NamedTuple):
     """When to stop, and how much the first step is damped."""
 
-    rtol: float  # on the step, relative to |y| (both scaled)
-    atol: float  # on the step, scaled
-    gtol: float  # on the projected gradient: cosine between the residual and a column of J
-    initial_damping: float | None  # relative to the largest curvature; None: steps are kept to a trust region instead
+    rtol: float = 1e-14  # on the next step, relative to |y| (both scaled)
+    atol: float = 0.0  # on the step, scaled
+    gtol: float = 1e-10  # on the projected gradient: cosine between the residual and a column of J
+    # Relative to the largest curvature; None: as little as keeps the steps within a trust region, whose first radius is
+    # the scaled length of the start. A value saves the search where a problem is known to need none.
+    initial_damping: float | None = None
 
 
 class Progress(eqx.Module):
@@ -113,6 +116,41 @@ def advance(progress: Progress, evaluated: QuadraticModel, box: Box, rules: Rule
         accepted=progress.accepted + xp.where(accept, 1, 0),
         reason=reason,
     )
+
+
+def minimise(
+    model: Callable[[Any, Any], QuadraticModel],
+    start: Float[AnyArray, " p"],
+    args: Any,
+    *,
+    lower: Float[AnyArray, " p"],
+    upper: Float[AnyArray, " p"],
+    scale: Float[AnyArray, " p"] | None,
+    rules: Rules,
+    max_steps: int,
+) -> Progress:
+    """The steps of `solver.least_squares` in NumPy, with nothing to compile; not differentiable.
+
+    Args:
+        model: A function of (y, args): the `QuadraticModel`.
+        start: Where to start ``(p,)``; it is clipped to the box.
+        args: Passed to ``model``.
+        lower: Lower bounds ``(p,)``.
+        upper: Upper bounds ``(p,)``.
+        scale: The natural step of each unknown ``(p,)``; None takes it from the curvature.
+        rules: Tolerances and initial damping.
+        max_steps: The largest number of evaluations.
+
+    Returns:
+        The last state; its reason is the step limit where that was reached.
+    """
+    box = Box(lower, upper, scale)
+    progress = begin(start, box)
+    for _ in range(max_steps):
+        progress = advance(progress, model(progress.step.trial, args), box, rules)
+        if progress.reason != RUNNING:
+            return progress
+    return eqx.tree_at(lambda p: p.reason, progress, np.asarray(MAX_STEPS))
 
 
 def _improves(progress: Progress, evaluated: QuadraticModel, trial_optimality: Number) -> Bool[AnyArray, "*slots"]:

@@ -128,7 +128,7 @@ def sample_lengths(
         direction = random.normal(size=(2 * count, 3))
         targets = np.asarray(arm.position(q)) + length * direction / np.linalg.norm(direction, axis=1, keepdims=True)
         # Most ends of a long length are farther from the shoulder than the stretched arm reaches: not worth the steps.
-        near = np.linalg.norm(targets - [0.0, 0.0, float(arm.d[0])], axis=1) <= total_link_length(arm)
+        near = np.linalg.norm(targets - [0.0, 0.0, float(np.asarray(arm.d)[0])], axis=1) <= total_link_length(arm)
         other, arrived = project_to_targets(arm, draw(2 * count)[near], targets[near], allowed)
         starts.append(q[near][arrived])
         ends.append(other[arrived])

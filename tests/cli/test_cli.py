@@ -277,13 +277,40 @@ def test_the_stored_summary_is_what_is_computed(aacmm, tmp_path):
         assert json.loads(aacmm("show", name, "--json").stdout) == stored
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["calibrate", "--help"], ["show", "capture.h5"]])
-def test_short_commands_import_no_jax(aacmm, tmp_path, arguments):
-    aacmm("simulate", "panda", "-o", "capture.h5", "--socket", "A=400,0,300", "--poses", 2)
-    code = "import sys\nfrom aacmm_jax.cli import main\ntry:\n main()\nfinally:\n assert 'jax' not in sys.modules"
-    command = [sys.executable, "-c", code, *arguments]
+_IMPORTED = """
+import sys
+from aacmm_jax.cli import main
+try:
+    main()
+finally:
+    print(*sys.modules, file=sys.stderr)
+"""
+_PLOTS = "matplotlib plotly jinja2"
+_NEVER_NEEDED = "optimistix lineax jax.experimental.pallas xarray matplotlib"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "absent"),
+    [
+        ("--help", f"jax scipy h5py {_PLOTS}"),
+        ("--version", f"jax scipy h5py {_PLOTS}"),
+        ("calibrate --help", f"jax scipy h5py {_PLOTS}"),
+        ("show p.h5", f"jax scipy {_PLOTS}"),
+        ("calibrate p.h5 -o again.h5", f"{_NEVER_NEEDED} plotly jinja2"),
+        ("evaluate c.h5 p.h5 -o e.h5", f"{_NEVER_NEEDED} plotly jinja2 scipy"),
+        ("compare c.h5 c.h5", f"{_NEVER_NEEDED} plotly jinja2"),
+        ("report c.h5 -o r.html", _NEVER_NEEDED),
+    ],
+)
+def test_a_command_imports_and_compiles_no_more_than_it_needs(aacmm, tmp_path, monkeypatch, arguments, absent):
+    aacmm("simulate", "panda", "-o", "p.h5", "--socket", "A=400,0,300", "--socket", "B=300,400,400", "--length", "A,B")
+    aacmm("calibrate", "p.h5", "-o", "c.h5", "--no-cross-validate")
+    monkeypatch.setenv("JAX_LOG_COMPILES", "1")
+    command = [sys.executable, "-c", _IMPORTED, *arguments.split()]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stderr) == (0, "")
+    *messages, imported = done.stderr.splitlines()
+    assert (done.returncode, [line for line in messages if "ompil" in line]) == (0, [])
+    assert set(absent.split()) & set(imported.split()) == set()
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import scipy.optimize
 
 import aacmm_jax as aj
 from aacmm_jax.solver.active_set import QuadraticModel
-from aacmm_jax.solver.bounded import BoundedLevenbergMarquardt, minimise
+from aacmm_jax.solver.levenberg_marquardt import Rules, minimise
 from aacmm_jax.solver.reason import reasons
 from tests.refusals import assert_refused
 from tests.solver import bounded_problems, nist_problems
@@ -121,7 +121,7 @@ def _by_steps(data):
                 lower=-free,
                 upper=free,
                 scale=None,
-                solver=BoundedLevenbergMarquardt(),
+                rules=Rules(),
                 max_steps=1000,
             )
         return last.y, last.model.cost, reasons(last.reason)
