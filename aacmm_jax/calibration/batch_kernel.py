@@ -18,6 +18,7 @@ from ..core.numpy_or_jax import AnyArray
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import with_values
 from ..kinematics.chain import Geometry, SinesCosines, forward_pass, sines_cosines
+from ..kinematics.jacobian import tip_and_columns
 from ..model.measurement import Measurement
 from ..model.metrics import repeatability
 from ..model.residuals import JointWeights, normal_equations
@@ -136,7 +137,8 @@ def _solve_all(batch: _Batch, shape: Shape, count: Int[Array, ""], capacity: int
         joint_weights = (
             None if part.joint_weights is None else JointWeights(shape.ends, problems.nominal, *part.joint_weights)
         )
-        return normal_equations(geometry, part.sines_cosines, shape.sizes, indices, joint_weights, part.weights)
+        tip, columns = tip_and_columns(geometry, part.sines_cosines, indices)
+        return normal_equations(tip, columns, shape.sizes, joint_weights, part.weights)
 
     def more(carry) -> Bool[Array, ""]:
         _, index, _, _ = carry

@@ -4,7 +4,9 @@ Rotating the chain by a small angle about a unit axis ``u`` through a point ``o`
 sliding it along ``u`` moves the tip by ``u``. So each Jacobian column follows from one axis of the forward pass.
 """
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,16 @@ from jaxtyping import Float
 
 from ..core._compat import SymbolicZero
 from ..core.numpy_or_jax import AnyArray, compiled, namespace
-from .chain import ForwardPass, Geometry, components_last, forward_pass, joints_first, sines_cosines
+from .chain import (
+    ForwardPass,
+    Geometry,
+    SinesCosines,
+    components_last,
+    forward_pass,
+    forward_pass_by_joints,
+    joints_first,
+    sines_cosines,
+)
 
 
 def _cross(u: Float[AnyArray, "... 3 N"], v: Float[AnyArray, "... 3 N"]) -> Float[AnyArray, "... 3 N"]:
@@ -26,17 +37,22 @@ def jacobian_columns(forward: ForwardPass) -> dict[str, Float[AnyArray, "k ... 3
 
     ``theta`` also serves for q, since the two enter only as their sum.
     """
-    tip = forward.tip[None]
-    columns = {
-        "alpha": _cross(forward.x, tip - forward.origin),
-        "a": forward.x,
-        "d": forward.z_before,
-        "theta": _cross(forward.z_before, tip - forward.origin_before),
-        "probe": namespace(tip).stack(forward.frame),
+    kinds = ("alpha", "a", "d", "theta") if forward.y is None else ("alpha", "a", "d", "theta", "beta")
+    columns = {kind: _columns_of(forward, kind, slice(None)) for kind in kinds}
+    return columns | {"probe": namespace(forward.tip).stack(forward.frame)}
+
+
+def _columns_of(forward: ForwardPass, kind: str, at: int | slice) -> Float[AnyArray, "... 3 N"]:
+    """Derivative of the tip by a parameter of one joint, or of several."""
+    rotations = {
+        "alpha": (forward.x, forward.origin),
+        "theta": (forward.z_before, forward.origin_before),
+        "beta": (forward.y, forward.origin),
     }
-    if forward.y is not None:
-        columns["beta"] = _cross(forward.y, tip - forward.origin)
-    return columns
+    if kind in rotations:
+        axis, origin = rotations[kind]
+        return _cross(axis[at], (forward.tip if isinstance(at, int) else forward.tip[None]) - origin[at])
+    return {"a": forward.x, "d": forward.z_before, "probe": forward.frame}[kind][at]
 
 
 def readings_gradient(forward: ForwardPass, cotangents: dict[str, Float[AnyArray, "k 3 N"]]) -> Float[AnyArray, "n N"]:
@@ -70,8 +86,12 @@ def stacked_jacobian_columns(
     forward: ForwardPass, indices: tuple[tuple[str, int], ...]
 ) -> Float[AnyArray, "... p 3 N"]:
     """The Jacobian columns of some parameters, each a kind (``q`` counts as ``theta``) and a 0-based index."""
-    columns, xp = jacobian_columns(forward), namespace(forward)
-    chosen = [columns["theta" if kind == "q" else kind][i] for kind, i in indices]
+    xp, wanted = namespace(forward), [("theta" if kind == "q" else kind, i) for kind, i in indices]
+    if isinstance(forward.x, tuple):
+        chosen = [_columns_of(forward, kind, i) for kind, i in wanted]
+    else:
+        columns = jacobian_columns(forward)
+        chosen = [columns[kind][i] for kind, i in wanted]
     return xp.stack(chosen, axis=-3) if chosen else xp.zeros((*forward.tip.shape[:-2], 0, *forward.tip.shape[-2:]))
 
 
@@ -84,6 +104,23 @@ def rotation_columns(forward: ForwardPass, indices: tuple[tuple[str, int], ...])
     still = xp.zeros_like(forward.tip)
     chosen = [still if axes.get(kind) is None else axes[kind][i] for kind, i in indices]
     return xp.stack(chosen, axis=-3) if chosen else xp.zeros((*still.shape[:-2], 0, *still.shape[-2:]))
+
+
+def tip_and_columns(
+    geometry: Geometry, sines_cosines: SinesCosines, indices: tuple[tuple[str, int], ...]
+) -> tuple[Float[AnyArray, "... 3 N"], Float[AnyArray, "... p 3 N"]]:
+    """The tip and `stacked_jacobian_columns`, in the way that is fastest for a batch in JAX on each platform."""
+
+    def computed(forward_pass: Callable, *operands: Any) -> tuple[AnyArray, AnyArray]:
+        forward = forward_pass(*operands)
+        return forward.tip, stacked_jacobian_columns(forward, indices)
+
+    return jax.lax.platform_dependent(
+        geometry,
+        sines_cosines,
+        cpu=partial(computed, forward_pass_by_joints),
+        default=partial(computed, forward_pass),
+    )
 
 
 def _plain_tip_position(geometry: Geometry, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3"]:

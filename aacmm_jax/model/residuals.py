@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import AnyArray, namespace
-from ..kinematics.chain import Geometry, SinesCosines, forward_pass
+from ..kinematics.chain import forward_pass
 from ..kinematics.jacobian import stacked_jacobian_columns
 from ..kinematics.parameters import Parameters
 from ..solver.active_set import QuadraticModel
@@ -65,10 +65,8 @@ def repeatability_normal_equations(
 ) -> QuadraticModel:
     """Cost, gradient and Gram matrix of `repeatability_residual`, from the analytic Jacobian columns."""
     space, measurement = args
-    geometry = space.geometry(vector)
-    return normal_equations(
-        geometry, measurement.sines_cosines, measurement.sizes, space.indices(), weights=measurement.weights
-    )
+    tip, columns = _tip_and_columns(vector, space, measurement)
+    return normal_equations(tip, columns, measurement.sizes, weights=measurement.weights)
 
 
 def joint_normal_equations(
@@ -78,41 +76,42 @@ def joint_normal_equations(
     """Cost, gradient and Gram matrix of `joint_residual`."""
     space, measurement, sigma, whitening = args
     joint_weights = JointWeights(measurement.ends, measurement.nominal, sigma, whitening)
-    geometry = space.geometry(vector)
-    return normal_equations(
-        geometry, measurement.sines_cosines, measurement.sizes, space.indices(), joint_weights, measurement.weights
-    )
+    tip, columns = _tip_and_columns(vector, space, measurement)
+    return normal_equations(tip, columns, measurement.sizes, joint_weights, measurement.weights)
+
+
+def _tip_and_columns(
+    vector: Float[AnyArray, " p"], space: Parameters, measurement: Measurement
+) -> tuple[Float[AnyArray, "... 3 N"], Float[AnyArray, "... p 3 N"]]:
+    forward = forward_pass(space.geometry(vector), measurement.sines_cosines)
+    return forward.tip, stacked_jacobian_columns(forward, space.indices())
 
 
 def measured_lengths(
     vector: Float[AnyArray, " p"], space: Parameters, measurement: Measurement
 ) -> tuple[Float[AnyArray, " l"], Float[AnyArray, "l p"]]:
     """Measured reference lengths, mm, and their analytic Jacobian by the free parameters."""
-    forward = forward_pass(space.geometry(vector), measurement.sines_cosines)
-    columns = stacked_jacobian_columns(forward, space.indices())
-    return _distances(forward.tip, columns, measurement.sizes, measurement.ends, measurement.weights)
+    tip, columns = _tip_and_columns(vector, space, measurement)
+    return _distances(tip, columns, measurement.sizes, measurement.ends, measurement.weights)
 
 
 def normal_equations(
-    geometry: Geometry,
-    sines_cosines: SinesCosines,
+    tip: Float[AnyArray, "*batch 3 N"],
+    columns: Float[AnyArray, "*batch p 3 N"],
     sizes: tuple[int, ...],
-    indices: tuple[tuple[str, int], ...],
     joint_weights: JointWeights | None = None,
     weights: Weights | None = None,
 ) -> QuadraticModel:
-    """Cost, gradient and Gram matrix of the repeatability residual, for any batch of arms and poses that broadcast;
-    with ``joint_weights``, of the joint residual of poses and lengths; with ``weights``, of whitened poses.
+    """Cost, gradient and Gram matrix of the repeatability residual, from tips and Jacobian columns; with
+    ``joint_weights``, of the joint residual of poses and lengths; with ``weights``, of whitened poses.
 
     The mean over a socket is subtracted from the Gram matrix as a correction of rank 3 for each socket, J^T J - m mu^T
     mu, so that no centred copy of the columns is needed; nor for the gradient, because centred residuals sum to zero.
     """
-    forward = forward_pass(geometry, sines_cosines)
-    columns = stacked_jacobian_columns(forward, indices)
     # Centred twice: the rounding error that one pass leaves in the mean (1e-13 mm) would otherwise be multiplied by the
     # columns' means, and exceed the gradient near a perfect fit.
-    xp = namespace(forward)
-    residual = _centred(forward.tip, sizes)
+    xp = namespace(tip, columns)
+    residual = _centred(tip, sizes)
     if weights is None:
         residual, counted = _centred(residual, sizes), columns
         shifts = sums_over_sockets(columns, sizes) / np.sqrt(counts(sizes, columns.ndim))
@@ -129,7 +128,7 @@ def normal_equations(
     )
     if joint_weights is None:
         return poses
-    distance, rows = _distances(forward.tip, columns, sizes, joint_weights.ends, weights)
+    distance, rows = _distances(tip, columns, sizes, joint_weights.ends, weights)
     off = (joint_weights.whitening @ (distance - joint_weights.nominal)[..., None])[..., 0]
     rows = joint_weights.whitening @ rows
     weight = 1 / joint_weights.sigma**2

@@ -59,6 +59,21 @@ def test_pose_is_the_textbook_product(joints, beta):
     np.testing.assert_allclose(arm.position(q), expected[:, :3, 3], atol=1e-11)
 
 
+@pytest.mark.parametrize("beta", [False, True])
+def test_the_tips_and_columns_of_a_batch_are_those_of_the_loop(beta):
+    arm, q = random_arm(6, 1, beta=beta, batch=(4, 1)), np.random.default_rng(0).uniform(-3, 3, (5, 6))
+    kinds = ("alpha", "a", "d", "theta", "q", *(("beta",) if beta else ()))
+    indices = (*((kind, i) for kind in kinds for i in (0, 3, 5)), ("probe", 2))
+    given = arm.geometry, chain.sines_cosines(q)
+    compiled = jax.jit(lambda *given: jacobian.tip_and_columns(*given, indices)).lower(*given).compile()
+    forward = chain.forward_pass(*given)
+    tip, columns = compiled(*given)
+    np.testing.assert_allclose(tip, forward.tip, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(columns, jacobian.stacked_jacobian_columns(forward, indices), rtol=0, atol=1e-11)
+    # XLA has not simplified the condition that keeps it from computing the chain again for every column.
+    assert jax.default_backend() != "cpu" or " conditional(" in compiled.as_text()
+
+
 @pytest.mark.parametrize("joints", range(2, 10))
 def test_jacobian_is_jax_own_differentiation(joints):
     """Analytic columns; JAX's forward and reverse modes through the custom rule; and the plain chain: all equal."""
