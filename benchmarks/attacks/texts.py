@@ -129,7 +129,7 @@ def originals(folder: Path) -> dict[str, Callable[[], object]]:
 
 
 NASTY = ["\0", "\x1b[2J", "\u202e", "\x7f", "\x9b", "\u2028", "\x1c", "\ufeff"]
-NUMBER = re.compile(r"(?<![\w.{])-?\d+(?:\.\d+)?(?![\w.}])")
+NUMBER = re.compile(r"(?<![\w.{])(?<!e[+-])-?\d+(?:\.\d+)?(?![\w.}])")
 
 
 def random_position(text: str, choose: random.Random) -> int:

@@ -27,6 +27,7 @@ from aacmm_jax.study.blocks import Layout
 from .outcomes import LOST, REFUSED, SAME, UNEXPECTED, Attempt, ending, exact
 from .samples import BLOCK, READERS, results, studies, study_results
 
+SECONDS = 120  # of wall time: making all files, on a busy machine
 DISK = 2**20  # bytes of the disk that is filled
 PAGE = 4096  # by which it is filled
 
@@ -77,7 +78,7 @@ def forked(load: Callable[[], Any], work: Callable[[Any], Any], delay: float | N
         with contextlib.suppress(BaseException):
             loaded = load()
             os.write(writing, b".")
-            outcome, found = ending(lambda: work(loaded))
+            outcome, found = ending(lambda: work(loaded), SECONDS)
             os.write(writing, pickle.dumps((outcome or "written", found if outcome else exact(found))))
         os._exit(0)
     os.close(writing)
