@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 @pytest.mark.parametrize(
     ("attacks", "count"),
     [
-        (("flips", "texts", "calls"), 80),
+        (("flips", "texts", "calls"), 60),
         pytest.param(("writes",), 36, marks=pytest.mark.slow),
         pytest.param(("kills",), 6, marks=pytest.mark.slow),
         pytest.param(("users",), 0, marks=pytest.mark.slow),
