@@ -1,7 +1,7 @@
-"""Monte Carlo studies: speed against identifications alone, memory, equal results however run, kills, full disks, Dask.
+"""Monte Carlo studies: speed against identifications alone, memory, equal results however run, full disks, Dask.
 
     python benchmarks/studies.py                 # all of it, about ten minutes on 2 quiet cores
-    python benchmarks/studies.py speed memory    # some of it: speed, memory, same, kills, disk, dask
+    python benchmarks/studies.py speed memory    # some of it: speed, memory, same, disk, dask
 
 writes results/studies-DATE.json and prints it. The study is `bound-sensitivity`, with other numbers of trials in its 20
 cells.
@@ -11,7 +11,6 @@ import json
 import os
 import platform
 import resource
-import signal
 import subprocess
 import sys
 import tempfile
@@ -148,35 +147,6 @@ def command(folder: str, *arguments: object) -> subprocess.Popen:
     return subprocess.Popen(line, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def kills() -> dict:
-    """SIGKILL at 20 random moments of the run, each time resumed."""
-    generator, parts_at = np.random.default_rng(0), []
-    with tempfile.TemporaryDirectory() as folder:
-        whole, path = Path(folder) / "whole.h5", Path(folder) / "killed.h5"
-        arguments = ("--trials", 2000, "--chunk", 250)
-        command(folder, "-o", whole, *arguments).communicate()
-        for number in range(20):
-            process = command(folder, "-o", path, *arguments)
-            parts = path.with_name(path.name + ".parts")
-            wanted = 1 + 160 * number // 20
-            while process.poll() is None and len(list(parts.glob("*.h5"))) < wanted:
-                time.sleep(0.005)
-            time.sleep(generator.uniform(0, 0.3))
-            process.send_signal(signal.SIGKILL)
-            process.communicate()
-            parts_at.append(len(list(parts.glob("*.h5"))))
-        last = command(folder, "-o", path, *arguments)
-        last.communicate()
-        left = sorted(item.name for item in Path(folder).iterdir())
-        return {
-            "kills": 20,
-            "blocks_kept": parts_at,
-            "exit": last.returncode,
-            "difference": differs(whole, path),
-            "left": left,
-        }
-
-
 def disk() -> dict:
     """A small tmpfs that fills: needs the right to mount."""
     with tempfile.TemporaryDirectory() as folder:
@@ -256,7 +226,7 @@ def on_dask(address: str, count: str, folder: str) -> dict:
     return {"seconds": seconds}
 
 
-PARTS = {"speed": speed, "memory": memory, "same": same, "kills": kills, "disk": disk, "dask": dask}
+PARTS = {"speed": speed, "memory": memory, "same": same, "disk": disk, "dask": dask}
 CALLS = {"once": lambda *a: once(*map(int, a)), "run_into": run_into, "on_dask": on_dask}
 
 

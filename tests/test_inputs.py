@@ -365,7 +365,7 @@ WRONG_TYPES = {
     "aj.identify(arm, capture, bounds, noise=2.0)": "noise is a float; give a Noise.",
     "aj.simulate(arm, {'A': (400, 200, 300)}, poses=2.5)": "'A' is given 2.5 poses; give at least one, and a whole",
     "aj.simulate(arm, {'A': (400, 200, 300)}, poses=1, seed=1.5)": "seed is 1.5; give a whole number",
-    "aj.load_arm(None)": "by its name or from a file, not from None",
+    "aj.load_arm(None)": "a file is named by a NoneType",
     "aj.Arm(alpha=[0.0], a=[1.0], d=[0.0], limits=[0, 1])": "limits must be 1 row of (lowest, highest)",
 }
 
@@ -488,6 +488,20 @@ jax.jit(lambda x: aj.identify_many(arm, capture, bounds, start=x).de)(start)
 jax.vmap(lambda x: aj.calibrate_many(arm, capture, bounds, start=x).de)(start[None])
 batch(result).active_names()
 batch(result.stage1).implausible_residual
+aj.study.read_study(2.5)
+aj.load_arm(np.ones((9, 9)))
+aj.Parameters.free_of(arm, held=np.ones((2, 2, 2)))
+aj.calibrate(arm, capture, bounds, method=np.array(["1", "2"]))
+aj.fix_scale(arm, capture, sigma=np.inf)
+aj.files.load_capture(0)
+aj.files.save_arm(arm, 1)
+arm.jacobian(q, 1e300)
+aj.calibrate(arm, capture, bounds, hold=np.ones(0))
+aj.Capture({"A": q}, np.ones((2, 2, 2)))
+aj.simulate(arm, {"A": (400, 200, 300)}, lengths=np.ones((2, 2, 2)))
+aj.simulate(arm, {"A": (400, 200, 300), "B": (300, 200, 300)}, lengths=[("A", "B", "2")])
+aj.simulate(arm, {"A": (400, 200, 300), "B": (300, 200, 300)}, lengths=[(["A"], "B")])
+aj.simulate(arm, {"A": (400, 200, 300)}, poses=10**30)
 """.strip().splitlines()
 
 # Lengths that overflow, or no arm can have: data, and never called converged.

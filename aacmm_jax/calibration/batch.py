@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arguments import check_finite, checked_arguments, items_of, with_options
+from ..core.arguments import check_finite, checked_arguments, items_of, shown, with_options
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
 from ..data.capture import Capture, check_sockets_only
@@ -115,8 +115,8 @@ def calibrate_many(
     Raises:
         InputError: As `identify_many`, and where the capture holds no reference length.
     """
-    if method not in ("two-stage", "joint"):
-        raise InputError(f"method is '{method}'; it must be 'two-stage' or 'joint'.")
+    if not isinstance(method, str) or method not in ("two-stage", "joint"):
+        raise InputError(f"method is {shown(method)}; it must be 'two-stage' or 'joint'.")
     if not capture.lengths:
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many."

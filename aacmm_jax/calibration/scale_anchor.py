@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from ..core.arguments import shown
 from ..core.arrays import is_concrete
 from ..core.errors import InputError
 from ..core.text import shorten
@@ -68,6 +69,8 @@ def scale_anchor(space: Parameters, arm: Arm, hold: str | None, noise: Noise | N
     arm = space.base
     known = is_concrete(*jax.tree.leaves(arm))
     lengths = [name for name in space.names if is_length(name)]
+    if not isinstance(hold, str | None):
+        raise InputError(f"hold is {shown(hold)}; give the name of a length, 'longest' or None.")
     if hold not in (None, "longest") and hold not in lengths:
         space.index(hold)
         example = f", for example '{lengths[0]}'" if lengths else ", or leave out hold, since no length is free"

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..core._compat import inside_trace
-from ..core.arguments import check_finite, checked_arguments
+from ..core.arguments import check_finite, checked_arguments, shown
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
@@ -167,8 +167,8 @@ def calibrate(
     """
     general = bool(capture.observations) or robust is not None
     method = ("joint" if general else "two-stage") if method is None else method
-    if method not in ("two-stage", "joint"):
-        raise InputError(f"method is '{method}'; it must be 'two-stage' or 'joint'.")
+    if not isinstance(method, str) or method not in ("two-stage", "joint"):
+        raise InputError(f"method is {shown(method)}; it must be 'two-stage' or 'joint'.")
     if method == "two-stage" and general:
         raise InputError(
             "method='two-stage' is for sockets and reference lengths, without a robust loss; use method='joint'."

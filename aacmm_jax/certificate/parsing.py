@@ -5,9 +5,11 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from ..core.errors import InputError
+from ..core.text import number, quoted
 from .xml_elements import DCC, SI
 
 _PREFIXES = {"dcc": DCC, "si": SI}
+_LARGEST = 1e100  # no quantity is as large in any unit
 
 
 class CertifiedValue(NamedTuple):
@@ -56,14 +58,20 @@ def _collect(element: Element, path: tuple[str, ...], values: dict[tuple[str, ..
         expanded = real.findtext(
             "si:measurementUncertaintyUnivariate/si:expandedMU/si:valueExpandedMU", None, _PREFIXES
         )
-        try:
-            value = float(real.findtext("si:value", "", _PREFIXES))
-            u = None if expanded is None else float(expanded)
-        except ValueError as error:
-            raise InputError(
-                f"the value of {' / '.join(path)!r} is no number; export the certificate again."
-            ) from error
+        value = _number(real.findtext("si:value", "", _PREFIXES), "value", path)
+        u = None if expanded is None else _number(expanded, "expanded uncertainty", path)
         values[path] = CertifiedValue(value, real.findtext("si:unit", "", _PREFIXES), u)
     for tag in ("results", "result", "data", "list", "quantity"):
         for child in element.iterfind(f"dcc:{tag}", _PREFIXES):
             _collect(child, path, values)
+
+
+def _number(text: str, what: str, path: tuple[str, ...]) -> float:
+    """A number as XML Schema's decimal and double write it, as far as a quantity can have it."""
+    try:
+        value = number(text.strip(" \t\r\n"))
+        if abs(value) < _LARGEST and (value >= 0 or what == "value"):
+            return value
+    except ValueError:
+        pass
+    raise InputError(f"the {what} of {quoted(' / '.join(path))} is no number; export the certificate again.")

@@ -28,7 +28,6 @@ from .app import (
 )
 
 _U_ARTEFACT = 0.001  # mm
-MOST_POSES = 100_000  # in a socket, as in a study
 _DIGITS = 9
 
 
@@ -178,6 +177,8 @@ def import_(
 
 
 def _poses_option(texts: Sequence[str], sockets: Iterable[str]) -> dict[str, int]:
+    from ..data.simulation import MOST_POSES
+
     counts = dict.fromkeys(sockets, 70)
     for text in texts:
         name, equals, count = text.rpartition("=")

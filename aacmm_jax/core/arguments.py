@@ -83,7 +83,7 @@ def _check(name: str, value: Any, kinds: tuple[type, ...]) -> None:
 def whole_number(value: Any, what: str) -> None:
     """Raise `InputError` for what is no whole number, such as 2.5, "2" or True."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
-        raise InputError(f"{what} is {_shown(value)}; give a whole number.")
+        raise InputError(f"{what} is {shown(value)}; give a whole number.")
 
 
 def real_number(value: Any, what: str) -> None:
@@ -92,7 +92,7 @@ def real_number(value: Any, what: str) -> None:
     if isinstance(value, jax.Array | np.ndarray) and not isinstance(value, np.ma.MaskedArray):
         number = value.ndim == 0 and value.dtype.kind in "iuf"
     if not number or (is_concrete(value) and math.isnan(float(value))):
-        raise InputError(f"{what} is {_shown(value)}; give a number.")
+        raise InputError(f"{what} is {shown(value)}; give a number.")
 
 
 def items_of(values: Any, what: str) -> list[Any]:
@@ -100,7 +100,7 @@ def items_of(values: Any, what: str) -> list[Any]:
     try:
         return list(values)
     except TypeError:
-        raise InputError(f"{what} is {_shown(values)}; give a list.") from None
+        raise InputError(f"{what} is {shown(values)}; give a list.") from None
 
 
 def check_finite(**trees: Any) -> None:
@@ -112,7 +112,8 @@ def check_finite(**trees: Any) -> None:
                 raise InputError(f"the {what} holds a value that is not finite; make it anew from finite numbers.")
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """A value as a message shows it: in one line, and of a long one its type only."""
     text = " ".join(repr(value).split())
     return text if len(text) < 60 else f"{_article(type(value).__name__)} {type(value).__name__}"
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..core.arguments import items_of
+from ..core.arguments import items_of, shown
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray
@@ -40,7 +40,7 @@ class ReferenceLength(eqx.Module):
     def __init__(self, start: str, end: str, value: Numbers, u: Numbers = 0.0):
         for name in (start, end):
             if not isinstance(name, str):
-                raise InputError(f"an end of a reference length is {name!r}; give the name of a socket.")
+                raise InputError(f"an end of a reference length is {shown(name)}; give the name of a socket.")
         self.start, self.end = start, end
         where = f"reference length '{start}' to '{end}'"
         self.value, self.u = as_array(value, where), as_array(u, f"u of {where}")
@@ -148,7 +148,9 @@ class Capture(eqx.Module):
         given = (lengths,) if isinstance(lengths, ReferenceLength) else tuple(items_of(lengths, "lengths"))
         for length in given:
             if not isinstance(length, ReferenceLength):
-                raise InputError(f"{length!r} is no reference length; give aj.ReferenceLength(start, end, value, u).")
+                raise InputError(
+                    f"{shown(length)} is no reference length; give aj.ReferenceLength(start, end, value, u)."
+                )
             known = (*self.names, *(o.name for o in self.observations if isinstance(o, Socket)))
             for end in (length.start, length.end):
                 if end not in known:

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core.arguments import check_finite, checked_arguments, items_of
+from ..core.arguments import check_finite, checked_arguments, items_of, real_number, shown
 from ..core.arrays import Numbers, as_floats, random_key, random_numbers
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, to_numpy
@@ -18,6 +18,8 @@ from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture, ReferenceLength
 from .noise import Noise
 from .observations.observation import AbstractObservation, AbstractSimulated
+
+MOST_POSES = 100_000  # in a socket, as in a study
 
 
 @checked_arguments
@@ -162,6 +164,8 @@ def _counts(points: Mapping[str, AnyArray], poses: int | Mapping[str, int]) -> d
     for name, count in counts.items():
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise InputError(f"socket '{name}' is given {count} poses; give at least one, and a whole number.")
+        if count > MOST_POSES:
+            raise InputError(f"socket '{name}' is given {count:,} poses, more than {MOST_POSES:,}; give fewer.")
     return counts
 
 
@@ -172,14 +176,18 @@ def _reference_lengths(points: Mapping[str, AnyArray], lengths: Iterable, key: A
             drawn.append(length)
             continue
         if not isinstance(length, tuple | list) or len(length) not in (2, 3):
-            raise InputError(f"reference length {length!r} must be (socket, socket) or (socket, socket, u), u in mm.")
+            raise InputError(
+                f"reference length {shown(length)} must be (socket, socket) or (socket, socket, u), u in mm."
+            )
         start, end = length[:2]
         for name in (start, end):
-            if name not in points:
+            if not isinstance(name, str) or name not in points:
                 raise InputError(
-                    f"reference length '{start}' to '{end}' names the unknown socket '{name}'{nearest(name, points)}"
+                    f"reference length '{start}' to '{end}' names the unknown socket '{name}'"
+                    f"{nearest(str(name), points)}"
                 )
-        u = float(length[2]) if len(length) == 3 else 0.0
+        u = length[2] if len(length) == 3 else 0.0
+        real_number(u, f"u of reference length '{start}' to '{end}'")
         draw = float(random_numbers("normal", jax.random.fold_in(key, number), ()))
         true = float(np.linalg.norm(np.asarray(points[start]) - np.asarray(points[end])))
         drawn.append(ReferenceLength(start, end, true + u * draw, u))

@@ -15,6 +15,7 @@ from ..core.units import DEG
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import ArmSpecification, Parameters, single
 from .atomic_write import storable, write_text
+from .outputs import as_path
 from .toml import Strict, read_toml
 
 if TYPE_CHECKING:
@@ -129,9 +130,7 @@ def _read(source: str | os.PathLike, *, choose: bool) -> ArmSpecification:
     if isinstance(source, str) and source in shipped_arms():
         with resources.as_file(resources.files("aacmm_jax.files") / "shipped_arms" / f"{source}.toml") as path:
             return _specification(path, choose)
-    if not isinstance(source, str | os.PathLike):
-        raise InputError(f"an arm is read by its name or from a file, not from {source!r}; give one of the two.")
-    path = Path(source)
+    path = as_path(source)
     if not os.path.exists(path) and path.suffix != ".toml":
         raise InputError(
             f"'{source}' is neither a file nor an arm that ships with the package{nearest(str(source), shipped_arms())}"

@@ -287,7 +287,9 @@ def opened(
             raise InputError(f"{path} is not an HDF5 file, or it is damaged; name a file written by aacmm.")
         stream.seek(0)
         image = stream.read() if size <= _IN_MEMORY else None
-        untouched = verify and is_sealed(stream if image is None else io.BytesIO(image))
+        untouched = is_sealed(stream if image is None else io.BytesIO(image)) if verify else None
+        if untouched is False:
+            raise _damaged(path)
         with h5py.File(stream if image is None else h5py.h5f.open_file_image(image), "r") as file:
             attributes = {key: _plain(value) for key, value in file.attrs.items()}
             parts = attributes.get("parts") if study else None
@@ -299,7 +301,7 @@ def opened(
             yield content, attributes
 
 
-def _verify(path: str | os.PathLike, content: "Content", attributes: Mapping[str, Any], untouched: bool) -> None:
+def _verify(path: str | os.PathLike, content: "Content", attributes: Mapping[str, Any], untouched: bool | None) -> None:
     """Raise `InputError` where the content is not what was written; files of earlier versions carry no digest.
 
     Blocks of a study have their seal only: the digest of their content would take as long as writing them.
@@ -310,7 +312,11 @@ def _verify(path: str | os.PathLike, content: "Content", attributes: Mapping[str
     if digest is None and attributes["format_version"] < DIGESTS_SINCE:
         return
     if digest is None or not (untouched or (digest and content.digest() == digest)):
-        raise InputError(f"{path} is damaged or was edited: its content does not match its SHA-256; make it again.")
+        raise _damaged(path)
+
+
+def _damaged(path: str | os.PathLike) -> InputError:
+    return InputError(f"{path} is damaged or was edited: its content does not match its SHA-256; make it again.")
 
 
 @contextlib.contextmanager

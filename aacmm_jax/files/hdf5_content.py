@@ -3,9 +3,10 @@
 A file carries two digests. The attribute ``content_sha256`` is of its logical content: groups, attributes, and arrays
 with their types, shapes and values, in the order of their names; compression and layout do not change it, so it also
 holds for a file that another program has repacked. The seal, some bytes after the end of what HDF5 reads, is of all
-bytes before it. Where it matches, the content is what was written, at a hundredth of the time that the first one takes;
-where it does not, or is gone, the content decides. Both detect damage. Neither is a signature: whoever changes a file
-on purpose can compute them again.
+bytes before it. Where it matches, the content is what was written, at a hundredth of the time that the first one takes.
+Where it does not match, the file is not opened, as the HDF5 library may crash on damaged metadata. Where it is gone
+(other programs do not write it), the content decides. Both detect damage. Neither is a signature: whoever changes a
+file on purpose can compute them again.
 """
 
 import hashlib
@@ -41,15 +42,15 @@ def sealed(image: bytes) -> bytes:
     return image + _SEAL % hashlib.sha256(image).hexdigest().encode()
 
 
-def is_sealed(stream: Any) -> bool:
-    """Whether a file ends with the SHA-256 of all bytes before."""
+def is_sealed(stream: Any) -> bool | None:
+    """Whether the SHA-256 at the end of a file is that of all bytes before; None where there is none."""
     size = stream.seek(0, os.SEEK_END) - _SEAL_SIZE
     if size < 0:
-        return False
+        return None
     stream.seek(size)
     last = stream.read()
     if not last.startswith(_SEAL[: _SEAL.index(b"%")]):  # most files of other origin are not read whole
-        return False
+        return None
     stream.seek(0)
     digest, left = hashlib.sha256(), size
     while left and (part := stream.read(min(left, 2**20))):

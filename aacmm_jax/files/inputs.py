@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError
-from .outputs import reading, waiting
+from .outputs import as_path, reading, waiting
 
 LARGEST_FILE = "AACMM_LARGEST_FILE_MB"  # environment variable: size limit of inputs, MiB
 STREAMED = 100  # a study's file, which is read in parts, may be larger than the limit by this factor
@@ -37,7 +37,7 @@ class InputFile(os.PathLike):
     """
 
     def __init__(self, path: str | os.PathLike):
-        self._path = Path(path)
+        self._path = as_path(path)
         with open_input(path) as stream:
             self.content: bytes = stream.read()
 
@@ -63,7 +63,7 @@ def open_input(path: str | os.PathLike, times: int = 1) -> Iterator[Any]:
     if isinstance(path, InputFile):
         yield io.BytesIO(path.content)
         return
-    reading(path)
+    reading(as_path(path))
     limit = times * largest_file()
     try:
         # Before it is opened, as opening a device may have effects; and again, as it may have been replaced.

@@ -26,6 +26,7 @@ from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
 from .arms import load_specification
 from .inputs import InputFile, fingerprint
+from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
 from .text_table import read_numbers
 from .toml import Strict, each_once, read_toml
@@ -153,7 +154,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     Raises:
         InputError: names the file, the place in it and what to do.
     """
-    path = Path(path)
+    path = as_path(path)
     model = read_toml(manifest := InputFile(path), _Manifest)
     try:
         nominal = load_specification(_arm_source(path, model.arm))

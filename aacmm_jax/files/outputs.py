@@ -13,6 +13,7 @@ import stat
 from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
+from typing import Any
 
 from ..core.errors import InputError
 
@@ -24,11 +25,18 @@ except ImportError:  # Windows, where an open file cannot be removed, which serv
 ELSEWHERE = "choose another output path"
 
 
+def as_path(path: Any) -> Path:
+    """The path of a file, or `InputError` for what is none: a number, for one, would name an open file."""
+    if isinstance(path, str | os.PathLike):
+        return Path(path)
+    raise InputError(f"a file is named by a {type(path).__name__}; give its path as text.")
+
+
 class OutputFile:
     """A file that is being written under a temporary name; a symbolic link is followed to the file it points to."""
 
     def __init__(self, path: str | os.PathLike, advice: str = ELSEWHERE):
-        self.named, self._advice = Path(path), advice
+        self.named, self._advice = as_path(path), advice
         with self.refusing():
             if "\0" in str(path):
                 raise OSError(None, "its name holds a NUL")

@@ -11,6 +11,7 @@ from ..core.units import INCH, UM, M
 from ..kinematics.workspace import Reach
 from .inputs import InputFile, fingerprint
 from .manifest import PointsManifest, recorded
+from .outputs import as_path
 from .text_table import read_numbers
 from .toml import read_toml
 
@@ -33,7 +34,7 @@ def read_points(path: str | os.PathLike) -> Measured:
     Raises:
         InputError: names the file, the place in it and what to do.
     """
-    path = Path(path)
+    path = as_path(path)
     model = read_toml(manifest := InputFile(path), PointsManifest)
     try:
         files = [manifest]

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from ..core.arguments import items_of, shown
 from ..core.arrays import Numbers, as_array, as_floats, in_chunks
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace, to_jax, to_numpy
@@ -123,7 +124,9 @@ class Arm(eqx.Module):
         Raises:
             InputError: A name is unknown, or q has another number of joints.
         """
-        names = parameter_names(self) if names is None else (names,) if isinstance(names, str) else names
+        names = (
+            parameter_names(self) if names is None else (names,) if isinstance(names, str) else items_of(names, "names")
+        )
         return self._evaluated(
             partial(tip_jacobian, indices=tuple(locate(self.joints, n, extra=("q",)) for n in names)), q
         )
@@ -208,7 +211,8 @@ def locate(joints: int, name: str, extra: tuple[str, ...] = ()) -> tuple[str, in
     if kind in kinds and index.isdecimal() and str(int(index)) == index and 1 <= int(index) <= joints:
         return kind, int(index) - 1
     known = [f"{k}_{i}" for k in kinds for i in range(1, joints + 1)] + [f"probe_{axis}" for axis in _PROBE_AXES]
-    raise InputError(f"unknown parameter '{name}' of a {joints}-joint arm{nearest(str(name), known)}")
+    given = name if isinstance(name, str) else shown(name)
+    raise InputError(f"unknown parameter '{given}' of a {joints}-joint arm{nearest(given, known)}")
 
 
 def with_arrays(arm: Arm, **changes: AnyArray | None) -> Arm:

@@ -108,8 +108,8 @@ def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> Scal
     check_finite(arm=arm, capture=capture)
     if not is_single(arm):
         raise InputError("the arm is a batch, but one scale is fixed here; map over its arms with jax.vmap.")
-    if sigma is not None and is_concrete(sigma) and sigma < 0:
-        raise InputError(f"sigma is {float(sigma):g} mm; a standard deviation must be zero or positive.")
+    if sigma is not None and is_concrete(sigma) and not 0 <= sigma < np.inf:
+        raise InputError(f"sigma is {float(sigma):g} mm; a standard deviation must be zero or positive, and finite.")
     scatter = None if sigma is None else as_array(sigma, "sigma", like=np.zeros(0))
     return to_jax(_fixed(*to_numpy((arm, Measurement.of(capture), scatter))))
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ..core.errors import InputError
 from ..files.hdf5 import undamaged
+from ..files.outputs import as_path
 from . import store
 from .blocks import VARIABLES, Layout, fill_of
 from .definition import POOL_PARTS, Study
@@ -112,7 +113,7 @@ class Results(NamedTuple):
         Raises:
             InputError: Where the file is missing, damaged or no study, or its folder of blocks is missing.
         """
-        path = Path(os.path.realpath(path))
+        path = Path(os.path.realpath(as_path(path)))
         stored = store.read(path)
         store.check_parts(path, stored)
         store.check_results(path, stored)

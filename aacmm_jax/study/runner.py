@@ -16,6 +16,7 @@ import jax
 from filelock import FileLock, Timeout
 
 from ..core.errors import InputError
+from ..files.outputs import as_path
 from . import store
 from .blocks import Block, Layout, parts_of
 from .configuration_pool import check_reach
@@ -90,7 +91,7 @@ def run_study(
         InputError: For a file of another study, a file that another process is writing, and a full disk; finished
             blocks are kept.
     """
-    path = Path(os.path.realpath(path))
+    path = Path(os.path.realpath(as_path(path)))
     for what, number in (("workers", workers), ("chunk", chunk)):
         if number is not None and (not isinstance(number, int) or number < 1):
             raise InputError(f"{what} is {number!r}; give a whole number of at least 1, or leave it out.")

@@ -12,6 +12,7 @@ from ..data.recording import Recording
 from ..files.arms import load_specification
 from ..files.atomic_write import storable
 from ..files.captures import load_capture
+from ..files.outputs import as_path
 from ..files.toml import read_toml
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import ArmSpecification
@@ -93,10 +94,11 @@ def read_study(source: str | os.PathLike) -> Study:
     if isinstance(source, str) and source in shipped_studies():
         with resources.as_file(_shipped() / f"{source}.toml") as path:
             return _study_of_file(path)
-    if not os.path.exists(source) and Path(source).suffix != ".toml":
+    path = as_path(source)
+    if not os.path.exists(path) and path.suffix != ".toml":
         known = nearest(str(source), shipped_studies())
         raise InputError(f"'{source}' is neither a file nor a study that ships with the package{known}")
-    return _study_of_file(Path(source))
+    return _study_of_file(path)
 
 
 def _shipped() -> Any:

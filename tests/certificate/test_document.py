@@ -574,5 +574,6 @@ def test_what_is_no_certificate_is_refused(text, parts):
 def test_a_certificate_whose_number_was_edited_is_refused(record):
     text = dcc_xml(record, AdministrativeData(), created=CREATED)
     k = f"<si:value>{record.k!r}</si:value>"
-    for edited in (k.replace(".", ","), ""):
+    numbers = (f"<si:value>{number}</si:value>" for number in ("1_0", "\u0663", "NaN", "INF", "1e300", "9" * 5001))
+    for edited in (k.replace(".", ","), "", *numbers):
         assert_refused(lambda edited=edited: parse_dcc(text.replace(k, edited)), "'As left / Scale / k'", "no number")

@@ -5,6 +5,7 @@ import os
 import pytest
 
 from aacmm_jax.files.atomic_write import write_text
+from aacmm_jax.files.outputs import as_path
 from tests.refusals import assert_refused
 
 
@@ -34,3 +35,9 @@ def test_what_is_no_ordinary_file_is_refused(tmp_path):
         os.close(writing)
     assert_refused(lambda: write_text(tmp_path, ""), "it is a folder")
     assert sorted(os.listdir(tmp_path)) == ["fifo", "link", "loop"]
+
+
+@pytest.mark.parametrize("path", [2.5, 1, [1.0], b"arm.toml", None], ids=repr)
+def test_what_is_no_path_is_refused(path):
+    """A number would name an open file, such as standard output."""
+    assert_refused(lambda: as_path(path), f"a file is named by a {type(path).__name__}", "as text")

@@ -211,3 +211,12 @@ def test_the_fingerprint_is_of_what_was_read(path, tmp_path):
     shutil.move(tmp_path / "new.h5", path)
     assert read_tables(read, KIND).attributes["scale"] == 2.0
     assert fingerprint(read) == before != fingerprint(path)
+
+
+def test_a_damaged_file_is_not_given_to_hdf5(path, monkeypatch):
+    """Damaged metadata of virtual arrays crashed the HDF5 library, and the process with it."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    monkeypatch.setattr(h5py, "File", None)
+    assert_refused(lambda: read_tables(path, KIND), path, "does not match its SHA-256; make it again.")

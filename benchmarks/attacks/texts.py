@@ -1,29 +1,23 @@
-"""Mutated text files through every loader: ``python benchmarks/hostile_texts.py [--count 10000] [--seed 1]``.
+"""Text files of every kind are mutated and read again.
 
-Prints what became of them. An edit (a digit, a name, a line) is another valid text and may give another result; a
-corruption (digits of another script, quotes, control characters, columns numbered in the first row, ...) never may. A
-mutation that changes neither the result nor raises `InputError` in one sentence is a failure, and so is one that takes
-longer than ten seconds. Exit code 1 where anything failed or a corruption gave another result.
+An edit (a digit, a name, a line) is another valid text and may give another result. A corruption (digits of another
+script, quotes, control characters, another encoding, ...) never may: the result is the same, or the file is refused in
+one sentence.
 """
 
-import argparse
-import collections
 import random
 import re
-import signal
-import sys
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 import aacmm_jax as aj
-from aacmm_jax.files.administrative_data import read_administrative_data
-from aacmm_jax.files.arms import specification_toml
-from aacmm_jax.study import read_study
 
-SECONDS = 10
+from .outcomes import OTHER, SILENT, Attempt, exact, read_again
+from .samples import results
+
+MADE = "2026-01-31T12:00:00+00:00"
 MANIFEST = """date = 2026-01-31
 arm = "arm.toml"
 
@@ -97,7 +91,8 @@ temperature_u_celsius = 0.2
 def originals(folder: Path) -> dict[str, Callable[[], object]]:
     """Write one file of every kind; name of the file that is mutated -> what it is read by."""
     random_numbers = np.random.default_rng(0)
-    (folder / "arm.toml").write_text(specification_toml(aj.files.load_specification("cheng2018-simulation")))
+    sample = results()
+    aj.files.save_arm(sample.arm.arm, folder / "arm.toml")
     for name in ("hole_0.csv", "hole_1.csv", "hole_1_old.csv"):
         rows = random_numbers.uniform(-90, 90, (5, 7))
         lines = [",".join(f"{x:.4f}" for x in row) for row in rows]
@@ -109,39 +104,35 @@ def originals(folder: Path) -> dict[str, Callable[[], object]]:
         (folder / name).write_text("\n".join(";".join(f"{x:.5f}" for x in row) for row in points) + "\n")
     for name, text in (("m.toml", MANIFEST), ("p.toml", POINTS), ("s.toml", STUDY), ("l.toml", ABOUT)):
         (folder / name).write_text(text)
+    about = aj.files.read_administrative_data(folder / "l.toml")
+    (folder / "dcc.xml").write_text(aj.certificate.dcc_xml(sample.record, about, created=MADE))
 
     def manifest() -> object:
         return aj.files.read_manifest(folder / "m.toml")._replace(sources=())
 
-    def points() -> object:
+    def points_file() -> object:
         return aj.files.read_points(folder / "p.toml")._replace(sources=())
+
+    def certificate_text() -> str:
+        return (folder / "dcc.xml").read_text(errors="surrogateescape")
 
     return {
         "m.toml": manifest,
         "hole_0.csv": manifest,
         "arm.toml": lambda: aj.files.load_specification(folder / "arm.toml"),
-        "p.toml": points,
-        "points.csv": points,
-        "s.toml": lambda: read_study(folder / "s.toml").specification,
-        "l.toml": lambda: read_administrative_data(folder / "l.toml"),
+        "p.toml": points_file,
+        "points.csv": points_file,
+        "s.toml": lambda: aj.study.read_study(folder / "s.toml").specification,
+        "l.toml": lambda: aj.files.read_administrative_data(folder / "l.toml"),
+        "dcc.xml": lambda: sorted(aj.certificate.parse_dcc(certificate_text()).values()),
     }
 
 
-def content(item: object) -> str:
-    """All numbers and texts of a result, exactly."""
-    import jax
-
-    if isinstance(item, tuple) and not hasattr(item, "_fields"):
-        return repr([content(part) for part in item])
-    leaves, structure = jax.tree.flatten(item)
-    return repr([x.tolist() if hasattr(x, "tolist") else x for x in leaves]) + str(structure)
-
-
 NASTY = ["\0", "\x1b[2J", "\u202e", "\x7f", "\x9b", "\u2028", "\x1c", "\ufeff"]
-NUMBER = re.compile(r"(?<![\w.{])-?\d+(?:\.\d+)?(?![\w.}])")
+NUMBER = re.compile(r"(?<![\w.{])(?<!e[+-])-?\d+(?:\.\d+)?(?![\w.}])")
 
 
-def place(text: str, choose: random.Random) -> int:
+def random_position(text: str, choose: random.Random) -> int:
     return choose.randrange(len(text) + 1)
 
 
@@ -159,7 +150,7 @@ def replaced(pattern: str, text: str, choose: random.Random, by: Callable[[str],
 
 
 def inserted(text: str, choose: random.Random, what: str) -> str:
-    at = place(text, choose)
+    at = random_position(text, choose)
     return text[:at] + what + text[at:]
 
 
@@ -181,8 +172,15 @@ EDITS: dict[str, Callable[[str, random.Random], str]] = {
     "character twice": lambda text, choose: replaced(".", text, choose, lambda one: 2 * one),
     "line left out": lambda text, choose: lines_changed(text, choose, lambda lines, i: lines.pop(i)),
     "line twice": lambda text, choose: lines_changed(text, choose, lambda lines, i: lines.insert(i, lines[i])),
-    "cut short": lambda text, choose: text[: place(text, choose)],
+    "cut short": lambda text, choose: text[: random_position(text, choose)],
     "negative": lambda text, choose: number(text, choose, lambda one: "-" + one),
+    "lines exchanged": lambda text, choose: lines_changed(
+        text, choose, lambda lines, i: lines.insert(choose.randrange(len(lines)), lines.pop(i))
+    ),
+    "cell moved": lambda text, choose: replaced(
+        r"[^,;=\n]+[,;][^,;=\n]+", text, choose, lambda one: re.sub(r"(.*)([,;])(.*)", r"\3\2\1", one)
+    ),
+    "another case": lambda text, choose: replaced(r"[A-Za-z]+", text, choose, str.swapcase),
 }
 CORRUPTIONS: dict[str, Callable[[str, random.Random], str]] = {
     "control character": lambda text, choose: inserted(text, choose, choose.choice(NASTY)),
@@ -213,68 +211,39 @@ CORRUPTIONS: dict[str, Callable[[str, random.Random], str]] = {
     ),
     "dotted": lambda text, choose: "\n" + ".".join(["a"] * 20_000) + " = 1\n" + text,
     "bytes": lambda text, choose: inserted(text, choose, "\udcff\udcfe"),
+    "unit": lambda text, choose: number(text, choose, lambda one: one + choose.choice(["mm", " mm", "\u00b0", "%"])),
+    "exponent of Fortran": lambda text, choose: number(text, choose, lambda one: one + choose.choice("dDqf") + "1"),
+    "digits in groups": lambda text, choose: number(
+        text, choose, lambda one: re.sub(r"\d", lambda digit: digit[0] + choose.choice("'_\u00a0\u2009"), one, count=1)
+    ),
+    "typographic minus": lambda text, choose: number(
+        text, choose, lambda one: choose.choice("\u2212\u2013\ufe63\uff0d") + one.lstrip("-")
+    ),
+    "letter of another alphabet": lambda text, choose: replaced(
+        r"(?m)(?<=^)[aceopxy](?=\w* ?=)",
+        text,
+        choose,
+        lambda one: "\u0430\u0441\u0435\u043e\u0440\u0445\u0443"["aceopxy".index(one)],
+    ),
+    "another encoding": lambda text, choose: text.encode(choose.choice(["utf-16", "utf-16-le", "utf-32"])).decode(
+        errors="surrogateescape"
+    ),
 }
 
 
-class Hang(BaseException):
-    """The time limit of one mutation has passed."""
-
-
-def stop(*_: object) -> None:
-    raise Hang
-
-
-def outcome(read: Callable[[], object], expected: str) -> tuple[str, str]:
-    signal.alarm(SECONDS)
-    try:
-        return ("same", "") if content(read()) == expected else ("different", "")
-    except aj.InputError as error:
-        sentence = str(error)
-        return ("refused", "") if "\n" not in sentence and len(sentence) < 2000 else ("failure", sentence[:300])
-    except Hang:
-        return "hang", ""
-    except Exception as error:
-        return "failure", f"{type(error).__name__}: {error}"[:300]
-    finally:
-        signal.alarm(0)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=1)
-    options = parser.parse_args()
-    choose = random.Random(options.seed)
-    signal.signal(signal.SIGALRM, stop)
-    counts: dict[str, collections.Counter[str]] = {"edits": collections.Counter(), "corruptions": collections.Counter()}
-    shown: collections.Counter[str] = collections.Counter()
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        readers = originals(folder)
-        expected = {file: content(read()) for file, read in readers.items()}
-        for _ in range(options.count):
-            file = choose.choice(list(readers))
-            kind, mutations = choose.choice([("edits", EDITS), ("corruptions", CORRUPTIONS)])
-            mutation = choose.choice(list(mutations))
-            original = (folder / file).read_text()
-            mutated = mutations[mutation](original, choose)
-            (folder / file).write_bytes(mutated.encode(errors="surrogateescape"))
-            found, detail = outcome(readers[file], expected[file])
-            (folder / file).write_text(original)
-            counts[kind][found] += 1
-            wrong = found in ("failure", "hang") or (found == "different" and kind == "corruptions")
-            if wrong and (shown[mutation] < 4 or found != "different"):
-                shown[mutation] += 1
-                changed = [line for line in mutated.split("\n") if line not in original.split("\n")][:2]
-                print(f"{found}: {file}, {mutation}: {[line[:90] for line in changed]} {detail}")
-    for kind, count in counts.items():
-        print(
-            f"{kind}: "
-            + ", ".join(f"{count[what]:,} {what}" for what in ("refused", "same", "different", "failure", "hang"))
-        )
-    failed = sum(count["failure"] + count["hang"] for count in counts.values()) + counts["corruptions"]["different"]
-    sys.exit(1 if failed else 0)
-
-
-if __name__ == "__main__":
-    main()
+def attack(folder: Path, seed: int, count: int) -> Iterator[Attempt]:
+    """So many mutations, each of a file and of a kind drawn at random."""
+    choose = random.Random(seed)
+    readers = originals(folder)
+    expected = {file: exact(read()) for file, read in readers.items()}
+    for _ in range(count):
+        file = choose.choice(list(readers))
+        kind, mutations = choose.choice([("edits", EDITS), ("corruptions", CORRUPTIONS)])
+        mutation = choose.choice(list(mutations))
+        original = (folder / file).read_text()
+        mutated = mutations[mutation](original, choose)
+        (folder / file).write_bytes(mutated.encode(errors="surrogateescape"))
+        outcome, message = read_again(readers[file], expected[file], OTHER if kind == "edits" else SILENT)
+        (folder / file).write_text(original)
+        changed = [line for line in mutated.split("\n") if line not in original.split("\n")][:2]
+        yield Attempt(kind, outcome, f"{file}, {mutation}: {[line[:90] for line in changed]} {message}")

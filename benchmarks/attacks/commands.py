@@ -1,25 +1,19 @@
-"""Hostile calls of the command line, in this process: ``python benchmarks/hostile_calls.py [--count 200] [--seed 1]``.
+"""Hostile arguments of commands, run in this process.
 
-Each call must end with exit code 0, 1 or 2 and, for 2, one sentence on standard error and no file written; nothing that
-was there before may change but the outputs that the call names, and no temporary file may be left. Prints counts and
-every call that broke this; exit code 1 where there was one.
+Each call ends with exit code 0, 1 or 2 and, for 2, one sentence on standard error and no file written. Nothing that was
+there before changes but the outputs that the call names, and no temporary file is left.
 """
 
-import argparse
 import collections
 import contextlib
-import io
 import os
 import random
-import signal
-import sys
-import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import aacmm_jax as aj
-from aacmm_jax.cli import main as aacmm
-from aacmm_jax.data.recording import Recording
-from aacmm_jax.files.arms import specification_toml
+
+from .outcomes import DONE, LOST, REFUSED, UNEXPECTED, Attempt, command_line, contents, ending, is_sentence
 
 SECONDS = 120
 NUMBERS = [
@@ -72,23 +66,15 @@ READ_BY = {
 }  # what a file makes a command read; twice where it is no output of these calls
 
 
-class Hang(BaseException):
-    """The time limit of one call has passed."""
-
-
-def stop(*_: object) -> None:
-    raise Hang
-
-
 def prepare(folder: Path) -> None:
     """One file of every kind, and what is no file."""
     arm = aj.files.load_specification("cheng2018-simulation")
-    (folder / "arm.toml").write_text(specification_toml(arm))
+    aj.files.save_arm(arm.arm, folder / "arm.toml")
     sockets = {"A": (400, 200, 300), "B": (600, 200, 300)}
     capture = aj.simulate(
         arm.arm, sockets, poses={"A": 30, "B": 3}, lengths=[("A", "B", 0.002)], encoder_arcsec=2, seating=0.005, seed=1
     )
-    aj.files.save_capture(folder / "capture.h5", Recording(capture, arm))
+    aj.files.save_capture(folder / "capture.h5", aj.Recording(capture, arm))
     (folder / "cut.h5").write_bytes((folder / "capture.h5").read_bytes()[:3000])
     for name in "AB":
         rows = [",".join(repr(float(x)) for x in row) for row in capture.sockets[name]]
@@ -110,7 +96,7 @@ def prepare(folder: Path) -> None:
     (folder / "link.csv").symlink_to("A.csv")
 
 
-def call(choose: random.Random) -> list[str]:
+def hostile_words(choose: random.Random) -> list[str]:
     """A command with one or two hostile words in it."""
     one = choose.choice
     output = one([*OUTPUTS, "new.h5", "new.h5"])
@@ -162,88 +148,45 @@ def call(choose: random.Random) -> list[str]:
     return ["plan", one(["arm.toml", one(INPUTS)]), "-o", output, *more]
 
 
-def run(words: list[str]) -> tuple[int | str, str, str]:
-    """Exit code (or what went wrong), standard output and standard error."""
-    output, errors = io.StringIO(), io.StringIO()
-    signal.alarm(SECONDS)
-    kept = sys.argv
-    sys.argv = ["aacmm", *words]
-    try:
-        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
-            aacmm()
-        code: int | str = 0
-    except SystemExit as ended:
-        code = ended.code if isinstance(ended.code, int) else 0 if ended.code is None else str(ended.code)
-    except Hang:
-        code = "hang"
-    except BaseException as error:
-        code = f"{type(error).__name__}: {error}"
-    finally:
-        signal.alarm(0)
-        sys.argv = kept
-    return code, output.getvalue(), errors.getvalue()
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    """Every regular file below a folder."""
-    found = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in found}
-
-
-def judged(words: list[str], code: int | str, errors: str, before: dict[str, bytes], after: dict[str, bytes]) -> str:
-    """What is wrong with how a call ended; empty where nothing is."""
+def judged(
+    words: list[str], code: int, errors: str, before: dict[str, bytes], after: dict[str, bytes]
+) -> tuple[str, str]:
+    """The outcome of a command that ended, and what is wrong with it."""
     sentence = errors.strip()
-    if code == "hang":
-        return "hang"
     if code not in (0, 1, 2) or "failed unexpectedly" in errors or "Traceback" in errors:
-        return "unexpected failure"
-    if code == 2 and not (sentence.endswith((".", "?")) and sentence.count("\n") == 0) and "Usage:" not in errors:
-        return "not one sentence"
+        return UNEXPECTED, f"exit code {code}: {sentence}"
+    if code == 2 and not is_sentence(sentence) and "Usage:" not in errors:
+        return UNEXPECTED, f"not one sentence: {sentence!r}"
     if "\x1b" in errors.replace(" ".join(words), ""):
-        return "control characters"
+        return UNEXPECTED, f"control characters: {sentence!r}"
     changed = {name for name in before | after if before.get(name) != after.get(name)}
     if any(name.endswith(".part") for name in after):
-        return "temporary file left"
+        return LOST, f"a temporary file is left: {sorted(after)}"
     if code == 2 and changed:
-        return f"exit code 2, but changed {sorted(changed)}"
+        return LOST, f"refused, but changed {sorted(changed)}"
     named = collections.Counter(os.path.normpath(word) for word in words)
     named.update(name for word in words for name in READ_BY.get(word, ()))
-    lost = {name for name in changed if name in before and named[name] != 1}  # once: as the output
-    return f"changed {sorted(lost)}" if lost else ""
+    lost = sorted(name for name in changed if name in before and named[name] != 1)  # once: as the output
+    return (LOST, f"changed {lost}") if lost else (REFUSED if code == 2 else DONE, "")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=1)
-    options = parser.parse_args()
-    choose = random.Random(options.seed)
-    signal.signal(signal.SIGALRM, stop)
-    counts: collections.Counter[str] = collections.Counter()
-    with tempfile.TemporaryDirectory() as name, contextlib.chdir(name):
-        folder = Path(name)
+def attack(folder: Path, seed: int, count: int) -> Iterator[Attempt]:
+    """So many commands in a folder, each of which starts from the same files."""
+    choose = random.Random(seed)
+    with contextlib.chdir(folder):
         prepare(folder)
-        run(["calibrate", "capture.h5", "-o", "calibration.h5"])
-        before = content(folder)
-        if "calibration.h5" not in before:
-            sys.exit("the calibration that the calls start from failed")
-        for number in range(options.count):
-            words = call(choose)
-            code, _, errors = run(words)
-            after = content(folder)
-            wrong = judged(words, code, errors, before, after)
-            counts[f"exit code {code}" if not wrong else wrong.partition(" [")[0]] += 1
-            if wrong:
-                shown = [word[:60] for word in words]
-                print(f"{number}: {wrong}: {shown!r} -> {code}: {errors[:300]!r}", flush=True)
+        code, _, errors = command_line(["calibrate", "capture.h5", "-o", "calibration.h5"])
+        assert (folder / "calibration.h5").exists(), (code, errors)
+        before = contents(folder)
+        for _ in range(count):
+            words = hostile_words(choose)
+            outcome, found = ending(lambda words=words: command_line(words), SECONDS)
+            after = contents(folder)
+            if outcome is None:
+                outcome, found = judged(words, found[0], found[2], before, after)
+            yield Attempt(words[0], outcome, f"{[word[:60] for word in words]} {found}")
             for path in set(after) - set(before):
                 (folder / path).unlink()
             for path, stored in before.items():
                 if after.get(path) != stored:
                     (folder / path).write_bytes(stored)
-    print(", ".join(f"{count} {what}" for what, count in sorted(counts.items())))
-    sys.exit(0 if all(what.startswith("exit code") for what in counts) else 1)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,90 @@
+"""A study is killed by SIGKILL at random moments, resumed each time, and compared to the bit with one that was not.
+
+The command runs in a process of its own; half of the kills hit a study in threads, half one in processes
+(``--dask local``).
+"""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+import aacmm_jax as aj
+
+from .outcomes import HANG, LOST, SAME, SILENT, UNEXPECTED, Attempt
+
+SECONDS = 600
+WAYS = {"threads": (), "processes": ("--dask", "local")}
+
+
+def started(folder: Path, *arguments: object) -> subprocess.Popen:
+    """The command ``study`` as a process of its own."""
+    line = [sys.executable, "-m", "aacmm_jax", "study", "bound-sensitivity", *map(str, arguments)]
+    return subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+
+def differences(one: Path, other: Path) -> list[str]:
+    """The arrays of two studies that are not the same to the bit."""
+    with h5py.File(one) as a, h5py.File(other) as b:
+        groups = sorted({*a, *b})
+        pairs = ((f"{group}/{name}", a[group].get(name), b[group].get(name)) for group in groups for name in a[group])
+        return [name for name, x, y in pairs if x is None or y is None or _bytes(x) != _bytes(y)]
+
+
+def _bytes(item: h5py.Dataset) -> object:
+    values = item[()]
+    return values.tolist() if values.dtype.kind == "O" else (values.dtype.str, values.shape, values.tobytes())
+
+
+def killed(process: subprocess.Popen, path: Path, blocks: int, delay: float) -> None:
+    """Kill a study when so many blocks are kept and some time has passed, or when it has ended."""
+    folder, deadline = path.with_name(path.name + ".parts"), time.monotonic() + SECONDS
+    while process.poll() is None and time.monotonic() < deadline and len(list(folder.glob("*.h5"))) < blocks:
+        time.sleep(0.005)
+    time.sleep(delay)
+    process.kill()
+    process.communicate()
+
+
+def attack(folder: Path, seed: int, count: int, trials: int = 1000, chunk: int = 125) -> Iterator[Attempt]:
+    """So many kills; one attempt is a kill after which the file still reads, or the end of a study."""
+    random = np.random.default_rng(seed)
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder / "cache"))
+    whole, arguments = folder / "whole.h5", ("--trials", trials, "--chunk", chunk)
+    started(folder, "-o", whole, *arguments).communicate()
+    blocks = 20 * trials // chunk
+    for (way, more), kills in zip(WAYS.items(), (count - count // 2, count // 2), strict=True):
+        path = folder / way / "study.h5"
+        path.parent.mkdir()
+        for number in range(kills):
+            process = started(folder, "-o", path, *arguments, *more)
+            killed(process, path, blocks * number // kills, random.uniform(0, 0.3))
+            if not path.exists():
+                yield Attempt(f"{way}: killed", SAME if number == 0 else LOST, "no file")
+                continue
+            try:
+                kept = int((aj.study.open_study(path).converged.values >= 0).sum())
+                yield Attempt(f"{way}: killed", SAME, f"{kept} trials kept")
+            except Exception as error:
+                yield Attempt(f"{way}: killed", LOST, f"{type(error).__name__}: {error}")
+        yield _resumed(whole, path, started(folder, "-o", path, *arguments, *more), way)
+
+
+def _resumed(whole: Path, path: Path, process: subprocess.Popen, way: str) -> Attempt:
+    try:
+        _, errors = process.communicate(timeout=SECONDS)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return Attempt(f"{way}: resumed", HANG)
+    if process.returncode:
+        return Attempt(f"{way}: resumed", UNEXPECTED, errors)
+    left = sorted(item.name for item in path.parent.iterdir() if item != path)
+    if left:
+        return Attempt(f"{way}: resumed", LOST, f"left: {left}")
+    different = differences(whole, path)
+    return Attempt(f"{way}: resumed", SILENT if different else SAME, str(different))

@@ -1,0 +1,189 @@
+"""Another user of the machine against the compilation cache and against a study that runs in local processes.
+
+The other user is a fork of this process that gives up the superuser's rights; it lists, opens and connects to whatever
+it can find.
+"""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from .outcomes import DONE, REFUSED, SILENT, UNEXPECTED, Attempt
+
+OTHER_USER = 65534
+SECRETS = ("mem", "environ", "maps", "fd", "cwd", "root", "exe")  # of a process, in /proc
+PRINT_FOLDER = "import aacmm_jax, jax; print(jax.config.jax_compilation_cache_dir)"
+
+
+def as_other(work: Callable[[], list[str]]) -> list[str]:
+    """What a function returns that another user runs."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.setgroups([])
+            os.setresgid(*[OTHER_USER] * 3)
+            os.setresuid(*[OTHER_USER] * 3)
+            found = work()
+        except BaseException as error:
+            found = [f"{type(error).__name__}: {error}"]
+        os.write(writing, json.dumps(found).encode())
+        os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading) as stream:
+        content = stream.read()
+    os.waitpid(child, 0)
+    return json.loads(content)
+
+
+def succeeded(tries: dict[str, Callable[[], object]]) -> list[str]:
+    """The names of what was not refused by the operating system."""
+    found = []
+    for name, attempt in tries.items():
+        try:
+            attempt()
+        except OSError:
+            continue
+        found.append(name)
+    return found
+
+
+def against_the_cache(folder: Path) -> Iterator[Attempt]:
+    """Whether another user can put a program into the cache, or offer a folder that is then used."""
+
+    def used(cache: Path, name: str = "XDG_CACHE_HOME") -> tuple[str, str]:
+        kept = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XDG_"))}
+        line = [sys.executable, "-c", PRINT_FOLDER]
+        done = subprocess.run(line, env=kept | {name: str(cache)}, capture_output=True, text=True, check=True)
+        return done.stdout.strip(), done.stderr
+
+    own = folder / "own"
+    own.mkdir(mode=0o755)
+    used_folder, _ = used(own)
+    cache = own / "aacmm_jax"
+    assert used_folder == str(cache)
+    (cache / "program-cache").write_bytes(b"native code")
+    tries = {
+        "listed": lambda: os.listdir(cache),
+        "read": lambda: (cache / "program-cache").read_bytes(),
+        "replaced": lambda: (cache / "program-cache").write_bytes(b"poison"),
+        "added": lambda: (cache / "other-cache").write_bytes(b"poison"),
+        "renamed": lambda: cache.rename(own / "away"),
+        "opened": lambda: cache.chmod(0o777),
+    }
+    done = as_other(lambda: succeeded(tries))
+    for name in tries:
+        yield Attempt("cache", SILENT if name in done else REFUSED, f"the other user: {name}")
+    offered = Path(tempfile.mkdtemp(dir="/tmp"))  # where everybody may make folders
+    offered.chmod(0o1777)
+    made = as_other(lambda: succeeded({"made": lambda: (offered / "aacmm_jax").mkdir(mode=0o755)}))
+    assert made == ["made"]
+    for name, cache in (("XDG_CACHE_HOME", offered), ("JAX_COMPILATION_CACHE_DIR", offered / "aacmm_jax")):
+        used_folder, warning = used(cache, name)
+        refused = used_folder == "None" and "it belongs to another user" in warning and warning.count("\n") == 1
+        yield Attempt("cache", REFUSED if refused else SILENT, f"a folder of another user in {name}: {warning}")
+    (offered / "aacmm_jax").rmdir()
+    offered.rmdir()
+
+
+def descendants(process: int) -> list[int]:
+    """A process and all that it has started."""
+    children: dict[int, list[int]] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            except OSError:
+                continue
+            children.setdefault(parent, []).append(int(entry.name))
+    found = [process]
+    for one in found:
+        found.extend(children.get(one, []))
+    return found
+
+
+def listening(processes: list[int]) -> list[tuple[str, str]]:
+    """The sockets on which processes wait for connections: the table in /proc/net and the line's address."""
+    inodes = set()
+    for process in processes:
+        for file in Path(f"/proc/{process}/fd").iterdir():
+            try:
+                inodes.add(os.readlink(file).removeprefix("socket:[").removesuffix("]"))
+            except OSError:
+                continue
+    found = []
+    for table, inode, state, waiting, address in (
+        ("tcp", 9, 3, "0A", 1), ("tcp6", 9, 3, "0A", 1), ("udp", 9, 3, "07", 1), ("unix", 6, 3, "00010000", 7)
+    ):  # fmt: skip
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            columns = line.split()
+            if columns[inode] in inodes and columns[state] == waiting:
+                found.append((table, columns[address] if len(columns) > address else ""))
+    return found
+
+
+def connected(table: str, address: str) -> None:
+    """Connect to a socket, or raise `OSError`."""
+    if table == "unix":
+        with socket.socket(socket.AF_UNIX) as one:
+            one.connect("\0" + address[1:] if address.startswith("@") else address)
+        return
+    with socket.create_connection(("localhost", int(address.rpartition(":")[2], 16)), timeout=5):
+        pass
+
+
+def against_a_study(folder: Path) -> Iterator[Attempt]:
+    """Whether another user can reach a study that runs in two processes."""
+    folder.chmod(0o755)
+    line = [sys.executable, "-m", "aacmm_jax", "study", "bound-sensitivity", "--trials", "4000", "-o", "study.h5"]
+    line += ["--dask", "local", "--workers", "2"]
+    process = subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    try:
+        parts, deadline = folder / "study.h5.parts", time.monotonic() + 300
+        while process.poll() is None and time.monotonic() < deadline and not any(parts.glob("*.h5")):
+            time.sleep(0.05)
+        if process.poll() is not None:
+            yield Attempt("study", UNEXPECTED, process.stderr.read() if process.stderr else "")
+            return
+        processes = descendants(process.pid)
+        sockets = listening(processes)
+        tries: dict[str, Callable[[], object]] = {}
+        for one in processes:
+            for name in SECRETS:
+                path = Path(f"/proc/{one}/{name}")
+                tries[str(path)] = lambda path=path: (
+                    os.listdir(path) if path.name == "fd" else os.readlink(path)
+                    if path.name in ("cwd", "root", "exe") else path.read_bytes()
+                )  # fmt: skip
+            tries[f"signal to {one}"] = lambda one=one: os.kill(one, 0)
+        tries |= {f"connected to {one}": lambda one=one: connected(*one) for one in sockets}
+        block = next(parts.glob("*.h5"))
+        tries |= {
+            "a block replaced": lambda: block.write_bytes(b"poison"),
+            "a block added": lambda: (parts / "x.h5").write_bytes(b"poison"),
+            "the study replaced": lambda: (folder / "study.h5").write_bytes(b"poison"),
+        }
+        done = as_other(lambda: succeeded(tries))
+        yield Attempt("study: processes", DONE if len(processes) >= 3 else UNEXPECTED, str(len(processes)))
+        yield Attempt("study: sockets", SILENT if sockets else REFUSED, str(sockets))
+        for name in tries:
+            yield Attempt("study: tries", SILENT if name in done else REFUSED, f"the other user: {name}")
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def attack(folder: Path, seed: int, count: int) -> Iterator[Attempt]:
+    """Everything once, where the superuser runs it on Linux; ``seed`` and ``count`` change nothing."""
+    if not hasattr(os, "getuid") or os.getuid() != 0 or not sys.platform.startswith("linux"):
+        return
+    folder.chmod(0o755)
+    yield from against_the_cache(folder)
+    (folder / "study").mkdir()
+    yield from against_a_study(folder / "study")

@@ -1,0 +1,47 @@
+"""A small part of benchmarks/hostile.py: nothing gives other numbers, fails unexpectedly, hangs, or is lost.
+
+In processes of their own: the run-time checks of types that the other tests run with would refuse hostile arguments
+before the package sees them, and a fork needs a process in which JAX has not computed.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.mark.parametrize(
+    ("attacks", "count"),
+    [
+        (("flips", "texts", "calls"), 60),
+        pytest.param(("writes",), 36, marks=pytest.mark.slow),
+        pytest.param(("kills",), 6, marks=pytest.mark.slow),
+        pytest.param(("users",), 0, marks=pytest.mark.slow),
+        pytest.param(("flips", "texts", "calls"), 1000, marks=pytest.mark.slow),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, tuple) else str(value),
+)
+def test_an_attack_fails(attacks, count):
+    line = [
+        sys.executable,
+        ROOT / "benchmarks" / "hostile.py",
+        "--seed",
+        "0",
+        "--count",
+        str(count),
+        "--only",
+        *attacks,
+    ]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(line, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=1800)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    for attack in attacks:
+        assert sum(found[attack]["total"].values()) >= count
+        if attack in ("flips", "texts", "calls"):
+            assert found[attack]["total"]["refused in one sentence"] > count / 4
