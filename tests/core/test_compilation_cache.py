@@ -17,7 +17,7 @@ IMPORTS = {
 }
 COMPILE = """
 import jax, jax.numpy as jnp
-from aacmm_jax.core import namespace
+from aacmm_jax.core import numpy_or_jax
 print(float(jax.jit(lambda x: jnp.sin(x) @ jnp.cos(x))(jnp.arange(9.0))))
 """
 
