@@ -16,7 +16,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.chain import forward_pass
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import check_joints
-from ..model.metrics import Repeatability, repeatability
+from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Linear, Observed, Whitening, linear_rows, observed_model, observed_rows, whitening_of
 from ..model.robust import LOSSES, Loss, LossName
 from ..uncertainty import observed_covariance as propagation
@@ -110,7 +110,7 @@ def check_observed(capture: Capture, space: Parameters, vector: Float[AnyArray, 
     for observation, rows in zip(observed.observations, observed.slices, strict=True):
         observation.check_determined(np.asarray(forward.tip[:, rows]))
     _check_targets(observed, forward)
-    equations = _equations(observed)
+    equations = observed.equations
     unknowns = count + len(observed.steps)
     if equations < unknowns:
         raise InputError(
@@ -139,18 +139,13 @@ def _check_targets(observed: Observed, forward: Any) -> None:
             )
 
 
-def _equations(observed: Observed) -> int:
-    rows = sum(observation.rows * observation.q.shape[0] for observation in observed.observations)
-    return rows + len(observed.ends) + sum(len(value) for value, _ in observed.certified().values())
-
-
 def _state(task: ObservedTask, space: Parameters, z: Float[AnyArray, " z"], sigma: Any) -> State:
     linear = linear_rows(space, task.observed, z)
     p = len(space.names)
     forward = task.observed.forward(space, z[:p], z[p:])
     errors = propagation.arm_errors(forward, linear, task.observed)
     if sigma is None:
-        freedom = max(_equations(task.observed) - z.shape[0], 1)
+        freedom = max(task.observed.equations - z.shape[0], 1)
         scatter = propagation.scatter_of if task.loss is None else propagation.robust_scatter_of
         sigma = scatter(linear, errors, freedom)
     return State(linear, errors, sigma)
@@ -224,7 +219,7 @@ def identify_observed(task: ObservedTask) -> Identification:
         noise_model=task.noise_model,
         degrees_of_freedom=float("inf")
         if task.noise_model == "given"
-        else max(float(_equations(task.observed) - p - count), 1.0),
+        else max(float(task.observed.equations - p - count), 1.0),
         observed=metrics[2],
     )
 
@@ -322,7 +317,7 @@ def _metrics(
         weights.append(xp.ones(white.shape[1]) if task.loss is None else task.loss.cost_and_weight(white)[1])
     for state in (before, after):
         rms.append(xp.stack([xp.sqrt(xp.mean(xp.sum(part.rows.values[:3] ** 2, axis=0))) for part in state.linear]))
-    freedom = max(_equations(observed) - len(observed.steps) - len(task.bounds.space.names), 1)
+    freedom = max(observed.equations - len(observed.steps) - len(task.bounds.space.names), 1)
     metrics = ObservedMetrics(
         names=tuple(observation.name for observation in observed.observations),
         kinds=tuple(observation.kind for observation in observed.observations),
@@ -340,12 +335,9 @@ def _metrics(
 
 def _repeatability(state: State, sockets: list[int]) -> Repeatability:
     """Of the tips in sockets; NaN where there is none."""
-    xp = namespace(state.sigma)
     if not sockets:
-        none = xp.asarray(np.nan)
-        empty = xp.zeros(0)
-        return Repeatability(none, none, none, empty, empty, empty, xp.zeros((0, 3)), state.sigma)
+        return no_repeatability(state.sigma)
     # Distances from the centroid do not depend on where the socket is, so residuals do as well as tips.
-    tips = xp.concatenate([state.linear[i].rows.values for i in sockets], axis=1)
+    tips = namespace(state.sigma).concatenate([state.linear[i].rows.values for i in sockets], axis=1)
     found = repeatability(tips.T, tuple(state.linear[i].rows.values.shape[1] for i in sockets))
     return eqx.tree_at(lambda r: r.sigma, found, state.sigma)

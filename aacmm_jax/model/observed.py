@@ -85,6 +85,12 @@ class Observed(eqx.Module):
             slice(end - observation.q.shape[0], end) for observation, end in zip(self.observations, ends, strict=True)
         ]
 
+    @property
+    def equations(self) -> int:
+        """Number of rows of `observed_rows`."""
+        rows = sum(observation.rows * observation.q.shape[0] for observation in self.observations)
+        return rows + len(self.ends) + sum(len(value) for value, _ in self.certified().values())
+
     def split(self, geometry: Float[AnyArray, " g"]) -> dict[str, Float[AnyArray, " k"]]:
         """The numbers of each part."""
         return {name: geometry[rows[0] : rows[-1] + 1] for name, rows in self.positions.items()}

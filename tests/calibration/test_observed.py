@@ -267,7 +267,6 @@ def test_what_does_not_know_observations_says_so(paper_arm, bounds, sockets, tmp
     capture = aj.Capture(sockets.sockets, sockets.lengths, [kinds.Socket("D", sockets.sockets["C"] + 0.1)])
     recording = aj.Recording(capture, aj.kinematics.ArmSpecification(paper_arm))
     for function in (
-        lambda: aj.evaluate(paper_arm, capture),
         lambda: aj.observability(paper_arm, capture),
         lambda: aj.cross_validate(paper_arm, capture, bounds),
         lambda: aj.identify_many(paper_arm, capture, np.stack([bounds.lower] * 2), bounds.upper),
