@@ -26,7 +26,7 @@ from .results import Identification, ObservedMetrics
 from .scale_anchor import ScaleAnchor, scale_anchor
 from .task import fit
 
-_NO_ANCHOR = ScaleAnchor(hold=None, adjusted=None, set_by=(), partners=None)
+NO_ANCHOR = ScaleAnchor(hold=None, adjusted=None, set_by=(), partners=None)
 _LEAST = 1e-4  # smallest standard uncertainty of what is certified, of a tip coordinate's standard deviation
 
 
@@ -42,6 +42,7 @@ class ObservedTask(NamedTuple):
     max_steps: int
     loss: Loss | None
     pose: tuple[int, ...]  # number of the configuration of each row; equal ones were read at once
+    differentiable: bool = True  # whether derivatives pass through the solve
 
 
 class State(NamedTuple):
@@ -76,7 +77,7 @@ def observed_task(
     fixed = bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
     if fixed and hold == "longest":
         hold = None
-    anchor = scale_anchor(space, space.base, hold, noise) if not fixed or hold else _NO_ANCHOR
+    anchor = scale_anchor(space, space.base, hold, noise) if not fixed or hold else NO_ANCHOR
     noise_model = check_noise_model(noise_model, noise, arm.joints)
     if is_concrete(*jax.tree.leaves((arm, capture, vector))):
         known, at = to_numpy((space, vector))
@@ -91,11 +92,11 @@ def observed_task(
         noise_model=noise_model,
         max_steps=max_steps,
         loss=None if robust is None else Loss(robust),
-        pose=_configurations(observed.q),
+        pose=configurations(observed.q),
     )
 
 
-def _configurations(q: Any) -> tuple[int, ...]:
+def configurations(q: Any) -> tuple[int, ...]:
     """A number for each different configuration; different ones where the readings are traced."""
     if not is_concrete(q):
         return tuple(range(q.shape[0]))
@@ -189,7 +190,8 @@ def identify_observed(task: ObservedTask) -> Identification:
     for loss in losses:
         whitening = _whitening(task, state)
         args = (space, task.observed, whitening, loss)
-        found = fit(observed_rows, observed_model, z, args, sides, steps, task.max_steps)
+        functions = observed_rows, observed_model
+        found = fit(*functions, z, args, sides, steps, task.max_steps, differentiable=task.differentiable)
         z, evaluations = found.parameters, evaluations + found.steps
         state = _state(task, space, z, None)
     assert found is not None

@@ -269,7 +269,6 @@ def test_what_does_not_know_observations_says_so(paper_arm, bounds, sockets, tmp
     for function in (
         lambda: aj.observability(paper_arm, capture),
         lambda: aj.cross_validate(paper_arm, capture, bounds),
-        lambda: aj.identify_many(paper_arm, capture, np.stack([bounds.lower] * 2), bounds.upper),
         lambda: aj.fix_scale(paper_arm, capture),
         lambda: aj.files.save_capture(tmp_path / "c.h5", recording),
     ):
