@@ -218,6 +218,23 @@ def _vectors(observed: Observed, parts: dict[str, AnyArray]) -> Float[AnyArray, 
     return xp.stack([parts[end] - parts[start] for start, end in observed.ends])
 
 
+def certified_and_lengths(
+    observed: Observed, z: Float[AnyArray, " z"], p: int
+) -> tuple[Float[np.ndarray, "l z"], Float[np.ndarray, " l"]]:
+    """Derivatives of reference lengths and of certified values by all unknowns, and their standard uncertainties."""
+    unit, positions = np.eye(len(z)), observed.positions
+    vectors = np.asarray(_vectors(observed, observed.split(z[p:])))
+    directions = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    rows, u = [np.zeros((0, len(z)))], [np.zeros(0)]
+    for (start, end), direction, own in zip(observed.ends, directions, np.asarray(observed.u), strict=True):
+        rows.append((direction @ (unit[p + positions[end]] - unit[p + positions[start]]))[None])
+        u.append(own[None])
+    for name, (_, own) in observed.certified().items():
+        rows.append(unit[p + positions[name]])
+        u.append(np.asarray(own))
+    return np.concatenate(rows), np.concatenate(u)
+
+
 def observed_model(
     z: Float[AnyArray, " z"], args: tuple[Parameters, Observed, Whitening, Loss | None]
 ) -> QuadraticModel:
