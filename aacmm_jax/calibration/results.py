@@ -308,12 +308,12 @@ def active_names(space: Parameters, active: Numbers) -> dict[str, str]:
 
 
 class LeftOut(NamedTuple):
-    """One group of sockets that an arm was not identified from; mm. Predictions are infinite where the other groups
-    leave a direction open that matters."""
+    """One group of sockets and observations that an arm was not identified from; mm. Predictions are infinite where the
+    other groups leave a direction open that matters."""
 
-    sockets: tuple[str, ...]
+    sockets: tuple[str, ...]  # names, also of observations
     poses: int  # in sockets with more than one
-    rms: float  # distance from the socket's centroid, found
+    rms: float  # distance from the socket's centroid or the fitted geometry, found
     rms_predicted: float  # root of the mean square that the uncertainty predicts
     length_error: Float[np.ndarray, " l"]
     length_u: Float[np.ndarray, " l"]  # standard uncertainty of that error, predicted

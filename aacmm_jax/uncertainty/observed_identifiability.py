@@ -52,7 +52,7 @@ class Agreeing(NamedTuple):
         for _ in range(_ROUNDS):
             linear, errors = _linear(observed, space, z)
             unit = _whitening(observed, linear, [covariance_of_sigma(error, np.asarray(1.0)) for error in errors])
-            dense, values = _dense(linear, unit.roots, len(z))
+            dense, values = dense_rows(linear, unit.roots, len(z))
             step = np.linalg.lstsq(dense[:, p:] * observed.steps, -values, rcond=_NULL)[0] * observed.steps
             z[p:] += step
             if np.max(np.abs(step), initial=0.0) < 1e-8:
@@ -77,7 +77,7 @@ class Agreeing(NamedTuple):
         # Poses that this arm cannot take, next to a singularity, would look like information.
         agree = [np.abs(part.rows.values).max(axis=0) < _AGREES for part in self.linear]
         roots = tuple(root * kept[:, None, None] for root, kept in zip(whitening.roots, agree, strict=True))
-        poses, _ = _dense(self.linear, roots, p + len(steps))
+        poses, _ = dense_rows(self.linear, roots, p + len(steps))
         u = np.maximum(self.u, 1e-6) if measured else np.ones_like(self.u)
         rows = np.concatenate([poses, self.relations / u[:, None]])
         parameters, geometry = rows[:, :p] * np.asarray(self.space.scale), rows[:, p:] * steps
@@ -122,7 +122,7 @@ def _whitening(
     return whitening_of(linear, observed, of_arm, np.asarray(1e-6))
 
 
-def _dense(
+def dense_rows(
     linear: list[Linear], roots: tuple[Float[AnyArray, "_ _ _"], ...], size: int
 ) -> tuple[Float[np.ndarray, "r z"], Float[np.ndarray, " r"]]:
     """All derivatives as one matrix, and the residuals."""

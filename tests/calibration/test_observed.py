@@ -267,7 +267,6 @@ def test_what_does_not_know_observations_says_so(paper_arm, bounds, sockets, tmp
     capture = aj.Capture(sockets.sockets, sockets.lengths, [kinds.Socket("D", sockets.sockets["C"] + 0.1)])
     recording = aj.Recording(capture, aj.kinematics.ArmSpecification(paper_arm))
     for function in (
-        lambda: aj.cross_validate(paper_arm, capture, bounds),
         lambda: aj.fix_scale(paper_arm, capture),
         lambda: aj.files.save_capture(tmp_path / "c.h5", recording),
     ):
