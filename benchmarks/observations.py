@@ -10,6 +10,8 @@ import datetime
 import itertools
 import json
 import os
+import subprocess
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -18,8 +20,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import equinox as eqx
 import numpy as np
+from contenders import build_ceres
+from scipy.optimize import least_squares
 
 import aacmm_jax as aj
+from aacmm_jax.core.numpy_or_jax import to_numpy
+from aacmm_jax.core.rotations import rotation_matrix
 from aacmm_jax.data import observations as kinds
 
 NOISE = aj.Noise(encoder_arcsec=2, seating=0.005)
@@ -146,7 +152,97 @@ def coverage(given: argparse.Namespace) -> list[dict[str, Any]]:
     return found
 
 
-PARTS = {"coverage": coverage}
+class Tracker:
+    """Five hundred points of a tracker whose frame is unknown: 21 parameters and 6 numbers, from random starts."""
+
+    def __init__(self, poses: int = 500):
+        self.arm = aj.load_arm("cheng2018-simulation")
+        self.space = aj.Parameters.free_of(self.arm)
+        self.bounds = aj.Bounds.around(self.arm, self.space)
+        true = aj.perturbed_arm(self.space, length=1.0, angle=np.deg2rad(0.1), seed=1)
+        simulated = kinds.SimulatedPoints("T", BOX, poses, FRAME, u=0.01)
+        self.capture = aj.simulate(true, {}, observations=[simulated], noise=NOISE, seed=3)
+        observation = self.capture.observations[0]
+        self.q, self.points = np.asarray(observation.q), np.asarray(observation.points)
+
+    def starts(self, count: int, seed: int) -> np.ndarray:
+        """Half a millimetre and half a milliradian about the nominal arm."""
+        random = np.random.default_rng(seed).uniform(-0.5, 0.5, (count, len(self.space.names)))
+        return np.asarray(self.space.vector()) + random * np.asarray(self.space.scale)
+
+    def whole(self, starts: np.ndarray) -> np.ndarray:
+        """With a start for the frame, which the others need: that of the true frame, a little off."""
+        rough = np.array(FRAME) + np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0])
+        return np.concatenate([starts, np.tile(rough, (len(starts), 1))], axis=1)
+
+
+def ours(task: Tracker, starts: np.ndarray) -> tuple[float, np.ndarray]:
+    """With weights from the noise, so that each problem is solved twice."""
+    begun = time.perf_counter()
+    found = aj.calibrate_many(task.arm, task.capture, task.bounds, start=starts, noise=NOISE)
+    return time.perf_counter() - begun, found.parameters
+
+
+def ceres(task: Tracker, starts: np.ndarray) -> tuple[float, np.ndarray]:
+    """C++ with automatic differentiation, the frame among the unknowns, all points with one weight; two threads."""
+    arm, n = task.arm, task.arm.joints
+    offsets = {"alpha": 0, "a": n, "d": 2 * n, "theta": 3 * n, "probe": 4 * n}
+    slots = [offsets[kind] + i for kind, i in task.space.indices()]
+    base = [np.asarray(getattr(arm, kind)) for kind in offsets]
+    whole = task.whole(starts)
+    parts = ([n, len(task.q), len(starts), 2], *base, slots, task.q, task.points, whole)
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "in", Path(folder) / "out"
+        np.concatenate([np.ravel(np.asarray(part, dtype=float)) for part in parts]).tofile(source)
+        subprocess.run([Path(__file__).parent / "peers/ceres/build/peer_tracker", source, target], check=True)
+        out = np.fromfile(target)
+    return float(out[0]), out[1:].reshape(whole.shape)[:, : starts.shape[1]]
+
+
+def scipy_trf(task: Tracker, starts: np.ndarray) -> tuple[float, np.ndarray]:
+    """SciPy with finite differences, the same unknowns, one core."""
+    space, p = to_numpy(task.space), len(task.space.names)
+    scale = np.concatenate([np.asarray(space.scale), np.full(3, 1e-3), np.ones(3)])
+
+    def residual(z: np.ndarray) -> np.ndarray:
+        frame = z[p:]
+        seen = task.points @ rotation_matrix(frame[:3]).T + frame[3:]
+        return (space.arm(z[:p]).position(task.q) - seen).ravel()
+
+    begun = time.perf_counter()
+    tolerances = {"xtol": 1e-12, "ftol": 1e-14, "gtol": 1e-14}
+    found = [least_squares(residual, z, x_scale=scale, method="trf", **tolerances).x for z in task.whole(starts)]
+    return time.perf_counter() - begun, np.array(found)[:, :p]
+
+
+def throughput(given: argparse.Namespace) -> dict[str, Any]:
+    """Problems a second, in turns, the median of the rounds; and how far the solutions are from the first's."""
+    task, rates, others = Tracker(), {}, {}
+    built = build_ceres() is not None
+    entrants = {"aacmm_jax.calibrate_many": (ours, 128), "SciPy TRF, finite differences": (scipy_trf, 2)}
+    entrants |= {"Ceres, 2 threads": (ceres, 64)} if built else {}
+    for run, count in entrants.values():
+        run(task, task.starts(count, 0))  # compile, warm up
+    for number in range(1, given.rounds + 1):
+        for name, (run, count) in entrants.items():
+            seconds, found = run(task, task.starts(count, number))
+            rates.setdefault(name, []).append(count / seconds)
+            others[name] = found[0]
+    first = others["aacmm_jax.calibrate_many"]
+    steps = np.asarray(task.space.scale)
+    result = {
+        name: {
+            "per_second": round(float(np.median(values)), 2),
+            "range": [round(min(values), 2), round(max(values), 2)],
+            "largest_difference_steps": float(np.abs((others[name] - first) / steps).max()),
+        }
+        for name, values in rates.items()
+    }
+    print(json.dumps(result, indent=1), flush=True)
+    return result
+
+
+PARTS = {"coverage": coverage, "throughput": throughput}
 
 
 def main() -> None:
