@@ -187,13 +187,15 @@ def identify_observed(task: ObservedTask) -> Identification:
     # Once more with the weights of a nearly right arm. Far from the solution a robust loss would see nothing but bad
     # poses, so it begins where least squares ends, and one with several minima where Huber's, which has one, ends.
     losses = [None, None] if task.loss is None else [None, Loss("huber"), task.loss, task.loss]
-    for loss in losses:
+    for number, loss in enumerate(losses, 1):
         whitening = _whitening(task, state)
         args = (space, task.observed, whitening, loss)
         functions = observed_rows, observed_model
         found = fit(*functions, z, args, sides, steps, task.max_steps, differentiable=task.differentiable)
         z, evaluations = found.parameters, evaluations + found.steps
-        state = _state(task, space, z, None)
+        # Where the noise is given, only the last scatter matters, and its iteration costs as much as a few steps.
+        known = task.noise is not None and number < len(losses)
+        state = _state(task, space, z, _scatter(task, space, z) if known else None)
     assert found is not None
     whitening = _whitening(task, state)
     reduced = Bounds(space, *(side[:p] for side in sides))

@@ -4,6 +4,7 @@ One compiled program for each form of a capture solves as many problems as there
 the size of the batch, fixes the arithmetic.
 """
 
+import math
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -28,7 +29,9 @@ from .observed import NO_ANCHOR, ObservedTask, check_observed, configurations, i
 from .results import ManyIdentifications
 from .scale_anchor import ScaleAnchor, scale_anchor
 
-_SLOTS_CPU, _SLOTS_ELSEWHERE = 32, 1024
+# Of one program. On a CPU the derivatives of all slots should fit the second-level cache.
+_SLOTS_CPU, _POSES_IN_CACHE = 32, 2000
+_SLOTS_ELSEWHERE = 1024
 
 
 class _Form(NamedTuple):
@@ -80,7 +83,7 @@ def solve_observed(
         batched=axes,
     )
     devices = devices_of(options.devices)
-    slots = options.slots or (_SLOTS_CPU if devices[0].platform == "cpu" else _SLOTS_ELSEWHERE)
+    slots = options.slots or _default_slots(devices[0].platform, len(form.pose))
 
     def run(chunk: range, device: Any) -> dict[str, np.ndarray]:
         rows = np.full(slots, chunk.start)
@@ -100,6 +103,12 @@ def solve_observed(
         anchor=anchor,
         **fields,
     )
+
+
+def _default_slots(platform: str, poses: int) -> int:
+    if platform != "cpu":
+        return _SLOTS_ELSEWHERE
+    return min(_SLOTS_CPU, 2 ** max(round(math.log2(_POSES_IN_CACHE / poses)), 0))
 
 
 def _selected(given: tuple[Any, ...], axes: tuple[Any, ...], rows: Any) -> tuple[Any, ...]:
