@@ -4,11 +4,7 @@ The batch is cut into chunks, which are distributed over devices and cores; `bat
 """
 
 import math
-import os
-import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from queue import Empty, SimpleQueue
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -16,17 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arguments import check_finite, checked_arguments, items_of, shown, with_options
+from ..core.arguments import check_finite, checked_arguments, shown, with_options
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
-from ..data.capture import Capture, check_sockets_only
+from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import check_joints
+from ..model.robust import LossName
 from ..solver.reason import reasons
 from .batch_kernel import Problems, Shape, solve_chunk
 from .checks import based_on, check_enough
+from .chunks import cut_into_chunks, default_workers, devices_of, round_up, run_chunks
+from .observed_batch import solve_observed
 from .results import ManyCalibrations, ManyIdentifications
 from .scale_anchor import ScaleAnchor, scale_anchor
 from .second_stage import divide_by_k, fix_scale_many, select_problems
@@ -35,7 +34,6 @@ from .second_stage import divide_by_k, fix_scale_many, select_problems
 # 7,000 poses: five times slower where they do not); a GPU needs thousands.
 _SLOTS_CPU, _POSES_IN_CACHE = 16, 2000
 _SLOTS_ELSEWHERE = 4096
-_ROUNDS = 64  # problems that a slot of one chunk takes at most, one after the other
 
 
 class BatchOptions(NamedTuple):
@@ -49,6 +47,8 @@ class BatchOptions(NamedTuple):
     slots: int | None = None
     devices: Sequence[Any] | None = None
     workers: int | None = None
+    robust: LossName | None = None
+    covariance: bool = False
 
 
 @checked_arguments
@@ -80,6 +80,9 @@ def identify_many(
         slots: Problems in work at the same time in one call.
         devices: The devices to use; by default all.
         workers: Threads; by default one for each device or, on a CPU, for each core.
+        robust: A robust loss, as in `identify`.
+        covariance: Whether the covariances of the parameters are computed too: of captures with observations besides
+            sockets, and of robust or joint solves.
 
     Returns:
         Parameters, metrics and reasons, problem by problem.
@@ -87,7 +90,15 @@ def identify_many(
     Raises:
         InputError: For shapes that do not fit, a lower bound above its upper one, and too few poses.
     """
-    return _batch_task("identify", arm, capture, lower, upper, start, BatchOptions(**options)).identify()
+    given = BatchOptions(**options)
+    if capture.observations or given.robust is not None:
+        return _solve_observed("identify", arm, capture, lower, upper, start, given)
+    if given.covariance:
+        raise InputError(
+            "covariances of many identifications from sockets alone are not computed; use jax.vmap of identify, or "
+            "calibrate_many with method='joint'."
+        )
+    return _batch_task("identify", arm, capture, lower, upper, start, given).identify()
 
 
 @checked_arguments
@@ -99,29 +110,44 @@ def calibrate_many(
     upper: Numbers | None = None,
     start: Numbers | None = None,
     *,
-    method: Literal["two-stage", "joint"] = "two-stage",
+    method: Literal["two-stage", "joint"] | None = None,
     **options: Any,
 ) -> ManyCalibrations:
     """Both stages for a batch: what `calibrate` does, problem by problem, fast.
 
     Args:
         arm: As for `identify_many`, like all arguments that are not named here.
-        capture: Readings and at least one reference length.
-        method: "two-stage" or "joint", as in `calibrate`.
+        capture: Readings and at least one reference length, or another observation that fixes the scale.
+        method: "two-stage" or "joint", as in `calibrate`; with ``covariance`` it is joint.
 
     Returns:
         Parameters, scale, metrics and reasons, problem by problem.
 
     Raises:
-        InputError: As `identify_many`, and where the capture holds no reference length.
+        InputError: As `identify_many`, and where nothing fixes the scale.
     """
+    given = BatchOptions(**options)
+    general = bool(capture.observations) or given.robust is not None or given.covariance
+    method = ("joint" if general else "two-stage") if method is None else method
     if not isinstance(method, str) or method not in ("two-stage", "joint"):
         raise InputError(f"method is {shown(method)}; it must be 'two-stage' or 'joint'.")
-    if not capture.lengths:
+    if method == "two-stage" and general:
+        raise InputError(
+            "method='two-stage' is for sockets and reference lengths, without a robust loss and covariances; use "
+            "method='joint'."
+        )
+    if not capture.lengths and not any(observation.fixes_scale for observation in capture.observations):
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many."
         )
-    return _batch_task("calibrate", arm, capture, lower, upper, start, BatchOptions(**options)).calibrate(method)
+    if general:
+        found = _solve_observed("calibrate", arm, capture, lower, upper, start, given._replace(hold=None))
+        fields = {name: getattr(found, name) for name in _SHARED}
+        return ManyCalibrations(k=None, stage1=found, method="joint", **fields)
+    return _batch_task("calibrate", arm, capture, lower, upper, start, given).calibrate(method)
+
+
+_SHARED = ("parameters", "de", "deltam", "steps", "result", "active", "covariance", "reduced_chi")
 
 
 def _batch_task(
@@ -134,8 +160,38 @@ def _batch_task(
     options: BatchOptions,
 ) -> "BatchTask":
     """The task that a user's arguments state; ``single`` is the function that solves one problem."""
+    bounds, space = _checked_box(single, arm, capture, lower, upper, start, options)
+    return BatchTask.of(arm, capture, bounds, start, space, options)
+
+
+def _solve_observed(
+    single: str,
+    arm: Arm,
+    capture: Capture,
+    lower: Bounds | Numbers,
+    upper: Numbers | None,
+    start: Numbers | None,
+    options: BatchOptions,
+) -> ManyIdentifications:
+    """The same for captures with observations."""
+    bounds, space = _checked_box(single, arm, capture, lower, upper, start, options)
+    problems, _, size = _lay_out(arm, capture, bounds, start, space, None)
+    _check_options(arm, options)
+    given = problems.start, problems.lower, problems.upper
+    return solve_observed(arm, capture, given, size, space, options)
+
+
+def _checked_box(
+    single: str,
+    arm: Arm,
+    capture: Capture,
+    lower: Bounds | Numbers,
+    upper: Numbers | None,
+    start: Numbers | None,
+    options: BatchOptions,
+) -> tuple[tuple[Numbers, Numbers], Parameters]:
+    """Lower and upper bounds, and the free parameters."""
     # A batch is distributed over threads by its values, so that it cannot be traced.
-    check_sockets_only(capture, "a batch")
     if not is_concrete(*jax.tree.leaves((arm, capture, lower, upper, start))):
         raise InputError(
             f"{single}_many needs known values, but is called inside jit, vmap or a derivative; call it outside, "
@@ -153,7 +209,18 @@ def _batch_task(
         raise InputError("lower bounds are given without upper ones; give both, or Bounds, which hold both.")
     else:
         bounds, space = (lower, upper), Parameters.free_of(arm) if options.space is None else options.space
-    return BatchTask.of(arm, capture, bounds, start, space, options)
+    return bounds, space
+
+
+def _check_options(arm: Arm, options: BatchOptions) -> None:
+    """Refuse options that mean nothing."""
+    if options.noise is not None:
+        check_finite(noise=options.noise)
+        options.noise.check(arm.joints)
+    for what in ("max_steps", "chunk", "slots", "workers"):
+        number = getattr(options, what)
+        if number is not None and number < 1:
+            raise InputError(f"{what} is {number}; give at least 1, or leave it out.")
 
 
 class BatchTask(NamedTuple):
@@ -188,20 +255,12 @@ class BatchTask(NamedTuple):
         problems, batched, size = _lay_out(arm, capture, bounds, start, space, sigma)
         anchor = scale_anchor(space, arm, options.hold, options.noise) if anchor is None else anchor
         check_joints(capture, space)
-        if options.noise is not None:
-            check_finite(noise=options.noise)
-            options.noise.check(arm.joints)
+        _check_options(arm, options)
         check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
-        for what in ("max_steps", "chunk", "slots", "workers"):
-            number = getattr(options, what)
-            if number is not None and number < 1:
-                raise InputError(f"{what} is {number}; give at least 1, or leave it out.")
-        devices = jax.local_devices() if options.devices is None else items_of(options.devices, "devices")
-        if not devices:
-            raise InputError("devices is empty; name at least one, or leave it out.")
+        devices = devices_of(options.devices)
         slots = options.slots or _default_slots(devices, sum(capture.sizes))
-        workers = options.workers or _default_workers(devices)
-        chunks = _cut_into_chunks(size, slots, workers, options.chunk)
+        workers = options.workers or default_workers(devices)
+        chunks = cut_into_chunks(size, slots, workers, options.chunk)
         shape = Shape(
             sizes=capture.sizes,
             ends=tuple((int(a), int(b)) for a, b in capture.ends()),
@@ -212,13 +271,13 @@ class BatchTask(NamedTuple):
             slots=slots,
             max_steps=options.max_steps,
         )
-        capacity = _round_up(max(map(len, chunks)), slots)
+        capacity = round_up(max(map(len, chunks)), slots)
         space = based_on(space, arm)
         return cls(arm, capture, problems, shape, chunks, capacity, devices, workers, space, anchor, options)
 
     def identify(self) -> ManyIdentifications:
         """Stage 1 of all problems."""
-        found = _run_chunks(self.run, self.chunks, self.devices, self.workers)
+        found = run_chunks(self.run, self.chunks, self.devices, self.workers)
         parameters, de, deltam, sigma, k, steps, reason, active = (
             np.concatenate(column) for column in zip(*found, strict=True)
         )
@@ -293,59 +352,6 @@ def _default_slots(devices: Sequence[Any], poses: int) -> int:
     if devices[0].platform != "cpu":
         return _SLOTS_ELSEWHERE
     return min(_SLOTS_CPU, 2 ** max(round(math.log2(_POSES_IN_CACHE / poses)), 0))
-
-
-def _default_workers(devices: Sequence[Any]) -> int:
-    """Chunks in work at the same time: one for each device; on a CPU, one for each core."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return len(devices) if devices[0].platform != "cpu" else max(len(devices), cores)
-
-
-def _cut_into_chunks(size: int, slots: int, workers: int, chunk: int | None) -> list[range]:
-    """The batch in chunks: of the given size, or as few as keep all workers busy, since slots idle at the end of
-    each."""
-    if chunk is None:
-        rounds = -(-size // (slots * _ROUNDS))
-        calls = min(-(-rounds // workers) * workers, -(-size // slots))
-        chunk = -(-size // calls)
-    return [range(first, min(first + chunk, size)) for first in range(0, size, chunk)]
-
-
-def _round_up(count: int, slots: int) -> int:
-    """Whole rounds of the slots, their number a power of two: each size is compiled once, so there should be few."""
-    return slots * 2 ** math.ceil(math.log2(-(-count // slots)))
-
-
-def _run_chunks(run: Callable, chunks: Sequence[range], devices: Sequence[Any], workers: int) -> list:
-    """Results of all chunks in their order, computed by threads: XLA releases the interpreter's lock while it computes.
-
-    The calling thread is one of the workers, since a new one takes a millisecond to start. A worker keeps its device.
-    """
-    # A queue and not a shared iterator, which two threads may advance at once where Python runs without its lock.
-    numbers: SimpleQueue[int] = SimpleQueue()
-    for i in range(len(chunks)):
-        numbers.put(i)
-    failed = threading.Event()
-    results: list[Any] = [None] * len(chunks)
-
-    def work(worker: int) -> None:
-        while not failed.is_set():
-            try:
-                i = numbers.get_nowait()
-            except Empty:
-                return
-            try:
-                results[i] = run(chunks[i], devices[worker % len(devices)])
-            except BaseException:
-                failed.set()
-                raise
-
-    with ThreadPoolExecutor(workers) as pool:
-        others = [pool.submit(work, worker) for worker in range(1, min(workers, len(chunks)))]
-        work(0)
-        for other in others:
-            other.result()
-    return results
 
 
 def _lay_out(

@@ -16,7 +16,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.chain import forward_pass
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import check_joints
-from ..model.metrics import Repeatability, repeatability
+from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Linear, Observed, Whitening, linear_rows, observed_model, observed_rows, whitening_of
 from ..model.robust import LOSSES, Loss, LossName
 from ..uncertainty import observed_covariance as propagation
@@ -26,7 +26,7 @@ from .results import Identification, ObservedMetrics
 from .scale_anchor import ScaleAnchor, scale_anchor
 from .task import fit
 
-_NO_ANCHOR = ScaleAnchor(hold=None, adjusted=None, set_by=(), partners=None)
+NO_ANCHOR = ScaleAnchor(hold=None, adjusted=None, set_by=(), partners=None)
 _LEAST = 1e-4  # smallest standard uncertainty of what is certified, of a tip coordinate's standard deviation
 
 
@@ -42,6 +42,7 @@ class ObservedTask(NamedTuple):
     max_steps: int
     loss: Loss | None
     pose: tuple[int, ...]  # number of the configuration of each row; equal ones were read at once
+    differentiable: bool = True  # whether derivatives pass through the solve
 
 
 class State(NamedTuple):
@@ -76,7 +77,7 @@ def observed_task(
     fixed = bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
     if fixed and hold == "longest":
         hold = None
-    anchor = scale_anchor(space, space.base, hold, noise) if not fixed or hold else _NO_ANCHOR
+    anchor = scale_anchor(space, space.base, hold, noise) if not fixed or hold else NO_ANCHOR
     noise_model = check_noise_model(noise_model, noise, arm.joints)
     if is_concrete(*jax.tree.leaves((arm, capture, vector))):
         known, at = to_numpy((space, vector))
@@ -91,11 +92,11 @@ def observed_task(
         noise_model=noise_model,
         max_steps=max_steps,
         loss=None if robust is None else Loss(robust),
-        pose=_configurations(observed.q),
+        pose=configurations(observed.q),
     )
 
 
-def _configurations(q: Any) -> tuple[int, ...]:
+def configurations(q: Any) -> tuple[int, ...]:
     """A number for each different configuration; different ones where the readings are traced."""
     if not is_concrete(q):
         return tuple(range(q.shape[0]))
@@ -110,7 +111,7 @@ def check_observed(capture: Capture, space: Parameters, vector: Float[AnyArray, 
     for observation, rows in zip(observed.observations, observed.slices, strict=True):
         observation.check_determined(np.asarray(forward.tip[:, rows]))
     _check_targets(observed, forward)
-    equations = _equations(observed)
+    equations = observed.equations
     unknowns = count + len(observed.steps)
     if equations < unknowns:
         raise InputError(
@@ -139,18 +140,13 @@ def _check_targets(observed: Observed, forward: Any) -> None:
             )
 
 
-def _equations(observed: Observed) -> int:
-    rows = sum(observation.rows * observation.q.shape[0] for observation in observed.observations)
-    return rows + len(observed.ends) + sum(len(value) for value, _ in observed.certified().values())
-
-
 def _state(task: ObservedTask, space: Parameters, z: Float[AnyArray, " z"], sigma: Any) -> State:
     linear = linear_rows(space, task.observed, z)
     p = len(space.names)
     forward = task.observed.forward(space, z[:p], z[p:])
     errors = propagation.arm_errors(forward, linear, task.observed)
     if sigma is None:
-        freedom = max(_equations(task.observed) - z.shape[0], 1)
+        freedom = max(task.observed.equations - z.shape[0], 1)
         scatter = propagation.scatter_of if task.loss is None else propagation.robust_scatter_of
         sigma = scatter(linear, errors, freedom)
     return State(linear, errors, sigma)
@@ -191,12 +187,15 @@ def identify_observed(task: ObservedTask) -> Identification:
     # Once more with the weights of a nearly right arm. Far from the solution a robust loss would see nothing but bad
     # poses, so it begins where least squares ends, and one with several minima where Huber's, which has one, ends.
     losses = [None, None] if task.loss is None else [None, Loss("huber"), task.loss, task.loss]
-    for loss in losses:
+    for number, loss in enumerate(losses, 1):
         whitening = _whitening(task, state)
         args = (space, task.observed, whitening, loss)
-        found = fit(observed_rows, observed_model, z, args, sides, steps, task.max_steps)
+        functions = observed_rows, observed_model
+        found = fit(*functions, z, args, sides, steps, task.max_steps, differentiable=task.differentiable)
         z, evaluations = found.parameters, evaluations + found.steps
-        state = _state(task, space, z, None)
+        # Where the noise is given, only the last scatter matters, and its iteration costs as much as a few steps.
+        known = task.noise is not None and number < len(losses)
+        state = _state(task, space, z, _scatter(task, space, z) if known else None)
     assert found is not None
     whitening = _whitening(task, state)
     reduced = Bounds(space, *(side[:p] for side in sides))
@@ -224,7 +223,7 @@ def identify_observed(task: ObservedTask) -> Identification:
         noise_model=task.noise_model,
         degrees_of_freedom=float("inf")
         if task.noise_model == "given"
-        else max(float(_equations(task.observed) - p - count), 1.0),
+        else max(float(task.observed.equations - p - count), 1.0),
         observed=metrics[2],
     )
 
@@ -322,7 +321,7 @@ def _metrics(
         weights.append(xp.ones(white.shape[1]) if task.loss is None else task.loss.cost_and_weight(white)[1])
     for state in (before, after):
         rms.append(xp.stack([xp.sqrt(xp.mean(xp.sum(part.rows.values[:3] ** 2, axis=0))) for part in state.linear]))
-    freedom = max(_equations(observed) - len(observed.steps) - len(task.bounds.space.names), 1)
+    freedom = max(observed.equations - len(observed.steps) - len(task.bounds.space.names), 1)
     metrics = ObservedMetrics(
         names=tuple(observation.name for observation in observed.observations),
         kinds=tuple(observation.kind for observation in observed.observations),
@@ -340,12 +339,9 @@ def _metrics(
 
 def _repeatability(state: State, sockets: list[int]) -> Repeatability:
     """Of the tips in sockets; NaN where there is none."""
-    xp = namespace(state.sigma)
     if not sockets:
-        none = xp.asarray(np.nan)
-        empty = xp.zeros(0)
-        return Repeatability(none, none, none, empty, empty, empty, xp.zeros((0, 3)), state.sigma)
+        return no_repeatability(state.sigma)
     # Distances from the centroid do not depend on where the socket is, so residuals do as well as tips.
-    tips = xp.concatenate([state.linear[i].rows.values for i in sockets], axis=1)
+    tips = namespace(state.sigma).concatenate([state.linear[i].rows.values for i in sockets], axis=1)
     found = repeatability(tips.T, tuple(state.linear[i].rows.values.shape[1] for i in sockets))
     return eqx.tree_at(lambda r: r.sigma, found, state.sigma)

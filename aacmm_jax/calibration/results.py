@@ -221,6 +221,14 @@ class AbstractManyResults(AbstractResult):
     """What `ManyIdentifications` and `ManyCalibrations` have in common."""
 
     parameters: eqx.AbstractVar[Float[np.ndarray, "b p"]]
+    covariance: eqx.AbstractVar[Float[np.ndarray, "b p p"] | None]
+
+    @property
+    def u(self) -> Float[np.ndarray, "b p"]:
+        """Standard uncertainties of the parameters, mm and rad. Raises `InputError` where they were not computed."""
+        if self.covariance is None:
+            raise InputError("the batch was solved without covariances; solve it with covariance=True.")
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     @property
     def arm(self) -> Arm:
@@ -247,6 +255,8 @@ class ManyIdentifications(AbstractManyResults):
     active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, 0 inside or fixed
     bounds: Bounds  # with a batch axis where bounds or arms were given as a batch
     anchor: ScaleAnchor = eqx.field(static=True)  # what sets the scale
+    covariance: Float[np.ndarray, "b p p"] | None = None  # where it was asked for
+    reduced_chi: Float[np.ndarray, " b"] | None = None  # of all observations, where there are any but sockets
 
     @property
     def _stage1(self) -> "ManyIdentifications":
@@ -260,7 +270,7 @@ class ManyCalibrations(AbstractManyResults):
     """
 
     parameters: Float[np.ndarray, "b p"]
-    k: Float[np.ndarray, " b"]  # of stage 1
+    k: Float[np.ndarray, " b"] | None  # of stage 1; None where observations fix the scale
     de: Float[np.ndarray, " b"]  # mm
     deltam: Float[np.ndarray, " b"]  # mm
     steps: Int[np.ndarray, " b"]  # evaluations of all solves
@@ -268,6 +278,8 @@ class ManyCalibrations(AbstractManyResults):
     active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, in the last solve
     stage1: ManyIdentifications
     method: str = eqx.field(static=True)
+    covariance: Float[np.ndarray, "b p p"] | None = None  # where it was asked for
+    reduced_chi: Float[np.ndarray, " b"] | None = None  # of all observations, where there are any but sockets
 
     @property
     def _stage1(self) -> ManyIdentifications:
@@ -296,12 +308,12 @@ def active_names(space: Parameters, active: Numbers) -> dict[str, str]:
 
 
 class LeftOut(NamedTuple):
-    """One group of sockets that an arm was not identified from; mm. Predictions are infinite where the other groups
-    leave a direction open that matters."""
+    """One group of sockets and observations that an arm was not identified from; mm. Predictions are infinite where the
+    other groups leave a direction open that matters."""
 
-    sockets: tuple[str, ...]
+    sockets: tuple[str, ...]  # names, also of observations
     poses: int  # in sockets with more than one
-    rms: float  # distance from the socket's centroid, found
+    rms: float  # distance from the socket's centroid or the fitted geometry, found
     rms_predicted: float  # root of the mean square that the uncertainty predicts
     length_error: Float[np.ndarray, " l"]
     length_u: Float[np.ndarray, " l"]  # standard uncertainty of that error, predicted

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from ..core.arguments import checked_arguments
 from ..core.arrays import Numbers, random_generator
 from ..core.errors import InputError
-from ..data.capture import Capture
+from ..data.capture import Capture, check_sockets_only
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.inverse_kinematics import project_to_centroids
@@ -262,6 +262,7 @@ class _RepeatedTask(NamedTuple):
     def of(
         cls, result: Calibration, capture: Capture, lengths: tuple[np.ndarray, np.ndarray] | None
     ) -> "_RepeatedTask":
+        check_sockets_only(capture, "resampling")
         if lengths is not None and (
             not isinstance(lengths, tuple | list)
             or len(lengths) != 2
@@ -293,6 +294,7 @@ class _RepeatedTask(NamedTuple):
         good = many.converged
         ends = (jnp.asarray(self.start), jnp.asarray(self.end))
         lengths = _lengths_of(Parameters(result.arm, result.space.names), jnp.asarray(many.parameters), ends)
+        assert many.k is not None  # stage 1 of sockets and lengths
         found = np.hstack([many.parameters, many.k[:, None], np.asarray(lengths)])
         return found[good], int(np.sum(~good))
 

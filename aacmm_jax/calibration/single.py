@@ -182,6 +182,8 @@ def calibrate(
         check_single(arm, capture, bounds, "calibrate_many")
         check_finite(arm=arm, capture=capture, noise=noise)
         task = observed_task(arm, capture, bounds, start, noise, None, noise_model, max_steps, robust)
+        if check_identifiability or strict:
+            _check_identifiable(capture, task, strict)
         return _as_calibration(task, identify_observed(to_numpy(task)))
     task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
     if hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
@@ -233,11 +235,12 @@ def _as_calibration(task: ObservedTask, found: Identification) -> Calibration:
     return to_jax(result)
 
 
-def _check_identifiable(capture: Capture, task: Task, strict: bool) -> None:
+def _check_identifiable(capture: Capture, task: Task | ObservedTask, strict: bool) -> None:
     """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; not of traced values."""
     if inside_trace() or not is_concrete(*jax.tree.leaves((capture, task.bounds))):
         return
-    sentences = observability(task.space.base, capture, task.space).sentences()
+    space = task.bounds.space
+    sentences = observability(space.base, capture, space).sentences()
     if sentences and strict:
         raise InputError(" ".join(sentences))
     for sentence in sentences:

@@ -54,10 +54,13 @@ def fit(
     bounds: tuple[Float[AnyArray, " p"], Float[AnyArray, " p"]],
     scale: Float[AnyArray, " p"],
     max_steps: int,
+    *,
+    differentiable: bool = True,
 ) -> Fit:
-    """A least squares within bounds: by Optimistix for arrays of JAX, step by step for NumPy's."""
+    """A least squares within bounds: by Optimistix for arrays of JAX, unless no derivative is needed; else by its bare
+    steps."""
     lower, upper = bounds
-    if namespace(start, args, bounds) is np:
+    if not differentiable or namespace(start, args, bounds) is np:
         last = minimise(normal, start, args, lower=lower, upper=upper, scale=scale, rules=RULES, max_steps=max_steps)
         return Fit(last.y, last.steps, reasons(last.reason), last.optimality)
     # Optimistix takes 0.2 s to import, and NumPy needs none of it.

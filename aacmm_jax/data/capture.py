@@ -2,7 +2,7 @@
 
 import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -361,9 +361,23 @@ def stack_captures(captures: Iterable[Capture]) -> Capture:
         raise InputError("there is no capture to stack; give at least one.")
     for capture in captures:
         check_one_capture(capture)
-    if len({(c.names, c.sizes, tuple((r.start, r.end) for r in c.lengths), c.joints) for c in captures}) != 1:
-        raise InputError("captures of a batch must have the same sockets, numbers of poses, joints and lengths.")
-    arrays = [(capture.q, capture.lengths) for capture in captures]
+    shapes = {
+        (c.names, c.sizes, tuple((r.start, r.end) for r in c.lengths), c.joints, _form(c.observations))
+        for c in captures
+    }
+    if len(shapes) != 1:
+        raise InputError(
+            "captures of a batch must have the same sockets, numbers of poses, joints, lengths and observations."
+        )
+    arrays = [(capture.q, capture.lengths, capture.observations) for capture in captures]
     return eqx.tree_at(
-        lambda c: (c.q, c.lengths), captures[0], jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrays)
+        lambda c: (c.q, c.lengths, c.observations),
+        captures[0],
+        jax.tree.map(lambda *leaves: np.stack(leaves) if is_concrete(*leaves) else jnp.stack(leaves), *arrays),
     )
+
+
+def _form(observations: tuple[AbstractObservation, ...]) -> tuple[Any, ...]:
+    """What observations must share to be stacked."""
+    leaves, structure = jax.tree.flatten(observations)
+    return structure, tuple(leaf.shape for leaf in leaves)

@@ -75,7 +75,7 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
     return arm, taken
 
 
-def tip_movements(poses: Float[np.ndarray, "N 3 p"], lengths: Float[np.ndarray, "l p"]) -> Float[np.ndarray, "r p"]:
+def tip_movements(poses: Float[np.ndarray, "N r p"], lengths: Float[np.ndarray, "l p"]) -> Float[np.ndarray, "m p"]:
     """`equations` as rows whose sum of squares is the mean square over the poses plus that over the lengths."""
     return np.concatenate(
         [poses.reshape(-1, poses.shape[-1]) / math.sqrt(len(poses)), lengths / math.sqrt(max(len(lengths), 1))]

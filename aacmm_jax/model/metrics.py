@@ -76,6 +76,13 @@ def repeatability(tips: Float[AnyArray, "N 3"], sizes: Sequence[int], *, fitted:
     )
 
 
+def no_repeatability(sigma: Float[AnyArray, ""]) -> Repeatability:
+    """Of a capture without sockets: NaN, but for the standard deviation of a tip coordinate, mm."""
+    xp = namespace(sigma)
+    none, empty = xp.asarray(np.nan), xp.zeros(0)
+    return Repeatability(none, none, none, empty, empty, empty, xp.zeros((0, 3)), sigma)
+
+
 def pose_outliers(
     distances: Float[np.ndarray, " N"], sizes: Sequence[int]
 ) -> tuple[Int[np.ndarray, " outliers"], float]:

@@ -85,6 +85,12 @@ class Observed(eqx.Module):
             slice(end - observation.q.shape[0], end) for observation, end in zip(self.observations, ends, strict=True)
         ]
 
+    @property
+    def equations(self) -> int:
+        """Number of rows of `observed_rows`."""
+        rows = sum(observation.rows * observation.q.shape[0] for observation in self.observations)
+        return rows + len(self.ends) + sum(len(value) for value, _ in self.certified().values())
+
     def split(self, geometry: Float[AnyArray, " g"]) -> dict[str, Float[AnyArray, " k"]]:
         """The numbers of each part."""
         return {name: geometry[rows[0] : rows[-1] + 1] for name, rows in self.positions.items()}
@@ -160,13 +166,13 @@ def linear_rows(space: Parameters, observed: Observed, z: Float[AnyArray, " z"])
         blocks, indices = [], [np.arange(p)]
         if observation.target:
             mine = xp.where(own_probe[:, None, None], 0.0, mine)
-        by_parameters = xp.einsum("rcm,kcm->krm", residual.by_tip, mine)
+        by_parameters = _times(residual.by_tip, mine)
         if residual.by_rotation is not None:
             turned = rotation_columns(forward, space.indices()) if turned is None else turned
-            by_parameters = by_parameters + xp.einsum("rcm,kcm->krm", residual.by_rotation, turned[..., rows])
+            by_parameters = by_parameters + _times(residual.by_rotation, turned[..., rows])
         if observation.target:
             axes = xp.stack([axis[:, rows] for axis in forward.frame])
-            blocks.append(xp.einsum("rcm,kcm->krm", residual.by_tip, axes))
+            blocks.append(_times(residual.by_tip, axes))
             indices.append(p + positions[offset_of(observation.target)])
         for name, derivative in residual.by_unknowns.items():
             blocks.append(derivative)
@@ -212,6 +218,23 @@ def _vectors(observed: Observed, parts: dict[str, AnyArray]) -> Float[AnyArray, 
     return xp.stack([parts[end] - parts[start] for start, end in observed.ends])
 
 
+def certified_and_lengths(
+    observed: Observed, z: Float[AnyArray, " z"], p: int
+) -> tuple[Float[np.ndarray, "l z"], Float[np.ndarray, " l"]]:
+    """Derivatives of reference lengths and of certified values by all unknowns, and their standard uncertainties."""
+    unit, positions = np.eye(len(z)), observed.positions
+    vectors = np.asarray(_vectors(observed, observed.split(z[p:])))
+    directions = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    rows, u = [np.zeros((0, len(z)))], [np.zeros(0)]
+    for (start, end), direction, own in zip(observed.ends, directions, np.asarray(observed.u), strict=True):
+        rows.append((direction @ (unit[p + positions[end]] - unit[p + positions[start]]))[None])
+        u.append(own[None])
+    for name, (_, own) in observed.certified().items():
+        rows.append(unit[p + positions[name]])
+        u.append(np.asarray(own))
+    return np.concatenate(rows), np.concatenate(u)
+
+
 def observed_model(
     z: Float[AnyArray, " z"], args: tuple[Parameters, Observed, Whitening, Loss | None]
 ) -> QuadraticModel:
@@ -251,9 +274,16 @@ def observed_model(
 def whitened(linear: Linear, root: Float[AnyArray, "m r r"]) -> tuple[Float[AnyArray, "r m"], Float[AnyArray, "k r m"]]:
     """An observation's residuals and derivatives in standard deviations."""
     xp = namespace(linear.jacobian, root)
-    if root.shape[-1] == 1:
-        return root[None, :, 0, 0] * linear.rows.values, root[None, None, :, 0, 0] * linear.jacobian
-    return xp.einsum("mab,bm->am", root, linear.rows.values), xp.einsum("mab,kbm->kam", root, linear.jacobian)
+    each = xp.moveaxis(root, 0, -1)
+    both = _times(each, xp.concatenate([linear.rows.values[None], linear.jacobian]))
+    return both[0], both[1:]
+
+
+def _times(matrices: Float[AnyArray, "r c m"], columns: Float[AnyArray, "k c m"]) -> Float[AnyArray, "k r m"]:
+    """One matrix a pose times its columns, written as sums: XLA computes many products of small matrices several times
+    as slowly."""
+    xp = namespace(matrices, columns)
+    return xp.stack([sum(row[c][None] * columns[:, c] for c in range(columns.shape[1])) for row in matrices], axis=1)
 
 
 def whitening_of(

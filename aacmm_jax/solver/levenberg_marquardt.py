@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.numpy_or_jax import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace, while_loop
 from .active_set import Box, Flat, Number, QuadraticModel, Step, choose, diagonal, norm, propose
 from .reason import GRADIENT, MAX_STEPS, NONFINITE, ROUNDING, RUNNING, STALLED, STEP
 
@@ -129,7 +129,7 @@ def minimise(
     rules: Rules,
     max_steps: int,
 ) -> Progress:
-    """The steps of `solver.least_squares` in NumPy, with nothing to compile; not differentiable.
+    """The steps of `solver.least_squares` in NumPy, with nothing to compile, or in JAX for a batch; not differentiable.
 
     Args:
         model: A function of (y, args): the `QuadraticModel`.
@@ -145,12 +145,13 @@ def minimise(
         The last state; its reason is the step limit where that was reached.
     """
     box = Box(lower, upper, scale)
-    progress = begin(start, box)
-    for _ in range(max_steps):
-        progress = advance(progress, model(progress.step.trial, args), box, rules)
-        if progress.reason != RUNNING:
-            return progress
-    return eqx.tree_at(lambda p: p.reason, progress, np.asarray(MAX_STEPS))
+    progress = while_loop(
+        lambda progress: (progress.reason == RUNNING) & (progress.steps < max_steps),
+        lambda progress: advance(progress, model(progress.step.trial, args), box, rules),
+        begin(start, box),
+    )
+    ended = namespace(progress).where(progress.reason == RUNNING, MAX_STEPS, progress.reason).astype(np.int32)
+    return eqx.tree_at(lambda p: p.reason, progress, ended)
 
 
 def _improves(progress: Progress, evaluated: QuadraticModel, trial_optimality: Number) -> Bool[AnyArray, "*slots"]:

@@ -68,10 +68,10 @@ def _identified(
     problem = (study.nominal.arm, capture, drawn.lower, drawn.upper, drawn.start)
     if setting.method == "stage1":
         many = stage1 = identify_many(*problem, **options)
-        k = np.full(len(many.de), np.nan) if many.k is None else many.k
     else:
         many = calibrate_many(*problem, method=setting.method, **options)  # pyright: ignore[reportArgumentType]
-        stage1, k = many.stage1, many.k
+        stage1 = many.stage1
+    k = np.full(len(many.de), np.nan) if many.k is None else many.k
     lengths = study.space.lengths
     # Scale of the arm: the factor that best maps the true lengths onto the identified ones. Rows are contiguous, so
     # that each is summed in the same order however many there are.

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..core.arguments import check_finite, checked_arguments
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
-from ..data.capture import Capture, ReferenceLength, check_one_capture, check_sockets_only
+from ..data.capture import Capture, ReferenceLength, check_one_capture
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, joint_limits, neighbouring_arm, with_arrays
 from ..kinematics.chain import sines_cosines
@@ -17,9 +17,11 @@ from ..kinematics.inverse_kinematics import project_to_centroids, project_to_tar
 from ..kinematics.near_degeneracy import TradeOff, trade_offs
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement, check_joints
+from ..model.observed import Observed
 from ..model.residuals import JointWeights
 from .covariance import linearised
 from .null_space import complement, named_directions, structural
+from .observed_identifiability import Agreeing
 
 _RANK = 1e-8  # singular values below this, of the largest, are zero
 _NAMED = 4
@@ -105,15 +107,15 @@ def observability(
     sigma: float | None = None,
     bounds: Bounds | None = None,
 ) -> Observability:
-    """What the poses and reference lengths of a capture determine of the free parameters.
+    """What the poses, reference lengths and other observations of a capture determine of the free parameters.
 
-    The poses are first moved to their socket's centroid by this arm, a few mm at most, so that the errors of an arm
-    that is not yet calibrated do not look like information. For near-degenerate directions see
-    `kinematics.near_degeneracy`.
+    The poses are first moved to their socket's centroid, or onto the geometry of their observation, by this arm, a few
+    mm at most, so that the errors of an arm that is not yet calibrated do not look like information. For
+    near-degenerate directions see `kinematics.near_degeneracy`.
 
     Args:
         arm: The arm, nominal or calibrated.
-        capture: Poses and reference lengths.
+        capture: Poses, reference lengths and other observations, whose unknown geometry is eliminated.
         space: The free parameters; by default those of ``bounds``, else those of `Parameters.free_of`.
         noise: Of readings and seat, if known: the equations are then weighted by it.
         sigma: Standard deviation of a tip coordinate, mm, such as that of the residuals; with ``noise`` it follows from
@@ -127,13 +129,13 @@ def observability(
     if space is None:
         space = Parameters.free_of(arm) if bounds is None else bounds.space
     check_one_capture(capture)
-    check_sockets_only(capture, "observability")
     check_finite(arm=arm, capture=capture, noise=noise)
     check_joints(capture, space)
     arm, capture, space, noise, bounds = to_numpy((arm, capture, space, noise, bounds))
     if noise is not None:
         noise.check(arm.joints)
-        covariances = tip_covariances(arm.geometry, sines_cosines(capture.q), noise)
+        q = np.concatenate([capture.q, *(observation.q for observation in capture.observations)])
+        covariances = tip_covariances(arm.geometry, sines_cosines(q), noise)
         sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
     # Fixed values are those of the arm, not of the space's base.
     base = with_arrays(arm, beta=np.zeros_like(arm.alpha)) if arm.beta is None and space.base.beta is not None else arm
@@ -148,9 +150,11 @@ def observability(
     rank, p = spectrum.rank, len(space.names)
     null, undetermined = named_directions(complement(spectrum.vectors[:rank], p), base, space)
     always = tuple(bool(x) for x in structural(null, base, space))
+    if spectrum.agreeing is not None:
+        undetermined = spectrum.agreeing.named(undetermined, null)
     return Observability(
         names=space.names,
-        poses=sum(capture.sizes),
+        poses=sum(capture.sizes) + sum(observation.q.shape[0] for observation in capture.observations),
         singular=spectrum.singular,
         condition=spectrum.condition,
         null=null,
@@ -163,15 +167,25 @@ def observability(
 
 
 class _Spectrum(NamedTuple):
-    poses: Float[np.ndarray, "N 3 p"]  # `equations` in natural steps
+    poses: Float[np.ndarray, "N r p"]  # `equations` in natural steps, or those of all observations
     lengths: Float[np.ndarray, "l p"]
     singular: Float[np.ndarray, " p"]
     vectors: Float[np.ndarray, "r p"]
     rank: int
     condition: float
+    agreeing: Agreeing | None = None  # where the capture has observations besides sockets
 
 
 def _spectrum(arm: Arm, targets_of: Arm, capture: Capture, space: Parameters, noise: Noise | None) -> _Spectrum:
+    if capture.observations:
+        observed = Observed.of(capture)
+        agreeing = Agreeing.of(observed, Parameters(arm, space.names))
+        plain = agreeing.eliminated()
+        rows = plain if noise is None else agreeing.eliminated(noise)
+        # Each pose has as many rows on average: only their number of poses counts.
+        poses = plain.poses * np.sqrt(len(plain.poses) / len(observed.q))
+        found = _decomposed(np.concatenate([rows.poses, rows.relations]), poses[:, None], plain.relations)
+        return found._replace(agreeing=agreeing)
     q = project_to_centroids(arm, capture, targets_of)
     poses, lengths = (part * np.asarray(space.scale) for part in equations(arm, capture, space.names, q))
     rows = np.concatenate([poses.reshape(-1, len(space.names)), lengths])
@@ -180,8 +194,15 @@ def _spectrum(arm: Arm, targets_of: Arm, capture: Capture, space: Parameters, no
         rows = np.asarray(
             whitened_equations(arm, Parameters(arm, space.names), Measurement.of(moved).weighted(arm.geometry, noise))
         )
+    return _decomposed(rows, poses, lengths)
+
+
+def _decomposed(
+    rows: Float[np.ndarray, "w p"], poses: Float[np.ndarray, "N r p"], lengths: Float[np.ndarray, "l p"]
+) -> _Spectrum:
+    p = rows.shape[1]
     _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
-    singular = np.concatenate([singular, np.zeros(len(space.names) - len(singular))])
+    singular = np.concatenate([singular, np.zeros(p - len(singular))])
     rank = int(np.sum(singular > _RANK * max(singular[0], 1e-300)))
     norms = np.linalg.norm(rows, axis=0)
     equal = np.linalg.svd(rows / np.where(norms > 0, norms, 1), compute_uv=False)[:rank]
@@ -194,22 +215,26 @@ def _trade_offs(
     movements = tip_movements(spectrum.poses, spectrum.lengths)
     if sigma is None or not sigma > 0:
         return trade_offs(movements, space.names)
-    # A measured length follows the means of the poses at its ends.
-    sizes = np.asarray(capture.sizes, dtype=float)
-    u = np.array([float(length.u) for length in capture.lengths])
-    u_lengths = np.sqrt(u**2 + sigma**2 * np.sum(1 / sizes[capture.ends()], axis=1)) if len(u) else u
-    whitened = np.concatenate(
-        [
-            spectrum.poses.reshape(-1, len(space.names)) / sigma,
-            spectrum.lengths / u_lengths[:, None],
-        ]
-    )
+    if spectrum.agreeing is not None:
+        rows = spectrum.agreeing.eliminated(sigma=sigma)
+        whitened = np.concatenate([rows.poses, rows.relations])
+    else:
+        whitened = _whitened_by_sigma(spectrum, capture, sigma)
     default = np.where(space.lengths, 10.0, 17.5)
     half = default
     if bounds is not None:
         half = np.asarray(bounds.upper - bounds.lower) / 2 / np.asarray(space.scale)
         half = np.where(np.isfinite(half), half, default)
     return trade_offs(movements, space.names, whitened=whitened, half_widths=half)
+
+
+def _whitened_by_sigma(spectrum: _Spectrum, capture: Capture, sigma: float) -> Float[np.ndarray, "w p"]:
+    # A measured length follows the means of the poses at its ends.
+    sizes = np.asarray(capture.sizes, dtype=float)
+    u = np.array([float(length.u) for length in capture.lengths])
+    u_lengths = np.sqrt(u**2 + sigma**2 * np.sum(1 / sizes[capture.ends()], axis=1)) if len(u) else u
+    poses = spectrum.poses.reshape(-1, spectrum.poses.shape[-1])
+    return np.concatenate([poses / sigma, spectrum.lengths / u_lengths[:, None]])
 
 
 def _lacks_beta(space: Parameters, i: int) -> bool:
@@ -239,8 +264,9 @@ def _remedy(arm: Arm, capture: Capture, space: Parameters, rank: int) -> str:
     }
     one = [ReferenceLength("\0000", "\0001", 1.0)]
     two = [*one, ReferenceLength("\0002", "\0003", 1.0)]
-    first = next(iter(capture.sockets))
-    more_poses = {f"\0 {first}": _other_configurations(arm, np.asarray(capture.sockets[first])[0], random)}
+    more_poses = {}
+    for first, readings in list(capture.sockets.items())[:1]:
+        more_poses = {f"\0 {first}": _other_configurations(arm, np.asarray(readings)[0], random)}
     length = "a second position of the reference length" if capture.lengths else "a reference length"
     for text, sockets, lengths in (
         (f"{length[0].upper()}{length[1:]} would determine them.", more_sockets, one),
@@ -248,7 +274,9 @@ def _remedy(arm: Arm, capture: Capture, space: Parameters, rank: int) -> str:
         ("More poses in a socket, as different as possible, would determine them.", more_poses, []),
         (f"More poses in a socket, and {length}, would determine them.", more_poses | more_sockets, one),
     ):
-        more = Capture({**capture.sockets, **sockets}, [*capture.lengths, *lengths])
+        if not sockets:
+            continue
+        more = Capture({**capture.sockets, **sockets}, [*capture.lengths, *lengths], capture.observations)
         if _spectrum(arm, arm, more, space, None).rank >= rank:
             return text
     return ""

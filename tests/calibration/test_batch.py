@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration import batch
+from aacmm_jax.calibration import batch, chunks
 from tests import published
 
 BATCH = 50
@@ -188,9 +188,9 @@ def test_no_more_chunks_in_work_than_workers_and_a_failure_stops_the_rest():
         return piece.start
 
     pieces = [range(i, i + 1) for i in range(20)]
-    assert batch._run_chunks(run, pieces[2:], ["one", "two"], 2) == list(range(2, 20))
+    assert chunks.run_chunks(run, pieces[2:], ["one", "two"], 2) == list(range(2, 20))
     assert most == 2
     ran.clear()
     with pytest.raises(RuntimeError, match="chunk 1"):
-        batch._run_chunks(run, pieces, ["one"], 1)
+        chunks.run_chunks(run, pieces, ["one"], 1)
     assert ran == [0, 1]

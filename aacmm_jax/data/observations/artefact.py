@@ -50,6 +50,7 @@ class Artefact(AbstractObservation):
     """
 
     kind: ClassVar[str] = "artefact"
+    by_pose: ClassVar[tuple[str, ...]] = ("q", "owner")
     rows: ClassVar[int] = 3
     q: Float[AnyArray, "m n"]
     coordinates: Float[AnyArray, "c 3"]

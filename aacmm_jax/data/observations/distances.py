@@ -43,6 +43,7 @@ class Distances(AbstractObservation):
     """
 
     kind: ClassVar[str] = "distances"
+    by_pose: ClassVar[tuple[str, ...]] = ("q", "values")
     rows: ClassVar[int] = 1
     q: Float[AnyArray, "m n"]
     values: Float[AnyArray, " m"]

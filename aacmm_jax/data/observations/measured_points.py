@@ -51,6 +51,7 @@ class MeasuredPoints(AbstractObservation):
     """
 
     kind: ClassVar[str] = "points"
+    by_pose: ClassVar[tuple[str, ...]] = ("q", "points", "covariance")
     rows: ClassVar[int] = 3
     q: Float[AnyArray, "m n"]
     points: Float[AnyArray, "m 3"]

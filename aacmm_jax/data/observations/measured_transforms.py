@@ -51,6 +51,7 @@ class MeasuredTransforms(AbstractObservation):
     """
 
     kind: ClassVar[str] = "transforms"
+    by_pose: ClassVar[tuple[str, ...]] = ("q", "points", "rotations", "covariance")
     rows: ClassVar[int] = 6
     q: Float[AnyArray, "m n"]
     points: Float[AnyArray, "m 3"]

@@ -7,7 +7,7 @@ calibration) is the same for all kinds.
 
 import abc
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -52,6 +52,7 @@ class AbstractObservation(eqx.Module):
     """
 
     kind: ClassVar[str]
+    by_pose: ClassVar[tuple[str, ...]] = ("q",)  # fields with one row a pose
     rows: eqx.AbstractClassVar[int]
     name: eqx.AbstractVar[str]
     target: eqx.AbstractVar[str]
@@ -95,6 +96,15 @@ class AbstractObservation(eqx.Module):
         changed = copy.copy(self)
         for field, value in {**names, "target": target}.items():
             object.__setattr__(changed, field, value)
+        return changed
+
+    def select(self, poses: Sequence[int] | np.ndarray) -> "AbstractObservation":
+        """The same observation with some of its poses, in their order."""
+        changed = copy.copy(self)
+        for field in self.by_pose:
+            values = getattr(self, field)
+            chosen = tuple(values[i] for i in poses) if isinstance(values, tuple) else values[np.asarray(poses)]
+            object.__setattr__(changed, field, chosen)
         return changed
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:

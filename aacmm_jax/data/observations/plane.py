@@ -96,6 +96,7 @@ class ParallelPlanes(AbstractObservation):
     """
 
     kind: ClassVar[str] = "parallel planes"
+    by_pose: ClassVar[tuple[str, ...]] = ("q", "second")
     rows: ClassVar[int] = 1
     q: Float[AnyArray, "m n"]
     distance: Float[AnyArray, ""]  # of the tip's centres, mm
@@ -103,7 +104,7 @@ class ParallelPlanes(AbstractObservation):
     form: Float[AnyArray, ""]
     name: str = eqx.field(static=True)
     target: str = eqx.field(static=True)
-    first: int = eqx.field(static=True)  # number of poses on the first plane
+    second: tuple[bool, ...] = eqx.field(static=True)  # whether a pose is on the second plane; these come last
     free: bool = eqx.field(static=True)  # whether the distance is an unknown with a certified value
 
     def __init__(
@@ -125,7 +126,7 @@ class ParallelPlanes(AbstractObservation):
         if sides[0].shape[1] != sides[1].shape[1]:
             raise InputError(f"{where} have {sides[0].shape[1]} and {sides[1].shape[1]} columns; give one a joint.")
         self.q = namespace(*sides).concatenate(sides)
-        self.first = sides[0].shape[0]
+        self.second = (False,) * sides[0].shape[0] + (True,) * sides[1].shape[0]
         ball = checked_scalar(f"stylus of {where}", stylus)
         between = checked_scalar(f"distance of {where}", distance, positive=True)
         self.distance = between - ball if inside else between + ball
@@ -138,6 +139,11 @@ class ParallelPlanes(AbstractObservation):
     def place(self) -> str:
         """Name of the first of the unknown planes."""
         return f"plane {self.name}"
+
+    @property
+    def first(self) -> int:
+        """Number of poses on the first plane."""
+        return self.second.count(False)
 
     @property
     def separation(self) -> str:
@@ -168,7 +174,7 @@ class ParallelPlanes(AbstractObservation):
         height, normal, by_plane = heights(tips.position, unknowns[self.place])
         m, k = self.q.shape[0], self.first
         xp = namespace(height, self.form)
-        other = np.arange(m) >= k
+        other = np.array(self.second)
         # The normal may point either way; which way the other plane is follows from the tips.
         side = xp.where(xp.mean(height[k:]) >= xp.mean(height[:k]), 1.0, -1.0) * xp.asarray(other.astype(float))
         distance = unknowns[self.separation][0] if self.free else self.distance

@@ -1,0 +1,94 @@
+"""What observations determine: ranks that follow from geometry, and the words for what is open."""
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.data import observations as kinds
+
+NOISE = aj.Noise(encoder_arcsec=2, seating=0.005)
+BOX = [[200, -300, 100], [600, 300, 500]]
+FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
+CORNER, SIDES = (200, -200, 100), [(300, 0, 0), (0, 400, 0)]
+CENTRES = [(300, 0, 300), (500, 200, 200), (300, -300, 150)]
+RIGID = {"d_1", "theta_1"}  # they move the whole arm
+LAST = {"a_6 and theta_6 trade off", "alpha_6 and d_6 trade off"}
+SCALE = "all lengths together: the scale"
+
+# Observations, the geometry that follows a motion of the whole arm, and whether they determine the scale.
+CASES = {
+    "points": ([kinds.SimulatedPoints("T", BOX, 60, FRAME, u=0.01)], "frame of T", True),
+    "certified spheres": (
+        [kinds.SimulatedSphere(f"s{i}", centre, 50.0, 25) for i, centre in enumerate(CENTRES)],
+        "centre of s0, centre of s1 and centre of s2",
+        True,
+    ),
+    "spheres": (
+        [kinds.SimulatedSphere(f"s{i}", centre, 50.0, 25, certified=False) for i, centre in enumerate(CENTRES)],
+        "centre of s0, centre of s1 and centre of s2",
+        False,
+    ),
+    "one plane": ([kinds.SimulatedPlanes("wall", CORNER, SIDES, 100)], "plane wall", False),
+    "parallel planes": (
+        [kinds.SimulatedPlanes("pair", CORNER, SIDES, 60, distance=150.0, u=0.001)],
+        "plane pair",
+        True,
+    ),
+    "distances": ([kinds.SimulatedDistances("d", BOX, 90, (900, 300, 100), u=0.003)], "pivot of d", True),
+}
+
+
+@pytest.mark.parametrize("noise", [None, NOISE], ids=["plain", "whitened"])
+@pytest.mark.parametrize("case", CASES)
+def test_what_a_kind_alone_determines(paper_arm, case, noise):
+    """Of 25 parameters four never; the scale only where a size is certified. The arm is 1 mm and 0.1 degrees off."""
+    simulated, geometry, has_scale = CASES[case]
+    true = aj.perturbed_arm(aj.Parameters.independent(paper_arm), length=1.0, angle=np.deg2rad(0.1), seed=1)
+    capture = aj.simulate(true, {}, observations=simulated, noise=NOISE, seed=3)
+    space = aj.Parameters.free_of(paper_arm, held=("probe_x", "probe_y"))
+    seen = aj.observability(paper_arm, capture, space, noise=noise)
+    joined = "," if " and " in geometry else " and"
+    rigid = {f"{name}{joined} {geometry} trade off" for name in RIGID}
+    assert set(seen.undetermined) == rigid | LAST | (set() if has_scale else {SCALE})
+    assert seen.rank == (21 if has_scale else 20)
+    structural = {text for text, never in zip(seen.undetermined, seen.structural, strict=True) if never}
+    assert structural == rigid | LAST
+    assert seen.remedy == ("" if has_scale else "A reference length would determine them.")
+    assert seen.poses == sum(observation.q.shape[0] for observation in capture.observations)
+
+
+def test_a_target_takes_the_place_of_the_probe(paper_arm):
+    simulated = kinds.SimulatedTransforms("T6", BOX, 40, (10, 20, 80, 0.1, 0.2, 0.3), FRAME, u=0.01, u_angle=1e-4)
+    space = aj.Parameters.independent(paper_arm)
+    true = aj.perturbed_arm(space, length=1.0, angle=np.deg2rad(0.1), seed=1)
+    capture = aj.simulate(true, {}, observations=[simulated], noise=NOISE, seed=3)
+    seen = aj.observability(paper_arm, capture, space)
+    assert set(seen.undetermined) == {
+        "d_6 and offset of T6 trade off",
+        "theta_6, orientation of T6 and offset of T6 trade off",
+        "probe_z (changes nothing that is measured)",
+    }
+
+
+def test_indices_agree_with_eliminated_sockets(paper_arm):
+    """A socket as an observation is a socket: the same spectrum by code of its own."""
+    points = {"A": (400, 200, 300), "B": (500, 300, 100), "C": (300, -300, 300)}
+    sockets = aj.simulate(paper_arm, points, poses=20, lengths=[("A", "B", 0.001)], noise=NOISE)
+    q = sockets.sockets
+    written = aj.Capture({name: q[name] for name in "AB"}, sockets.lengths, [kinds.Socket("C", q["C"])])
+    space = aj.Parameters.independent(paper_arm)
+    for noise in (None, NOISE):
+        one, other = (aj.observability(paper_arm, capture, space, noise=noise) for capture in (sockets, written))
+        # A length is one row of the sockets' centroids there, and follows their weighted positions here.
+        np.testing.assert_allclose(other.singular[:-1], one.singular[:-1], rtol=0.02)
+        assert other.rank == one.rank == len(space.names)
+
+
+def test_calibrate_warns_of_what_observations_leave_open(paper_arm):
+    simulated = kinds.SimulatedPoints("T", BOX, 60, FRAME, u=0.01)
+    capture = aj.simulate(paper_arm, {}, observations=[simulated], noise=NOISE, seed=3)
+    space = aj.Parameters.free_of(paper_arm, held=("d_1", "probe_x", "probe_y", "a_6", "alpha_6"))
+    with pytest.warns(aj.IdentifiabilityWarning, match="theta_1 and frame of T trade off"):
+        aj.calibrate(paper_arm, capture, aj.Bounds.around(paper_arm, space), noise=NOISE)
+    with pytest.raises(aj.InputError, match="theta_1 and frame of T trade off"):
+        aj.calibrate(paper_arm, capture, aj.Bounds.around(paper_arm, space), noise=NOISE, strict=True)
