@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
         pytest.param(("writes",), 36, marks=pytest.mark.slow),
         pytest.param(("kills",), 6, marks=pytest.mark.slow),
         pytest.param(("users",), 0, marks=pytest.mark.slow),
-        pytest.param(("flips", "texts", "calls"), 1000, marks=pytest.mark.slow),
+        pytest.param(("flips", "texts", "calls"), 300, marks=pytest.mark.slow),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, tuple) else str(value),
 )
