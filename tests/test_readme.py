@@ -32,13 +32,13 @@ def test_no_command_overwrites_an_earlier_result():
 
 
 def test_study_is_read(tmp_path):
-    (tmp_path / "study.toml").write_text(blocks("toml")[3])
+    (tmp_path / "study.toml").write_text(blocks("toml")[4])
     assert len(aj.study.read_study(tmp_path / "study.toml").cells) == 6
 
 
 def test_administrative_data_is_read(tmp_path):
     # The table of conformity is commented out, because few certificates have one.
-    uncommented = re.sub(r"^# (\[conformity\]|\w+ = )", r"\1", blocks("toml")[2], flags=re.MULTILINE)
+    uncommented = re.sub(r"^# (\[conformity\]|\w+ = )", r"\1", blocks("toml")[3], flags=re.MULTILINE)
     (tmp_path / "laboratory.toml").write_text(uncommented)
     data = aj.files.read_administrative_data(tmp_path / "laboratory.toml")
     # The example has every key.
@@ -56,6 +56,7 @@ def test_arm_file_is_read(tmp_path):
 
 def test_the_manifest_is_the_one_of_the_examples(mukca):
     assert blocks("toml")[0] == (mukca / "capture.toml").read_text()
+    assert blocks("toml")[2] == (mukca.parent / "ipa_ur10" / "positions.toml").read_text()
 
 
 @pytest.mark.parametrize("name", re.findall(r"`(cheng2018-\w+|panda|iiwa14)`", README))

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from ..calibration.checks import plausible
 from ..calibration.evaluation import evaluate
 from ..calibration.record import CalibrationRecord
 from ..calibration.second_stage import LARGEST_LOG_K
+from ..data.capture import check_sockets_only
 from ..data.recording import Recording
 from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry
@@ -107,11 +107,12 @@ def evaluation_of(
     Raises:
         InputError: A limit is impossible, or there is nothing to measure its metric on.
     """
-    known = {row.tobytes() for row in np.asarray(record.recording.capture.q)}
+    check_sockets_only(recording.capture, "an evaluation")
+    known = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
     sockets = {name: np.asarray(q) for name, q in recording.capture.sockets.items()}
     shared = {name: sum(row.tobytes() in known for row in q) for name, q in sockets.items()}
     warnings = []
-    if not record.converged or not plausible(record.k):
+    if not record.converged or not record.plausible_scale:
         reason = record.reason if not record.converged else f"k = {record.k:.6g} is not a plausible scale."
         warnings.append(f"The calibration failed, so the results mean nothing: {reason}")
     if recording.true is not None:

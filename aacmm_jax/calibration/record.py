@@ -3,20 +3,41 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from ..core.arguments import checked_arguments
+from ..core.errors import InputError
 from ..core.numpy_or_jax import to_jax
 from ..core.text import shorten
+from ..data.capture import Capture, check_sockets_only
 from ..data.noise import Noise
 from ..data.recording import Recording
+from ..kinematics.arm import Arm
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..solver.reason import SCALE, Reason, numbers_of
 from ..uncertainty.arm_uncertainty import Uncertainty
-from .checks import largest_plausible_residual
+from .checks import largest_plausible_residual, plausible
 from .evaluation import Evaluation, evaluate
-from .results import Calibration, CrossValidation, Identification
+from .results import Calibration, CrossValidation, Identification, ObservedMetrics
 from .second_stage import LARGEST_LOG_K
+
+REPEATABILITY = "repeatability"  # method of stage 1 alone
+
+
+class OtherPoses(NamedTuple):
+    """How the calibrated arm agrees with poses that it was not calibrated with; the geometry found is kept."""
+
+    names: tuple[str, ...]  # sockets and other observations
+    poses: np.ndarray
+    rms: np.ndarray  # mm
+    rms_angle: np.ndarray  # rad; NaN where no orientation was measured
+
+    @property
+    def rms_of_all(self) -> float:
+        """Over all of these poses, mm."""
+        known = np.isfinite(self.rms)
+        return float(np.sqrt(np.sum(self.poses[known] * self.rms[known] ** 2) / max(self.poses[known].sum(), 1)))
 
 
 class CalibrationRecord(NamedTuple):
@@ -50,11 +71,19 @@ class CalibrationRecord(NamedTuple):
     # Monte Carlo after JCGM 101: quantity, estimate, u, low, high, linear_u, agrees; and its summary in words.
     sampled: Mapping[str, np.ndarray] | None = None
     sampled_says: str | None = None
+    observed: ObservedMetrics | None = None  # where there are observations besides sockets, or a robust loss
+    robust: str | None = None  # the robust loss
+    others: OtherPoses | None = None
 
     @property
     def given_noise(self) -> Noise | None:
         """The noise, where it was given and not estimated."""
         return None if self.reduced_chi is None else self.noise
+
+    @property
+    def plausible_scale(self) -> bool:
+        """Whether k may be the scale of an arm, where reference lengths measured one."""
+        return bool(np.isnan(self.k)) or plausible(self.k)
 
     @property
     def fixed_by_one_length(self) -> bool:
@@ -71,7 +100,13 @@ class CalibrationRecord(NamedTuple):
     def implausible_residual(self) -> bool:
         """Whether the residual is a hundred times what an arm of this size can be, so that data and arm do not fit."""
         arm, capture = self.calibrated.arm, self.recording.capture
-        rms = float(evaluate(arm, capture).repeatability.rms)
+        if self.robust is not None and self.observed is not None:
+            rms = float(np.sqrt(3) * self.observed.sigma)  # bad poses do not count
+        elif self.observed is not None:
+            poses = [len(weights) for weights in self.observed.weights]
+            rms = float(np.sqrt(np.average(np.asarray(self.observed.rms_after) ** 2, weights=poses)))
+        else:
+            rms = float(evaluate(arm, capture).repeatability.rms)
         return rms > largest_plausible_residual(arm, self.given_noise)
 
     def vectors(self) -> dict[str, np.ndarray]:
@@ -88,18 +123,38 @@ class CalibrationRecord(NamedTuple):
         return {stage: evaluate(arm, self.recording.capture) for stage, arm in arms.items()}
 
 
+def check_document(record: CalibrationRecord, what: str) -> None:
+    """Raise `InputError` for a calibration that ``what``, a document on sockets, lengths and k, cannot be made of."""
+    check_sockets_only(record.recording.capture, what)
+    if np.isnan(record.k) or record.method == REPEATABILITY:
+        raise InputError(
+            f"{what} states the scale k that reference lengths gave, but this calibration used none (--robust, or "
+            "--scale nominal); see aacmm show."
+        )
+
+
 @checked_arguments
-def record_of(calibration: Calibration, recording: Recording) -> CalibrationRecord:
+def record_of(
+    calibration: Calibration | Identification,
+    recording: Recording,
+    *,
+    robust: str | None = None,
+    others: Capture | None = None,
+) -> CalibrationRecord:
     """The record of a calibration.
 
     Args:
-        calibration: what `calibrate` returned.
+        calibration: what `calibrate` returned, or `identify`: the scale is then that of the nominal arm.
         recording: the capture that it was identified from, and the nominal arm.
+        robust: the robust loss of the calibration.
+        others: poses that it was not identified from, on which it is tested.
 
     Returns:
         What a calibration file holds, as NumPy arrays.
     """
-    nominal, stage1 = recording.nominal, calibration.stage1
+    nominal = recording.nominal
+    single = isinstance(calibration, Identification)
+    stage1 = calibration if single else calibration.stage1
     return CalibrationRecord(
         recording=recording,
         stage1=nominal._replace(arm=stage1.arm, name=f"{nominal.name}, after stage 1"),
@@ -121,16 +176,31 @@ def record_of(calibration: Calibration, recording: Recording) -> CalibrationReco
         reduced_chi=None if stage1.reduced_chi is None else float(stage1.reduced_chi),
         k=np.nan if calibration.scale is None else float(calibration.scale.value),
         u_k=np.nan if calibration.scale is None else float(calibration.scale.u),
-        method=calibration.method,
+        method=REPEATABILITY if single else calibration.method,
         steps=int(calibration.steps),
         converged=bool(calibration.converged),
-        reason=_reason(calibration),
+        reason=_reason(calibration, stage1),
+        observed=None if stage1.observed is None else jax.tree.map(np.asarray, stage1.observed),
+        robust=robust,
+        others=None if others is None else _other_poses(calibration.arm, others, stage1.observed),
     )
 
 
-def _reason(calibration: Calibration) -> str:
+def _other_poses(arm: Arm, capture: Capture, observed: ObservedMetrics | None) -> OtherPoses:
+    """Of an arm, with the geometry found; what another observation alone determined is fitted."""
+    if observed is None or not capture.observations:
+        found = evaluate(arm, capture).repeatability
+        none = np.full(len(capture.names), np.nan)
+        return OtherPoses(capture.names, np.array(capture.sizes), np.asarray(found.socket_rms), none)
+    found = evaluate(arm, capture, geometry=observed.geometry).observed
+    assert found is not None
+    poses = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
+    return OtherPoses(found.names, np.array(poses), np.asarray(found.rms), np.asarray(found.rms_angle))
+
+
+def _reason(calibration: Calibration | Identification, stage1: Identification) -> str:
     """Why the calibration ended, in words; where bounds set the scale, with their names."""
-    result = calibration.result if bool(calibration.stage1.converged) else calibration.stage1.result
+    result = calibration.result if bool(stage1.converged) else stage1.result
     sides = [f"{name} ({side})" for name, side in calibration.active_names().items()]
     sentence = Reason[result]
     return f"{sentence.rstrip('.')}: {shorten(sides)}." if int(numbers_of(result)) == SCALE and sides else sentence
@@ -152,7 +222,7 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
             covariance=to_jax(result.covariance),
             open=to_jax(result.open),
             noise=result.noise,
-            u_k=to_jax(np.asarray(result.u_k)),
+            u_k=None if np.isnan(result.u_k) else to_jax(np.asarray(result.u_k)),
             names=result.names,
             degrees_of_freedom=result.degrees_of_freedom,
         )

@@ -5,10 +5,10 @@ import uuid
 from collections.abc import Sequence
 from xml.etree.ElementTree import Element
 
-from ..calibration.record import CalibrationRecord
+from ..calibration.record import CalibrationRecord, check_document
 from ..core.errors import InputError
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity, held_by_xml
-from ..summaries.warnings import of_calibration, plausible
+from ..summaries.warnings import of_calibration
 from .measurement_results import add_results, uncertainty_statement
 from .xml_elements import (
     DCC,
@@ -57,7 +57,8 @@ def dcc_xml(
         raise InputError(
             f"a calibration that failed has no certificate ({reason}); calibrate again until it converges."
         )
-    if not plausible(record.k):
+    check_document(record, "a certificate")
+    if not record.plausible_scale:
         raise InputError(
             f"k = {record.k:.6g} cannot be the scale of an arm, so there is no certificate; correct the lengths and "
             "calibrate again."

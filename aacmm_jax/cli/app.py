@@ -37,8 +37,6 @@ Without = Annotated[
     ),
 ]
 
-CaptureFile = Annotated[Path, typer.Argument(metavar="CAPTURE.h5", help="Capture, written by import or simulate.")]
-
 CaptureOutput = Annotated[Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Capture to write (HDF5).")]
 
 NominalArm = Annotated[

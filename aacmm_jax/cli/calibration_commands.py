@@ -10,25 +10,52 @@ import typer
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.text import number
 from ..core.units import DEG
+from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import reading, together
-from .app import CaptureFile, Json, Only, Without, app, examples, show_summary, with_spinner
+from .app import Json, Only, Without, app, examples, show_summary, with_spinner
 
 
 @app.command(
     epilog=examples(
         "aacmm calibrate capture.h5 -o calibration.h5",
         "aacmm calibrate capture.h5 -o calibration.h5 --without 'test*' --method joint",
+        "aacmm calibrate monday.h5 tuesday.h5 -o calibration.h5 --robust tukey",
     )
 )
 def calibrate(
-    capture: CaptureFile,
+    capture: Annotated[
+        list[Path],
+        typer.Argument(metavar="CAPTURE.h5 ...", help="Capture, or captures of one arm in several sessions."),
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Calibration to write (HDF5).")],
     method: Annotated[
-        Literal["two-stage", "joint"],
+        Literal["two-stage", "joint"] | None,
         typer.Option(
-            help="two-stage: repeatability, then the scale by the reference lengths; joint: one least squares of both."
+            help="two-stage: repeatability, then the scale by the reference lengths; joint: one least squares of all. "
+            "Default: two-stage, but joint with observations besides sockets or a robust loss."
         ),
-    ] = "two-stage",
+    ] = None,
+    robust: Annotated[
+        Literal["huber", "cauchy", "tukey"] | None,
+        typer.Option(help="Robust loss, which takes weight from bad poses and lists them."),
+    ] = None,
+    scale: Annotated[
+        Literal["measured", "nominal"],
+        typer.Option(
+            help="nominal: stage 1 alone, with the scale of the nominal arm, where nothing in the capture fixes it."
+        ),
+    ] = "measured",
+    same_probe: Annotated[
+        bool,
+        typer.Option("--same-probe", help="Of several sessions: the probe was not remounted between them."),
+    ] = False,
+    only_poses: Annotated[
+        int | None,
+        typer.Option(
+            min=1, metavar="N", help="Calibrate with N poses drawn at random, and test the result on the others."
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_INTEGER, metavar="N", help="Seed of --only-poses.")] = 0,
     hold: Annotated[
         str,
         typer.Option(
@@ -99,58 +126,71 @@ def calibrate(
     ] = 300,
     as_json: Json = False,
 ) -> None:
-    """Identify the parameters of an arm from a capture.
+    """Identify the parameters of an arm from a capture, or from several sessions.
 
-    Stage 1 makes the tips of each socket coincide; the reference lengths then fix the scale.
+    Stage 1 makes the tips of each socket coincide; the reference lengths then fix the scale. Observations of other
+    kinds (measured points, spheres, planes, artefacts) are solved with all else at once.
     """
-    from ..calibration.checks import plausible
     from ..calibration.record import record_of
-    from ..calibration.single import calibrate as run
+    from ..data.capture import check_sockets_only
     from ..files.calibrations import save_calibration
-    from ..files.captures import load_capture
-    from ..files.inputs import InputFile, fingerprint
     from ..summaries.calibration import calibration_summary
-    from ..summaries.warnings import does_not_fit
     from . import calibration_display
 
     with together(output, figure):
-        reading(capture)
+        for file in capture:
+            reading(file)
+        recording = _joined(capture, same_probe)
+        recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
         if figure is not None:
             from ..plot.style import check_format
 
             check_format(figure)
-        recording = load_capture(read := InputFile(capture))
-        recording = recording._replace(
-            capture=recording.capture.select(only or None, without or ()),
-            sources=(fingerprint(read), *recording.sources),
-        )
+            check_sockets_only(recording.capture, "a figure of residuals")
+        others = None
+        if only_poses is not None:
+            from ..data.drawing import draw_poses
+
+            part, others = draw_poses(recording.capture, only_poses, seed)
+            recording = recording._replace(capture=part)
         bounds = _bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])
         recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
         solving = {
-            "method": method,
             "hold": None if hold == "none" else hold,
             "noise": _noise(encoder_arcsec, seating_mm),
         }
         capture_used = recording.capture
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", IdentifiabilityWarning)  # the summary says it
-            result = with_spinner(
-                "Calibrating",
-                lambda: run(bounds.space.base, capture_used, bounds, **solving, max_steps=max_steps, strict=strict),
-            )
-            record = record_of(result, recording)
+            result = with_spinner("Calibrating", lambda: _solved(
+                bounds, capture_used, scale, method,
+                solving | {"robust": robust, "max_steps": max_steps}, strict,
+            ))  # fmt: skip
+            record = record_of(result, recording, robust=robust, others=others)
+            alike = scale == "measured" and robust is None and not capture_used.observations
             if cross_validate or (
-                cross_validate is None and recording.true is None and _several(capture_used, len(bounds.space.names))
+                cross_validate is None
+                and alike
+                and recording.true is None
+                and _several(capture_used, len(bounds.space.names))
             ):
                 from ..calibration.cross_validation import cross_validate as validated
 
+                if not alike:
+                    check_sockets_only(capture_used, "cross-validation")
+                    raise InputError("--cross-validate is for calibrations without --robust and --scale nominal.")
+                solving["method"] = method or "two-stage"
                 found = with_spinner(
                     "Cross-validating", lambda: validated(bounds.space.base, capture_used, bounds, **solving)
                 )
                 record = record._replace(validation=found)
         if monte_carlo:
+            from ..calibration.results import Calibration
             from ..calibration.sampling import monte_carlo as sample
 
+            check_sockets_only(capture_used, "--monte-carlo")
+            if not isinstance(result, Calibration) or robust is not None:
+                raise InputError("--monte-carlo is for calibrations without --robust and --scale nominal.")
             sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))
             record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
         summary = calibration_summary(record)
@@ -160,8 +200,65 @@ def calibrate(
 
             save_calibration_figure(record, figure)
     show_summary(summary | {"written": str(output)}, as_json, calibration_display.calibration)
-    if not record.converged or not plausible(record.k) or record.implausible_residual or does_not_fit(record):
+    if _failed(record):
         raise typer.Exit(1)
+
+
+def _failed(record: Any) -> bool:
+    """Whether the result is not one to use."""
+    from ..summaries.warnings import does_not_fit
+
+    return not record.converged or not record.plausible_scale or record.implausible_residual or does_not_fit(record)
+
+
+def _joined(files: Sequence[Path], same_probe: bool) -> Any:
+    """The recording of a file, or of several as the sessions of one arm, with the digests of the files."""
+    from ..data.capture import join_sessions
+    from ..files.captures import load_capture
+    from ..files.inputs import InputFile, fingerprint
+
+    found = {}
+    for file in files:
+        recording = load_capture(read := InputFile(file))
+        if file.stem in found:
+            raise InputError(f"two captures have the name '{file.stem}', which names their session; rename one.")
+        found[file.stem] = recording._replace(sources=(fingerprint(read), *recording.sources))
+    first, *rest = found.values()
+    if not rest:
+        if same_probe:
+            raise InputError("--same-probe is for several captures; name them, or leave it out.")
+        return first
+    for file, recording in zip(files[1:], rest, strict=True):
+        if not same_arm(recording.nominal.arm, first.nominal.arm):
+            raise InputError(f"{file} has another nominal arm than {files[0]}; import both with the same arm file.")
+    capture = join_sessions({name: one.capture for name, one in found.items()}, own_probe=not same_probe)
+    sources = tuple(source for recording in found.values() for source in recording.sources)
+    return first._replace(capture=capture, true=None, seed=None, spheres=(), sources=sources)
+
+
+def same_arm(one: Any, other: Any) -> bool:
+    """Whether two arms are the same to the bit."""
+    import jax
+    import numpy as np
+
+    leaves = [jax.tree.leaves(arm) for arm in (one, other)]
+    return jax.tree.structure(one) == jax.tree.structure(other) and all(map(np.array_equal, *leaves))
+
+
+def _solved(bounds: Any, capture: Any, scale: str, method: Any, solving: dict[str, Any], strict: bool) -> Any:
+    """Both stages, or stage 1 alone."""
+    from ..calibration.single import calibrate as run
+    from ..calibration.single import identify
+
+    if scale == "measured":
+        return run(bounds.space.base, capture, bounds, method=method, **solving, strict=strict)
+    if method is not None or strict:
+        raise InputError("--scale nominal is stage 1 alone; leave out --method and --strict.")
+    if any(observation.fixes_scale for observation in capture.observations):
+        raise InputError(
+            "--scale nominal is for captures without a scale, but these observations fix it; leave it out."
+        )
+    return identify(bounds.space.base, capture, bounds, **solving)
 
 
 def _bounds(
@@ -177,7 +274,8 @@ def _bounds(
     from ..kinematics.parameters import Bounds, Parameters
 
     names = _names(held) if held is not None else nominal.held
-    space = Parameters.free_of(nominal.arm, held=names, free=_names(free or ""))
+    proposed = [name for name in nominal.free if name not in (names or ())]
+    space = Parameters.free_of(nominal.arm, held=names, free=tuple(dict.fromkeys([*proposed, *_names(free or "")])))
     override = {name: width for name, width in nominal.override.items() if name in space.names}
     seen = set()
     for text in single:

@@ -11,6 +11,7 @@ from ..core.units import ARCSEC, DEG
 from ..summaries.tables import METRICS, volume_rows
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
+_MOST_PARTS = 12  # rows of a table
 _TRUTH = (
     ("length_error_largest_mm", "largest error of a length parameter [mm]", 1.0),
     ("angle_error_largest_rad", "largest error of an angle parameter [arcsec]", 1 / ARCSEC),
@@ -43,13 +44,21 @@ def capture(summary: dict[str, Any]) -> None:
     console.print(
         f"[bold]{escape(summary['arm'])}[/bold]: {pluralise(summary['poses'], 'pose')} of "
         f"{pluralise(summary['joints'], 'joint')} in {pluralise(len(summary['sockets']), 'socket')}, "
-        f"{pluralise(len(summary['lengths']), 'reference length')}" + (", simulated" if summary["simulated"] else "")
+        + (f"{pluralise(len(summary['observations']), 'other observation')}, " if summary["observations"] else "")
+        + f"{pluralise(len(summary['lengths']), 'reference length')}"
+        + (", simulated" if summary["simulated"] else "")
     )
     print_warnings(console, summary)
-    table = new_table("", "socket", "poses")
-    for row in summary["sockets"]:
-        table.add_row(escape(row["socket"]), str(row["poses"]))
-    print_table(console, table)
+    if summary["sockets"]:
+        table = new_table("", "socket", "poses")
+        for row in summary["sockets"]:
+            table.add_row(escape(row["socket"]), str(row["poses"]))
+        print_table(console, table)
+    if summary["observations"]:
+        table = new_table("\nOther observations", "observation", "kind", "target", "poses")
+        for row in summary["observations"]:
+            table.add_row(*(escape(str(row[key])) for key in ("observation", "kind", "target", "poses")))
+        print_table(console, table)
     table = new_table("\nReadings", "joint", "lowest [deg]", "highest [deg]")
     for row in summary["ranges"]:
         table.add_row(str(row["joint"]), *(f"{row[key] / DEG:.3f}" for key in ("lowest_rad", "highest_rad")))
@@ -67,13 +76,17 @@ def calibration(summary: dict[str, Any]) -> None:
     console = new_console()
     print_verdict(console, summary)
     anchor = f"scale anchor {summary['hold']}" if summary["hold"] else "no scale anchor"
-    console.print(f"Scale of stage 1: k = {summary['scale_k']:.8f}, u(k) = {summary['scale_u']:.1e} ({anchor})")
+    if summary["scale_k"] is not None:
+        console.print(
+            f"Scale of stage 1: k = {summary['scale_k']:.8f}, u(k) = {summary['scale_u'] or 0:.1e} ({anchor})"
+        )
     print_warnings(console, summary)
     _validated(console, summary["cross_validation"])
+    _observed(console, summary)
     stages = ("nominal", "stage1", "calibrated")
-    print_stages(
-        console, "\nOn the poses it was identified from [mm]", summary, stages, fitted=summary["fixed_by_one_length"]
-    )
+    title = "\nOn the poses it was identified from [mm]"
+    if summary["nominal"]:
+        print_stages(console, title, summary, stages, fitted=summary["fixed_by_one_length"])
     if "truth" in summary:
         _truth(console, summary["truth"])
     _parameters(console, summary["parameters"])
@@ -95,6 +108,50 @@ def print_verdict(console: Console, summary: dict[str, Any]) -> None:
         f"{pluralise(summary['steps'], 'step')} on {pluralise(summary['poses'], 'pose')} in "
         f"{pluralise(len(summary['sockets_used']), 'socket')}"
     )
+
+
+def _observed(console: Console, summary: dict[str, Any]) -> None:
+    """Observations, the geometry found, poses that lost weight, and poses that were left out at random."""
+    if summary["observations"]:
+        table = new_table(
+            "\nObservations, RMS distance from their geometry",
+            *("observation", "kind", "poses", "nominal [mm]", "calibrated [mm]", "reduced chi"),
+        )
+        for row in summary["observations"]:
+            numbers = (formatted(row["rms_before_mm"]), formatted(row["rms_after_mm"]), f"{row['reduced_chi']:.2f}")
+            table.add_row(escape(row["observation"]), row["kind"], str(row["poses"]), *numbers)
+        print_table(console, table)
+        table = new_table("\nUnknown geometry [mm; rotation vectors in deg]", "part", "values")
+        parts = [row for row in summary["geometry"] if not row["part"].startswith("position of ")]
+        for row in parts[:_MOST_PARTS]:
+            table.add_row(escape(row["part"]), ", ".join(_of_geometry(row)))
+        if parts:
+            print_table(console, table)
+        hidden = len(summary["geometry"]) - len(parts[:_MOST_PARTS])
+        if hidden:
+            console.print(f"{pluralise(hidden, 'more part')} of the geometry, positions of sockets too: --json.")
+    if summary["robust"]:
+        rows = summary["less_weight"]
+        console.print(f"Robust loss {summary['robust']}: {pluralise(len(rows), 'pose')} with half the weight or less.")
+        if rows:
+            table = new_table("", "observation", "pose", "weight")
+            for row in rows[:_MOST_PARTS]:
+                table.add_row(escape(row["observation"]), str(row["pose"]), f"{row['weight']:.3f}")
+            print_table(console, table)
+    if "other_poses" in summary:
+        found = summary["other_poses"]
+        console.print(
+            f"\n[bold]Other poses[/bold], drawn at random and not calibrated with: {found['poses']}, RMS "
+            f"{formatted(found['rms_mm'])} mm."
+        )
+        angles = [row for row in found["observations"] if row["rms_angle_rad"] is not None]
+        for row in angles:
+            console.print(f"Orientation of {escape(row['observation'])}: RMS {row['rms_angle_rad'] / DEG:.4f} deg.")
+
+
+def _of_geometry(row: dict[str, Any]) -> list[str]:
+    pairs = zip(row["values"], row["units"], strict=True)
+    return [f"{value / DEG:.4f} deg" if unit == "rad" else f"{value:.4f}" for value, unit in pairs]
 
 
 def _validated(console: Console, found: dict[str, Any] | None) -> None:

@@ -1,6 +1,7 @@
 """What is done with results: ``evaluate``, ``report``, ``export``, ``show``."""
 
 import json
+import math
 import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -223,11 +224,10 @@ def export(
         if not record.converged or record.implausible_residual:
             reason = "the residual is that of no arm; see aacmm show." if record.converged else record.reason
             typer.echo(f"Warning: {calibration} is not a calibration that can be used: {reason}", err=True)
-        source = (
-            f"calibrated from {sum(record.recording.capture.sizes)} poses, {record.method}, k = {record.k:.8f}"
-            if which == "calibrated"
-            else ""
-        )
+        source = ""
+        if which == "calibrated":
+            scale = "" if math.isnan(record.k) else f", k = {record.k:.8f}"
+            source = f"calibrated from {len(record.recording.capture.readings)} poses, {record.method}{scale}"
         text = {
             "toml": lambda: specification_toml(arm, source=source),
             "json": lambda: json.dumps(calibration_summary(record), indent=2) + "\n",

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from ..core.arguments import items_of, shown
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError, nearest
-from ..core.numpy_or_jax import AnyArray
+from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.text import pluralise, shorten
 from .observations.observation import AbstractObservation, checked_name, checked_readings
 from .observations.socket import Socket
@@ -179,6 +179,12 @@ class Capture(eqx.Module):
         return {name: q[..., end - size : end, :] for name, size, end in zip(self.names, self.sizes, ends, strict=True)}
 
     @property
+    def readings(self) -> Float[AnyArray, "M n"]:
+        """Joint readings of all poses, those of sockets first, ``(M, n)``; rad."""
+        blocks = [self.q, *(observation.q for observation in self.observations)]
+        return namespace(*blocks).concatenate(blocks)
+
+    @property
     def owner(self) -> Int[np.ndarray, " N"]:
         """Index of the socket of each pose, ``(N,)``."""
         return np.repeat(np.arange(len(self.sizes)), self.sizes)
@@ -189,24 +195,25 @@ class Capture(eqx.Module):
         return np.array(pairs, dtype=int).reshape(-1, 2)
 
     def select(self, only: Iterable[str] | str | None = None, without: Iterable[str] | str = ()) -> "Capture":
-        """Select sockets by name, with the reference lengths between them.
+        """Select sockets and other observations by name, with the reference lengths between the sockets.
 
         Args:
-            only: Names or shell patterns (``"hole_*"``) of the sockets to keep; None keeps all.
-            without: Names or shell patterns of sockets to leave out.
+            only: Names or shell patterns (``"hole_*"``) of what to keep; None keeps all.
+            without: Names or shell patterns of what to leave out.
 
         Returns:
-            A capture of the remaining sockets, in their order.
+            A capture of what remains, in its order.
 
         Raises:
-            InputError: Where a pattern matches no socket, no socket remains, or the capture is a batch.
+            InputError: Where a pattern matches nothing, nothing remains, or the capture is a batch.
         """
         check_one_capture(self)
         only = [only] if isinstance(only, str) else only
         only = None if only is None else items_of(only, "only")
         without = [without] if isinstance(without, str) else items_of(without, "without")
-        kept = list(self.names) if only is None else _matching(self.names, only)
-        dropped = _matching(self.names, without)
+        known = [*self.names, *(observation.name for observation in self.observations)]
+        kept = known if only is None else _matching(known, only)
+        dropped = _matching(known, without)
         kept = [name for name in kept if name not in dropped]
         if not kept:
             raise InputError("no socket is left after the selection; widen it.")
@@ -216,7 +223,8 @@ class Capture(eqx.Module):
             tuple((name, count) for name, count in self.repeated.poses if name in kept),
             tuple((start, end) for start, end in self.repeated.lengths if start in kept and end in kept),
         )
-        return Capture({name: sockets[name] for name in kept}, lengths, self.observations, repeated=repeated)
+        others = [observation for observation in self.observations if observation.name in kept]
+        return Capture({name: sockets[name] for name in self.names if name in kept}, lengths, others, repeated=repeated)
 
 
 def check_one_capture(capture: Capture) -> None:

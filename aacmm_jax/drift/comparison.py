@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.checks import plausible
 from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..core.text import shorten
@@ -211,7 +210,7 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[s
     for record, label in zip((old, new), labels, strict=True):
         if not record.converged:
             found.append(f"Failed: {label}. {record.reason} Its changes mean nothing.")
-        elif not plausible(record.k):
+        elif not record.plausible_scale:
             found.append(f"Implausible: {label}, with k = {record.k:.6g}. Check its units, sockets, lengths and arm.")
     found += [sentence for sentence in (_common_poses(old, new, labels), _other_arm(old, new, labels)) if sentence]
     if old.method != new.method:
@@ -230,7 +229,7 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[s
 
 def _common_poses(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str]) -> str:
     """A sentence on poses that both calibrations use, which makes them dependent; empty if there are none."""
-    rows = [{row.tobytes() for row in np.asarray(record.recording.capture.q)} for record in (old, new)]
+    rows = [{row.tobytes() for row in np.asarray(record.recording.capture.readings)} for record in (old, new)]
     common = len(rows[0] & rows[1])
     if not common:
         return ""

@@ -14,6 +14,7 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm, is_length, parameter_names, value_of
 from ..kinematics.parameters import Parameters
 from ..uncertainty.covariance import NOISE_MODELS
+from .calibration_observations import observed_of, observed_tables, other_poses_of
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .hdf5 import (
     Stored,
@@ -58,7 +59,9 @@ def save_calibration(
         tables["cross_validation"] = _validation_table(record)
     if record.sampled is not None:
         tables["monte_carlo"] = _sampled_table(record)
+    tables |= observed_tables(record)
     attributes = recording_attributes(record.recording) | {
+        "robust": record.robust,
         "sampled_says": record.sampled_says,
         "method": record.method,
         "held": list(record.held) or "",
@@ -157,6 +160,9 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
         validation=_validation_of(stored),
         sampled=stored.tables.get("monte_carlo"),
         sampled_says=attributes.get("sampled_says"),
+        observed=observed_of(path, stored, recording.capture),
+        robust=attributes.get("robust"),
+        others=other_poses_of(stored),
     )
 
 

@@ -1,4 +1,4 @@
-"""Captures in HDF5: poses, reference lengths, touched spheres, the nominal arm and, for a simulation, the true arm."""
+"""Captures in HDF5: poses, reference lengths, other observations, touched spheres, the nominal and the true arm."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..data.capture import Capture, ReferenceLength, Repeated, check_one_capture, check_sockets_only
+from ..data.capture import Capture, ReferenceLength, Repeated, check_one_capture
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm
@@ -26,6 +26,7 @@ from .hdf5 import (
     undamaged,
     write_tables,
 )
+from .observations import observation_tables, observations_of
 from .sense import check_recording
 
 _KINDS = {
@@ -74,10 +75,9 @@ def recording_attributes(recording: Recording) -> dict[str, Any]:
 
 
 def recording_tables(recording: Recording) -> dict[str, Table]:
-    """The tables of a recording: ``capture``, ``reference``, ``nominal_arm`` and perhaps ``true_arm``."""
+    """The tables of a recording: ``capture``, ``reference``, ``nominal_arm``, and one for each observation."""
     capture = recording.capture
     check_one_capture(capture)
-    check_sockets_only(capture, "a capture file")
     owner = [capture.names[i] for i in capture.owner]
     poses, lengths = capture.repeated
     tables = {
@@ -100,7 +100,7 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
         tables["true_arm"] = arm_table(recording.true)
     if recording.spheres:
         tables["sphere"] = sphere_table(recording.spheres)
-    return tables
+    return tables | observation_tables(capture.observations)
 
 
 def reference_table(lengths: Sequence[ReferenceLength]) -> Table:
@@ -174,7 +174,9 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     names = list(dict.fromkeys(owner.tolist()))
     try:
         sockets = {name: poses["angle"][owner == name] for name in names}
-        capture = Capture(sockets, lengths_of(path, stored), repeated=_repeated_of(stored))
+        capture = Capture(
+            sockets, lengths_of(path, stored), observations_of(path, stored), repeated=_repeated_of(stored)
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     true = specification_of(path, stored, "true_arm") if "true_arm" in stored.tables else None

@@ -1,4 +1,4 @@
-"""The manifest of a capture (TOML): which text files hold which socket, in which unit, and the lengths."""
+"""The manifest of a capture (TOML): which text files hold which socket or observation, in which unit; the lengths."""
 
 import datetime
 import math
@@ -16,16 +16,20 @@ from pydantic import (
     NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
+    create_model,
     model_validator,
 )
 
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG
 from ..data.capture import Capture, ReferenceLength
+from ..data.observations.observation import AbstractObservation
+from ..data.observations.socket import Socket
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
 from .arms import load_specification
 from .inputs import InputFile, fingerprint
+from .manifest_observations import FIELDS, TABLES, Source, observations
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
 from .text_table import read_numbers
@@ -62,6 +66,7 @@ class _Files(Strict):
 
 class _Socket(_Files):
     name: str | None = None
+    target: str = ""  # another tip than the arm's own probe
     exclude: list[str] = Field(default_factory=list)
 
     @model_validator(mode="after")
@@ -123,10 +128,12 @@ class _Recorded(Strict):
     sphere: list[_Sphere] = Field(default_factory=list)
 
 
-class _Manifest(_Recorded):
+class _Poses(_Recorded):
     arm: str
-    angles: _Angles
-    socket: Annotated[list[_Socket], Field(min_length=1)]  # pyright: ignore[reportGeneralTypeIssues]
+    angles: _Angles | None = None
+
+
+_Manifest = create_model("_Manifest", __base__=_Poses, **FIELDS)
 
 
 class PointsManifest(_Recorded):
@@ -145,6 +152,13 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     "-" only, so that ``hole_0_pose.csv`` is left alone. ``exclude = ["*_old.csv"]`` in ``[[socket]]`` leaves out the
     files that match such a shell pattern. Angles: reading -> sign * (reading - offset), in the stated unit.
 
+    ``[[points]]``, ``[[transforms]]``, ``[[touched_sphere]]``, ``[[plane]]``, ``[[parallel_planes]]``,
+    ``[[artefact]]`` and ``[[distances]]`` are observations of these kinds. Their ``file`` holds readings and measured
+    values (or ``readings`` is a file of readings with as many rows); ``columns`` picks them by header name, shell
+    pattern or number: ``columns = { q = "q*_rad", points = ["x", "y", "z"] }``. ``units``, ``rotation``,
+    ``coverage_factor``, ``delimiter``, ``decimal`` and ``skip`` say how they are written, ``group`` names a column that
+    divides the table into several observations, and ``preset`` (csv, leica, xyzijk, ipa) fills in what is not stated.
+
     Args:
         path: the manifest (TOML).
 
@@ -158,31 +172,68 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     model = read_toml(manifest := InputFile(path), _Manifest)
     try:
         nominal = load_specification(_arm_source(path, model.arm))
-        joints = nominal.arm.joints
-        if model.angles.columns is not None and len(model.angles.columns) != joints:
+        joints, columns = nominal.arm.joints, model.angles.columns if model.angles else None
+        if columns is not None and len(columns) != joints:
             raise InputError(
-                f"angles.columns picks {len(model.angles.columns)} columns, but the arm has {joints} joints; "
-                "pick one a joint."
+                f"angles.columns picks {len(columns)} columns, but the arm has {joints} joints; pick one a joint."
             )
         files = [manifest]
 
-        def angles(file: Path) -> np.ndarray:
+        def opened(file: Path) -> InputFile:
             files.append(read := InputFile(file))
-            table = read_numbers(read, model.angles.columns)
+            return read
+
+        def angles(file: Path) -> np.ndarray:
+            table = read_numbers(opened(file), columns)
             if table.shape[1] != joints:
                 raise InputError(
                     f"{file} has {table.shape[1]} columns, but the arm has {joints} joints; give one column a joint, "
                     "or pick them with columns = [...] in [angles]."
                 )
-            return _radians(table, model.angles)
+            return _radians(table, _angles_of(model.angles))
 
         sockets, lengths, spheres = recorded(path.parent, model, angles)
-        sources = tuple(fingerprint(file, path.parent) for file in files)
-        return Recording(
-            Capture(sockets, lengths), nominal, spheres=spheres, sources=sources, measured=str(model.date or "")
-        )
+
+        def radians(readings: np.ndarray, unit: str | None, preset: str | None) -> np.ndarray:
+            return _radians(readings, _angles_of(model.angles, unit, preset))
+
+        source = Source(path.parent, opened, joints, columns, radians)
+        observations = [*_sockets_of_targets(path.parent, model, sockets), *_observations(model, source)]
+        if not sockets and not observations:
+            raise InputError("there is neither a [[socket]] nor another observation; add one.")
+        sources = tuple(dict.fromkeys(fingerprint(file, path.parent) for file in files))
+        capture = Capture(sockets, lengths, observations)
+        return Recording(capture, nominal, spheres=spheres, sources=sources, measured=str(model.date or ""))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def _angles_of(angles: _Angles | None, unit: str | None = None, preset: str | None = None) -> _Angles:
+    """How readings are written: what a table states comes first, then [angles], then the table's preset."""
+    unit = unit if unit is not None or angles is not None else preset
+    if unit is None and angles is None:
+        raise InputError("'angles' is missing; add it.")
+    if unit is None:
+        assert angles is not None
+        return angles
+    if unit not in _UNITS:
+        raise InputError(f"units.q is '{unit}'; it must be one of {', '.join(_UNITS)}.")
+    stated = {} if angles is None else {"sign": angles.sign, "offset": angles.offset}
+    return _Angles(unit=unit, **stated)  # pyright: ignore[reportArgumentType]
+
+
+def _sockets_of_targets(folder: Path, model: _Poses, sockets: dict[str, np.ndarray]) -> Iterator[Socket]:
+    """Sockets that another tip than the arm's own probe was held in; they are taken out of ``sockets``."""
+    for entry in model.socket:
+        for name, *_ in _expand(folder, entry) if entry.target else ():
+            yield Socket(name, sockets.pop(name), target=entry.target)
+
+
+def _observations(model: _Poses, source: Source) -> Iterator[AbstractObservation]:
+    for kind in TABLES:
+        for entry in getattr(model, kind.table):
+            for values in _fields(source.folder, entry, kind.table):
+                yield from observations(source, kind, entry, values)
 
 
 def recorded(
@@ -232,8 +283,11 @@ def _radians(readings: np.ndarray, angles: _Angles) -> np.ndarray:
     return a_joint(angles.sign, "sign") * (readings - a_joint(angles.offset, "offset")) * unit
 
 
-def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dict[str, str]]]:
-    """Sockets of one entry: name, files and the values of its fields in braces."""
+def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
+    """The values of the fields in braces of one entry, for all files that match; nothing in them where it has none."""
+    if not entry.paths:
+        yield {}
+        return
     first = entry.paths[0]
     for text in (entry.name or "", *entry.paths):
         check_fields(text)
@@ -241,17 +295,22 @@ def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dic
     for what, text in (("name", entry.name or ""), *(("file", file) for file in entry.paths[1:])):
         if fields_of(text) != fields:
             raise InputError(
-                f"socket {what} '{text}' has {in_braces(fields_of(text))}, but file '{first}' has {in_braces(fields)}; "
-                "use the same fields in the name and in every file."
+                f"{table} {what} '{text}' has {in_braces(fields_of(text))}, but file '{first}' has "
+                f"{in_braces(fields)}; use the same fields in the name and in every file."
             )
-    if not fields:
-        if entry.exclude:
-            raise InputError(f"exclude is for files with a field in braces, but '{first}' has none; leave it out.")
-        yield Path(first).stem if entry.name is None else entry.name, [folder / file for file in entry.paths], {}
+    if fields:
+        yield from matches(folder, first, entry.exclude)
         return
-    assert entry.name is not None  # its fields are those of the file
-    for values in matches(folder, first, entry.exclude):
-        yield fill(entry.name, values), [folder / fill(file, values) for file in entry.paths], values
+    if entry.exclude:
+        raise InputError(f"exclude is for files with a field in braces, but '{first}' has none; leave it out.")
+    yield {}
+
+
+def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dict[str, str]]]:
+    """Sockets of one entry: name, files and the values of its fields in braces."""
+    for values in _fields(folder, entry, "socket"):
+        name = Path(entry.paths[0]).stem if entry.name is None else fill(entry.name, values)
+        yield name, [folder / fill(file, values) for file in entry.paths], values
 
 
 def _lengths(

@@ -28,7 +28,10 @@ def check_shown(path: str | os.PathLike, kind: str, summary: Mapping[str, Any]) 
             check_evaluation(path, stored)
         if kind == "calibration":
             check_calibration(path, stored)
-            pairs = [(summary[key], stored.attributes[key]) for key in ("scale_k", "scale_u", "converged")]
+            pairs = [
+                (np.nan if summary[key] is None else summary[key], stored.attributes[key])
+                for key in ("scale_k", "scale_u", "converged")
+            ]
             same = all(one == other or (np.isnan(one) and np.isnan(other)) for one, other in pairs)
             check_sense(path, {"its summary is not that of its values": not same})
 
@@ -73,7 +76,9 @@ def check_calibration(path: str | os.PathLike, stored: Stored) -> None:
         for stage in ("stage1", "calibrated")
         if len(reference["value"]) and f"measured_{stage}" in reference
     ]
-    finite = all(np.all(np.isfinite(x)) for x in (k, u_k, covariance))
+    # Observations, or a single stage, need no reference length.
+    scaled = "observed" not in stored.tables and attributes["method"] != "repeatability"
+    finite = all(np.all(np.isfinite(x)) for x in ((k, u_k, covariance) if scaled else (covariance,)))
     noise = np.append(attributes.get("encoder_arcsec", 0.0), attributes.get("seating_mm", 0.0))
     sampled = stored.tables.get("monte_carlo")
     check_sense(
@@ -85,10 +90,11 @@ def check_calibration(path: str | os.PathLike, stored: Stored) -> None:
             "the uncertainty of k is negative": bool(u_k < 0),
             "a converged calibration has a scale or covariance that is not finite": converged and not finite,
             "the scale k is not that of its lengths": converged
+            and (scaled or not np.isnan(k))
             and bool(ratios)
             and not any(ratio.min() - _ROUNDING <= k <= ratio.max() + _ROUNDING for ratio in ratios),
             "the covariance is not one": finite and not _is_semidefinite(covariance),
-            "the method is unknown": attributes["method"] not in ("two-stage", "joint"),
+            "the method is unknown": attributes["method"] not in ("two-stage", "joint", "repeatability"),
             "its number of steps is negative": attributes["steps"] < 0,
             "its degrees of freedom are not positive": not attributes.get("freedom", np.inf) > 0,
             "a standard deviation of its noise is negative": bool(np.any(noise < 0)),

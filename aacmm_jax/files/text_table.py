@@ -1,5 +1,6 @@
-"""Text tables of numbers: comma, semicolon, tab or blank between columns, header lines allowed."""
+"""Text tables: comma, semicolon, tab or blank between columns, header lines allowed."""
 
+import fnmatch
 import math
 import os
 import re
@@ -7,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.errors import InputError
-from ..core.text import is_number, number, quoted
+from ..core.errors import InputError, nearest
+from ..core.text import is_number, number, quoted, shorten
 from .inputs import InputFile
 
 _LARGEST = 1e15  # encoder counts reach 1e10; beyond it squares lose what is measured
@@ -22,10 +23,7 @@ def read_numbers(path: str | os.PathLike, columns: Sequence[int] | None = None) 
     A header is a line of words before the first row: none of them begins like a number. ``columns`` picks columns,
     counted from 1. Raises `InputError` that names the file, the line and the column.
     """
-    try:
-        lines = InputFile(path).text.split("\n")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} cannot be read as text; give a text file of numbers, in UTF-8.") from error
+    lines = _lines(path)
     rows: list[list[float]] = []
     for line_number, line in enumerate(lines, start=1):
         cells = _cells(line)
@@ -54,8 +52,95 @@ def read_numbers(path: str | os.PathLike, columns: Sequence[int] | None = None) 
     return table
 
 
-def _cells(line: str) -> list[str]:
-    delimiter = next((delimiter for delimiter in (";", ",", "\t") if delimiter in line), None)
+Column = str | int
+
+
+class TextTable:
+    """A text table whose columns are picked by header name, shell pattern or number from 1; other columns may be text.
+
+    Args:
+        path: The file.
+        delimiter: What divides its columns; None finds it.
+        decimal: The decimal mark of its numbers.
+        skip: Lines before its header.
+
+    Raises:
+        InputError: The file is no text, or its rows differ in their number of columns.
+    """
+
+    def __init__(self, path: str | os.PathLike, *, delimiter: str | None = None, decimal: str = ".", skip: int = 0):
+        self._path, self._decimal = path, decimal
+        self._header: list[str] = []
+        self._rows: list[tuple[str, list[str]]] = []
+        for line_number, line in enumerate(_lines(path)[skip:], start=skip + 1):
+            cells, where = _cells(line, delimiter, decimal), f"{path} line {line_number}"
+            if cells == [""] or cells[0].startswith("#"):
+                continue
+            if not self._rows and not any(_LIKE_A_NUMBER.match(cell) or is_number(cell) for cell in cells):
+                self._header = cells
+                continue
+            if self._rows and len(cells) != len(self._rows[0][1]):
+                count = len(self._rows[0][1])
+                raise InputError(f"{where} has {len(cells)} columns, the lines before it {count}; give all the same.")
+            self._rows.append((where, cells))
+        if not self._rows:
+            raise InputError(f"{path} holds no numbers; give one line a pose.")
+
+    def has(self, wanted: Sequence[Column]) -> bool:
+        """Whether every one of these columns is there."""
+        return all(bool(self._matching(column)) for column in wanted)
+
+    def _matching(self, column: Column) -> list[int]:
+        if isinstance(column, int):
+            return [column - 1] if 1 <= column <= len(self._rows[0][1]) else []
+        if column in self._header:
+            return [self._header.index(column)]
+        return [i for i, name in enumerate(self._header) if fnmatch.fnmatchcase(name, column)]
+
+    def pick(self, wanted: Sequence[Column]) -> list[int]:
+        """Indices of columns, a pattern in the order of the header. Raises `InputError` for one that is not there."""
+        found: list[int] = []
+        for column in wanted:
+            indices = self._matching(column)
+            if not indices and isinstance(column, int):
+                raise InputError(f"{self._path} has {len(self._rows[0][1])} columns, so there is no column {column}.")
+            if not indices and isinstance(column, str):
+                known = f"{nearest(column, self._header)}" if self._header else "; it has no header: give numbers."
+                raise InputError(f"{self._path} has no column {quoted(column)}{known}")
+            found += indices
+        if len(set(found)) < len(found):
+            raise InputError(f"{self._path}: one column is picked twice by {shorten([str(x) for x in wanted])}.")
+        return found
+
+    def numbers(self, wanted: Sequence[Column]) -> np.ndarray:
+        """The numbers of columns, ``(rows, columns)``."""
+        picked = self.pick(wanted)
+        return np.array([[self._number(where, i, cells[i]) for i in picked] for where, cells in self._rows])
+
+    def _number(self, where: str, index: int, cell: str) -> float:
+        if self._decimal == "," and "." not in cell:
+            cell = cell.replace(",", ".")
+        return _number(where, index + 1, cell)
+
+    def texts(self, column: Column) -> np.ndarray:
+        """The cells of one column."""
+        (index,) = self.pick([column])
+        return np.array([cells[index].strip("\"'") for _, cells in self._rows])
+
+
+def _lines(path: str | os.PathLike) -> list[str]:
+    try:
+        return InputFile(path).text.split("\n")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} cannot be read as text; give a text file of numbers, in UTF-8.") from error
+
+
+def _cells(line: str, delimiter: str | None = None, decimal: str = ".") -> list[str]:
+    if delimiter is None:
+        known = (";", "\t") if decimal == "," else (";", ",", "\t")
+        delimiter = next((one for one in known if one in line), None)
+    elif delimiter == " ":
+        delimiter = None
     cells = re.split("[ \t]+", line.strip(" \t")) if delimiter is None else line.split(delimiter)
     return [cell.strip(" \t") for cell in cells]
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..calibration.record import CalibrationRecord, uncertainty_of
+from ..calibration.record import CalibrationRecord, check_document, uncertainty_of
 from ..core.text import pluralise
 from ..core.units import ARCSEC, DEG
 from ..summaries.calibration import calibration_summary
@@ -42,6 +42,7 @@ _METHODS = {
 
 def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any]]:
     """The report, except for the origin of its file; and the summary that it was made from."""
+    check_document(record, "a report")
     uncertainty, observability = uncertainty_of(record), observed(record)
     volume = volumetric_uncertainty(uncertainty)
     summary = calibration_summary(record, observability, volume)

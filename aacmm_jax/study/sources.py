@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError, nearest
-from ..data.capture import Capture
+from ..data.capture import Capture, check_sockets_only
 from ..data.recording import Recording
 from ..files.arms import load_specification
 from ..files.atomic_write import storable
@@ -63,6 +63,8 @@ def make_study(
         )
     elif capture.get("file") is not None:
         recording = load_capture(capture["file"])
+    if recording is not None:
+        check_sockets_only(recording.capture, "a study")
     specification = checked(name=storable(name), arm=nominal.name, trials=trials, seed=seed, capture=capture, **tables)
     return Study(specification, nominal, recording)
 
@@ -113,6 +115,7 @@ def _study_of_file(path: Path) -> Study:
         recording = None
         if specification.capture.file is not None:
             recording = load_capture(path.parent / specification.capture.file)
+            check_sockets_only(recording.capture, "a study")
         if recording is not None and not specification.arm:
             return Study(specification, recording.nominal, recording)
         return Study(specification, _arm(path.parent, specification.arm), recording)

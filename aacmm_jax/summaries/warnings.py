@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ..calibration.checks import plausible
-from ..calibration.record import CalibrationRecord
+from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..calibration.results import active_names
 from ..calibration.scale_anchor import scale_set_by_clause
 from ..core.numpy_or_jax import to_numpy
@@ -41,7 +41,7 @@ def of_capture(recording: Recording) -> list[str]:
     A simulation keeps within the limits but for its noise.
     """
     found = []
-    q = np.asarray(recording.capture.q)
+    q = np.asarray(recording.capture.readings)
     for joint, limits in enumerate(recording.nominal.arm.limits or () if recording.true is None else ()):
         outside = int(np.sum((q[:, joint] < limits[0] - _TOLERANCE) | (q[:, joint] > limits[1] + _TOLERANCE)))
         if outside:
@@ -59,21 +59,49 @@ def of_capture(recording: Recording) -> list[str]:
 
 def of_calibration(record: CalibrationRecord, seen: Observability | None = None) -> list[str]:
     """What should be read about a calibration before its numbers; ``seen`` is the result of `observed`, if known."""
-    seen = observed(record) if seen is None else seen
     found = [] if record.converged else [record.reason]
     found += _implausible(record)
+    if record.recording.capture.observations:
+        found += [*_observations(record), *of_capture(record.recording)]
+        seen = observed(record) if seen is None else seen
+        return found if record.implausible_residual else found + _identifiability(record, seen)
     found += contradictions(record)
     found += _validation(record)
     found += [*_scale(record), *of_capture(record.recording)]
+    seen = observed(record) if seen is None else seen
     if record.implausible_residual:
         return found + _data(record)  # bounds and uncertainties of such a solve say nothing
     return [*found, *_bounds(record, seen), *_data(record), *_identifiability(record, seen)]
 
 
+def _observations(record: CalibrationRecord) -> list[str]:
+    """Of a calibration with observations besides sockets."""
+    observed = record.observed
+    assert observed is not None
+    found = [
+        f"{name} ({chi:.2g} times)"
+        for name, chi in zip(observed.names, observed.reduced_chi, strict=True)
+        if chi > _EXCESS and record.robust is None
+    ]
+    sentences = []
+    if found:
+        sentences.append(
+            "Residuals are larger than the uncertainties and the scatter of the tips predict: "
+            f"{shorten(found)}; check these observations, or their u."
+        )
+    sides = _sides(record)
+    if sides:
+        sentences.append(
+            f"On a bound: {shorten(sides)}; fix what the data hardly determine (--held), or widen the bounds. Every "
+            "uncertainty takes these values as exact."
+        )
+    return sentences
+
+
 def observed(record: CalibrationRecord) -> Observability:
     """What the data of a calibration determine about the calibrated arm, given its noise and bounds."""
     arm, capture = record.calibrated.arm, record.recording.capture
-    covariances = tip_covariances(*to_numpy((arm.geometry, sines_cosines(np.asarray(capture.q)), record.noise)))
+    covariances = tip_covariances(*to_numpy((arm.geometry, sines_cosines(np.asarray(capture.readings)), record.noise)))
     sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
     space = Parameters(arm, record.names)
     return observability(arm, capture, space, sigma=sigma, bounds=Bounds(space, record.lower, record.upper))
@@ -83,6 +111,13 @@ def _implausible(record: CalibrationRecord) -> list[str]:
     """A residual that no arm has: the solve ended at a minimum, but of data that do not belong to this arm."""
     if not record.implausible_residual:
         return []
+    if record.observed is not None and record.recording.capture.observations:
+        worst = int(np.argmax(record.observed.rms_after))
+        name, rms = record.observed.names[worst], record.observed.rms_after[worst]
+        return [
+            f"Poses of {name} are {rms:.3g} mm RMS from their geometry, over a hundred times what an arm of this size "
+            "can be, so data and arm do not belong together: check columns, units, signs and the arm."
+        ]
     rms = float(record.evaluations()["calibrated"].repeatability.rms)
     return [
         f"The poses of a socket disagree by {rms:.3g} mm RMS, over a hundred times what an arm of this size can be, "
@@ -133,6 +168,13 @@ def _validation(record: CalibrationRecord) -> list[str]:
 
 def _scale(record: CalibrationRecord) -> list[str]:
     k = record.k
+    if record.method == REPEATABILITY:
+        return [
+            "The scale is that of the nominal arm, and every uncertainty takes it as exact: lengths are wrong by as "
+            "much as it is." + (f" By the reference lengths, k = {k:.6f}." if math.isfinite(k) else "")
+        ]
+    if not math.isfinite(k):
+        return []
     stage1 = _sides(record)
     if not plausible(k):
         mistakes = (question for ratio, question in _MISTAKEN_UNITS.items() if abs(k / ratio - 1) < 0.1)

@@ -262,13 +262,12 @@ def test_derivatives_of_a_calibration(paper_arm, true, bounds, kind, field):
     np.testing.assert_allclose(exact, numerical, atol=2e-5 * np.abs(numerical).max())
 
 
-def test_what_does_not_know_observations_says_so(paper_arm, bounds, sockets, tmp_path):
+def test_what_does_not_know_observations_says_so(paper_arm, bounds, sockets):
     """Nothing is left out without a word."""
     capture = aj.Capture(sockets.sockets, sockets.lengths, [kinds.Socket("D", sockets.sockets["C"] + 0.1)])
-    recording = aj.Recording(capture, aj.kinematics.ArmSpecification(paper_arm))
     for function in (
         lambda: aj.fix_scale(paper_arm, capture),
-        lambda: aj.files.save_capture(tmp_path / "c.h5", recording),
+        lambda: aj.study.make_study(arm=paper_arm, trials=2, capture=capture),
     ):
         with pytest.raises(aj.InputError, match=r"other observations \(D\)"):
             function()

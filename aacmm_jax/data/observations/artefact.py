@@ -1,7 +1,7 @@
 """Artefacts of certified points: ball bars, plates of balls or holes, tetrahedra; in each of their placements."""
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -15,8 +15,11 @@ from .frames import placed
 from .measured_points import check_spread
 from .observation import (
     FRAME,
+    READINGS,
+    TARGET,
     AbstractObservation,
     AbstractSimulated,
+    Entry,
     Rows,
     Tips,
     Unknowns,
@@ -51,6 +54,18 @@ class Artefact(AbstractObservation):
 
     kind: ClassVar[str] = "artefact"
     by_pose: ClassVar[tuple[str, ...]] = ("q", "owner")
+    table: ClassVar[str] = "artefact"
+    entries: ClassVar[tuple[Entry, ...]] = (
+        READINGS,
+        Entry("point", "point of the artefact that held the tip", dimensions=("pose",), content="text", required=True),
+        Entry("names", "point of the artefact", dimensions=("names",), content="text", required=True),
+        Entry("coordinates", "certified coordinates", "mm", ("names", "axis"), required=True),
+        Entry("u", "standard uncertainty of a coordinate", "mm"),
+        Entry("artefact", "name of the artefact", content="text"),
+        Entry("placement", "name of its placement", content="text"),
+        Entry("index", "index of the platform that carries it", content="text"),
+        TARGET,
+    )
     rows: ClassVar[int] = 3
     q: Float[AnyArray, "m n"]
     coordinates: Float[AnyArray, "c 3"]
@@ -98,6 +113,18 @@ class Artefact(AbstractObservation):
         self.index = None if index is None else checked_name(index, "an index")
         self.target = checked_target(target)
         self.free = not (is_concrete(self.u) and float(self.u) == 0)
+
+    def stored(self) -> dict[str, Any]:
+        point = np.array([self.names[i] for i in self.owner])
+        return super().stored() | {"point": point, "names": np.array(self.names)}
+
+    @classmethod
+    def rebuilt(cls, name: str, stored: Mapping[str, Any]) -> "Artefact":
+        held = np.asarray(stored["point"])
+        points = dict(zip(np.asarray(stored["names"]).tolist(), stored["coordinates"], strict=True))
+        q = {point: stored["q"][held == point] for point in dict.fromkeys(held.tolist())}
+        rest = {key: value for key, value in stored.items() if key not in ("q", "point", "names", "coordinates")}
+        return cls(name, points, q, **rest)
 
     @property
     def frame(self) -> str:

@@ -7,21 +7,23 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ...core.arrays import Numbers
+from ...core.arrays import Numbers, as_floats, is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace
 from .observation import (
     POINT,
+    READINGS,
+    TARGET,
     AbstractObservation,
     AbstractSimulated,
+    Entry,
     Rows,
     Tips,
     Unknowns,
     as_numbers,
     checked_name,
     checked_readings,
-    checked_scalar,
     checked_target,
     checked_values,
 )
@@ -34,7 +36,7 @@ class Distances(AbstractObservation):
         name: Name of the observation.
         q: Joint readings ``(m, n)``, rad.
         values: Measured distances ``(m,)``, mm.
-        u: Standard uncertainty (k = 1) of each distance, mm.
+        u: Standard uncertainty (k = 1) of the distances, mm: one number, or one each ``(m,)``.
         constant: Whether an unknown constant is added to all distances (a bar of unknown zero).
         target: Name of the tip, by default the arm's own probe.
 
@@ -43,11 +45,19 @@ class Distances(AbstractObservation):
     """
 
     kind: ClassVar[str] = "distances"
-    by_pose: ClassVar[tuple[str, ...]] = ("q", "values")
+    by_pose: ClassVar[tuple[str, ...]] = ("q", "values", "u")
+    table: ClassVar[str] = "distances"
+    entries: ClassVar[tuple[Entry, ...]] = (
+        READINGS,
+        Entry("values", "measured distance from the pivot", "mm", ("pose",), required=True),
+        Entry("u", "standard uncertainty of a distance", "mm", ("pose",)),
+        Entry("constant", "whether an unknown constant is added to all distances", content="truth"),
+        TARGET,
+    )
     rows: ClassVar[int] = 1
     q: Float[AnyArray, "m n"]
     values: Float[AnyArray, " m"]
-    u: Float[AnyArray, ""]
+    u: Float[AnyArray, " m"]
     name: str = eqx.field(static=True)
     target: str = eqx.field(static=True)
     constant: bool = eqx.field(static=True)
@@ -66,7 +76,7 @@ class Distances(AbstractObservation):
         where = f"observation '{name}'"
         self.q = checked_readings(where, q)
         self.values = checked_values(f"distances of {where}", values, (self.q.shape[0],))
-        self.u = checked_scalar(f"u of {where}", u)
+        self.u = _checked_u(where, u, self.q.shape[0])
         self.target = checked_target(target)
         self.constant = bool(constant)
 
@@ -111,7 +121,7 @@ class Distances(AbstractObservation):
         if self.constant:
             values = values + unknowns[self.zero][0]
             by_unknowns[self.zero] = -xp.ones((1, 1, m))
-        measured = xp.broadcast_to(xp.asarray(self.u**2), (m, 1, 1))
+        measured = xp.reshape(xp.asarray(self.u**2), (m, 1, 1))
         return Rows((distance - values)[None], direction, by_unknowns, measured)
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
@@ -119,6 +129,15 @@ class Distances(AbstractObservation):
             raise InputError(
                 f"observation '{self.name}' has {tips.shape[1]} distances, but its pivot needs four; measure more."
             )
+
+
+def _checked_u(where: str, u: Numbers, poses: int) -> AnyArray:
+    array = as_floats(u, f"u of {where}")
+    if array.shape not in ((), (poses,)):
+        raise InputError(f"u of {where} has shape {array.shape}; give one number, or ({poses},).")
+    if is_concrete(array) and np.any(np.asarray(array) < 0):
+        raise InputError(f"u of {where} is negative; a standard uncertainty must be zero or positive.")
+    return namespace(array).broadcast_to(array, (poses,))
 
 
 class SimulatedDistances(AbstractSimulated):

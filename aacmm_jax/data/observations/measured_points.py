@@ -14,8 +14,11 @@ from ...core.rotations import fitted_frame, rotation_matrix
 from .frames import frame_and_offset, placed
 from .observation import (
     FRAME,
+    READINGS,
+    TARGET,
     AbstractObservation,
     AbstractSimulated,
+    Entry,
     Rows,
     Tips,
     Unknowns,
@@ -29,6 +32,7 @@ from .observation import (
     offset_of,
 )
 
+STATION = Entry("station", "station of the instrument", content="text")
 _FLAT = 1e-6  # second singular value of points on a line, of the first
 _SAME = 1e-9  # mm
 
@@ -52,6 +56,15 @@ class MeasuredPoints(AbstractObservation):
 
     kind: ClassVar[str] = "points"
     by_pose: ClassVar[tuple[str, ...]] = ("q", "points", "covariance")
+    table: ClassVar[str] = "points"
+    entries: ClassVar[tuple[Entry, ...]] = (
+        READINGS,
+        Entry("points", "measured point", "mm", ("pose", "axis"), required=True),
+        Entry("u", "standard uncertainty of a coordinate", "mm", ("pose", "axis")),
+        Entry("covariance", "covariance of a point", "mm^2", ("pose", "axis", "axis_2")),
+        STATION,
+        TARGET,
+    )
     rows: ClassVar[int] = 3
     q: Float[AnyArray, "m n"]
     points: Float[AnyArray, "m 3"]

@@ -12,11 +12,14 @@ from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, rotation_derivative, rotation_matrix, rotation_vector
 from .frames import frame_and_offset, placed
-from .measured_points import check_spread
+from .measured_points import STATION, check_spread
 from .observation import (
     FRAME,
+    READINGS,
+    TARGET,
     AbstractObservation,
     AbstractSimulated,
+    Entry,
     Rows,
     Tips,
     Unknowns,
@@ -52,6 +55,17 @@ class MeasuredTransforms(AbstractObservation):
 
     kind: ClassVar[str] = "transforms"
     by_pose: ClassVar[tuple[str, ...]] = ("q", "points", "rotations", "covariance")
+    table: ClassVar[str] = "transforms"
+    entries: ClassVar[tuple[Entry, ...]] = (
+        READINGS,
+        Entry("points", "measured point", "mm", ("pose", "axis"), required=True),
+        Entry("u", "standard uncertainty of a coordinate", "mm", ("pose", "axis")),
+        Entry("covariance", "covariance of a point", "mm^2", ("pose", "axis", "axis_2")),
+        Entry("rotations", "measured axes of the target, as columns", "1", ("pose", "axis", "axis_2"), required=True),
+        Entry("u_angle", "standard uncertainty of an orientation about each axis", "rad", required=True),
+        STATION,
+        TARGET,
+    )
     rows: ClassVar[int] = 6
     q: Float[AnyArray, "m n"]
     points: Float[AnyArray, "m 3"]

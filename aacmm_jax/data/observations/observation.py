@@ -8,7 +8,7 @@ calibration) is the same for all kinds.
 import abc
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -44,6 +44,21 @@ class Rows(NamedTuple):
     by_rotation: Float[AnyArray, "r 3 m"] | None = None  # by a small rotation of the last frame, rad
 
 
+class Entry(NamedTuple):
+    """One of the data of a kind, as files hold it and a manifest states it."""
+
+    name: str
+    says: str
+    unit: str = ""  # none for text and truth values
+    dimensions: tuple[str, ...] = ()  # of an array: the first is "pose" where there is a row for each pose
+    content: Literal["number", "text", "truth"] = "number"
+    required: bool = False
+
+
+READINGS = Entry("q", "joint angle as read", "rad", ("pose", "joint"), required=True)
+TARGET = Entry("target", "tip that was held or seen; empty: the arm's own probe", content="text")
+
+
 class AbstractObservation(eqx.Module):
     """Poses in which the tip owes something to an unknown geometry.
 
@@ -53,6 +68,8 @@ class AbstractObservation(eqx.Module):
 
     kind: ClassVar[str]
     by_pose: ClassVar[tuple[str, ...]] = ("q",)  # fields with one row a pose
+    table: ClassVar[str]  # name of its tables in a manifest
+    entries: ClassVar[tuple[Entry, ...]]
     rows: eqx.AbstractClassVar[int]
     name: eqx.AbstractVar[str]
     target: eqx.AbstractVar[str]
@@ -81,6 +98,17 @@ class AbstractObservation(eqx.Module):
     @abc.abstractmethod
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         """The residuals at these tips and this geometry."""
+
+    def stored(self) -> dict[str, Any]:
+        """The values of the entries, from which `rebuilt` makes the same observation; without those that have none."""
+        found = {entry.name: getattr(self, entry.name, None) for entry in self.entries}
+        return {name: value for name, value in found.items() if value is not None}
+
+    @classmethod
+    def rebuilt(cls, name: str, stored: Mapping[str, Any]) -> "AbstractObservation":
+        """An observation of this kind from the values of its entries, which are checked again."""
+        constructor: Any = cls
+        return constructor(name, **stored)
 
     @property
     def labels(self) -> tuple[str, ...]:

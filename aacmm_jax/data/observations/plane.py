@@ -1,7 +1,7 @@
 """Planes: the tip touches one, or two parallel ones at a certified distance."""
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -13,8 +13,11 @@ from ...core.linear_algebra import semidefinite_eigen
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, rotation_derivative, rotation_matrix
 from .observation import (
+    READINGS,
+    TARGET,
     AbstractObservation,
     AbstractSimulated,
+    Entry,
     Rows,
     Tips,
     Unknowns,
@@ -42,6 +45,12 @@ class Plane(AbstractObservation):
     """
 
     kind: ClassVar[str] = "plane"
+    table: ClassVar[str] = "plane"
+    entries: ClassVar[tuple[Entry, ...]] = (
+        READINGS,
+        Entry("form", "standard deviation of the surface about its plane", "mm"),
+        TARGET,
+    )
     rows: ClassVar[int] = 1
     q: Float[AnyArray, "m n"]
     form: Float[AnyArray, ""]
@@ -97,6 +106,17 @@ class ParallelPlanes(AbstractObservation):
 
     kind: ClassVar[str] = "parallel planes"
     by_pose: ClassVar[tuple[str, ...]] = ("q", "second")
+    table: ClassVar[str] = "parallel_planes"
+    entries: ClassVar[tuple[Entry, ...]] = (
+        READINGS,
+        Entry("side", "plane that was touched: one or other", dimensions=("pose",), content="text", required=True),
+        Entry("distance", "certified distance between the planes", "mm", required=True),
+        Entry("u", "standard uncertainty of the distance", "mm"),
+        Entry("stylus", "diameter of the tip's ball", "mm"),
+        Entry("inside", "whether the ball was between the planes", content="truth"),
+        Entry("form", "standard deviation of the surface about its plane", "mm"),
+        TARGET,
+    )
     rows: ClassVar[int] = 1
     q: Float[AnyArray, "m n"]
     distance: Float[AnyArray, ""]  # of the tip's centres, mm
@@ -139,6 +159,20 @@ class ParallelPlanes(AbstractObservation):
     def place(self) -> str:
         """Name of the first of the unknown planes."""
         return f"plane {self.name}"
+
+    def stored(self) -> dict[str, Any]:
+        # The distance of the tip's centres has taken up the ball.
+        sides = np.where(self.second, "other", "one")
+        return super().stored() | {"side": sides}
+
+    @classmethod
+    def rebuilt(cls, name: str, stored: Mapping[str, Any]) -> "ParallelPlanes":
+        rest = {key: value for key, value in stored.items() if key not in ("q", "side")}
+        side = np.asarray(stored["side"])
+        unknown = sorted(set(side.tolist()) - {"one", "other"})
+        if unknown:
+            raise InputError(f"planes '{name}' have the side '{unknown[0]}'; the sides are one and other.")
+        return cls(name, stored["q"][side == "one"], stored["q"][side == "other"], **rest)
 
     @property
     def first(self) -> int:

@@ -11,7 +11,10 @@ from ...core.arrays import Numbers
 from ...core.numpy_or_jax import AnyArray, namespace
 from .observation import (
     POINT,
+    READINGS,
+    TARGET,
     AbstractObservation,
+    Entry,
     Rows,
     Tips,
     Unknowns,
@@ -36,6 +39,11 @@ class Socket(AbstractObservation):
     """
 
     kind: ClassVar[str] = "socket"
+    table: ClassVar[str] = "socket"
+    entries: ClassVar[tuple[Entry, ...]] = (
+        READINGS,
+        TARGET,
+    )
     rows: ClassVar[int] = 3
     q: Float[AnyArray, "m n"]
     name: str = eqx.field(static=True)

@@ -1,7 +1,7 @@
 """A sphere: the tip touches it, so it is at one distance from an unknown centre."""
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -13,8 +13,11 @@ from ...core.linear_algebra import solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace
 from .observation import (
     POINT,
+    READINGS,
+    TARGET,
     AbstractObservation,
     AbstractSimulated,
+    Entry,
     Rows,
     Tips,
     Unknowns,
@@ -47,6 +50,14 @@ class Sphere(AbstractObservation):
     """
 
     kind: ClassVar[str] = "sphere"
+    table: ClassVar[str] = "touched_sphere"
+    entries: ClassVar[tuple[Entry, ...]] = (
+        READINGS,
+        Entry("diameter", "certified diameter", "mm"),
+        Entry("u", "standard uncertainty of the diameter", "mm"),
+        Entry("stylus", "diameter of the tip's ball", "mm"),
+        TARGET,
+    )
     q: Float[AnyArray, "m n"]
     radius: Float[AnyArray, ""] | None  # of the tip's centre, mm
     u: Float[AnyArray, ""]  # of the radius, mm
@@ -95,6 +106,11 @@ class Sphere(AbstractObservation):
     @property
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.centre: POINT} | ({self.size: ("mm",)} if self.free else {})
+
+    def stored(self) -> dict[str, Any]:
+        # The radius of the tip's centre has taken up the ball; twice and half of a number are exact.
+        size = {} if self.radius is None else {"diameter": 2 * self.radius}
+        return {"q": self.q, **size, "u": 2 * self.u, "target": self.target}
 
     @property
     def fixes_scale(self) -> bool:

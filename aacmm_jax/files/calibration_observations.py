@@ -1,0 +1,121 @@
+"""What a calibration file holds of observations: how they agree, the geometry found, and poses that lost weight."""
+
+import os
+
+import numpy as np
+
+from ..calibration.record import CalibrationRecord, OtherPoses
+from ..calibration.results import ObservedMetrics
+from ..data.capture import Capture
+from ..model.observed import Observed
+from .hdf5 import Stored, Table, check_sense, columns, need, numbering
+
+
+def observed_tables(record: CalibrationRecord) -> dict[str, Table]:
+    """The tables ``observed``, ``geometry``, ``pose_weights`` and ``other_poses``, as far as there is anything in
+    them."""
+    found = {}
+    if record.observed is not None:
+        found = _tables_of(record.observed, Observed.of(record.recording.capture).blocks)
+    others = record.others
+    if others is not None:
+        found["other_poses"] = Table(
+            columns(
+                "observation",
+                observation=(list(others.names), "", "observation"),
+                poses=(others.poses, "1", "number of poses that the arm was not calibrated with"),
+                rms=(others.rms, "mm", "their root mean square distance from the geometry found"),
+                rms_angle=(others.rms_angle, "rad", "their root mean square angle"),
+            )
+        )
+    return found
+
+
+def _tables_of(observed: ObservedMetrics, units: dict[str, tuple[str, ...]]) -> dict[str, Table]:
+    numbers = [(name, i, value) for name, values in observed.geometry.items() for i, value in enumerate(values)]
+    weights = [(name, weight) for name, of in zip(observed.names, observed.weights, strict=True) for weight in of]
+    return {
+        "observed": Table(
+            columns(
+                "observation",
+                observation=(list(observed.names), "", "observation"),
+                kind=(list(observed.kinds), "", "its kind"),
+                poses=([len(weights) for weights in observed.weights], "1", "number of poses"),
+                rms_before=(
+                    np.asarray(observed.rms_before),
+                    "mm",
+                    "root mean square distance from the geometry, nominal arm",
+                ),
+                rms_after=(np.asarray(observed.rms_after), "mm", "the same by the calibrated arm"),
+                reduced_chi=(
+                    np.asarray(observed.reduced_chi),
+                    "1",
+                    "root mean square in standard deviations of a residual",
+                ),
+            ),
+            {"sigma_mm": float(observed.sigma), "reduced_chi_of_all": float(observed.reduced_chi_of_all)},
+        ),
+        "geometry": Table(
+            numbering("number", len(numbers))
+            | columns(
+                "number",
+                part=([name for name, *_ in numbers], "", "part of the unknown geometry"),
+                unit=([units[name][i] for name, i, _ in numbers], "", "unit"),
+                value=([float(value) for *_, value in numbers], "mm or rad, see unit", "value"),
+            )
+        ),
+        "pose_weights": Table(
+            numbering("pose", len(weights))
+            | columns(
+                "pose",
+                observation=([name for name, _ in weights], "", "observation"),
+                weight=([float(weight) for _, weight in weights], "1", "weight; below 1 by a robust loss"),
+            )
+        ),
+    }
+
+
+def observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> ObservedMetrics | None:
+    """How the observations of a file agree with its arm; None where it holds sockets and lengths only."""
+    table = stored.tables.get("observed")
+    if table is None:
+        check_sense(path, {"its observations have no results": bool(capture.observations)})
+        return None
+    need(path, stored.tables, "geometry", "pose_weights")
+    need(path, table, "observation", "kind", "poses", "rms_before", "rms_after", "reduced_chi", of="entry")
+    geometry, weights = stored.tables["geometry"], stored.tables["pose_weights"]
+    parts = geometry["part"].astype(str)
+    attributes = stored.table_attributes["observed"]
+    blocks = Observed.of(capture).blocks
+    ends = np.cumsum(table["poses"])
+    found = ObservedMetrics(
+        names=tuple(map(str, table["observation"])),
+        kinds=tuple(map(str, table["kind"])),
+        rms_before=table["rms_before"],
+        rms_after=table["rms_after"],
+        reduced_chi=table["reduced_chi"],
+        reduced_chi_of_all=np.asarray(attributes["reduced_chi_of_all"]),
+        sigma=np.asarray(attributes["sigma_mm"]),
+        geometry={name: geometry["value"][parts == name] for name in dict.fromkeys(parts.tolist())},
+        weights=tuple(np.split(weights["weight"], ends[:-1])),
+    )
+    expected = (*capture.names, *(observation.name for observation in capture.observations))
+    check_sense(
+        path,
+        {
+            "its results are of other observations": found.names != expected,
+            "its geometry is that of other observations": {k: len(v) for k, v in found.geometry.items()}
+            != {name: len(units) for name, units in blocks.items()},
+            "a weight is not between 0 and 1": not np.all((weights["weight"] >= 0) & (weights["weight"] <= 1)),
+            "a root mean square is negative": bool(np.any(table["rms_after"] < 0) or np.any(table["rms_before"] < 0)),
+        },
+    )
+    return found
+
+
+def other_poses_of(stored: Stored) -> OtherPoses | None:
+    """How the arm of a file agrees with poses that it was not calibrated with."""
+    table = stored.tables.get("other_poses")
+    if table is None:
+        return None
+    return OtherPoses(tuple(map(str, table["observation"])), table["poses"], table["rms"], table["rms_angle"])

@@ -1,0 +1,312 @@
+"""Observations in a manifest: a table a kind, made of what the kind declares, whose columns are those of text files.
+
+Nothing here depends on a kind: `AbstractObservation.entries` says what each needs.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import AfterValidator, Field, FiniteFloat, NonNegativeInt, PositiveFloat, create_model
+
+from ..core.errors import InputError, nearest
+from ..core.text import shorten
+from ..core.units import ARCSEC, DEG, INCH, UM, M
+from ..data.observations.observation import AbstractObservation, Entry
+from ..data.observations.socket import Socket
+from .inputs import InputFile
+from .observations import kinds
+from .patterns import check_name, fields_of, fill
+from .text_table import Column, TextTable
+from .toml import Strict, each_once
+
+LENGTHS = {"mm": 1.0, "m": M, "um": UM, "inch": INCH}
+_ANGLES = {"rad": 1.0, "deg": DEG, "arcsec": ARCSEC}
+_NUMBERS_OF_ROTATION = {"vector": 3, "quaternion wxyz": 4, "quaternion xyzw": 4, "matrix": 9}
+_EULER = re.compile("[xyz]{3}|[XYZ]{3}")
+
+
+class Preset(NamedTuple):
+    """Columns, units and conventions of tables that people have; a manifest may change each of them."""
+
+    columns: Mapping[str, Sequence[Column]]
+    units: Mapping[str, str] = {}
+    rotation: str | None = None
+    coverage_factor: float = 1.0
+
+
+PRESETS = {
+    # Readings and positions as `aacmm plan` writes them.
+    "csv": Preset({"q": ["q_*_deg"], "points": ["[xyz]_mm"], "u": ["u_[xyz]_mm"]}, {"q": "deg"}),
+    # 6-D export of a laser tracker: U(95) of the coordinates, scalar part of the quaternion first.
+    "leica": Preset(
+        {"points": ["X", "Y", "Z"], "u": ["U95 X", "U95 Y", "U95 Z"], "rotations": ["Q0", "Q1", "Q2", "Q3"]},
+        rotation="quaternion wxyz",
+        coverage_factor=2.0,
+    ),
+    # Point lists with the direction in which a point was probed, which is not needed.
+    "xyzijk": Preset({"points": [1, 2, 3]}),
+    # christianlandgraf/ipa-robot-accuracy; R = Rx(rx) Ry(ry) Rz(rz) is the order that agrees with the robot's joints.
+    "ipa": Preset(
+        {"q": ["q?_rad"], "points": ["[xyz]_mm"], "u": ["std_[xyz]_mm"], "rotations": ["r[xyz]_deg"]},
+        {"q": "rad", "rotations": "deg"},
+        rotation="XYZ",
+    ),
+}
+
+
+def _rotation(text: str) -> str:
+    if text not in _NUMBERS_OF_ROTATION and not _EULER.fullmatch(text):
+        raise ValueError(
+            f"'{text}' is no convention of rotations; give {', '.join(_NUMBERS_OF_ROTATION)}, or three axes such as "
+            "XYZ (moving axes, R = Rx Ry Rz) or xyz (fixed axes, R = Rz Ry Rx)."
+        )
+    return text
+
+
+_Picked = Column | Annotated[list[Column], Field(min_length=1)]
+
+
+class _Table(Strict):
+    """What the tables of all kinds have in common."""
+
+    name: str | None = None
+    file: str | None = None
+    files: Annotated[list[str], Field(min_length=1), AfterValidator(each_once)] | dict[str, str] | None = None
+    exclude: list[str] = Field(default_factory=list)
+    readings: str | None = None  # file of the readings, in the same order
+    preset: Literal["csv", "leica", "xyzijk", "ipa"] | None = None
+    columns: dict[str, _Picked] = Field(default_factory=dict)
+    units: dict[str, str] = Field(default_factory=dict)
+    rotation: Annotated[str, AfterValidator(_rotation)] | None = None
+    coverage_factor: PositiveFloat | None = None  # of the columns of u
+    delimiter: Literal[",", ";", "\t", " "] | None = None
+    decimal: Literal[".", ","] = "."
+    skip: NonNegativeInt = 0
+    group: Column | None = None
+
+    @property
+    def paths(self) -> list[str]:
+        """Its files, for fields in braces."""
+        if self.file is not None:
+            return [self.file]
+        return list(self.files.values() if isinstance(self.files, dict) else self.files or ())
+
+
+def _model(kind: type[AbstractObservation]) -> type[_Table]:
+    fields: dict[str, Any] = {}
+    for entry in kind.entries:
+        stated = _stated(entry)
+        if stated is not None:
+            fields[entry.name] = (bool, False) if entry.content == "truth" else (stated | None, None)
+    return create_model(f"{kind.__name__}Table", __base__=_Table, **fields)
+
+
+def _stated(entry: Entry) -> Any:
+    """The type of an entry that is stated in the manifest itself, or None for one that is in columns only."""
+    if not entry.dimensions:
+        return {"number": FiniteFloat, "text": str, "truth": bool}[entry.content]
+    if entry.dimensions in (("pose",), ("pose", "axis")) and entry.content == "number" and not entry.required:
+        return FiniteFloat  # the same for all
+    if entry.dimensions[-1:] == ("axis",) and entry.dimensions[0] != "pose":
+        return dict[str, Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]]
+    return None
+
+
+# Sockets have a table of their own.
+TABLES = {kind: _model(kind) for kind in kinds().values() if kind is not Socket}
+FIELDS: dict[str, Any] = {
+    kind.table: (list[table], Field(default_factory=list))  # pyright: ignore[reportInvalidTypeForm]
+    for kind, table in TABLES.items()
+}
+
+
+class Source(NamedTuple):
+    """How the files of a manifest are read."""
+
+    folder: Path
+    open: Callable[[Path], InputFile]
+    joints: int
+    columns: Sequence[int] | None  # of the readings, by [angles]
+    radians: Callable[[np.ndarray, str | None, str | None], np.ndarray]  # unit of the table, and of its preset
+
+
+def observations(
+    source: Source, kind: type[AbstractObservation], table: Any, values: Mapping[str, str]
+) -> Iterator[AbstractObservation]:
+    """The observations of one table of a manifest, one for each group; ``values`` are those of its fields in braces."""
+    where = f"[[{kind.table}]]"
+    if (table.file is None) == (table.files is None):
+        raise InputError(f"a table {where} needs either file or files.")
+    first = Path(fill(table.paths[0], values))
+    name = first.stem if table.name is None else fill(table.name, values)
+    check_name(name)
+    reader = _Reader(source, kind, table, f"{where} '{name}'")
+    found = [reader.read(label, fill(file, values)) for label, file in _files(table)]
+    groups = np.concatenate([group for group, _ in found])
+    by_pose = {key: np.concatenate([rows[key] for _, rows in found]) for key in found[0][1]}
+    stated = reader.stated(values)
+    both = sorted(by_pose.keys() & stated.keys())
+    if both:
+        raise InputError(f"{where} '{name}': {both[0]} is given and also in columns; give it once.")
+    for group in dict.fromkeys(groups.tolist()):
+        rows = {key: value[groups == group] for key, value in by_pose.items()}
+        reader.check_complete({*rows, *stated})
+        yield kind.rebuilt(f"{name}/{group}" if table.group is not None else name, rows | stated)
+
+
+def _files(table: Any) -> list[tuple[str, str]]:
+    """The files of a table, each with the label of its poses."""
+    if isinstance(table.files, dict):
+        return list(table.files.items())
+    return [("", file) for file in table.paths]
+
+
+class _Reader:
+    """The entries of one table, from its files and from the manifest."""
+
+    def __init__(self, source: Source, kind: type[AbstractObservation], table: Any, where: str):
+        self._source, self._kind, self._table, self._where = source, kind, table, where
+        self._preset = PRESETS[table.preset] if table.preset is not None else Preset({})
+        self._entries = {entry.name: entry for entry in kind.entries}
+        for key in (*table.columns, *table.units):
+            if key not in self._entries:
+                raise InputError(f"{where} has no '{key}'{nearest(key, self._entries)}")
+        labels = [e for e in kind.entries if e.dimensions == ("pose",) and e.content == "text"]
+        self._label = labels[0].name if labels else None
+        if isinstance(table.files, dict) and self._label is None:
+            raise InputError(f"{where} has files by name, but its poses have none; give files as a list.")
+        if table.readings is not None and len(table.paths) > 1:
+            raise InputError(f"{where} has readings in a file of their own, so it needs one file of values.")
+
+    def read(self, label: str, file: str) -> tuple[np.ndarray, dict[str, Any]]:
+        """The group of each pose of a file, and what its columns hold."""
+        table, source = self._table, self._source
+        text = TextTable(
+            source.open(source.folder / file), delimiter=table.delimiter, decimal=table.decimal, skip=table.skip
+        )
+        chosen = {key: [x] if isinstance(x, str | int) else x for key, x in table.columns.items()}
+        for key, wanted in self._preset.columns.items():
+            # A preset may name more than a kind needs, or than a table has.
+            if key in self._entries and key not in chosen and getattr(table, key, None) is None and text.has(wanted):
+                chosen[key] = wanted
+        found: dict[str, Any] = {}
+        if label:
+            chosen.pop(self._label or "", None)
+        readings = self._readings(text, chosen.pop("q", None))
+        found["q"] = readings
+        for key, wanted in chosen.items():
+            found[key] = self._column(text, self._entries[key], wanted)
+        if label and self._label is not None:
+            found[self._label] = np.full(len(readings), label)
+        for key, rows in found.items():
+            if len(rows) != len(readings):
+                raise InputError(
+                    f"{self._where}: {file} has {len(rows)} rows of '{key}', but there are {len(readings)} readings; "
+                    "give a row of each for every pose."
+                )
+        group = np.full(len(readings), "") if table.group is None else text.texts(table.group)
+        return group, found
+
+    def _readings(self, text: TextTable, wanted: Sequence[Column] | None) -> np.ndarray:
+        source, table = self._source, self._table
+        if table.readings is not None:
+            text = TextTable(source.open(source.folder / table.readings), delimiter=table.delimiter,
+                             decimal=table.decimal)  # fmt: skip
+        if wanted is None:
+            wanted = list(range(1, source.joints + 1)) if source.columns is None else source.columns
+        numbers = text.numbers(wanted)
+        if numbers.shape[1] != source.joints:
+            raise InputError(
+                f"{self._where} picks {numbers.shape[1]} columns for the readings, but the arm has {source.joints} "
+                "joints; give one column a joint."
+            )
+        return source.radians(numbers, table.units.get("q"), self._preset.units.get("q"))
+
+    def _column(self, text: TextTable, entry: Entry, wanted: Sequence[Column]) -> np.ndarray:
+        if entry.dimensions[:1] != ("pose",):
+            raise InputError(f"{self._where}: {entry.name} is one for all poses; state it outside columns.")
+        if entry.content == "text":
+            if len(wanted) != 1:
+                raise InputError(f"{self._where}: {entry.name} is in one column; pick one.")
+            return text.texts(wanted[0])
+        numbers = text.numbers(wanted)
+        if entry.unit == "1":
+            return self._rotations(entry, numbers)
+        counts = {("pose",): (1,), ("pose", "axis"): (3,), ("pose", "axis", "axis_2"): (9,)}[entry.dimensions]
+        if entry.name == "u" and entry.dimensions == ("pose", "axis"):
+            counts = (1, 3)
+        self._check_count(entry.name, numbers.shape[1], counts)
+        numbers = numbers * self._unit(entry)
+        if entry.name == "u":
+            numbers = numbers / (self._table.coverage_factor or self._preset.coverage_factor)
+        if len(entry.dimensions) == 3:
+            return numbers.reshape(-1, 3, 3)
+        return numbers[:, 0] if entry.dimensions == ("pose",) else np.broadcast_to(numbers, (len(numbers), 3))
+
+    def _check_count(self, name: str, given: int, counts: Sequence[int]) -> None:
+        if given not in counts:
+            wanted = " or ".join(map(str, counts))
+            raise InputError(f"{self._where}: {name} is in {wanted} columns, but {given} are picked; pick {wanted}.")
+
+    def _unit(self, entry: Entry) -> float:
+        """What a number of the table or manifest is multiplied by."""
+        known = _ANGLES if entry.unit in ("rad", "1") else LENGTHS
+        unit = self._table.units.get(entry.name, self._preset.units.get(entry.name))
+        if unit is None:
+            if entry.unit == "1":
+                raise InputError(f"{self._where} has angles without a unit; give units = {{ {entry.name} = 'deg' }}.")
+            return 1.0
+        if unit not in known:
+            raise InputError(f"{self._where}: units.{entry.name} is '{unit}'; it must be one of {', '.join(known)}.")
+        return known[unit] ** (2 if entry.unit == "mm^2" else 1)
+
+    def _rotations(self, entry: Entry, numbers: np.ndarray) -> np.ndarray:
+        from scipy.spatial.transform import Rotation
+
+        convention = self._table.rotation or self._preset.rotation
+        if convention is None:
+            raise InputError(
+                f"{self._where} does not say how its rotations are written; give rotation = "
+                f"{', '.join(_NUMBERS_OF_ROTATION)}, or three axes such as XYZ or xyz."
+            )
+        self._check_count(entry.name, numbers.shape[1], (_NUMBERS_OF_ROTATION.get(convention, 3),))
+        if convention == "matrix":
+            return numbers.reshape(-1, 3, 3)
+        if convention.startswith("quaternion"):
+            if not np.allclose(np.linalg.norm(numbers, axis=1), 1, atol=1e-3):
+                raise InputError(f"{self._where} has quaternions that are not of length 1; pick their four columns.")
+            return Rotation.from_quat(numbers, scalar_first=convention.endswith("wxyz")).as_matrix()
+        numbers = numbers * self._unit(entry)
+        rotations = (
+            Rotation.from_rotvec(numbers) if convention == "vector" else Rotation.from_euler(convention, numbers)
+        )
+        return rotations.as_matrix()
+
+    def stated(self, values: Mapping[str, str]) -> dict[str, Any]:
+        """What the manifest itself states, in mm and rad."""
+        found: dict[str, Any] = {}
+        for entry in self._kind.entries:
+            value = getattr(self._table, entry.name, None)
+            if value is None:
+                continue
+            if isinstance(value, dict):
+                found[entry.dimensions[0]] = np.array(list(value))
+                found[entry.name] = np.array(list(value.values()), dtype=float) * self._unit(entry)
+            elif entry.content == "text":
+                unknown = fields_of(value) - values.keys()
+                if unknown:
+                    raise InputError(f"{self._where}: {entry.name} uses the unknown field {shorten(sorted(unknown))}.")
+                found[entry.name] = fill(value, values)
+            else:
+                found[entry.name] = value if entry.content == "truth" else value * self._unit(entry)
+        return found
+
+    def check_complete(self, given: set[str]) -> None:
+        """Raise `InputError` where something that the kind needs is nowhere."""
+        for entry in self._kind.entries:
+            if entry.required and entry.name not in given:
+                place = "pick its columns with columns" if entry.dimensions[:1] == ("pose",) else "state it"
+                raise InputError(f"{self._where} has no '{entry.name}' ({entry.says}); {place}.")

@@ -1,0 +1,85 @@
+"""Observations in HDF5: one table each, of the entries that its kind declares; nothing here depends on a kind."""
+
+import os
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from .. import data
+from ..core.errors import InputError
+from ..data.observations.observation import AbstractObservation
+from .hdf5 import Stored, Table, Variable, axes, columns, need, numbering
+
+_PREFIX = "observation_"
+
+
+def kinds() -> dict[str, type[AbstractObservation]]:
+    """Every kind of observations by its name."""
+    found = (getattr(data.observations, name) for name in dir(data.observations))
+    return {one.kind: one for one in found if isinstance(one, type) and issubclass(one, AbstractObservation)}
+
+
+def observation_tables(observations: Iterable[AbstractObservation]) -> dict[str, Table]:
+    """A table for each observation: arrays over its poses, and single values as attributes with the unit in the name.
+
+    They are named by number, since names of observations may hold what names of groups may not.
+    """
+    return {f"{_PREFIX}{number}": _table(one) for number, one in enumerate(observations, start=1)}
+
+
+def _table(observation: AbstractObservation) -> Table:
+    variables: dict[str, Variable] = {}
+    attributes: dict[str, Any] = {"kind": observation.kind, "name": observation.name}
+    stored = observation.stored()
+    for entry in observation.entries:
+        if entry.name not in stored:
+            continue
+        value = np.asarray(stored[entry.name])
+        if not entry.dimensions:
+            attributes[_attribute(entry.name, entry.unit)] = value.item()
+            continue
+        variables[entry.name] = Variable(entry.dimensions, value, entry.unit, entry.says)
+        for dimension, size in zip(entry.dimensions, value.shape, strict=True):
+            if dimension not in variables and dimension != entry.name:
+                variables |= _coordinate(dimension, size)
+    return Table(variables, attributes)
+
+
+def _attribute(name: str, unit: str) -> str:
+    return f"{name}_{unit}" if unit else name
+
+
+def _coordinate(dimension: str, size: int) -> dict[str, Variable]:
+    if dimension == "axis":
+        return axes()
+    if dimension == "axis_2":
+        return columns("axis_2", axis_2=(["x", "y", "z"], "", "second axis"))
+    return numbering(dimension, size)
+
+
+def observations_of(path: str | os.PathLike, stored: Stored) -> list[AbstractObservation]:
+    """The observations that a file holds, checked as when they were made. Raises `InputError`."""
+    numbers = sorted(int(name.removeprefix(_PREFIX)) for name in stored.tables if name.startswith(_PREFIX))
+    tables = [f"{_PREFIX}{number}" for number in numbers]
+    return [_observation(path, stored.tables[name], stored.table_attributes[name]) for name in tables]
+
+
+def _observation(
+    path: str | os.PathLike, table: Mapping[str, np.ndarray], attributes: Mapping[str, Any]
+) -> AbstractObservation:
+    need(path, attributes, "kind", "name", of="attribute")
+    kind = kinds().get(attributes["kind"])
+    if kind is None:
+        raise InputError(
+            f"{path} holds an observation of the unknown kind '{attributes['kind']}'; update aacmm_jax, or make the "
+            "file again."
+        )
+    values: dict[str, Any] = {}
+    for entry in kind.entries:
+        found = table.get(entry.name) if entry.dimensions else attributes.get(_attribute(entry.name, entry.unit))
+        if found is not None:
+            values[entry.name] = found.astype(str) if entry.dimensions and entry.content == "text" else found
+        elif entry.required:
+            need(path, {}, entry.name, of="entry")
+    return kind.rebuilt(attributes["name"], values)

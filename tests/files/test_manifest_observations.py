@@ -1,0 +1,238 @@
+"""Observations in a manifest: columns of text tables of every make, conventions of rotations, presets, bad columns."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import aacmm_jax as aj
+from aacmm_jax.data import observations as kinds
+from aacmm_jax.files.manifest_observations import TABLES
+from aacmm_jax.files.observations import kinds as known_kinds
+from tests.refusals import assert_refused
+
+HEAD = 'arm = "cheng2018-simulation"\n[angles]\nunit = "rad"\n'
+RANDOM = np.random.default_rng(0)
+Q = RANDOM.uniform(-3, 3, (5, 6))
+P = RANDOM.uniform(-900, 900, (5, 3))
+U = RANDOM.uniform(0.01, 0.1, (5, 3))
+R = Rotation.random(5, random_state=0)
+NAMES = ["q1", "q2", "q3", "q4", "q5", "q6", "x", "y", "z", "ux", "uy", "uz"]
+ALL = 'columns = { q = "q?", points = ["x", "y", "z"], u = ["ux", "uy", "uz"] }\n'
+
+
+def write(path, values, header=NAMES, delimiter=",", decimal=".", before=""):
+    lines = [delimiter.join(header)] if header is not None else []
+    for row in values:
+        cells = [cell if isinstance(cell, str) else repr(float(cell)).replace(".", decimal) for cell in row]
+        lines.append(delimiter.join(cells))
+    path.write_text(before + "\n".join(lines) + "\n")
+
+
+def read(tmp_path, text):
+    (tmp_path / "capture.toml").write_text(HEAD + text)
+    return aj.files.read_manifest(tmp_path / "capture.toml").capture.observations
+
+
+def test_every_kind_has_a_table():
+    assert set(TABLES) == set(known_kinds().values()) - {kinds.Socket}
+
+
+@pytest.mark.parametrize(
+    ("table", "stated", "factor"),
+    [
+        ({}, "", 1.0),
+        ({"delimiter": ";", "decimal": ","}, 'decimal = ","\n', 1.0),
+        ({"delimiter": "\t"}, "", 1.0),
+        ({"delimiter": " ", "decimal": ","}, 'decimal = ","\ndelimiter = " "\n', 1.0),
+        ({"before": "7 points\nof 1.5 m\n"}, "skip = 2\n", 1.0),
+        ({}, 'units = { points = "inch", u = "um" }\n', 25.4),
+        ({}, 'units = { points = "m" }\ncoverage_factor = 2.0\n', 1000.0),
+    ],
+)
+def test_tables_of_every_make(tmp_path, table, stated, factor):
+    write(tmp_path / "a.csv", np.hstack([Q, P, U]), **table)
+    (one,) = read(tmp_path, f'[[points]]\nfile = "a.csv"\ntarget = "ball"\n{stated}{ALL}')
+    assert (one.name, one.target, one.kind) == ("a", "ball", "points")
+    assert np.array_equal(one.q, Q)
+    assert np.allclose(one.points, factor * P, rtol=1e-15)
+    scale = 1e-3 if "um" in stated else 0.5 if "coverage" in stated else 1.0
+    assert np.allclose(np.sqrt(np.einsum("mii->mi", one.covariance)), scale * U, rtol=1e-12)
+
+
+def test_columns_by_number_and_readings_in_a_file_of_their_own(tmp_path):
+    write(tmp_path / "q.csv", np.rad2deg(Q), header=None)
+    write(tmp_path / "p.csv", [[f"P{i}", *row] for i, row in enumerate(P)], header=None, delimiter=";")
+    text = '[[points]]\nfile = "p.csv"\nreadings = "q.csv"\nu = 0.02\nname = "tracker"\nstation = "S1"\n'
+    (one,) = read(tmp_path, text + 'columns = { points = [2, 3, 4] }\nunits = { q = "deg" }\n')
+    assert np.allclose(one.q, Q)
+    assert np.array_equal(one.points, P)
+    assert np.allclose(one.covariance, 0.02**2 * np.eye(3))
+    assert (one.name, one.station) == ("tracker", "S1")
+
+
+@pytest.mark.parametrize(
+    ("rotation", "numbers", "unit"),
+    [
+        ("XYZ", R.as_euler("XYZ", degrees=True), "deg"),
+        ("zyx", R.as_euler("zyx", degrees=True), "deg"),
+        ("ZYZ", R.as_euler("ZYZ"), "rad"),
+        ("vector", R.as_rotvec(), "rad"),
+        ("quaternion wxyz", R.as_quat(scalar_first=True), None),
+        ("quaternion xyzw", R.as_quat(), None),
+        ("matrix", R.as_matrix().reshape(-1, 9), None),
+    ],
+)
+def test_rotations(tmp_path, rotation, numbers, unit):
+    names = [f"r{i}" for i in range(numbers.shape[1])]
+    write(tmp_path / "a.csv", np.hstack([Q, P, numbers]), header=[*NAMES[:9], *names])
+    units = f'units = {{ rotations = "{unit}" }}\n' if unit else ""
+    columns = 'columns = { q = "q?", points = ["x", "y", "z"], rotations = "r*" }\n'
+    (one,) = read(
+        tmp_path, f'[[transforms]]\nfile = "a.csv"\nu_angle = 0.001\nrotation = "{rotation}"\n{units}{columns}'
+    )
+    assert np.allclose(one.rotations, R.as_matrix(), atol=1e-12)
+    assert float(one.u_angle) == 0.001
+
+
+def test_moving_axes_are_turned_in_the_order_of_their_columns(tmp_path):
+    """The convention as the documents state it, without the library that computes it."""
+    write(tmp_path / "a.csv", np.hstack([Q, P, np.tile([30.0, 0.0, 90.0], (5, 1))]), header=[*NAMES[:9], "a", "b", "c"])
+    columns = 'columns = { q = "q?", points = ["x", "y", "z"], rotations = ["a", "b", "c"] }\n'
+    text = '[[transforms]]\nfile = "a.csv"\nu_angle = 0.001\nunits = { rotations = "deg" }\nrotation = "XYZ"\n'
+    (one,) = read(tmp_path, text + columns)
+    c, s = np.cos(np.pi / 6), 0.5
+    about_x, about_z = np.array([[1, 0, 0], [0, c, -s], [0, s, c]]), np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert np.allclose(one.rotations[0], about_x @ about_z, atol=1e-15)
+
+
+def test_a_tracker_export(tmp_path):
+    """U(95) is twice the standard uncertainty, and the scalar part of the quaternion comes first."""
+    write(tmp_path / "q.csv", Q, header=None)
+    header = ["Name", "X", "Y", "Z", "U95 X", "U95 Y", "U95 Z", "Q0", "Q1", "Q2", "Q3"]
+    rows = [[f"m{i}", *P[i], *2 * U[i], *R[i].as_quat(scalar_first=True)] for i in range(5)]
+    write(tmp_path / "t.csv", rows, header=header, delimiter=";")
+    text = '[[transforms]]\nfile = "t.csv"\nreadings = "q.csv"\npreset = "leica"\nu_angle = 2.0\n'
+    (one,) = read(tmp_path, text + 'units = { u_angle = "arcsec" }\n')
+    assert np.allclose(one.rotations, R.as_matrix())
+    assert np.allclose(np.sqrt(np.einsum("mii->mi", one.covariance)), U)
+    assert np.isclose(float(one.u_angle), 2 * aj.units.ARCSEC)
+
+
+def test_a_point_list(tmp_path):
+    write(tmp_path / "q.csv", Q, header=None)
+    write(tmp_path / "p.txt", np.hstack([P, R.as_rotvec()]), header=["X", "Y", "Z", "I", "J", "K"], delimiter=" ")
+    (one,) = read(tmp_path, '[[points]]\nfile = "p.txt"\nreadings = "q.csv"\npreset = "xyzijk"\n')
+    assert np.array_equal(one.points, P)
+
+
+def test_groups_and_names_of_points(tmp_path):
+    held = ["a", "b", "a", "b", "b"]
+    rows = [[*Q[i], held[i], "left" if i < 3 else "right", P[i, 0] + 1000] for i in range(5)]
+    write(tmp_path / "a.csv", rows, header=[*NAMES[:6], "ball", "place", "d"])
+    left, right = read(
+        tmp_path,
+        '[[artefact]]\nname = "bar"\nfile = "a.csv"\nartefact = "bar 1"\nu = 1.0\nunits = { u = "um" }\n'
+        'group = "place"\ncolumns = { point = "ball" }\ncoordinates = { a = [0.0, 0.0, 0.0], b = [300.5, 0.0, 0.0] }\n',
+    )
+    assert (left.name, right.name, left.artefact) == ("bar/left", "bar/right", "bar 1")
+    assert np.array_equal(left.q, Q[[0, 2, 1]])
+    assert (left.owner, right.owner) == ((0, 0, 1), (1, 1))
+    assert np.array_equal(left.coordinates[1], [300.5, 0, 0])
+    assert float(left.u) == 0.001
+    (distances,) = read(
+        tmp_path, '[[distances]]\nfile = "a.csv"\nu = 0.003\nconstant = true\ncolumns = { values = "d" }\n'
+    )
+    assert np.array_equal(distances.values, P[:, 0] + 1000)
+    assert distances.constant
+
+
+def test_touched_surfaces_and_files_by_name(tmp_path):
+    write(tmp_path / "one_a.csv", Q[:3], header=None)
+    write(tmp_path / "other_a.csv", Q[3:], header=None)
+    write(tmp_path / "ball.csv", Q, header=None)
+    planes, sphere, plane, socket = sorted(
+        read(
+            tmp_path,
+            '[[parallel_planes]]\nname = "block {x}"\nfiles = { one = "one_{x}.csv", other = "other_{x}.csv" }\n'
+            "distance = 100.0\nu = 0.001\nstylus = 6.0\ninside = true\n"
+            '[[touched_sphere]]\nfile = "ball.csv"\ndiameter = 1.0\nunits = { diameter = "inch" }\n'
+            '[[plane]]\nname = "wall"\nfile = "ball.csv"\n[[socket]]\nname = "z"\nfile = "ball.csv"\ntarget = "T"\n',
+        ),
+        key=lambda one: ["parallel planes", "sphere", "plane", "socket"].index(one.kind),
+    )
+    assert (planes.name, planes.first, float(planes.distance)) == ("block a", 3, 94.0)
+    assert float(sphere.radius) == 12.7
+    assert (plane.name, socket.target) == ("wall", "T")
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        (ALL.replace('"x"', '"X"'), ["a.csv has no column 'X'", "known are q1, q2"]),
+        (ALL.replace('"x"', "20"), ["a.csv has 12 columns", "no column 20"]),
+        (ALL.replace('"x"', '"y"'), ["one column is picked twice"]),
+        (ALL.replace('"q?"', '"q[1-3]"'), ["picks 3 columns for the readings", "6 joints"]),
+        (ALL.replace("points =", "point ="), ["no 'point'", "did you mean 'points'?"]),
+        (ALL.replace(', "z"]', "]"), ["points is in 3 columns, but 2 are picked"]),
+        ('columns = { q = "q?" }', ["no 'points' (measured point)", "pick its columns"]),
+        (ALL + 'units = { points = "cm" }', ["units.points is 'cm'", "mm, m, um, inch"]),
+        (ALL + 'units = { q = "degrees" }', ["units.q is 'degrees'", "rad, deg"]),
+        (ALL + "u = 0.1", ["u is given and also in columns"]),
+        (ALL + 'readings = "short.csv"', ["5 rows of 'points'", "2 readings"]),
+        (ALL + 'files = ["a.csv"]', ["needs either file or files"]),
+        (ALL + "group = 99", ["no column 99"]),
+        (ALL + "skip = -1", ["'points 1.skip' must be greater"]),
+        (ALL + 'preset = "excel"', ["'points 1.preset' must be"]),
+        (ALL + "dimaeter = 3", ["unknown key 'points 1.dimaeter'"]),
+        (ALL + 'delimiter = ";"', ["has no column"]),
+        (ALL + "coverage_factor = 0", ["greater than 0"]),
+        (ALL + 'target = "{x}"', ["target uses the unknown field x"]),
+        (ALL + "[[points]]", ["needs either file or files"]),
+    ],
+)
+def test_bad_columns(tmp_path, text, parts):
+    write(tmp_path / "a.csv", np.hstack([Q, P, U]))
+    write(tmp_path / "short.csv", np.hstack([Q, P, U])[:2])
+    assert_refused(lambda: read(tmp_path, f'[[points]]\nfile = "a.csv"\n{text}\n'), tmp_path / "capture.toml", *parts)
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ('rotation = "euler"', ["'euler' is no convention of rotations", "XYZ (moving axes"]),
+        ("", ["does not say how its rotations are written"]),
+        ('rotation = "XYZ"', ["angles without a unit", "rotations = 'deg'"]),
+        ('rotation = "quaternion wxyz"', ["rotations is in 4 columns, but 3 are picked"]),
+    ],
+)
+def test_bad_rotations(tmp_path, text, parts):
+    write(tmp_path / "a.csv", np.hstack([Q, P, U]))
+    columns = ALL.replace("u =", "rotations =")
+    table = f'[[transforms]]\nfile = "a.csv"\nu_angle = 0.01\n{text}\n{columns}'
+    assert_refused(lambda: read(tmp_path, table), tmp_path / "capture.toml", *parts)
+
+
+def test_bad_cells(tmp_path):
+    rows = np.hstack([Q, P, U]).tolist()
+    rows[2][7] = "n/a"
+    write(tmp_path / "a.csv", rows)
+    assert_refused(
+        lambda: read(tmp_path, f'[[points]]\nfile = "a.csv"\n{ALL}'), "a.csv line 4 column 8: 'n/a'", "number"
+    )
+    rows[2][7] = "3,5"
+    write(tmp_path / "a.csv", rows, delimiter=";")
+    assert_refused(lambda: read(tmp_path, f'[[points]]\nfile = "a.csv"\n{ALL}'), "line 4 column 8", "decimal point")
+    (tmp_path / "a.csv").write_text("q1,q2\n")
+    assert_refused(lambda: read(tmp_path, f'[[points]]\nfile = "a.csv"\n{ALL}'), "a.csv holds no numbers")
+
+
+def test_the_robot_of_the_examples(mukca):
+    """R = Rx(rx) Ry(ry) Rz(rz): the angle between two poses is that of the robot's, to its accuracy."""
+    recording = aj.files.read_manifest(mukca.parent / "ipa_ur10" / "transforms.toml")
+    one = recording.capture.observations[0]
+    arm, few = recording.nominal.arm, slice(0, 200)
+    measured = Rotation.from_matrix(one.rotations[few])
+    moved = Rotation.from_matrix(np.asarray(arm.pose(one.q[few]))[:, :3, :3])
+    between = [(turned[:-1].inv() * turned[1:]).magnitude() for turned in (measured, moved)]
+    assert np.sqrt(np.mean(np.subtract(*between) ** 2)) < np.deg2rad(0.06)
+    assert one.q.shape == (2772, 6)
