@@ -22,7 +22,7 @@ from ..model.robust import LOSSES, Loss, LossName
 from ..uncertainty import observed_covariance as propagation
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, inverse_information
 from .checks import based_on, check_noise_model, check_start
-from .results import Identification, ObservedMetrics
+from .results import Calibration, Identification, ObservedMetrics
 from .scale_anchor import ScaleAnchor, scale_anchor
 from .task import fit
 
@@ -225,6 +225,36 @@ def identify_observed(task: ObservedTask) -> Identification:
         if task.noise_model == "given"
         else max(float(task.observed.equations - p - count), 1.0),
         observed=metrics[2],
+    )
+
+
+def calibrate_observed(task: ObservedTask) -> Calibration:
+    """`identify_observed` of everything that the capture holds, as the result of a calibration."""
+    found = identify_observed(task)
+    observed, geometry = task.observed, found.observed
+    assert geometry is not None
+    xp = namespace(found)
+
+    def lengths(parts: dict[str, AnyArray]) -> Float[AnyArray, " l"]:
+        vectors = [parts[end] - parts[start] for start, end in observed.ends]
+        return xp.linalg.norm(xp.stack(vectors), axis=1) if vectors else xp.zeros(0)
+
+    return Calibration(
+        arm=found.arm,
+        parameters=found.parameters,
+        scale=None,
+        de=found.de,
+        deltam=found.deltam,
+        active=found.active,
+        steps=found.steps,
+        result=found.result,
+        parameter_covariance=found.parameter_covariance,
+        before=found.before,
+        after=found.after,
+        length_before=lengths(observed.split(observed.start(task.bounds.space, task.start))),
+        length_after=lengths(geometry.geometry),
+        stage1=found,
+        method="joint",
     )
 
 

@@ -26,7 +26,7 @@ from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
 from ..uncertainty.identifiability import observability
 from .checks import based_on, check_enough, check_noise_model, check_single, check_start
-from .observed import ObservedTask, identify_observed, observed_task
+from .observed import ObservedTask, calibrate_observed, identify_observed, observed_task
 from .results import Calibration, Identification
 from .scale_anchor import scale_anchor, scale_set_by_clause
 from .second_stage import adjust_anchor, clip_to_bounds, divide_by_k, must_adjust_anchor
@@ -184,7 +184,7 @@ def calibrate(
         task = observed_task(arm, capture, bounds, start, noise, None, noise_model, max_steps, robust)
         if check_identifiability or strict:
             _check_identifiable(capture, task, strict)
-        return _as_calibration(task, identify_observed(to_numpy(task)))
+        return to_jax(calibrate_observed(to_numpy(task)))
     task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
     if hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
         raise InputError(
@@ -203,36 +203,6 @@ def calibrate(
     if is_concrete(adjust):
         return to_jax(_calibrate_by_adjustment(task, result))
     return jax.lax.cond(adjust, lambda: _calibrate_by_adjustment(task, result), lambda: result)
-
-
-def _as_calibration(task: ObservedTask, found: Identification) -> Calibration:
-    """The one solve of all observations as the result of a calibration."""
-    observed, geometry = task.observed, found.observed
-    assert geometry is not None
-    xp = namespace(found)
-
-    def lengths(parts: dict[str, AnyArray]) -> Float[AnyArray, " l"]:
-        vectors = [parts[end] - parts[start] for start, end in observed.ends]
-        return xp.linalg.norm(xp.stack(vectors), axis=1) if vectors else xp.zeros(0)
-
-    result = Calibration(
-        arm=found.arm,
-        parameters=found.parameters,
-        scale=None,
-        de=found.de,
-        deltam=found.deltam,
-        active=found.active,
-        steps=found.steps,
-        result=found.result,
-        parameter_covariance=found.parameter_covariance,
-        before=found.before,
-        after=found.after,
-        length_before=lengths(observed.split(observed.start(to_numpy(task).bounds.space, to_numpy(task).start))),
-        length_after=lengths(geometry.geometry),
-        stage1=found,
-        method="joint",
-    )
-    return to_jax(result)
 
 
 def _check_identifiable(capture: Capture, task: Task | ObservedTask, strict: bool) -> None:
