@@ -126,10 +126,11 @@ def calibrate(
     ] = 300,
     as_json: Json = False,
 ) -> None:
-    """Identify the parameters of an arm from a capture, or from several sessions.
+    """Identify the parameters of an arm from captures.
 
     Stage 1 makes the tips of each socket coincide; the reference lengths then fix the scale. Observations of other
-    kinds (measured points, spheres, planes, artefacts) are solved with all else at once.
+    kinds (measured points, spheres, planes, artefacts) are solved with all else at once. Several captures are sessions
+    of one arm.
     """
     from ..calibration.record import record_of
     from ..data.capture import check_sockets_only
@@ -140,12 +141,13 @@ def calibrate(
     with together(output, figure):
         for file in capture:
             reading(file)
-        recording = _joined(capture, same_probe)
-        recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
         if figure is not None:
             from ..plot.style import check_format
 
             check_format(figure)
+        recording = _joined(capture, same_probe)
+        recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
+        if figure is not None:
             check_sockets_only(recording.capture, "a figure of residuals")
         others = None
         if only_poses is not None:
