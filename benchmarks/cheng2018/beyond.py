@@ -32,7 +32,7 @@ def noise_and_box() -> list[dict[str, float]]:
     table = []
     for noise in NOISES:
         drawn = twin.draw(made, twin.Noise(noise, 0.0, 0.0), TRIALS, 21)
-        captures = aj.stack_captures([aj.Capture({"A": q}) for q in drawn.sockets[:, 0]])
+        captures = twin.batch({"A": drawn.sockets[:, 0]})
         for width in WIDTHS:
             half = np.where(is_length(), width, (upper - lower) / 2)
             line = {"encoder_arcsec": noise, "half_width_mm": width}

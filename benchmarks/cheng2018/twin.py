@@ -6,6 +6,7 @@ encoder noise, the tip by seating, and every encoder by its eccentricity, which 
 of its own reading, with an amplitude and a phase drawn for each twin.
 """
 
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -111,6 +112,19 @@ def _least_move(q: np.ndarray, shift: np.ndarray) -> np.ndarray:
     return np.einsum("bci,bc->bi", jacobian, np.linalg.solve(square, shift[..., None])[..., 0])
 
 
+def batch(sockets: dict[str, np.ndarray], lengths: Sequence[aj.ReferenceLength] = ()) -> aj.Capture:
+    """The captures of all twins, by name of a socket the readings ``(t, m, 6)``; with the same lengths.
+
+    The shapes come from a capture of other readings: without noise a pose that is drawn twice would count once there.
+    """
+    shapes = {
+        name: 0.1 * i + 1e-3 * np.arange(q[0].size).reshape(q[0].shape) for i, (name, q) in enumerate(sockets.items())
+    }
+    readings = np.concatenate(list(sockets.values()), axis=1)
+    values = np.tile([float(length.value) for length in lengths], (len(readings), 1))
+    return aj.calibration.batch_of_captures(aj.Capture(shapes, lengths), readings, values)
+
+
 def joint(twins: Twins, u: float = 0.001) -> np.ndarray:
     """Parameters by the joint solve of poses and the four lengths (standard uncertainty ``u``), ``(t, 21)``."""
     lower, upper = box("experiment")
@@ -119,14 +133,9 @@ def joint(twins: Twins, u: float = 0.001) -> np.ndarray:
     lengths = [aj.ReferenceLength(*pair, value=REFERENCE, u=u) for pair in ends]
     names = [name for pair in ends for name in pair]
     bars = twins.reference.reshape(len(twins.reference), len(names), -1)
-    captures = [
-        aj.Capture({"Data1": poses} | {name: bar[i : i + 1] for i, name in enumerate(names)}, lengths)
-        for poses, bar in zip(twins.sockets[:, 0], bars, strict=True)
-    ]
+    sockets = {"Data1": twins.sockets[:, 0]} | {name: bars[:, i : i + 1] for i, name in enumerate(names)}
     space = aj.Parameters(nominal, NAMES)
-    many = aj.calibrate_many(
-        nominal, aj.stack_captures(captures), lower, upper, method="joint", space=space, hold="d_3"
-    )
+    many = aj.calibrate_many(nominal, batch(sockets, lengths), lower, upper, method="joint", space=space, hold="d_3")
     return np.asarray(many.parameters)
 
 
@@ -148,8 +157,9 @@ def identified(twins: Twins, hold: str | None) -> Outcome:
     lower, upper = box("experiment")
     start = (lower + upper) / 2
     space = aj.Parameters(true_arm(), NAMES)
-    captures = aj.stack_captures([aj.Capture({"Data1": q}) for q in twins.sockets[:, 0]])
-    many = aj.identify_many(true_arm(), captures, lower, upper, start, space=space, hold=hold)
+    many = aj.identify_many(
+        true_arm(), batch({"Data1": twins.sockets[:, 0]}), lower, upper, start, space=space, hold=hold
+    )
     return outcome(twins, many.parameters, np.any(many.active != 0, axis=1))
 
 
