@@ -20,9 +20,9 @@ ROOT = Path(__file__).resolve().parents[1]
     [
         (("flips", "texts", "calls"), 60),
         pytest.param(("writes",), 36, marks=pytest.mark.slow),
-        pytest.param(("kills",), 6, marks=pytest.mark.slow),
+        pytest.param(("kills",), 2, marks=pytest.mark.slow),
         pytest.param(("users",), 0, marks=pytest.mark.slow),
-        pytest.param(("flips", "texts", "calls"), 300, marks=pytest.mark.slow),
+        pytest.param(("flips", "texts", "calls"), 150, marks=pytest.mark.slow),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, tuple) else str(value),
 )
