@@ -131,6 +131,19 @@ def test_estimated_noise_agrees_with_the_eliminated_sockets(paper_arm, bounds, s
     np.testing.assert_allclose(u_of(explicit), u_of(classic), rtol=1e-3)
 
 
+def test_a_bar_may_have_its_points_on_one_line(paper_arm, true, space, bounds):
+    """A ball step turned about its line is the same: what is open there is of no consequence for the arm."""
+    step = {name: (x, 0.0, 0.0) for name, x in {"a": 0.0, "b": 120.0, "c": 300.0}.items()}
+    simulated = [kinds.SimulatedArtefact(f"s{i}", step, 8, frame) for i, frame in enumerate(PLACEMENTS)]
+    capture = aj.simulate(true, {}, observations=simulated, noise=NOISE, seed=5)
+    result = aj.calibrate(paper_arm, capture, bounds, noise=NOISE)
+    assert result.converged
+    assert np.all(result.determined)
+    normalised = (np.asarray(result.parameters) - np.asarray(space.vector(true))) / u_of(result)
+    assert np.abs(normalised).max() < 4.5
+    assert 0.3 < np.mean(normalised**2) < 2.5
+
+
 def test_a_platform_shares_its_frames(paper_arm, true, bounds):
     """One bar in two placements on a platform with three indices has five unknown frames, up to that of the platform
     itself, where six placements alone have six: its uncertainty is smaller."""
@@ -166,7 +179,7 @@ def _composed(outer, inner):
 
 
 @pytest.mark.parametrize("robust", ["huber", "cauchy", "tukey"])
-def test_a_robust_loss_stands_bad_poses(paper_arm, true, space, bounds, sockets, robust):
+def test_a_robust_loss_withstands_bad_poses(paper_arm, true, space, bounds, sockets, robust):
     """One pose in ten is 1 degree off in one joint: least squares is far off, a robust loss is not."""
     bad = np.random.default_rng(0).random(sockets.q.shape[0]) < 0.1
     shifted = eqx.tree_at(lambda c: c.q, sockets, np.asarray(sockets.q) + np.deg2rad(1.0) * np.outer(bad, np.eye(6)[2]))

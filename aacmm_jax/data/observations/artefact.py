@@ -12,7 +12,6 @@ from ...core.errors import InputError, nearest
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import fitted_frame, rotation_matrix
 from .frames import placed
-from .measured_points import check_spread
 from .observation import (
     FRAME,
     READINGS,
@@ -199,10 +198,6 @@ class Artefact(AbstractObservation):
             by_unknowns=by_unknowns,
             measured=no_covariance(3, m),
         )
-
-    def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
-        if len(set(self.owner)) > 2:
-            check_spread(f"artefact '{self.name}'", np.asarray(self.coordinates)[np.array(self.owner)].T)
 
 
 class SimulatedArtefact(AbstractSimulated):
