@@ -146,9 +146,9 @@ def _state(task: ObservedTask, space: Parameters, z: Float[AnyArray, " z"], sigm
     forward = task.observed.forward(space, z[:p], z[p:])
     errors = propagation.arm_errors(forward, linear, task.observed)
     if sigma is None:
-        freedom = max(task.observed.equations - z.shape[0], 1)
+        degrees_of_freedom = max(task.observed.equations - z.shape[0], 1)
         scatter = propagation.scatter_of if task.loss is None else propagation.robust_scatter_of
-        sigma = scatter(linear, errors, freedom)
+        sigma = scatter(linear, errors, degrees_of_freedom)
     return State(linear, errors, sigma)
 
 
@@ -351,14 +351,14 @@ def _metrics(
         weights.append(xp.ones(white.shape[1]) if task.loss is None else task.loss.cost_and_weight(white)[1])
     for state in (before, after):
         rms.append(xp.stack([xp.sqrt(xp.mean(xp.sum(part.rows.values[:3] ** 2, axis=0))) for part in state.linear]))
-    freedom = max(observed.equations - len(observed.steps) - len(task.bounds.space.names), 1)
+    degrees_of_freedom = max(observed.equations - len(observed.steps) - len(task.bounds.space.names), 1)
     metrics = ObservedMetrics(
         names=tuple(observation.name for observation in observed.observations),
         kinds=tuple(observation.kind for observation in observed.observations),
         rms_before=rms[0],
         rms_after=rms[1],
         reduced_chi=xp.stack(chi),
-        reduced_chi_of_all=xp.sqrt(total / freedom),
+        reduced_chi_of_all=xp.sqrt(total / degrees_of_freedom),
         sigma=after.sigma,
         geometry=observed.split(geometry),
         weights=tuple(weights),

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ...core.arrays import Numbers, is_concrete
+from ...core.arrays import Numbers
 from ...core.errors import InputError, nearest
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import fitted_frame, rotation_matrix
@@ -29,6 +29,7 @@ from .observation import (
     checked_target,
     checked_values,
     each_pose,
+    is_exact,
     no_covariance,
 )
 
@@ -111,7 +112,7 @@ class Artefact(AbstractObservation):
         self.placement = checked_name(name if placement is None else placement, "a placement")
         self.index = None if index is None else checked_name(index, "an index")
         self.target = checked_target(target)
-        self.free = not (is_concrete(self.u) and float(self.u) == 0)
+        self.free = not is_exact(self.u)
 
     def stored(self) -> dict[str, Any]:
         point = np.array([self.names[i] for i in self.owner])

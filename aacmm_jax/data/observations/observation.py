@@ -202,6 +202,11 @@ def checked_scalar(where: str, value: Numbers, *, positive: bool = False) -> Any
     return array
 
 
+def is_exact(u: AnyArray) -> bool:
+    """Whether a certified value is exact, and not an unknown of its own; a traced uncertainty is not known to be 0."""
+    return is_concrete(u) and float(u) == 0
+
+
 def checked_covariances(where: str, u: Numbers | None, covariance: Numbers | None, poses: int) -> AnyArray:
     """Covariances ``(m, 3, 3)`` of measured points, mm^2, from one of both statements: ``u`` a number, one a coordinate
     or one a coordinate and pose; ``covariance`` one for all poses or one each."""

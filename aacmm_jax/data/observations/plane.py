@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ...core.arrays import Numbers, is_concrete
+from ...core.arrays import Numbers
 from ...core.errors import InputError
 from ...core.linear_algebra import semidefinite_eigen
 from ...core.numpy_or_jax import AnyArray, namespace
@@ -26,6 +26,7 @@ from .observation import (
     checked_readings,
     checked_scalar,
     checked_target,
+    is_exact,
 )
 
 PLANE = ("rad", "rad", "mm")
@@ -153,7 +154,7 @@ class ParallelPlanes(AbstractObservation):
         self.u = checked_scalar(f"u of {where}", u)
         self.form = checked_scalar(f"form of {where}", form)
         self.target = checked_target(target)
-        self.free = not (is_concrete(self.u) and float(self.u) == 0)
+        self.free = not is_exact(self.u)
 
     @property
     def place(self) -> str:

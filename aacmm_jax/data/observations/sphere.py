@@ -27,6 +27,7 @@ from .observation import (
     checked_scalar,
     checked_target,
     each_pose,
+    is_exact,
     no_covariance,
 )
 
@@ -83,7 +84,7 @@ class Sphere(AbstractObservation):
         self.u = checked_scalar(f"u of {where}", u) / 2
         ball = checked_scalar(f"stylus of {where}", stylus)
         self.radius = None if diameter is None else (checked_scalar(f"diameter of {where}", diameter) + ball) / 2
-        exact = is_concrete(self.u) and float(self.u) == 0
+        exact = is_exact(self.u)
         known = self.radius is not None and is_concrete(self.radius)
         self.point = known and exact and float(self.radius) == 0  # pyright: ignore[reportArgumentType]
         self.free = self.radius is None or not exact
