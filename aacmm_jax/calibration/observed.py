@@ -24,9 +24,11 @@ from ..uncertainty.covariance import NoiseModel, ParameterCovariance, inverse_in
 from .checks import based_on, check_noise_model, check_start
 from .results import Calibration, Identification, ObservedMetrics
 from .scale_anchor import ScaleAnchor, scale_anchor
-from .task import fit
+from .task import RULES, fit
 
 NO_ANCHOR = ScaleAnchor(hold=None, adjusted=None, set_by=(), partners=None)
+# Of the solves whose result only gives the weights of the next, or its start: a few standard uncertainties' millionths.
+_ROUGH = RULES._replace(rtol=1e-5)
 _LEAST = 1e-4  # smallest standard uncertainty of what is certified, of a tip coordinate's standard deviation
 
 
@@ -191,7 +193,8 @@ def identify_observed(task: ObservedTask) -> Identification:
         whitening = _whitening(task, state)
         args = (space, task.observed, whitening, loss)
         functions = observed_rows, observed_model
-        found = fit(*functions, z, args, sides, steps, task.max_steps, differentiable=task.differentiable)
+        rules = RULES if number == len(losses) else _ROUGH
+        found = fit(*functions, z, args, sides, steps, task.max_steps, rules=rules, differentiable=task.differentiable)
         z, evaluations = found.parameters, evaluations + found.steps
         # Where the noise is given, only the last scatter matters, and its iteration costs as much as a few steps.
         known = task.noise is not None and number < len(losses)

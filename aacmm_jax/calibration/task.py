@@ -55,13 +55,14 @@ def fit(
     scale: Float[AnyArray, " p"],
     max_steps: int,
     *,
+    rules: Rules = RULES,
     differentiable: bool = True,
 ) -> Fit:
     """A least squares within bounds: by Optimistix for arrays of JAX, unless no derivative is needed; else by its bare
     steps."""
     lower, upper = bounds
     if not differentiable or namespace(start, args, bounds) is np:
-        last = minimise(normal, start, args, lower=lower, upper=upper, scale=scale, rules=RULES, max_steps=max_steps)
+        last = minimise(normal, start, args, lower=lower, upper=upper, scale=scale, rules=rules, max_steps=max_steps)
         return Fit(last.y, last.steps, reasons(last.reason), last.optimality)
     # Optimistix takes 0.2 s to import, and NumPy needs none of it.
     from ..solver.bounded import BoundedLevenbergMarquardt, least_squares
@@ -74,7 +75,7 @@ def fit(
         upper=upper,
         scale=scale,
         normal=normal,
-        solver=BoundedLevenbergMarquardt(**RULES._asdict()),
+        solver=BoundedLevenbergMarquardt(**rules._asdict()),
         max_steps=max_steps,
         throw=False,
     )

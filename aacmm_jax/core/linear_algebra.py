@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from .numpy_or_jax import AnyArray, namespace
 
 _EPSILON = float(np.finfo(np.float64).eps)
+_UNROLLED = 6  # rows of matrices whose factors are written out entry by entry
 _MAX_SWEEPS = 30  # of Jacobi rotations; matrices of 40 rows need about 10
 
 
@@ -75,8 +76,24 @@ def _inverse_cholesky(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batc
     p = matrix.shape[-1]
     if not p:
         return matrix
+    if p <= _UNROLLED:
+        return _inverse_cholesky_by_entries(matrix)
     identity = jnp.broadcast_to(jnp.eye(p), matrix.shape)
     return jnp.tril(_triangular(jnp.concatenate([matrix, identity], axis=-1))[..., p:])
+
+
+def _inverse_cholesky_by_entries(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batch p p"]:
+    """The same, entry by entry: for many very small matrices several times as fast as loops over their rows."""
+    p = matrix.shape[-1]
+    inverse: list[list[Array]] = []  # rows of W, up to the diagonal
+    for i in range(p):
+        # With the rows above, w_k: L[i, k] = w_k . A[i, :], and row i of W follows from that of L by substitution.
+        known = [sum(inverse[k][j] * matrix[..., i, j] for j in range(k + 1)) for k in range(i)]
+        scale = lax.rsqrt(matrix[..., i, i] - sum(value**2 for value in known))
+        row = [-scale * sum(known[k] * inverse[k][j] for k in range(j, i)) for j in range(i)]
+        inverse.append([*row, scale])
+    zero = jnp.zeros(matrix.shape[:-2])
+    return jnp.stack([jnp.stack([*row, *[zero] * (p - len(row))], axis=-1) for row in inverse], axis=-2)
 
 
 @_inverse_cholesky.defjvp
@@ -90,7 +107,9 @@ def _inverse_cholesky_jvp(primals: tuple[Array], tangents: tuple[Any]) -> tuple[
 
 def inverse_positive_definite(matrix: Float[AnyArray, "*batch p p"]) -> Float[AnyArray, "*batch p p"]:
     """Inverse of a symmetric positive definite matrix; NaN where it is not."""
-    whitening = inverse_cholesky(matrix)
+    whitening, p = inverse_cholesky(matrix), matrix.shape[-1]
+    if namespace(matrix) is jnp and p <= _UNROLLED:
+        return sum((whitening[..., k, :, None] * whitening[..., k, None, :] for k in range(p)), jnp.zeros_like(matrix))
     return namespace(matrix).swapaxes(whitening, -1, -2) @ whitening
 
 

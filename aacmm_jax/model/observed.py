@@ -151,8 +151,10 @@ class Whitening(NamedTuple):
     certified: dict[str, Float[AnyArray, " k"]]
 
 
-def linear_rows(space: Parameters, observed: Observed, z: Float[AnyArray, " z"]) -> list[Linear]:
-    """The rows of every observation and their analytic derivatives."""
+def linear_rows(
+    space: Parameters, observed: Observed, z: Float[AnyArray, " z"], whitening: Whitening | None = None
+) -> list[Linear]:
+    """The rows of every observation and their analytic derivatives; with ``whitening`` in standard deviations."""
     p = len(space.names)
     forward = observed.forward(space, z[:p], z[p:])
     xp, parts, positions = namespace(forward, z), observed.split(z[p:]), observed.positions
@@ -160,8 +162,10 @@ def linear_rows(space: Parameters, observed: Observed, z: Float[AnyArray, " z"])
     own_probe = np.array([kind == "probe" for kind, _ in space.indices()])
     turned = None
     found = []
-    for observation, rows in zip(observed.observations, observed.slices, strict=True):
+    for number, (observation, rows) in enumerate(zip(observed.observations, observed.slices, strict=True)):
         residual = observation.residual(_tips(forward, rows), parts)
+        if whitening is not None:
+            residual = _whitened_rows(residual, whitening.roots[number])
         mine = columns[..., rows]
         blocks, indices = [], [np.arange(p)]
         if observation.target:
@@ -242,8 +246,8 @@ def observed_model(
     space, observed, whitening, loss = args
     xp = namespace(z, args)
     cost, gradient, gram = xp.zeros(()), xp.zeros_like(z), xp.zeros((z.shape[0], z.shape[0]))
-    for linear, root in zip(linear_rows(space, observed, z), whitening.roots, strict=True):
-        white, jacobian = whitened(linear, root)
+    for linear in linear_rows(space, observed, z, whitening):
+        white, jacobian = linear.rows.values, linear.jacobian
         if loss is not None:
             each, weight = loss.cost_and_weight(white)
             cost = cost + xp.sum(each)
@@ -269,6 +273,23 @@ def observed_model(
         gradient = add_at(gradient, indices, whitening.certified[name] * residual)
         gram = add_at(gram, (indices, indices), whitening.certified[name] ** 2)
     return QuadraticModel(cost, gradient, gram)
+
+
+def _whitened_rows(rows: Rows, root: Float[AnyArray, "m r r"]) -> Rows:
+    """Rows in standard deviations: their few derivatives by tip and geometry cost less than those by all parameters."""
+    each = namespace(rows.values, root).moveaxis(root, 0, -1)
+    return rows._replace(
+        values=_times(each, rows.values[None])[0],
+        by_tip=_product(each, rows.by_tip),
+        by_rotation=None if rows.by_rotation is None else _product(each, rows.by_rotation),
+        by_unknowns={name: _times(each, derivative) for name, derivative in rows.by_unknowns.items()},
+    )
+
+
+def _product(one: Float[AnyArray, "r s m"], other: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r c m"]:
+    """The product of two matrices a pose."""
+    xp = namespace(one, other)
+    return xp.moveaxis(_times(one, xp.moveaxis(other, 1, 0)), 0, 1)
 
 
 def whitened(linear: Linear, root: Float[AnyArray, "m r r"]) -> tuple[Float[AnyArray, "r m"], Float[AnyArray, "k r m"]]:

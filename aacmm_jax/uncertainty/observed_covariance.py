@@ -39,10 +39,11 @@ def arm_errors(forward: ForwardPass, linear: list[Linear], observed: Observed) -
     found = []
     for part, rows in zip(linear, observed.slices, strict=True):
         by_tip, by_rotation = part.rows.by_tip, part.rows.by_rotation
-        by_readings = xp.einsum("rcm,ncm->rnm", by_tip, theta[..., rows])
+        by_readings = sum(by_tip[:, None, c] * theta[None, :, c, rows] for c in range(3))
         by_seat = by_tip
         if by_rotation is not None:
-            by_readings = by_readings + xp.einsum("rcm,ncm->rnm", by_rotation, forward.z_before[..., rows])
+            turned = forward.z_before[..., rows]
+            by_readings = by_readings + sum(by_rotation[:, None, c] * turned[None, :, c] for c in range(3))
             by_seat = xp.concatenate([by_tip, by_rotation / size], axis=1)
         found.append(ArmErrors(by_readings, by_seat))
     return found
@@ -62,7 +63,15 @@ def covariance_of_sigma(errors: ArmErrors, sigma: Float[AnyArray, ""]) -> Float[
 
 
 def _squares(rows: Float[AnyArray, "r c m"]) -> Float[AnyArray, "m r r"]:
-    return namespace(rows).einsum("rcm,scm->mrs", rows, rows)
+    # As sums: XLA computes many products of small matrices several times as slowly.
+    products = sum(rows[:, None, c] * rows[None, :, c] for c in range(rows.shape[1]))
+    return namespace(rows).moveaxis(products, -1, 0)
+
+
+def _each(matrices: Float[AnyArray, "m r s"], vectors: Float[AnyArray, "s m"]) -> Float[AnyArray, "r m"]:
+    """A matrix a pose times its vector."""
+    xp = namespace(matrices, vectors)
+    return sum(xp.moveaxis(matrices[..., s], -1, 0) * vectors[s][None] for s in range(vectors.shape[0]))
 
 
 def scatter_of(linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom: int) -> Float[AnyArray, ""]:
@@ -79,9 +88,9 @@ def scatter_of(linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom
         for part, error in zip(linear, errors, strict=True):
             of_arm = covariance_of_sigma(error, xp.exp(log_sigma))
             inverse = inverse_positive_definite(part.rows.measured + of_arm)
-            solved = xp.einsum("mrs,sm->rm", inverse, part.rows.values)
+            solved = _each(inverse, part.rows.values)
             total = total + xp.sum(solved * part.rows.values)
-            slope = slope - 2 * xp.einsum("rm,mrs,sm->", solved, of_arm, solved)
+            slope = slope - 2 * xp.sum(solved * _each(of_arm, solved))
         return total, xp.where(slope < 0, slope, -1.0)
 
     known = stop_gradient((linear, errors))
