@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ..core.arguments import checked_arguments
 from ..core.errors import InputError
-from ..data.capture import Capture
+from ..data.capture import Capture, part_of
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
@@ -148,16 +148,9 @@ def _parts(capture: Capture) -> list[tuple[Capture, Capture, tuple[str, ...]]]:
     groups = groups_of(capture)
     every = [name for group in groups for name in group]
     return [
-        (_part(capture, tuple(name for name in every if name not in group)), _part(capture, group), group)
+        (part_of(capture, tuple(name for name in every if name not in group)), part_of(capture, group), group)
         for group in groups
     ]
-
-
-def _part(capture: Capture, names: tuple[str, ...]) -> Capture:
-    """Sockets by their exact names, which `Capture.select` would take for patterns."""
-    lengths = [length for length in capture.lengths if length.start in names and length.end in names]
-    others = [observation for observation in capture.observations if observation.name in names]
-    return Capture({name: q for name, q in capture.sockets.items() if name in names}, lengths, others)
 
 
 def _left_out(result: Calibration, left: Capture, names: tuple[str, ...]) -> LeftOut:

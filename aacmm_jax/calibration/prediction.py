@@ -48,6 +48,9 @@ class Agreement(NamedTuple):
         return chance(self.rms, self.predicted, self.degrees_of_freedom, self.noise_degrees_of_freedom)
 
 
+NOTHING = Agreement(0, math.nan, math.nan, math.nan, math.inf)  # where there is nothing to compare
+
+
 class _Part(NamedTuple):
     """Sums of squares of one observation: found, and of what the trace of V, and that of its square, consist."""
 
@@ -80,7 +83,7 @@ class Comparison(NamedTuple):
         parts = [self.parts[name] for name in names if self.parts[name].poses]
         poses = sum(part.poses for part in parts)
         if not poses:
-            return Agreement(0, math.nan, math.nan, math.nan, self.noise_degrees_of_freedom)
+            return NOTHING
         trace, freedom = sum(part.trace for part in parts), math.nan
         if 0 < trace < math.inf:
             both = np.sum([part.shared for part in parts], axis=0) @ self.common
@@ -104,7 +107,7 @@ class Comparison(NamedTuple):
         u = self.length_u
         known = [i for i in (range(len(u)) if which is None else which) if np.isfinite(u[i])]
         if not known:
-            return Agreement(0, math.nan, math.nan, math.nan, self.noise_degrees_of_freedom)
+            return NOTHING
         u = np.maximum(u[known], _LEAST_LENGTH_U)
         correlation = self.length_covariance[np.ix_(known, known)] / np.outer(u, u)
         predicted = math.sqrt(np.mean(u**2))

@@ -15,7 +15,7 @@ from ..core.arrays import Numbers, is_concrete
 from ..core.distributions import chance
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
-from ..core.text import shorten
+from ..core.text import common_label
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
@@ -328,11 +328,8 @@ class LeftOut(NamedTuple):
 
     @property
     def label(self) -> str:
-        """What the names have in common before the last "/", such as a placement; else the names."""
-        folders = {name.rpartition("/")[0] for name in self.sockets}
-        if len(self.sockets) > 1 and len(folders) == 1 and "" not in folders:
-            return folders.pop()
-        return shorten(self.sockets, 3)
+        """The group in a few words."""
+        return common_label(self.sockets)
 
     @property
     def freedoms(self) -> tuple[float, float]:
