@@ -8,15 +8,17 @@ import jax
 import numpy as np
 
 from ..calibration.evaluation import evaluate
+from ..calibration.observed import check_observed
 from ..calibration.prediction import Comparison, compare
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.second_stage import LARGEST_LOG_K
+from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry
-from ..kinematics.parameters import ArmSpecification
+from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .all_tests import AcceptanceTest, Measured, checked_limits, measured_by, run, without_stated_uncertainty
 from .decision import Limit
@@ -124,8 +126,8 @@ def evaluation_of(
 ) -> EvaluationRecord:
     """Evaluate a calibration on a capture.
 
-    A socket or another observation counts as identified from if the calibration used any of its poses. The unknown
-    geometry of the capture is fitted to the arm.
+    A socket counts as identified from if the calibration used any of its poses. Of another observation, the poses that
+    it did not use are held out, as far as they determine their geometry: that is fitted to the arm.
 
     Args:
         record: The calibration.
@@ -140,9 +142,13 @@ def evaluation_of(
         The record, with warnings on what makes it doubtful.
 
     Raises:
-        InputError: A limit is impossible, or there is nothing to measure its metric on.
+        InputError: A limit is impossible, there is nothing to measure its metric on, or the observations do not
+            determine their own unknown geometry.
     """
     known = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
+    recording = recording._replace(capture=_divided(record.calibrated.arm, recording.capture, known))
+    if recording.capture.observations:
+        _check_geometry(record.calibrated.arm, recording.capture)
     readings = {name: np.asarray(q) for name, q in recording.capture.sockets.items()}
     readings |= {observation.name: np.asarray(observation.q) for observation in recording.capture.observations}
     shared = {name: sum(row.tobytes() in known for row in q) for name, q in readings.items()}
@@ -180,6 +186,29 @@ def evaluation_of(
         )
     warnings += unstated_uncertainty_warning(found.acceptance()["calibrated"])
     return found._replace(warnings=tuple(warnings))
+
+
+def _divided(arm: Arm, capture: Capture, known: Collection[bytes]) -> Capture:
+    """With the unseen poses of observations of which others are known as observations of their own."""
+    found = []
+    for observation in capture.observations:
+        seen = np.array([row.tobytes() in known for row in np.asarray(observation.q)])
+        parts = [observation]
+        if seen.any() and not seen.all() and not any(observation.name in (r.start, r.end) for r in capture.lengths):
+            unseen = observation.select(np.flatnonzero(~seen)).renamed(f"{observation.name}, unseen")
+            try:
+                _check_geometry(arm, Capture({}, [], [unseen]))
+                parts = [observation.select(np.flatnonzero(seen)), unseen]
+            except InputError:
+                pass  # too few poses: the observation counts as identified from
+        found += parts
+    return Capture(capture.sockets, capture.lengths, found, capture.repeated)
+
+
+def _check_geometry(arm: Arm, capture: Capture) -> None:
+    """Raise `InputError` where observations do not determine their own unknowns."""
+    space = to_numpy(Parameters(arm, ("d_1",)))
+    check_observed(capture, space, np.asarray(space.vector()), 0)
 
 
 def made_for(recording: Recording) -> tuple[Standard, ...]:

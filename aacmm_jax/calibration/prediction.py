@@ -180,7 +180,8 @@ def _of_sockets(uncertainty: Uncertainty, capture: Capture) -> Comparison:
             same = ends[:, one][:, None] == ends[:, other][None, :]
             covariance = covariance + np.where(same, 1.0 if one == other else -1.0, 0.0) * (pulled @ direction.T)
     error = measured - np.array([float(length.value) for length in lengths])
-    return Comparison(parts, uncertainty.covariance, error, covariance, uncertainty.degrees_of_freedom)
+    shared = np.asarray(uncertainty.covariance)
+    return Comparison(parts, shared, error, np.asarray(covariance), uncertainty.degrees_of_freedom)
 
 
 def _of_observations(uncertainty: Uncertainty, capture: Capture) -> Comparison:
@@ -235,4 +236,4 @@ def _of_observations(uncertainty: Uncertainty, capture: Capture) -> Comparison:
     geometry = observed.split(fitted.geometry)
     measured = np.array([float(np.linalg.norm(geometry[end] - geometry[start])) for start, end in observed.ends])
     error = measured - np.asarray(observed.nominal)
-    return Comparison(parts, common, error, covariance, uncertainty.degrees_of_freedom)
+    return Comparison(parts, common, error, np.asarray(covariance), uncertainty.degrees_of_freedom)

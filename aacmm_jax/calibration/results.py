@@ -334,9 +334,11 @@ class LeftOut(NamedTuple):
     @property
     def freedoms(self) -> tuple[float, float]:
         """Degrees of freedom of the poses and of the lengths."""
-        known = (self.rms_freedom, self.length_freedom)
-        independent = (3 * self.poses, int(_predicted(self).sum()))
-        return tuple(found if math.isfinite(found) else other for found, other in zip(known, independent, strict=True))
+        poses, lengths = self.rms_freedom, self.length_freedom
+        return (
+            poses if math.isfinite(poses) else 3.0 * self.poses,
+            lengths if math.isfinite(lengths) else float(_predicted(self).sum()),
+        )
 
     @property
     def length_ratio(self) -> float:

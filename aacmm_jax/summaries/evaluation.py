@@ -14,7 +14,7 @@ from ..data.capture import Capture, part_of
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from .calibration import length_metrics, metrics, metrics_by_socket_and_length
-from .validation import agreement_row, finite, surprise
+from .validation import agreement_row, finite, no_better, surprise
 
 _LIMITED = {"rms_mm": "RMS distance", "deltam_mm": "Deltam", "length_error_largest_mm": "largest length error"}
 _GROUPS = ("held_out", "identified_from")
@@ -131,7 +131,8 @@ def _add_prediction(
             "probability": finite(lengths_found.probability),
         },
     }
-    return surprise(poses, lengths_found, each)
+    before, after = (group[stage].get("observed_rms_mm", group[stage].get("rms_mm")) for stage in record.arms())
+    return surprise(poses, lengths_found, each) + no_better(before, after)
 
 
 def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = None) -> dict[str, Any]:

@@ -53,9 +53,9 @@ def contradicted_prediction(validation: CrossValidation) -> list[str]:
     if 0 < len(groups) < len(validation.groups) / 2:
         others = len(validation.groups) - len(groups)
         return [
-            f"Held out one after the other, {others} of {len(validation.groups)} groups agree with the others as "
-            f"predicted, but not {named}: look for what differs there (a socket or tool that moved, poses far from all "
-            "others), and leave it out or record it again."
+            f"Held out one after the other, some groups disagree with the others by more than predicted: {named}; the "
+            f"other {others} agree. Look for what differs there (a socket or tool that moved, a wrong length, poses "
+            "far from all others)."
         ]
     pairs = (
         ("poses", validation.rms, validation.rms_predicted),
@@ -127,6 +127,16 @@ def surprise(poses: Agreement, lengths: Agreement, parts: dict[str, Agreement]) 
         f"Data that the calibration has not seen disagree with it by more than chance: {'; '.join(found)}. The arm or "
         "its probe has changed since (a remounted tip), these data have errors of their own, or the model misses "
         "effects that poses of the calibration did not show: its uncertainties do not hold here."
+    ]
+
+
+def no_better(nominal: float | None, calibrated: float | None) -> list[str]:
+    """A sentence where the calibration has not improved the RMS distance of held-out poses, mm."""
+    if nominal is None or calibrated is None or calibrated < nominal:
+        return []
+    return [
+        f"On data that it has not seen, the calibrated arm is no better than the nominal one: {calibrated:.3g} mm RMS "
+        f"instead of {nominal:.3g} mm."
     ]
 
 
