@@ -13,9 +13,10 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
 from ..model.observed import Observed
 from ..model.robust import LossName
+from .left_out import CrossValidation, LeftOut
 from .prediction import compare
 from .record import uncertainty_of
-from .results import Calibration, CrossValidation, LeftOut
+from .results import Calibration
 from .single import calibrate
 
 _REGIONS = 4  # a power of two

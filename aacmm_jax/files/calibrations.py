@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.left_out import CrossValidation, LeftOut
 from ..calibration.record import CalibrationRecord
-from ..calibration.results import CrossValidation, LeftOut
 from ..calibration.scale_anchor import scale_anchor
 from ..core.errors import InputError
 from ..data.noise import Noise

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.left_out import LEVEL, CrossValidation, LeftOut
 from ..calibration.prediction import Agreement
-from ..calibration.results import LEVEL, CrossValidation, LeftOut
 from ..core.text import shorten
 
 
@@ -104,8 +104,8 @@ def surprise(poses: Agreement, lengths: Agreement, parts: dict[str, Agreement]) 
     """A sentence on unseen data that scatter more than predicted, by more than chance does in one case of a hundred;
     ``parts`` are the sockets and observations, of which the most improbable are named."""
     found = []
-    tested = [agreement for agreement in (poses, lengths) if math.isfinite(agreement.probability)]
-    if poses.probability < LEVEL / len(tested):
+    tested = sum(math.isfinite(agreement.probability) for agreement in (poses, lengths))
+    if poses.probability < LEVEL / max(tested, 1):
         improbable = sorted(
             (part.probability, name) for name, part in parts.items() if part.probability < LEVEL / len(parts)
         )
@@ -117,7 +117,7 @@ def surprise(poses: Agreement, lengths: Agreement, parts: dict[str, Agreement]) 
             f"poses are {poses.rms:.3g} mm RMS from their geometry, {poses.rms / poses.predicted:.1f} times the "
             f"predicted {poses.predicted:.3g} mm" + (f", most of all in {', '.join(worst)}" if worst else "")
         )
-    if lengths.probability < LEVEL / len(tested):
+    if lengths.probability < LEVEL / max(tested, 1):
         found.append(
             f"reference lengths err by {lengths.rms / lengths.predicted:.1f} times their standard uncertainty (RMS)"
         )
