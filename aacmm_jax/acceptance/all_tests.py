@@ -47,10 +47,13 @@ def measured_by(arm: Arm, recording: Recording) -> Measured:
     capture, touched = recording.capture, [group for sphere in recording.spheres for group in sphere.groups]
     readings = [np.asarray(q) for q in (*capture.sockets.values(), *touched)]
     ends = np.cumsum([len(q) for q in readings])
-    points = iter(np.split(np.asarray(arm.position(np.concatenate(readings))), ends[:-1]))
+    none = np.zeros((0, capture.joints))
+    points = iter(np.split(np.asarray(arm.position(np.concatenate([*readings, none]))), ends[:-1]))
     sockets = {name: next(points) for name in capture.sockets}
+    # Sockets that held another target than the arm's own probe are not part of any procedure.
+    lengths = tuple(length for length in capture.lengths if length.start in sockets and length.end in sockets)
     spheres = tuple(sphere._replace(groups=tuple(next(points) for _ in sphere.groups)) for sphere in recording.spheres)
-    return Measured(sockets, capture.lengths, spheres, arm_reach(arm))
+    return Measured(sockets, lengths, spheres, arm_reach(arm))
 
 
 def run(

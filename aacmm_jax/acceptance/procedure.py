@@ -160,4 +160,4 @@ def simulate_procedure(
         groups = tuple(readings(item, 0.0) for item in procedure.touches if TOUCHED[item.test] == sphere.test)
         size = diameters.setdefault(sphere.name, sphere.diameter + u_diameter * random.normal())
         spheres.append(ProbedSphere(sphere.name, sphere.test, groups, size, u_diameter, sphere.stylus))
-    return Recording(Capture(sockets, lengths), nominal, true, seed, tuple(spheres))
+    return Recording(Capture(sockets, lengths), nominal, true, seed, tuple(spheres), acceptance=(procedure.standard,))

@@ -1,6 +1,6 @@
 """The records of an evaluation: a calibrated arm on a capture, or points, with the limits they are judged by."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -8,15 +8,21 @@ import jax
 import numpy as np
 
 from ..calibration.evaluation import evaluate
-from ..calibration.record import CalibrationRecord
+from ..calibration.observed import check_observed
+from ..calibration.prediction import Comparison, compare
+from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.second_stage import LARGEST_LOG_K
-from ..data.capture import check_sockets_only
+from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
+from ..data.capture import Capture
 from ..data.recording import Recording
 from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry
-from ..kinematics.parameters import ArmSpecification
+from ..kinematics.parameters import ArmSpecification, Parameters
+from ..uncertainty.arm_uncertainty import Uncertainty
 from .all_tests import AcceptanceTest, Measured, checked_limits, measured_by, run, without_stated_uncertainty
 from .decision import Limit
+from .standards import OF_SPHERES, STANDARDS, Standard, checked_standards
 
 MAXIMA = ("rms_mm", "deltam_mm", "length_error_largest_mm")
 SIMULATED = "The readings are simulated: no real arm was measured."
@@ -32,6 +38,8 @@ class EvaluationRecord(NamedTuple):
     limits: Mapping[str, Limit] = MappingProxyType({})  # MPE by the name of a metric (`acceptance.METRICS`)
     u_test: float = 0.0  # standard uncertainty that seat, fixture and temperature add, mm
     maxima: Mapping[str, float] = MappingProxyType({})  # limits of the quantities in `MAXIMA`, mm
+    standards: tuple[str, ...] = tuple(STANDARDS)  # whose acceptance tests are run, beside those with a limit
+    uncertainty: Uncertainty | None = None  # of the calibrated arm; files of earlier versions have none
 
     def arms(self) -> dict[str, ArmSpecification]:
         """The arm as found (nominal) and as left (calibrated)."""
@@ -56,18 +64,30 @@ class EvaluationRecord(NamedTuple):
         whole = measured_by(arm, self.recording)
         if not self.independent:
             return whole._replace(none_held_out=True)
-        lengths = tuple(whole.lengths[i] for i in self.held_out_lengths())
-        return whole._replace(lengths=lengths, identified_from=self.used)
+        lengths = self.recording.capture.lengths
+        held_out = {(lengths[i].start, lengths[i].end) for i in self.held_out_lengths()}
+        tested = tuple(length for length in whole.lengths if (length.start, length.end) in held_out)
+        return whole._replace(lengths=tested, identified_from=self.used)
 
     @property
     def independent(self) -> bool:
         """Whether there are data that the calibration was not identified from."""
-        new = set(self.recording.capture.names) - self.used
-        return bool(new or self.held_out_lengths() or self.recording.spheres)
+        return bool(self.held_out() or self.held_out_lengths() or self.recording.spheres)
+
+    def held_out(self) -> tuple[str, ...]:
+        """Sockets and observations that the calibration was not identified from."""
+        return tuple(name for name in names_in(self.recording.capture) if name not in self.used)
+
+    def compared(self) -> Comparison | None:
+        """Errors of the calibrated arm on the whole capture, found and predicted; only those of held-out data may be
+        compared. None where the uncertainty of the calibration is not known."""
+        return None if self.uncertainty is None else compare(self.uncertainty, self.recording.capture)
 
     def acceptance(self) -> dict[str, list[AcceptanceTest]]:
-        """Every test that the capture allows, as found and as left."""
-        return {stage: run(self.measured(arm.arm), self.limits, self.u_test) for stage, arm in self.arms().items()}
+        """The tests of ``standards``, and those with a limit, as far as the capture allows; as found and as left."""
+        arms = self.arms() if self.standards or self.limits else {}
+        found = {stage: run(self.measured(arm.arm), self.limits, self.u_test) for stage, arm in arms.items()}
+        return {stage: _chosen(found.get(stage, []), self.standards, self.limits) for stage in self.arms()}
 
 
 class PointsRecord(NamedTuple):
@@ -76,10 +96,23 @@ class PointsRecord(NamedTuple):
     measured: Measured
     limits: Mapping[str, Limit | float] = MappingProxyType({})
     u_test: float = 0.0  # standard uncertainty that seat, fixture and temperature add, mm
+    standards: tuple[str, ...] = tuple(STANDARDS)  # whose acceptance tests are run, beside those with a limit
 
     def acceptance(self) -> list[AcceptanceTest]:
-        """Every test that the points allow."""
-        return run(self.measured, self.limits, self.u_test)
+        """The tests of ``standards``, and those with a limit, as far as the points allow."""
+        return _chosen(run(self.measured, self.limits, self.u_test), self.standards, self.limits)
+
+
+def _chosen(
+    tests: list[AcceptanceTest], standards: Collection[str], limits: Mapping[str, Limit | float]
+) -> list[AcceptanceTest]:
+    names = {STANDARDS[name] for name in standards if name in STANDARDS}
+    return [test for test in tests if test.standard in names or any(metric.name in limits for metric in test.metrics)]
+
+
+def names_in(capture: Capture) -> tuple[str, ...]:
+    """Names of the sockets and the other observations of a capture."""
+    return (*capture.names, *(observation.name for observation in capture.observations))
 
 
 def evaluation_of(
@@ -89,10 +122,12 @@ def evaluation_of(
     limits: Mapping[str, Limit | float] | None = None,
     u_test: float = 0.0,
     maxima: Mapping[str, float] | None = None,
+    standards: Iterable[str] | None = None,
 ) -> EvaluationRecord:
     """Evaluate a calibration on a capture.
 
-    A socket counts as identified from if the calibration used any of its poses.
+    A socket counts as identified from if the calibration used any of its poses. Of another observation, the poses that
+    it did not use are held out, as far as they determine their geometry: that is fitted to the arm.
 
     Args:
         record: The calibration.
@@ -100,17 +135,23 @@ def evaluation_of(
         limits: MPE by the name of a metric: a `Limit`, or a number of mm.
         u_test: Standard uncertainty that seat, fixture and temperature add to every test value, mm.
         maxima: Limits of the quantities in `MAXIMA`, mm.
+        standards: Standards whose acceptance tests are run: "jjf", "asme", "iso". Default: those whose procedure the
+            recording was made for. Tests with a limit are run in any case.
 
     Returns:
         The record, with warnings on what makes it doubtful.
 
     Raises:
-        InputError: A limit is impossible, or there is nothing to measure its metric on.
+        InputError: A limit is impossible, there is nothing to measure its metric on, or the observations do not
+            determine their own unknown geometry.
     """
-    check_sockets_only(recording.capture, "an evaluation")
     known = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
-    sockets = {name: np.asarray(q) for name, q in recording.capture.sockets.items()}
-    shared = {name: sum(row.tobytes() in known for row in q) for name, q in sockets.items()}
+    recording = recording._replace(capture=_divided(record.calibrated.arm, recording.capture, known))
+    if recording.capture.observations:
+        _check_geometry(record.calibrated.arm, recording.capture)
+    readings = {name: np.asarray(q) for name, q in recording.capture.sockets.items()}
+    readings |= {observation.name: np.asarray(observation.q) for observation in recording.capture.observations}
+    shared = {name: sum(row.tobytes() in known for row in q) for name, q in readings.items()}
     warnings = []
     if not record.converged or not record.plausible_scale:
         reason = record.reason if not record.converged else f"k = {record.k:.6g} is not a plausible scale."
@@ -118,12 +159,11 @@ def evaluation_of(
     if recording.true is not None:
         warnings.append(SIMULATED)
     warnings += recording.capture.repeated.sentences()
-    partly = [f"{name} ({count} of {len(sockets[name])} poses)" for name, count in shared.items()
-              if 0 < count < len(sockets[name])]  # fmt: skip
+    partly = [f"{name} ({count} of {len(readings[name])} poses)" for name, count in shared.items()
+              if 0 < count < len(readings[name])]  # fmt: skip
     if partly:
-        warnings.append(
-            f"The arm was identified from some poses of {', '.join(partly)}; these sockets count as identified from."
-        )
+        names = ", ".join(partly)
+        warnings.append(f"The arm was identified from some poses of {names}; these count as identified from.")
     if not _same(recording.nominal.arm, record.recording.nominal.arm):
         warnings.append(
             f"The capture is of '{recording.nominal.name}', but the calibration is of "
@@ -136,14 +176,44 @@ def evaluation_of(
         limits=checked_limits(limits or {}),
         u_test=u_test,
         maxima=dict(maxima or {}),
+        standards=made_for(recording) if standards is None else checked_standards(standards),
+        uncertainty=to_numpy(uncertainty_of(record)),
     )
     if not found.independent:
         warnings.append(
             "The arm was identified from all of this capture, so the results are too favourable and are not a test; "
-            "measure sockets and lengths that the calibration does not use."
+            "measure what the calibration does not use."
         )
     warnings += unstated_uncertainty_warning(found.acceptance()["calibrated"])
     return found._replace(warnings=tuple(warnings))
+
+
+def _divided(arm: Arm, capture: Capture, known: Collection[bytes]) -> Capture:
+    """With the unseen poses of observations of which others are known as observations of their own."""
+    found = []
+    for observation in capture.observations:
+        seen = np.array([row.tobytes() in known for row in np.asarray(observation.q)])
+        parts = [observation]
+        if seen.any() and not seen.all() and not any(observation.name in (r.start, r.end) for r in capture.lengths):
+            unseen = observation.select(np.flatnonzero(~seen)).renamed(f"{observation.name}, unseen")
+            try:
+                _check_geometry(arm, Capture({}, [], [unseen]))
+                parts = [observation.select(np.flatnonzero(seen)), unseen]
+            except InputError:
+                pass  # too few poses: the observation counts as identified from
+        found += parts
+    return Capture(capture.sockets, capture.lengths, found, capture.repeated)
+
+
+def _check_geometry(arm: Arm, capture: Capture) -> None:
+    """Raise `InputError` where observations do not determine their own unknowns."""
+    space = to_numpy(Parameters(arm, ("d_1",)))
+    check_observed(capture, space, np.asarray(space.vector()), 0)
+
+
+def made_for(recording: Recording) -> tuple[Standard, ...]:
+    """Standards whose acceptance procedure a recording was made for: as it says, or as the spheres say it has."""
+    return checked_standards((*recording.acceptance, *(OF_SPHERES[sphere.test] for sphere in recording.spheres)))
 
 
 def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:

@@ -1,6 +1,5 @@
 """Cross-validation: the arm identified without some of the sockets or observations, and evaluated on those left out."""
 
-import math
 from typing import Literal
 
 import numpy as np
@@ -8,21 +7,16 @@ from jaxtyping import Float
 
 from ..core.arguments import checked_arguments
 from ..core.errors import InputError
-from ..core.numpy_or_jax import to_numpy
-from ..data.capture import Capture
-from ..data.noise import Noise, tip_covariances
-from ..data.observations.observation import AbstractObservation
-from ..data.observations.socket import Socket
+from ..data.capture import Capture, part_of
+from ..data.noise import Noise
 from ..kinematics.arm import Arm
-from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Bounds
 from ..model.observed import Observed
-from ..model.socket_sums import means_over_sockets, sums_over_sockets
-from ..uncertainty.arm_uncertainty import Uncertainty
-from .evaluation import evaluate
-from .observed_evaluation import predicted_residuals
+from ..model.robust import LossName
+from .left_out import CrossValidation, LeftOut
+from .prediction import compare
 from .record import uncertainty_of
-from .results import CrossValidation, LeftOut
+from .results import Calibration
 from .single import calibrate
 
 _REGIONS = 4  # a power of two
@@ -61,13 +55,8 @@ def can_cross_validate(capture: Capture, parameters: int) -> bool:
 
 def _observed_parts(capture: Capture) -> list[tuple[Capture, Capture, tuple[str, ...]]]:
     """What remains, what is left out, and its names: group by group or, of one group only, region by region."""
-    groups = groups_of(capture)
-    if len(groups) > 1:
-        every = [name for group in groups for name in group]
-        return [
-            (_part(capture, tuple(name for name in every if name not in group)), _part(capture, group), group)
-            for group in groups
-        ]
+    if len(groups_of(capture)) > 1:
+        return _parts(capture)
     if capture.sizes or any(len(o.q) < _REGIONS * _POSES_A_REGION for o in capture.observations):
         return []
     regions = [_regions(np.asarray(observation.q)) for observation in capture.observations]
@@ -115,6 +104,7 @@ def cross_validate(
     method: Literal["two-stage", "joint"] | None = None,
     hold: str | None = "longest",
     noise: Noise | None = None,
+    robust: LossName | None = None,
 ) -> CrossValidation:
     """Calibrate once without each group of sockets and observations, and evaluate the result on that group.
 
@@ -132,6 +122,7 @@ def cross_validate(
         method: as for `calibrate`.
         hold: the scale anchor of stage 1, as for `calibrate`.
         noise: standard deviations of readings and seat, as for `calibrate`.
+        robust: robust loss of the calibrations, as for `calibrate`; bad poses of what is left out count in full.
 
     Returns:
         Errors of each group, found and predicted, mm.
@@ -146,87 +137,36 @@ def cross_validate(
             "the parameters; place the reference length somewhere else too, or leave cross-validation out "
             "(--no-cross-validate)."
         )
-    if capture.observations:
-        parts = _observed_parts(capture)
-        return CrossValidation(tuple(_left_out(arm, *part, bounds, noise) for part in parts))
-    found = []
-    for group in groups_of(capture):
-        rest = _part(capture, tuple(name for name in capture.names if name not in group))
-        result = calibrate(arm, rest, bounds, method=method, hold=hold, noise=noise, check_identifiability=False)
-        left = _part(capture, group)
-        found.append(_evaluated(uncertainty_of(result), left, group, bool(result.converged)))
-    return CrossValidation(tuple(found))
+    parts = _observed_parts(capture) if capture.observations else _parts(capture)
+    solving = {"method": method, "hold": hold, "noise": noise, "robust": robust, "check_identifiability": False}
+    return CrossValidation(
+        tuple(_left_out(calibrate(arm, rest, bounds, **solving), left, group) for rest, left, group in parts)
+    )
 
 
-def _part(capture: Capture, names: tuple[str, ...]) -> Capture:
-    """Sockets by their exact names, which `Capture.select` would take for patterns."""
-    lengths = [length for length in capture.lengths if length.start in names and length.end in names]
-    others = [observation for observation in capture.observations if observation.name in names]
-    return Capture({name: q for name, q in capture.sockets.items() if name in names}, lengths, others)
+def _parts(capture: Capture) -> list[tuple[Capture, Capture, tuple[str, ...]]]:
+    """What remains, what is left out, and its names, group by group."""
+    groups = groups_of(capture)
+    every = [name for group in groups for name in group]
+    return [
+        (part_of(capture, tuple(name for name in every if name not in group)), part_of(capture, group), group)
+        for group in groups
+    ]
 
 
-def _left_out(
-    arm: Arm, rest: Capture, left: Capture, group: tuple[str, ...], bounds: Bounds, noise: Noise | None
-) -> LeftOut:
-    """A calibration from observations without a group, tried on it."""
-    result = calibrate(arm, rest, bounds, noise=noise, check_identifiability=False)
-    uncertainty, observed = to_numpy((uncertainty_of(result), Observed.of(left)))
-    found = evaluate(uncertainty.arm, left if left.observations else _as_observed(left), noise=uncertainty.noise)
-    assert found.observed is not None
-    predicted = predicted_residuals(uncertainty, observed)
-    distances = [np.sum(np.asarray(residuals)[:3] ** 2, axis=0) for residuals in found.observed.residuals]
+def _left_out(result: Calibration, left: Capture, names: tuple[str, ...]) -> LeftOut:
+    """How a calibration without a group agrees with it."""
+    found = compare(uncertainty_of(result), left)
+    poses, lengths = found.of(found.parts), found.of_lengths()
     return LeftOut(
-        sockets=group,
-        poses=len(observed.q),
-        rms=float(np.sqrt(np.concatenate(distances).mean())),
-        rms_predicted=predicted.rms,
-        length_error=np.asarray(found.error),
-        length_u=predicted.length_u,
+        sockets=names,
+        poses=poses.count,
+        rms=poses.rms,
+        rms_predicted=poses.predicted,
+        length_error=found.length_error,
+        length_u=found.length_u,
         converged=bool(result.converged),
+        rms_freedom=poses.degrees_of_freedom,
+        length_freedom=lengths.degrees_of_freedom,
+        noise_freedom=found.noise_degrees_of_freedom,
     )
-
-
-def _as_observed(capture: Capture) -> Capture:
-    """The same with its sockets among the observations."""
-    sockets: list[AbstractObservation] = [Socket(name, q) for name, q in capture.sockets.items()]
-    return Capture({}, capture.lengths, sockets)
-
-
-def _evaluated(uncertainty: Uncertainty, left: Capture, group: tuple[str, ...], converged: bool) -> LeftOut:
-    evaluation = evaluate(uncertainty.arm, left)
-    predicted, length_u = predicted_errors(uncertainty, left)
-    return LeftOut(
-        sockets=group,
-        poses=sum(size for size in left.sizes if size > 1),
-        rms=float(evaluation.repeatability.rms),
-        rms_predicted=predicted,
-        length_error=np.asarray(evaluation.error),
-        length_u=length_u,
-        converged=converged,
-    )
-
-
-def predicted_errors(uncertainty: Uncertainty, capture: Capture) -> tuple[float, Float[np.ndarray, " l"]]:
-    """Predictions of an arm's uncertainty and the readings' noise for a capture that it was not identified from, mm:
-    the RMS distance from the sockets' centroids, and the standard uncertainty of the error of every reference
-    length."""
-    uncertainty, capture = to_numpy((uncertainty, capture))
-    arm, owner = uncertainty.arm, capture.owner
-    sizes = np.asarray(capture.sizes, dtype=float)
-    slopes = np.asarray(uncertainty.derivatives(capture.q))
-    means = np.moveaxis(np.asarray(means_over_sockets(np.moveaxis(slopes, 0, -1), capture.sizes)), -1, 0)
-    centred = slopes - means[owner]
-    reading = np.asarray(tip_covariances(arm.geometry, sines_cosines(capture.q), uncertainty.noise))
-    squares = np.trace(uncertainty.covariance_of_functions(centred), axis1=1, axis2=2)
-    squares = squares + np.einsum("ccN->N", reading) * (1 - 1 / sizes[owner])
-    scattered = sizes[owner] > 1
-    centroids = means_over_sockets(np.asarray(arm.position(capture.q)).T, capture.sizes).T
-    ends = capture.ends()
-    between = centroids[ends[:, 1]] - centroids[ends[:, 0]]
-    direction = between / np.linalg.norm(between, axis=1, keepdims=True)
-    along = np.einsum("lc,lcp->lp", direction, means[ends[:, 1]] - means[ends[:, 0]])
-    of_means = np.moveaxis(np.asarray(sums_over_sockets(reading, capture.sizes)) / sizes**2, -1, 0)
-    scatter = np.einsum("lc,lcd,ld->l", direction, of_means[ends[:, 0]] + of_means[ends[:, 1]], direction)
-    own = np.array([float(length.u) for length in capture.lengths])
-    variance = np.asarray(uncertainty.covariance_of_functions(along[:, None, :]))[:, 0, 0] + scatter + own**2
-    return math.sqrt(squares[scattered].mean()) if scattered.any() else math.nan, np.sqrt(variance)

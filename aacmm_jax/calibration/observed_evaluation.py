@@ -17,21 +17,17 @@ from ..model.observed import (
     Linear,
     Observed,
     Whitening,
-    certified_and_lengths,
     linear_rows,
     observed_model,
     observed_rows,
     whitening_of,
 )
 from ..uncertainty import observed_covariance as propagation
-from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.covariance import inverse_information
-from ..uncertainty.observed_identifiability import dense_rows
 from .task import fit
 
 _MAX_STEPS = 300
 _LEAST = 1e-4  # smallest standard uncertainty of what is certified, of a tip coordinate's standard deviation
-_NULL = 1e-10  # singular values of the geometry below this, of the largest, are zero
 _POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
 
 
@@ -175,45 +171,3 @@ def evaluate_observations(
 def _rms(xp: Any, rows: Float[AnyArray, "r m"]) -> Float[AnyArray, ""]:
     """Root mean square length of the columns; NaN where they have no rows."""
     return xp.sqrt(xp.mean(xp.sum(rows**2, axis=0))) if rows.shape[0] else xp.asarray(np.nan)
-
-
-class Predicted(NamedTuple):
-    """Errors that an arm's uncertainty and the noise predict for a capture that it was not identified from, mm."""
-
-    rms: float  # root mean square distance of a pose from the fitted geometry
-    length_u: Float[np.ndarray, " l"]  # standard uncertainty of the error of every reference length
-
-
-def predicted_residuals(uncertainty: Uncertainty, observed: Observed) -> Predicted:
-    """The prediction for observations whose geometry is fitted to the arm; everything is NumPy's.
-
-    With whitened derivatives A by the parameters and G by the geometry, and U an orthonormal basis of G, errors dp of
-    the parameters and w of the rows leave (I - U U^T) (A dp + w).
-    """
-    fitted = fit_geometry(uncertainty.arm, observed, {}, uncertainty.noise)
-    space = uncertainty.space
-    p = len(space.names)
-    z = np.concatenate([np.asarray(space.vector()), fitted.geometry])
-    linear = linear_rows(space, observed, z)
-    rows, _ = dense_rows(linear, fitted.whitening.roots, len(z))
-    relations, u = certified_and_lengths(observed, z, p)
-    count = len(observed.ends)
-    rows = np.concatenate([rows, relations[count:] / np.maximum(u[count:], 1e-9)[:, None]])
-    basis, singular, vectors = np.linalg.svd(rows[:, p:] * observed.steps, full_matrices=False)
-    known = singular > _NULL * singular[0]
-    basis, follow = basis[:, known], vectors[known].T / singular[known]
-    along = basis.T @ rows[:, :p]
-    rest = rows[:, :p] - basis @ along
-    total, poses, first = 0.0, 0, 0
-    for part, root in zip(linear, fitted.whitening.roots, strict=True):
-        r, m = part.rows.values.shape
-        slopes, inside = (matrix[first : first + r * m].reshape(r, m, -1) for matrix in (rest, basis))
-        first, poses = first + r * m, poses + m
-        to_mm = np.linalg.inv(np.asarray(root))[:, :_POSITION_ROWS]
-        by_parameters = np.einsum("mab,bmp->map", to_mm, slopes)
-        left = np.eye(r) - np.einsum("amg,bmg->mab", inside, inside)
-        total += np.einsum("mab,mbc,mac->", to_mm, left, to_mm)
-        total += np.trace(uncertainty.covariance_of_functions(by_parameters), axis1=1, axis2=2).sum()
-    pull = (relations[:count, p:] * observed.steps) @ follow
-    variance = uncertainty.covariance_of_functions((pull @ along)[:, None, :])[:, 0, 0] + np.sum(pull**2, axis=1)
-    return Predicted(float(np.sqrt(total / poses)), np.sqrt(variance + u[:count] ** 2))

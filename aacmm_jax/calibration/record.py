@@ -19,7 +19,8 @@ from ..solver.reason import SCALE, Reason, numbers_of
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .checks import largest_plausible_residual, plausible
 from .evaluation import Evaluation, evaluate
-from .results import Calibration, CrossValidation, Identification, ObservedMetrics
+from .left_out import CrossValidation
+from .results import Calibration, Identification, ObservedMetrics
 from .second_stage import LARGEST_LOG_K
 
 REPEATABILITY = "repeatability"  # method of stage 1 alone

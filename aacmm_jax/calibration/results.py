@@ -1,8 +1,6 @@
-"""What identifications and calibrations, of one and of many, and a cross-validation return."""
+"""What identifications and calibrations, of one and of many, return."""
 
 import abc
-import math
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 
 from ..core._compat import member_numbers
 from ..core.arrays import Numbers, is_concrete
-from ..core.distributions import chi_square_quantile
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
 from ..data.noise import Noise
@@ -305,84 +302,3 @@ def active_names(space: Parameters, active: Numbers) -> dict[str, str]:
         for name, side in zip(space.names, np.asarray(active), strict=True)
         if side
     }
-
-
-class LeftOut(NamedTuple):
-    """One group of sockets and observations that an arm was not identified from; mm. Predictions are infinite where the
-    other groups leave a direction open that matters."""
-
-    sockets: tuple[str, ...]  # names, also of observations
-    poses: int  # in sockets with more than one
-    rms: float  # distance from the socket's centroid or the fitted geometry, found
-    rms_predicted: float  # root of the mean square that the uncertainty predicts
-    length_error: Float[np.ndarray, " l"]
-    length_u: Float[np.ndarray, " l"]  # standard uncertainty of that error, predicted
-    converged: bool
-
-
-class CrossValidation(NamedTuple):
-    """Every group of sockets left out once. The metrics pool the groups that the others can predict."""
-
-    groups: tuple[LeftOut, ...]
-
-    @property
-    def rms(self) -> float:
-        """Root mean square distance from the socket's centroid over the poses of all groups, mm."""
-        return self._pooled([group.rms for group in self.groups])
-
-    @property
-    def rms_predicted(self) -> float:
-        """What the uncertainties of the calibrations without them predicted, mm."""
-        return self._pooled([group.rms_predicted for group in self.groups])
-
-    def _pooled(self, values: list[float]) -> float:
-        counted = [
-            (group.poses, value)
-            for group, value in zip(self.groups, values, strict=True)
-            if group.poses and np.isfinite(group.rms_predicted)
-        ]
-        total = sum(poses for poses, _ in counted)
-        return float(np.sqrt(sum(poses * value**2 for poses, value in counted) / total)) if total else float("nan")
-
-    def _lengths(self) -> tuple[np.ndarray, np.ndarray]:
-        errors, u = (
-            np.concatenate([getattr(group, what) for group in self.groups]) for what in ("length_error", "length_u")
-        )
-        return errors[np.isfinite(u)], u[np.isfinite(u)]
-
-    @property
-    def length_rms(self) -> float:
-        """Root mean square error of the reference lengths, mm."""
-        errors, _ = self._lengths()
-        return float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan")
-
-    @property
-    def length_u(self) -> float:
-        """Root mean square of the predicted standard uncertainties of these errors, mm."""
-        _, u = self._lengths()
-        return float(np.sqrt(np.mean(u**2))) if len(u) else float("nan")
-
-    @property
-    def open(self) -> int:
-        """How many groups the others cannot predict, because without them something is not determined."""
-        return sum(not np.all(np.isfinite(group.length_u)) or group.rms_predicted == np.inf for group in self.groups)
-
-    def ratios(self) -> list[tuple[float, int]]:
-        """Found over predicted, of poses and of lengths, and the number of values behind each, where they are known."""
-        pairs = [
-            (self.rms, self.rms_predicted, 3 * sum(group.poses for group in self.groups)),
-            (self.length_rms, self.length_u, len(self._lengths()[0])),
-        ]
-        return [(found / predicted, count) for found, predicted, count in pairs if predicted > 0 and np.isfinite(found)]
-
-    @property
-    def excess(self) -> float:
-        """Errors over their prediction, the larger of both ratios: about 1 where the uncertainty is right."""
-        return max((ratio for ratio, _ in self.ratios()), default=float("nan"))
-
-    @property
-    def surprising(self) -> bool:
-        """Whether errors exceed their prediction by half, and by more than chance allows in one case of a hundred."""
-        return any(
-            ratio > max(1.5, math.sqrt(chi_square_quantile(0.99, count) / count)) for ratio, count in self.ratios()
-        )

@@ -6,6 +6,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..core.text import pluralise
+from ..core.units import DEG
 from .calibration_display import print_lengths, print_stages
 from .display import (
     formatted,
@@ -21,29 +22,100 @@ _STYLES = {"conforms": "green", "fails": "red", "undecided": "yellow", None: "de
 
 
 def evaluation(summary: dict[str, Any]) -> None:
-    """One evaluation: held-out sockets come first, since they are what counts."""
+    """One evaluation: held-out data come first, since they are what counts."""
     console = new_console()
     console.print(f"[bold]{escape(summary['arm'])}[/bold]")
     print_warnings(console, summary)
     for group, text in (
-        ("held_out", "Held-out sockets, which the calibration has not used"),
-        ("identified_from", "Sockets used for identification"),
+        ("held_out", "Held-out data, which the calibration has not used"),
+        ("identified_from", "Data used for identification"),
     ):
         part = summary[group]
         if part is None:
             continue
         fitted = part["fixed_by_one_length"]
         print_stages(console, f"\n{text} [mm]", part, ("nominal", "calibrated"), fitted=fitted)
-        table = new_table("", "socket", "poses", "DE [mm]", "Deltam [mm]", "RMS [mm]")
-        for row in part["sockets"]:
-            cells = (formatted(row[key]) for key in ("de_mm", "deltam_mm", "rms_mm"))
-            table.add_row(escape(row["socket"]), str(row["poses"]), *cells)
-        print_table(console, table)
-        if part["lengths"]:
+        predicted = part.get("predicted")
+        _sockets(console, part["sockets"], predicted is not None)
+        _observations(console, part, predicted is not None)
+        if part["lengths"] and predicted is not None:
+            _predicted_lengths(console, part["lengths"], predicted, fitted)
+        elif part["lengths"]:
             print_lengths(console, part["lengths"], fitted=fitted)
     print_verdicts(console, summary)
-    _acceptance(console, summary)
+    if summary["acceptance"] or summary["standards"]:
+        _acceptance(console, summary)
     print_written(console, summary)
+
+
+def _sockets(console: Console, rows: list[dict[str, Any]], predicted: bool) -> None:
+    """Repeatability socket by socket; of held-out ones, the predicted RMS too."""
+    if not rows:
+        return
+    keys = ("de_mm", "deltam_mm", "rms_mm", *(["rms_predicted_mm"] if predicted else []))
+    headings = ("DE [mm]", "Deltam [mm]", "RMS [mm]", *(["predicted"] if predicted else []))
+    table = new_table("", "socket", "poses", *headings)
+    for row in rows:
+        table.add_row(escape(row["socket"]), str(row["poses"]), *(formatted(row[key]) for key in keys))
+    print_table(console, table)
+
+
+def _observations(console: Console, part: dict[str, Any], predicted: bool) -> None:
+    """Residuals of the other observations; of held-out ones also by kind, and by what shares a geometry or a length."""
+    rows = part["observations"]
+    if rows:
+        headings = ("nominal", "RMS", *(["predicted"] if predicted else []), "in s.d.")
+        table = new_table(
+            "\nObservations, RMS distance of poses from their geometry [mm]", "observation", "kind", "poses", *headings
+        )
+        keys = ("nominal_rms_mm", "rms_mm", *(["rms_predicted_mm"] if predicted else []), "reduced_chi")
+        for row in rows:
+            cells = (formatted(row[key]) for key in keys)
+            table.add_row(escape(row["observation"]), row["kind"], str(row["poses"]), *cells)
+        print_table(console, table)
+        for row in rows:
+            if row["rms_angle_rad"] is not None:
+                angle = row["rms_angle_rad"] / DEG
+                console.print(f"Orientation of {escape(row['observation'])}: RMS {angle:.4f} deg.")
+    if not predicted:
+        return
+    for what, key in (("kind", "kinds"), ("group", "groups")):
+        alone = all(len(row["members"]) == 1 for row in part[key]) if key == "groups" else not rows
+        if len(part[key]) > 1 and not alone:
+            title = "\nBy kind [mm]" if key == "kinds" else "\nBy what shares a length or an unknown geometry [mm]"
+            table = new_table(title, what, "poses", "RMS", "predicted", "in s.d.")
+            for row in part[key]:
+                cells = (formatted(row[name]) for name in ("rms_mm", "rms_predicted_mm", "reduced_chi"))
+                table.add_row(escape(row[what]), str(row["poses"]), *cells)
+            print_table(console, table)
+    poses = part["predicted"]["poses"]
+    if poses["rms_mm"] is not None:
+        prediction = poses["rms_predicted_mm"]
+        console.print(
+            f"All held-out poses: RMS {formatted(poses['rms_mm'])} mm, predicted "
+            + (f"{formatted(prediction)} mm" if prediction is not None else "not, because something is not determined")
+            + " by the uncertainty of the calibration"
+            + (" and the noise (s.d.: its standard deviation)." if rows else " and the noise.")
+        )
+
+
+def _predicted_lengths(console: Console, rows: list[dict[str, Any]], predicted: dict[str, Any], fitted: bool) -> None:
+    """Held-out reference lengths: U contains the uncertainty of the calibration and of the length, and the noise."""
+    factor = predicted["coverage_factor"]
+    title = f"\nReference lengths [mm]; U: 95 %, coverage factor {factor:.2f}"
+    table = new_table(title, "between", "value", "measured", "error", "U", "error / U")
+    for row in rows:
+        ratio = row["error_over_expanded"]
+        error = "fixed the scale" if fitted else formatted(row["error_mm"])
+        mark = "-" if ratio is None or fitted else f"{ratio:+.2f}"
+        table.add_row(
+            escape(f"{row['from']} - {row['to']}"),
+            *(formatted(row[key]) for key in ("value_mm", "measured_mm")),
+            error,
+            formatted(row["expanded_mm"]),
+            f"[red]{mark}[/red]" if ratio is not None and abs(ratio) > 1 and not fitted else mark,
+        )
+    print_table(console, table)
 
 
 def report(summary: dict[str, Any]) -> None:
@@ -70,7 +142,9 @@ def _acceptance(console: Console, summary: dict[str, Any]) -> None:
     """One row a result, with its worst part; then what full procedures would need."""
     tests = summary["acceptance"]
     if not tests:
-        console.print("No acceptance test applies: there is no socket with several poses, no length and no sphere.")
+        console.print(
+            "No acceptance test applies: there is no socket with several poses, no length and no sphere for it."
+        )
         return
     before = any(metric["as_found_mm"] is not None for test in tests for metric in test["figures"])
     limited = any(metric["limit_mm"] is not None for test in tests for metric in test["figures"])

@@ -106,8 +106,9 @@ def calibrate(
     cross_validate: Annotated[
         bool | None,
         typer.Option(
-            help="Calibrate once without each placement of the reference length, and test the result there. "
-            "Default: yes, for a recorded capture with several placements."
+            help="Calibrate once without each placement, station or other group of what was observed, or each region "
+            "of joint space where all is one group, and test the result there. "
+            "Default: yes, for a recorded capture with several placements of the reference length."
         ),
     ] = None,
     monte_carlo: Annotated[
@@ -178,13 +179,11 @@ def calibrate(
             ):
                 from ..calibration.cross_validation import cross_validate as validated
 
-                if not alike:
-                    check_sockets_only(capture_used, "cross-validation")
-                    raise InputError("--cross-validate is for calibrations without --robust and --scale nominal.")
-                solving["method"] = method or "two-stage"
-                found = with_spinner(
-                    "Cross-validating", lambda: validated(bounds.space.base, capture_used, bounds, **solving)
-                )
+                if scale != "measured":
+                    raise InputError("--cross-validate needs a calibrated scale; leave out --scale nominal.")
+                found = with_spinner("Cross-validating", lambda: validated(
+                    bounds.space.base, capture_used, bounds, method=method, robust=robust, **solving,
+                ))  # fmt: skip
                 record = record._replace(validation=found)
         if monte_carlo:
             from ..calibration.results import Calibration

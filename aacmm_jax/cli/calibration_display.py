@@ -158,16 +158,31 @@ def _validated(console: Console, found: dict[str, Any] | None) -> None:
     """Cross-validation."""
     if found is None:
         return
-    title = f"\nCross-validated: each of {found['groups']} placements held out once [mm]"
+    title = f"\nCross-validated: each of {found['groups']} groups held out once [mm]"
     table = new_table(title, "", "found", "predicted by u")
     table.add_row(
-        "RMS distance of poses from their socket's centroid",
+        "RMS distance of poses from their socket or geometry",
         formatted(found["rms_mm"]),
         formatted(found["rms_predicted_mm"]),
     )
     table.add_row(
         "RMS error of reference lengths", formatted(found["length_error_rms_mm"]), formatted(found["length_u_mm"])
     )
+    print_table(console, table)
+    if "left_out" in found:
+        _left_out(console, found["left_out"])
+
+
+def _left_out(console: Console, rows: list[dict[str, Any]]) -> None:
+    """Every group that was left out, the most improbable first; those beyond chance are marked."""
+    lengths = any(row["lengths"] for row in rows)
+    headings = ("poses", "RMS", "predicted", *(("length error", "u") if lengths else ()))
+    table = new_table("", "held out", *headings, "")
+    keys = ("rms_mm", "rms_predicted_mm", *(("length_error_rms_mm", "length_u_mm") if lengths else ()))
+    for row in rows:
+        mark = "[red]disagrees[/red]" if row["disagrees"] else "" if row["converged"] else "[red]did not converge[/red]"
+        cells = (formatted(row[key]) for key in keys)
+        table.add_row(escape(row["group"]), str(row["poses"]), *cells, mark)
     print_table(console, table)
 
 

@@ -54,6 +54,14 @@ def evaluate(
             "one is not met by the decision rule of ISO 14253-1.",
         ),
     ] = None,
+    acceptance: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[jjf|asme|iso]",
+            help="Run the acceptance tests of JJF 1408, ASME B89.4.22 or ISO 10360-12; repeatable. Default: those of "
+            "the standard that the capture was made for, of --mpe, and of all for a manifest of points."
+        ),
+    ] = None,
     test_u_mm: Annotated[
         float,
         typer.Option(
@@ -73,7 +81,8 @@ def evaluate(
 ) -> None:
     """Test a calibration on a capture that it has not seen.
 
-    Runs every acceptance test that the capture allows. A manifest of points is tested without a calibration.
+    Errors on data that the calibration has not used are printed beside those that its uncertainty predicts. A manifest
+    of points is tested without a calibration.
     """
     from ..acceptance.decision import read_limits
     from ..acceptance.results import METRICS
@@ -85,13 +94,13 @@ def evaluate(
     if capture is None:
         if maxima or only or without:
             raise InputError(
-                "a manifest of points takes only --mpe, --test-u-mm, --output and --json; name a calibration and a "
-                "capture for the other options."
+                "a manifest of points takes only --mpe, --acceptance, --test-u-mm, --output and --json; name a "
+                "calibration and a capture for the other options."
             )
-        summary = _evaluated_points(calibration, output, limits, test_u_mm)
+        summary = _evaluated_points(calibration, output, limits, test_u_mm, acceptance)
         show_summary(summary, as_json, acceptance_display.points)
     else:
-        summary = _evaluated(calibration, capture, output, (only, without), limits, test_u_mm, maxima)
+        summary = _evaluated(calibration, capture, output, (only, without), limits, test_u_mm, maxima, acceptance)
         show_summary(summary, as_json, acceptance_display.evaluation)
     undecided = [test for test in summary["acceptance"] if test["decision"] in ("fails", "undecided")]
     if summary["failed"] or undecided:
@@ -137,6 +146,7 @@ def _evaluated(
     limits: Any,
     u_test: float,
     maxima: dict[str, float],
+    standards: list[str] | None,
 ) -> dict[str, Any]:
     from ..acceptance.record import evaluation_of
     from ..files.calibrations import load_calibration
@@ -152,7 +162,7 @@ def _evaluated(
             capture=recording.capture.select(choice[0] or None, choice[1] or ()),
             sources=(*map(fingerprint, read), *recording.sources),
         )
-        found = evaluation_of(record, recording, limits=limits, u_test=u_test, maxima=maxima)
+        found = evaluation_of(record, recording, limits=limits, u_test=u_test, maxima=maxima, standards=standards)
         summary = with_spinner("Evaluating", lambda: evaluation_summary(found))
         if output is not None:
             save_evaluation(output, found, summary)
@@ -160,8 +170,11 @@ def _evaluated(
     return summary
 
 
-def _evaluated_points(manifest: Path, output: Path | None, limits: Any, u_test: float) -> dict[str, Any]:
+def _evaluated_points(
+    manifest: Path, output: Path | None, limits: Any, u_test: float, standards: list[str] | None
+) -> dict[str, Any]:
     from ..acceptance.record import PointsRecord
+    from ..acceptance.standards import STANDARDS, checked_standards
     from ..files.evaluations import save_points
     from ..files.points import read_points
     from ..summaries.evaluation import points_summary
@@ -171,7 +184,8 @@ def _evaluated_points(manifest: Path, output: Path | None, limits: Any, u_test: 
             f"{manifest} alone cannot be evaluated; name a capture as well, or a manifest of points (TOML)."
         )
     with together(output):
-        record = PointsRecord(read_points(manifest), limits, u_test)
+        chosen = checked_standards(STANDARDS if standards is None else standards)
+        record = PointsRecord(read_points(manifest), limits, u_test, chosen)
         summary = points_summary(record)
         if output is not None:
             save_points(output, record, summary)

@@ -34,3 +34,14 @@ def f_tail(value: float, numerator: float, denominator: float) -> float:
     from scipy import special
 
     return float(special.fdtrc(numerator, denominator, value))
+
+
+def chance(found: float, predicted: float, degrees_of_freedom: float, of_prediction: float) -> float:
+    """Probability of a root mean square of at least ``found`` where ``predicted`` is right, by the F distribution; by
+    the chi-square distribution where the prediction is exact (infinite degrees of freedom). NaN where it is unknown."""
+    if not (0 < predicted < np.inf and np.isfinite(found) and np.isfinite(degrees_of_freedom)):
+        return float("nan")
+    ratio = (found / predicted) ** 2
+    if np.isinf(of_prediction):
+        return chi_square_tail(ratio * degrees_of_freedom, degrees_of_freedom)
+    return f_tail(ratio, degrees_of_freedom, of_prediction)

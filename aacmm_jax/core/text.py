@@ -48,6 +48,12 @@ def shorten(items: Sequence[str], most: int = 5) -> str:
     return ", ".join(items[:most]) + (f" and {len(items) - most} more" if len(items) > most else "")
 
 
+def common_label(names: Sequence[str]) -> str:
+    """What several names have in common before the last "/", such as a placement; else the first of the names."""
+    folders = {name.rpartition("/")[0] for name in names}
+    return folders.pop() if len(names) > 1 and len(folders) == 1 and "" not in folders else shorten(names, 3)
+
+
 def pluralise(number: int, noun: str) -> str:
     """A number of things: ``1 socket``, ``2 sockets``."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

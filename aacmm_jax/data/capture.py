@@ -1,7 +1,7 @@
 """Captures: joint readings taken while the tip rested in fixed sockets, and reference lengths between sockets."""
 
 import fnmatch
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -225,6 +225,14 @@ class Capture(eqx.Module):
         )
         others = [observation for observation in self.observations if observation.name in kept]
         return Capture({name: sockets[name] for name in self.names if name in kept}, lengths, others, repeated=repeated)
+
+
+def part_of(capture: Capture, names: Collection[str]) -> Capture:
+    """Sockets and other observations by their exact names, which `Capture.select` would take for patterns, with the
+    reference lengths between them."""
+    lengths = [length for length in capture.lengths if length.start in names and length.end in names]
+    others = [observation for observation in capture.observations if observation.name in names]
+    return Capture({name: q for name, q in capture.sockets.items() if name in names}, lengths, others)
 
 
 def check_one_capture(capture: Capture) -> None:

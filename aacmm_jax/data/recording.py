@@ -18,6 +18,7 @@ class Recording(NamedTuple):
         spheres: Spheres probed for acceptance tests.
         sources: Files that it was read from, as name and SHA-256, the latest first.
         measured: Day of the recording, ISO 8601; empty where not stated.
+        acceptance: Standards whose acceptance procedure the poses were taken for: "jjf", "asme", "iso".
     """
 
     capture: Capture
@@ -27,3 +28,4 @@ class Recording(NamedTuple):
     spheres: tuple[ProbedSphere, ...] = ()
     sources: tuple[str, ...] = ()
     measured: str = ""
+    acceptance: tuple[str, ...] = ()

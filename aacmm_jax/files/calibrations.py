@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.left_out import CrossValidation, LeftOut
 from ..calibration.record import CalibrationRecord
-from ..calibration.results import CrossValidation, LeftOut
 from ..calibration.scale_anchor import scale_anchor
 from ..core.errors import InputError
 from ..data.noise import Noise
@@ -30,6 +30,8 @@ from .hdf5 import (
     write_tables,
 )
 from .sense import check_calibration
+
+_FREEDOMS = ("rms_freedom", "length_freedom", "noise_freedom")  # of cross-validation; earlier files have none
 
 
 def save_calibration(
@@ -202,6 +204,9 @@ def _validation_table(record: CalibrationRecord) -> Table:
         rms=([group.rms for group in groups], "mm", "RMS distance from the centroid, found"),
         rms_predicted=([group.rms_predicted for group in groups], "mm", "the same, predicted"),
         converged=([int(group.converged) for group in groups], "1", "1: the others converged"),
+        rms_freedom=([group.freedoms[0] for group in groups], "1", "effective degrees of freedom of rms_predicted"),
+        length_freedom=([group.freedoms[1] for group in groups], "1", "effective degrees of freedom of length_u"),
+        noise_freedom=([group.noise_freedom for group in groups], "1", "degrees of freedom of the noise behind both"),
     )
     by_socket = columns(
         "left_out_socket",
@@ -236,6 +241,7 @@ def _validation_of(stored: Stored) -> CrossValidation | None:
                 length_error=table["length_error"][of],
                 length_u=table["length_u"][of],
                 converged=bool(table["converged"][i]),
+                **{name: float(table[name][i]) for name in _FREEDOMS if name in table},
             )
         )
     return CrossValidation(tuple(groups))

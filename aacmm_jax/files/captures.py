@@ -71,7 +71,12 @@ def load_capture(path: str | os.PathLike) -> Recording:
 
 def recording_attributes(recording: Recording) -> dict[str, Any]:
     """Root attributes of a file that holds a recording."""
-    return {"seed": recording.seed, "sources": list(recording.sources) or None, "measured": recording.measured or None}
+    return {
+        "seed": recording.seed,
+        "sources": list(recording.sources) or None,
+        "measured": recording.measured or None,
+        "acceptance": list(recording.acceptance) or None,
+    }
 
 
 def recording_tables(recording: Recording) -> dict[str, Table]:
@@ -188,7 +193,16 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     attributes = stored.attributes
     nominal = specification_of(path, stored, "nominal_arm")
     check_recording(path, stored)
-    return Recording(capture, nominal, true, attributes.get("seed"), spheres, sources, attributes.get("measured", ""))
+    return Recording(
+        capture,
+        nominal,
+        true,
+        attributes.get("seed"),
+        spheres,
+        sources,
+        attributes.get("measured", ""),
+        names_in(attributes.get("acceptance")),
+    )
 
 
 def _repeated_of(stored: Stored) -> Repeated:

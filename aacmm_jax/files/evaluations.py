@@ -11,7 +11,11 @@ from ..acceptance.all_tests import checked_limits
 from ..acceptance.decision import Limit
 from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord
 from ..acceptance.results import METRICS, Measured
+from ..acceptance.standards import STANDARDS
+from ..data.noise import Noise
+from ..kinematics.arm import Arm, parameter_names
 from ..kinematics.workspace import Reach
+from ..uncertainty.arm_uncertainty import Uncertainty
 from .captures import (
     arm_table,
     lengths_of,
@@ -30,6 +34,7 @@ from .hdf5 import (
     axes,
     check_sense,
     columns,
+    names_in,
     need,
     numbering,
     read_tables,
@@ -57,12 +62,56 @@ def save_evaluation(
     tables["used"] = Table(columns("used", used=(sorted(record.used), "", "socket that the arm was identified from")))
     tables["limits"] = _limit_table(record.limits)
     tables["figures"] = _metric_table(record)
+    if record.uncertainty is not None:
+        tables["uncertainty"] = _uncertainty_table(record.uncertainty)
     attributes = recording_attributes(record.recording) | {
         "warnings": list(record.warnings) or None,
+        "standards": list(record.standards) or "",
         "u_test_mm": record.u_test,
         **{f"most_{name}": value for name, value in record.maxima.items()},
     }
     write_tables(path, "evaluation", tables, attributes, summary=summary)
+
+
+def _uncertainty_table(uncertainty: Uncertainty) -> Table:
+    """The covariance of the calibrated arm's parameters, from which errors are predicted."""
+    names, square = list(uncertainty.names), ("parameter", "parameter_2")
+    variables = columns("parameter", parameter=(names, "", "free parameter"))
+    variables |= columns("parameter_2", parameter_2=(names, "", "free parameter, second axis of the covariance"))
+    variables["covariance"] = Variable(square, np.asarray(uncertainty.covariance), "products of units", "covariance")
+    variables["open"] = Variable(
+        square, np.asarray(uncertainty.open), "1", "projector onto what is not determined, in mm and mrad"
+    )
+    return Table(
+        variables,
+        {
+            "encoder_arcsec": np.asarray(uncertainty.noise.encoder_arcsec),
+            "seating_mm": float(uncertainty.noise.seating),
+            "degrees_of_freedom": uncertainty.degrees_of_freedom,
+        },
+    )
+
+
+def _uncertainty_of(path: str | os.PathLike, stored: Stored, calibrated: Arm) -> Uncertainty | None:
+    """The uncertainty of the calibrated arm; files of earlier versions have none."""
+    table = stored.tables.get("uncertainty")
+    if table is None:
+        return None
+    need(path, table, "parameter", "covariance", "open", of="entry")
+    attributes, names = stored.table_attributes["uncertainty"], tuple(map(str, table["parameter"]))
+    strange = not set(names) <= set(parameter_names(calibrated)) or len(set(names)) < len(names)
+    check_sense(path, {"a parameter is unknown, or named twice": strange})
+    return Uncertainty(
+        arm=calibrated,
+        covariance=table["covariance"],
+        open=table["open"],
+        noise=Noise(
+            encoder_arcsec=np.squeeze(np.atleast_1d(attributes["encoder_arcsec"])), seating=attributes["seating_mm"]
+        ),
+        u_k=None,
+        names=names,
+        degrees_of_freedom=float(attributes["degrees_of_freedom"]),
+    )
 
 
 def _limit_table(limits: Mapping[str, Limit | float]) -> Table:
@@ -140,7 +189,14 @@ def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
             _limits_in(stored),
             float(attributes["u_test_mm"]),
             maxima,
+            _standards_of(stored),
+            _uncertainty_of(path, stored, calibrated.arm),
         )
+
+
+def _standards_of(stored: Stored) -> tuple[str, ...]:
+    """Whose tests are run; in files of earlier versions, those of all standards."""
+    return names_in(stored.attributes.get("standards", list(STANDARDS)))
 
 
 def save_points(path: str | os.PathLike, record: PointsRecord, summary: Mapping[str, Any] | None = None) -> None:
@@ -172,6 +228,7 @@ def save_points(path: str | os.PathLike, record: PointsRecord, summary: Mapping[
     reach = measured.reach
     attributes = {
         "of": "points",
+        "standards": list(record.standards) or "",
         "u_test_mm": record.u_test,
         "sources": list(measured.sources) or None,
         "measured": measured.measured or None,
@@ -211,4 +268,4 @@ def load_points(path: str | os.PathLike) -> PointsRecord:
             sources=tuple(attributes.get("sources") or ()),
             measured=attributes.get("measured", ""),
         )
-        return PointsRecord(measured, _limits_in(stored), float(attributes["u_test_mm"]))
+        return PointsRecord(measured, _limits_in(stored), float(attributes["u_test_mm"]), _standards_of(stored))

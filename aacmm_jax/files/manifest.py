@@ -20,6 +20,7 @@ from pydantic import (
     model_validator,
 )
 
+from ..acceptance.standards import Standard
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG
 from ..data.capture import Capture, ReferenceLength
@@ -130,6 +131,7 @@ class _Recorded(Strict):
 
 class _Poses(_Recorded):
     arm: str
+    acceptance: Standard | Annotated[list[Standard], AfterValidator(each_once)] = Field(default_factory=list)
     angles: _Angles | None = None
 
 
@@ -140,6 +142,16 @@ class PointsManifest(_Recorded):
     """A manifest of points instead of poses."""
 
     points: _Points
+
+    @model_validator(mode="after")
+    def _own_tip(self) -> "PointsManifest":
+        named = [f"'{entry.name or entry.paths[0]}'" for entry in self.socket if entry.target]
+        if named:
+            raise ValueError(
+                f"target is for manifests of poses, but socket {named[0]} has points, which say where the tip was; "
+                "leave it out."
+            )
+        return self
 
 
 def read_manifest(path: str | os.PathLike) -> Recording:
@@ -158,6 +170,8 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     pattern or number: ``columns = { q = "q*_rad", points = ["x", "y", "z"] }``. ``units``, ``rotation``,
     ``coverage_factor``, ``delimiter``, ``decimal`` and ``skip`` say how they are written, ``group`` names a column that
     divides the table into several observations, and ``preset`` (csv, leica, xyzijk, ipa) fills in what is not stated.
+
+    ``acceptance`` (jjf, asme, iso, or a list) says for which standards' acceptance procedure the poses were taken.
 
     Args:
         path: the manifest (TOML).
@@ -203,7 +217,14 @@ def read_manifest(path: str | os.PathLike) -> Recording:
             raise InputError("there is neither a [[socket]] nor another observation; add one.")
         sources = tuple(dict.fromkeys(fingerprint(file, path.parent) for file in files))
         capture = Capture(sockets, lengths, observations)
-        return Recording(capture, nominal, spheres=spheres, sources=sources, measured=str(model.date or ""))
+        return Recording(
+            capture,
+            nominal,
+            spheres=spheres,
+            sources=sources,
+            measured=str(model.date or ""),
+            acceptance=(model.acceptance,) if isinstance(model.acceptance, str) else tuple(model.acceptance),
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -63,10 +63,11 @@ def plan_manifest(plan: Plan, arm: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _manifest_start(arm: str, *comments: str) -> list[str]:
+def _manifest_start(arm: str, *comments: str, acceptance: str | None = None) -> list[str]:
     """The first lines of a manifest of readings in degrees."""
     date = "# date = 2026-01-31   # when it was recorded"
-    return [*comments, f"arm = {_quoted(arm)}", date, "", "[angles]", 'unit = "deg"']
+    made_for = [] if acceptance is None else [f"acceptance = {_quoted(acceptance)}"]
+    return [*comments, f"arm = {_quoted(arm)}", *made_for, date, "", "[angles]", 'unit = "deg"']
 
 
 def procedure_csv(procedure: Procedure) -> str:
@@ -108,6 +109,7 @@ def procedure_manifest(procedure: Procedure, arm: str) -> str:
         f"# {PLANNED[procedure.standard]}, as planned. Fill in the calibrated values and uncertainties (k = 1) of your",
         "# artefacts, record a file for each socket and each group of touches (one row a pose, in the order of the",
         "# plan), then: aacmm import THIS.toml -o acceptance.h5",
+        acceptance=procedure.standard,
     )
     kinds = dict.fromkeys(item.name.split("/")[0] for item in procedure.sockets)
     for kind in kinds:

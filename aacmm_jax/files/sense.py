@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..acceptance.standards import STANDARDS
 from .hdf5 import Stored, check_sense, names_in, read_tables, undamaged
 
 _ROUNDING = 1e-6  # of k
@@ -47,6 +48,7 @@ def check_recording(path: str | os.PathLike, stored: Stored) -> None:
             "its arm has another number of joints than its readings": any(len(x["alpha"]) != joints for x in arms),
             "the day of measurement is no date": not _is_date(attributes.get("measured", "")),
             "its seed is no whole number": not isinstance(attributes.get("seed", 0), int),
+            "its acceptance procedure is unknown": not set(names_in(attributes.get("acceptance"))) <= set(STANDARDS),
         },
     )
 
@@ -107,11 +109,14 @@ def check_calibration(path: str | os.PathLike, stored: Stored) -> None:
 def check_evaluation(path: str | os.PathLike, stored: Stored) -> None:
     """Raise `InputError` where a limit or an uncertainty of an evaluation cannot be."""
     limits = [value for name, value in stored.attributes.items() if name.startswith("most_")]
+    covariance = stored.tables.get("uncertainty", {}).get("covariance", np.zeros((0, 0)))
     check_sense(
         path,
         {
             "a limit is negative or not finite": not all(0 <= value < math.inf for value in limits),
             "the uncertainty of the test is negative or not finite": not 0 <= stored.attributes["u_test_mm"] < math.inf,
+            "a standard is unknown": not set(names_in(stored.attributes.get("standards"))) <= set(STANDARDS),
+            "the covariance is not that of real numbers": not _is_semidefinite(covariance),
         },
     )
 

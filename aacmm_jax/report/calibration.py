@@ -82,7 +82,7 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
 def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
     nominal, calibrated, facts = summary["nominal"], summary["calibrated"], []
     validated = summary["cross_validation"]
-    if validated is not None and not math.isnan(validated["rms_mm"]):
+    if validated is not None and validated["rms_mm"] is not None:
         rms, predicted = format_number(validated["rms_mm"]), format_number(validated["rms_predicted_mm"])
         facts.append(("Held-out placements, RMS distance", f"{rms}\u00a0mm (predicted {predicted})"))
     for key, name in (("de_mm", "DE"), ("deltam_mm", "Deltam")) if "de_mm" in calibrated else ():

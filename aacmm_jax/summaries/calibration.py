@@ -7,7 +7,7 @@ import numpy as np
 
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord, uncertainty_of
-from ..calibration.results import CrossValidation, ObservedMetrics, active_names
+from ..calibration.results import ObservedMetrics, active_names
 from ..data.capture import Capture, ReferenceLength
 from ..data.recording import Recording
 from ..kinematics.arm import is_length
@@ -15,6 +15,7 @@ from ..kinematics.parameters import ArmSpecification, Parameters
 from ..model.observed import Observed
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
+from .validation import cross_validation_summary
 from .warnings import observed, of_calibration, of_capture
 
 _CORRELATED = 0.95
@@ -176,7 +177,7 @@ def calibration_summary(
         **metrics_by_socket_and_length(record.recording.capture, evaluations["calibrated"]),
         "parameters": parameters,
         "uncertainty": uncertainty_summary(record, observability, volume),
-        "cross_validation": None if record.validation is None else _validation_summary(record.validation),
+        "cross_validation": None if record.validation is None else cross_validation_summary(record.validation),
         "monte_carlo": record.sampled_says,
         "warnings": of_calibration(record, observability),
         **observed_summary(record),
@@ -258,17 +259,6 @@ def uncertainty_summary(
     found["volume"] = {key: value if np.isfinite(value) else None for key, value in found["volume"].items()}
     found["condition"] = found["condition"] if np.isfinite(found["condition"]) else None
     return found
-
-
-def _validation_summary(validation: CrossValidation) -> dict[str, Any]:
-    return {
-        "groups": len(validation.groups),
-        "rms_mm": validation.rms,
-        "rms_predicted_mm": validation.rms_predicted,
-        "length_error_rms_mm": validation.length_rms,
-        "length_u_mm": validation.length_u,
-        "excess": validation.excess,
-    }
 
 
 def active_names_of(record: CalibrationRecord, active: np.ndarray) -> dict[str, str]:

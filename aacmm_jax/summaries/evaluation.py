@@ -4,13 +4,20 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.record import EvaluationRecord, PointsRecord, unstated_uncertainty_warning
+from ..acceptance.record import EvaluationRecord, PointsRecord, names_in, unstated_uncertainty_warning
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
+from ..calibration.cross_validation import groups_of
 from ..calibration.evaluation import Evaluation, evaluate
-from ..data.capture import Capture
+from ..calibration.prediction import NOTHING, Agreement, compare
+from ..core.text import common_label
+from ..data.capture import Capture, part_of
+from ..data.noise import Noise
+from ..kinematics.arm import Arm
 from .calibration import length_metrics, metrics, metrics_by_socket_and_length
+from .validation import agreement_row, finite, no_better, surprise
 
 _LIMITED = {"rms_mm": "RMS distance", "deltam_mm": "Deltam", "length_error_largest_mm": "largest length error"}
+_GROUPS = ("held_out", "identified_from")
 
 
 def evaluation_summary(
@@ -18,8 +25,9 @@ def evaluation_summary(
 ) -> dict[str, Any]:
     """The nominal and the calibrated arm on a capture, on held-out data and on those identified from; acceptance tests.
 
-    A length counts as held out if at least one of its ends was not identified from. ``tests``
-    (`EvaluationRecord.acceptance`) are run if not given.
+    A length counts as held out if at least one of its ends was not identified from. Errors on held-out data stand
+    beside those that the uncertainty of the calibration predicts. ``tests`` (`EvaluationRecord.acceptance`) are run if
+    not given.
     """
     capture, unseen = record.recording.capture, record.held_out_lengths()
     summary: dict[str, Any] = {
@@ -27,29 +35,104 @@ def evaluation_summary(
         "arm": record.recording.nominal.name,
         "warnings": list(record.warnings),
     }
-    whole = {stage: evaluate(specification.arm, capture) for stage, specification in record.arms().items()}
+    noise = None if record.uncertainty is None else record.uncertainty.noise
+    whole = {stage: _evaluated(specification.arm, capture, noise) for stage, specification in record.arms().items()}
     rows = metrics_by_socket_and_length(capture, whole["calibrated"])
-    fixed_scale = record.length_that_fixed_scale()
+    fixed_scale, held_out = record.length_that_fixed_scale(), record.held_out()
     for group in ("held_out", "identified_from"):
         wanted = group == "identified_from"
-        names = [name for name in capture.names if (name in record.used) == wanted]
+        names = [name for name in names_in(capture) if (name in held_out) != wanted]
         lengths = [i for i in range(len(capture.lengths)) if (i not in unseen) == wanted]
         if not names and not lengths:
             summary[group] = None
             continue
-        part = Capture({name: capture.sockets[name] for name in names}) if names else None
-        summary[group] = {
-            stage: _grouped(None if part is None else evaluate(specification.arm, part), whole[stage], lengths)
-            for stage, specification in record.arms().items()
+        part = None if not names else capture if len(names) == len(names_in(capture)) else part_of(capture, names)
+        found = {
+            stage: whole[stage] if part is capture else None if part is None else _evaluated(arm.arm, part, noise)
+            for stage, arm in record.arms().items()
         }
+        summary[group] = {stage: _grouped(found[stage], whole[stage], lengths) for stage in whole}
         summary[group]["sockets"] = [row for row in rows["sockets"] if row["socket"] in names]
+        summary[group]["observations"] = _observation_rows(found["nominal"], found["calibrated"])
         summary[group]["lengths"] = [rows["lengths"][i] for i in lengths]
         summary[group]["fixed_by_one_length"] = fixed_scale in lengths
+        if not wanted:
+            summary["warnings"] += _add_prediction(summary[group], record, part, lengths)
     summary["kept"], summary["failed"] = _exceeded(summary, record)
     found = record.acceptance() if tests is None else tests
     summary["acceptance"] = acceptance_summary(found["calibrated"], found["nominal"])
+    summary["standards"] = list(record.standards)
     summary["u_test_mm"] = record.u_test
     return summary
+
+
+def _evaluated(arm: Arm, capture: Capture, noise: Noise | None) -> Evaluation:
+    return evaluate(arm, capture, noise=noise if capture.observations else None)
+
+
+def _observation_rows(nominal: Evaluation | None, calibrated: Evaluation | None) -> list[dict[str, Any]]:
+    """Residuals of the observations besides sockets by both arms, mm, and in standard deviations of the noise."""
+    if nominal is None or calibrated is None or nominal.observed is None or calibrated.observed is None:
+        return []
+    before, after = nominal.observed, calibrated.observed
+    columns = (before.rms, after.rms, after.rms_angle, after.reduced_chi)
+    rows = list(zip(after.names, after.kinds, after.residuals, *columns, strict=True))
+    keys = ("nominal_rms_mm", "rms_mm", "rms_angle_rad", "reduced_chi")
+    return [
+        {"observation": name, "kind": kind, "poses": residuals.shape[1]}
+        | {key: finite(float(value)) for key, value in zip(keys, values, strict=True)}
+        for name, kind, residuals, *values in rows[len(calibrated.repeatability.socket_rms) :]
+    ]
+
+
+def _add_prediction(
+    group: dict[str, Any], record: EvaluationRecord, part: Capture | None, lengths: list[int]
+) -> list[str]:
+    """Add what the uncertainty of the calibration predicts to the rows of held-out data; sentences on contradictions.
+
+    Each kind, and all that shares a geometry or a length (a placement, a station), has a row of its own.
+    """
+    group["predicted"], group["kinds"], group["groups"] = None, [], []
+    if record.uncertainty is None:
+        return []
+    capture, factor = record.recording.capture, record.uncertainty.factor(0.95)
+    compared = None if part is None else compare(record.uncertainty, part)
+    of_lengths = compared if part is capture or not lengths else compare(record.uncertainty, capture)
+    each: dict[str, Agreement] = {}
+    poses = lengths_found = NOTHING
+    if compared is not None and part is not None:
+        each, poses = {name: compared.of([name]) for name in compared.parts}, compared.of(compared.parts)
+        for row in (*group["sockets"], *group["observations"]):
+            found = agreement_row(each[row.get("socket", row.get("observation"))])
+            row |= {key: found[key] for key in ("rms_predicted_mm", "reduced_chi", "probability")}
+        kinds: dict[str, list[str]] = {"socket": list(part.names)} if part.names else {}
+        for observation in part.observations:
+            kinds.setdefault(observation.kind, []).append(observation.name)
+        group["kinds"] = [
+            {"kind": kind, "observations": len(names)} | agreement_row(compared.of(names))
+            for kind, names in kinds.items()
+        ]
+        group["groups"] = [
+            {"group": common_label(names), "members": list(names)} | agreement_row(compared.of(names))
+            for names in groups_of(part)
+        ]
+    if of_lengths is not None and lengths:
+        lengths_found = of_lengths.of_lengths(lengths)
+        for row, i in zip(group["lengths"], lengths, strict=True):
+            expanded = finite(factor * of_lengths.length_u[i])
+            row["expanded_mm"] = expanded
+            row["error_over_expanded"] = finite(row["error_mm"] / expanded) if expanded else None
+    group["predicted"] = {
+        "coverage_factor": factor,
+        "poses": agreement_row(poses),
+        "lengths": {
+            "lengths": lengths_found.count,
+            "normalised_error_rms": finite(lengths_found.rms / lengths_found.predicted),
+            "probability": finite(lengths_found.probability),
+        },
+    }
+    before, after = (group[stage].get("observed_rms_mm", group[stage].get("rms_mm")) for stage in record.arms())
+    return surprise(poses, lengths_found, each) + no_better(before, after)
 
 
 def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = None) -> dict[str, Any]:
@@ -67,6 +150,7 @@ def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = No
         "kept": [],
         "failed": [],
         "acceptance": acceptance_summary(tests),
+        "standards": list(record.standards),
         "u_test_mm": record.u_test,
     }
 
@@ -106,23 +190,34 @@ def _part(part: MetricValue) -> dict[str, Any]:
 def _grouped(part: Evaluation | None, whole: Evaluation, lengths: list[int]) -> dict[str, Any]:
     """Repeatability of a group's own sockets, and errors of the lengths that count for it."""
     found = {} if part is None else metrics(part)
+    if part is not None and part.observed is not None:
+        pairs = zip(part.observed.kinds, part.observed.residuals, strict=True)
+        # The only pose of a socket shows no scatter.
+        known = [np.asarray(values)[:3] for kind, values in pairs if kind != "socket" or values.shape[1] > 1]
+        squares = [np.zeros(0), *(np.sum(values**2, axis=0) for values in known)]
+        found["observed_rms_mm"] = float(np.sqrt(np.concatenate(squares).mean()))
     return found | (length_metrics(np.asarray(whole.error)[lengths]) if lengths else {})
 
 
 def _exceeded(summary: dict[str, Any], record: EvaluationRecord) -> tuple[list[str], list[str]]:
     """Sentences on limits kept and limits exceeded by the calibrated arm, on held-out data if there are any."""
     kept, failed = [], []
-    for key, limit in record.maxima.items():
-        groups = ("held_out", "identified_from")
-        groups = [group for group in groups if summary[group] and key in summary[group]["calibrated"]]
+    for name, limit in record.maxima.items():
+        # Of a capture with observations besides sockets, the RMS distance is that of all poses.
+        keys = {group: _key(name, summary[group]["calibrated"]) for group in _GROUPS if summary[group] is not None}
+        groups = [group for group, key in keys.items() if key in summary[group]["calibrated"]]
         if not groups:
             failed.append(
-                f"{_LIMITED[key]} has a limit of {limit:g} mm, but the data contain nothing to measure it on."
+                f"{_LIMITED[name]} has a limit of {limit:g} mm, but the data contain nothing to measure it on."
             )
             continue
-        value = summary[groups[0]]["calibrated"][key]
+        value = summary[groups[0]]["calibrated"][keys[groups[0]]]
         where = "held-out data" if groups[0] == "held_out" else "the data identified from"
         relation = "within" if value <= limit else "over"
-        verdict = f"{_LIMITED[key]} on {where} is {value:.4f} mm, {relation} the limit of {limit:g} mm."
+        verdict = f"{_LIMITED[name]} on {where} is {value:.4f} mm, {relation} the limit of {limit:g} mm."
         (kept if value <= limit else failed).append(verdict)
     return kept, failed
+
+
+def _key(name: str, found: dict[str, Any]) -> str:
+    return "observed_rms_mm" if name == "rms_mm" and "observed_rms_mm" in found else name

@@ -8,6 +8,7 @@ METRICS = (
     ("de_mm", "DE, mean distance of poses from their socket's centroid"),
     ("deltam_mm", "Deltam, largest half range of a coordinate in a socket"),
     ("rms_mm", "RMS distance of poses from their socket's centroid"),
+    ("observed_rms_mm", "RMS distance of poses from their geometry, all kinds"),
     ("length_error_mean_absolute_mm", "length error, mean absolute"),
     ("length_error_largest_mm", "length error, largest"),
 )

@@ -19,6 +19,7 @@ from ..model.metrics import pose_outliers
 from ..uncertainty.identifiability import Observability, observability
 from .contradictions import contradictions
 from .likely_cause import likely_cause
+from .validation import contradicted_prediction
 
 _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a reference length is wrong
 _LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 through errors outside the D-H model
@@ -62,6 +63,7 @@ def of_calibration(record: CalibrationRecord, seen: Observability | None = None)
     found = [] if record.converged else [record.reason]
     found += _implausible(record)
     if record.recording.capture.observations:
+        found += [] if record.validation is None else contradicted_prediction(record.validation)
         found += [*_observations(record), *of_capture(record.recording)]
         seen = observed(record) if seen is None else seen
         return found if record.implausible_residual else found + _identifiability(record, seen)
@@ -139,22 +141,8 @@ def _cause(record: CalibrationRecord) -> str:
 def _validation(record: CalibrationRecord) -> list[str]:
     """Results of cross-validation that contradict the uncertainty, and residuals that contradict the given noise."""
     found = []
-    validation = record.validation
-    if validation is not None and validation.surprising:
-        pairs = (
-            ("poses", validation.rms, validation.rms_predicted),
-            ("reference lengths", validation.length_rms, validation.length_u),
-        )
-        ratios = [
-            f"{name} {error:.3g} mm RMS, {error / predicted:.1f} times the predicted {predicted:.3g} mm"
-            for name, error, predicted in pairs
-            if predicted > 0 and math.isfinite(error)
-        ]
-        found.append(
-            f"Held out one after the other, placements have larger errors than predicted: {'; '.join(ratios)}. Errors "
-            "of neighbouring poses are alike, as of effects outside the D-H model (compliant joints, eccentric "
-            "encoders). Use the cross-validated values; every u of this calibration is too small."
-        )
+    if record.validation is not None:
+        found += contradicted_prediction(record.validation)
     if record.reduced_chi is not None and not 1 / _EXCESS < record.reduced_chi < _EXCESS:
         word = "small" if record.reduced_chi > 1 else "large"
         factor = max(record.reduced_chi, 1 / record.reduced_chi)

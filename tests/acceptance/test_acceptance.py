@@ -17,7 +17,7 @@ from aacmm_jax.acceptance import Limit, Measured, enclosing_sphere, fit_sphere, 
 from aacmm_jax.acceptance.all_tests import checked_limits
 from aacmm_jax.acceptance.decision import read_limits
 from aacmm_jax.acceptance.procedure import plan_procedure, simulate_procedure
-from aacmm_jax.acceptance.standards import EDITIONS
+from aacmm_jax.acceptance.standards import EDITIONS, STANDARDS
 from aacmm_jax.files.plans import procedure_csv, procedure_manifest
 from aacmm_jax.kinematics.workspace import Reach
 from tests.refusals import assert_refused
@@ -458,6 +458,7 @@ def test_readings_taken_by_the_plan_come_back_through_its_manifest(procedure, re
         (tmp_path / name).write_text("\n".join(rows))
     imported = aj.files.read_manifest(tmp_path / "acceptance.toml")
     assert sorted(imported.capture.names) == sorted(recorded.capture.names)
+    assert imported.acceptance == recorded.acceptance == (procedure.standard,)
     assert len(imported.capture.lengths) == len(recorded.capture.lengths)
     assert len(imported.sources) == 1 + len(files)
     # The plan prints angles to 0.001 deg: 0.02 mm at the end of the arm, several joints together.
@@ -520,6 +521,7 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
         (('unit = "um"', 'unit = "um"\ncolumns = [1, 1, 2]'), "1 is given twice"),
         (("reach = 1000", "reech = 1000"), "did you mean 'reach'"),
         (("shoulder = [0, 0, 0]", ""), "reach and shoulder together"),
+        (('name = "{end}"', 'name = "{end}"\ntarget = "ball"'), "target is for manifests of poses"),
     ],
 )
 def test_wrong_manifests_of_points(tmp_path, change, said):
@@ -536,7 +538,8 @@ def test_an_evaluation_is_stored_whole(recorded, tmp_path):
     record = acceptance.EvaluationRecord(recorded, recorded.nominal, used, ("x",), limits, 0.001, {"rms_mm": 0.2})
     aj.files.save_evaluation(tmp_path / "e.h5", record)
     again = aj.files.load_evaluation(tmp_path / "e.h5")
-    assert (again.used, again.warnings, again.limits, again.u_test, again.maxima) == record[2:]
+    assert (again.used, again.warnings, again.limits, again.u_test, again.maxima) == record[2:7]
+    assert (again.standards, again.uncertainty) == (("jjf", "asme", "iso"), None)
     # To rounding of the last bit of poses read back, the same tests come out.
     assert again.acceptance()["calibrated"] == record.acceptance()["calibrated"]
     # Sockets that the arm was identified from are no test of repeatability.
@@ -559,7 +562,9 @@ def calibrated(cheng):
 
 def test_only_held_out_data_are_tested_with_the_uncertainty_that_is_stated(calibrated):
     record, recording = calibrated
-    found = values_of(acceptance.evaluation_of(record, recording, u_test=0.01).acceptance()["calibrated"])
+    found = values_of(
+        acceptance.evaluation_of(record, recording, u_test=0.01, standards=STANDARDS).acceptance()["calibrated"]
+    )
     assert {value.where for value in found["Deltam"]} == {"C"}
     assert {value.where.partition(",")[0] for value in found["E_Uni"]} == {"A - C"}
     assert found["Deltam"][0].expanded == pytest.approx(0.02)
@@ -577,6 +582,24 @@ def test_sockets_that_share_poses_with_the_calibration_are_not_new(calibrated):
     assert evaluation.limits == {"Deltam": Limit(1.0)}
     assert evaluation.used == {"A", "B"}
     assert "B (12 of 14 poses)" in " ".join(evaluation.warnings)
+
+
+def test_procedures_are_run_where_they_are_asked_for(calibrated, procedure, recorded):
+    """By name, by a limit, or because the capture was made for them: as it says, or as its touched spheres say."""
+    record, recording = calibrated
+
+    def standards(recording, **options):
+        found = acceptance.evaluation_of(record, recording, **options).acceptance()
+        nominal, calibrated = ({test.standard for test in found[stage]} for stage in ("nominal", "calibrated"))
+        assert nominal == calibrated
+        return calibrated
+
+    assert standards(recording) == set()
+    assert standards(recording, standards=["iso"]) == {"ISO 10360-12"}
+    assert standards(recording, limits={"Volumetric": 1.0}) == {"ASME B89.4.22"}
+    assert standards(recording._replace(acceptance=("jjf",))) == {"JJF 1408"}
+    assert standards(recorded._replace(acceptance=())) == {STANDARDS[procedure.standard]}
+    assert_refused(lambda: standards(recording, standards=["din"]), "'din'", "jjf, asme, iso")
 
 
 def test_what_makes_an_evaluation_doubtful_is_said_first(calibrated):

@@ -5,7 +5,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.cross_validation import groups_of
-from aacmm_jax.calibration.results import CrossValidation, LeftOut
+from aacmm_jax.calibration.left_out import CrossValidation, LeftOut
 from aacmm_jax.calibration.sampling import numerical_tolerance
 from aacmm_jax.summaries import warnings as cautions
 
@@ -137,7 +137,7 @@ def test_cross_validation_shows_what_the_uncertainty_misses(arm, bounds, capture
     found = cautions.of_calibration(record._replace(validation=checked))
     assert found[0].startswith("Held out one after the other, placements have larger errors than predicted")
     assert f"{checked.rms / checked.rms_predicted:.1f} times the predicted {checked.rms_predicted:.3g} mm;" in found[0]
-    assert f"{checked.length_rms / checked.length_u:.1f} times the predicted {checked.length_u:.3g} mm." in found[0]
+    assert f"{checked.length_rms / checked.length_u:.1f} times the predicted {checked.length_u:.3g} mm" in found[0]
     assert "Use the cross-validated values" in found[0]
     assert any("The 3 reference lengths disagree" in sentence for sentence in found)
 

@@ -19,7 +19,8 @@ def folder(tmp_path_factory, paper_arm):
     nominal = aj.kinematics.ArmSpecification(paper_arm, "paper's")
     space = nominal.space()
     true = aj.perturbed_arm(space, length=1.0, angle=np.deg2rad(0.1), seed=1)
-    points = {"A": (400, 200, 300), "B": (500, 300, 100), "C": (300, -300, 300)}
+    points = {"A": (400, 200, 300), "B": (500, 300, 100), "C": (300, -300, 300), "D": (400, -300, 300)}
+    lengths = [("A", "B", 0.001), ("C", "D", 0.001)]
 
     def save(name, capture):
         aj.files.save_capture(folder / f"{name}.h5", aj.Recording(capture, nominal))
@@ -27,15 +28,22 @@ def folder(tmp_path_factory, paper_arm):
     tracker = kinds.SimulatedPoints("tracker", BOX, 60, (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0), u=0.01)
     sphere = kinds.SimulatedSphere("ball", (300, 0, 300), 50.0, 25, u=0.001)
     save("tracker", aj.simulate(true, {}, observations=[tracker, sphere], noise=NOISE))
-    monday = aj.simulate(true, points, poses=20, lengths=[("A", "B", 0.001)], noise=NOISE, seed=1)
+    monday = aj.simulate(true, points, poses=20, lengths=lengths, noise=NOISE, seed=1)
     save("monday", monday)
     remounted = true.replace(probe=np.asarray(true.probe) + np.array([0.3, -0.2, 0.1]))
-    tuesday = aj.simulate(remounted, points, poses=20, lengths=[("A", "B", 0.001)], noise=NOISE, seed=2)
+    tuesday = aj.simulate(remounted, points, poses=20, lengths=lengths, noise=NOISE, seed=2)
     save("tuesday", tuesday)
     q = np.array(monday.sockets["C"])
     q[4] += 0.01
     save("bad", aj.Capture({**monday.sockets, "C": q}, monday.lengths))
     save("free", aj.Capture(monday.sockets))
+    again = [kinds.SimulatedPoints("camera", BOX, 30, (0.3, 0.0, 0.1, -500.0, 900.0, 100.0), u=0.02), sphere]
+    unseen = {"E": (450, 100, 250), "F": (550, 100, 250)}
+    fresh = aj.simulate(true, unseen, poses=12, lengths=[("E", "F", 0.001)], observations=again, noise=NOISE, seed=7)
+    save("fresh", fresh)
+    moved = aj.simulate(remounted, unseen, poses=12, lengths=[("E", "F", 0.001)], noise=NOISE, seed=8)
+    save("moved", moved)
+    save("few", aj.Capture({}, [], [fresh.observations[1].select(range(2))]))
     return folder
 
 
@@ -86,7 +94,7 @@ def test_sessions_have_a_probe_each(aacmm, folder):
     apart = aacmm("calibrate", folder / "monday.h5", folder / "tuesday.h5", "-o", "c.h5").stdout
     found = json.loads(aacmm("show", "c.h5", "--json").stdout)
     names = [row["observation"] for row in found["observations"]]
-    assert names == [f"{day}/{socket}" for day in ("monday", "tuesday") for socket in "ABC"]
+    assert names == [f"{day}/{socket}" for day in ("monday", "tuesday") for socket in "ABCD"]
     assert max(row["rms_after_mm"] for row in found["observations"]) < 0.1
     assert "offset of probe of tuesday" in apart
     aacmm("calibrate", folder / "monday.h5", folder / "tuesday.h5", "-o", "d.h5", "--same-probe", "--method", "joint")
@@ -112,12 +120,13 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
         ("calibrate free.h5 -o x.h5 --scale nominal --method joint", ["stage 1 alone; leave out --method"]),
         ("calibrate tracker.h5 -o x.h5 --figure x.png", ["a figure of residuals takes sockets"]),
         ("calibrate tracker.h5 -o x.h5 --monte-carlo", ["--monte-carlo takes sockets"]),
-        ("calibrate tracker.h5 -o x.h5 --cross-validate", ["cross-validation takes sockets"]),
+        ("calibrate free.h5 -o x.h5 --scale nominal --cross-validate", ["needs a calibrated scale"]),
         ("calibrate monday.h5 -o x.h5 --same-probe", ["--same-probe is for several captures"]),
         ("calibrate monday.h5 monday.h5 -o x.h5", ["two captures have the name 'monday'"]),
-        ("calibrate monday.h5 -o x.h5 --only-poses 60", ["60 of 60 poses cannot be drawn", "1 to 59"]),
+        ("calibrate monday.h5 -o x.h5 --only-poses 80", ["80 of 80 poses cannot be drawn", "1 to 79"]),
         ("calibrate tracker.h5 -o x.h5 --without 'no*'", ["no socket matches"]),
-        ("evaluate c.h5 tracker.h5", ["an evaluation takes sockets"]),
+        ("evaluate c.h5 few.h5", ["sphere 'ball' has 2 touches"]),
+        ("evaluate c.h5 monday.h5 --acceptance din", ["'din'", "jjf, asme, iso"]),
         ("report c.h5 -o x.html", ["a report takes sockets"]),
         ("export c.h5 --format dcc", ["a certificate takes sockets"]),
         ("report n.h5 -o x.html", ["a report states the scale k"]),
@@ -140,6 +149,64 @@ def calibrated(folder, paper_arm):
         result = solve(paper_arm, recording.capture, recording.nominal.bounds())
         aj.files.save_calibration(folder / f"{name}.h5", aj.calibration.record_of(result, recording))
     return folder
+
+
+def test_an_evaluation_stands_beside_its_prediction(aacmm, folder, calibrated, tmp_path):
+    """All kinds on a capture of the same arm: as predicted; with the probe remounted: beyond chance, and said."""
+    shown = " ".join(aacmm("evaluate", calibrated / "c.h5", folder / "fresh.h5", "-o", "e.h5").stdout.split())
+    for part in ("camera points 30", "ball sphere 25", "socket 24", "error / U", "predicted", "E 12"):
+        assert part in shown
+    assert "Warning" not in shown
+    assert "standard" not in shown.replace("standard deviation", "")  # no procedure was asked for
+    found = json.loads(aacmm("show", "e.h5", "--json").stdout, parse_constant=lambda text: pytest.fail(text))
+    part = found["held_out"]
+    assert found["identified_from"] is None
+    assert {row["kind"]: row["poses"] for row in part["kinds"]} == {"socket": 24, "points": 30, "sphere": 25}
+    for row in (*part["kinds"], *part["groups"], *part["observations"], *part["sockets"]):
+        assert 0.5 < row["rms_mm"] / row["rms_predicted_mm"] < 1.7
+        assert 0.5 < row["reduced_chi"] < 2.0
+    assert [row["members"] for row in part["groups"]] == [["E", "F"], ["camera"], ["ball"]]
+    assert part["calibrated"]["observed_rms_mm"] < 0.1 < part["nominal"]["observed_rms_mm"]
+    (length,) = part["lengths"]
+    assert length["error_over_expanded"] == pytest.approx(length["error_mm"] / length["expanded_mm"])
+    assert abs(length["error_over_expanded"]) < 1.5
+    aacmm("evaluate", calibrated / "c.h5", folder / "fresh.h5", "--max-rms-mm", 0.001, expect=1)
+    # What the file holds gives the same again.
+    record = aj.files.load_evaluation(tmp_path / "e.h5")
+    aj.files.save_evaluation(tmp_path / "again.h5", record)
+    assert json.loads(aacmm("show", "again.h5", "--json").stdout) == found
+    moved = json.loads(aacmm("evaluate", calibrated / "c.h5", folder / "moved.h5", "--json").stdout)
+    (warning,) = moved["warnings"]
+    assert "disagree with it by more than chance" in warning
+    assert "E (" in warning
+    assert moved["held_out"]["predicted"]["poses"]["probability"] < 1e-6
+
+
+def test_poses_that_a_calibration_did_not_use_are_held_out(aacmm, folder):
+    aacmm("calibrate", folder / "tracker.h5", "-o", "c.h5", "--only-poses", 60, "--seed", 1)
+    found = json.loads(aacmm("evaluate", "c.h5", folder / "tracker.h5", "--json").stdout)
+    unseen, seen = (found[group]["observations"] for group in ("held_out", "identified_from"))
+    assert sum(row["poses"] for row in unseen) == 25
+    assert {row["observation"] for row in unseen} == {f"{row['observation']}, unseen" for row in seen}
+    assert found["warnings"] == []
+
+
+def test_cross_validation_is_printed_group_by_group(aacmm, folder):
+    """The socket with a bad pose comes first, with and without a robust loss."""
+    for loss in ((), ("--robust", "huber")):
+        aacmm("calibrate", folder / "bad.h5", "-o", "c.h5", "--cross-validate", *loss)
+        found = json.loads(aacmm("show", "c.h5", "--json").stdout)
+        first, second = found["cross_validation"]["left_out"]
+        assert (first["members"], second["members"]) == (["C", "D"], ["A", "B"])
+        assert first["disagrees"]
+        assert first["rms_mm"] > 5 * first["rms_predicted_mm"]
+        assert any("Held out one after the other" in text and "C, D (" in text for text in found["warnings"])
+    shown = " ".join(aacmm("calibrate", folder / "tracker.h5", "-o", "c.h5", "--cross-validate").stdout.split())
+    assert "held out poses RMS predicted" in shown
+    found = json.loads(aacmm("show", "c.h5", "--json").stdout)["cross_validation"]
+    assert {row["group"]: row["poses"] for row in found["left_out"]} == {"tracker": 60, "ball": 25}
+    assert all(0.5 < row["rms_mm"] / row["rms_predicted_mm"] < 1.7 for row in found["left_out"])
+    assert not found["surprising"]
 
 
 def test_the_robot_of_the_examples(aacmm, mukca):

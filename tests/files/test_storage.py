@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.results import CrossValidation, LeftOut
+from aacmm_jax.calibration.left_out import CrossValidation, LeftOut
 from aacmm_jax.core.text import printable
 from aacmm_jax.files.arms import specification_toml
 from aacmm_jax.files.hdf5 import write_tables
@@ -439,9 +439,11 @@ def test_names_with_a_comma(tmp_path, good, held, earlier):
             table = file["cross_validation"]
             table["group"][...] = ",".join(names)
             del table["socket_number"], table["left_out_socket"]
+            del table["rms_freedom"], table["length_freedom"], table["noise_freedom"]
     read = aj.files.load_calibration(path)
     assert read.recording.capture.names == names
     assert [found.sockets for found in read.validation.groups] == [names, names]
+    assert [found.freedoms for found in read.validation.groups] == [group.freedoms] * 2
     assert (read.held, read.recording.nominal.held) == (held, held)
 
 

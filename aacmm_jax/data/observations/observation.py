@@ -126,6 +126,12 @@ class AbstractObservation(eqx.Module):
             object.__setattr__(changed, field, value)
         return changed
 
+    def renamed(self, name: str) -> "AbstractObservation":
+        """The same observation with another name."""
+        changed = copy.copy(self)
+        object.__setattr__(changed, "name", name)
+        return changed
+
     def select(self, poses: Sequence[int] | np.ndarray) -> "AbstractObservation":
         """The same observation with some of its poses, in their order."""
         changed = copy.copy(self)

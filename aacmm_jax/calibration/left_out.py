@@ -1,0 +1,153 @@
+"""What a cross-validation returns: errors on groups of poses that an arm was not identified from, and their chance."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.distributions import chance
+from ..core.text import common_label
+
+LEVEL = 0.01  # probability below which errors beyond their prediction are not put down to chance
+
+
+class LeftOut(NamedTuple):
+    """One group of sockets and observations that an arm was not identified from; mm. Predictions are infinite where the
+    other groups leave a direction open that matters."""
+
+    sockets: tuple[str, ...]  # names, also of observations
+    poses: int  # in sockets with more than one
+    rms: float  # distance from the socket's centroid or the fitted geometry, found
+    rms_predicted: float  # root of the mean square that the uncertainty predicts
+    length_error: Float[np.ndarray, " l"]
+    length_u: Float[np.ndarray, " l"]  # standard uncertainty of that error, predicted
+    converged: bool
+    # Effective degrees of freedom of both predictions (`prediction`), and of the noise that they rest on. Where they
+    # are not known, those of independent errors.
+    rms_freedom: float = math.nan
+    length_freedom: float = math.nan
+    noise_freedom: float = math.inf
+
+    @property
+    def label(self) -> str:
+        """The group in a few words."""
+        return common_label(self.sockets)
+
+    @property
+    def freedoms(self) -> tuple[float, float]:
+        """Degrees of freedom of the poses and of the lengths."""
+        poses, lengths = self.rms_freedom, self.length_freedom
+        return (
+            poses if math.isfinite(poses) else 3.0 * self.poses,
+            lengths if math.isfinite(lengths) else float(_predicted(self).sum()),
+        )
+
+    @property
+    def length_ratio(self) -> float:
+        """Root mean square error of the lengths in their own standard uncertainties; NaN where there is none."""
+        known = _predicted(self)
+        normalised = self.length_error[known] / self.length_u[known]
+        return float(np.sqrt(np.mean(normalised**2))) if known.any() else math.nan
+
+    @property
+    def probabilities(self) -> tuple[float, float]:
+        """Of such errors of poses, and of lengths, by chance where the predictions are right; NaN where unknown."""
+        poses, lengths = self.freedoms
+        return (
+            chance(self.rms, self.rms_predicted, poses, self.noise_freedom),
+            chance(self.length_ratio, 1.0, lengths, self.noise_freedom),
+        )
+
+
+class CrossValidation(NamedTuple):
+    """Every group of sockets left out once. The metrics pool the groups that the others can predict."""
+
+    groups: tuple[LeftOut, ...]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square distance from the socket's centroid over the poses of all groups, mm."""
+        return self._pooled([group.rms for group in self.groups])
+
+    @property
+    def rms_predicted(self) -> float:
+        """What the uncertainties of the calibrations without them predicted, mm."""
+        return self._pooled([group.rms_predicted for group in self.groups])
+
+    def _pooled(self, values: list[float]) -> float:
+        counted = [
+            (group.poses, value)
+            for group, value in zip(self.groups, values, strict=True)
+            if group.poses and np.isfinite(group.rms_predicted)
+        ]
+        total = sum(poses for poses, _ in counted)
+        return float(np.sqrt(sum(poses * value**2 for poses, value in counted) / total)) if total else float("nan")
+
+    def _lengths(self) -> tuple[np.ndarray, np.ndarray]:
+        errors, u = (
+            np.concatenate([getattr(group, what) for group in self.groups]) for what in ("length_error", "length_u")
+        )
+        return errors[np.isfinite(u)], u[np.isfinite(u)]
+
+    @property
+    def length_rms(self) -> float:
+        """Root mean square error of the reference lengths, mm."""
+        errors, _ = self._lengths()
+        return float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan")
+
+    @property
+    def length_u(self) -> float:
+        """Root mean square of the predicted standard uncertainties of these errors, mm."""
+        _, u = self._lengths()
+        return float(np.sqrt(np.mean(u**2))) if len(u) else float("nan")
+
+    @property
+    def open(self) -> int:
+        """How many groups the others cannot predict, because without them something is not determined."""
+        return sum(not np.all(np.isfinite(group.length_u)) or group.rms_predicted == np.inf for group in self.groups)
+
+    def ratios(self) -> list[float]:
+        """Found over predicted, of poses and of lengths, where they are known."""
+        pairs = [(self.rms, self.rms_predicted), (self.length_rms, self.length_u)]
+        return [found / predicted for found, predicted in pairs if predicted > 0 and np.isfinite(found)]
+
+    @property
+    def excess(self) -> float:
+        """Errors over their prediction, the larger of both ratios: about 1 where the uncertainty is right."""
+        return max(self.ratios(), default=float("nan"))
+
+    @property
+    def disagreeing(self) -> tuple[LeftOut, ...]:
+        """Groups whose errors exceed their prediction by more than chance does in one case of a hundred, over all
+        groups together; the most improbable first."""
+        known = [[p for p in group.probabilities if math.isfinite(p)] for group in self.groups]
+        least = {i: min(each) for i, each in enumerate(known) if each}
+        count = sum(map(len, known))
+        return tuple(self.groups[i] for i in sorted(least, key=least.__getitem__) if least[i] < LEVEL / count)
+
+    @property
+    def surprising(self) -> bool:
+        """Whether the errors of a group, or of all groups together, exceed their prediction by more than chance."""
+        return bool(self.disagreeing) or any(found < LEVEL / 2 for found in self._pooled_probabilities())
+
+    def _pooled_probabilities(self) -> list[float]:
+        """Of the errors of all poses, and of all lengths. A sum of squares of independent parts with means T and
+        degrees of freedom f has (sum T)^2 / sum (T^2 / f) of them (Satterthwaite)."""
+        poses = [(group.poses, group.rms, group.rms_predicted, group.freedoms[0]) for group in self.groups]
+        lengths = [(int(_predicted(group).sum()), group.length_ratio, 1.0, group.freedoms[1]) for group in self.groups]
+        found = []
+        for parts in (poses, lengths):
+            known = [part for part in parts if part[0] and part[3] > 0 and 0 < part[2] < math.inf]
+            if known:
+                count, rms, predicted, freedom = np.array(known).T
+                means = count * predicted**2
+                ratio = math.sqrt(np.sum(count * rms**2) / means.sum())
+                pooled = float(means.sum() ** 2 / np.sum(means**2 / freedom))
+                found.append(chance(ratio, 1.0, pooled, min(group.noise_freedom for group in self.groups)))
+        return [probability for probability in found if math.isfinite(probability)]
+
+
+def _predicted(group: LeftOut) -> np.ndarray:
+    """Which errors of lengths the other groups can predict."""
+    return np.isfinite(group.length_u) & (group.length_u > 0)

@@ -1,0 +1,73 @@
+"""What is said of errors on data that a calibration has not seen."""
+
+import math
+
+import numpy as np
+import pytest
+
+from aacmm_jax.calibration.left_out import CrossValidation, LeftOut
+from aacmm_jax.calibration.prediction import NOTHING, Agreement
+from aacmm_jax.summaries.validation import (
+    contradicted_prediction,
+    cross_validation_summary,
+    no_better,
+    surprise,
+)
+
+
+def group(place, rms=0.1, error=0.01, poses=30):
+    return LeftOut((f"{place}/0", f"{place}/1"), poses, rms, 0.1, np.array([error]), np.array([0.01]), True)
+
+
+def said(*groups):
+    return " ".join(contradicted_prediction(CrossValidation(groups)))
+
+
+def test_the_placement_that_disagrees_is_named():
+    """As in panda_2: one of nine placements is almost four times its prediction, pooled 1.5 times."""
+    others = [group(f"place_{i}") for i in range(8)]
+    assert said(*others, group("last")) == ""
+    text = said(*others, group("high", 0.38))
+    assert "some groups disagree with the others by more than predicted: high (0.38 mm RMS, 3.8 times" in text
+    assert "the other 8 agree" in text
+    assert "place_1 (lengths off by 0.05 mm, 5.0 times their u)" in said(group("a"), group("b"), group("place_1", error=0.05))
+    # Where most of them do, the model is at fault and not a placement.
+    assert "placements have larger errors than predicted" in said(*(group(f"place_{i}", 0.2) for i in range(3)))
+
+
+def test_few_degrees_of_freedom_allow_more():
+    """Poses that share the errors of parameters, and a noise that is an estimate from few residuals."""
+    ratio = [group("a", 0.16), group("b"), group("c")]
+    assert said(*ratio) != ""
+    assert said(*(one._replace(rms_freedom=4.0) for one in ratio)) == ""
+    assert said(*(one._replace(noise_freedom=5.0) for one in ratio)) == ""
+
+
+def test_the_worst_comes_first():
+    rows = cross_validation_summary(CrossValidation((group("a"), group("b", 0.3), group("c", 0.2, poses=60))))
+    assert [row["group"] for row in rows["left_out"]] == ["b", "c", "a"]
+    assert [row["disagrees"] for row in rows["left_out"]] == [True, True, False]
+    assert rows["surprising"]
+    unknown = LeftOut(("x", "y"), 30, 0.1, math.inf, np.zeros(0), np.zeros(0), True)
+    (row,) = cross_validation_summary(CrossValidation((unknown,)))["left_out"]
+    assert (row["group"], row["rms_predicted_mm"], row["length_u_mm"], row["probability"]) == ("x, y", None, None, None)
+
+
+def agreement(rms, poses=30, freedom=60.0):
+    return Agreement(poses, rms, 0.1, freedom, 200.0)
+
+
+def test_unseen_data_that_scatter_more_than_predicted():
+    parts = {"A": agreement(0.11), "B": agreement(0.35), "C": agreement(0.25)}
+    (text,) = surprise(agreement(0.25, 90, 180.0), NOTHING, parts)
+    assert "0.25 mm RMS from their geometry, 2.5 times the predicted 0.1 mm, most of all in B (0.35 mm, 3.5 times)" in text
+    assert "A (" not in text
+    assert "reference lengths" not in text
+    assert surprise(agreement(0.11), agreement(0.11), parts) == []
+    assert "reference lengths err by 3.0 times their" in surprise(agreement(0.1), agreement(0.3, 5, 5.0), parts)[0]
+    assert surprise(NOTHING, NOTHING, {}) == []
+
+
+@pytest.mark.parametrize(("nominal", "calibrated", "told"), [(0.5, 0.6, True), (0.6, 0.5, False), (None, None, False)])
+def test_a_calibration_that_does_not_help(nominal, calibrated, told):
+    assert bool(no_better(nominal, calibrated)) == told
