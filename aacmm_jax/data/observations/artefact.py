@@ -59,7 +59,7 @@ class Artefact(AbstractObservation):
         READINGS,
         Entry("point", "point of the artefact that held the tip", dimensions=("pose",), content="text", required=True),
         Entry("names", "point of the artefact", dimensions=("names",), content="text", required=True),
-        Entry("coordinates", "certified coordinates", "mm", ("names", "axis"), required=True),
+        Entry("coordinates", "certified coordinates", "mm", ("names", "axis"), required=True, uncertainty="u"),
         Entry("u", "standard uncertainty of a coordinate", "mm"),
         Entry("artefact", "name of the artefact", content="text"),
         Entry("placement", "name of its placement", content="text"),
