@@ -251,12 +251,13 @@ def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
 
 def test_poses_alone_in_their_socket_show_no_scatter(written):
     from aacmm_jax.report.arm_view import view_of_arm
-    from aacmm_jax.report.residuals import residual_chart, socket_table
+    from aacmm_jax.report.residuals import pose_distances, residual_chart, socket_table
 
     arm, q = written.record.calibrated.arm, written.record.recording.capture.q
     capture = aj.Capture({"A": q[:10], "B": q[10:11]})
     evaluation = aj.evaluate(arm, capture)
-    distances = [pose["distance"] for pose in view_of_arm(arm, capture, evaluation).data["poses"]]
+    view = view_of_arm(arm, capture, pose_distances(capture, evaluation))
+    distances = [pose["distance"] for pose in view.data["poses"]]
     assert distances[10] is None
     assert None not in distances[:10]
     assert [cell.text for cell in socket_table(capture, evaluation).rows[1]][2:5] == ["–"] * 3

@@ -19,6 +19,7 @@ from .observation import (
     AbstractObservation,
     AbstractSimulated,
     Entry,
+    Quantity,
     Rows,
     Tips,
     Unknowns,
@@ -153,6 +154,12 @@ class Artefact(AbstractObservation):
         if self.free:
             found[self.shape] = ("mm",) * self.coordinates.size
         return found
+
+    def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
+        if part != self.shape:
+            return super().quantities(part, values)
+        rows = zip(self.names, values.reshape(-1, 3), strict=True)
+        return tuple(Quantity(f"coordinates of {name}", row, "mm") for name, row in rows)
 
     @property
     def fixes_scale(self) -> bool:

@@ -240,7 +240,7 @@ class ParallelPlanes(AbstractObservation):
 
 
 def _normal_and_distance(values: Float[np.ndarray, " 3"]) -> tuple[Quantity, ...]:
-    normal = rotation_matrix(np.append(values[:2], 0.0))[:, 2]
+    normal = np.asarray(rotation_matrix(np.append(values[:2], 0.0)))[:, 2]
     return (Quantity("normal", normal, "1"), Quantity("distance from the origin", values[2:], "mm"))
 
 
