@@ -191,8 +191,8 @@ def geometry_section(summary: dict[str, Any]) -> Section:
             rows.append([*map(text_cell, cells), text_cell("") if difference is None else number_cell(difference)])
     introduction = (
         "The geometry that was unknown, as found with the parameters: positions and frames in the base frame, "
-        "rotations as vectors along their axis; offsets and orientations of targets in the last frame; placements on an indexed "
-        "platform in the platform's frame. A radius or distance is that of the tip's centre."
+        "rotations as vectors along their axis; offsets and orientations of targets in the last frame; placements on "
+        "an indexed platform in the platform's frame. A radius or distance is that of the tip's centre."
     )
     columns = ("part", "quantity", "found", "largest difference from the certified values [mm]")
     if all(part["certified"] is None for part in summary["geometry"]):

@@ -118,7 +118,7 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
         ("calibrate monday.h5 -o x.h5 --only-poses 60", ["60 of 60 poses cannot be drawn", "1 to 59"]),
         ("calibrate tracker.h5 -o x.h5 --without 'no*'", ["no socket matches"]),
         ("evaluate c.h5 tracker.h5", ["an evaluation takes sockets"]),
-        ("export c.h5 --format dcc", ["a certificate takes sockets"]),
+        ("export n.h5 --format dcc", ["a certificate states a scale that is traceable"]),
     ],
 )
 def test_what_cannot_take_observations_says_so(aacmm, folder, calibrated, command, parts):
