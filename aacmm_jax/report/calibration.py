@@ -35,7 +35,7 @@ from .observations import (
     residuals_section,
     stages_chart,
 )
-from .residuals import length_rows, metrics_table, pose_distances, residual_chart, socket_table
+from .residuals import length_rows, metrics_table, pose_distances, residual_chart, socket_table, validation_tables
 from .uncertainty import (
     bounds_section,
     correlations_section,
@@ -192,14 +192,19 @@ def _nominal_and_calibrated(
     if record.robust:
         blocks[0] += " Root mean squares count every pose in full, those too that lost weight."
     if summary["cross_validation"] is not None:
-        blocks.append(_validation_table(summary["cross_validation"]))
+        assert record.validation is not None
+        blocks += validation_tables(summary["cross_validation"], record.validation)
     capture, fixed = record.recording.capture, record.fixed_by_one_length
     if record.observed is not None or record.method == REPEATABILITY:
         del stages["stage1"]  # which is the calibrated arm
     if record.observed is not None:
         blocks += [*agreement_tables(summary), *other_poses_table(summary)]
     if summary["nominal"]:
-        blocks.append(metrics_table("Metrics by arm [mm]", summary, stages, fixed_scale=fixed))
+        caption = "Metrics by arm [mm]"
+        if capture.observations:
+            counts = pluralise(len(capture.names), "socket"), pluralise(len(capture.lengths), "reference length")
+            caption = f"{counts[0]} of the arm's own probe, {counts[1]} [mm]"
+        blocks.append(metrics_table(caption, summary, stages, fixed_scale=fixed))
     if record.observed is not None:
         blocks.append(stages_chart(record, distances_of(capture, evaluations["nominal"])))
     else:
@@ -216,18 +221,6 @@ def _nominal_and_calibrated(
         ]
         blocks.append(ReportTable("Against the true arm of the simulation", ("", *stages.values()), rows))
     return Section("stages", "Nominal and calibrated arm", blocks)
-
-
-def _validation_table(found: dict[str, Any]) -> ReportTable:
-    rows = [
-        [text_cell(title), number_cell(found[value]), number_cell(found[predicted])]
-        for title, value, predicted in (
-            ("RMS distance of poses from their socket's centroid", "rms_mm", "rms_predicted_mm"),
-            ("RMS error of reference lengths", "length_error_rms_mm", "length_u_mm"),
-        )
-    ]
-    caption = f"Cross-validated: each of {found['groups']} placements held out once [mm]"
-    return ReportTable(caption, ("", "found", "predicted by u"), rows)
 
 
 def _scale(
