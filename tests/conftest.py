@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 from . import run_time_types
@@ -112,6 +113,32 @@ def noisy_capture(paper_arm) -> "aj.Capture":
         seating=0.005,
         seed=5,
     )
+
+
+@pytest.fixture(scope="session")
+def observed_record(paper_arm) -> "aj.calibration.CalibrationRecord":
+    """A calibration from two sockets and other observations of several kinds, with a robust loss and one bad pose."""
+    from aacmm_jax.data import observations as kinds
+
+    station, box = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0), [[200, -300, 100], [600, 300, 500]]
+    bar = {"near": (0, 0, 0), "far": (300, 0, 0)}
+    simulated = [
+        kinds.SimulatedTransforms("tracker", box, 25, (10, 20, 80, 0.3, 0.2, -0.7), station, u=0.01, u_angle=2e-4),
+        kinds.SimulatedSphere("ball", (300, 0, 300), 50.0, 12, u=0.001),
+        kinds.SimulatedPlanes("block", (300, -200, 150), [[80, 0, 0], [0, 80, 0]], 8, distance=100.0, u=0.001),
+        kinds.SimulatedArtefact("bar", bar, 8, (0, 0, 0.7, 300, -200, 300), u=0.0005),
+    ]
+    nominal = aj.kinematics.ArmSpecification(paper_arm, "paper's")
+    true = aj.perturbed_arm(nominal.space(), length=1.0, angle=1e-3, seed=1)
+    sockets = {"A": (400, 200, 300), "B": (500, 300, 100)}
+    capture = aj.simulate(
+        true, sockets, poses={"A": 15, "B": 8}, observations=simulated, encoder_arcsec=2.0, seating=0.005, seed=3
+    )
+    q = np.array(capture.sockets["A"])
+    q[4] += 0.01
+    capture = aj.Capture(capture.sockets | {"A": q}, [], capture.observations)
+    result = aj.calibrate(paper_arm, capture, nominal.bounds(), robust="tukey")
+    return aj.calibration.record_of(result, aj.Recording(capture, nominal), robust="tukey")
 
 
 @pytest.fixture(autouse=True)

@@ -7,10 +7,9 @@ import jax
 import numpy as np
 
 from ..core.arguments import checked_arguments
-from ..core.errors import InputError
 from ..core.numpy_or_jax import to_jax
 from ..core.text import shorten
-from ..data.capture import Capture, check_sockets_only
+from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..kinematics.arm import Arm
@@ -122,16 +121,6 @@ class CalibrationRecord(NamedTuple):
         """The three arms on the capture that was identified from."""
         arms = {"nominal": self.recording.nominal.arm, "stage1": self.stage1.arm, "calibrated": self.calibrated.arm}
         return {stage: evaluate(arm, self.recording.capture) for stage, arm in arms.items()}
-
-
-def check_document(record: CalibrationRecord, what: str) -> None:
-    """Raise `InputError` for a calibration that ``what``, a document on sockets, lengths and k, cannot be made of."""
-    check_sockets_only(record.recording.capture, what)
-    if np.isnan(record.k) or record.method == REPEATABILITY:
-        raise InputError(
-            f"{what} states the scale k that reference lengths gave, but this calibration used none (--robust, or "
-            "--scale nominal); see aacmm show."
-        )
 
 
 @checked_arguments

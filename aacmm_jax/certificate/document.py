@@ -5,11 +5,13 @@ import uuid
 from collections.abc import Sequence
 from xml.etree.ElementTree import Element
 
-from ..calibration.record import CalibrationRecord, check_document
+from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..core.errors import InputError
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity, held_by_xml
+from ..summaries.observations import scale_sources
 from ..summaries.warnings import of_calibration
 from .measurement_results import add_results, uncertainty_statement
+from .observation_results import texts_of
 from .xml_elements import (
     DCC,
     SI,
@@ -49,15 +51,19 @@ def dcc_xml(
         The text of an XML file in UTF-8.
 
     Raises:
-        InputError: If the calibration did not converge, its scale is impossible, a name has characters that XML
-            does not allow, or the dates are out of order.
+        InputError: If the calibration did not converge, its scale is impossible or the nominal arm's, a name has
+            characters that XML does not allow, or the dates are out of order.
     """
     if not record.converged:
         reason = record.reason.partition(";")[0].rstrip(".")
         raise InputError(
             f"a calibration that failed has no certificate ({reason}); calibrate again until it converges."
         )
-    check_document(record, "a certificate")
+    if record.method == REPEATABILITY:
+        raise InputError(
+            "a certificate states a scale that is traceable, but this calibration took that of the nominal arm "
+            "(--scale nominal); calibrate with a reference length, or with another observation that fixes the scale."
+        )
     if not record.plausible_scale:
         raise InputError(
             f"k = {record.k:.6g} cannot be the scale of an arm, so there is no certificate; correct the lengths and "
@@ -80,6 +86,10 @@ def dcc_xml(
 def _check_texts(record: CalibrationRecord, sources: Sequence[str], command: str) -> None:
     for name in record.recording.capture.names:
         held_by_xml(name, f"the name of socket {name!r}")
+    for observation in record.recording.capture.observations:
+        for text in texts_of(observation):
+            held_by_xml(text, f"{text!r} of observation {observation.name!r}")
+        held_by_xml(observation.target, f"the name of target {observation.target!r}")
     held_by_xml(record.recording.nominal.name, f"the name of arm {record.recording.nominal.name!r}")
     for source in sources:
         held_by_xml(source, f"the name of file {source!r}")
@@ -163,12 +173,7 @@ def _add_statements(
 ) -> None:
     if record.recording.true is not None:
         _add_statement(parent, "Simulation", "The readings are simulated, so this is no certificate of a real arm.")
-    _add_statement(
-        parent,
-        "Scale",
-        "The scale of the arm comes from the reference lengths alone: its measurements are traceable as far as these "
-        "lengths are, and have no other connection to the metre.",
-    )
+    _add_statement(parent, "Scale", _scale(record))
     _add_statement(parent, "Uncertainty", uncertainty_statement(record), norm="JCGM 100:2008")
     if record.sampled_says:
         _add_statement(parent, "Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
@@ -184,6 +189,19 @@ def _add_statements(
         statement = add(parent, "statement")
         add_english(statement, "name", "Remarks")
         add_text(statement, "declaration", given.certificate.remarks)
+
+
+def _scale(record: CalibrationRecord) -> str:
+    if not record.recording.capture.observations:
+        return (
+            "The scale of the arm comes from the reference lengths alone: its measurements are traceable as far as "
+            "these lengths are, and have no other connection to the metre."
+        )
+    return (
+        f"The scale of the arm comes from {', '.join(scale_sources(record))}: its measurements are traceable as far as "
+        "the certified values of these artefacts, and the instruments that measured, are, and have no other connection "
+        "to the metre."
+    )
 
 
 def _add_statement(parent: Element, name: str, text: str, *, norm: str | None = None) -> Element:

@@ -8,11 +8,14 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
+from ..calibration.observation_residuals import ObservationResiduals, distances_of, observation_residuals
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..data.capture import ReferenceLength
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
 from ..kinematics.arm import Arm, is_length, parameter_names
 from ..kinematics.parameters import Parameters
+from ..summaries.observations import less_weight
+from .observation_results import add_observation_equipment, add_observations
 from .xml_elements import (
     CELSIUS,
     LEVEL,
@@ -47,68 +50,98 @@ def add_results(
     parent: Element, record: CalibrationRecord, administrative_data: AdministrativeData, command: str
 ) -> None:
     """Add both measurement results of a calibration."""
-    evaluations = record.evaluations()
+    evaluations, residuals = record.evaluations(), observation_residuals(record)
     found = "The readings, evaluated with the nominal parameters, those before the calibration."
     left = "The same readings, evaluated with the calibrated parameters, which were identified from them."
     for stage in (
         _Stage("As found", "beforeAdjustment", found, record.recording.nominal.arm, evaluations["nominal"]),
         _Stage("As left", "afterAdjustment", left, record.calibrated.arm, evaluations["calibrated"]),
     ):
-        _add_measurement(add(parent, "measurementResult"), record, administrative_data, stage, command)
+        measurement = add(parent, "measurementResult")
+        _add_measurement(measurement, record, administrative_data, stage, command, residuals)
 
 
 def uncertainty_statement(record: CalibrationRecord) -> str:
     """How the uncertainties were evaluated, and what they do not include."""
     noise = "as it was given" if record.noise_model == "given" else "as estimated from the residuals"
     count = "infinitely many" if math.isinf(record.degrees_of_freedom) else f"{record.degrees_of_freedom:.4g}"
+    sources = "uncertainty of the reference lengths"
+    if record.recording.capture.observations:
+        sources = "uncertainties of what was measured and certified"
     return (
         f"Expanded uncertainties are standard uncertainties times {uncertainty_of(record).factor(LEVEL):.4g}, the "
         f"coverage factor of Student's t for {count} degrees of freedom and a coverage probability of {LEVEL:.0%}. "
         f"They follow, by the law of propagation of uncertainty, from the noise of the readings, {noise}, and from the "
-        "uncertainty of the reference lengths. They apply to each parameter alone; the parameters are correlated. "
+        f"{sources}. They apply to each parameter alone; the parameters are correlated. "
         "Errors that the Denavit-Hartenberg model does not describe are not included."
     )
 
 
 def _add_measurement(
-    measurement: Element, record: CalibrationRecord, given: AdministrativeData, stage: _Stage, command: str
+    measurement: Element,
+    record: CalibrationRecord,
+    given: AdministrativeData,
+    stage: _Stage,
+    command: str,
+    residuals: tuple[ObservationResiduals, ...],
 ) -> None:
     add_english(measurement, "name", stage.name)
     add_english(measurement, "description", stage.description)
-    lengths = record.recording.capture.lengths
-    _add_methods(add(measurement, "usedMethods"), record)
+    capture = record.recording.capture
+    lengths = capture.lengths
+    _add_methods(add(measurement, "usedMethods"), record, residuals)
     add_software(measurement, "usedSoftware", command)
-    _add_equipment(add(measurement, "measuringEquipments"), lengths, given.reference)
+    equipments = add(measurement, "measuringEquipments")
+    _add_references(equipments, given.reference)
+    if lengths:
+        _add_length_equipment(equipments, lengths, any_artefact_stated=bool(given.reference))
+    add_observation_equipment(equipments, residuals, any_artefact_stated=bool(given.reference))
     _add_conditions(add(measurement, "influenceConditions"), given, stage)
     results = add(measurement, "results")
     factor = uncertainty_of(record).factor(LEVEL)
     _add_repeatability(results, stage)
     left = stage.name == "As left"
-    _add_lengths(results, lengths, stage, factor, fixed_scale=left and record.fixed_by_one_length)
+    if lengths:
+        _add_lengths(results, lengths, stage, factor, fixed_scale=left and record.fixed_by_one_length)
+    if residuals:
+        data = _add_result(results, "Observations", "Distances of the tip from the geometry of each observation.")
+        add_observations(data, residuals, distances_of(capture, stage.evaluation), left)
     _add_parameters(results, record, stage, factor)
-    if left:
+    if left and not math.isnan(record.k):
         _add_scale(results, record, factor)
 
 
-def _add_methods(parent: Element, record: CalibrationRecord) -> None:
+def _add_methods(parent: Element, record: CalibrationRecord, residuals: tuple[ObservationResiduals, ...]) -> None:
     capture = record.recording.capture
+    poses = f"Number of sockets in which the tip was seated: {len(capture.sizes)}; of poses: {sum(capture.sizes)}; of "
+    lengths = f"reference lengths between sockets: {len(capture.lengths)}"
+    squares = "Parameters were identified by bounded least squares"
+    words = (
+        f"{poses}{lengths}. {squares}, {_METHODS.get(record.method, record.method)}: those with which the positions of "
+        "the tip in each socket agree best, and the distances between the sockets with the reference lengths."
+    )
+    if residuals:
+        others = len(capture.observations)
+        words = (
+            f"{poses}{lengths}; of other observations: {others}, of their poses: "
+            f"{len(capture.readings) - sum(capture.sizes)}. {squares} together with the unknown geometry of each "
+            "observation, weighted by the uncertainties of what was measured and by the scatter of the tip."
+        )
+    if record.robust:
+        words += (
+            f" The robust loss '{record.robust}' took weight from poses with large residuals; "
+            f"{len(less_weight(residuals))} have half of their weight or less."
+        )
     method = add(parent, "usedMethod")
     add_english(method, "name", "Identification of Denavit-Hartenberg parameters")
-    add_english(
-        method,
-        "description",
-        f"Number of sockets in which the tip was seated: {len(capture.sizes)}; of poses: {sum(capture.sizes)}; of "
-        f"reference lengths between sockets: {len(capture.lengths)}. Parameters were identified by bounded least "
-        f"squares, {_METHODS.get(record.method, record.method)}: those with which the positions of the tip in each "
-        "socket agree best, and the distances between the sockets with the reference lengths.",
-    )
+    add_english(method, "description", words)
     method = add(parent, "usedMethod", ref_type="basic_methodMeasurementUncertainty")
     add_english(method, "name", "Evaluation of measurement uncertainty")
     add_english(method, "description", uncertainty_statement(record))
     add(method, "norm", "JCGM 100:2008")
 
 
-def _add_equipment(parent: Element, lengths: Sequence[ReferenceLength], references: Sequence[Reference]) -> None:
+def _add_references(parent: Element, references: Sequence[Reference]) -> None:
     for reference in references:
         equipment = add(parent, "measuringEquipment")
         add_text(equipment, "name", reference.name)
@@ -119,9 +152,12 @@ def _add_equipment(parent: Element, lengths: Sequence[ReferenceLength], referenc
         serial = ("manufacturer", reference.serial_number, "Serial number")
         certificate = ("other", reference.certificate_number, "Number of its calibration certificate")
         add_identifications(equipment, [serial, certificate])
+
+
+def _add_length_equipment(parent: Element, lengths: Sequence[ReferenceLength], any_artefact_stated: bool) -> None:
     equipment = add(parent, "measuringEquipment")
     add_english(equipment, "name", "Reference lengths")
-    if not references:
+    if not any_artefact_stated:
         add_english(equipment, "description", f"Artefact: {NOT_STATED}")
     quantities = add(equipment, "measuringEquipmentQuantities")
     for number, length in enumerate(lengths, start=1):

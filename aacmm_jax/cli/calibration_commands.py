@@ -148,8 +148,6 @@ def calibrate(
             check_format(figure)
         recording = _joined(capture, same_probe)
         recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
-        if figure is not None:
-            check_sockets_only(recording.capture, "a figure of residuals")
         others = None
         if only_poses is not None:
             from ..data.drawing import draw_poses

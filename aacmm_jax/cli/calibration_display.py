@@ -6,9 +6,9 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from ..core.text import pluralise
+from ..core.text import pluralise, shorten
 from ..core.units import ARCSEC, DEG
-from ..summaries.tables import METRICS, volume_rows
+from ..summaries.tables import METRICS, quantity_words, volume_rows
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
 _MOST_PARTS = 12  # rows of a table
@@ -55,10 +55,7 @@ def capture(summary: dict[str, Any]) -> None:
             table.add_row(escape(row["socket"]), str(row["poses"]))
         print_table(console, table)
     if summary["observations"]:
-        table = new_table("\nOther observations", "observation", "kind", "target", "poses")
-        for row in summary["observations"]:
-            table.add_row(*(escape(str(row[key])) for key in ("observation", "kind", "target", "poses")))
-        print_table(console, table)
+        _observations_of_capture(console, summary["observations"])
     table = new_table("\nReadings", "joint", "lowest [deg]", "highest [deg]")
     for row in summary["ranges"]:
         table.add_row(str(row["joint"]), *(f"{row[key] / DEG:.3f}" for key in ("lowest_rad", "highest_rad")))
@@ -69,6 +66,19 @@ def capture(summary: dict[str, Any]) -> None:
             table.add_row(escape(row["from"]), escape(row["to"]), formatted(row["value_mm"]), formatted(row["u_mm"]))
         print_table(console, table)
     print_written(console, summary)
+
+
+def _observations_of_capture(console: Console, rows: list[dict[str, Any]]) -> None:
+    """Every observation, its unknown geometry, and what is certified or stated of it."""
+    table = new_table("\nOther observations", "observation", "kind", "target", "poses", "unknown geometry")
+    for row in rows:
+        cells = [str(row[key]) for key in ("observation", "kind", "target", "poses")]
+        table.add_row(*map(escape, cells), escape(", ".join(row["unknowns"])))
+    print_table(console, table)
+    for row in rows:
+        words = [f"{one['quantity']} {quantity_words(one)}" for one in (*row["certified"], *row["stated"])]
+        if words:
+            console.print(f"{escape(row['observation'])}: {escape(shorten(words, _MOST_PARTS))}.")
 
 
 def calibration(summary: dict[str, Any]) -> None:
@@ -121,10 +131,11 @@ def _observed(console: Console, summary: dict[str, Any]) -> None:
             numbers = (formatted(row["rms_before_mm"]), formatted(row["rms_after_mm"]), f"{row['reduced_chi']:.2f}")
             table.add_row(escape(row["observation"]), row["kind"], str(row["poses"]), *numbers)
         print_table(console, table)
-        table = new_table("\nUnknown geometry [mm; rotation vectors in deg]", "part", "values")
+        table = new_table("\nUnknown geometry", "part", "quantity", "found")
         parts = [row for row in summary["geometry"] if not row["part"].startswith("position of ")]
         for row in parts[:_MOST_PARTS]:
-            table.add_row(escape(row["part"]), ", ".join(_of_geometry(row)))
+            for one in row["quantities"]:
+                table.add_row(escape(row["part"]), one["quantity"], quantity_words(one))
         if parts:
             print_table(console, table)
         hidden = len(summary["geometry"]) - len(parts[:_MOST_PARTS])
@@ -134,9 +145,10 @@ def _observed(console: Console, summary: dict[str, Any]) -> None:
         rows = summary["less_weight"]
         console.print(f"Robust loss {summary['robust']}: {pluralise(len(rows), 'pose')} with half the weight or less.")
         if rows:
-            table = new_table("", "observation", "pose", "weight")
+            table = new_table("", "observation", "pose", "weight", "residual [mm]", "[standard deviations]")
             for row in rows[:_MOST_PARTS]:
-                table.add_row(escape(row["observation"]), str(row["pose"]), f"{row['weight']:.3f}")
+                numbers = f"{row['weight']:.3f}", formatted(row["residual_mm"]), f"{row['normalised']:.1f}"
+                table.add_row(escape(row["observation"]), str(row["pose"]), *numbers)
             print_table(console, table)
     if "other_poses" in summary:
         found = summary["other_poses"]
@@ -147,11 +159,6 @@ def _observed(console: Console, summary: dict[str, Any]) -> None:
         angles = [row for row in found["observations"] if row["rms_angle_rad"] is not None]
         for row in angles:
             console.print(f"Orientation of {escape(row['observation'])}: RMS {row['rms_angle_rad'] / DEG:.4f} deg.")
-
-
-def _of_geometry(row: dict[str, Any]) -> list[str]:
-    pairs = zip(row["values"], row["units"], strict=True)
-    return [f"{value / DEG:.4f} deg" if unit == "rad" else f"{value:.4f}" for value, unit in pairs]
 
 
 def _validated(console: Console, found: dict[str, Any] | None) -> None:

@@ -1,17 +1,17 @@
 """Figures of a calibration: distances of the poses, parameters and reference lengths, nominal and calibrated."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..calibration.record import CalibrationRecord, uncertainty_of
+from ..calibration.observation_residuals import ObservationResiduals, distances_of, observation_residuals
+from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
-from ..core.units import ARCSEC
+from ..core.units import ARCSEC, DEG
 from ..kinematics.arm import is_length
-from ..model.measurement import Measurement
-from .style import ACCENT, DARK, LIGHT, axes_or_new, label_axes, label_parameters, save_figure
+from .style import ACCENT, DARK, LIGHT, axes_or_new, label_axes, label_parameters, logarithmic, save_figure
 
 _STAGES: Mapping[str, Mapping[str, Any]] = {
     "nominal": {"label": "nominal", "color": LIGHT, "marker": "o"},
@@ -20,8 +20,19 @@ _STAGES: Mapping[str, Mapping[str, Any]] = {
 }
 
 
+# Of the kinds of a calibration, in their order; distinct in grey.
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
+_COLORS = (DARK, ACCENT, "0.45")
+_UNITS = {"mm": "distance from the geometry [mm]", "standard deviations": "residual [standard deviations]",
+          "deg": "angle between orientations [deg]"}  # fmt: skip
+_LITTLE_WEIGHT = 0.5
+_MOST_IN_A_ROW = 3  # panels of a figure
+_NAMED = 12  # most observations whose names fit an axis
+
+
 def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
-    """Plot the distance of each pose's tip from its socket's centroid, nominal and calibrated, mm (logarithmic).
+    """Plot the distance of each pose's tip from its socket's centroid, or from the geometry of its observation, nominal
+    and calibrated, mm (logarithmic).
 
     Args:
         record: The calibration.
@@ -31,19 +42,90 @@ def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
         The axes.
     """
     axes = axes_or_new(axes)
-    measurement = Measurement.of(record.recording.capture)
-    for stage, arm in (("nominal", record.recording.nominal.arm), ("calibrated", record.calibrated.arm)):
-        distance = np.linalg.norm(np.asarray(measurement.centred(arm.position(measurement.q))), axis=1)
+    capture, evaluations = record.recording.capture, record.evaluations()
+    by_stage = {stage: distances_of(capture, evaluations[stage]) for stage in ("nominal", "calibrated")}
+    found = observation_residuals(record)
+    if found:
+        by_stage["calibrated"] = tuple(one.distance for one in found)  # with the geometry of the calibration
+    for stage, distances in by_stage.items():
+        distance = np.concatenate(distances)
         style = {**_STAGES[stage]} | {"label": f"{_STAGES[stage]['label']} (mean {distance.mean():.3g} mm)"}
         axes.plot(np.arange(1, len(distance) + 1), distance, linestyle="none", markersize=3.5, **style)
-    sizes = record.recording.capture.sizes
-    for border in np.cumsum(sizes)[:-1] if len(sizes) <= 40 else ():
-        axes.axvline(border + 0.5, color="0.3", linewidth=0.8, linestyle="--", zorder=0)
-    axes.set_yscale("log")
-    x = "pose (dashed lines separate sockets)" if len(sizes) > 1 else "pose"
-    label_axes(axes, x, "distance from the socket's centroid [mm]")
+    logarithmic(axes)
+    names = (*capture.names, *(observation.name for observation in capture.observations))
+    of = "socket's centroid" if not capture.observations else "geometry"
+    word = "observation" if capture.observations else "socket"
+    x = _separate(axes, names, [len(distances) for distances in by_stage["nominal"]], word)
+    label_axes(axes, x, f"distance from the {of} [mm]")
     _legend_above(axes, 2)
     return axes
+
+
+def residuals(record: CalibrationRecord, unit: str = "mm", axes: Any = None) -> Any:
+    """Plot the residual of every pose of a calibration from observations, or with a robust loss, by kind (logarithmic).
+
+    Poses that a robust loss took half of their weight from or more have a ring.
+
+    Args:
+        record: The calibration.
+        unit: ``"mm"``, ``"standard deviations"``, or ``"deg"`` for orientations.
+        axes: Axes to plot into; new ones if None.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: If the calibration has no such residuals.
+    """
+    if unit not in _UNITS:
+        raise InputError(f"unit is '{unit}'; it must be mm, standard deviations or deg.")
+    found = [one for one in observation_residuals(record) if unit != "deg" or one.angle is not None]
+    if not found:
+        what = "orientations" if unit == "deg" else "observations besides sockets, and no robust loss"
+        raise InputError(f"the calibration has no {what}; draw its residuals with aj.plot.pose_distances.")
+    axes = axes_or_new(axes)
+    values = [_in_unit(one, unit) for one in found]
+    starts = np.cumsum([0, *(len(one) for one in values)])
+    owners = [one.observation.kind for one in found]
+    for number, kind in enumerate(dict.fromkeys(owners)):
+        mine = [i for i, owner in enumerate(owners) if owner == kind]
+        x = np.concatenate([starts[i] + np.arange(1, len(values[i]) + 1) for i in mine])
+        style = {"marker": _MARKERS[number % len(_MARKERS)], "color": _COLORS[number % len(_COLORS)]}
+        y = np.concatenate([values[i] for i in mine])
+        axes.plot(x, y, linestyle="none", markersize=3.5, label=kind, **style)
+    light = np.flatnonzero(np.concatenate([one.weight for one in found]) <= _LITTLE_WEIGHT)
+    if len(light):
+        ring = {"marker": "o", "markersize": 9, "markerfacecolor": "none", "color": ACCENT}
+        axes.plot(
+            light + 1, np.concatenate(values)[light], linestyle="none", label="half of its weight or less", **ring
+        )
+    if unit == "standard deviations":
+        axes.axhline(1, color="0.4", linewidth=0.8)
+    logarithmic(axes)
+    word = "observation" if record.recording.capture.observations else "socket"
+    x = _separate(axes, [one.observation.name for one in found], [len(one) for one in values], word)
+    label_axes(axes, x, _UNITS[unit])
+    _legend_above(axes, 3)
+    return axes
+
+
+def _in_unit(one: ObservationResiduals, unit: str) -> np.ndarray:
+    if unit == "deg":
+        return np.asarray(one.angle) / DEG
+    return one.distance if unit == "mm" else one.normalised
+
+
+def _separate(axes: Any, names: Sequence[str], sizes: Sequence[int], word: str) -> str:
+    """Separate groups of poses by dashed lines, name observations where there is room, and return the axis' title."""
+    if len(sizes) == 1:
+        return "pose"
+    ends = np.cumsum(sizes)
+    for border in ends[:-1] if len(sizes) <= 40 else ():
+        axes.axvline(border + 0.5, color="0.3", linewidth=0.8, linestyle="--", zorder=0)
+    if word == "observation" and len(sizes) <= _NAMED:
+        axes.set_xticks(ends - (np.array(sizes) - 1) / 2, names, rotation=30, ha="right")
+        return ""
+    return f"pose (dashed lines separate {word}s)"
 
 
 def length_parameter_errors(record: CalibrationRecord, axes: Any = None) -> Any:
@@ -64,14 +146,21 @@ def length_parameter_errors(record: CalibrationRecord, axes: Any = None) -> Any:
     axes = axes_or_new(axes)
     vectors = record.vectors()
     chosen = [i for i, name in enumerate(record.names) if is_length(name)]
-    for stage, style in _STAGES.items():
+    stages = _stages(record)
+    for stage, style in stages.items():
         error = np.abs(vectors[stage] - vectors["true"])[chosen]
         axes.plot(np.arange(len(chosen)), np.maximum(error, 1e-5), linestyle="none", markersize=5, **style)
-    axes.set_yscale("log")
+    logarithmic(axes)
     label_parameters(axes, [record.names[i] for i in chosen])
     label_axes(axes, "", "error against the true arm [mm]")
-    _legend_above(axes, 3)
+    _legend_above(axes, len(stages))
     return axes
+
+
+def _stages(record: CalibrationRecord) -> Mapping[str, Mapping[str, Any]]:
+    """The arms of a calibration; without that of stage 1 where there was one solve."""
+    one = record.observed is not None or record.method == REPEATABILITY
+    return {stage: style for stage, style in _STAGES.items() if not (one and stage == "stage1")}
 
 
 def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any = None) -> Any:
@@ -105,7 +194,7 @@ def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any
         axes.plot(np.flatnonzero(~known), change[~known], "x", **style)
     label_parameters(axes, [record.names[i] for i in chosen])
     label_axes(axes, "", f"calibrated - nominal [{'mm' if kind == 'length' else 'arcsec'}]")
-    axes.legend(frameon=False)
+    _legend_above(axes, 2)
     return axes
 
 
@@ -128,16 +217,19 @@ def reference_length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
     axes = axes_or_new(axes)
     stage1, calibrated = (record.evaluations()[stage] for stage in ("stage1", "calibrated"))
     x = np.arange(len(lengths))
-    axes.plot(x - 0.1, np.asarray(stage1.error), linestyle="none", **_STAGES["stage1"])
+    two = "stage1" in _stages(record)
+    if two:
+        axes.plot(x - 0.1, np.asarray(stage1.error), linestyle="none", **_STAGES["stage1"])
     u = np.asarray(calibrated.u)
     bars = np.where(np.isfinite(u), uncertainty_of(record).factor() * u, 0.0)
     style = {"fmt": "s", "color": DARK, "capsize": 3, "markersize": 4, "label": "calibrated, with U (95 %)"}
-    axes.errorbar(x + 0.1, np.asarray(calibrated.error), yerr=bars, **style)
+    axes.errorbar(x + 0.1 * two, np.asarray(calibrated.error), yerr=bars, **style)
     axes.axhline(0, color="0.4", linewidth=0.8)
     names = [f"{length.start} - {length.end}" for length in lengths]
     label_parameters(axes, names if len(names) <= 20 else [str(i + 1) for i in x])
+    axes.set_xlim(-0.5, len(lengths) - 0.5)
     label_axes(axes, "", "measured - value [mm]")
-    axes.legend(frameon=False)
+    _legend_above(axes, 2)
     return axes
 
 
@@ -147,7 +239,8 @@ def _legend_above(axes: Any, columns: int) -> None:
 
 
 def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
-    """Write the distances of the poses and, if the truth is known, the errors of the length parameters.
+    """Write the distances of the poses; of observations also the residuals in standard deviations and those of
+    orientations; and, if the truth is known, the errors of the length parameters.
 
     Args:
         record: The calibration.
@@ -158,10 +251,20 @@ def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
     """
     from matplotlib.figure import Figure
 
-    panels = 2 if record.recording.true is not None else 1
-    figure = Figure(figsize=(5.5 * panels, 3.9), layout="constrained")
-    axes = figure.subplots(1, panels, squeeze=False)
-    pose_distances(record, axes[0, 0])
-    if panels == 2:
-        length_parameter_errors(record, axes[0, 1])
+    found = observation_residuals(record)
+    draw = [pose_distances]
+    if found:
+        draw.append(lambda record, axes: residuals(record, "standard deviations", axes))
+    if any(one.angle is not None for one in found):
+        draw.append(lambda record, axes: residuals(record, "deg", axes))
+    if record.recording.true is not None:
+        draw.append(length_parameter_errors)
+    columns = len(draw) if len(draw) <= _MOST_IN_A_ROW else 2
+    rows = -(-len(draw) // columns)
+    figure = Figure(figsize=(5.5 * columns, 3.9 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for function, axes in zip(draw, panels, strict=False):
+        function(record, axes)
+    for axes in panels[len(draw) :]:
+        axes.remove()
     save_figure(figure, path)

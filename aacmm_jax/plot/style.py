@@ -1,5 +1,6 @@
 """What all figures share: colours that stay distinct in grey, new axes, labels, and files written whole."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,21 @@ def label_axes(axes: Any, x: str, y: str) -> None:
     """Label both axes and add a grid."""
     axes.set(xlabel=x, ylabel=y)
     axes.grid(True, which="major", alpha=0.3)
+
+
+def logarithmic(axes: Any) -> None:
+    """Make the y axis logarithmic, with plain numbers, also between powers of ten where there are few."""
+    from matplotlib.ticker import FuncFormatter
+
+    def between(value: float, _: int) -> str:
+        low, high = axes.get_ylim()
+        leading = round(value / 10.0 ** math.floor(math.log10(value) + 1e-9))
+        shown = () if high > 1e3 * low else (2, 5) if high > 10 * low else (2, 3, 4, 5, 6, 8)
+        return f"{value:g}" if leading in shown else ""
+
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(FuncFormatter(between))
 
 
 def label_parameters(axes: Any, names: list[str]) -> None:

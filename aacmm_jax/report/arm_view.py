@@ -1,49 +1,77 @@
 """The interactive view of the arm in its poses."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from ..calibration.evaluation import Evaluation
+from ..core.numpy_or_jax import AnyArray
 from ..data.capture import Capture
+from ..data.observations.observation import POINT, offset_of
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach, skeleton
 from .elements import ArmView
-from .residuals import pose_distances
+from .residuals import Groups
 
 _MOST = 150  # poses in a page
+_NO_GEOMETRY: Mapping[str, Any] = {}
 
 
-def view_of_arm(arm: Arm, capture: Capture, evaluation: Evaluation) -> ArmView:
+def view_of_arm(
+    arm: Arm,
+    capture: Capture,
+    distances: Float[np.ndarray, " m"],
+    geometry: Mapping[str, Float[AnyArray, " _"]] = _NO_GEOMETRY,
+) -> ArmView:
     """The calibrated arm in the poses of a capture.
 
-    The data are the sockets, and up to 150 poses as lines from joint to joint, mm, each with its tip's distance from
-    the centroid of its socket (None for a single pose).
+    The data are marks at the sockets and at the points of the geometry that was found (centres, pivots), and up to 150
+    poses as lines from joint to joint, mm, each with its residual.
+
+    Args:
+        arm: The calibrated arm.
+        capture: Its poses.
+        distances: Distance of every pose from its socket's centroid or its geometry, mm; NaN where there is none.
+        geometry: The parts of the unknown geometry, mm and rad, of a capture with observations besides sockets.
+
+    Returns:
+        The view.
     """
-    owner, distances = capture.owner, pose_distances(capture, evaluation)
+    groups = Groups.of(capture)
+    owner, numbers, q = groups.owner, groups.numbers, np.asarray(capture.readings)
     chosen = np.arange(len(owner))
     if len(chosen) > _MOST:
         chosen = np.unique(np.linspace(0, len(chosen) - 1, _MOST).round().astype(int))
-    first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
     tips = np.asarray(arm.position(capture.q))
+    marks = {name: tips[capture.owner == i].mean(axis=0) for i, name in enumerate(capture.names)}
+    lines = skeleton(arm, q[chosen])
+    for i, observation in enumerate(capture.observations, start=len(capture.names)):
+        points = [part for part, units in observation.unknowns.items() if units == POINT]
+        # A part with certified values has its numbers in a frame of its own.
+        marks |= {part: geometry[part] for part in points if part not in observation.certified}
+        if observation.target:
+            mine = owner[chosen] == i
+            lines[mine] = skeleton(arm.replace(probe=geometry[offset_of(observation.target)]), q[chosen[mine]])
     data: dict[str, Any] = {
-        "sockets": [
-            {"name": name, "at": np.round(tips[owner == i].mean(axis=0), 1).tolist()}
-            for i, name in enumerate(capture.names)
-        ],
+        "marks": [{"name": name, "at": np.round(at, 1).tolist()} for name, at in marks.items()],
+        "from": "geometry" if capture.observations else "socket's centroid",
         "poses": [
             {
-                "label": f"{capture.names[owner[i]]}, pose {i - first[owner[i]] + 1}",
+                "label": f"{groups.names[owner[i]]}, pose {numbers[i]}",
                 "points": np.round(line, 1).tolist(),
                 "distance": float(f"{distances[i]:.4g}") if np.isfinite(distances[i]) else None,
             }
-            for i, line in zip(chosen, skeleton(arm, np.asarray(capture.q)[chosen]), strict=True)
+            for i, line in zip(chosen, lines, strict=True)
         ],
         "reach": round(arm_reach(arm).radius, 1),
-        "all": len(capture.q),
+        "all": len(q),
     }
     description = (
         "Drag, or use the arrow keys, to rotate the view; plus and minus change its size. "
         "The slider goes through the poses."
     )
-    return ArmView("scene", "The calibrated arm, its sockets and its poses", description, data)
+    title = "The calibrated arm and its poses"
+    if marks:
+        title = f"The calibrated arm, its {'points' if capture.observations else 'sockets'} and its poses"
+    return ArmView("scene", title, description, data)

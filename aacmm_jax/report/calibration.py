@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..calibration.record import CalibrationRecord, check_document, uncertainty_of
+from ..calibration.observation_residuals import distances_of, observation_residuals
+from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise
 from ..core.units import ARCSEC, DEG
 from ..summaries.calibration import calibration_summary
@@ -15,6 +16,7 @@ from ..uncertainty.volume import volumetric_uncertainty
 from . import charts
 from .arm_view import view_of_arm
 from .elements import (
+    ArmView,
     Chart,
     Report,
     ReportTable,
@@ -25,7 +27,15 @@ from .elements import (
     scientific,
     text_cell,
 )
-from .residuals import length_rows, metrics_table, residual_chart, socket_table
+from .observations import (
+    agreement_tables,
+    geometry_section,
+    observation_tables,
+    other_poses_table,
+    residuals_section,
+    stages_chart,
+)
+from .residuals import length_rows, metrics_table, pose_distances, residual_chart, socket_table, validation_tables
 from .uncertainty import (
     bounds_section,
     correlations_section,
@@ -37,39 +47,47 @@ from .uncertainty import (
 _METHODS = {
     "two-stage": "Identification from repeatability, then a scale fix",
     "joint": "Joint least squares of poses and lengths",
+    REPEATABILITY: "Identification with the scale of the nominal arm",
 }
+_MOST_KINDS = 3  # among the facts at the beginning
+_OBSERVED = "Joint least squares of everything observed"
 
 
 def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any]]:
     """The report, except for the origin of its file; and the summary that it was made from."""
-    check_document(record, "a report")
     uncertainty, observability = uncertainty_of(record), observed(record)
     volume = volumetric_uncertainty(uncertainty)
     summary = calibration_summary(record, observability, volume)
     evaluations = record.evaluations()
     factor = uncertainty.factor(0.95)
-    view = view_of_arm(record.calibrated.arm, record.recording.capture, evaluations["calibrated"])
+    capture = record.recording.capture
     sections = [
         _data(record, summary),
         _nominal_and_calibrated(record, summary, evaluations),
         _scale(record, summary, evaluations, factor),
         _parameters(summary, factor),
-        _residuals(record, evaluations["calibrated"]),
-        Section("arm", "The arm in its poses", [view]),
+        *_residuals(record, summary, evaluations["calibrated"]),
+        Section("arm", "The arm in its poses", [_view(record, evaluations["calibrated"])]),
         volume_section(volume, summary, factor),
         *([] if record.sampled is None else [monte_carlo_section(record)]),
         correlations_section(record, uncertainty),
         observability_section(observability),
         bounds_section(record, summary),
     ]
-    count = len(summary["lengths"])
+    other = "other " if capture.names else ""
+    groups = [
+        pluralise(len(capture.names), "socket") if capture.names or not capture.observations else "",
+        pluralise(len(capture.observations), f"{other}observation") if capture.observations else "",
+        pluralise(len(capture.lengths), "reference length") if capture.lengths or not capture.observations else "",
+    ]
+    method = _OBSERVED if record.method == "joint" and capture.observations else _METHODS[record.method]
+    robust = f", robust loss {record.robust}" if record.robust else ""
     verdict, good = record.reason, record.converged and not record.implausible_residual
     if not good:
         verdict = "Not to be used" + (": data and arm do not belong together." if record.converged else f". {verdict}")
     report = Report(
         title="Calibration of " + (record.recording.nominal.name or "an arm"),
-        subtitle=f"{_METHODS[record.method]}; {pluralise(summary['poses'], 'pose')} in "
-        f"{pluralise(len(summary['sockets_used']), 'socket')}, {pluralise(count, 'reference length')}",
+        subtitle=f"{method}{robust}; {pluralise(summary['poses'], 'pose')} in {', '.join(filter(None, groups))}",
         verdict=verdict,
         verdict_mark="good" if good else "bad",
         warnings=summary["warnings"],
@@ -77,6 +95,14 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
         sections=sections,
     )
     return report, summary
+
+
+def _view(record: CalibrationRecord, evaluation: Evaluation) -> ArmView:
+    arm, capture = record.calibrated.arm, record.recording.capture
+    if record.observed is None:
+        return view_of_arm(arm, capture, pose_distances(capture, evaluation))
+    distances = np.concatenate([one.distance for one in observation_residuals(record)])
+    return view_of_arm(arm, capture, distances, record.observed.geometry)
 
 
 def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
@@ -88,6 +114,11 @@ def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
     for key, name in (("de_mm", "DE"), ("deltam_mm", "Deltam")) if "de_mm" in calibrated else ():
         change = f"{format_number(nominal[key])} → {format_number(calibrated[key])}\u00a0mm"
         facts.append((f"{name}, nominal → calibrated", change))
+    if "other_poses" in summary:
+        facts.append(("Other poses, RMS distance", f"{format_number(summary['other_poses']['rms_mm'])}\u00a0mm"))
+    for row in summary["kinds"][:_MOST_KINDS]:
+        change = f"{format_number(row['rms_before_mm'])} → {format_number(row['rms_after_mm'])}\u00a0mm"
+        facts.append((f"RMS residual, {row['kind']}, nominal → calibrated", change))
     volume = summary["uncertainty"]["volume"]
     length = f"U of a {volume['length_mm']:g} mm length"
     largest, median = volume["u_length_largest_mm"], volume["u_length_median_mm"]
@@ -97,10 +128,11 @@ def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
         )
     else:
         facts.append((length, "not determined everywhere"))
-    expanded = factor * summary["scale_u"]
-    decimals = decimals_for(expanded, 7)
-    k = f"{summary['scale_k']:.{decimals}f}\u00a0±\u00a0{expanded:.{decimals}f} (95\u00a0%)"
-    facts.append(("Scale k of stage 1", k))
+    if summary["scale_k"] is not None:
+        expanded = factor * (summary["scale_u"] or 0.0)
+        decimals = decimals_for(expanded, 7)
+        k = f"{summary['scale_k']:.{decimals}f}\u00a0±\u00a0{expanded:.{decimals}f} (95\u00a0%)"
+        facts.append(("Scale k of stage 1", k))
     return facts
 
 
@@ -121,16 +153,35 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
         f"{len(record.names)} parameters of {capture.joints} joints were identified. "
         f"Fixed at their nominal values: {', '.join(record.held) or 'none'}."
     )
-    if record.hold:
+    if record.hold and record.method == REPEATABILITY:
+        introduction += f" {record.hold} sets the scale, since nothing that was observed does."
+    elif record.hold:
         introduction += f" {record.hold} was the scale anchor of stage 1, since poses alone do not determine the scale."
-    blocks: list = [
-        introduction,
-        ReportTable("Sockets in which the tip was seated", ("socket", "poses"), sockets),
-        ReportTable("Reference lengths", ("between", "calibrated value [mm]", "u [mm]"), lengths),
-        "Measurements of the arm are traceable to the metre through these reference lengths alone, as far as their "
-        "calibration certificates are.",
-    ]
+    blocks: list = [introduction]
+    if sockets or not capture.observations:
+        blocks.append(ReportTable("Sockets in which the tip was seated", ("socket", "poses"), sockets))
+    blocks += observation_tables(record)
+    if lengths or not capture.observations:
+        blocks.append(ReportTable("Reference lengths", ("between", "calibrated value [mm]", "u [mm]"), lengths))
+    blocks.append(_traceability(summary["scale_from"]))
     return Section("data", "What was calibrated, and from which data", blocks)
+
+
+def _traceability(sources: list[str]) -> str:
+    if not sources:
+        return (
+            "Measurements of the arm are not traceable to the metre by this calibration: nothing that was measured set "
+            "its scale."
+        )
+    if sources == ["the reference lengths"]:
+        return (
+            "Measurements of the arm are traceable to the metre through these reference lengths alone, as far as their "
+            "calibration certificates are."
+        )
+    return (
+        "Measurements of the arm are traceable to the metre as far as the calibration certificates are of what sets "
+        f"its scale: {', '.join(sources)}."
+    )
 
 
 def _nominal_and_calibrated(
@@ -138,13 +189,28 @@ def _nominal_and_calibrated(
 ) -> Section:
     stages = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
     blocks: list = ["The nominal and the calibrated arm on the poses used for identification."]
+    if record.robust:
+        blocks[0] += " Root mean squares count every pose in full, those too that lost weight."
     if summary["cross_validation"] is not None:
-        blocks.append(_validation_table(summary["cross_validation"]))
-    fixed = record.fixed_by_one_length
-    blocks.append(metrics_table("Metrics by arm [mm]", summary, stages, fixed_scale=fixed))
-    pair = {stage: evaluations[stage] for stage in ("nominal", "calibrated")}
-    title = "Distance of every pose from its socket's centroid"
-    blocks.append(residual_chart("stages", title, record.recording.capture, pair))
+        assert record.validation is not None
+        blocks += validation_tables(summary["cross_validation"], record.validation)
+    capture, fixed = record.recording.capture, record.fixed_by_one_length
+    if record.observed is not None or record.method == REPEATABILITY:
+        del stages["stage1"]  # which is the calibrated arm
+    if record.observed is not None:
+        blocks += [*agreement_tables(summary), *other_poses_table(summary)]
+    if summary["nominal"]:
+        caption = "Metrics by arm [mm]"
+        if capture.observations:
+            counts = pluralise(len(capture.names), "socket"), pluralise(len(capture.lengths), "reference length")
+            caption = f"{counts[0]} of the arm's own probe, {counts[1]} [mm]"
+        blocks.append(metrics_table(caption, summary, stages, fixed_scale=fixed))
+    if record.observed is not None:
+        blocks.append(stages_chart(record, distances_of(capture, evaluations["nominal"])))
+    else:
+        pair = {stage: evaluations[stage] for stage in ("nominal", "calibrated")}
+        title = "Distance of every pose from its socket's centroid"
+        blocks.append(residual_chart("stages", title, capture, pair))
     if "truth" in summary:
         rows = [
             [text_cell(title), *(number_cell(scale * summary["truth"][stage][key]) for stage in stages)]
@@ -157,24 +223,18 @@ def _nominal_and_calibrated(
     return Section("stages", "Nominal and calibrated arm", blocks)
 
 
-def _validation_table(found: dict[str, Any]) -> ReportTable:
-    rows = [
-        [text_cell(title), number_cell(found[value]), number_cell(found[predicted])]
-        for title, value, predicted in (
-            ("RMS distance of poses from their socket's centroid", "rms_mm", "rms_predicted_mm"),
-            ("RMS error of reference lengths", "length_error_rms_mm", "length_u_mm"),
-        )
-    ]
-    caption = f"Cross-validated: each of {found['groups']} placements held out once [mm]"
-    return ReportTable(caption, ("", "found", "predicted by u"), rows)
-
-
 def _scale(
     record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation], factor: float
 ) -> Section:
     k, u, single = record.k, record.u_k, record.fixed_by_one_length
     u_of_k = f"u(k)\u00a0=\u00a0{scientific(u)}"
-    if record.method == "joint":
+    if record.method == REPEATABILITY:
+        introduction = "The scale is that of the nominal arm: nothing that was measured set it." + (
+            f" By the reference lengths, which took no part, k = {k:.8f}." if math.isfinite(k) else ""
+        )
+    elif math.isnan(k):
+        introduction = f"Fitted with all else at once, the scale comes from {', '.join(summary['scale_from'])}."
+    elif record.method == "joint":
         introduction = (
             "Poses and reference lengths were fitted together. The arm that poses alone give measures the lengths as "
             f"k = {k:.8f} times their calibrated value, with {u_of_k}."
@@ -186,36 +246,40 @@ def _scale(
             f"were divided by k: {format_number(abs(k - 1) * 1000, 4)} mm in a metre, known to "
             f"± {format_number(1000 * factor * u, 4)} mm in a metre (95 %)."
         )
+    if not summary["lengths"]:
+        return Section("scale", "Scale", [introduction])
     introduction += (
         " The only length fixed the scale, so its own error is zero by construction and is not shown."
         if single
         else " U of a length contains the uncertainty of its certificate and the scatter of the poses at its ends."
     )
     errors = {stage: np.asarray(evaluations[stage].error) for stage in ("nominal", "stage1", "calibrated")}
-    before = [errors["nominal"], errors["stage1"]]
-    columns = ("between", "value", "error, nominal", "error, stage 1", "error, calibrated", "U of error")
+    two = record.method != REPEATABILITY and record.observed is None
+    before = [errors["nominal"], *([errors["stage1"]] if two else [])]
+    stage1 = ["error, stage 1"] if two else []
+    columns = ("between", "value", "error, nominal", *stage1, "error, calibrated", "U of error")
     table = ReportTable(
         "Reference lengths [mm]", columns, length_rows(summary["lengths"], factor, before, 0 if single else None)
     )
-    block = table if single else _length_chart(summary["lengths"], errors, factor, table)
+    block = table if single else _length_chart(summary["lengths"], errors, two, factor, table)
     return Section("scale", "Scale and reference lengths", [introduction, block])
 
 
 def _length_chart(
-    lengths: list[dict[str, Any]], errors: dict[str, np.ndarray], factor: float, table: ReportTable
+    lengths: list[dict[str, Any]], errors: dict[str, np.ndarray], two: bool, factor: float, table: ReportTable
 ) -> Chart:
     names = [f"{row['from']} – {row['to']}" for row in lengths]
     x = list(range(1, len(names) + 1))
     u = [factor * (row["error_u_mm"] or np.nan) for row in lengths]
-    traces = [
-        charts.markers("stage 1", x, errors["stage1"], charts.WARM, "triangle-up-open", hover=names),
-        charts.markers("calibrated, with U", x, errors["calibrated"], charts.DARK, "square", hover=names, bars=u),
-    ]
+    traces = [charts.markers("calibrated, with U", x, errors["calibrated"], charts.DARK, "square", hover=names, bars=u)]
+    if two:
+        stage1 = charts.markers("stage 1", x, errors["stage1"], charts.WARM, "triangle-up-open", hover=names)
+        traces = [stage1, *traces]
     shapes = charts.horizontal([0.0], "solid")
     figure = {"data": traces, "layout": charts.layout("reference length", "measured − value [mm]", shapes=shapes)}
     if len(names) <= 12 and max(map(len, names)) <= 12:
         figure["layout"]["xaxis"] |= {"tickvals": x, "ticktext": [charts.escaped(name) for name in names]}
-    description = "Measured minus calibrated value, before and after the scale fix."
+    description = "Measured minus calibrated value" + (", before and after the scale fix." if two else ".")
     return Chart("lengths", "Errors of the reference lengths", description, figure, table)
 
 
@@ -270,8 +334,10 @@ def _change_chart(unit: str, parameters: list[dict[str, Any]], factor: float) ->
     )
 
 
-def _residuals(record: CalibrationRecord, evaluation: Evaluation) -> Section:
+def _residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Evaluation) -> list[Section]:
     capture = record.recording.capture
+    if record.observed is not None:
+        return [residuals_section(record, summary), geometry_section(summary)]
     chart = residual_chart(
         "residuals", "Residuals of the calibrated arm", capture, {"calibrated": evaluation}, mark=True
     )
@@ -279,6 +345,5 @@ def _residuals(record: CalibrationRecord, evaluation: Evaluation) -> Section:
         "The distance of each pose's tip from the centroid of its socket, by the calibrated arm. Poses more than eight "
         "times as far as the median are marked: check how the tip was seated there."
     )
-    return Section(
-        "residuals", "Residuals by socket and pose", [introduction, socket_table(capture, evaluation), chart]
-    )
+    blocks = [introduction, socket_table(capture, evaluation), chart]
+    return [Section("residuals", "Residuals by socket and pose", blocks)]

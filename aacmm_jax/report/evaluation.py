@@ -11,13 +11,14 @@ from ..acceptance.results import METRICS, AcceptanceTest, Metric
 from ..acceptance.standards import EDITIONS
 from ..calibration.evaluation import Evaluation, evaluate
 from ..core.text import pluralise
-from ..data.capture import ReferenceLength
+from ..data.capture import Capture, ReferenceLength
 from ..data.sphere import ProbedSphere
+from ..kinematics.arm import Arm
 from ..summaries.evaluation import evaluation_summary, points_summary
 from . import charts
 from .arm_view import view_of_arm
-from .elements import Cell, Chart, Report, ReportTable, Section, format_number, number_cell, text_cell
-from .residuals import length_rows, metrics_table, residual_chart, socket_table
+from .elements import ArmView, Cell, Chart, Report, ReportTable, Section, format_number, number_cell, text_cell
+from .residuals import length_rows, metrics_table, pose_distances, residual_chart, socket_table
 
 _MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}
 _SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
@@ -49,10 +50,15 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
             Section("stages", "Nominal and calibrated arm", _nominal_and_calibrated(record, summary, evaluations)),
             *_lengths(record, tests["calibrated"], evaluations),
             Section("residuals", "Residuals by socket and pose", [socket_table(capture, calibrated), residuals]),
-            Section("arm", "The arm in its poses", [view_of_arm(record.calibrated.arm, capture, calibrated)]),
+            Section("arm", "The arm in its poses", [_view(record.calibrated.arm, capture, calibrated)]),
         ],
     )
     return report, summary
+
+
+def _view(arm: Arm, capture: Capture, evaluation: Evaluation) -> ArmView:
+    geometry = {} if evaluation.observed is None else evaluation.observed.geometry
+    return view_of_arm(arm, capture, pose_distances(capture, evaluation), geometry)
 
 
 def points_report(record: PointsRecord) -> tuple[Report, dict[str, Any]]:

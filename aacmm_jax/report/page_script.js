@@ -57,11 +57,11 @@
   // The arm: lines in space, rotated about the vertical and tilted, as SVG, which prints and scales.
   const SVG = "http://www.w3.org/2000/svg";
   function scene(container) {
-    const { sockets, poses, reach } = parsed("scenes")[container.dataset.scene];
+    const { marks, from, poses, reach } = parsed("scenes")[container.dataset.scene];
     const view = { turn: -0.9, tilt: 0.45, size: 1, pose: 0 };
     const svg = document.createElementNS(SVG, "svg");
     container.append(svg);
-    const all = [[0, 0, 0], ...sockets.map((s) => s.at), ...poses.flatMap((p) => p.points)];
+    const all = [[0, 0, 0], ...marks.map((mark) => mark.at), ...poses.flatMap((p) => p.points)];
     const middle = [0, 1, 2].map((i) => (Math.min(...all.map((p) => p[i])) + Math.max(...all.map((p) => p[i]))) / 2);
     const extent = Math.max(...all.map((p) => Math.hypot(...p.map((x, i) => x - middle[i]))), 1);
     const shadows = poses.filter((_, i) => i % Math.max(1, Math.ceil(poses.length / 24)) === 0);
@@ -110,9 +110,9 @@
         const [cx, cy] = project(point);
         add("circle", { cx, cy, r: 4, fill: "#fff", stroke: "#1b3a6b", "stroke-width": 2 });
       }
-      // From the lowest socket upwards: a label that would cover an earlier one moves up and is joined to its socket.
-      const labelled = sockets.length <= 30, labels = [], line = 15;
-      const projected = sockets.map(({ name, at }) => [name, ...project(at)]).sort((one, other) => other[2] - one[2]);
+      // From the lowest mark upwards: a label that would cover an earlier one moves up and is joined to its mark.
+      const labelled = marks.length <= 30, labels = [], line = 15;
+      const projected = marks.map(({ name, at }) => [name, ...project(at)]).sort((one, other) => other[2] - one[2]);
       for (const [name, x, y] of projected) {
         add("path", { d: `M${x - 6},${y}h12M${x},${y - 6}v12`, stroke: "#c8560a", "stroke-width": 2.5 });
         if (!labelled) continue;
@@ -169,7 +169,7 @@
       view.pose = Number(slider.value) - 1;
       const pose = poses[view.pose];
       const distance = pose.distance === null
-        ? "the only pose of its socket" : `${pose.distance.toPrecision(3)} mm from its socket's centroid`;
+        ? "the only pose of its socket" : `${pose.distance.toPrecision(3)} mm from its ${from}`;
       output.textContent = `${pose.label}: ${distance}`;
       render();
     };

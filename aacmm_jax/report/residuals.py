@@ -1,11 +1,13 @@
 """Tables and charts of repeatability and of lengths, common to reports of calibrations and of evaluations."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
+from ..calibration.observation_residuals import distances_of, rms
+from ..calibration.results import CrossValidation, LeftOut
 from ..data.capture import Capture
 from ..model.metrics import pose_outliers
 from ..summaries.tables import METRICS
@@ -13,7 +15,36 @@ from . import charts
 from .elements import Cell, Chart, ReportTable, format_number, number_cell, text_cell
 
 _DRAWN, _LISTED = 2000, 1000  # most poses in a chart, and in its table
-_LEAST = 1e-5  # mm: a distance of zero on a logarithmic axis
+_NAMED = 12  # most observations that are named along an axis
+_LEAST = 1e-5  # a residual of zero on a logarithmic axis, mm
+
+
+class Groups(NamedTuple):
+    """Poses in groups, the sockets or observations of a capture, one after the other."""
+
+    names: tuple[str, ...]
+    sizes: tuple[int, ...]
+    word: str = "socket"  # what a group is
+
+    @classmethod
+    def of(cls, capture: Capture) -> "Groups":
+        """The sockets of a capture, then its other observations."""
+        if not capture.observations:
+            return cls(capture.names, capture.sizes)
+        others = capture.observations
+        sizes = (len(observation.q) for observation in others)
+        names = (observation.name for observation in others)
+        return cls((*capture.names, *names), (*capture.sizes, *sizes), "observation")
+
+    @property
+    def owner(self) -> np.ndarray:
+        """Index of the group of each pose."""
+        return np.repeat(np.arange(len(self.sizes)), self.sizes)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """Number of each pose within its group, from 1."""
+        return np.concatenate([np.arange(1, size + 1) for size in self.sizes])
 
 
 def metrics_table(
@@ -36,21 +67,20 @@ def metrics_table(
     return ReportTable(caption, ("", *stages.values()), rows)
 
 
-def _outliers(capture: Capture, evaluation: Evaluation) -> np.ndarray:
-    return pose_outliers(np.asarray(evaluation.distances), capture.sizes)[0]
-
-
 def pose_distances(capture: Capture, evaluation: Evaluation) -> np.ndarray:
-    """Distances from the centroid, mm; NaN for a pose that is the only one of its socket, since it shows no scatter."""
-    single = np.asarray(capture.sizes)[capture.owner] == 1
-    return np.where(single, np.nan, np.asarray(evaluation.distances))
+    """Distances of all poses from their socket's centroid or their observation's geometry, mm; NaN for the only pose of
+    a socket, which shows no scatter."""
+    distances, sizes = np.concatenate(distances_of(capture, evaluation)), Groups.of(capture).sizes
+    single = np.repeat(np.asarray(sizes) == 1, sizes) & (np.arange(len(distances)) < sum(capture.sizes))
+    return np.where(single, np.nan, distances)
 
 
 def socket_table(capture: Capture, evaluation: Evaluation) -> ReportTable:
     """Repeatability and number of outliers, socket by socket."""
     found = evaluation.repeatability
     metrics = [np.asarray(column) for column in (found.socket_de, found.socket_deltam, found.socket_rms)]
-    far = np.bincount(capture.owner[_outliers(capture, evaluation)], minlength=len(capture.names))
+    outliers, _ = pose_outliers(np.asarray(evaluation.distances), capture.sizes)
+    far = np.bincount(capture.owner[outliers], minlength=len(capture.names))
     rows = [
         [
             text_cell(name),
@@ -66,66 +96,134 @@ def socket_table(capture: Capture, evaluation: Evaluation) -> ReportTable:
 def residual_chart(
     id: str, title: str, capture: Capture, evaluations: Mapping[str, Evaluation], *, mark: bool = False
 ) -> Chart:
-    """Distance of every pose from its socket's centroid, by arm, on a logarithmic axis.
-
-    ``mark``: outliers of the last arm are marked. The table lists at most the 1000 farthest poses.
-    """
-    owner = capture.owner
-    first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
-    labels = [f"{capture.names[socket]}, pose {i - first[socket] + 1}" for i, socket in enumerate(owner)]
+    """Distance of every pose from its socket's centroid, or the geometry of its observation, by arm; ``mark``: poses of
+    the last arm that are far off are marked."""
+    groups = Groups.of(capture)
+    last = np.concatenate(distances_of(capture, list(evaluations.values())[-1]))
+    far = pose_outliers(last, groups.sizes)[0] if mark else None
     distances = {name: pose_distances(capture, evaluation) for name, evaluation in evaluations.items()}
-    last = list(distances.values())[-1]
+    return pose_chart(id, title, groups, distances, far=far)
+
+
+def pose_chart(
+    id: str,
+    title: str,
+    groups: Groups,
+    residuals: Mapping[str, np.ndarray],
+    *,
+    unit: str = "mm",
+    axis: str = "distance",
+    far: Sequence[int] | np.ndarray | None = None,
+    far_says: str = "far from its socket",
+    normal: float | None = None,
+) -> Chart:
+    """The residual of every pose, by arm, on a logarithmic axis; the table lists at most the 1000 largest.
+
+    Args:
+        id: Identifier of the chart.
+        title: Its title.
+        groups: What the poses belong to.
+        residuals: Name of an arm -> residual of every pose, NaN where there is none.
+        unit: Their unit.
+        axis: What a residual is, on the axis.
+        far: Indices of poses to mark; None where the table has no column of marks.
+        far_says: Why they are marked.
+        normal: A value to draw as a horizontal line.
+
+    Returns:
+        The chart with its table.
+    """
+    last_arm, last = list(residuals.items())[-1]
     known = np.flatnonzero(np.isfinite(last))
     if not len(known):
         empty = {"data": [], "layout": charts.layout("", "")}
         return Chart(id, title, "Every socket has one pose only, so there is no scatter to show.", empty)
-    far = _outliers(capture, list(evaluations.values())[-1]) if mark else np.zeros(0, dtype=int)
+    owner, numbers = groups.owner, groups.numbers
+    labels = [f"{groups.names[group]}, pose {number}" for group, number in zip(owner, numbers, strict=True)]
+    marked = np.asarray([] if far is None else far, dtype=int)
     drawn = known if len(known) <= _DRAWN else known[np.linspace(0, len(known) - 1, _DRAWN).round().astype(int)]
-    drawn = np.union1d(drawn, far)
-    styles = [(charts.LIGHT, "circle-open"), (charts.DARK, "circle")][-len(evaluations) :]
+    drawn = np.union1d(drawn, marked)
+    styles = [(charts.LIGHT, "circle-open"), (charts.DARK, "circle")][-len(residuals) :]
     traces = []
-    for (name, values), (color, symbol) in zip(distances.items(), styles, strict=True):
-        hover = [f"{labels[i]}: {format_number(float(values[i]))} mm ({name})" for i in drawn]
+    for (name, values), (color, symbol) in zip(residuals.items(), styles, strict=True):
+        hover = [f"{labels[i]}: {format_number(float(values[i]))} {unit} ({name})" for i in drawn]
         y = np.maximum(values[drawn], _LEAST)
         traces.append(charts.markers(name, (drawn + 1).tolist(), y, color, symbol, hover=hover, size=5))
-    if len(far):
-        hover = [f"{labels[i]}: {format_number(float(last[i]))} mm" for i in far]
-        style = {"hover": hover, "size": 13}
-        traces.append(
-            charts.markers("far from its socket", (far + 1).tolist(), last[far], charts.WARM, "diamond-open", **style)
-        )
-    borders = [] if len(capture.sizes) > 40 else charts.vertical((np.cumsum(capture.sizes)[:-1] + 0.5).tolist())
-    x = "pose, socket after socket" if len(capture.sizes) > 1 else "pose"
-    axis = charts.logarithmic(*([y for y in trace["y"] if y is not None] for trace in traces))
-    layout = charts.layout(x, "distance [mm]", yaxis=axis, shapes=borders)
+    if len(marked):
+        hover = [f"{labels[i]}: {format_number(float(last[i]))} {unit}" for i in marked]
+        x, y = (marked + 1).tolist(), np.maximum(last[marked], _LEAST)
+        traces.append(charts.markers(far_says, x, y, charts.WARM, "diamond-open", hover=hover, size=13))
+    borders = [] if len(groups.sizes) > 40 else charts.vertical((np.cumsum(groups.sizes)[:-1] + 0.5).tolist())
+    lines = borders + ([] if normal is None else charts.horizontal([normal]))
+    x = f"pose, {groups.word} after {groups.word}" if len(groups.sizes) > 1 else "pose"
+    scale = charts.logarithmic(*([y for y in trace["y"] if y is not None] for trace in traces))
+    layout = charts.layout(x, f"{axis} [{unit}]", yaxis=scale, shapes=lines)
+    if 1 < len(groups.sizes) <= _NAMED and groups.word != "socket":
+        middle = np.cumsum(groups.sizes) - (np.array(groups.sizes) - 1) / 2
+        layout["xaxis"] |= {"tickvals": middle.tolist(), "ticktext": [charts.escaped(name) for name in groups.names]}
     median, largest = (format_number(float(reduced)) for reduced in (np.median(last[known]), last[known].max()))
-    description = "Dotted lines separate the sockets. " if borders else ""
-    description += f"Median {median} mm, largest {largest} mm ({list(evaluations)[-1]} arm)."
+    description = f"Dotted lines separate the {groups.word}s. " if borders else ""
+    description += f"Median {median} {unit}, largest {largest} {unit} ({last_arm} arm)."
     description += " The only pose of a socket has no distance." if len(known) < len(owner) else ""
     description += f" {len(drawn)} of {len(known)} poses are drawn." if len(drawn) < len(known) else ""
-    table = _pose_table(capture, distances, far, mark)
+    table = _pose_table(groups, residuals, unit, None if far is None else marked, far_says)
     return Chart(id, title, description, {"data": traces, "layout": layout}, table)
 
 
-def _pose_table(capture: Capture, distances: Mapping[str, np.ndarray], far: np.ndarray, mark: bool) -> ReportTable:
-    """Every pose, or the farthest of very many."""
-    last = list(distances.values())[-1]
+def _pose_table(
+    groups: Groups, residuals: Mapping[str, np.ndarray], unit: str, far: np.ndarray | None, far_says: str
+) -> ReportTable:
+    """Every pose, or those of very many that have the largest residuals."""
+    last = list(residuals.values())[-1]
     chosen, caption = np.arange(len(last)), "Every pose"
     if len(chosen) > _LISTED:
         chosen = np.argsort(-np.nan_to_num(last))[:_LISTED]
         caption = f"The {_LISTED} farthest of {len(last)} poses"
-    first, marked = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]]), set(far.tolist())
+    owner, numbers, marked = groups.owner, groups.numbers, set([] if far is None else far.tolist())
     rows = [
         [
-            text_cell(capture.names[capture.owner[i]]),
-            number_cell(int(i - first[capture.owner[i]] + 1), 0),
-            *(number_cell(float(values[i]), 5) for values in distances.values()),
-            *([text_cell("far" if i in marked else "", "outlier" if i in marked else "")] if mark else []),
+            text_cell(groups.names[owner[i]]),
+            number_cell(int(numbers[i]), 0),
+            *(number_cell(float(values[i]), 5) for values in residuals.values()),
+            *([] if far is None else [text_cell(far_says if i in marked else "", "outlier" if i in marked else "")]),
         ]
         for i in chosen.tolist()
     ]
-    columns = ("socket", "pose", *(f"{name} [mm]" for name in distances), *(["marked"] if mark else []))
+    columns = (groups.word, "pose", *(f"{name} [{unit}]" for name in residuals), *([] if far is None else ["marked"]))
     return ReportTable(caption, columns, rows)
+
+
+def validation_tables(summary: Mapping[str, Any], validation: CrossValidation) -> list[ReportTable]:
+    """Cross-validation, pooled and group by group, the group that most exceeds its prediction first."""
+    pooled = [
+        [text_cell(title), number_cell(summary[value]), number_cell(summary[predicted])]
+        for title, value, predicted in (
+            ("RMS distance of poses from their socket's centroid or geometry", "rms_mm", "rms_predicted_mm"),
+            ("RMS error of reference lengths", "length_error_rms_mm", "length_u_mm"),
+        )
+        if np.isfinite(summary[value])
+    ]
+    count, rows = len(validation.groups), sorted(map(_held_out, validation.groups), key=lambda pair: pair[0])
+    caption = f"Cross-validated: each of {count} placements held out once [mm]"
+    columns = ("group held out", "poses", "RMS distance", "predicted", "found / predicted", "RMS length error", "u")
+    return [
+        ReportTable(caption, ("", "found", "predicted by u"), pooled),
+        ReportTable("Groups held out [mm]", columns, [row for _, row in rows]),
+    ]
+
+
+def _held_out(group: LeftOut) -> tuple[float, list[Cell]]:
+    """What a group is sorted by, and its row."""
+    ratio = group.rms / group.rms_predicted if group.rms_predicted > 0 else np.nan
+    lengths = (rms(np.asarray(values)) for values in (group.length_error, group.length_u))
+    values = (group.rms, group.rms_predicted)
+    return -ratio if np.isfinite(ratio) else 0.0, [
+        text_cell(", ".join(group.sockets)),
+        number_cell(group.poses, 0),
+        *map(number_cell, values),
+        number_cell(ratio, 2),
+        *map(number_cell, lengths),
+    ]
 
 
 def length_rows(

@@ -7,19 +7,18 @@ import numpy as np
 
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord, uncertainty_of
-from ..calibration.results import ObservedMetrics, active_names
+from ..calibration.results import active_names
 from ..data.capture import Capture, ReferenceLength
 from ..data.recording import Recording
 from ..kinematics.arm import is_length
 from ..kinematics.parameters import ArmSpecification, Parameters
-from ..model.observed import Observed
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .validation import cross_validation_summary
+from .observations import capture_observations, observed_summary
 from .warnings import observed, of_calibration, of_capture
 
 _CORRELATED = 0.95
-_LITTLE_WEIGHT = 0.5
 
 
 def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
@@ -65,10 +64,7 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
         "joints": capture.joints,
         "poses": len(capture.readings),
         "sockets": [{"socket": name, "poses": size} for name, size in zip(capture.names, capture.sizes, strict=True)],
-        "observations": [
-            {"observation": one.name, "kind": one.kind, "poses": len(one.q), "target": one.target}
-            for one in capture.observations
-        ],
+        "observations": capture_observations(capture),
         "lengths": reference_length_rows(capture.lengths),
         "ranges": [
             {"joint": i + 1, "lowest_rad": float(low), "highest_rad": float(high)}
@@ -180,61 +176,13 @@ def calibration_summary(
         "cross_validation": None if record.validation is None else cross_validation_summary(record.validation),
         "monte_carlo": record.sampled_says,
         "warnings": of_calibration(record, observability),
-        **observed_summary(record),
+        **observed_summary(record, evaluations["nominal"]),
     }
     if "true" in vectors:
         summary["truth"] = {
             stage: truth_errors(record, vectors, stage) for stage in ("nominal", "stage1", "calibrated")
         }
     return summary
-
-
-def observed_summary(record: CalibrationRecord) -> dict[str, Any]:
-    """How each observation agrees, the geometry found, poses that lost weight, and poses not calibrated with."""
-    found: dict[str, Any] = {"robust": record.robust, "observations": [], "geometry": [], "less_weight": []}
-    observed, others = record.observed, record.others
-    if observed is not None:
-        columns = (observed.rms_before, observed.rms_after, observed.reduced_chi)
-        rows = zip(observed.names, observed.kinds, observed.weights, *columns, strict=True)
-        found["observations"] = [
-            {
-                "observation": name,
-                "kind": kind,
-                "poses": len(weights),
-                "rms_before_mm": float(before),
-                "rms_after_mm": float(after),
-                "reduced_chi": float(chi),
-            }
-            for name, kind, weights, before, after, chi in rows
-        ]
-        units = Observed.of(record.recording.capture).blocks
-        found["geometry"] = [
-            {"part": part, "units": list(units[part]), "values": np.asarray(values).tolist()}
-            for part, values in observed.geometry.items()
-        ]
-        found["less_weight"] = less_weight(observed)
-    if others is not None:
-        angles = [None if np.isnan(angle) else float(angle) for angle in others.rms_angle]
-        found["other_poses"] = {
-            "poses": int(others.poses.sum()),
-            "rms_mm": others.rms_of_all,
-            "observations": [
-                {"observation": name, "poses": int(poses), "rms_mm": float(rms), "rms_angle_rad": angle}
-                for name, poses, rms, angle in zip(others.names, others.poses, others.rms, angles, strict=True)
-            ],
-        }
-    return found
-
-
-def less_weight(observed: ObservedMetrics) -> list[dict[str, Any]]:
-    """Poses that a robust loss took half of their weight from or more, the lightest first."""
-    rows = [
-        {"observation": name, "pose": number, "weight": float(weight)}
-        for name, weights in zip(observed.names, observed.weights, strict=True)
-        for number, weight in enumerate(weights, start=1)
-        if weight <= _LITTLE_WEIGHT
-    ]
-    return sorted(rows, key=lambda row: row["weight"])
 
 
 def uncertainty_summary(

@@ -1,5 +1,6 @@
 """Titles and rows of tables that command line and report share; imports nothing, for the sake of ``--help``."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,6 +13,19 @@ METRICS = (
     ("length_error_mean_absolute_mm", "length error, mean absolute"),
     ("length_error_largest_mm", "length error, largest"),
 )
+
+
+def quantity_words(row: Mapping[str, Any], u: bool = True) -> str:
+    """A quantity of an observation as a person reads it, angles in deg; with its standard uncertainty where one is
+    known and ``u`` is true."""
+    factor, unit = (180 / math.pi, "deg") if row["unit"] == "rad" else (1.0, row["unit"])
+    decimals = 6 if unit == "1" else 4
+    values = ", ".join(f"{round(factor * value, decimals) + 0.0:.{decimals}f}" for value in row["values"])  # no -0
+    words = f"({values})" if len(row["values"]) > 1 else values
+    words += "" if unit == "1" else f" {unit}"
+    if not u or row["u"] is None:
+        return words
+    return f"{words} (exact)" if row["u"] == 0 else f"{words} (u = {factor * row['u']:.4g} {unit})"
 
 
 def volume_rows(volume: Mapping[str, Any], factor: float) -> list[tuple[str, list[float | None]]]:

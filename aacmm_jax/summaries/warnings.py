@@ -64,7 +64,7 @@ def of_calibration(record: CalibrationRecord, seen: Observability | None = None)
     found += _implausible(record)
     if record.recording.capture.observations:
         found += [] if record.validation is None else contradicted_prediction(record.validation)
-        found += [*_observations(record), *of_capture(record.recording)]
+        found += [*_observations(record), *_scale(record), *of_capture(record.recording)]
         seen = observed(record) if seen is None else seen
         return found if record.implausible_residual else found + _identifiability(record, seen)
     found += contradictions(record)
@@ -252,7 +252,7 @@ def _data(record: CalibrationRecord) -> list[str]:
             "poses predict (Birge ratio), and u(k) has been multiplied by it. Look for a wrong length, or for errors "
             "outside the D-H model."
         )
-    if len(capture.lengths) == 1:
+    if len(capture.lengths) == 1 and record.method != REPEATABILITY:
         found.append("One reference length fixes the scale, so its own error is no check; keep another for checking.")
     return found
 

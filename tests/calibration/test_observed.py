@@ -252,7 +252,7 @@ def test_what_cannot_be_determined_is_refused(paper_arm, bounds, observation, me
     ("kind", "field"),
     [
         ("points", "points"),
-        ("spheres", "radius"),
+        ("spheres", "diameter"),
         ("planes", "distance"),
         ("bars", "coordinates"),
         ("distances", "values"),

@@ -121,7 +121,7 @@ def full(tmp_path_factory) -> AdministrativeData:
 
 
 @pytest.fixture(scope="module")
-def certificates(record, full) -> dict[str, str]:
+def certificates(record, observed_record, full) -> dict[str, str]:
     """Certificates of every kind, to be checked against the published rules."""
     uncertain = record.determined.copy()
     uncertain[0] = False
@@ -141,10 +141,11 @@ def certificates(record, full) -> dict[str, str]:
             AdministrativeData(),
             created=CREATED,
         ),
+        "observations": dcc_xml(observed_record, AdministrativeData(), created=CREATED),
     }
 
 
-KINDS = ("nothing stated", "all stated", "hostile names", "on bounds", "joint")
+KINDS = ("nothing stated", "all stated", "hostile names", "on bounds", "joint", "observations")
 
 
 def contents(text: str, path: str) -> list[str]:
@@ -224,8 +225,9 @@ def test_elements_are_in_the_order_of_the_schema(certificates, kind):
     assert core is not None
     assert children(core) == f"countryCodeISO3166_1 {languages} uniqueIdentifier {given}".split()
     found, left = (contents(certificates[kind], f"*/dcc:measurementResult[{n}]/dcc:results/*/dcc:name") for n in (1, 2))
-    assert found == ["Repeatability", "Reference lengths", PARAMETERS]
-    assert left == [*found, "Scale"]
+    observations = kind == "observations"
+    assert found == ["Repeatability", "Observations" if observations else "Reference lengths", PARAMETERS]
+    assert left == [*found, *([] if observations else ["Scale"])]
 
 
 def test_numbers_read_back_exactly(record):
@@ -270,6 +272,37 @@ def test_numbers_read_back_exactly(record):
     np.testing.assert_allclose(k.expanded, factor * record.u_k, rtol=1e-12)
     # Three figures, three numbers for each of two lengths, and 27 parameters, twice; and the scale.
     assert len(values) == 2 * (3 + 6 + 27) + 1
+
+
+def test_observations_are_stated_with_what_is_certified_of_them(observed_record, certificates):
+    """The values of the artefacts' own certificates: not the distances of the tip's centre."""
+    text = certificates["observations"]
+    ball = observed_record.recording.capture.observations[1]
+    equipments = {
+        element.findtext(f"{DCC}name/{DCC}content"): {
+            quantity.findtext(f"{DCC}name/{DCC}content"): tuple(
+                quantity.findtext(f".//{SI}{tag}") for tag in ("value", "unit", "valueStandardMU")
+            )
+            for quantity in element.iter(f"{DCC}measuringEquipmentQuantity")
+        }
+        for element in ElementTree.fromstring(text).findall(f".//{DCC}measuringEquipment")[:4]
+    }
+    assert equipments["ball"] == {"certified diameter": (repr(float(ball.diameter)), MM, "0.001")}
+    assert list(equipments["block"]) == ["certified distance between the planes"]
+    assert equipments["bar"]["certified coordinates of far, x"] == ("300.0", MM, "0.0005")
+    assert [value[1:] for value in equipments["tracker"].values()] == [(MM, None), (RAD, None)]
+    values = parse_dcc(text)
+    found = observed_record.observed
+    for i, name in enumerate(found.names):
+        row = ("As left", "Observations", f"{i + 1}: {name}")
+        assert values[*row, "RMS residual"][:2] == (pytest.approx(found.rms_after[i], rel=1e-12), MM)
+        assert values[*row, "RMS residual in standard deviations"].value == pytest.approx(found.reduced_chi[i])
+        assert values["As found", *row[1:], "RMS residual"].value > 0.3
+    assert ("As left", "Observations", "3: tracker", "RMS residual of the orientation") in values
+    assert ("As left", "Scale", "k") not in values
+    said = " ".join(contents(text, "*/dcc:statements"))
+    assert "comes from tracker (transforms), ball (sphere), block (parallel planes), bar (artefact):" in said
+    assert "robust loss 'tukey'" in text
 
 
 @pytest.mark.parametrize("value", [5e-324, -0.0, 1e-5, 0.1, 1 / 3, -123456789.125, 1e99])
@@ -477,7 +510,7 @@ def test_any_text_survives_or_is_refused(text):
             ["too few steps", "calibrate again"],
         ),
         ({"k": 25.4}, {}, ["25.4", "correct the lengths"]),
-        ({"k": math.nan}, {}, ["scale k", "used none"]),
+        ({"method": "repeatability"}, {}, ["traceable", "--scale nominal", "another observation"]),
         ({}, {"created": "yesterday"}, ["yesterday", "ISO 8601"]),
         ({}, {"sources": ["a\x07.h5"]}, ["file", "U+0007", "take it out"]),
         ({}, {"command": "aacmm \x00"}, ["command", "U+0000"]),

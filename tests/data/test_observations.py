@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.data.observations.observation import Tips
+from aacmm_jax.data.observations.observation import Tips, certified_quantities, stated_quantities
 
 RANDOM = np.random.default_rng(1)
 POSES = 12
@@ -106,6 +106,56 @@ def test_starts_are_exact_for_exact_data(paper_arm):
             moved = tips.position + np.einsum("pcm,p->cm", np.stack(axes), offset - probe)
             tips = tips._replace(position=moved)
         assert np.abs(observation.residual(tips, found).values).max() < 1e-3, observation.kind
+
+
+@pytest.mark.parametrize(
+    ("name", "certified", "stated"),
+    [
+        ("socket", {}, {}),
+        ("transforms", {}, {"standard uncertainty of an orientation about each axis": ([1e-3], "rad")}),
+        ("sphere", {}, {}),
+        ("certified sphere", {"certified diameter": ([100.0], 0.1)}, {"diameter of the tip's ball": ([4.0], "mm")}),
+        ("exact sphere", {"certified diameter": ([100.0], 0.0)}, {}),
+        ("plane", {}, {"standard deviation of the surface about its plane": ([0.01], "mm")}),
+        (
+            "exact planes",
+            {"certified distance between the planes": ([50.0], 0.0)},
+            {"diameter of the tip's ball": ([3.0], "mm")},
+        ),
+        (
+            "indexed artefact",
+            {f"certified coordinates of {name}": (values, 0.1) for name, values in CORNERS.items()},
+            {},
+        ),
+        ("distances", {}, {}),
+    ],
+)
+def test_what_is_certified_is_that_of_the_artefact(name, certified, stated):
+    """As on its certificate: without the stylus, which the distance of the tip's centre contains."""
+    observation = to_numpy(ALL[name])
+    found = {one.says: (one.values.tolist(), one.u) for one in certified_quantities(observation)}
+    assert found == certified
+    assert {one.says: (one.values.tolist(), one.unit) for one in stated_quantities(observation)} == stated
+    assert {one.says for one in certified_quantities(observation) if one.unit != "mm"} == set()
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_number_of_a_geometry_can_be_read(name):
+    observation = to_numpy(ALL[name])
+    for part, values in unknowns_of(observation).items():
+        if part in observation.unknowns:
+            quantities = observation.quantities(part, values)
+            assert {quantity.unit for quantity in quantities} <= {"mm", "rad", "1"}
+            assert len({quantity.says for quantity in quantities}) == len(quantities)
+            count = sum(len(quantity.values) for quantity in quantities)
+            assert count == (4 if quantities[0].says == "normal" else len(values))
+
+
+def test_a_plane_is_read_by_its_normal():
+    """The rotation vector (0, 30 deg, 0) turns z to (sin 30, 0, cos 30)."""
+    normal, distance = ALL["plane"].quantities("plane f", np.array([0.0, np.pi / 6, 12.5]))
+    np.testing.assert_allclose(normal.values, [0.5, 0, np.sqrt(0.75)], atol=1e-12)
+    assert (normal.unit, distance.values.tolist(), distance.unit) == ("1", [12.5], "mm")
 
 
 @pytest.mark.parametrize(

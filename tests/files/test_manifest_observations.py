@@ -160,7 +160,7 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
         ),
         key=lambda one: ["parallel planes", "sphere", "plane", "socket"].index(one.kind),
     )
-    assert (planes.name, planes.first, float(planes.distance)) == ("block a", 3, 94.0)
+    assert (planes.name, planes.first, float(planes.between)) == ("block a", 3, 94.0)
     assert float(sphere.radius) == 12.7
     assert (plane.name, socket.target) == ("wall", "T")
 

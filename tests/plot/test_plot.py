@@ -56,6 +56,38 @@ FIGURES = [
 ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("unit", "count"), [("mm", 15 + 8 + 25 + 12 + 16 + 16), ("standard deviations", 92), ("deg", 25)]
+)
+def test_residuals_of_observations(observed_record, unit, count):
+    """Every pose once, by kind, those that lost weight with a ring, and a legend outside the axes."""
+    axes = aj.plot.residuals(observed_record, unit)
+    labels = [line.get_label() for line in axes.lines]
+    lines = dict(zip(labels, axes.lines, strict=True))
+    kinds = ["socket", "transforms", "sphere", "parallel planes", "artefact"] if unit != "deg" else ["transforms"]
+    assert [label for label in labels if not label.startswith(("_", "half"))] == kinds
+    drawn = np.concatenate([lines[kind].get_xdata() for kind in kinds])
+    assert sorted(drawn) == list(range(1, count + 1))
+    if unit != "deg":
+        found = observed_record.observed
+        expected = found.rms_after if unit == "mm" else found.reduced_chi
+        assert np.sqrt(np.mean(lines["sphere"].get_ydata() ** 2)) == pytest.approx(expected[3])
+        assert 5 in lines["half of its weight or less"].get_xdata()
+        assert [text.get_text() for text in axes.get_xticklabels()] == list(found.names)
+    axes.figure.savefig(io.BytesIO())
+    assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1
+
+
+def test_figures_of_a_calibration_from_observations(observed_record, tmp_path):
+    """The file has the distances, the residuals in standard deviations and the orientations."""
+    aj.plot.save_calibration_figure(observed_record, tmp_path / "figure.svg")
+    text = (tmp_path / "figure.svg").read_text()
+    for words in ("distance from the geometry [mm]", "residual [standard deviations]", "angle between orientations"):
+        assert f"<!-- {words}" in text
+    lines = aj.plot.pose_distances(observed_record).lines
+    assert np.sqrt(np.mean(lines[1].get_ydata()[:15] ** 2)) == pytest.approx(observed_record.observed.rms_after[0])
+
+
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_figure_draws_into_the_axes_it_is_given_or_into_new_ones(made, name, tmp_path):
     axes = Figure().subplots()
@@ -80,7 +112,9 @@ def test_figures_hold_the_numbers(record, made):
     np.testing.assert_allclose(values, made["singular_values"][0].singular)
 
 
-@pytest.mark.parametrize("name", ["pose_distances", "length_parameter_errors"])
+@pytest.mark.parametrize(
+    "name", ["pose_distances", "length_parameter_errors", "parameter_changes", "reference_length_errors"]
+)
 def test_a_legend_covers_no_data(made, name):
     axes = getattr(aj.plot, name)(*made[name])
     axes.figure.savefig(io.BytesIO())  # sets the layout
@@ -99,6 +133,9 @@ def test_an_arm_is_drawn_in_space(record):
     ("call", "said"),
     [
         (lambda record: aj.plot.parameter_changes(record, "lengths"), "length or angle"),
+        (lambda record: aj.plot.residuals(record, "um"), "mm, standard deviations or deg"),
+        (lambda record: aj.plot.residuals(record), "no observations besides sockets"),
+        (lambda record: aj.plot.residuals(record, "deg"), "no orientations"),
         (
             lambda record: aj.plot.acceptance_metrics(aj.acceptance.run(aj.acceptance.Measured({"A": np.eye(3)}))),
             "no metric has a limit",

@@ -1,5 +1,7 @@
 """Reports: their contents, that no given text becomes markup, and that a browser shows, sorts and prints them."""
 
+import copy
+import dataclasses
 import json
 import math
 import re
@@ -25,8 +27,9 @@ STUDY = {
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    """The files and reports of a simulated arm with hostile names: calibration, evaluation, study."""
+def written(tmp_path_factory, observed_record):
+    """The files and reports of a simulated arm with hostile names: calibration, evaluation, study; and of a calibration
+    from observations, two of which have hostile names."""
     folder = tmp_path_factory.mktemp("reports")
     nominal = aj.files.load_specification("cheng2018-simulation")._replace(name=f"Arm {HOSTILE}")
     space = aj.Parameters.free_of(nominal.arm)
@@ -48,10 +51,27 @@ def written(tmp_path_factory):
     evaluation = evaluation._replace(warnings=(*evaluation.warnings, f"Beware of {HOSTILE}"))
     aj.files.save_evaluation(folder / "evaluation.h5", evaluation)
     aj.study.run_study(aj.study.make_study(**{**STUDY, "arm": nominal.arm}), folder / "study.h5")
-    pages = {kind: folder / f"{kind}.html" for kind in ("calibration", "evaluation", "study")}
+    aj.files.save_calibration(folder / "observations.h5", with_hostile_names(observed_record))
+    pages = {kind: folder / f"{kind}.html" for kind in ("calibration", "evaluation", "study", "observations")}
     for kind, page in pages.items():
         write_report(folder / f"{kind}.h5", page)
     return SimpleNamespace(folder=folder, pages=pages, record=record, evaluation=evaluation)
+
+
+def with_hostile_names(record):
+    """The same calibration, with a socket and an artefact of another name."""
+    capture, found = record.recording.capture, record.observed
+    bar = copy.copy(capture.observations[-1])
+    for field in ("name", "placement", "artefact"):
+        object.__setattr__(bar, field, HOSTILE)
+    sockets = {HOSTILE if name == "A" else name: q for name, q in capture.sockets.items()}
+    capture = aj.Capture(sockets, [], [*capture.observations[:-1], bar])
+    renamed = {"position of A": f"position of {HOSTILE}", "placement bar": f"placement {HOSTILE}"}
+    renamed["coordinates of bar"] = f"coordinates of {HOSTILE}"
+    geometry = {renamed.get(part, part): values for part, values in found.geometry.items()}
+    names = tuple(HOSTILE if name in ("A", "bar") else name for name in found.names)
+    found = dataclasses.replace(found, names=names, geometry=geometry)
+    return record._replace(recording=record.recording._replace(capture=capture), observed=found)
 
 
 class Page(HTMLParser):
@@ -84,7 +104,7 @@ def test_a_target_that_cannot_be_written_is_refused(written):
     assert_refused(lambda: write_report(source, source), "one of the files that this command reads")
 
 
-@pytest.fixture(scope="module", params=["calibration", "evaluation", "study"])
+@pytest.fixture(scope="module", params=["calibration", "evaluation", "study", "observations"])
 def page(request, written):
     found = Page(written.pages[request.param].read_text(encoding="utf-8"))
     found.kind = request.param
@@ -125,7 +145,7 @@ def test_every_chart_is_one_that_plotly_takes(page):
     assert set(figures) == places
     for figure in figures.values():
         graph_objects.Figure(figure)  # raises for an attribute or value that Plotly does not know
-    assert len(figures) >= (4 if page.kind != "calibration" else 8)
+    assert len(figures) >= {"calibration": 8, "observations": 9}.get(page.kind, 4)
 
 
 def test_every_chart_has_words_and_numbers(page):
@@ -215,6 +235,85 @@ def test_numbers_of_a_report_are_under_the_right_heading(written):
     assert change["error_y"]["array"][0] == pytest.approx(factor * u[i], rel=1e-5)
 
 
+def test_a_report_of_observations_by_kind_observation_and_pose(observed_record):
+    from aacmm_jax.report.calibration import calibration_report
+
+    report = calibration_report(observed_record)[0]
+    assert report.subtitle.endswith("robust loss tukey; 92 poses in 2 sockets, 4 other observations")
+    found, tables = observed_record.observed, tables_of(report)
+    nominal = observed_record.evaluations()["nominal"].observed
+    rows = tables["RMS residuals by observation"].rows
+    assert [row[0].text for row in rows] == ["A", "B", "tracker", "ball", "block", "bar"]
+    np.testing.assert_allclose([row[3].value for row in rows], nominal.rms)
+    np.testing.assert_allclose([row[4].value for row in rows], found.rms_after)
+    np.testing.assert_allclose([row[6].value for row in rows], found.reduced_chi)
+    assert [row[5].text == "–" for row in rows] == [True, True, False, True, True, True]
+    socket = tables["RMS residuals by kind"].rows[0]
+    assert [cell.text for cell in socket[:3]] == ["socket", "2", "23"]
+    assert socket[4].value == pytest.approx(math.sqrt(np.average(found.rms_after[:2] ** 2, weights=[15, 8])))
+    charts_by_id = {
+        block.id: block for section in report.sections for block in section.blocks if isinstance(block, elements.Chart)
+    }
+    normalised = charts_by_id["normalised"].figure["data"]
+    in_ball = np.array(normalised[0]["y"])[15 + 8 + 25 :][:12]
+    assert math.sqrt(np.mean(in_ball**2)) == pytest.approx(found.reduced_chi[3], rel=1e-5)
+    assert normalised[1]["x"][0] == 5  # the bad pose of A is marked
+    weights = next(table for caption, table in tables.items() if caption.startswith("Poses that the robust loss"))
+    assert [cell.text for cell in weights.rows[0][:3]] == ["A", "5", "0.000"]
+    assert weights.rows[0][3].value > 1
+    certified = [[cell.text for cell in row[:3]] for row in tables["Certified values"].rows]
+    assert ["bar", "certified coordinates of far", "(300.0000, 0.0000, 0.0000) mm"] in certified
+    geometry = {(row[0].text, row[1].text): row[2].text for row in tables["Geometry found"].rows}
+    assert geometry["plane block", "normal"].endswith(", 1.000000)")
+    assert geometry["frame of tracker", "rotation vector"].endswith(" deg")
+    values = found.geometry["offset of tracker"]
+    assert geometry["offset of tracker", "position"] == f"({', '.join(f'{x:.4f}' for x in values)}) mm"
+    scene = next(
+        block for section in report.sections for block in section.blocks if isinstance(block, elements.ArmView)
+    )
+    assert [mark["name"] for mark in scene.data["marks"]] == ["A", "B", "centre of ball"]
+    transforms = [pose for pose in scene.data["poses"] if pose["label"].startswith("tracker")]
+    arm = observed_record.calibrated.arm.replace(probe=values)
+    q = observed_record.recording.capture.observations[0].q
+    np.testing.assert_allclose([pose["points"][-1] for pose in transforms], arm.position(q), atol=0.06)
+
+
+def test_groups_held_out_are_listed_one_by_one_the_worst_first(written):
+    from aacmm_jax.calibration.results import CrossValidation, LeftOut
+    from aacmm_jax.report.calibration import calibration_report
+
+    def left_out(name, rms, predicted):
+        return LeftOut((name, f"{name}2"), 10, rms, predicted, np.array([0.03, -0.04]), np.array([0.01, 0.01]), True)
+
+    groups = left_out("low", 0.2, 0.2), left_out("high", 1.17, 0.31), left_out("far", 0.2, 0.2)
+    validation = CrossValidation((*groups, left_out("open", 0.2, np.inf)))
+    tables = tables_of(calibration_report(written.record._replace(validation=validation))[0])
+    rows = tables["Groups held out [mm]"].rows
+    assert [row[0].text for row in rows] == ["high, high2", "low, low2", "far, far2", "open, open2"]
+    assert [cell.value for cell in rows[0][1:5]] == pytest.approx([10, 1.17, 0.31, 1.17 / 0.31])
+    assert rows[0][5].value == pytest.approx(0.025 * math.sqrt(2))
+    assert rows[3][3].text == "not determined"
+
+
+def test_a_report_says_where_the_scale_comes_from(observed_record):
+    from aacmm_jax.report.calibration import calibration_report
+
+    def text_of(record):
+        report = calibration_report(record)[0]
+        blocks = [block for section in report.sections for block in section.blocks if isinstance(block, str)]
+        return report.subtitle + " ".join(blocks)
+
+    said = text_of(observed_record)
+    assert "the scale comes from tracker (transforms), ball (sphere), block (parallel planes), bar (artefact)." in said
+    recording = observed_record.recording
+    alone = recording._replace(capture=aj.Capture(recording.capture.sockets))
+    found = aj.identify(recording.nominal.arm, alone.capture, recording.nominal.bounds())
+    said = text_of(aj.calibration.record_of(found, alone))
+    assert "with the scale of the nominal arm" in said
+    assert "The scale is that of the nominal arm: nothing that was measured set it." in said
+    assert "not traceable" in said
+
+
 def test_lengths_of_a_report_by_arm_and_with_expanded_uncertainty(written):
     """The recording has two lengths, so that none is zero by construction."""
     from aacmm_jax.report.calibration import calibration_report
@@ -251,12 +350,13 @@ def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
 
 def test_poses_alone_in_their_socket_show_no_scatter(written):
     from aacmm_jax.report.arm_view import view_of_arm
-    from aacmm_jax.report.residuals import residual_chart, socket_table
+    from aacmm_jax.report.residuals import pose_distances, residual_chart, socket_table
 
     arm, q = written.record.calibrated.arm, written.record.recording.capture.q
     capture = aj.Capture({"A": q[:10], "B": q[10:11]})
     evaluation = aj.evaluate(arm, capture)
-    distances = [pose["distance"] for pose in view_of_arm(arm, capture, evaluation).data["poses"]]
+    view = view_of_arm(arm, capture, pose_distances(capture, evaluation))
+    distances = [pose["distance"] for pose in view.data["poses"]]
     assert distances[10] is None
     assert None not in distances[:10]
     assert [cell.text for cell in socket_table(capture, evaluation).rows[1]][2:5] == ["–"] * 3
@@ -457,10 +557,10 @@ def shown(browser, written):
 @pytest.mark.parametrize(
     ("kind", "width"),
     [
-        *(("calibration", 400), ("evaluation", 1600), ("study", 400)),
+        *(("calibration", 400), ("evaluation", 1600), ("study", 400), ("observations", 400)),
         *(
             pytest.param(kind, width, marks=pytest.mark.slow)
-            for kind, width in (("calibration", 1600), ("evaluation", 400), ("study", 1600))
+            for kind, width in (("calibration", 1600), ("evaluation", 400), ("study", 1600), ("observations", 1600))
         ),
     ],
 )

@@ -19,6 +19,7 @@ from .observation import (
     AbstractObservation,
     AbstractSimulated,
     Entry,
+    Quantity,
     Rows,
     Tips,
     Unknowns,
@@ -59,7 +60,7 @@ class Artefact(AbstractObservation):
         READINGS,
         Entry("point", "point of the artefact that held the tip", dimensions=("pose",), content="text", required=True),
         Entry("names", "point of the artefact", dimensions=("names",), content="text", required=True),
-        Entry("coordinates", "certified coordinates", "mm", ("names", "axis"), required=True),
+        Entry("coordinates", "certified coordinates", "mm", ("names", "axis"), required=True, uncertainty="u"),
         Entry("u", "standard uncertainty of a coordinate", "mm"),
         Entry("artefact", "name of the artefact", content="text"),
         Entry("placement", "name of its placement", content="text"),
@@ -153,6 +154,12 @@ class Artefact(AbstractObservation):
         if self.free:
             found[self.shape] = ("mm",) * self.coordinates.size
         return found
+
+    def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
+        if part != self.shape:
+            return super().quantities(part, values)
+        rows = zip(self.names, values.reshape(-1, 3), strict=True)
+        return tuple(Quantity(f"coordinates of {name}", row, "mm") for name, row in rows)
 
     @property
     def fixes_scale(self) -> bool:

@@ -53,6 +53,16 @@ class Entry(NamedTuple):
     dimensions: tuple[str, ...] = ()  # of an array: the first is "pose" where there is a row for each pose
     content: Literal["number", "text", "truth"] = "number"
     required: bool = False
+    uncertainty: str = ""  # of a certified value: name of the entry with its standard uncertainty
+
+
+class Quantity(NamedTuple):
+    """A quantity in words: what is certified or stated of an observation, or a part of the geometry that was found."""
+
+    says: str
+    values: Float[np.ndarray, " k"]
+    unit: str  # mm, rad, or 1
+    u: float | None = None  # standard uncertainty of a certified value; 0 where it is taken as exact
 
 
 READINGS = Entry("q", "joint angle as read", "rad", ("pose", "joint"), required=True)
@@ -90,6 +100,11 @@ class AbstractObservation(eqx.Module):
     def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
         """Unknowns that have a certified value: the values, and their standard uncertainties."""
         return {}
+
+    def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
+        """A part of the unknown geometry as a person reads it; a kind whose numbers need another form says so itself,
+        such as a plane with its normal."""
+        return quantities_by_unit(self.unknowns[part], values)
 
     @abc.abstractmethod
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
@@ -143,6 +158,46 @@ class AbstractObservation(eqx.Module):
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         """Raise `InputError` where nearly right tips (mm) cannot determine the unknown geometry."""
+
+
+def quantities_by_unit(units: Sequence[str], values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
+    """Positions, rotations and frames, told by the units of their numbers; other numbers as they are, unit by unit."""
+    if tuple(units) == FRAME:
+        return (Quantity("position of the origin", values[3:], "mm"), Quantity("rotation vector", values[:3], "rad"))
+    if tuple(units) == POINT:
+        return (Quantity("position", values, "mm"),)
+    if tuple(units) == FRAME[:3]:
+        return (Quantity("rotation vector", values, "rad"),)
+    kinds = dict.fromkeys(units)
+    return tuple(Quantity("value", values[[one == unit for one in units]], unit) for unit in kinds)
+
+
+def certified_quantities(observation: AbstractObservation) -> tuple[Quantity, ...]:
+    """What is certified of the artefact of an observation, by the entries of its kind: the values of its certificate,
+    one quantity for each row of a table such as the coordinates of points."""
+    stored, found = observation.stored(), []
+    for entry in observation.entries:
+        if not entry.uncertainty or entry.name not in stored:
+            continue
+        values, u = np.asarray(stored[entry.name]), float(stored.get(entry.uncertainty, 0.0))
+        if values.ndim < 2:
+            found.append(Quantity(entry.says, np.atleast_1d(values), entry.unit, u))
+        else:
+            rows = zip(stored[entry.dimensions[0]], values, strict=True)
+            found += [Quantity(f"{entry.says} of {name}", row, entry.unit, u) for name, row in rows]
+    return tuple(found)
+
+
+def stated_quantities(observation: AbstractObservation) -> tuple[Quantity, ...]:
+    """What else was stated of an observation as a whole, where it is not zero: the diameter of a stylus, an u."""
+    stored, entries = observation.stored(), observation.entries
+    certified = {name for entry in entries if entry.uncertainty for name in (entry.name, entry.uncertainty)}
+    numbers = (entry for entry in entries if entry.content == "number" and not entry.dimensions)
+    return tuple(
+        Quantity(entry.says, np.atleast_1d(np.asarray(stored[entry.name])), entry.unit)
+        for entry in numbers
+        if entry.name in stored and entry.name not in certified and float(stored[entry.name]) != 0
+    )
 
 
 def offset_of(target: str) -> str:

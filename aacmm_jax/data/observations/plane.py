@@ -18,6 +18,7 @@ from .observation import (
     AbstractObservation,
     AbstractSimulated,
     Entry,
+    Quantity,
     Rows,
     Tips,
     Unknowns,
@@ -74,6 +75,9 @@ class Plane(AbstractObservation):
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.place: PLANE}
 
+    def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
+        return _normal_and_distance(values)
+
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
         return {self.place: fitted_plane(tips.position)}
 
@@ -111,7 +115,7 @@ class ParallelPlanes(AbstractObservation):
     entries: ClassVar[tuple[Entry, ...]] = (
         READINGS,
         Entry("side", "plane that was touched: one or other", dimensions=("pose",), content="text", required=True),
-        Entry("distance", "certified distance between the planes", "mm", required=True),
+        Entry("distance", "certified distance between the planes", "mm", required=True, uncertainty="u"),
         Entry("u", "standard uncertainty of the distance", "mm"),
         Entry("stylus", "diameter of the tip's ball", "mm"),
         Entry("inside", "whether the ball was between the planes", content="truth"),
@@ -120,12 +124,14 @@ class ParallelPlanes(AbstractObservation):
     )
     rows: ClassVar[int] = 1
     q: Float[AnyArray, "m n"]
-    distance: Float[AnyArray, ""]  # of the tip's centres, mm
+    distance: Float[AnyArray, ""]  # mm
+    stylus: Float[AnyArray, ""]  # mm
     u: Float[AnyArray, ""]
     form: Float[AnyArray, ""]
     name: str = eqx.field(static=True)
     target: str = eqx.field(static=True)
     second: tuple[bool, ...] = eqx.field(static=True)  # whether a pose is on the second plane; these come last
+    inside: bool = eqx.field(static=True)
     free: bool = eqx.field(static=True)  # whether the distance is an unknown with a certified value
 
     def __init__(
@@ -148,9 +154,9 @@ class ParallelPlanes(AbstractObservation):
             raise InputError(f"{where} have {sides[0].shape[1]} and {sides[1].shape[1]} columns; give one a joint.")
         self.q = namespace(*sides).concatenate(sides)
         self.second = (False,) * sides[0].shape[0] + (True,) * sides[1].shape[0]
-        ball = checked_scalar(f"stylus of {where}", stylus)
-        between = checked_scalar(f"distance of {where}", distance, positive=True)
-        self.distance = between - ball if inside else between + ball
+        self.stylus = checked_scalar(f"stylus of {where}", stylus)
+        self.distance = checked_scalar(f"distance of {where}", distance, positive=True)
+        self.inside = bool(inside)
         self.u = checked_scalar(f"u of {where}", u)
         self.form = checked_scalar(f"form of {where}", form)
         self.target = checked_target(target)
@@ -161,8 +167,12 @@ class ParallelPlanes(AbstractObservation):
         """Name of the first of the unknown planes."""
         return f"plane {self.name}"
 
+    @property
+    def between(self) -> Float[AnyArray, ""]:
+        """Certified distance of the tip's centres on both planes, mm."""
+        return self.distance - self.stylus if self.inside else self.distance + self.stylus
+
     def stored(self) -> dict[str, Any]:
-        # The distance of the tip's centres has taken up the ball.
         sides = np.where(self.second, "other", "one")
         return super().stored() | {"side": sides}
 
@@ -189,13 +199,16 @@ class ParallelPlanes(AbstractObservation):
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.place: PLANE} | ({self.separation: ("mm",)} if self.free else {})
 
+    def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
+        return _normal_and_distance(values) if part == self.place else super().quantities(part, values)
+
     @property
     def fixes_scale(self) -> bool:
         return True
 
     @property
     def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
-        return {self.separation: (self.distance[None], self.u[None])} if self.free else {}
+        return {self.separation: (self.between[None], self.u[None])} if self.free else {}
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
         xp, k = namespace(tips), self.first
@@ -203,7 +216,7 @@ class ParallelPlanes(AbstractObservation):
         centres = [xp.mean(side, axis=1, keepdims=True) for side in sides]
         both = xp.concatenate([side - centre for side, centre in zip(sides, centres, strict=True)], axis=1)
         start = fitted_plane(both + centres[0])
-        return {self.place: start} | ({self.separation: self.distance[None]} if self.free else {})
+        return {self.place: start} | ({self.separation: self.between[None]} if self.free else {})
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         height, normal, by_plane = heights(tips.position, unknowns[self.place])
@@ -212,7 +225,7 @@ class ParallelPlanes(AbstractObservation):
         other = np.array(self.second)
         # The normal may point either way; which way the other plane is follows from the tips.
         side = xp.where(xp.mean(height[k:]) >= xp.mean(height[:k]), 1.0, -1.0) * xp.asarray(other.astype(float))
-        distance = unknowns[self.separation][0] if self.free else self.distance
+        distance = unknowns[self.separation][0] if self.free else self.between
         by_unknowns = {self.place: by_plane[:, None]}
         if self.free:
             by_unknowns[self.separation] = -side[None, None]
@@ -224,6 +237,11 @@ class ParallelPlanes(AbstractObservation):
         sides = [tips[:, :k], tips[:, k:]]
         both = np.concatenate([side - side.mean(axis=1, keepdims=True) for side in sides], axis=1)
         check_plane(f"planes '{self.name}'", both)
+
+
+def _normal_and_distance(values: Float[np.ndarray, " 3"]) -> tuple[Quantity, ...]:
+    normal = np.asarray(rotation_matrix(np.append(values[:2], 0.0)))[:, 2]
+    return (Quantity("normal", normal, "1"), Quantity("distance from the origin", values[2:], "mm"))
 
 
 def _each(normal: Float[AnyArray, " 3"], poses: int) -> Float[AnyArray, "1 3 m"]:

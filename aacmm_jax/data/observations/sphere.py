@@ -54,13 +54,14 @@ class Sphere(AbstractObservation):
     table: ClassVar[str] = "touched_sphere"
     entries: ClassVar[tuple[Entry, ...]] = (
         READINGS,
-        Entry("diameter", "certified diameter", "mm"),
+        Entry("diameter", "certified diameter", "mm", uncertainty="u"),
         Entry("u", "standard uncertainty of the diameter", "mm"),
         Entry("stylus", "diameter of the tip's ball", "mm"),
         TARGET,
     )
     q: Float[AnyArray, "m n"]
-    radius: Float[AnyArray, ""] | None  # of the tip's centre, mm
+    diameter: Float[AnyArray, ""] | None  # mm
+    stylus: Float[AnyArray, ""]  # mm
     u: Float[AnyArray, ""]  # of the radius, mm
     name: str = eqx.field(static=True)
     target: str = eqx.field(static=True)
@@ -82,12 +83,17 @@ class Sphere(AbstractObservation):
         self.q = checked_readings(where, q)
         self.target = checked_target(target)
         self.u = checked_scalar(f"u of {where}", u) / 2
-        ball = checked_scalar(f"stylus of {where}", stylus)
-        self.radius = None if diameter is None else (checked_scalar(f"diameter of {where}", diameter) + ball) / 2
+        self.stylus = checked_scalar(f"stylus of {where}", stylus)
+        self.diameter = None if diameter is None else checked_scalar(f"diameter of {where}", diameter)
         exact = is_exact(self.u)
         known = self.radius is not None and is_concrete(self.radius)
         self.point = known and exact and float(self.radius) == 0  # pyright: ignore[reportArgumentType]
         self.free = self.radius is None or not exact
+
+    @property
+    def radius(self) -> Float[AnyArray, ""] | None:
+        """Certified distance of the tip's centre from the centre, mm."""
+        return None if self.diameter is None else (self.diameter + self.stylus) / 2
 
     @property
     def rows(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -109,9 +115,7 @@ class Sphere(AbstractObservation):
         return {self.centre: POINT} | ({self.size: ("mm",)} if self.free else {})
 
     def stored(self) -> dict[str, Any]:
-        # The radius of the tip's centre has taken up the ball; twice and half of a number are exact.
-        size = {} if self.radius is None else {"diameter": 2 * self.radius}
-        return {"q": self.q, **size, "u": 2 * self.u, "target": self.target}
+        return super().stored() | {"u": 2 * self.u}  # twice and half of a number are exact
 
     @property
     def fixes_scale(self) -> bool:

@@ -1,0 +1,98 @@
+"""Residuals of a calibration pose by pose, in mm and in standard deviations, with the weights of its last solve."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.numpy_or_jax import to_numpy
+from ..data.capture import Capture
+from ..data.observations.observation import AbstractObservation
+from ..kinematics.parameters import Parameters
+from ..model.observed import Linear, Observed, linear_rows, whitening_of
+from ..uncertainty import observed_covariance as propagation
+from .evaluation import Evaluation
+from .record import CalibrationRecord
+
+_POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
+
+
+class ObservationResiduals(NamedTuple):
+    """How far the poses of one observation are from its geometry."""
+
+    observation: AbstractObservation
+    distance: Float[np.ndarray, " m"]  # mm
+    angle: Float[np.ndarray, " m"] | None  # rad; None where no orientation was measured
+    # Root mean square over the pose's rows in standard deviations: about 1, whatever the kind.
+    normalised: Float[np.ndarray, " m"]
+    weight: Float[np.ndarray, " m"]  # below 1 where a robust loss took weight from the pose
+    u: float  # standard uncertainty of a coordinate or distance that was measured, RMS over the poses, mm
+    u_angle: float | None  # of an orientation about each axis, rad
+
+
+def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResiduals, ...]:
+    """The residuals of a calibration from observations, or with a robust loss; sockets first, in the capture's order.
+
+    Arm, geometry and the standard deviations of the rows are those of its last solve, so that the root mean square of
+    ``normalised`` over an observation is its ``reduced_chi``.
+
+    Args:
+        record: The calibration.
+
+    Returns:
+        One for each observation; none where the record has no `ObservedMetrics`.
+    """
+    metrics = record.observed
+    if metrics is None:
+        return ()
+    capture, arm = record.recording.capture, to_numpy(record.calibrated.arm)
+    observed, space = Observed.of(capture), Parameters(arm, record.names)
+    vector = np.asarray(space.vector())
+    geometry = np.concatenate([np.asarray(metrics.geometry[part]) for part in observed.blocks])
+    z = np.concatenate([vector, geometry])
+    linear = linear_rows(space, observed, z)
+    errors = propagation.arm_errors(observed.forward(space, vector, geometry), linear, observed)
+    noise, sigma = to_numpy(record.given_noise), np.asarray(metrics.sigma)
+    of_arm = [
+        propagation.covariance_of_sigma(error, sigma)
+        if noise is None
+        else propagation.covariance_of_noise(error, noise)
+        for error in errors
+    ]
+    roots = whitening_of(linear, observed, of_arm, np.maximum(1e-4 * sigma, 1e-12)).roots
+    return tuple(
+        _residuals(observation, part, np.asarray(root), np.asarray(weight))
+        for observation, part, root, weight in zip(observed.observations, linear, roots, metrics.weights, strict=True)
+    )
+
+
+def _residuals(
+    observation: AbstractObservation, linear: Linear, root: Float[np.ndarray, "m r r"], weight: Float[np.ndarray, " m"]
+) -> ObservationResiduals:
+    values = np.asarray(linear.rows.values)
+    white = np.einsum("mab,bm->am", root, values)
+    variances = np.diagonal(np.asarray(linear.rows.measured), axis1=1, axis2=2)
+    turned = values.shape[0] > _POSITION_ROWS
+    return ObservationResiduals(
+        observation=observation,
+        distance=np.linalg.norm(values[:_POSITION_ROWS], axis=0),
+        angle=np.linalg.norm(values[_POSITION_ROWS:], axis=0) if turned else None,
+        normalised=np.sqrt(np.mean(white**2, axis=0)),
+        weight=weight,
+        u=float(np.sqrt(np.mean(variances[:, :_POSITION_ROWS]))),
+        u_angle=float(np.sqrt(np.mean(variances[:, _POSITION_ROWS:]))) if turned else None,
+    )
+
+
+def distances_of(capture: Capture, evaluation: Evaluation) -> tuple[Float[np.ndarray, " m"], ...]:
+    """Distances of all poses from their geometry in an evaluation, mm: of each socket, then of each observation."""
+    if evaluation.observed is not None:
+        rows = (np.asarray(values)[:_POSITION_ROWS] for values in evaluation.observed.residuals)
+        return tuple(np.linalg.norm(values, axis=0) for values in rows)
+    return tuple(np.split(np.asarray(evaluation.distances), np.cumsum(capture.sizes)[:-1]))
+
+
+def rms(values: Sequence[float] | Float[np.ndarray, " m"]) -> float:
+    """Root mean square; NaN of nothing."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")

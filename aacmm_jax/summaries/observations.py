@@ -1,0 +1,158 @@
+"""Observations as plain dictionaries with the unit in every key: what they are, how they agree, the geometry found."""
+
+from typing import Any
+
+import numpy as np
+
+from ..calibration.evaluation import Evaluation
+from ..calibration.observation_residuals import (
+    ObservationResiduals,
+    distances_of,
+    observation_residuals,
+    rms,
+)
+from ..calibration.record import REPEATABILITY, CalibrationRecord
+from ..data.capture import Capture
+from ..data.observations.observation import (
+    POINT,
+    AbstractObservation,
+    Quantity,
+    certified_quantities,
+    offset_of,
+    quantities_by_unit,
+    stated_quantities,
+)
+from ..model.observed import Observed
+
+_LITTLE_WEIGHT = 0.5
+
+
+def capture_observations(capture: Capture) -> list[dict[str, Any]]:
+    """What a capture holds besides sockets and lengths: unknowns of each observation, and what is certified of it."""
+    return [
+        {
+            "observation": one.name,
+            "kind": one.kind,
+            "poses": len(one.q),
+            "target": one.target,
+            "unknowns": list(_parts(one)),
+            "certified": [_row(quantity) for quantity in certified_quantities(one)],
+            "stated": [_row(quantity) for quantity in stated_quantities(one)],
+            "fixes_scale": bool(one.fixes_scale),
+        }
+        for one in capture.observations
+    ]
+
+
+def _parts(observation: AbstractObservation) -> dict[str, tuple[str, ...]]:
+    """The unknown geometry of an observation, with the place of its target in the last frame."""
+    target = {offset_of(observation.target): POINT} if observation.target else {}
+    return {**observation.unknowns, **target}
+
+
+def _row(quantity: Quantity) -> dict[str, Any]:
+    values = np.asarray(quantity.values, dtype=float).tolist()
+    return {"quantity": quantity.says, "values": values, "unit": quantity.unit, "u": quantity.u}
+
+
+def scale_sources(record: CalibrationRecord) -> list[str]:
+    """What the scale of the calibrated arm comes from: reference lengths and observations, by their names; none where
+    it is that of the nominal arm."""
+    capture = record.recording.capture
+    if record.method == REPEATABILITY or record.scale_set_by:
+        return []
+    lengths = ["the reference lengths"] if capture.lengths else []
+    return lengths + [f"{one.name} ({one.kind})" for one in capture.observations if one.fixes_scale]
+
+
+def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str, Any]:
+    """How each observation and each kind agree, the geometry found, poses that lost weight, and poses not calibrated
+    with; ``nominal`` is the evaluation of the nominal arm, with the geometry that fits it best."""
+    found: dict[str, Any] = {
+        "robust": record.robust,
+        "scale_from": scale_sources(record),
+        "observations": [],
+        "kinds": [],
+        "geometry": [],
+        "less_weight": [],
+    }
+    observed, others = record.observed, record.others
+    if observed is not None:
+        residuals = observation_residuals(record)
+        before = distances_of(record.recording.capture, nominal)
+        pairs = list(zip(residuals, before, strict=True))
+        found["observations"] = [
+            {"observation": one.observation.name, "kind": one.observation.kind, "target": one.observation.target}
+            | _agreement([(one, distances)])
+            for one, distances in pairs
+        ]
+        for kind in dict.fromkeys(one.observation.kind for one in residuals):
+            of_kind = [pair for pair in pairs if pair[0].observation.kind == kind]
+            found["kinds"].append({"kind": kind, "observations": len(of_kind)} | _agreement(of_kind))
+        found["geometry"] = _geometry(record.recording.capture, observed.geometry)
+        found["less_weight"] = less_weight(residuals)
+    if others is not None:
+        angles = [None if np.isnan(angle) else float(angle) for angle in others.rms_angle]
+        found["other_poses"] = {
+            "poses": int(others.poses.sum()),
+            "rms_mm": others.rms_of_all,
+            "observations": [
+                {"observation": name, "poses": int(poses), "rms_mm": float(distance), "rms_angle_rad": angle}
+                for name, poses, distance, angle in zip(others.names, others.poses, others.rms, angles, strict=True)
+            ],
+        }
+    return found
+
+
+def _agreement(pairs: list[tuple[ObservationResiduals, np.ndarray]]) -> dict[str, Any]:
+    """Root mean squares of some observations together, by the nominal and by the calibrated arm."""
+    residuals = [one for one, _ in pairs]
+    angles = [one.angle for one in residuals if one.angle is not None]
+    rows = np.concatenate([np.full(len(one.distance), one.observation.rows) for one in residuals])
+    squares = np.concatenate([one.normalised for one in residuals]) ** 2
+    return {
+        "poses": len(rows),
+        "rms_before_mm": rms(np.concatenate([distances for _, distances in pairs])),
+        "rms_after_mm": rms(np.concatenate([one.distance for one in residuals])),
+        "rms_angle_rad": rms(np.concatenate(angles)) if angles else None,
+        "reduced_chi": float(np.sqrt(np.average(squares, weights=rows))),
+    }
+
+
+def _geometry(capture: Capture, geometry: dict[str, Any]) -> list[dict[str, Any]]:
+    """Every part of the geometry with its numbers, in words too, and with the values certified of it."""
+    observed, found = Observed.of(capture), {}
+    certified = observed.certified()
+    for observation in observed.observations:
+        for part, units in _parts(observation).items():
+            values = np.asarray(geometry[part])
+            own = part in observation.unknowns
+            quantities = observation.quantities(part, values) if own else quantities_by_unit(units, values)
+            value, u = certified.get(part, (None, None))
+            found[part] = {
+                "part": part,
+                "units": list(units),
+                "values": values.tolist(),
+                "quantities": [_row(quantity) for quantity in quantities],
+                "certified": None if value is None else np.asarray(value).tolist(),
+                "certified_u": None if u is None else np.asarray(u).tolist(),
+            }
+    return [found[part] for part in observed.blocks]
+
+
+def less_weight(residuals: tuple[ObservationResiduals, ...]) -> list[dict[str, Any]]:
+    """Poses that a robust loss took half of their weight from or more, the lightest first, with their residuals, which
+    are the reason."""
+    rows = [
+        {
+            "observation": one.observation.name,
+            "pose": int(i) + 1,
+            "weight": float(one.weight[i]),
+            "residual_mm": float(one.distance[i]),
+            "residual_angle_rad": None if one.angle is None else float(one.angle[i]),
+            "normalised": float(one.normalised[i]),
+        }
+        for one in residuals
+        for i in np.flatnonzero(one.weight <= _LITTLE_WEIGHT)
+    ]
+    return sorted(rows, key=lambda row: (row["weight"], -row["normalised"]))
