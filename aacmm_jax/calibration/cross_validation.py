@@ -65,7 +65,7 @@ def _observed_parts(capture: Capture) -> list[tuple[Capture, Capture, tuple[str,
     if len(groups) > 1:
         every = [name for group in groups for name in group]
         return [
-            (_part(capture, tuple(name for name in every if name not in group)), _part(capture, group), group)
+            (part_of(capture, tuple(name for name in every if name not in group)), part_of(capture, group), group)
             for group in groups
         ]
     if capture.sizes or any(len(o.q) < _REGIONS * _POSES_A_REGION for o in capture.observations):
@@ -151,18 +151,19 @@ def cross_validate(
         return CrossValidation(tuple(_left_out(arm, *part, bounds, noise) for part in parts))
     found = []
     for group in groups_of(capture):
-        rest = _part(capture, tuple(name for name in capture.names if name not in group))
+        rest = part_of(capture, tuple(name for name in capture.names if name not in group))
         result = calibrate(arm, rest, bounds, method=method, hold=hold, noise=noise, check_identifiability=False)
-        left = _part(capture, group)
+        left = part_of(capture, group)
         found.append(_evaluated(uncertainty_of(result), left, group, bool(result.converged)))
     return CrossValidation(tuple(found))
 
 
-def _part(capture: Capture, names: tuple[str, ...]) -> Capture:
-    """Sockets by their exact names, which `Capture.select` would take for patterns."""
+def part_of(capture: Capture, names: tuple[str, ...]) -> Capture:
+    """Sockets and observations by their exact names, which `Capture.select` would take for patterns."""
     lengths = [length for length in capture.lengths if length.start in names and length.end in names]
     others = [observation for observation in capture.observations if observation.name in names]
-    return Capture({name: q for name, q in capture.sockets.items() if name in names}, lengths, others)
+    sockets = {name: q for name, q in capture.sockets.items() if name in names}
+    return Capture(sockets, lengths, others, sessions=capture.sessions)
 
 
 def _left_out(

@@ -82,6 +82,7 @@ def calibration(summary: dict[str, Any]) -> None:
         )
     print_warnings(console, summary)
     _validated(console, summary["cross_validation"])
+    _sessions(console, summary.get("sessions"))
     _observed(console, summary)
     stages = ("nominal", "stage1", "calibrated")
     title = "\nOn the poses it was identified from [mm]"
@@ -147,6 +148,18 @@ def _observed(console: Console, summary: dict[str, Any]) -> None:
         angles = [row for row in found["observations"] if row["rms_angle_rad"] is not None]
         for row in angles:
             console.print(f"Orientation of {escape(row['observation'])}: RMS {row['rms_angle_rad'] / DEG:.4f} deg.")
+
+
+def _sessions(console: Console, rows: list[dict[str, Any]] | None) -> None:
+    """Each session in the calibration of all, beside what it reaches alone; files of earlier versions do not say."""
+    if not rows:
+        return
+    title = "\nSessions, RMS distance of poses from their geometry [mm]"
+    table = new_table(title, "session", "poses", "together", "alone")
+    for row in rows:
+        numbers = (formatted(row["rms_mm"]), formatted(row["rms_alone_mm"]))
+        table.add_row(escape(row["session"]), str(row["poses"]), *numbers)
+    print_table(console, table)
 
 
 def _of_geometry(row: dict[str, Any]) -> list[str]:

@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 
-from ..calibration.record import CalibrationRecord, OtherPoses
+from ..calibration.record import CalibrationRecord, OtherPoses, Removed
 from ..calibration.results import ObservedMetrics
 from ..data.capture import Capture
 from ..model.observed import Observed
@@ -28,7 +28,54 @@ def observed_tables(record: CalibrationRecord) -> dict[str, Table]:
                 rms_angle=(others.rms_angle, "rad", "their root mean square angle"),
             )
         )
+    if record.removed:
+        found["removed"] = _removed_table(record.removed)
     return found
+
+
+def _removed_table(removed: tuple[Removed, ...]) -> Table:
+    members = [(i, name) for i, one in enumerate(removed) for name in one.members]
+    by_group = columns(
+        "removed_group",
+        removed_group=([one.group for one in removed], "", "group left out, because it contradicts the rest"),
+        kind=([one.kind for one in removed], "", "kind of group"),
+        ratio=([one.ratio for one in removed], "1", "F: mean square that it added, over that of the rest"),
+        numerator=([one.degrees_of_freedom[0] for one in removed], "1", "degrees of freedom of the numerator"),
+        denominator=([one.degrees_of_freedom[1] for one in removed], "1", "degrees of freedom of the denominator"),
+        probability=([one.probability for one in removed], "1", "probability of this F where nothing is wrong"),
+        rms_with=([one.rms_with for one in removed], "mm", "RMS distance of the rest from its geometry"),
+        rms_without=([one.rms_without for one in removed], "mm", "the same without the group"),
+        changed_most=([one.changed_most for one in removed], "", "parameter that changed most"),
+        change=([one.change for one in removed], "1", "its change in standard uncertainties"),
+    )
+    by_member = columns(
+        "removed_member",
+        removed_member=([name for _, name in members], "", "socket or observation left out"),
+        group_number=([i for i, _ in members], "1", "which group it is of, from 0"),
+    )
+    return Table(by_group | by_member)
+
+
+def removed_of(stored: Stored) -> tuple[Removed, ...]:
+    """What a calibration left out because it contradicts the rest."""
+    table = stored.tables.get("removed")
+    if table is None:
+        return ()
+    return tuple(
+        Removed(
+            kind=str(table["kind"][i]),
+            group=str(group),
+            members=tuple(map(str, table["removed_member"][table["group_number"] == i])),
+            ratio=float(table["ratio"][i]),
+            degrees_of_freedom=(int(table["numerator"][i]), int(table["denominator"][i])),
+            probability=float(table["probability"][i]),
+            rms_with=float(table["rms_with"][i]),
+            rms_without=float(table["rms_without"][i]),
+            changed_most=str(table["changed_most"][i]),
+            change=float(table["change"][i]),
+        )
+        for i, group in enumerate(table["removed_group"])
+    )
 
 
 def _tables_of(observed: ObservedMetrics, units: dict[str, tuple[str, ...]]) -> dict[str, Table]:

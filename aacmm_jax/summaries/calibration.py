@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.contradictions import session_metrics
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import CrossValidation, ObservedMetrics, active_names
@@ -191,6 +192,14 @@ def calibration_summary(
 def observed_summary(record: CalibrationRecord) -> dict[str, Any]:
     """How each observation agrees, the geometry found, poses that lost weight, and poses not calibrated with."""
     found: dict[str, Any] = {"robust": record.robust, "observations": [], "geometry": [], "less_weight": []}
+    found["sessions"] = [
+        {"session": session, "poses": poses, "rms_mm": together, "rms_alone_mm": alone}
+        for session, (poses, together, alone) in session_metrics(record).items()
+    ]
+    found["removed"] = [
+        removed._asdict() | {"members": list(removed.members), "degrees_of_freedom": list(removed.degrees_of_freedom)}
+        for removed in record.removed
+    ]
     observed, others = record.observed, record.others
     if observed is not None:
         columns = (observed.rms_before, observed.rms_after, observed.reduced_chi)
