@@ -31,7 +31,7 @@ class Cause(NamedTuple):
     """An error of one group alone that explains why it contradicts the others."""
 
     names: tuple[str, ...]  # the joint's zero, or the three coordinates of the probe
-    values: Float[np.ndarray, " k"]  # by which they differ there, rad or mm
+    values: Float[np.ndarray, " k"]  # what they are there, less what they are for the others, rad or mm
     share: float  # of the contradiction that this explains
     ratio: float  # F of these unknowns
 
@@ -65,9 +65,11 @@ def groupings(capture: Capture) -> dict[str, dict[str, str | None]]:
         kinds[kind] = dict.fromkeys(names) | {o.name: getattr(o, kind, None) for o in capture.observations}
     kinds["target"] = {name: label or None for name, label in kinds["target"].items()}
     placed = {o.name: getattr(o, "placement", None) for o in capture.observations}
-    placed |= {name: name.rpartition("/")[0] or name for name in names if name in sockets}
-    kinds["socket" if len(sockets) == len(names) else "observation"] = {name: name for name in names}
-    kinds["placement"] = placed
+    alone = len(sockets) == len(names)
+    placed |= {name: name.rpartition("/")[0] or (name if alone else None) for name in sockets}
+    each: dict[str, str | None] = {name: name for name in names}
+    # Of equal divisions the first is kept, and it is named in the words of a user.
+    kinds |= {"socket": each, "placement": placed} if alone else {"placement": placed, "observation": each}
     found: dict[str, dict[str, str | None]] = {}
     seen: set[frozenset[frozenset[str]]] = set()
     for kind, labels in kinds.items():
@@ -178,7 +180,7 @@ def _cause(equations: Equations, members: Sequence[str]) -> Cause | None:
         gain, variance = whole.cost - fitted.cost, max(fitted.cost / max(fitted.degrees_of_freedom, 1), 1e-300)
         if added == len(names) and gain > _EXPLAINS * contradicted and (best is None or gain > 1.05 * best[0]):
             indices = [equations.extra.index(name) for name in names]
-            values = -fitted.step[-added:] * equations.steps[indices]
+            values = fitted.step[-added:] * equations.steps[indices]
             best = gain, Cause(names, values, gain / contradicted, gain / added / variance)
     return None if best is None else best[1]
 

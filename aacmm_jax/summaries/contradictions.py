@@ -74,7 +74,7 @@ def _as_if(cause: Cause | None, group: str = "it") -> str:
     if cause.names == PROBE:
         return f"In {group}, the probe seems to be elsewhere by {_offset(cause)}. "
     joint = cause.names[0].removeprefix("theta_")
-    return f"In {group}, joint {joint} seems to read {cause.values[0] / DEG:+.3g} deg more. "
+    return f"In {group}, joint {joint} seems to read {-cause.values[0] / DEG:+.3g} deg more. "
 
 
 def _offset(cause: Cause) -> str:

@@ -32,6 +32,7 @@ from ..uncertainty.observed_identifiability import dense_rows
 
 _BETTER = 4.0  # the factor by which a correction must reduce the residual to be named
 _SMALL = 0.05  # of the arm's size: a larger residual is left by an arm that the data do not belong to
+_NOMINAL = 0.005  # of the arm's size: a smaller residual is what a nominal arm leaves
 _POSES, _OBSERVATIONS = 60, 24  # of which as many as these are looked at
 _TURN = 2 * np.pi * 1.02  # rad; readings of few joints go further
 _ROUNDS = 4  # Gauss-Newton steps of the geometry
@@ -44,7 +45,13 @@ _MEASURED: dict[type[AbstractObservation], str] = {
     Distances: "values",
     Sphere: "radius",
 }
-_UNITS = {"m": M, "um": UM, "inches": INCH, "cm": 10.0}
+_UNITS = {
+    "measured values in m are taken for mm": M,
+    "measured values in cm are taken for mm": 10.0,
+    "measured values in inches are taken for mm": INCH,
+    "measured values in um are taken for mm, or those in mm for m": UM,
+    "measured values in mm are taken for inches": 1 / INCH,
+}
 _MIRRORED = "left-handed: two columns are exchanged, or one has the wrong sign"
 
 
@@ -67,10 +74,15 @@ def likely_cause(arm: Arm, capture: Capture) -> str:
     arm, capture = to_numpy((arm, capture))
     with np.errstate(all="ignore"):
         misfit = _OfObservations.by(arm, capture) if capture.observations else _OfSockets(arm, capture)
-        given = misfit.rms(misfit.given)
-        tried = ((misfit.rms(each), each.cause) for each in misfit.corrections())
-        rms, cause = min(tried, default=(np.inf, ""))
-    if not rms < min(given / _BETTER, _SMALL * total_link_length(arm)):
+        given, size = misfit.rms(misfit.given), total_link_length(arm)
+        if given < _NOMINAL * size:
+            return ""
+        rms, cause = np.inf, ""
+        for tried in misfit.corrections():
+            found = misfit.rms(tried)
+            if found < 0.98 * rms:  # of equally good corrections, the first
+                rms, cause = found, tried.cause
+    if not rms < min(given / _BETTER, _SMALL * size):
         return ""
     return (
         f"Likely cause: {cause}. Corrected, the residuals by the nominal arm fall from {given:.3g} to {rms:.3g} mm RMS."
@@ -118,7 +130,13 @@ class _OfObservations(NamedTuple):
         q, observations = np.asarray(self.observed.q), self.observed.observations
         yield from _readings(q)
         concerned = [i for i, one in enumerate(observations) if type(one) in _MEASURED]
-        for several in dict.fromkeys([tuple(concerned), *((i,) for i in concerned)]):
+        alike: dict[tuple[str, str], list[int]] = {}
+        for i in concerned:
+            for label in ("kind", "station", "artefact"):
+                alike.setdefault((label, str(getattr(observations[i], label, i))), []).append(i)
+        for several in dict.fromkeys([tuple(concerned), *map(tuple, alike.values()), *((i,) for i in concerned)]):
+            if not several:
+                continue
             corrected = [list(_measured(observations[i])) for i in several]
             for cause in dict.fromkeys(text for of in corrected for text, _ in of):
                 changed = list(observations)
@@ -149,7 +167,10 @@ class _OfObservations(NamedTuple):
                 roots = tuple(_roots(part.rows.values.shape, lever) for part in linear)
                 dense, values = dense_rows(linear, roots, len(z))
                 poses = sum(part.rows.values.shape[1] for part in linear)
-                best = min(best, float(np.sqrt(np.sum(values**2) / poses)))
+                found = float(np.sqrt(np.sum(values**2) / poses))
+                if not found < 0.95 * best:
+                    break
+                best = found
                 by = (dense[:, 1:] * observed.steps)[:, free]
                 z[1:][free] -= np.linalg.lstsq(by, values, rcond=1e-10)[0] * observed.steps[free]
         except np.linalg.LinAlgError:
@@ -205,9 +226,8 @@ def _measured(observation: AbstractObservation) -> Iterator[tuple[str, AbstractO
     def changed(new: np.ndarray, field: str = name) -> Any:
         return eqx.tree_at(lambda o: getattr(o, field), observation, new)
 
-    for unit, factor in _UNITS.items():
-        yield f"measured values in {unit} are taken for mm", changed(values * factor)
-        yield f"measured values in mm are taken for {unit}", changed(values / factor)
+    for cause, factor in _UNITS.items():
+        yield cause, changed(values * factor)
     if values.shape[1:] != (3,):
         return
     yield f"measured coordinates are {_MIRRORED}", changed(values * [1, 1, -1])
@@ -224,7 +244,7 @@ def _measured(observation: AbstractObservation) -> Iterator[tuple[str, AbstractO
 def _order_says(order: tuple[int, ...], signs: tuple[int, ...]) -> str:
     if order == (0, 1, 2):
         wrong = [axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0]
-        return f"measured {' and '.join(wrong)} of positions have the wrong sign, but not their orientations"
+        return f"the signs of measured positions are wrong in {' and '.join(wrong)}"
     return f"the columns of positions are in the order {' '.join('xyz'[i] for i in np.argsort(order))}"
 
 
