@@ -171,7 +171,6 @@ def calibrate(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", IdentifiabilityWarning)  # the summary says it
 
-
             def solved(part: Any) -> Any:
                 options = solving | {"robust": robust, "max_steps": max_steps}
                 return _solved(bounds, part, scale, method, options, strict)
