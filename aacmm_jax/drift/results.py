@@ -54,14 +54,11 @@ class Drift(NamedTuple):
 
     def findings(self) -> list[str]:
         """What was found: of all parameters together, of each, of lengths, and of parameters without uncertainty."""
-        sentences = (
-            _of_probe(self),
-            _of_all(self),
-            _of_each(self),
-            _of_lengths(self),
-            _of_scale(self.lengths),
-            _of_undetermined(self),
-        )
+        probe = self.joint_test.probe
+        together = (_of_all(self), _of_probe(self))
+        together = together[::-1] if probe is not None and probe.remounted else together
+        lengths = (_of_lengths(self), _of_scale(self.lengths))
+        sentences = (*together, _of_each(self), *lengths, _of_undetermined(self))
         return [sentence for sentence in sentences if sentence]
 
 

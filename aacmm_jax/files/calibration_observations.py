@@ -1,6 +1,7 @@
 """What a calibration file holds of observations: how they agree, the geometry found, and poses that lost weight."""
 
 import os
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from ..calibration.record import CalibrationRecord, OtherPoses, Removed
 from ..calibration.results import ObservedMetrics
 from ..data.capture import Capture
 from ..model.observed import Observed
-from .hdf5 import Stored, Table, check_sense, columns, need, numbering
+from .hdf5 import Stored, Table, Variable, check_sense, columns, need, numbering
 
 
 def observed_tables(record: CalibrationRecord) -> dict[str, Table]:
@@ -110,6 +111,7 @@ def _tables_of(observed: ObservedMetrics, units: dict[str, tuple[str, ...]]) -> 
                 unit=([units[name][i] for name, i, _ in numbers], "", "unit"),
                 value=([float(value) for *_, value in numbers], "mm or rad, see unit", "value"),
             )
+            | {"covariance": Variable(("entry",), _flat(observed), "products of units", "of each part, row by row")}
         ),
         "pose_weights": Table(
             numbering("pose", len(weights))
@@ -119,6 +121,21 @@ def _tables_of(observed: ObservedMetrics, units: dict[str, tuple[str, ...]]) -> 
                 weight=([float(weight) for _, weight in weights], "1", "weight; below 1 by a robust loss"),
             )
         ),
+    }
+
+
+def _flat(observed: ObservedMetrics) -> np.ndarray:
+    """The covariances of all parts, one after the other."""
+    found = [np.asarray(matrix).ravel() for matrix in observed.geometry_covariance.values()]
+    return np.concatenate(found) if found else np.zeros(0)
+
+
+def _covariances(geometry: Mapping[str, np.ndarray], flat: np.ndarray) -> dict[str, np.ndarray]:
+    """Of each part, from all of them."""
+    ends = np.cumsum([len(values) ** 2 for values in geometry.values()], dtype=int)
+    pieces = np.split(flat, ends[:-1]) if len(ends) else []
+    return {
+        name: piece.reshape(len(values), -1) for (name, values), piece in zip(geometry.items(), pieces, strict=True)
     }
 
 
@@ -135,6 +152,11 @@ def observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> Ob
     attributes = stored.table_attributes["observed"]
     blocks = Observed.of(capture).blocks
     ends = np.cumsum(table["poses"])
+    values = {name: geometry["value"][parts == name] for name in dict.fromkeys(parts.tolist())}
+    size = sum(len(part) ** 2 for part in values.values())
+    # Files of earlier development versions have none.
+    flat = geometry.get("covariance", np.full(size, np.nan))
+    check_sense(path, {"the covariance of its geometry has another size": len(flat) != size})
     found = ObservedMetrics(
         names=tuple(map(str, table["observation"])),
         kinds=tuple(map(str, table["kind"])),
@@ -143,7 +165,8 @@ def observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> Ob
         reduced_chi=table["reduced_chi"],
         reduced_chi_of_all=np.asarray(attributes["reduced_chi_of_all"]),
         sigma=np.asarray(attributes["sigma_mm"]),
-        geometry={name: geometry["value"][parts == name] for name in dict.fromkeys(parts.tolist())},
+        geometry=values,
+        geometry_covariance=_covariances(values, flat),
         weights=tuple(np.split(weights["weight"], ends[:-1])),
     )
     expected = (*capture.names, *(observation.name for observation in capture.observations))

@@ -9,6 +9,7 @@ from ..calibration.contradictions import session_metrics
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import CrossValidation, ObservedMetrics, active_names
+from ..core.rotations import inverse_frame
 from ..data.capture import Capture, ReferenceLength
 from ..data.recording import Recording
 from ..kinematics.arm import is_length
@@ -217,9 +218,15 @@ def observed_summary(record: CalibrationRecord) -> dict[str, Any]:
         ]
         units = Observed.of(record.recording.capture).blocks
         found["geometry"] = [
-            {"part": part, "units": list(units[part]), "values": np.asarray(values).tolist()}
+            {
+                "part": part,
+                "units": list(units[part]),
+                "values": np.asarray(values).tolist(),
+                "u": _known(np.sqrt(np.diag(observed.geometry_covariance[part]))),
+            }
             for part, values in observed.geometry.items()
         ]
+        found["base"] = _base_rows(record, observed)
         found["less_weight"] = less_weight(observed)
     if others is not None:
         angles = [None if np.isnan(angle) else float(angle) for angle in others.rms_angle]
@@ -232,6 +239,29 @@ def observed_summary(record: CalibrationRecord) -> dict[str, Any]:
             ],
         }
     return found
+
+
+def _known(u: np.ndarray) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in u]
+
+
+def _base_rows(record: CalibrationRecord, observed: ObservedMetrics) -> list[dict[str, Any]]:
+    """The base frame as seen from each frame with known coordinates (an artefact's, a station's), k = 1."""
+    rows = {}
+    for one in record.recording.capture.observations:
+        part = getattr(one, "frame", None)
+        if part is None or getattr(one, "index", None) is not None:  # a placement on a platform is not in the base
+            continue
+        base, by = inverse_frame(np.asarray(observed.geometry[part]))
+        u = _known(np.sqrt(np.diag(by @ observed.geometry_covariance[part] @ by.T)))
+        rows[part] = {
+            "in": part,
+            "position_mm": base[3:].tolist(),
+            "position_u_mm": u[3:],
+            "rotation_rad": base[:3].tolist(),
+            "rotation_u_rad": u[:3],
+        }
+    return list(rows.values())
 
 
 def less_weight(observed: ObservedMetrics) -> list[dict[str, Any]]:
