@@ -203,10 +203,10 @@ def identify_observed(task: ObservedTask) -> Identification:
     whitening = _whitening(task, state)
     reduced = Bounds(space, *(side[:p] for side in sides))
     active = reduced.active(z[:p])
-    covariance = _covariance(task, space, z, state, whitening, active, steps)
+    covariance, of_geometry = _covariance(task, space, z, state, whitening, active, steps)
     parameters = set_at(task.start, free, z[:p])
     arm = task.bounds.space.arm(parameters)
-    metrics = _metrics(task, before, state, whitening, z[p:])
+    metrics = _metrics(task, before, state, whitening, z[p:], of_geometry)
     return Identification(
         arm=arm,
         parameters=parameters,
@@ -277,7 +277,8 @@ def _covariance(
     whitening: Whitening,
     active: Any,
     steps: Float[AnyArray, " z"],
-) -> ParameterCovariance:
+) -> tuple[ParameterCovariance, Float[AnyArray, "g g"]]:
+    """Of the parameters, and of the geometry."""
     xp, p = namespace(z, task), len(space.names)
     on_bound = xp.concatenate([active != 0, xp.zeros(z.shape[0] - p, dtype=bool)])
     model = observed_model(z, (space, task.observed, whitening, task.loss))
@@ -311,8 +312,11 @@ def _covariance(
         matrix = propagation.propagated(
             state.linear, state.errors, rows, whitening, inverse, relations, noise, np.array(task.pose)
         )
-    matrix = matrix[:p, :p] * steps[:p, None] * steps[None, :p]
-    return ParameterCovariance(matrix, determined[:p], lost[:p, :p], noise)
+    matrix = matrix * steps[:, None] * steps[None, :]
+    # What the data leave open of the geometry (the turn of a ball bar about itself) has no uncertainty.
+    known = determined[p:]
+    of_geometry = xp.where(known[:, None] & known[None, :], matrix[p:, p:], np.nan)
+    return ParameterCovariance(matrix[:p, :p], determined[:p], lost[:p, :p], noise), of_geometry
 
 
 def _weighted_rows(loss: Loss, state: State, whitening: Whitening, rows: list[Any]) -> list[Any]:
@@ -342,7 +346,12 @@ def _expanded(covariance: ParameterCovariance, free: np.ndarray, size: int) -> P
 
 
 def _metrics(
-    task: ObservedTask, before: State, after: State, whitening: Whitening, geometry: Float[AnyArray, " g"]
+    task: ObservedTask,
+    before: State,
+    after: State,
+    whitening: Whitening,
+    geometry: Float[AnyArray, " g"],
+    covariance: Float[AnyArray, "g g"],
 ) -> tuple[Repeatability, Repeatability, ObservedMetrics]:
     """Repeatability of the sockets, and how far each observation is from its geometry."""
     xp, observed = namespace(geometry, after.sigma), task.observed
@@ -364,6 +373,10 @@ def _metrics(
         reduced_chi_of_all=xp.sqrt(total / degrees_of_freedom),
         sigma=after.sigma,
         geometry=observed.split(geometry),
+        geometry_covariance={
+            name: covariance[rows[0] : rows[-1] + 1, rows[0] : rows[-1] + 1]
+            for name, rows in observed.positions.items()
+        },
         weights=tuple(weights),
     )
     sockets = [i for i, kind in enumerate(metrics.kinds) if kind == "socket"]

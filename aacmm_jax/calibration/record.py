@@ -40,6 +40,21 @@ class OtherPoses(NamedTuple):
         return float(np.sqrt(np.sum(self.poses[known] * self.rms[known] ** 2) / max(self.poses[known].sum(), 1)))
 
 
+class Removed(NamedTuple):
+    """What a calibration left out because it contradicts the rest, why, and what that changed."""
+
+    kind: str  # "socket", "placement", "station", ...
+    group: str
+    members: tuple[str, ...]  # names of its sockets and observations
+    ratio: float  # F: mean square that it added, over that of the rest
+    degrees_of_freedom: tuple[int, int]
+    probability: float  # of this ratio or a larger one, where nothing is wrong
+    rms_with: float  # root mean square distance of the rest from its geometry, mm
+    rms_without: float  # the same without the group
+    changed_most: str  # parameter
+    change: float  # of it, in standard uncertainties before
+
+
 class CalibrationRecord(NamedTuple):
     """Everything a calibration file holds. Arrays are NumPy's, in mm and rad, in the order of ``names``."""
 
@@ -74,6 +89,7 @@ class CalibrationRecord(NamedTuple):
     observed: ObservedMetrics | None = None  # where there are observations besides sockets, or a robust loss
     robust: str | None = None  # the robust loss
     others: OtherPoses | None = None
+    removed: tuple[Removed, ...] = ()
 
     @property
     def given_noise(self) -> Noise | None:

@@ -125,6 +125,7 @@ class ObservedMetrics(eqx.Module):
     reduced_chi_of_all: Float[AnyArray, ""]  # over the degrees of freedom of all
     sigma: Float[AnyArray, ""]  # standard deviation of a tip coordinate, mm, estimated from the residuals
     geometry: dict[str, Float[AnyArray, " _"]]  # part of the unknown geometry -> its numbers, mm and rad
+    geometry_covariance: dict[str, Float[AnyArray, "_ _"]]  # of the numbers of each part
     weights: tuple[Float[AnyArray, " _"], ...]  # of every pose; less than 1 where a robust loss takes weight from it
 
 

@@ -119,6 +119,13 @@ def calibrate(
         bool,
         typer.Option("--strict", help="Refuse free parameters that such data could not determine even without noise."),
     ] = False,
+    remove_contradicting: Annotated[
+        bool,
+        typer.Option(
+            "--remove-contradicting",
+            help="Leave out a socket, placement or station that contradicts all others, and say what that changed.",
+        ),
+    ] = False,
     figure: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Plot the residual of every pose: PNG, SVG or PDF by the name.")
     ] = None,
@@ -160,14 +167,21 @@ def calibrate(
             "hold": None if hold == "none" else hold,
             "noise": _noise(encoder_arcsec, seating_mm),
         }
-        capture_used = recording.capture
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", IdentifiabilityWarning)  # the summary says it
-            result = with_spinner("Calibrating", lambda: _solved(
-                bounds, capture_used, scale, method,
-                solving | {"robust": robust, "max_steps": max_steps}, strict,
-            ))  # fmt: skip
+
+            def solved(part: Any) -> Any:
+                options = solving | {"robust": robust, "max_steps": max_steps}
+                return _solved(bounds, part, scale, method, options, strict)
+
+            result = with_spinner("Calibrating", lambda: solved(recording.capture))
             record = record_of(result, recording, robust=robust, others=others)
+            if remove_contradicting:
+                from ..calibration.contradictions import remove_contradicting as removed
+
+                record = with_spinner("Comparing groups", lambda: removed(record, solved))
+                result = solved(record.recording.capture) if record.removed and monte_carlo else result
+            recording, capture_used = record.recording, record.recording.capture
             alike = scale == "measured" and robust is None and not capture_used.observations
             if cross_validate or (
                 cross_validate is None

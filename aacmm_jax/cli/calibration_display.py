@@ -92,6 +92,7 @@ def calibration(summary: dict[str, Any]) -> None:
         )
     print_warnings(console, summary)
     _validated(console, summary["cross_validation"])
+    _sessions(console, summary.get("sessions"))
     _observed(console, summary)
     stages = ("nominal", "stage1", "calibrated")
     title = "\nOn the poses it was identified from [mm]"
@@ -141,6 +142,7 @@ def _observed(console: Console, summary: dict[str, Any]) -> None:
         hidden = len(summary["geometry"]) - len(parts[:_MOST_PARTS])
         if hidden:
             console.print(f"{pluralise(hidden, 'more part')} of the geometry, positions of sockets too: --json.")
+    _base(console, summary)
     if summary["robust"]:
         rows = summary["less_weight"]
         console.print(f"Robust loss {summary['robust']}: {pluralise(len(rows), 'pose')} with half the weight or less.")
@@ -159,6 +161,36 @@ def _observed(console: Console, summary: dict[str, Any]) -> None:
         angles = [row for row in found["observations"] if row["rms_angle_rad"] is not None]
         for row in angles:
             console.print(f"Orientation of {escape(row['observation'])}: RMS {row['rms_angle_rad'] / DEG:.4f} deg.")
+
+
+def _base(console: Console, summary: dict[str, Any]) -> None:
+    """Where the base is in each frame of known coordinates, with its expanded uncertainty."""
+    rows = summary.get("base")
+    if not rows:
+        return
+    factor = summary["uncertainty"]["coverage_factor_95"]
+    table = new_table("\nBase frame as seen from frames with known coordinates, U (95 %)", "in", "", "x", "y", "z")
+    for row in rows[:_MOST_PARTS]:
+        for what, key, of_u, unit in (
+            ("position [mm]", "position_mm", "position_u_mm", 1.0),
+            ("rotation vector [deg]", "rotation_rad", "rotation_u_rad", 1 / DEG),
+        ):
+            pairs = zip(row[key], row[of_u], strict=True)
+            cells = [f"{unit * x:.4f}" + ("" if u is None else f" ± {factor * unit * u:.4f}") for x, u in pairs]
+            table.add_row(escape(row["in"]) if key == "position_mm" else "", what, *cells)
+    print_table(console, table)
+
+
+def _sessions(console: Console, rows: list[dict[str, Any]] | None) -> None:
+    """Each session in the calibration of all, beside what it reaches alone; files of earlier versions do not say."""
+    if not rows:
+        return
+    title = "\nSessions, RMS distance of poses from their geometry [mm]"
+    table = new_table(title, "session", "poses", "together", "alone")
+    for row in rows:
+        numbers = (formatted(row["rms_mm"]), formatted(row["rms_alone_mm"]))
+        table.add_row(escape(row["session"]), str(row["poses"]), *numbers)
+    print_table(console, table)
 
 
 def _validated(console: Console, found: dict[str, Any] | None) -> None:

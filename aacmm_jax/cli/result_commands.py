@@ -59,7 +59,7 @@ def evaluate(
         typer.Option(
             metavar="[jjf|asme|iso]",
             help="Run the acceptance tests of JJF 1408, ASME B89.4.22 or ISO 10360-12; repeatable. Default: those of "
-            "the standard that the capture was made for, of --mpe, and of all for a manifest of points."
+            "the standard that the capture was made for, of --mpe, and of all for a manifest of points.",
         ),
     ] = None,
     test_u_mm: Annotated[

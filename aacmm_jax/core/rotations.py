@@ -52,6 +52,17 @@ def rotation_derivative(w: Float[AnyArray, " 3"]) -> Float[AnyArray, "3 3"]:
     return namespace(w).asarray(np.eye(3)) + cosine * skew + cubic * (skew @ skew)
 
 
+def inverse_frame(frame: Float[AnyArray, " 6"]) -> tuple[Float[AnyArray, " 6"], Float[AnyArray, "6 6"]]:
+    """The outer frame as seen in the given one, and the derivatives of its six numbers by those of the given one."""
+    xp, rotation, origin = namespace(frame), rotation_matrix(frame[:3]).T, frame[3:]
+    identity, none = xp.asarray(np.eye(3)), xp.zeros((3, 3))
+    by_rotation = -rotation @ _skew(origin) @ rotation_derivative(frame[:3])
+    derivative = xp.concatenate(
+        [xp.concatenate([-identity, none], axis=1), xp.concatenate([by_rotation, -rotation], axis=1)]
+    )
+    return xp.concatenate([-frame[:3], -rotation @ origin]), derivative
+
+
 def rotation_vector(matrix: Float[AnyArray, "3 3"]) -> Float[AnyArray, " 3"]:
     """The rotation vector of a matrix, of length pi at most; by its quaternion (Shepperd 1978)."""
     xp, r = namespace(matrix), matrix

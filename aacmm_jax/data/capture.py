@@ -100,6 +100,7 @@ class Capture(eqx.Module):
         lengths: Reference lengths between these sockets, or one.
         observations: What else ties the tip down (`data.observations`): measured points, spheres, planes, artefacts.
         repeated: Copies that were left out of these data before.
+        sessions: Names of the sessions of `join_sessions`; what belongs to one is named ``session/name``.
 
     Raises:
         InputError: For names that are empty or longer than a line, readings that are not finite or look like degrees,
@@ -112,6 +113,7 @@ class Capture(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
     repeated: Repeated = eqx.field(static=True)
+    sessions: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -119,6 +121,7 @@ class Capture(eqx.Module):
         lengths: Iterable[ReferenceLength] | ReferenceLength = (),
         observations: Iterable[AbstractObservation] | AbstractObservation = (),
         repeated: Repeated = NOTHING_REPEATED,
+        sessions: Iterable[str] = (),
     ):
         if not isinstance(sockets, Mapping):
             raise InputError(
@@ -165,6 +168,19 @@ class Capture(eqx.Module):
         self.repeated = Repeated(
             tuple((name, count) for name, count in poses.items() if count), (*repeated.lengths, *copies)
         )
+        self.sessions = tuple(dict.fromkeys(checked_name(session, "a session") for session in sessions))
+        for name in (*self.names, *(o.name for o in self.observations)) if self.sessions else ():
+            self.session_of(name)
+
+    def session_of(self, name: str) -> str:
+        """The session of a socket or observation, by its name; `InputError` where it belongs to none."""
+        found = [session for session in self.sessions if name.startswith(f"{session}/")]
+        if not found:
+            raise InputError(
+                f"'{name}' is in none of the sessions {shorten(self.sessions)}; name it session/name, as join_sessions "
+                "does."
+            )
+        return max(found, key=len)
 
     @property
     def joints(self) -> int:
@@ -224,7 +240,8 @@ class Capture(eqx.Module):
             tuple((start, end) for start, end in self.repeated.lengths if start in kept and end in kept),
         )
         others = [observation for observation in self.observations if observation.name in kept]
-        return Capture({name: sockets[name] for name in self.names if name in kept}, lengths, others, repeated=repeated)
+        chosen = {name: sockets[name] for name in self.names if name in kept}
+        return Capture(chosen, lengths, others, repeated=repeated, sessions=self.sessions)
 
 
 def part_of(capture: Capture, names: Collection[str]) -> Capture:
@@ -232,7 +249,8 @@ def part_of(capture: Capture, names: Collection[str]) -> Capture:
     reference lengths between them."""
     lengths = [length for length in capture.lengths if length.start in names and length.end in names]
     others = [observation for observation in capture.observations if observation.name in names]
-    return Capture({name: q for name, q in capture.sockets.items() if name in names}, lengths, others)
+    sockets = {name: q for name, q in capture.sockets.items() if name in names}
+    return Capture(sockets, lengths, others, sessions=capture.sessions)
 
 
 def check_one_capture(capture: Capture) -> None:
@@ -354,7 +372,7 @@ def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) ->
         ]
         own = f"probe of {session}" if number and own_probe else ""
         observations += [observation.in_session(session, own) for observation in capture.observations]
-    return Capture(sockets, lengths, observations)
+    return Capture(sockets, lengths, observations, sessions=tuple(captures))
 
 
 def stack_captures(captures: Iterable[Capture]) -> Capture:

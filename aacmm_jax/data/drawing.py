@@ -37,5 +37,5 @@ def draw_poses(capture: Capture, count: int, seed: int = 0) -> tuple[Capture, Ca
         others = [observation.select(chosen) for observation, chosen in of_others if chosen]
         known = {*sockets, *(observation.name for observation in others)}
         lengths = [length for length in capture.lengths if {length.start, length.end} <= known]
-        halves.append(Capture(sockets, lengths, others))
+        halves.append(Capture(sockets, lengths, others, sessions=capture.sessions))
     return halves[0], halves[1]

@@ -54,7 +54,11 @@ class Drift(NamedTuple):
 
     def findings(self) -> list[str]:
         """What was found: of all parameters together, of each, of lengths, and of parameters without uncertainty."""
-        sentences = (_of_all(self), _of_each(self), _of_lengths(self), _of_scale(self.lengths), _of_undetermined(self))
+        probe = self.joint_test.probe
+        together = (_of_all(self), _of_probe(self))
+        together = together[::-1] if probe is not None and probe.remounted else together
+        lengths = (_of_lengths(self), _of_scale(self.lengths))
+        sentences = (*together, _of_each(self), *lengths, _of_undetermined(self))
         return [sentence for sentence in sentences if sentence]
 
 
@@ -105,10 +109,29 @@ def _of_all(drift: Drift) -> str:
     if test.p >= 1 - drift.level:
         return f"{start} no more than their uncertainties explain ({law}, {probability})."
     causes = [f"{name} by {in_words(name, amount)}" for name, amount in test.causes]
+    arm = "the arm has changed" if test.probe is None or not test.probe.remounted else "its probe has been remounted"
     few = f" A change of these alone would explain all of it: {', '.join(causes)}." if causes else ""
     return (
-        f"{start} more than their uncertainties explain ({law}, {probability}): the arm has changed, or there are "
+        f"{start} more than their uncertainties explain ({law}, {probability}): {arm}, or there are "
         f"errors that the uncertainties leave out.{few}"
+    )
+
+
+def _of_probe(drift: Drift) -> str:
+    """Whether the probe was remounted, or the arm has changed; empty where nothing has, or the probe is not tested."""
+    test, probe = drift.joint_test, drift.joint_test.probe
+    if probe is None:
+        return ""
+    share = 100 * (1 - probe.statistic / test.statistic)
+    change = ", ".join(f"{name} by {in_words(name, value)}" for name, value in probe.change)
+    if not probe.remounted:
+        return f"Not only the probe has changed: a remounted probe would explain {share:.0f} % of the changes."
+    start = f"Probe remounted: a change of the probe alone ({change}) explains {share:.0f} % of the changes, and"
+    if not probe.p < 1 - drift.level:
+        return f"{start} chance the rest, so the arm has not changed."
+    return (
+        f"{start} the rest ({probe.statistic:.0f} with {probe.rank} degrees of freedom) is more than the uncertainties "
+        "explain: errors outside the model, or a small change of the arm."
     )
 
 

@@ -14,10 +14,24 @@ from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from ..kinematics.arm import is_length
 from ..uncertainty.arm_uncertainty import Uncertainty
 
+PROBE = ("probe_x", "probe_y", "probe_z")
+_REMOUNTED_LEVEL, _REMOUNTED_SHARE = 1e-3, 0.67  # probability by chance; least share of the change that it explains
+_PROBE_POSES = 60
 FIXED, ON_BOUND = "fixed", "on a bound"  # reasons for which a parameter takes no part in the joint test
 _OPEN = 1e-5  # a combination with a larger component along open directions is not determined: see `uncertainty`
 _MOST_CAUSES = 4
 _SINGULAR = 1e-12  # relative to the largest eigenvalue of a correlation matrix: below, a combination has no variance
+
+
+class ProbeTest(NamedTuple):
+    """The hypothesis that only the probe changed, against none (the joint test) and against all parameters."""
+
+    statistic: float  # left of the joint test's after the probe has changed as fits best
+    rank: int
+    p: float  # of what is left, by chance
+    ratio: float  # F: what the probe explains for each coordinate, over what is left for each combination
+    change: tuple[tuple[str, float], ...]  # coordinates of the probe, with their changes, mm
+    remounted: bool
 
 
 class JointTest(NamedTuple):
@@ -31,6 +45,7 @@ class JointTest(NamedTuple):
     # If chance does not explain the statistic: the fewest parameters whose change alone would, found one by one, with
     # their changes (mm, rad); empty if a few do not suffice.
     causes: tuple[tuple[str, float], ...]
+    probe: ProbeTest | None = None  # where chance does not explain the statistic
 
 
 class LengthChange(NamedTuple):
@@ -137,7 +152,61 @@ def joint_test(
     columns = root.T @ determined.T  # whitened change for a change of each parameter by one step
     causes = _causes(whitened, columns, lambda remaining, fitted: probability(remaining, fitted) >= 1 - level)
     named = tuple((tested[i], float(amount * steps[i])) for i, amount in causes)
-    return JointTest(statistic, rank, degrees_of_freedom, probability(statistic, 0), tested, named)
+    p = probability(statistic, 0)
+    probe = None
+    if p < 1 - level:
+        of_probe = columns @ (_changes_of_probe(new, tested) / steps[:, None])
+        probe = _probe_test(whitened, of_probe, columns, probability)
+    return JointTest(statistic, rank, degrees_of_freedom, p, tested, named, probe)
+
+
+def _changes_of_probe(record: CalibrationRecord, names: tuple[str, ...]) -> Float[np.ndarray, "p 3"]:
+    """Changes of the compared parameters for one of each coordinate of the probe, 1 a mm.
+
+    A coordinate that is fixed shows in what moves the tips most like it (a_6 where alpha_6 turns about the same axis).
+    """
+    arm, q = to_numpy((record.calibrated.arm, np.asarray(record.recording.capture.readings)))
+    q = q[np.unique(np.linspace(0, len(q) - 1, _PROBE_POSES).astype(int))]
+    every = (*names, *(name for name in PROBE if name not in names))
+    by = np.moveaxis(np.asarray(arm.jacobian(q, every)), -1, 0).reshape(len(every), -1).T
+    steps = np.where([is_length(name) for name in names], 1.0, 1e-3)
+    found = np.zeros((len(names), 3))
+    for i, name in enumerate(PROBE):
+        if name in names:
+            found[names.index(name), i] = 1.0
+        else:
+            alike = np.linalg.lstsq(by[:, : len(names)] * steps, by[:, every.index(name)], rcond=1e-6)[0]
+            found[:, i] = alike * steps
+    return found
+
+
+def _probe_test(
+    whitened: Float[np.ndarray, " r"],
+    of_probe: Float[np.ndarray, "r 3"],
+    columns: Float[np.ndarray, "r p"],
+    probability: Callable[[float, int], float],
+) -> ProbeTest | None:
+    """Whether a change of the probe explains nearly all, and better than that of any one parameter would.
+
+    What is left may be more than chance explains: errors outside the model change with the poses of a calibration. A
+    probe was remounted where it explains several times as much for each unknown (F against what is left).
+    """
+
+    def left_by(which: Float[np.ndarray, "r k"]) -> tuple[float, int, np.ndarray]:
+        factors, _, known, _ = np.linalg.lstsq(which, whitened, rcond=1e-9)
+        return float(np.sum((whitened - which @ factors) ** 2)), int(known), factors
+
+    total = float(np.sum(whitened**2))
+    left, known, factors = left_by(of_probe)
+    spare = len(whitened) - known
+    if known == 0 or spare < 1:
+        return None
+    others = min(left_by(columns[:, [i]])[0] for i in range(columns.shape[1]))
+    ratio = (total - left) / known / max(left / spare, 1e-300)
+    significant = f_tail(ratio, known, spare) < _REMOUNTED_LEVEL
+    remounted = significant and total - left > _REMOUNTED_SHARE * total and left < others
+    change = tuple(zip(PROBE, map(float, factors), strict=True))
+    return ProbeTest(left, spare, probability(left, known), ratio, change, remounted)
 
 
 def _causes(

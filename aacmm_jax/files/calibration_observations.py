@@ -1,14 +1,15 @@
 """What a calibration file holds of observations: how they agree, the geometry found, and poses that lost weight."""
 
 import os
+from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.record import CalibrationRecord, OtherPoses
+from ..calibration.record import CalibrationRecord, OtherPoses, Removed
 from ..calibration.results import ObservedMetrics
 from ..data.capture import Capture
 from ..model.observed import Observed
-from .hdf5 import Stored, Table, check_sense, columns, need, numbering
+from .hdf5 import Stored, Table, Variable, check_sense, columns, need, numbering
 
 
 def observed_tables(record: CalibrationRecord) -> dict[str, Table]:
@@ -28,7 +29,54 @@ def observed_tables(record: CalibrationRecord) -> dict[str, Table]:
                 rms_angle=(others.rms_angle, "rad", "their root mean square angle"),
             )
         )
+    if record.removed:
+        found["removed"] = _removed_table(record.removed)
     return found
+
+
+def _removed_table(removed: tuple[Removed, ...]) -> Table:
+    members = [(i, name) for i, one in enumerate(removed) for name in one.members]
+    by_group = columns(
+        "removed_group",
+        removed_group=([one.group for one in removed], "", "group left out, because it contradicts the rest"),
+        kind=([one.kind for one in removed], "", "kind of group"),
+        ratio=([one.ratio for one in removed], "1", "F: mean square that it added, over that of the rest"),
+        numerator=([one.degrees_of_freedom[0] for one in removed], "1", "degrees of freedom of the numerator"),
+        denominator=([one.degrees_of_freedom[1] for one in removed], "1", "degrees of freedom of the denominator"),
+        probability=([one.probability for one in removed], "1", "probability of this F where nothing is wrong"),
+        rms_with=([one.rms_with for one in removed], "mm", "RMS distance of the rest from its geometry"),
+        rms_without=([one.rms_without for one in removed], "mm", "the same without the group"),
+        changed_most=([one.changed_most for one in removed], "", "parameter that changed most"),
+        change=([one.change for one in removed], "1", "its change in standard uncertainties"),
+    )
+    by_member = columns(
+        "removed_member",
+        removed_member=([name for _, name in members], "", "socket or observation left out"),
+        group_number=([i for i, _ in members], "1", "which group it is of, from 0"),
+    )
+    return Table(by_group | by_member)
+
+
+def removed_of(stored: Stored) -> tuple[Removed, ...]:
+    """What a calibration left out because it contradicts the rest."""
+    table = stored.tables.get("removed")
+    if table is None:
+        return ()
+    return tuple(
+        Removed(
+            kind=str(table["kind"][i]),
+            group=str(group),
+            members=tuple(map(str, table["removed_member"][table["group_number"] == i])),
+            ratio=float(table["ratio"][i]),
+            degrees_of_freedom=(int(table["numerator"][i]), int(table["denominator"][i])),
+            probability=float(table["probability"][i]),
+            rms_with=float(table["rms_with"][i]),
+            rms_without=float(table["rms_without"][i]),
+            changed_most=str(table["changed_most"][i]),
+            change=float(table["change"][i]),
+        )
+        for i, group in enumerate(table["removed_group"])
+    )
 
 
 def _tables_of(observed: ObservedMetrics, units: dict[str, tuple[str, ...]]) -> dict[str, Table]:
@@ -63,6 +111,7 @@ def _tables_of(observed: ObservedMetrics, units: dict[str, tuple[str, ...]]) -> 
                 unit=([units[name][i] for name, i, _ in numbers], "", "unit"),
                 value=([float(value) for *_, value in numbers], "mm or rad, see unit", "value"),
             )
+            | {"covariance": Variable(("entry",), _flat(observed), "products of units", "of each part, row by row")}
         ),
         "pose_weights": Table(
             numbering("pose", len(weights))
@@ -72,6 +121,21 @@ def _tables_of(observed: ObservedMetrics, units: dict[str, tuple[str, ...]]) -> 
                 weight=([float(weight) for _, weight in weights], "1", "weight; below 1 by a robust loss"),
             )
         ),
+    }
+
+
+def _flat(observed: ObservedMetrics) -> np.ndarray:
+    """The covariances of all parts, one after the other."""
+    found = [np.asarray(matrix).ravel() for matrix in observed.geometry_covariance.values()]
+    return np.concatenate(found) if found else np.zeros(0)
+
+
+def _covariances(geometry: Mapping[str, np.ndarray], flat: np.ndarray) -> dict[str, Any]:
+    """Of each part, from all of them."""
+    ends = np.cumsum([len(values) ** 2 for values in geometry.values()], dtype=int)
+    pieces = np.split(flat, ends[:-1]) if len(ends) else []
+    return {
+        name: piece.reshape(len(values), -1) for (name, values), piece in zip(geometry.items(), pieces, strict=True)
     }
 
 
@@ -88,6 +152,11 @@ def observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> Ob
     attributes = stored.table_attributes["observed"]
     blocks = Observed.of(capture).blocks
     ends = np.cumsum(table["poses"])
+    values: dict[str, Any] = {name: geometry["value"][parts == name] for name in dict.fromkeys(parts.tolist())}
+    size = sum(len(part) ** 2 for part in values.values())
+    # Files of earlier development versions have none.
+    flat = geometry.get("covariance", np.full(size, np.nan))
+    check_sense(path, {"the covariance of its geometry has another size": len(flat) != size})
     found = ObservedMetrics(
         names=tuple(map(str, table["observation"])),
         kinds=tuple(map(str, table["kind"])),
@@ -96,7 +165,8 @@ def observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> Ob
         reduced_chi=table["reduced_chi"],
         reduced_chi_of_all=np.asarray(attributes["reduced_chi_of_all"]),
         sigma=np.asarray(attributes["sigma_mm"]),
-        geometry={name: geometry["value"][parts == name] for name in dict.fromkeys(parts.tolist())},
+        geometry=values,
+        geometry_covariance=_covariances(values, flat),
         weights=tuple(np.split(weights["weight"], ends[:-1])),
     )
     expected = (*capture.names, *(observation.name for observation in capture.observations))

@@ -14,7 +14,7 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm, is_length, parameter_names, value_of
 from ..kinematics.parameters import Parameters
 from ..uncertainty.covariance import NOISE_MODELS
-from .calibration_observations import observed_of, observed_tables, other_poses_of
+from .calibration_observations import observed_of, observed_tables, other_poses_of, removed_of
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .hdf5 import (
     Stored,
@@ -165,6 +165,7 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
         observed=observed_of(path, stored, recording.capture),
         robust=attributes.get("robust"),
         others=other_poses_of(stored),
+        removed=removed_of(stored),
     )
 
 

@@ -91,7 +91,11 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
             | numbering("joint", capture.joints)
             | {"angle": Variable(("pose", "joint"), np.asarray(capture.q), "rad", "joint angle as read")}
             | columns("pose", socket=(owner, "", "socket that held the tip")),
-            {"repeated_sockets": [n for n, _ in poses] or None, "repeated_poses": [n for _, n in poses] or None},
+            {
+                "repeated_sockets": [n for n, _ in poses] or None,
+                "repeated_poses": [n for _, n in poses] or None,
+                "sessions": list(capture.sessions) or None,
+            },
         ),
         "reference": reference_table(capture.lengths)._replace(
             attributes={
@@ -180,7 +184,11 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     try:
         sockets = {name: poses["angle"][owner == name] for name in names}
         capture = Capture(
-            sockets, lengths_of(path, stored), observations_of(path, stored), repeated=_repeated_of(stored)
+            sockets,
+            lengths_of(path, stored),
+            observations_of(path, stored),
+            repeated=_repeated_of(stored),
+            sessions=stored.table_attributes["capture"].get("sessions") or (),
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

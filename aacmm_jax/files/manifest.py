@@ -31,6 +31,7 @@ from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
 from .arms import load_specification
 from .inputs import InputFile, fingerprint
 from .manifest_observations import FIELDS, TABLES, Source, observations
+from .manifest_sessions import in_sessions, session_name
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
 from .text_table import read_numbers
@@ -68,6 +69,7 @@ class _Files(Strict):
 class _Socket(_Files):
     name: str | None = None
     target: str = ""  # another tip than the arm's own probe
+    session: str | None = None
     exclude: list[str] = Field(default_factory=list)
 
     @model_validator(mode="after")
@@ -129,10 +131,17 @@ class _Recorded(Strict):
     sphere: list[_Sphere] = Field(default_factory=list)
 
 
+class _Sessions(Strict):
+    """What differs between the sessions that tables name."""
+
+    probe: Literal["remounted", "same"] = "remounted"
+
+
 class _Poses(_Recorded):
     arm: str
     acceptance: Standard | Annotated[list[Standard], AfterValidator(each_once)] = Field(default_factory=list)
     angles: _Angles | None = None
+    sessions: _Sessions | None = None
 
 
 _Manifest = create_model("_Manifest", __base__=_Poses, **FIELDS)
@@ -145,11 +154,11 @@ class PointsManifest(_Recorded):
 
     @model_validator(mode="after")
     def _own_tip(self) -> "PointsManifest":
-        named = [f"'{entry.name or entry.paths[0]}'" for entry in self.socket if entry.target]
+        named = [f"'{entry.name or entry.paths[0]}'" for entry in self.socket if entry.target or entry.session]
         if named:
             raise ValueError(
-                f"target is for manifests of poses, but socket {named[0]} has points, which say where the tip was; "
-                "leave it out."
+                f"target and session are for manifests of poses, but socket {named[0]} has points, which say where the "
+                "tip was; leave them out."
             )
         return self
 
@@ -171,6 +180,9 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     ``coverage_factor``, ``delimiter``, ``decimal`` and ``skip`` say how they are written, ``group`` names a column that
     divides the table into several observations, and ``preset`` (csv, leica, xyzijk, ipa) fills in what is not stated.
 
+    ``session = "monday"`` in such tables, with fields in braces if needed, or ``columns = { session = "day" }`` for
+    each row, makes sessions of one arm (`data.capture.join_sessions`); names are then ``monday/name``, in lengths too.
+    ``[sessions] probe = "same"`` says that the probe was not remounted between them.
     ``acceptance`` (jjf, asme, iso, or a list) says for which standards' acceptance procedure the poses were taken.
 
     Args:
@@ -212,11 +224,20 @@ def read_manifest(path: str | os.PathLike) -> Recording:
             return _radians(readings, _angles_of(model.angles, unit, preset))
 
         source = Source(path.parent, opened, joints, columns, radians)
-        observations = [*_sockets_of_targets(path.parent, model, sockets), *_observations(model, source)]
+        sessions = _sessions_of(path.parent, model)
+        of_targets = [(sessions.get(one.name, ""), one) for one in _sockets_of_targets(path.parent, model, sockets)]
+        observations = [*of_targets, *_observations(model, source)]
         if not sockets and not observations:
             raise InputError("there is neither a [[socket]] nor another observation; add one.")
         sources = tuple(dict.fromkeys(fingerprint(file, path.parent) for file in files))
-        capture = Capture(sockets, lengths, observations)
+        named = {*sessions.values(), *(session for session, _ in observations)} - {""}
+        if named:
+            remounted = (model.sessions or _Sessions()).probe == "remounted"
+            capture = in_sessions(sessions, sockets, lengths, observations, remounted)
+        elif model.sessions is not None:
+            raise InputError("[sessions] is for tables with a session, but there is none; leave it out.")
+        else:
+            capture = Capture(sockets, lengths, [observation for _, observation in observations])
         return Recording(
             capture,
             nominal,
@@ -250,7 +271,16 @@ def _sockets_of_targets(folder: Path, model: _Poses, sockets: dict[str, np.ndarr
             yield Socket(name, sockets.pop(name), target=entry.target)
 
 
-def _observations(model: _Poses, source: Source) -> Iterator[AbstractObservation]:
+def _sessions_of(folder: Path, model: _Poses) -> dict[str, str]:
+    """The session of each socket that has one."""
+    return {
+        name: session_name(entry.session, values, "[[socket]]")
+        for entry in model.socket
+        for name, _, values in (_expand(folder, entry) if entry.session is not None else ())
+    }
+
+
+def _observations(model: _Poses, source: Source) -> Iterator[tuple[str, AbstractObservation]]:
     for kind in TABLES:
         for entry in getattr(model, kind.table):
             for values in _fields(source.folder, entry, kind.table):
@@ -313,8 +343,9 @@ def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
     for text in (entry.name or "", *entry.paths):
         check_fields(text)
     fields = fields_of(first)
+    of_session = fields_of(getattr(entry, "session", None) or "")
     for what, text in (("name", entry.name or ""), *(("file", file) for file in entry.paths[1:])):
-        if fields_of(text) != fields:
+        if fields_of(text) | (of_session if what == "name" else set()) != fields:
             raise InputError(
                 f"{table} {what} '{text}' has {in_braces(fields_of(text))}, but file '{first}' has "
                 f"{in_braces(fields)}; use the same fields in the name and in every file."
@@ -331,7 +362,8 @@ def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dic
     """Sockets of one entry: name, files and the values of its fields in braces."""
     for values in _fields(folder, entry, "socket"):
         name = Path(entry.paths[0]).stem if entry.name is None else fill(entry.name, values)
-        yield name, [folder / fill(file, values) for file in entry.paths], values
+        session = session_name(entry.session, values, "[[socket]]")
+        yield f"{session}/{name}" if session else name, [folder / fill(file, values) for file in entry.paths], values
 
 
 def _lengths(

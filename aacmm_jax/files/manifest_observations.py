@@ -17,6 +17,7 @@ from ..core.units import ARCSEC, DEG, INCH, UM, M
 from ..data.observations.observation import AbstractObservation, Entry
 from ..data.observations.socket import Socket
 from .inputs import InputFile
+from .manifest_sessions import session_name
 from .observations import kinds
 from .patterns import check_name, fields_of, fill
 from .text_table import Column, TextTable
@@ -86,6 +87,7 @@ class _Table(Strict):
     decimal: Literal[".", ","] = "."
     skip: NonNegativeInt = 0
     group: Column | None = None
+    session: str | None = None  # of all rows; columns.session, of each
 
     @property
     def paths(self) -> list[str]:
@@ -135,8 +137,9 @@ class Source(NamedTuple):
 
 def observations(
     source: Source, kind: type[AbstractObservation], table: Any, values: Mapping[str, str]
-) -> Iterator[AbstractObservation]:
-    """The observations of one table of a manifest, one for each group; ``values`` are those of its fields in braces."""
+) -> Iterator[tuple[str, AbstractObservation]]:
+    """The observations of one table of a manifest, one for each session and group, each with its session, which may be
+    empty; ``values`` are those of its fields in braces."""
     where = f"[[{kind.table}]]"
     if (table.file is None) == (table.files is None):
         raise InputError(f"a table {where} needs either file or files.")
@@ -144,17 +147,20 @@ def observations(
     name = first.stem if table.name is None else fill(table.name, values)
     check_name(name)
     reader = _Reader(source, kind, table, f"{where} '{name}'")
-    found = [reader.read(label, fill(file, values)) for label, file in _files(table)]
-    groups = np.concatenate([group for group, _ in found])
-    by_pose = {key: np.concatenate([rows[key] for _, rows in found]) for key in found[0][1]}
+    session = session_name(table.session, values, where)
+    found = [reader.read(label, fill(file, values), session) for label, file in _files(table)]
+    groups = np.concatenate([group for group, _, _ in found])
+    sessions = np.concatenate([session for _, session, _ in found])
+    by_pose = {key: np.concatenate([rows[key] for *_, rows in found]) for key in found[0][2]}
     stated = reader.stated(values)
     both = sorted(by_pose.keys() & stated.keys())
     if both:
         raise InputError(f"{where} '{name}': {both[0]} is given and also in columns; give it once.")
-    for group in dict.fromkeys(groups.tolist()):
-        rows = {key: value[groups == group] for key, value in by_pose.items()}
+    for session, group in dict.fromkeys(zip(sessions.tolist(), groups.tolist(), strict=True)):
+        chosen = (groups == group) & (sessions == session)
+        rows = {key: value[chosen] for key, value in by_pose.items()}
         reader.check_complete({*rows, *stated})
-        yield kind.rebuilt(f"{name}/{group}" if table.group is not None else name, rows | stated)
+        yield session, kind.rebuilt(f"{name}/{group}" if table.group is not None else name, rows | stated)
 
 
 def _files(table: Any) -> list[tuple[str, str]]:
@@ -171,8 +177,10 @@ class _Reader:
         self._source, self._kind, self._table, self._where = source, kind, table, where
         self._preset = PRESETS[table.preset] if table.preset is not None else Preset({})
         self._entries = {entry.name: entry for entry in kind.entries}
+        if table.session is not None and "session" in table.columns:
+            raise InputError(f"{where}: session is given and also in columns; give it once.")
         for key in (*table.columns, *table.units):
-            if key not in self._entries:
+            if key not in (*self._entries, *({"session"} & table.columns.keys())):
                 raise InputError(f"{where} has no '{key}'{nearest(key, self._entries)}")
         labels = [e for e in kind.entries if e.dimensions == ("pose",) and e.content == "text"]
         self._label = labels[0].name if labels else None
@@ -181,8 +189,8 @@ class _Reader:
         if table.readings is not None and len(table.paths) > 1:
             raise InputError(f"{where} has readings in a file of their own, so it needs one file of values.")
 
-    def read(self, label: str, file: str) -> tuple[np.ndarray, dict[str, Any]]:
-        """The group of each pose of a file, and what its columns hold."""
+    def read(self, label: str, file: str, session: str) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+        """The group and the session of each pose of a file, and what its columns hold."""
         table, source = self._table, self._source
         text = TextTable(
             source.open(source.folder / file), delimiter=table.delimiter, decimal=table.decimal, skip=table.skip
@@ -195,20 +203,22 @@ class _Reader:
         found: dict[str, Any] = {}
         if label:
             chosen.pop(self._label or "", None)
+        of_session = chosen.pop("session", None)
         readings = self._readings(text, chosen.pop("q", None))
         found["q"] = readings
         for key, wanted in chosen.items():
             found[key] = self._column(text, self._entries[key], wanted)
         if label and self._label is not None:
             found[self._label] = np.full(len(readings), label)
-        for key, rows in found.items():
+        sessions = np.full(len(readings), session) if of_session is None else text.texts(of_session[0])
+        for key, rows in (found | {"session": sessions}).items():
             if len(rows) != len(readings):
                 raise InputError(
                     f"{self._where}: {file} has {len(rows)} rows of '{key}', but there are {len(readings)} readings; "
                     "give a row of each for every pose."
                 )
         group = np.full(len(readings), "") if table.group is None else text.texts(table.group)
-        return group, found
+        return group, sessions, found
 
     def _readings(self, text: TextTable, wanted: Sequence[Column] | None) -> np.ndarray:
         source, table = self._source, self._table

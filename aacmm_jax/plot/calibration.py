@@ -1,6 +1,6 @@
 """Figures of a calibration: distances of the poses, parameters and reference lengths, nominal and calibrated."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -252,7 +252,7 @@ def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
     from matplotlib.figure import Figure
 
     found = observation_residuals(record)
-    draw = [pose_distances]
+    draw: list[Callable[..., Any]] = [pose_distances]
     if found:
         draw.append(lambda record, axes: residuals(record, "standard deviations", axes))
     if any(one.angle is not None for one in found):

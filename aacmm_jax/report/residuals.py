@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
+from ..calibration.left_out import CrossValidation, LeftOut
 from ..calibration.observation_residuals import distances_of, rms
-from ..calibration.results import CrossValidation, LeftOut
 from ..data.capture import Capture
 from ..model.metrics import pose_outliers
 from ..summaries.tables import METRICS

@@ -14,8 +14,8 @@ from ..kinematics.arm import is_length
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
-from .validation import cross_validation_summary
 from .observations import capture_observations, observed_summary
+from .validation import cross_validation_summary
 from .warnings import observed, of_calibration, of_capture
 
 _CORRELATED = 0.95

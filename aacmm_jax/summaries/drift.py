@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..drift.results import Drift, Trend
-from ..drift.statistics import LengthChange
+from ..drift.statistics import LengthChange, ProbeTest
 from ..kinematics.arm import is_length
 
 
@@ -33,8 +33,21 @@ def drift_summary(drift: Drift) -> dict[str, Any]:
                 {"parameter": name, "unit": "mm" if is_length(name) else "rad", "change": amount}
                 for name, amount in joint.causes
             ],
+            "probe": None if joint.probe is None else _probe_summary(joint.probe),
         },
         "lengths": lengths_summary(drift.lengths),
+    }
+
+
+def _probe_summary(probe: ProbeTest) -> dict[str, Any]:
+    """Of the hypothesis that only the probe changed."""
+    return {
+        "remounted": bool(probe.remounted),
+        "statistic_left": probe.statistic,
+        "rank": probe.rank,
+        "p": _finite(probe.p),
+        "ratio": probe.ratio,
+        "change_mm": dict(probe.change),
     }
 
 

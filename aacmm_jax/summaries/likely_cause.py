@@ -1,41 +1,261 @@
-"""Why data do not belong to an arm: mistakes in the recording that are tried one by one on the nominal arm."""
+"""Why data do not belong to an arm: mistakes in the recording, tried one by one on the nominal arm.
+
+A mistake is corrected, the unknown geometry fitted to the tips of the nominal arm, and the residuals compared; nothing
+is identified. A nominal arm is a few millimetres off, a mistake some hundred.
+"""
 
 import itertools
 from collections.abc import Iterator
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
+from jaxtyping import Float
 
+from ..core.numpy_or_jax import to_numpy
+from ..core.text import shorten
+from ..core.units import DEG, INCH, UM, M
 from ..data.capture import Capture
+from ..data.observations.artefact import Artefact
+from ..data.observations.distances import Distances
+from ..data.observations.measured_points import MeasuredPoints
+from ..data.observations.measured_transforms import MeasuredTransforms
+from ..data.observations.observation import AbstractObservation
+from ..data.observations.plane import ParallelPlanes
+from ..data.observations.sphere import Sphere
 from ..kinematics.arm import Arm
+from ..kinematics.chain import sines_cosines
+from ..kinematics.parameters import Parameters
+from ..kinematics.workspace import total_link_length
+from ..model.observed import Observed, linear_rows
+from ..uncertainty.observed_identifiability import dense_rows
 
-_BETTER = 4.0  # the factor by which a correction must reduce the scatter of the tips to be named
+_BETTER = 4.0  # the factor by which a correction must reduce the residual to be named
+_SMALL = 0.05  # of the arm's size: a larger residual is left by an arm that the data do not belong to
+_NOMINAL = 0.005  # of the arm's size: a smaller residual is what a nominal arm leaves
+_POSES, _OBSERVATIONS = 60, 24  # of which as many as these are looked at
+_TURN = 2 * np.pi * 1.02  # rad; readings of few joints go further
+_ROUNDS = 4  # Gauss-Newton steps of the geometry
+# Coordinates, radii and distances that a kind measured.
+_MEASURED: dict[type[AbstractObservation], str] = {
+    MeasuredPoints: "points",
+    MeasuredTransforms: "points",
+    Artefact: "coordinates",
+    ParallelPlanes: "distance",
+    Distances: "values",
+    Sphere: "radius",
+}
+_UNITS = {
+    "measured values in m are taken for mm": M,
+    "measured values in cm are taken for mm": 10.0,
+    "measured values in inches are taken for mm": INCH,
+    "measured values in um are taken for mm, or those in mm for m": UM,
+    "measured values in mm are taken for inches": 1 / INCH,
+}
+_MIRRORED = "left-handed: two columns are exchanged, or one has the wrong sign"
+
+
+class _Tried(NamedTuple):
+    cause: str
+    q: Float[np.ndarray, "M n"]
+    observations: tuple[AbstractObservation, ...] | None = None  # None: as given
 
 
 def likely_cause(arm: Arm, capture: Capture) -> str:
-    """The mistake whose correction makes the tips of each socket coincide far better, as a sentence; or nothing."""
-    q = np.asarray(capture.q)
-    given = _scatter(arm, capture, q)
-    scatter, cause = min((_scatter(arm, capture, corrected), cause) for cause, corrected in _corrections(q))
-    return f"Likely cause: {cause}." if scatter < given / _BETTER else ""
+    """The mistake whose correction makes the residuals far smaller, as a sentence; or nothing.
+
+    Args:
+        arm: the nominal arm.
+        capture: sockets and other observations.
+
+    Returns:
+        A sentence, with the root mean square of the residuals by the nominal arm before and after, mm.
+    """
+    arm, capture = to_numpy((arm, capture))
+    with np.errstate(all="ignore"):
+        misfit = _OfObservations.by(arm, capture) if capture.observations else _OfSockets(arm, capture)
+        given, size = misfit.rms(misfit.given), total_link_length(arm)
+        if given < _NOMINAL * size:
+            return ""
+        rms, cause = np.inf, ""
+        for tried in misfit.corrections():
+            found = misfit.rms(tried)
+            if found < 0.98 * rms:  # of equally good corrections, the first
+                rms, cause = found, tried.cause
+    if not rms < min(given / _BETTER, _SMALL * size):
+        return ""
+    return (
+        f"Likely cause: {cause}. Corrected, the residuals by the nominal arm fall from {given:.3g} to {rms:.3g} mm RMS."
+    )
 
 
-def _scatter(arm: Arm, capture: Capture, q: np.ndarray) -> float:
-    """RMS distance of the tips from the centroid of their socket, mm."""
-    tips = np.split(np.asarray(arm.position(q)), np.cumsum(capture.sizes)[:-1])
-    return float(np.sqrt(np.mean(np.concatenate([np.sum((tip - tip.mean(axis=0)) ** 2, axis=1) for tip in tips]))))
+class _OfSockets(NamedTuple):
+    """Sockets, of which there may be thousands."""
+
+    arm: Arm
+    capture: Capture
+
+    @property
+    def given(self) -> _Tried:
+        return _Tried("", np.asarray(self.capture.q))
+
+    def corrections(self) -> Iterator[_Tried]:
+        return _readings(np.asarray(self.capture.q))
+
+    def rms(self, tried: _Tried) -> float:
+        """RMS distance of the tips from the centroid of their socket, mm."""
+        tips = np.split(np.asarray(self.arm.position(tried.q)), np.cumsum(self.capture.sizes)[:-1])
+        centred = np.concatenate([tip - tip.mean(axis=0) for tip in tips if len(tip) > 1] or [np.zeros((1, 3))])
+        return float(np.sqrt(np.mean(np.sum(centred**2, axis=1))))
 
 
-def _corrections(q: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+class _OfObservations(NamedTuple):
+    """Observations of all kinds, a part of them where there are many."""
+
+    arm: Arm
+    observed: Observed
+
+    @classmethod
+    def by(cls, arm: Arm, capture: Capture) -> "_OfObservations":
+        observed = Observed.of(capture)
+        chosen = [observed.observations[i] for i in _evenly(len(observed.observations), _OBSERVATIONS)]
+        part = tuple(one.select(_evenly(one.q.shape[0], _POSES)) for one in chosen)
+        return cls(arm, _replaced(eqx.tree_at(lambda o: o.observations, observed, part), part))
+
+    @property
+    def given(self) -> _Tried:
+        return _Tried("", np.asarray(self.observed.q))
+
+    def corrections(self) -> Iterator[_Tried]:
+        q, observations = np.asarray(self.observed.q), self.observed.observations
+        yield from _readings(q)
+        concerned = [i for i, one in enumerate(observations) if type(one) in _MEASURED]
+        alike: dict[tuple[str, str], list[int]] = {}
+        for i in concerned:
+            for label in ("kind", "station", "artefact"):
+                alike.setdefault((label, str(getattr(observations[i], label, i))), []).append(i)
+        for several in dict.fromkeys([tuple(concerned), *map(tuple, alike.values()), *((i,) for i in concerned)]):
+            if not several:
+                continue
+            corrected = [list(_measured(observations[i])) for i in several]
+            for cause in dict.fromkeys(text for of in corrected for text, _ in of):
+                changed = list(observations)
+                for i, of in zip(several, corrected, strict=True):
+                    changed[i] = dict(of).get(cause, observations[i])
+                names = shorten([observations[i].name for i in several], 3)
+                yield _Tried(f"{cause} ({names})", q, tuple(changed))
+
+    def rms(self, tried: _Tried) -> float:
+        """RMS distance of the tips from the geometry that fits them, mm; an angle counts as the arm's lever makes it.
+
+        What is certified stays as it is stated.
+        """
+        observations = tried.observations
+        if observations is None:
+            parts = zip(self.observed.observations, self.observed.slices, strict=True)
+            observations = tuple(eqx.tree_at(lambda o: o.q, one, tried.q[rows]) for one, rows in parts)
+        observed = _replaced(self.observed, observations)
+        space, lever = Parameters(self.arm, ("d_1",)), total_link_length(self.arm) / 4
+        fixed = {name: np.asarray(value) for name, (value, _) in observed.certified().items()}
+        free = np.concatenate([np.full(len(units), name not in fixed) for name, units in observed.blocks.items()])
+        try:
+            start = observed.split(np.asarray(observed.start(space, np.asarray(space.vector())))) | fixed
+            z = np.concatenate([np.asarray(space.vector()), *(start[name] for name in observed.blocks)])
+            best = np.inf
+            for _ in range(_ROUNDS):
+                linear = linear_rows(space, observed, z)
+                roots = tuple(_roots(part.rows.values.shape, lever) for part in linear)
+                dense, values = dense_rows(linear, roots, len(z))
+                poses = sum(part.rows.values.shape[1] for part in linear)
+                found = float(np.sqrt(np.sum(values**2) / poses))
+                if not found < 0.95 * best:
+                    break
+                best = found
+                by = (dense[:, 1:] * observed.steps)[:, free]
+                z[1:][free] -= np.linalg.lstsq(by, values, rcond=1e-10)[0] * observed.steps[free]
+        except np.linalg.LinAlgError:
+            return np.inf
+        return best if np.isfinite(best) else np.inf
+
+
+def _evenly(number: int, most: int) -> np.ndarray:
+    return np.unique(np.linspace(0, number - 1, min(number, most)).astype(int))
+
+
+def _replaced(observed: Observed, observations: tuple[AbstractObservation, ...]) -> Observed:
+    q = np.concatenate([np.asarray(one.q) for one in observations])
+    return eqx.tree_at(lambda o: (o.observations, o.q, o.sines_cosines), observed, (observations, q, sines_cosines(q)))
+
+
+def _roots(shape: tuple[int, ...], lever: float) -> Float[np.ndarray, "m r r"]:
+    rows, poses = shape
+    return np.broadcast_to(np.diag([1.0] * min(rows, 3) + [lever] * (rows - 3)), (poses, rows, rows))
+
+
+def _readings(q: Float[np.ndarray, "M n"]) -> Iterator[_Tried]:
     joints = range(q.shape[1])
     for several in (1, 2):
         for chosen in itertools.combinations(joints, several):
             signs = np.where(np.isin(joints, chosen), -1.0, 1.0)
             named = " and ".join(str(joint + 1) for joint in chosen)
-            yield f"joint{'s' if several > 1 else ''} {named} read with the wrong sign", q * signs
-    yield "all joints read with the wrong sign", -q
+            yield _Tried(f"joint{'s' if several > 1 else ''} {named} read with the wrong sign", q * signs)
+    yield _Tried("all joints read with the wrong sign", -q)
     for one, other in itertools.combinations(joints, 2):
         order = list(joints)
         order[one], order[other] = other, one
-        yield f"the columns of joints {one + 1} and {other + 1} are exchanged", q[:, order]
-    yield "the columns are in reverse order", q[:, ::-1]
-    yield "readings in gon are taken for degrees", 0.9 * q
+        yield _Tried(f"the columns of joints {one + 1} and {other + 1} are exchanged", q[:, order])
+    yield _Tried("the columns are in reverse order", q[:, ::-1])
+    yield _Tried("the columns begin with that of the last joint", np.roll(q, -1, axis=1))
+    yield _Tried("the columns end with that of the first joint", np.roll(q, 1, axis=1))
+    yield _Tried("readings in gon are taken for degrees", 0.9 * q)
+    largest = float(np.abs(q).max())
+    if largest < _TURN * DEG:
+        yield _Tried("readings in radians are taken for degrees", q / DEG)
+    if largest > _TURN:  # otherwise every tip would come near every other
+        yield _Tried("readings in degrees are taken for radians", q * DEG)
+
+
+def _measured(observation: AbstractObservation) -> Iterator[tuple[str, AbstractObservation]]:
+    """Corrections of what one observation measured."""
+    name = _MEASURED[type(observation)]
+    values = getattr(observation, name)
+    if values is None:
+        return
+    values = np.asarray(values)
+
+    def changed(new: np.ndarray, field: str = name) -> Any:
+        return eqx.tree_at(lambda o: getattr(o, field), observation, new)
+
+    for cause, factor in _UNITS.items():
+        yield cause, changed(values * factor)
+    if values.shape[1:] != (3,):
+        return
+    yield f"measured coordinates are {_MIRRORED}", changed(values * [1, 1, -1])
+    if isinstance(observation, MeasuredTransforms):
+        rotations = np.asarray(observation.rotations)
+        for order in itertools.permutations(range(3)):
+            for signs in itertools.product((1, -1), repeat=3) if order == (0, 1, 2) else ((1, 1, 1),):
+                if (order, signs) != ((0, 1, 2), (1, 1, 1)):
+                    yield _order_says(order, signs), changed(values[:, order] * signs)
+        for cause, corrected in _rotations(rotations):
+            yield cause, changed(corrected, "rotations")
+
+
+def _order_says(order: tuple[int, ...], signs: tuple[int, ...]) -> str:
+    if order == (0, 1, 2):
+        wrong = [axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0]
+        return f"the signs of measured positions are wrong in {' and '.join(wrong)}"
+    return f"the columns of positions are in the order {' '.join('xyz'[i] for i in np.argsort(order))}"
+
+
+def _rotations(rotations: Float[np.ndarray, "m 3 3"]) -> Iterator[tuple[str, Float[np.ndarray, "m 3 3"]]]:
+    from scipy.spatial.transform import Rotation
+
+    read = Rotation.from_matrix(rotations)
+    first, last = read.as_quat(scalar_first=True), read.as_quat()
+    yield "quaternions in the order x y z w are taken for w x y z", Rotation.from_quat(first).as_matrix()
+    yield (
+        "quaternions in the order w x y z are taken for x y z w",
+        Rotation.from_quat(last, scalar_first=True).as_matrix(),
+    )
+    yield "orientations are those of the instrument in the target's frame", rotations.swapaxes(-1, -2)

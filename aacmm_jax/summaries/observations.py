@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.contradictions import session_metrics
 from ..calibration.evaluation import Evaluation
 from ..calibration.observation_residuals import (
     ObservationResiduals,
@@ -12,6 +13,8 @@ from ..calibration.observation_residuals import (
     rms,
 )
 from ..calibration.record import REPEATABILITY, CalibrationRecord
+from ..calibration.results import ObservedMetrics
+from ..core.rotations import inverse_frame
 from ..data.capture import Capture
 from ..data.observations.observation import (
     POINT,
@@ -75,6 +78,14 @@ def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str
         "kinds": [],
         "geometry": [],
         "less_weight": [],
+        "sessions": [
+            {"session": session, "poses": poses, "rms_mm": together, "rms_alone_mm": alone}
+            for session, (poses, together, alone) in session_metrics(record).items()
+        ],
+        "removed": [
+            one._asdict() | {"members": list(one.members), "degrees_of_freedom": list(one.degrees_of_freedom)}
+            for one in record.removed
+        ],
     }
     observed, others = record.observed, record.others
     if observed is not None:
@@ -89,7 +100,8 @@ def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str
         for kind in dict.fromkeys(one.observation.kind for one in residuals):
             of_kind = [pair for pair in pairs if pair[0].observation.kind == kind]
             found["kinds"].append({"kind": kind, "observations": len(of_kind)} | _agreement(of_kind))
-        found["geometry"] = _geometry(record.recording.capture, observed.geometry)
+        found["geometry"] = _geometry(record.recording.capture, observed)
+        found["base"] = _base_rows(record, observed)
         found["less_weight"] = less_weight(residuals)
     if others is not None:
         angles = [None if np.isnan(angle) else float(angle) for angle in others.rms_angle]
@@ -119,13 +131,13 @@ def _agreement(pairs: list[tuple[ObservationResiduals, np.ndarray]]) -> dict[str
     }
 
 
-def _geometry(capture: Capture, geometry: dict[str, Any]) -> list[dict[str, Any]]:
+def _geometry(capture: Capture, metrics: ObservedMetrics) -> list[dict[str, Any]]:
     """Every part of the geometry with its numbers, in words too, and with the values certified of it."""
     observed, found = Observed.of(capture), {}
     certified = observed.certified()
     for observation in observed.observations:
         for part, units in _parts(observation).items():
-            values = np.asarray(geometry[part])
+            values = np.asarray(metrics.geometry[part])
             own = part in observation.unknowns
             quantities = observation.quantities(part, values) if own else quantities_by_unit(units, values)
             value, u = certified.get(part, (None, None))
@@ -133,11 +145,35 @@ def _geometry(capture: Capture, geometry: dict[str, Any]) -> list[dict[str, Any]
                 "part": part,
                 "units": list(units),
                 "values": values.tolist(),
+                "u": _known(np.sqrt(np.diag(metrics.geometry_covariance[part]))),
                 "quantities": [_row(quantity) for quantity in quantities],
                 "certified": None if value is None else np.asarray(value).tolist(),
                 "certified_u": None if u is None else np.asarray(u).tolist(),
             }
     return [found[part] for part in observed.blocks]
+
+
+def _known(u: np.ndarray) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in u]
+
+
+def _base_rows(record: CalibrationRecord, observed: ObservedMetrics) -> list[dict[str, Any]]:
+    """The base frame as seen from each frame with known coordinates (an artefact's, a station's), k = 1."""
+    rows = {}
+    for one in record.recording.capture.observations:
+        part = getattr(one, "frame", None)
+        if part is None or getattr(one, "index", None) is not None:  # a placement on a platform is not in the base
+            continue
+        base, by = inverse_frame(np.asarray(observed.geometry[part]))
+        u = _known(np.sqrt(np.diag(by @ observed.geometry_covariance[part] @ by.T)))
+        rows[part] = {
+            "in": part,
+            "position_mm": base[3:].tolist(),
+            "position_u_mm": u[3:],
+            "rotation_rad": base[:3].tolist(),
+            "rotation_u_rad": u[:3],
+        }
+    return list(rows.values())
 
 
 def less_weight(residuals: tuple[ObservationResiduals, ...]) -> list[dict[str, Any]]:

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from ..calibration.checks import plausible
+from ..calibration.contradictions import session_metrics
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..calibration.results import active_names
 from ..calibration.scale_anchor import scale_set_by_clause
@@ -17,13 +18,15 @@ from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import pose_outliers
 from ..uncertainty.identifiability import Observability, observability
-from .contradictions import contradictions
+from .contradictions import contradictions, removals
 from .likely_cause import likely_cause
 from .validation import contradicted_prediction
 
 _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a reference length is wrong
 _LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 through errors outside the D-H model
 _TOLERANCE = math.radians(0.01)  # beyond a limit: more than the noise of any encoder
+_APART = 5.0  # RMS of a session among others, over that which it has alone, beyond which they are not of one arm
+_EXACT = 1e-6  # mm: smaller residuals are rounding errors of a simulation without noise
 _EXCESS = 1.5  # ratio of errors to their prediction that is reported
 # By k, which is a length measured by the nominal arm over its reference value: one in m, read as mm, makes k = 1000.
 _MISTAKEN_UNITS = {
@@ -58,16 +61,23 @@ def of_capture(recording: Recording) -> list[str]:
     return found
 
 
+def of_import(recording: Recording) -> list[str]:
+    """Of a capture before any calibration: as `of_capture`, after the likely cause where the nominal arm is far off."""
+    cause = likely_cause(recording.nominal.arm, recording.capture) if recording.true is None else ""
+    return [*([cause] if cause else []), *of_capture(recording)]
+
+
 def of_calibration(record: CalibrationRecord, seen: Observability | None = None) -> list[str]:
     """What should be read about a calibration before its numbers; ``seen`` is the result of `observed`, if known."""
     found = [] if record.converged else [record.reason]
+    found += removals(record)
     found += _implausible(record)
+    found += contradictions(record)
     if record.recording.capture.observations:
         found += [] if record.validation is None else contradicted_prediction(record.validation)
         found += [*_observations(record), *_scale(record), *of_capture(record.recording)]
         seen = observed(record) if seen is None else seen
         return found if record.implausible_residual else found + _identifiability(record, seen)
-    found += contradictions(record)
     found += _validation(record)
     found += [*_scale(record), *of_capture(record.recording)]
     seen = observed(record) if seen is None else seen
@@ -92,7 +102,9 @@ def _observations(record: CalibrationRecord) -> list[str]:
             f"{shorten(found)}; check these observations, or their u."
         )
     sides = _sides(record)
-    if sides:
+    if _many_on_bounds(record) and not record.implausible_residual:
+        sentences.append(_on_bounds(record, sides))
+    elif sides:
         sentences.append(
             f"On a bound: {shorten(sides)}; fix what the data hardly determine (--held), or widen the bounds. Every "
             "uncertainty takes these values as exact."
@@ -118,7 +130,7 @@ def _implausible(record: CalibrationRecord) -> list[str]:
         name, rms = record.observed.names[worst], record.observed.rms_after[worst]
         return [
             f"Poses of {name} are {rms:.3g} mm RMS from their geometry, over a hundred times what an arm of this size "
-            "can be, so data and arm do not belong together: check columns, units, signs and the arm."
+            "can be, so data and arm do not belong together: check columns, units, signs and the arm." + _cause(record)
         ]
     rms = float(record.evaluations()["calibrated"].repeatability.rms)
     return [
@@ -129,8 +141,22 @@ def _implausible(record: CalibrationRecord) -> list[str]:
 
 
 def does_not_fit(record: CalibrationRecord) -> bool:
-    """Whether so many parameters are on a bound that the arm is not that of the data."""
-    return len(_sides(record)) >= len(record.names) / 3 and record.hold is not None
+    """Whether so many parameters are on a bound that the arm is not that of the data, or sessions of one arm are far
+    worse together than each alone."""
+    metrics = session_metrics(record).values()
+    return _many_on_bounds(record) or any(together > _APART * max(alone, _EXACT) for _, together, alone in metrics)
+
+
+def _many_on_bounds(record: CalibrationRecord) -> bool:
+    anchored = record.hold is not None or bool(record.recording.capture.observations)
+    return len(_sides(record)) >= len(record.names) / 3 and anchored
+
+
+def _on_bounds(record: CalibrationRecord, sides: list[str]) -> str:
+    return (
+        f"{len(sides)} of {len(record.names)} parameters are on a bound, so the arm does not fit the data: "
+        "check unit, order of columns, sockets and arm." + _cause(record)
+    )
 
 
 def _cause(record: CalibrationRecord) -> str:
@@ -194,10 +220,7 @@ def _bounds(record: CalibrationRecord, seen: Observability) -> list[str]:
     if not sides or (record.hold is None and len(sides) < len(record.names) / 3):
         return []
     if len(sides) >= len(record.names) / 3:
-        return [
-            f"{len(sides)} of {len(record.names)} parameters are on a bound, so the arm does not fit the data: "
-            "check unit, order of columns, sockets and arm." + _cause(record)
-        ]
+        return [_on_bounds(record, sides)]
     traded = {name for trade_off in seen.trade_offs for name in trade_off.names}
     weak = [side for side in sides if side.split(" ")[0] in traded]
     others = [side for side in sides if side not in weak]

@@ -4,6 +4,9 @@ A group with an error of its own (readings of a joint that were shifted while on
 parameters, so that its residuals show little of the error. The test compares the least squares with and without the
 group. The second is one Gauss-Newton step away, by the normal equations less the group's part of them (case deletion:
 Cook and Weisberg, "Residuals and Influence in Regression", 1982, section 3.6), so that nothing is identified again.
+
+What an error of its own may be (a joint's zero, a remounted probe) is tested likewise: by unknowns that only the group
+has, which must explain what it contradicts.
 """
 
 from collections.abc import Hashable, Mapping, Sequence
@@ -15,7 +18,7 @@ from jaxtyping import Float
 
 from ..core.distributions import f_tail
 
-_NULL = 1e-10  # eigenvalues of the normal matrix below this, of the largest, are zero
+_NULL = 1e-10  # eigenvalues of the scaled normal matrix below this, of the largest, are zero
 _AS_WELL = 2.0  # ratio of the variances of what remains, up to which two groups explain a contradiction equally well
 
 
@@ -30,11 +33,29 @@ class GroupTest(NamedTuple):
     step: Float[np.ndarray, " p"]  # from the given parameters to those of the others alone
 
 
+class Block(NamedTuple):
+    """Equations of one fixture and one group: residuals in standard deviations, and their derivatives.
+
+    Blocks of one fixture have the same unknowns of their own. Those whose group is None are never taken out.
+    """
+
+    fixture: Hashable
+    group: Hashable | None
+    residual: Float[np.ndarray, " r"]
+    shared: Float[np.ndarray, "r p"]  # by the parameters, and by what several fixtures share
+    own: Float[np.ndarray, "r k"]  # by what only this fixture has, such as the position of a socket
+
+
 class _Gram(NamedTuple):
     """Gram matrix of the derivatives by the parameters, the residual and the derivatives by the fixture's unknowns."""
 
     matrix: Float[np.ndarray, "m m"]
     rows: int
+
+    @classmethod
+    def of(cls, block: Block) -> "_Gram":
+        columns = np.concatenate([block.shared, block.residual[:, None], block.own], axis=1)
+        return cls(columns.T @ columns, len(columns))
 
     def plus(self, other: "_Gram") -> "_Gram":
         return _Gram(self.matrix + other.matrix, self.rows + other.rows)
@@ -42,31 +63,44 @@ class _Gram(NamedTuple):
     def less(self, other: "_Gram") -> "_Gram":
         return _Gram(self.matrix - other.matrix, self.rows - other.rows)
 
+    def without_own(self, unknowns: int) -> "_Gram":
+        """Less what the fixture's own unknowns account for."""
+        size = len(self.matrix) - unknowns
+        if not unknowns:
+            return self
+        inverse, rank = _inverse(self.matrix[size:, size:], np.diag(self.matrix)[size:])
+        crossed = self.matrix[size:, :size]
+        return _Gram(self.matrix[:size, :size] - crossed.T @ inverse @ crossed, self.rows - rank)
 
-class _Fit(NamedTuple):
+
+class Fit(NamedTuple):
+    """A least squares from its Gram matrix."""
+
     cost: float  # sum of squares
     degrees_of_freedom: int
     step: np.ndarray
 
     @classmethod
-    def of(cls, gram: _Gram) -> "_Fit":
+    def of(cls, gram: _Gram, diagonal: Float[np.ndarray, " p"]) -> "Fit":
+        """``diagonal``: that of the whole normal matrix, against which what is left of a column may be rounding."""
         information, gradient = gram.matrix[:-1, :-1], gram.matrix[:-1, -1]
-        values, vectors = np.linalg.eigh(information)
-        known = values > _NULL * values.max(initial=0.0)
-        step = -vectors[:, known] @ ((vectors[:, known].T @ gradient) / values[known])
+        inverse, rank = _inverse(information, diagonal)
+        step = -inverse @ gradient
         cost = float(gram.matrix[-1, -1] + step @ gradient)
-        return cls(max(cost, 0.0), gram.rows - int(known.sum()), step)
+        return cls(max(cost, 0.0), gram.rows - rank, step)
+
+
+def _inverse(matrix: Float[np.ndarray, "p p"], diagonal: Float[np.ndarray, " p"]) -> tuple[np.ndarray, int]:
+    """The pseudo-inverse of a normal matrix whose columns are first scaled, and its rank."""
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(scale[:, None] * matrix * scale)
+    known = values > _NULL * values.max(initial=0.0)
+    rows = (scale[:, None] * vectors)[:, known]
+    return (rows / values[known]) @ rows.T, int(known.sum())
 
 
 def contradicting_groups(
-    residual: Float[np.ndarray, "N c"],
-    jacobian: Float[np.ndarray, "N c p"],
-    by_fixture: Float[np.ndarray, "N c k"],
-    fixtures: Sequence[Hashable],
-    groups: Sequence[Hashable],
-    *,
-    level: float = 0.01,
-    least_ratio: float = 1.0,
+    blocks: Sequence[Block], *, level: float = 0.01, least_ratio: float = 1.0
 ) -> list[list[GroupTest]]:
     """Find the groups of poses that contradict the others.
 
@@ -75,11 +109,7 @@ def contradicting_groups(
     one that reaches ``least_ratio`` and all before it.
 
     Args:
-        residual: Residual of every pose in units of its standard deviation, at parameters near the solution.
-        jacobian: Its derivatives by the free parameters.
-        by_fixture: Its derivatives by the unknowns of the fixture that held the tip (the position of a socket).
-        fixtures: The fixture of every pose.
-        groups: The group of every pose.
+        blocks: The equations at parameters near the solution, by fixture and group.
         level: Probability of finding any group where nothing is wrong (Bonferroni's bound).
         least_ratio: The smallest ratio of a group that is found.
 
@@ -87,19 +117,12 @@ def contradicting_groups(
         The test of each group that was found, without those before it; and after it, as its alternatives, the tests of
         groups without which the others agree as well (of two groups that contradict each other, either).
     """
-    poses: dict[tuple[Hashable, Hashable], list[int]] = {}
-    for pose, both in enumerate(zip(fixtures, groups, strict=True)):
-        poses.setdefault(both, []).append(pose)
-    parts: dict[Hashable, dict[Hashable, _Gram]] = {}
-    columns = np.concatenate([jacobian, residual[:, :, None], by_fixture], axis=2)
-    for (fixture, group), chosen in poses.items():
-        rows = columns[chosen].reshape(-1, columns.shape[2])
-        parts.setdefault(fixture, {})[group] = _Gram(rows.T @ rows, len(rows))
+    parts = _Parts.of(blocks)
     removed: list[Hashable] = []
     found: list[list[GroupTest]] = []
     number = 0
-    for _ in range(len(dict.fromkeys(groups)) // 2):
-        tests = _tests(parts, removed, by_fixture.shape[2])
+    for _ in range(len(parts.groups) // 2):
+        tests = parts.tests(removed)
         significant = [test for test in tests if test.probability * len(tests) < level]
         if not significant:
             break
@@ -112,37 +135,83 @@ def contradicting_groups(
     return found[:number]
 
 
-def _tests(
-    parts: Mapping[Hashable, Mapping[Hashable, _Gram]], removed: Sequence[Hashable], unknowns: int
-) -> list[GroupTest]:
-    """Every group that is left against the others; not those that add no equation, or leave none to compare."""
+def fit_of(blocks: Sequence[Block]) -> Fit:
+    """The least squares of some of the equations."""
+    parts = _Parts.of(blocks)
+    whole = reduce(_Gram.plus, parts.eliminated([]).values())
+    return Fit.of(whole, np.diag(whole.matrix)[:-1])
 
-    def eliminated(fixture: Hashable, *without: Hashable) -> _Gram | None:
-        """The sum over a fixture's groups, less what its unknowns account for."""
-        grams = [gram for group, gram in parts[fixture].items() if group not in (*removed, *without)]
-        if not grams:
-            return None
-        matrix, rows = reduce(_Gram.plus, grams)
-        size = len(matrix) - unknowns
-        crossed = matrix[size:, :size]
-        accounted = crossed.T @ np.linalg.solve(matrix[size:, size:], crossed)
-        return _Gram(matrix[:size, :size] - accounted, rows - unknowns)
 
-    whole = {fixture: gram for fixture in parts if (gram := eliminated(fixture)) is not None}
-    if not whole:
-        return []
-    total = reduce(_Gram.plus, whole.values())
-    everything, tests = _Fit.of(total), []
-    for group in dict.fromkeys(group for fixture in whole for group in parts[fixture] if group not in removed):
-        rest = total
-        for fixture in whole:
-            if group in parts[fixture]:
-                kept, rest = eliminated(fixture, group), rest.less(whole[fixture])
-                rest = rest if kept is None else rest.plus(kept)
-        others = _Fit.of(rest)
-        added, spare = everything.degrees_of_freedom - others.degrees_of_freedom, others.degrees_of_freedom
-        if added > 0 and spare > 0:
-            variance = max(others.cost / spare, 1e-300)
-            ratio = max(everything.cost - others.cost, 0.0) / added / variance
+def different_groups(blocks: Sequence[Block]) -> list[GroupTest]:
+    """Each group against the others by parameters of its own, the largest ratio first.
+
+    A group that is larger than the number of parameters adds many residuals, among which an error of its own is
+    diluted; that it needs other parameters than the others is not (Chow 1960, Econometrica 28). What belongs to no
+    group counts with both sides: it relates unknowns that only one of them has.
+    """
+    whole, tests = fit_of(blocks), []
+    for group in _Parts.of(blocks).groups:
+        own = fit_of([block for block in blocks if block.group in (group, None)])
+        others = fit_of([block for block in blocks if block.group != group])
+        spare = own.degrees_of_freedom + others.degrees_of_freedom
+        again = sum(block.residual.size for block in blocks if block.group is None)
+        added = whole.degrees_of_freedom + again - spare
+        if added > 0 and min(own.degrees_of_freedom, others.degrees_of_freedom) > 0:
+            variance = max((own.cost + others.cost) / spare, 1e-300)
+            ratio = max(whole.cost - own.cost - others.cost, 0.0) / added / variance
             tests.append(GroupTest(group, ratio, (added, spare), f_tail(ratio, added, spare), variance, others.step))
-    return tests
+    return sorted(tests, key=lambda test: -test.ratio)
+
+
+class _Parts(NamedTuple):
+    """Gram matrices by fixture and group."""
+
+    grams: Mapping[Hashable, Mapping[Hashable | None, _Gram]]
+    unknowns: Mapping[Hashable, int]  # own ones of each fixture
+
+    @classmethod
+    def of(cls, blocks: Sequence[Block]) -> "_Parts":
+        grams: dict[Hashable, dict[Hashable | None, _Gram]] = {}
+        for block in blocks:
+            of_fixture, gram = grams.setdefault(block.fixture, {}), _Gram.of(block)
+            of_fixture[block.group] = of_fixture[block.group].plus(gram) if block.group in of_fixture else gram
+        return cls(grams, {block.fixture: block.own.shape[1] for block in blocks})
+
+    @property
+    def groups(self) -> list[Hashable]:
+        return [g for g in dict.fromkeys(g for of in self.grams.values() for g in of) if g is not None]
+
+    def eliminated(self, without: Sequence[Hashable]) -> dict[Hashable, _Gram]:
+        """The sum over each fixture's groups, less what its unknowns account for."""
+        found = {}
+        for fixture, grams in self.grams.items():
+            kept = [gram for group, gram in grams.items() if group is None or group not in without]
+            if kept:
+                found[fixture] = reduce(_Gram.plus, kept).without_own(self.unknowns[fixture])
+        return found
+
+    def tests(self, removed: Sequence[Hashable]) -> list[GroupTest]:
+        """Every group that is left against the others; not those that add no equation, or leave none to compare."""
+        whole = self.eliminated(removed)
+        if not whole:
+            return []
+        total = reduce(_Gram.plus, whole.values())
+        diagonal = np.diag(total.matrix)[:-1]
+        everything, tests = Fit.of(total, diagonal), []
+        touched: dict[Hashable, list[Hashable]] = {}
+        for fixture in whole:
+            for group in self.grams[fixture]:
+                if group is not None and group not in removed:
+                    touched.setdefault(group, []).append(fixture)
+        for group, fixtures in touched.items():
+            part = _Parts({fixture: self.grams[fixture] for fixture in fixtures}, self.unknowns)
+            rest = reduce(_Gram.less, (whole[fixture] for fixture in fixtures), total)
+            rest = reduce(_Gram.plus, part.eliminated([*removed, group]).values(), rest)
+            others = Fit.of(rest, diagonal)
+            added, spare = everything.degrees_of_freedom - others.degrees_of_freedom, others.degrees_of_freedom
+            if added > 0 and spare > 0:
+                variance = max(others.cost / spare, 1e-300)
+                ratio = max(everything.cost - others.cost, 0.0) / added / variance
+                probability = f_tail(ratio, added, spare)
+                tests.append(GroupTest(group, ratio, (added, spare), probability, variance, others.step))
+        return tests

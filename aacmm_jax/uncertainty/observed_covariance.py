@@ -39,11 +39,10 @@ def arm_errors(forward: ForwardPass, linear: list[Linear], observed: Observed) -
     found = []
     for part, rows in zip(linear, observed.slices, strict=True):
         by_tip, by_rotation = part.rows.by_tip, part.rows.by_rotation
-        by_readings = sum(by_tip[:, None, c] * theta[None, :, c, rows] for c in range(3))
+        by_readings = _product(by_tip, theta[..., rows])
         by_seat = by_tip
         if by_rotation is not None:
-            turned = forward.z_before[..., rows]
-            by_readings = by_readings + sum(by_rotation[:, None, c] * turned[None, :, c] for c in range(3))
+            by_readings = by_readings + _product(by_rotation, forward.z_before[..., rows])
             by_seat = xp.concatenate([by_tip, by_rotation / size], axis=1)
         found.append(ArmErrors(by_readings, by_seat))
     return found
@@ -63,15 +62,19 @@ def covariance_of_sigma(errors: ArmErrors, sigma: Float[AnyArray, ""]) -> Float[
 
 
 def _squares(rows: Float[AnyArray, "r c m"]) -> Float[AnyArray, "m r r"]:
-    # As sums: XLA computes many products of small matrices several times as slowly.
-    products = sum(rows[:, None, c] * rows[None, :, c] for c in range(rows.shape[1]))
-    return namespace(rows).moveaxis(products, -1, 0)
+    return namespace(rows).moveaxis(_product(rows, rows), -1, 0)
+
+
+def _product(one: Float[AnyArray, "r c m"], other: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r s m"]:
+    """A matrix a pose times the transpose of another, as sums: XLA computes many products of small matrices several
+    times as slowly."""
+    first, *others = (one[:, None, c] * other[None, :, c] for c in range(one.shape[1]))
+    return sum(others, first)
 
 
 def _each(matrices: Float[AnyArray, "m r s"], vectors: Float[AnyArray, "s m"]) -> Float[AnyArray, "r m"]:
     """A matrix a pose times its vector."""
-    xp = namespace(matrices, vectors)
-    return sum(xp.moveaxis(matrices[..., s], -1, 0) * vectors[s][None] for s in range(vectors.shape[0]))
+    return _product(namespace(matrices).moveaxis(matrices, 0, -1), vectors[None])[:, 0]
 
 
 def scatter_of(linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom: int) -> Float[AnyArray, ""]:

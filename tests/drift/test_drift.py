@@ -526,3 +526,41 @@ def test_command_refuses(run, files):
 def test_command_in_a_process_of_its_own(aacmm_process, files):
     refused = aacmm_process("compare", "a.h5", "b.h5", "--length-mm", 100000, expect=2)
     assert refused.stderr.startswith("Error: a length of 100000 mm does not fit")
+
+
+REMOUNTED = {"probe_z": 0.3}  # the only coordinate of the probe that is free here
+
+
+@pytest.mark.parametrize(
+    ("changes", "remounted"),
+    [({}, None), (REMOUNTED, True), (MOVED, False), ({"a_2": 0.3}, False), ({"theta_2": 1e-3, **REMOUNTED}, False)],
+    ids=["nothing", "probe", "arm", "one length", "both"],
+)
+def test_a_remounted_probe_is_told_from_a_changed_arm(old, new, changes, remounted):
+    """Compared are a calibration of the arm and one of the arm with these changes."""
+    drift = compare(old, shifted(new, changes), points=20)
+    probe = drift.joint_test.probe
+    said = " ".join(drift.findings())
+    assert ("Probe remounted" in said) == (remounted is True)
+    assert ("Not only the probe has changed" in said) == (remounted is False)
+    if remounted is None:
+        assert probe is None
+        return
+    assert probe.remounted == remounted
+    if remounted:
+        assert dict(probe.change)["probe_z"] == pytest.approx(0.3, abs=0.05)
+        assert "so the arm has not changed" in said
+
+
+def test_sessions_of_a_real_arm_with_the_ball_remounted(mukca):
+    records = []
+    for name in ("panda_3", "panda_3_bis"):
+        recording = aj.files.read_manifest(mukca / f"{name}.toml")
+        bounds = recording.nominal.bounds()
+        result = aj.calibrate(bounds.space.base, recording.capture, bounds, check_identifiability=False)
+        records.append(aj.calibration.record_of(result, recording))
+    drift = compare(*records, points=50)
+    assert drift.joint_test.probe.remounted
+    assert dict(drift.joint_test.probe.change)["probe_x"] == pytest.approx(-0.347, abs=0.01)
+    assert drift.findings()[0].startswith("Probe remounted: a change of the probe alone (probe_x by -347 um")
+    assert drift_summary(drift)["joint"]["probe"]["remounted"]

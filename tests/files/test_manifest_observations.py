@@ -236,3 +236,72 @@ def test_the_robot_of_the_examples(mukca):
     between = [(turned[:-1].inv() * turned[1:]).magnitude() for turned in (measured, moved)]
     assert np.sqrt(np.mean(np.subtract(*between) ** 2)) < np.deg2rad(0.06)
     assert one.q.shape == (2772, 6)
+
+
+def test_sessions_of_tables_and_of_rows(tmp_path):
+    """As `join_sessions` makes them; a probe each, unless the manifest says otherwise."""
+    for day in ("monday", "tuesday"):
+        for hole in range(2):
+            write(tmp_path / f"{day}_{hole}.csv", RANDOM.uniform(-1, 1, (4, 6)), header=None)
+    days = np.array([["monday"], ["tuesday"], ["monday"], ["tuesday"], ["tuesday"]])
+    write(tmp_path / "t.csv", np.hstack([Q, P, U, days]).astype(object), header=[*NAMES, "day"])
+    text = """
+[[socket]]
+name = "{hole}"
+file = "{day}_{hole}.csv"
+session = "{day}"
+[[length]]
+from = "{day}/0"
+to = "{day}/1"
+value = 50.0
+"""
+    rows = f'[[points]]\nname = "T"\nfile = "t.csv"\n{ALL}'.replace("points = [", 'session = "day", points = [')
+    for probe, targets in ((None, {"probe of tuesday"}), ("same", set())):
+        (tmp_path / "capture.toml").write_text(
+            HEAD + (f'[sessions]\nprobe = "{probe}"\n' if probe else "") + text + rows
+        )
+        capture = aj.files.read_manifest(tmp_path / "capture.toml").capture
+        assert capture.sessions == ("monday", "tuesday")
+        names = {*capture.names, *(one.name for one in capture.observations)}
+        assert names == {f"{day}/{x}" for day in capture.sessions for x in ("0", "1", "T")}
+        assert {one.target for one in capture.observations} - {""} == targets
+        assert {(one.start, one.end) for one in capture.lengths} == {
+            (f"{day}/0", f"{day}/1") for day in capture.sessions
+        }
+        stations = {one.name: one.station for one in capture.observations if one.kind == "points"}
+        assert stations == {"monday/T": "monday/T", "tuesday/T": "tuesday/T"}
+    both = next(one for one in capture.observations if one.name == "tuesday/T")
+    assert np.array_equal(both.q, Q[[1, 3, 4]])
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ('[[points]]\nfile = "a.csv"\n[[points]]\nname = "b"\nfile = "a.csv"\nsession = "x"\n', ["a has no session"]),
+        ('[sessions]\nprobe = "same"\n[[points]]\nfile = "a.csv"\n', ["[sessions] is for tables with a session"]),
+        ('[[points]]\nfile = "a.csv"\nsession = "{day}"\n', ["session uses the unknown field day"]),
+        (
+            '[[points]]\nfile = "a.csv"\nsession = "x"\ncolumns = { session = "x" }\n',
+            ["session is given and also in columns"],
+        ),
+    ],
+)
+def test_bad_sessions(tmp_path, text, parts):
+    write(tmp_path / "a.csv", np.hstack([Q, P, U]))
+    with_columns = text.replace('file = "a.csv"\n', f'file = "a.csv"\n{ALL if "columns" not in text else ""}')
+    with pytest.raises(aj.InputError) as refused:
+        read(tmp_path, with_columns)
+    assert all(part in str(refused.value) for part in parts), refused.value
+
+
+def test_known_coordinates_of_sockets(tmp_path):
+    """A plate or plant whose holes a CMM has measured: an artefact with one placement, with a file for each hole."""
+    for hole in "abc":
+        write(tmp_path / f"{hole}.csv", RANDOM.uniform(-1, 1, (4, 6)), header=None)
+    (plant,) = read(
+        tmp_path,
+        '[[artefact]]\nname = "plant"\nfiles = { a = "a.csv", b = "b.csv", c = "c.csv" }\nu = 0.002\n'
+        "coordinates = { a = [0, 0, 0], b = [400, 0, 0], c = [0, 400, 50] }\n",
+    )
+    assert (plant.kind, plant.placement, plant.names, plant.q.shape) == ("artefact", "plant", ("a", "b", "c"), (12, 6))
+    assert np.array_equal(plant.coordinates, [[0, 0, 0], [400, 0, 0], [0, 400, 50]])

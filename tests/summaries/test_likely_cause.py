@@ -1,25 +1,117 @@
-"""Mistakes of a recording are named by what makes the tips coincide."""
+"""Mistakes of a recording are named by what makes the residuals small; of right data nothing is said."""
 
+import equinox as eqx
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
+from aacmm_jax.data import observations as kinds
 from aacmm_jax.summaries.likely_cause import likely_cause
+
+BOX = [[200, -300, 100], [600, 300, 500]]
+FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
+SIMULATED = {
+    "points": kinds.SimulatedPoints("points", BOX, 20, FRAME, u=0.01),
+    "transforms": kinds.SimulatedTransforms("six", BOX, 20, (10, 20, 80, 0.1, 0.2, 0.3), FRAME, u=0.01, u_angle=1e-4),
+    "bar 1": kinds.SimulatedArtefact("bar 1", {"a": (0, 0, 0), "b": (300, 0, 0)}, 8, (0, 0, 0, 300, 0, 200)),
+    "bar 2": kinds.SimulatedArtefact("bar 2", {"a": (0, 0, 0), "b": (300, 0, 0)}, 8, (0, 0, 1.5, 300, -200, 250)),
+    "sphere": kinds.SimulatedSphere("sphere", (300, 0, 300), 50.0, 20, u=0.001),
+    "distances": kinds.SimulatedDistances("distances", BOX, 30, (900, 300, 100), u=0.003),
+    "planes": kinds.SimulatedPlanes("planes", (200, -200, 100), [(300, 0, 0), (0, 400, 0)], 15, distance=150.0),
+}
 
 
 @pytest.mark.parametrize(
     ("mistake", "cause"),
     [
         (lambda q: q, ""),
-        (lambda q: q * [1, 1, -1, 1, 1, 1], "Likely cause: joint 3 read with the wrong sign."),
-        (lambda q: q * [1, -1, 1, 1, -1, 1], "Likely cause: joints 2 and 5 read with the wrong sign."),
-        (lambda q: q[:, [0, 1, 3, 2, 4, 5]], "Likely cause: the columns of joints 3 and 4 are exchanged."),
-        (lambda q: q[:, ::-1], "Likely cause: the columns are in reverse order."),
-        (lambda q: q / 0.9, "Likely cause: readings in gon are taken for degrees."),
+        (lambda q: q * [1, 1, -1, 1, 1, 1], "joint 3 read with the wrong sign"),
+        (lambda q: q * [1, -1, 1, 1, -1, 1], "joints 2 and 5 read with the wrong sign"),
+        (lambda q: q[:, [0, 1, 3, 2, 4, 5]], "the columns of joints 3 and 4 are exchanged"),
+        (lambda q: q[:, ::-1], "the columns are in reverse order"),
+        (lambda q: np.roll(q, 1, axis=1), "the columns begin with that of the last joint"),
+        (lambda q: np.roll(q, -1, axis=1), "the columns end with that of the first joint"),
+        (lambda q: q / 0.9, "readings in gon are taken for degrees"),
+        (np.deg2rad, "readings in radians are taken for degrees"),
+        (np.rad2deg, "readings in degrees are taken for radians"),
         (lambda q: np.random.default_rng(0).uniform(-2, 2, q.shape), ""),
     ],
 )
-def test_cause(paper_arm, noisy_capture, mistake, cause):
+def test_readings_of_sockets(paper_arm, noisy_capture, mistake, cause):
     q = mistake(np.asarray(noisy_capture.q))
-    capture = aj.Capture({"A": q[:70], "B": q[70:]})
-    assert likely_cause(paper_arm, capture) == cause
+    capture = eqx.tree_at(lambda c: c.q, noisy_capture, q)
+    check(likely_cause(paper_arm, capture), cause)
+
+
+def check(said, cause):
+    assert said.partition(". Corrected")[0] == (f"Likely cause: {cause}" if cause else "")
+
+
+def requaternioned(read, meant):
+    """Rotations whose quaternions are read in one order and meant in another."""
+
+    def mistaken(rotations):
+        columns = Rotation.from_matrix(rotations).as_quat(scalar_first=meant == "wxyz")
+        return Rotation.from_quat(columns, scalar_first=read == "wxyz").as_matrix()
+
+    return mistaken
+
+
+@pytest.fixture(scope="module")
+def captures(paper_arm):
+    """Of an arm 1 mm and 0.1 degrees off the nominal one."""
+    true = aj.perturbed_arm(aj.Parameters.independent(paper_arm), length=1.0, angle=np.deg2rad(0.1), seed=1)
+    noise = aj.Noise(encoder_arcsec=2, seating=0.005)
+
+    def made(names):
+        return aj.simulate(true, {}, observations=[SIMULATED[name] for name in names.split(", ")], noise=noise)
+
+    return {names: made(names) for names in {row[0] for row in MISTAKES}}
+
+
+LEFT_HANDED = "measured coordinates are left-handed: two columns are exchanged, or one has the wrong sign (points)"
+METRES = "measured values in m are taken for mm"
+MISTAKES = [
+    ("points", "points", lambda x: x / 1000, f"{METRES} (points)"),
+    ("points", "points", lambda x: x / 25.4, "measured values in inches are taken for mm (points)"),
+    ("points", "points", lambda x: x * 1000, "measured values in um are taken for mm, or those in mm for m (points)"),
+    ("points", "points", lambda x: x[:, [1, 0, 2]], LEFT_HANDED),
+    ("points", "points", lambda x: x * [1, -1, 1], LEFT_HANDED),
+    ("points", "q", lambda q: q * [-1, 1, 1, 1, 1, 1], "joint 1 read with the wrong sign"),
+    ("points", "q", lambda q: q[:, [1, 0, 2, 3, 4, 5]], "the columns of joints 1 and 2 are exchanged"),
+    ("points", "q", np.deg2rad, "readings in radians are taken for degrees"),
+    ("transforms", "points", lambda x: x[:, [1, 2, 0]], "the columns of positions are in the order y z x (six)"),
+    ("transforms", "points", lambda x: x * [-1, 1, 1], "the signs of measured positions are wrong in x (six)"),
+    (
+        *("transforms", "rotations", requaternioned("wxyz", "xyzw")),
+        "quaternions in the order x y z w are taken for w x y z (six)",
+    ),
+    (
+        *("transforms", "rotations", requaternioned("xyzw", "wxyz")),
+        "quaternions in the order w x y z are taken for x y z w (six)",
+    ),
+    (
+        *("transforms", "rotations", lambda rotations: rotations.swapaxes(1, 2)),
+        "orientations are those of the instrument in the target's frame (six)",
+    ),
+    ("bar 1, bar 2", "coordinates", lambda x: x / 1000, f"{METRES} (bar 1, bar 2)"),
+    ("sphere, bar 1", "radius", lambda x: x / 1000, f"{METRES} (sphere)"),
+    ("distances, bar 1", "values", lambda x: x / 1000, f"{METRES} (distances)"),
+    ("planes, bar 1", "distance", lambda x: x / 1000, f"{METRES} (planes)"),
+]
+
+
+@pytest.mark.parametrize(("names", "field", "mistake", "cause"), MISTAKES, ids=[f"{x[0]}-{x[3]}" for x in MISTAKES])
+def test_observations(paper_arm, captures, names, field, mistake, cause):
+    def concerned(capture):
+        return [getattr(one, field) for one in capture.observations if one.name in cause or field == "q"]
+
+    capture = captures[names]
+    wrong = eqx.tree_at(concerned, capture, [mistake(np.asarray(values)) for values in concerned(capture)])
+    check(likely_cause(paper_arm, wrong), cause)
+
+
+@pytest.mark.parametrize("names", sorted({row[0] for row in MISTAKES}))
+def test_of_right_data_nothing_is_said(paper_arm, captures, names):
+    check(likely_cause(paper_arm, captures[names]), "")

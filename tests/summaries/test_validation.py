@@ -30,7 +30,9 @@ def test_the_placement_that_disagrees_is_named():
     text = said(*others, group("high", 0.38))
     assert "some groups disagree with the others by more than predicted: high (0.38 mm RMS, 3.8 times" in text
     assert "the other 8 agree" in text
-    assert "place_1 (lengths off by 0.05 mm, 5.0 times their u)" in said(group("a"), group("b"), group("place_1", error=0.05))
+    assert "place_1 (lengths off by 0.05 mm, 5.0 times their u)" in said(
+        group("a"), group("b"), group("place_1", error=0.05)
+    )
     # Where most of them do, the model is at fault and not a placement.
     assert "placements have larger errors than predicted" in said(*(group(f"place_{i}", 0.2) for i in range(3)))
 
@@ -60,7 +62,9 @@ def agreement(rms, poses=30, freedom=60.0):
 def test_unseen_data_that_scatter_more_than_predicted():
     parts = {"A": agreement(0.11), "B": agreement(0.35), "C": agreement(0.25)}
     (text,) = surprise(agreement(0.25, 90, 180.0), NOTHING, parts)
-    assert "0.25 mm RMS from their geometry, 2.5 times the predicted 0.1 mm, most of all in B (0.35 mm, 3.5 times)" in text
+    assert (
+        "0.25 mm RMS from their geometry, 2.5 times the predicted 0.1 mm, most of all in B (0.35 mm, 3.5 times)" in text
+    )
     assert "A (" not in text
     assert "reference lengths" not in text
     assert surprise(agreement(0.11), agreement(0.11), parts) == []

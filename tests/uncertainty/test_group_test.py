@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aacmm_jax.uncertainty.group_test import contradicting_groups
+from aacmm_jax.uncertainty.group_test import Block, contradicting_groups
 
 PARAMETERS = 4
 
@@ -30,9 +30,15 @@ def solved(residual, jacobian, by_fixture, fixtures):
 
 
 def found_in(blocks, groups=None, **options):
-    *arrays, fixtures = blocks
+    residual, jacobian, by_fixture, fixtures = blocks
+    arrays = residual, jacobian, by_fixture
     groups = fixtures if groups is None else groups
-    return contradicting_groups(*arrays, fixtures.tolist(), groups.tolist(), **options)
+    split = [
+        Block(fixture, group, *(array[chosen].reshape(-1, *array.shape[2:]) for array in arrays))
+        for fixture, group in dict.fromkeys(zip(fixtures.tolist(), groups.tolist(), strict=True))
+        for chosen in [(fixtures == fixture) & (groups == group)]
+    ]
+    return contradicting_groups([block._replace(residual=block.residual.ravel()) for block in split], **options)
 
 
 @pytest.mark.parametrize("across", [False, True], ids=["fixtures", "groups across fixtures"])
