@@ -6,6 +6,7 @@
 """
 
 import argparse
+import dataclasses
 import datetime
 import itertools
 import json
@@ -35,7 +36,9 @@ BAR = {"a": (0, 0, 0), "b": (300, 0, 0)}
 PLATE = {f"{i}{j}": (150.0 * i, 150.0 * j, 0.0) for i in range(3) for j in range(3)}
 PLACEMENTS = [(0, 0, 0, 300, 0, 200), (0, 0, 1.5, 300, -200, 250), (0, 1.5, 0, 400, 100, 500)]
 CENTRES = [(300, 0, 300), (500, 200, 200), (300, -300, 150)]
+SOCKETS = [(400, 100, 300), (300, -250, 200), (500, 150, 450)]
 SIMULATED: dict[str, list[Any]] = {
+    "sockets": [kinds.SimulatedSocket(f"socket{i}", point, 20) for i, point in enumerate(SOCKETS)],
     "points": [kinds.SimulatedPoints("T", BOX, 60, FRAME, u=0.01)],
     "transforms": [kinds.SimulatedTransforms("T6", BOX, 60, (10, 20, 80, 0.1, 0.2, 0.3), FRAME, u=0.01, u_angle=1e-4)],
     "spheres": [kinds.SimulatedSphere(f"s{i}", centre, 50.0, 25, u=0.001) for i, centre in enumerate(CENTRES)],
@@ -53,6 +56,8 @@ SIMULATED: dict[str, list[Any]] = {
         kinds.SimulatedDistances("e", BOX, 60, (100, 700, 100), u=0.003),
     ],
 }
+ALONE = tuple(name for name in SIMULATED if name != "sockets")  # which see no scale
+PAIRED = tuple(name for name in SIMULATED if name != "plate")  # whose kind is that of the bars
 # A target in an unknown place of the last frame, with unknown orientation, leaves these of the last link open.
 OPEN_WITH_A_TARGET = ("probe_z", "alpha_6", "theta_6", "a_6", "d_6")
 
@@ -68,7 +73,10 @@ class Trials:
             space = aj.Parameters(space.base, names)
         self.space, self.bounds = space, aj.Bounds.around(self.nominal, space)
         self.true = aj.perturbed_arm(space, length=1.0, angle=np.deg2rad(0.1), seed=1)
-        self.simulated = [one for kind in chosen for one in SIMULATED[kind]]
+        # Of a pair each kind has half of its poses, so that a pair has about as many as a kind alone.
+        self.simulated = [
+            dataclasses.replace(one, poses=-(-one.poses // len(chosen))) for kind in chosen for one in SIMULATED[kind]
+        ]
         exact = aj.simulate(self.true, {}, observations=self.simulated, noise=aj.Noise(), seed=3)
         self.exact = []
         for one, observation in zip(self.simulated, exact.observations, strict=True):
@@ -141,14 +149,17 @@ def coverage_of(chosen: tuple[str, ...], trials: int, noise: aj.Noise | None) ->
 
 
 def coverage(given: argparse.Namespace) -> list[dict[str, Any]]:
-    """Each kind alone, and with ``--pairs`` each pair of them."""
-    names = tuple(given.kinds or SIMULATED)
-    chosen = [(name,) for name in names] if not given.pairs else list(itertools.combinations(names, 2))
+    """Each kind alone, or with ``--pairs`` each pair of them; what is finished is written at once."""
+    if given.pairs:
+        chosen = list(itertools.combinations(given.kinds or PAIRED, 2))
+    else:
+        chosen = [(name,) for name in given.kinds or ALONE]
     found = []
     for combination in chosen:
         for noise in (NOISE, None) if given.estimated else (NOISE,):
             found.append(coverage_of(combination, given.trials, noise))
             print(found[-1], flush=True)
+            write(given, found, "coverage-of-pairs" if given.pairs else "coverage")
     return found
 
 
@@ -258,7 +269,13 @@ def main() -> None:
     )
     given = parser.parse_args()
     found = PARTS[given.part](given)
-    path = given.results / f"observations-{datetime.date.today()}-{given.part}.json"
+    if given.part != "coverage":
+        write(given, found, given.part)
+
+
+def write(given: argparse.Namespace, found: Any, part: str) -> None:
+    """Store what was measured."""
+    path = given.results / f"observations-{datetime.date.today()}-{part}.json"
     path.write_text(json.dumps(found, indent=1) + "\n")
 
 
