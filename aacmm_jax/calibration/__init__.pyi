@@ -1,9 +1,9 @@
 from .evaluation import Evaluation as Evaluation
 from .record import CalibrationRecord as CalibrationRecord
 from .record import record_of as record_of
+from .redrawn import batch_of_captures as batch_of_captures
 from .results import CrossValidation as CrossValidation
 from .results import ManyCalibrations as ManyCalibrations
 from .results import ManyIdentifications as ManyIdentifications
 from .results import converged as converged
 from .sampling import Sampled as Sampled
-from .sampling import batch_of_captures as batch_of_captures

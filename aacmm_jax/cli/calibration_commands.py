@@ -190,7 +190,6 @@ def calibrate(
             from ..calibration.results import Calibration
             from ..calibration.sampling import monte_carlo as sample
 
-            check_sockets_only(capture_used, "--monte-carlo")
             if not isinstance(result, Calibration) or robust is not None:
                 raise InputError("--monte-carlo is for calibrations without --robust and --scale nominal.")
             sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from ..calibration.batch import calibrate_many, identify_many
-from ..calibration.sampling import batch_of_captures
+from ..calibration.redrawn import batch_of_captures
 from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..data.capture import Capture, ReferenceLength
