@@ -1,7 +1,8 @@
-"""Calibrations from observations of all kinds: coverage of 95 % intervals by kind and pair of kinds, and throughput.
+"""Calibrations from observations of all kinds: coverage of 95 % intervals by kind and pair, platforms, throughput.
 
-``python benchmarks/observations.py coverage [KIND ...] [--pairs] [--trials 2000]`` and
-``python benchmarks/observations.py throughput [--rounds 5]`` print a line for each measurement and write
+``python benchmarks/observations.py coverage [KIND ...] [--pairs] [--trials 2000]``, ``python
+benchmarks/observations.py platform`` (one ball bar on an indexed platform against one alone) and ``python
+benchmarks/observations.py throughput [--rounds 5]`` print a line for each measurement and write
 ``results/observations-DATE-PART.json``.
 """
 
@@ -26,7 +27,7 @@ from scipy.optimize import least_squares
 
 import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
-from aacmm_jax.core.rotations import rotation_matrix
+from aacmm_jax.core.rotations import rotation_matrix, rotation_vector
 from aacmm_jax.data import observations as kinds
 
 NOISE = aj.Noise(encoder_arcsec=2, seating=0.005)
@@ -163,6 +164,56 @@ def coverage(given: argparse.Namespace) -> list[dict[str, Any]]:
     return found
 
 
+INDICES = 6
+# Places of the bar, of indices, and poses at each of the two balls in each.
+PLATFORMS = [(1, 1, 10), (1, 1, 60), (1, INDICES, 10), (3, 1, 20), (3, INDICES, 10)]
+
+
+def platform(given: argparse.Namespace) -> list[dict[str, Any]]:
+    """Largest U of lengths of 300 mm over the volume: one ball bar alone, and with the arm on a platform that turns it
+    by sixths of a revolution, whose frames are unknown; the bar in one place, and in three."""
+    nominal = aj.load_arm("cheng2018-simulation")
+    space = aj.Parameters.independent(nominal)
+    bounds = aj.Bounds.around(nominal, space)
+    true = aj.perturbed_arm(space, length=1.0, angle=np.deg2rad(0.1), seed=1)
+    turned = [(0.0, 0.0, i * 2 * np.pi / INDICES, 0.0, 0.0, 0.0) for i in range(INDICES)]
+    found = []
+    for places, indices, poses in PLATFORMS:
+        observations = [
+            kinds.SimulatedArtefact(
+                f"bar/{place}/{index}", BAR, poses, composed(turned[index], PLACEMENTS[place]), u=0.001,
+                artefact="bar", placement=f"place {place}", index=f"index {index}" if indices > 1 else None,
+            )
+            for place in range(places) for index in range(indices)
+        ]  # fmt: skip
+        largest, median, determined = [], [], []
+        for seed in range(given.rounds):
+            capture = aj.simulate(true, {}, observations=observations, noise=NOISE, seed=seed)
+            result = aj.calibrate(nominal, capture, bounds, noise=NOISE)
+            volume = aj.volumetric_uncertainty(aj.uncertainty_of(result), points=400, length=300.0)
+            largest.append(2 * float(volume.u_length.max()))
+            median.append(2 * float(np.median(volume.u_length)))
+            determined.append(int(np.sum(result.determined)) if result.converged else 0)
+        row = {
+            "places": places,
+            "indices": indices,
+            "poses": 2 * places * indices * poses,
+            "determined": [min(determined), len(space.names)],
+            "largest_U_mm": [round(x, 4) for x in (min(largest), float(np.median(largest)), max(largest))],
+            "median_U_mm": round(float(np.median(median)), 4),
+        }
+        found.append(row)
+        print(row, flush=True)
+    return found
+
+
+def composed(outer: tuple[float, ...], inner: tuple[float, ...]) -> np.ndarray:
+    """Rotation vector and origin of a frame that is stated in another."""
+    rotation = rotation_matrix(np.array(outer[:3]))
+    both = rotation @ rotation_matrix(np.array(inner[:3]))
+    return np.concatenate([rotation_vector(both), rotation @ np.array(inner[3:]) + np.array(outer[3:])])
+
+
 class Tracker:
     """Five hundred points of a tracker whose frame is unknown: 21 parameters and 6 numbers, from random starts."""
 
@@ -253,7 +304,7 @@ def throughput(given: argparse.Namespace) -> dict[str, Any]:
     return result
 
 
-PARTS = {"coverage": coverage, "throughput": throughput}
+PARTS = {"coverage": coverage, "platform": platform, "throughput": throughput}
 
 
 def main() -> None:

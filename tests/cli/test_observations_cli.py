@@ -111,7 +111,10 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
         ("calibrate tracker.h5 -o x.h5 --scale nominal", ["--scale nominal is for captures without a scale"]),
         ("calibrate free.h5 -o x.h5 --scale nominal --method joint", ["stage 1 alone; leave out --method"]),
         ("calibrate tracker.h5 -o x.h5 --figure x.png", ["a figure of residuals takes sockets"]),
-        ("calibrate tracker.h5 -o x.h5 --monte-carlo", ["--monte-carlo takes sockets"]),
+        (
+            "calibrate bad.h5 -o x.h5 --robust huber --monte-carlo",
+            ["--monte-carlo is for calibrations without --robust"],
+        ),
         ("calibrate tracker.h5 -o x.h5 --cross-validate", ["cross-validation takes sockets"]),
         ("calibrate monday.h5 -o x.h5 --same-probe", ["--same-probe is for several captures"]),
         ("calibrate monday.h5 monday.h5 -o x.h5", ["two captures have the name 'monday'"]),
