@@ -220,19 +220,16 @@ def _square_roots(covariances: Float[np.ndarray, "m r r"]) -> Float[np.ndarray, 
 def _rows_with_replacement(
     observation: AbstractObservation, count: int, random: np.random.Generator
 ) -> Int[np.ndarray, "t m"]:
-    alike: dict[tuple[Any, ...], list[int]] = {}
-    static = [getattr(observation, field) for field in observation.by_pose]
-    static = [values for values in static if isinstance(values, tuple)]
-    for i in range(observation.q.shape[0]):
-        alike.setdefault(tuple(values[i] for values in static), []).append(i)
-    if max(map(len, alike.values())) < 2:
+    places = observation.places
+    if np.bincount(places).max() < 2:
         raise InputError(
             f"observation '{observation.name}' has one pose in each point, so none can be drawn in the place of "
             "another; record several, or use monte_carlo."
         )
     rows = np.empty((count, observation.q.shape[0]), dtype=int)
-    for group in alike.values():
-        rows[:, group] = np.array(group)[random.integers(len(group), size=(count, len(group)))]
+    for place in range(places.max() + 1):
+        group = np.flatnonzero(places == place)
+        rows[:, group] = group[random.integers(len(group), size=(count, len(group)))]
     return rows
 
 

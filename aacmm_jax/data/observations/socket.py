@@ -1,5 +1,6 @@
 """A socket: the tip is at one point, whose position is unknown."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -9,6 +10,7 @@ from jaxtyping import Float
 
 from ...core.arrays import Numbers
 from ...core.numpy_or_jax import AnyArray, namespace
+from .frames import moved
 from .observation import (
     POINT,
     READINGS,
@@ -95,6 +97,7 @@ class SimulatedSocket(AbstractSimulated):
             probe.
     """
 
+    table: ClassVar[str] = "socket"
     name: str = eqx.field(static=True)
     point: np.ndarray = eqx.field(converter=as_numbers)
     poses: int = eqx.field(static=True)
@@ -104,6 +107,9 @@ class SimulatedSocket(AbstractSimulated):
     @property
     def offset(self) -> Float[np.ndarray, " 3"] | None:
         return None if self.place is None else as_numbers(self.place)
+
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedSocket":
+        return dataclasses.replace(self, name=name, point=moved(frame, self.point))
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         return np.tile(self.point, (self.poses, 1))
