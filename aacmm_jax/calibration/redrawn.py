@@ -107,19 +107,30 @@ class ObservedTruth(NamedTuple):
         """A batch of captures with new errors; ``level`` (t, 1, 1) multiplies the noise of readings and seat."""
         q = np.asarray(self.observed.q)
         read = np.asarray(noise.encoder) * level * random.normal(size=(count, self.reading.max() + 1, q.shape[1]))
-        values = {
+        values = self.values(count, random)
+        errors = self.errors_of_rows(count, level * float(noise.seating), random)
+        found = []
+        for (observation, part), rows, error in zip(self._parts(), self.observed.slices, errors, strict=True):
+            shift = error - np.asarray(part.rows.values)
+            found.append(shifted(observation, q[rows] + read[:, self.reading[rows]], shift, values))
+        return batch_of_observations(found, self.ends, self.lengths(count, random))
+
+    def errors_of_rows(self, count: int, seating: Any, random: np.random.Generator) -> list[Float[np.ndarray, "t r m"]]:
+        """Errors of the seat (of this standard deviation, mm) and of what was measured, in each observation's rows."""
+        found = []
+        for part, error, root in zip(self.linear, self.errors, self.roots, strict=True):
+            r, m = part.rows.values.shape
+            seat = seating * random.normal(size=(count, error.by_seat.shape[1], m))
+            measured = np.einsum("mab,tbm->tam", root, random.normal(size=(count, r, m)))
+            found.append(measured + np.einsum("rcm,tcm->trm", error.by_seat, seat))
+        return found
+
+    def values(self, count: int, random: np.random.Generator) -> dict[str, Float[np.ndarray, "t k"]]:
+        """Certified values of the parts that have them."""
+        return {
             name: self.geometry[name] + np.asarray(u) * random.normal(size=(count, len(u)))
             for name, (_, u) in self.observed.certified().items()
         }
-        found = []
-        parts = zip(self._parts(), self.observed.slices, self.errors, self.roots, strict=True)
-        for (observation, part), rows, error, root in parts:
-            r, m = part.rows.values.shape
-            seat = float(noise.seating) * level * random.normal(size=(count, error.by_seat.shape[1], m))
-            measured = np.einsum("mab,tbm->tam", root, random.normal(size=(count, r, m)))
-            shift = measured + np.einsum("rcm,tcm->trm", error.by_seat, seat) - np.asarray(part.rows.values)
-            found.append(shifted(observation, q[rows] + read[:, self.reading[rows]], shift, values))
-        return batch_of_observations(found, self._ends(), self.lengths(count, random))
 
     def lengths(self, count: int, random: np.random.Generator) -> DrawnLengths:
         """Certified values of the reference lengths."""
@@ -153,12 +164,14 @@ class ObservedTruth(NamedTuple):
             found.append(ShiftedObservation(batch, batch.q, none, own))
         nominal, u = np.asarray(self.observed.nominal), np.asarray(self.observed.u)
         drawn = nominal + u * random.normal(size=(count, len(u)))
-        return batch_of_observations(found, self._ends(), DrawnLengths(drawn, np.broadcast_to(u, drawn.shape)))
+        return batch_of_observations(found, self.ends, DrawnLengths(drawn, np.broadcast_to(u, drawn.shape)))
 
     def _parts(self) -> Any:
         return list(zip(self.observed.observations, self.linear, strict=True))
 
-    def _ends(self) -> list[tuple[str, str]]:
+    @property
+    def ends(self) -> list[tuple[str, str]]:
+        """Names of the positions at the ends of the reference lengths."""
         return list(self.observed.ends)
 
 
