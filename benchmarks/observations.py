@@ -1,11 +1,13 @@
-"""Calibrations from observations of all kinds: coverage of 95 % intervals by kind and pair of kinds, and throughput.
+"""Calibrations from observations of all kinds: coverage of 95 % intervals by kind and pair, platforms, throughput.
 
-``python benchmarks/observations.py coverage [KIND ...] [--pairs] [--trials 2000]`` and
-``python benchmarks/observations.py throughput [--rounds 5]`` print a line for each measurement and write
+``python benchmarks/observations.py coverage [KIND ...] [--pairs] [--trials 2000]``, ``python
+benchmarks/observations.py platform`` (one ball bar on an indexed platform against one alone) and ``python
+benchmarks/observations.py throughput [--rounds 5]`` print a line for each measurement and write
 ``results/observations-DATE-PART.json``.
 """
 
 import argparse
+import dataclasses
 import datetime
 import itertools
 import json
@@ -25,7 +27,7 @@ from scipy.optimize import least_squares
 
 import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
-from aacmm_jax.core.rotations import rotation_matrix
+from aacmm_jax.core.rotations import rotation_matrix, rotation_vector
 from aacmm_jax.data import observations as kinds
 
 NOISE = aj.Noise(encoder_arcsec=2, seating=0.005)
@@ -35,7 +37,9 @@ BAR = {"a": (0, 0, 0), "b": (300, 0, 0)}
 PLATE = {f"{i}{j}": (150.0 * i, 150.0 * j, 0.0) for i in range(3) for j in range(3)}
 PLACEMENTS = [(0, 0, 0, 300, 0, 200), (0, 0, 1.5, 300, -200, 250), (0, 1.5, 0, 400, 100, 500)]
 CENTRES = [(300, 0, 300), (500, 200, 200), (300, -300, 150)]
+SOCKETS = [(400, 100, 300), (300, -250, 200), (500, 150, 450)]
 SIMULATED: dict[str, list[Any]] = {
+    "sockets": [kinds.SimulatedSocket(f"socket{i}", point, 20) for i, point in enumerate(SOCKETS)],
     "points": [kinds.SimulatedPoints("T", BOX, 60, FRAME, u=0.01)],
     "transforms": [kinds.SimulatedTransforms("T6", BOX, 60, (10, 20, 80, 0.1, 0.2, 0.3), FRAME, u=0.01, u_angle=1e-4)],
     "spheres": [kinds.SimulatedSphere(f"s{i}", centre, 50.0, 25, u=0.001) for i, centre in enumerate(CENTRES)],
@@ -53,6 +57,8 @@ SIMULATED: dict[str, list[Any]] = {
         kinds.SimulatedDistances("e", BOX, 60, (100, 700, 100), u=0.003),
     ],
 }
+ALONE = tuple(name for name in SIMULATED if name != "sockets")  # which see no scale
+PAIRED = tuple(name for name in SIMULATED if name != "plate")  # whose kind is that of the bars
 # A target in an unknown place of the last frame, with unknown orientation, leaves these of the last link open.
 OPEN_WITH_A_TARGET = ("probe_z", "alpha_6", "theta_6", "a_6", "d_6")
 
@@ -68,7 +74,10 @@ class Trials:
             space = aj.Parameters(space.base, names)
         self.space, self.bounds = space, aj.Bounds.around(self.nominal, space)
         self.true = aj.perturbed_arm(space, length=1.0, angle=np.deg2rad(0.1), seed=1)
-        self.simulated = [one for kind in chosen for one in SIMULATED[kind]]
+        # Of a pair each kind has half of its poses, so that a pair has about as many as a kind alone.
+        self.simulated = [
+            dataclasses.replace(one, poses=-(-one.poses // len(chosen))) for kind in chosen for one in SIMULATED[kind]
+        ]
         exact = aj.simulate(self.true, {}, observations=self.simulated, noise=aj.Noise(), seed=3)
         self.exact = []
         for one, observation in zip(self.simulated, exact.observations, strict=True):
@@ -141,15 +150,68 @@ def coverage_of(chosen: tuple[str, ...], trials: int, noise: aj.Noise | None) ->
 
 
 def coverage(given: argparse.Namespace) -> list[dict[str, Any]]:
-    """Each kind alone, and with ``--pairs`` each pair of them."""
-    names = tuple(given.kinds or SIMULATED)
-    chosen = [(name,) for name in names] if not given.pairs else list(itertools.combinations(names, 2))
+    """Each kind alone, or with ``--pairs`` each pair of them; what is finished is written at once."""
+    if given.pairs:
+        chosen = list(itertools.combinations(given.kinds or PAIRED, 2))
+    else:
+        chosen = [(name,) for name in given.kinds or ALONE]
     found = []
     for combination in chosen:
         for noise in (NOISE, None) if given.estimated else (NOISE,):
             found.append(coverage_of(combination, given.trials, noise))
             print(found[-1], flush=True)
+            write(given, found, "coverage-of-pairs" if given.pairs else "coverage")
     return found
+
+
+INDICES = 6
+# Places of the bar, of indices, and poses at each of the two balls in each.
+PLATFORMS = [(1, 1, 10), (1, 1, 60), (1, INDICES, 10), (3, 1, 20), (3, INDICES, 10)]
+
+
+def platform(given: argparse.Namespace) -> list[dict[str, Any]]:
+    """Largest U of lengths of 300 mm over the volume: one ball bar alone, and with the arm on a platform that turns it
+    by sixths of a revolution, whose frames are unknown; the bar in one place, and in three."""
+    nominal = aj.load_arm("cheng2018-simulation")
+    space = aj.Parameters.independent(nominal)
+    bounds = aj.Bounds.around(nominal, space)
+    true = aj.perturbed_arm(space, length=1.0, angle=np.deg2rad(0.1), seed=1)
+    turned = [(0.0, 0.0, i * 2 * np.pi / INDICES, 0.0, 0.0, 0.0) for i in range(INDICES)]
+    found = []
+    for places, indices, poses in PLATFORMS:
+        observations = [
+            kinds.SimulatedArtefact(
+                f"bar/{place}/{index}", BAR, poses, composed(turned[index], PLACEMENTS[place]), u=0.001,
+                artefact="bar", placement=f"place {place}", index=f"index {index}" if indices > 1 else None,
+            )
+            for place in range(places) for index in range(indices)
+        ]  # fmt: skip
+        largest, median, determined = [], [], []
+        for seed in range(given.rounds):
+            capture = aj.simulate(true, {}, observations=observations, noise=NOISE, seed=seed)
+            result = aj.calibrate(nominal, capture, bounds, noise=NOISE)
+            volume = aj.volumetric_uncertainty(aj.uncertainty_of(result), points=400, length=300.0)
+            largest.append(2 * float(volume.u_length.max()))
+            median.append(2 * float(np.median(volume.u_length)))
+            determined.append(int(np.sum(result.determined)) if result.converged else 0)
+        row = {
+            "places": places,
+            "indices": indices,
+            "poses": 2 * places * indices * poses,
+            "determined": [min(determined), len(space.names)],
+            "largest_U_mm": [round(x, 4) for x in (min(largest), float(np.median(largest)), max(largest))],
+            "median_U_mm": round(float(np.median(median)), 4),
+        }
+        found.append(row)
+        print(row, flush=True)
+    return found
+
+
+def composed(outer: tuple[float, ...], inner: tuple[float, ...]) -> np.ndarray:
+    """Rotation vector and origin of a frame that is stated in another."""
+    rotation = rotation_matrix(np.array(outer[:3]))
+    both = rotation @ rotation_matrix(np.array(inner[:3]))
+    return np.concatenate([rotation_vector(both), rotation @ np.array(inner[3:]) + np.array(outer[3:])])
 
 
 class Tracker:
@@ -242,7 +304,7 @@ def throughput(given: argparse.Namespace) -> dict[str, Any]:
     return result
 
 
-PARTS = {"coverage": coverage, "throughput": throughput}
+PARTS = {"coverage": coverage, "platform": platform, "throughput": throughput}
 
 
 def main() -> None:
@@ -258,7 +320,13 @@ def main() -> None:
     )
     given = parser.parse_args()
     found = PARTS[given.part](given)
-    path = given.results / f"observations-{datetime.date.today()}-{given.part}.json"
+    if given.part != "coverage":
+        write(given, found, given.part)
+
+
+def write(given: argparse.Namespace, found: Any, part: str) -> None:
+    """Store what was measured."""
+    path = given.results / f"observations-{datetime.date.today()}-{part}.json"
     path.write_text(json.dumps(found, indent=1) + "\n")
 
 

@@ -2,8 +2,8 @@ from .evaluation import Evaluation as Evaluation
 from .left_out import CrossValidation as CrossValidation
 from .record import CalibrationRecord as CalibrationRecord
 from .record import record_of as record_of
+from .redrawn import batch_of_captures as batch_of_captures
 from .results import ManyCalibrations as ManyCalibrations
 from .results import ManyIdentifications as ManyIdentifications
 from .results import converged as converged
 from .sampling import Sampled as Sampled
-from .sampling import batch_of_captures as batch_of_captures

@@ -77,7 +77,7 @@ def solve_observed(
         names=space.names,
         anchor=anchor,
         loss=None if robust is None else Loss(robust),
-        pose=configurations(Observed.of(first[1]).q),
+        pose=_poses_read_at_once(first[1], options.covariance),
         max_steps=options.max_steps,
         covariance=options.covariance,
         batched=axes,
@@ -103,6 +103,12 @@ def solve_observed(
         anchor=anchor,
         **fields,
     )
+
+
+def _poses_read_at_once(capture: Capture, covariance: bool) -> tuple[int, ...]:
+    """Numbers of the configurations; only covariances need to know which are one, and each answer is a program."""
+    q = Observed.of(capture).q
+    return configurations(q) if covariance else tuple(range(q.shape[0]))
 
 
 def _default_slots(platform: str, poses: int) -> int:

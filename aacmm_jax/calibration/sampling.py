@@ -10,17 +10,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..core.arguments import checked_arguments
-from ..core.arrays import Numbers, random_generator
+from ..core.arrays import random_generator
 from ..core.errors import InputError
-from ..data.capture import Capture, check_sockets_only
+from ..data.capture import Capture
 from ..data.noise import Noise
-from ..kinematics.arm import Arm
-from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
+from ..model.robust import LossName
 from ..uncertainty.volume import default_length, sample_lengths
-from .batch import BatchOptions, BatchTask
+from .batch import BatchOptions, BatchTask, identify_many
 from .record import uncertainty_of
-from .results import Calibration
+from .redrawn import batch_of_captures, trials_of, truth_of
+from .results import Calibration, ManyCalibrations, ManyIdentifications
 
 _LENGTHS = 24  # lengths over the working volume whose distribution is found with those of the parameters and k
 _REFINED = 5  # the standard's own tolerance is divided by this where a linear result is validated (JCGM 101, 8.2)
@@ -78,7 +78,8 @@ class Sampled(NamedTuple):
         else:
             found.append(
                 f"The linear {percent} intervals agree with those of {self.trials} Monte Carlo trials within the "
-                "tolerance of JCGM 101, for every parameter, k, and lengths over the volume."
+                f"tolerance of JCGM 101, for every parameter{', k,' if 'k' in self.quantities else ''} and lengths "
+                "over the volume."
             )
         return found
 
@@ -97,10 +98,11 @@ def monte_carlo(
 ) -> Sampled:
     """Propagation of distributions (JCGM 101:2008): the whole calibration is repeated on readings drawn anew.
 
-    Readings are drawn about poses in which the calibrated arm meets its sockets exactly, certified lengths with their
-    u. Blocks of max(100 / (1 - level), 10,000) trials are added until mean, u and both ends of the interval of every
-    quantity are stable to a fifth of the tolerance (section 7.9). Bounds act in every trial as they did in the
-    calibration, so the distribution ends where one is active.
+    Readings are drawn about poses in which the calibrated arm meets its sockets exactly, certified values with their u.
+    Of captures with other observations, residuals are drawn about 0: readings, seat and measured values have new
+    errors, by the geometry that was found. Blocks of max(100 / (1 - level), 10,000) trials are added until mean, u and
+    both ends of the interval of every quantity are stable to a fifth of the tolerance (section 7.9). Bounds act in
+    every trial as they did in the calibration, so the distribution ends where one is active.
 
     Args:
         result: what `calibrate` returned.
@@ -117,7 +119,8 @@ def monte_carlo(
         Distribution of every parameter, k and the lengths, with the linear result to compare it with.
 
     Raises:
-        InputError: a number is out of range, or hardly any trial converges.
+        InputError: a number is out of range, the calibration had a robust loss (a bootstrap keeps bad poses), or hardly
+            any trial converges.
     """
     if digits not in (1, 2):
         raise InputError(f"digits is {digits}; give 1 or 2 significant digits of the uncertainty.")
@@ -130,14 +133,13 @@ def monte_carlo(
     if most < block:
         raise InputError(f"most is {most}, but one block of trials has {block}; allow that many at least.")
     task = _RepeatedTask.of(result, capture, lengths)
-    exact, moves = _exact(result.arm, capture)
-    true_lengths = np.asarray(_lengths_by(result.arm, capture))
+    trials = trials_of(result, capture, noise, task.u)
     drawn, failed, blocks = [], 0, []
     stable = False
     while sum(map(len, drawn)) + failed < most and not stable:
         random = np.random.default_rng([seed, len(drawn)])
         parts = []
-        for count in _slices(block, exact.size):
+        for count in _slices(block, trials.size):
             # Noise estimated with few degrees of freedom is itself uncertain: its scale is drawn too, which gives
             # Student's t (JCGM 101, 6.4.9).
             known = math.isinf(result.degrees_of_freedom)
@@ -148,11 +150,7 @@ def monte_carlo(
                     result.degrees_of_freedom / random.chisquare(result.degrees_of_freedom, size=(count, 1, 1))
                 )
             )
-            seats = float(noise.seating) * level_of * random.normal(size=(count, *exact.shape[:1], 3))
-            readings = exact + np.einsum("Nic,tNc->tNi", moves, seats)
-            readings += np.asarray(noise.encoder) * level_of * random.normal(size=readings.shape)
-            values = true_lengths + task.u * random.normal(size=(count, len(task.u)))
-            solved, lost = task.solved(readings, values)
+            solved, lost = task.solved(trials.drawn(count, random, level_of))
             parts.append(solved)
             failed += lost
         found = np.concatenate(parts)
@@ -170,40 +168,49 @@ def monte_carlo(
 
 @checked_arguments
 def bootstrap(
-    result: Calibration, capture: Capture, *, trials: int = 2000, level: float = 0.95, seed: int = 0
+    result: Calibration,
+    capture: Capture,
+    *,
+    trials: int = 2000,
+    level: float = 0.95,
+    robust: LossName | None = None,
+    seed: int = 0,
 ) -> Sampled:
-    """The calibration repeated on poses drawn with replacement from each socket, and lengths drawn with their u.
+    """The calibration repeated on poses drawn with replacement, and certified values drawn with their u.
 
-    It only assumes that the errors of poses are independent. (The variance of a socket of m poses is (m - 1) / m too
-    small.)
+    Poses are drawn from those of each socket; of other observations from those that owe the same, such as one point of
+    an artefact. It only assumes that the errors of poses are independent. (The variance of a socket of m poses is
+    (m - 1) / m too small.)
 
     Args:
         result: what `calibrate` returned.
         capture: the capture that it was identified from.
         trials: how many repetitions, at least 100.
         level: coverage probability of the intervals.
+        robust: the robust loss of the calibration, where it had one.
         seed: of the random numbers.
 
     Returns:
         Distribution of every parameter, k and lengths over the working volume.
 
     Raises:
-        InputError: too few trials, or hardly any of them converges.
+        InputError: too few trials, poses that cannot be drawn one in the place of another, another loss than the
+            calibration's, or hardly any of them converges.
     """
     if trials < 100:
         raise InputError(f"{trials} trials show no distribution; ask for at least 100.")
     _check_level(level)
     random = random_generator(seed)
-    starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
-    task = _RepeatedTask.of(result, capture, None)
-    rows = np.concatenate(
-        [start + random.integers(size, size=(trials, size)) for start, size in zip(starts, capture.sizes, strict=True)],
-        axis=1,
-    )
-    nominal = np.array([float(length.value) for length in capture.lengths])
-    found, failed = task.solved(
-        np.asarray(capture.q)[rows], nominal + task.u * random.normal(size=(trials, len(nominal)))
-    )
+    task = _RepeatedTask.of(result, capture, None, robust)
+    if result.observed is not None:
+        found, failed = task.solved(truth_of(result, capture).resampled(trials, random))
+    else:
+        starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
+        sizes = zip(starts, capture.sizes, strict=True)
+        rows = np.concatenate([start + random.integers(size, size=(trials, size)) for start, size in sizes], axis=1)
+        nominal = np.array([float(length.value) for length in capture.lengths])
+        values = nominal + task.u * random.normal(size=(trials, len(nominal)))
+        found, failed = task.solved(batch_of_captures(capture, np.asarray(capture.q)[rows], values))
     if len(found) < 10:
         raise InputError("hardly any bootstrap trial converges: too few poses a socket for this; record more.")
     return task.sampled(result, found, True, failed, level, 1)
@@ -212,6 +219,22 @@ def bootstrap(
 def _check_level(level: float) -> None:
     if not 0 < level <= 0.9999:
         raise InputError(f"level is {level:g}; give a probability between 0 and 0.9999, for example 0.95.")
+
+
+def _check_loss(result: Calibration, capture: Capture, robust: LossName | None) -> None:
+    """Refuse trials that would be solved with another loss than the calibration, or of another capture."""
+    if result.observed is None:
+        if capture.observations or robust is not None:
+            raise InputError(
+                "the calibration is of sockets and lengths without a robust loss; give its own capture and loss."
+            )
+        return
+    lost = any(bool(np.any(np.asarray(weights) < 1)) for weights in result.observed.weights)
+    if lost and robust is None:
+        raise InputError(
+            "a robust loss took weight from poses of this calibration; name it for the bootstrap (robust='huber'), "
+            "which keeps such poses, or calibrate without it."
+        )
 
 
 def numerical_tolerance(u: Float[np.ndarray, " q"], digits: int) -> Float[np.ndarray, " q"]:
@@ -235,20 +258,6 @@ def _slices(block: int, numbers: int) -> list[int]:
     return [min(most, block - first) for first in range(0, block, most)]
 
 
-def _exact(arm: Arm, capture: Capture) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n 3"]]:
-    """Poses that hold their socket exactly, and the least change of the joints for each mm that the tip shall move."""
-    q = project_to_centroids(arm, capture)
-    by_joints = np.asarray(arm.jacobian(q, [f"q_{i}" for i in range(1, arm.joints + 1)]))
-    return q, np.linalg.pinv(by_joints, rcond=1e-8)
-
-
-def _lengths_by(arm: Arm, capture: Capture) -> np.ndarray:
-    tips = np.asarray(arm.position(project_to_centroids(arm, capture)))
-    first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
-    ends = capture.ends()
-    return np.linalg.norm(tips[first[ends[:, 0]]] - tips[first[ends[:, 1]]], axis=1)
-
-
 class _RepeatedTask(NamedTuple):
     """What is the same in all trials."""
 
@@ -257,12 +266,17 @@ class _RepeatedTask(NamedTuple):
     start: Float[np.ndarray, "v n"]
     end: Float[np.ndarray, "v n"]
     u: Float[np.ndarray, " l"]
+    robust: LossName | None
 
     @classmethod
     def of(
-        cls, result: Calibration, capture: Capture, lengths: tuple[np.ndarray, np.ndarray] | None
+        cls,
+        result: Calibration,
+        capture: Capture,
+        lengths: tuple[np.ndarray, np.ndarray] | None,
+        robust: LossName | None = None,
     ) -> "_RepeatedTask":
-        check_sockets_only(capture, "resampling")
+        _check_loss(result, capture, robust)
         if lengths is not None and (
             not isinstance(lengths, tuple | list)
             or len(lengths) != 2
@@ -274,28 +288,27 @@ class _RepeatedTask(NamedTuple):
             )
         start, end = lengths or sample_lengths(result.arm, _LENGTHS, length=default_length(result.arm))
         u = np.array([float(length.u) for length in capture.lengths])
-        return cls(result, capture, np.asarray(start), np.asarray(end), u)
+        return cls(result, capture, np.asarray(start), np.asarray(end), u, robust)
 
-    def solved(self, q: Float[np.ndarray, "t N n"], values: Float[np.ndarray, "t l"]) -> tuple[np.ndarray, int]:
-        """Outputs of the trials that converged ``(t, q)``, and how many did not."""
+    def _many(self, captures: Capture) -> ManyCalibrations | ManyIdentifications:
         result = self.result
         stage1, bounds = result.stage1, result.bounds
         # What sets the scale, and the noise that weights the poses, are the calibration's own.
-        task = BatchTask.of(
-            stage1.arm,
-            batch_of_captures(self.capture, q, values),
-            (bounds.lower, bounds.upper),
-            stage1.parameters,
-            result.space,
-            BatchOptions(noise=result.given_noise),
-            stage1.anchor,
-        )
-        many = task.calibrate(result.method)
+        if result.observed is not None:
+            options = {"noise": result.given_noise, "hold": result.hold, "robust": self.robust}
+            return identify_many(result.arm, captures, bounds, start=result.parameters, **options)
+        box, options = (bounds.lower, bounds.upper), BatchOptions(noise=result.given_noise)
+        task = BatchTask.of(stage1.arm, captures, box, stage1.parameters, result.space, options, stage1.anchor)
+        return task.calibrate(result.method)
+
+    def solved(self, captures: Capture) -> tuple[np.ndarray, int]:
+        """Outputs of the trials that converged ``(t, q)``, and how many did not."""
+        result, many = self.result, self._many(captures)
         good = many.converged
         ends = (jnp.asarray(self.start), jnp.asarray(self.end))
         lengths = _lengths_of(Parameters(result.arm, result.space.names), jnp.asarray(many.parameters), ends)
-        assert many.k is not None  # stage 1 of sockets and lengths
-        found = np.hstack([many.parameters, many.k[:, None], np.asarray(lengths)])
+        scale = np.zeros((len(good), 0)) if many.k is None else many.k[:, None]
+        found = np.hstack([many.parameters, scale, np.asarray(lengths)])
         return found[good], int(np.sum(~good))
 
     def sampled(
@@ -308,15 +321,16 @@ class _RepeatedTask(NamedTuple):
         low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
         start, end = (np.asarray(result.arm.position(q)) for q in (self.start, self.end))
         lengths = np.linalg.norm(start - end, axis=1)
-        assert result.scale is not None  # of sockets and lengths
-        estimate = np.concatenate([result.parameters, [result.scale.value], lengths])
+        scale = result.scale  # None where observations fix it, and not reference lengths alone
+        k, u_k = ([], []) if scale is None else ([float(scale.value)], [float(scale.u)])
+        estimate = np.concatenate([result.parameters, k, lengths])
         return Sampled(
-            quantities=(*result.space.names, "k", *(f"length {i + 1}" for i in range(len(self.start)))),
+            quantities=(*result.space.names, *("k" for _ in k), *(f"length {i + 1}" for i in range(len(self.start)))),
             estimate=estimate,
             u=u,
             low=low,
             high=high,
-            linear_u=np.concatenate([linear.u, [float(result.scale.u)], u_length]),
+            linear_u=np.concatenate([linear.u, u_k, u_length]),
             factor=linear.factor(level),
             tolerance=numerical_tolerance(u, digits),
             stable=stable,
@@ -334,24 +348,3 @@ def _lengths_of(space: Parameters, parameters: Array, ends: tuple[Array, Array])
         return jnp.linalg.norm(arm.position(ends[0]) - arm.position(ends[1]), axis=-1)
 
     return jax.lax.map(one, parameters, batch_size=256)
-
-
-def batch_of_captures(capture: Capture, q: Numbers, values: Numbers, u: Numbers | None = None) -> Capture:
-    """A batch of captures like this one, with other readings and reference lengths, as `identify_many` takes it.
-
-    Args:
-        capture: The sockets with their numbers of poses, and the reference lengths, l of them.
-        q: Readings ``(batch, N, n)``, socket after socket, rad.
-        values: Certified values of the reference lengths ``(batch, l)``, mm.
-        u: Their standard uncertainties, likewise; by default the capture's.
-
-    Returns:
-        The captures; nothing is checked.
-    """
-    lengths = range(len(capture.lengths))
-    if u is None:
-        own = [np.asarray(length.u) for length in capture.lengths]
-        u = np.broadcast_to(np.stack(own), np.shape(values)) if own else np.zeros((len(np.asarray(q)), 0))
-    leaves = lambda c: [c.q, *(c.lengths[i].value for i in lengths), *(c.lengths[i].u for i in lengths)]  # noqa: E731
-    columns = [np.asarray(column)[:, i] for column in (values, u) for i in lengths]
-    return eqx.tree_at(leaves, capture, [np.asarray(q), *columns])

@@ -141,7 +141,6 @@ def calibrate(
     of one arm.
     """
     from ..calibration.record import record_of
-    from ..data.capture import check_sockets_only
     from ..files.calibrations import save_calibration
     from ..summaries.calibration import calibration_summary
     from . import calibration_display
@@ -201,7 +200,6 @@ def calibrate(
             from ..calibration.results import Calibration
             from ..calibration.sampling import monte_carlo as sample
 
-            check_sockets_only(capture_used, "--monte-carlo")
             if not isinstance(result, Calibration) or robust is not None:
                 raise InputError("--monte-carlo is for calibrations without --robust and --scale nominal.")
             sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))

@@ -33,6 +33,7 @@ from .app import (
         "aacmm plan my-arm.toml --acceptance iso -o acceptance.csv --manifest acceptance.toml",
         "aacmm plan my-arm.toml -o plan.csv --poses 25 \\\n"
         "  --socket A=400,200,300 --socket B=700,500,500 --length A,B,0.002",
+        "aacmm plan my-arm.toml --kit kit.toml --poses 60 -o plan.csv --manifest capture.toml",
     )
 )
 def plan(
@@ -98,6 +99,13 @@ def plan(
             help="Length whose uncertainty is predicted all over the volume. Default 300, or half a small arm's reach.",
         ),
     ] = None,
+    kit: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.toml",
+            help="Instead of sockets: artefacts to place and instruments at hand, with their uncertainties.",
+        ),
+    ] = None,
     acceptance: Annotated[
         Literal["asme", "iso"] | None,
         typer.Option(help="Instead: the poses of an acceptance test, by ASME B89.4.22 or ISO 10360-12."),
@@ -130,9 +138,9 @@ def plan(
     """
     from ..data.noise import Noise
     from ..files.arms import load_specification
-    from ..files.plans import plan_csv, plan_manifest
+    from ..files.plans import kit_csv, kit_manifest, plan_csv, plan_manifest
     from ..planning.design import plan as run
-    from ..summaries.planning import plan_summary
+    from ..summaries.planning import kit_plan_summary, plan_summary
     from . import acceptance_display, plan_display
 
     with together(output, manifest):  # refuses outputs that are inputs or cannot be written, before the work
@@ -143,6 +151,8 @@ def plan(
         raise InputError(
             "--length is between sockets of --socket; to have a reference length positioned, use --length-mm."
         )
+    if kit is not None and (socket or sockets is not None or length or acceptance is not None):
+        raise InputError("--kit names what is used; leave out --socket, --sockets, --length and --acceptance.")
     if region and socket:
         raise InputError("--region is for sockets that are to be positioned; leave it out with --socket.")
     if acceptance is not None:
@@ -166,27 +176,42 @@ def plan(
     if len(dict(axes)) < len(axes):
         raise InputError("an axis is named twice in --region; give each one range.")
     points = sockets_option(socket)
+    shared: dict[str, Any] = {
+        "poses": poses,
+        "region": dict(axes) if axes else None,
+        "space": specification.space(),
+        "noise": Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm),
+        "criterion": criterion,
+        "margin": margin_deg * DEG,
+        "above": above_mm,
+        "candidates": candidates,
+        "check_length": check_length_mm,
+        "seed": seed,
+    }
+    if kit is not None:
+        from ..files.kits import read_kit
+        from ..planning.kit import plan_kit
+
+        with together(output, manifest):
+            things = read_kit(kit)
+        with plan_display.progress() as report_progress:
+            planned = plan_kit(specification.arm, things, **shared, progress=report_progress)
+        written = _written(output, kit_csv(planned), manifest, lambda name: kit_manifest(planned, name), arm)
+        summary = kit_plan_summary(planned, specification.name) | {"written": written}
+        show_summary(summary, as_json, plan_display.kit_plan)
+        return
     with plan_display.progress() as report_progress:
         found = run(
             specification.arm,
             sockets=points or (4 if sockets is None else sockets),
-            poses=poses,
             length=_range("--length-mm", length_mm),
             u=u_mm,
             lengths=[length_option(text) for text in length or ()],
-            region=dict(axes) if axes else None,
-            space=specification.space(),
-            noise=Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm),
-            criterion=criterion,
-            margin=margin_deg * DEG,
-            above=above_mm,
-            candidates=candidates,
-            check_length=check_length_mm,
-            seed=seed,
+            **shared,
             progress=report_progress,
         )
     written = _written(output, plan_csv(found), manifest, lambda name: plan_manifest(found, name), arm)
-    summary: dict[str, Any] = plan_summary(found, specification.name) | {"written": written}
+    summary = plan_summary(found, specification.name) | {"written": written}
     show_summary(summary, as_json, plan_display.plan)
 
 

@@ -47,6 +47,32 @@ def plan(summary: dict[str, Any]) -> None:
             f"Reference length {escape(row['from'])} - {escape(row['to'])}: {row['value_mm']:.1f} mm, "
             f"u = {1e3 * row['u_mm']:.3g} um"
         )
+    _print_predictions(console, summary, "random poses in the same sockets")
+    print_written(console, summary)
+
+
+def kit_plan(summary: dict[str, Any]) -> None:
+    """Where artefacts are put, how many poses each gets, and the predicted uncertainty, also without each part."""
+    console = new_console()
+    console.print(f"[bold]{escape(summary['arm'])}[/bold]: {pluralise(summary['poses'], 'pose')}")
+    table = new_table("", "observation", "kind", "tip's x [mm]", "y [mm]", "z [mm]", "poses")
+    for row in summary["observations"]:
+        for number, place in enumerate(row["places"]):
+            name, kind = (escape(row["observation"]), row["kind"]) if number == 0 else ("", "")
+            table.add_row(name, kind, *(f"{value:.0f}" for value in place["position_mm"]), str(place["poses"]))
+    print_table(console, table)
+    console.print("Positions are those of the points of an artefact; elsewhere the middle of the tips.")
+    rows = [(f"without {escape(name)}", prediction) for name, prediction in summary["without"].items()]
+    _print_predictions(console, summary, "random poses in the same places", rows)
+    print_written(console, summary)
+
+
+def _print_predictions(
+    console: Console,
+    summary: dict[str, Any],
+    random: str,
+    more: list[tuple[str, dict[str, float] | None]] | None = None,
+) -> None:
     length = f"{summary['check_length_mm']:g} mm"
     console.print(
         f"\n[bold]Standard uncertainty that the calibration adds to lengths of {length} over the volume \\[um][/bold]"
@@ -55,10 +81,17 @@ def plan(summary: dict[str, Any]) -> None:
     for key, text in (
         ("predicted", "this plan"),
         ("loose", "this plan, joints kept to about 5 deg only"),
-        ("random", f"{summary['poses']} random poses in the same sockets"),
+        ("random", f"{summary['poses']} {random}"),
         ("more", f"this plan and {summary['more_poses']} more poses"),
     ):
         table.add_row(text, *(f"{1e3 * summary[key][which]:.1f}" for which in ("median_mm", "largest_mm")))
+    for text, prediction in more or []:
+        values = (
+            ["not determined", ""]
+            if prediction is None
+            else [f"{1e3 * prediction[which]:.1f}" for which in ("median_mm", "largest_mm")]
+        )
+        table.add_row(text, *values)
     print_table(console, table)
     console.print(
         f"For a joint calibration with encoders of {summary['encoder_arcsec']:g} arcsec and a seat of "
@@ -69,4 +102,3 @@ def plan(summary: dict[str, Any]) -> None:
         "Checked: joint limits, reach, and that nothing comes below the table. Not checked: obstacles, collisions of "
         "the arm with itself, and from which side a socket can be entered (the plan's file has the probe's direction)."
     )
-    print_written(console, summary)

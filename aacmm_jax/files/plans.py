@@ -12,25 +12,29 @@ from ..acceptance.procedure import TOUCHED, Procedure
 from ..acceptance.procedure_items import ProcedureItem
 from ..acceptance.standards import PLANNED
 from ..core.units import DEG
+from ..data.observations.observation import AbstractObservation, Entry
+from ..data.observations.socket import Socket
 from ..kinematics.arm import Arm
 from ..planning.design import Plan
+from ..planning.kit import KitPlan
 from .atomic_write import write_text
 
 
-def save_plan(path: str | os.PathLike, plan: Plan) -> None:
+def save_plan(path: str | os.PathLike, plan: Plan | KitPlan) -> None:
     """Write the poses of a plan as CSV, in the order in which to take them.
 
-    Columns: ``pose``, ``socket``, ``x_mm``, ``y_mm``, ``z_mm`` (the socket), ``q_1_deg`` and so on (joint readings),
-    ``probe_direction_x``, ``_y``, ``_z`` (the last frame's z axis).
+    Columns: ``pose``, ``socket`` (of a kit: ``observation`` and ``point``), ``x_mm``, ``y_mm``, ``z_mm`` (the socket,
+    or the tip), ``q_1_deg`` and so on (joint readings), ``probe_direction_x``, ``_y``, ``_z`` (the last frame's z
+    axis).
 
     Args:
         path: the file to write.
-        plan: what `planning.plan` returned.
+        plan: what `planning.plan` or `planning.plan_kit` returned.
 
     Raises:
         InputError: the file cannot be written.
     """
-    write_text(path, plan_csv(plan))
+    write_text(path, plan_csv(plan) if isinstance(plan, Plan) else kit_csv(plan))
 
 
 def plan_csv(plan: Plan) -> str:
@@ -61,6 +65,94 @@ def plan_manifest(plan: Plan, arm: str) -> str:
             f"u = {float(length.u)!r}   # mm: its standard uncertainty",
         ]
     return "\n".join(lines) + "\n"
+
+
+def kit_csv(plan: KitPlan) -> str:
+    """A row for each pose of a plan with a kit: observation, point of an artefact or plane, position, readings."""
+    labels, points, q = [], [], []
+    for simulated, one in zip(plan.kit, plan.observations, strict=True):
+        label = _label(one)
+        held = [""] * one.q.shape[0] if label is None else [str(text) for text in one.stored()[label.name]]
+        labels += [[one.name, point] for point in held]
+        arm = plan.arm if simulated.offset is None else plan.arm.replace(probe=simulated.offset)
+        points.append(np.asarray(arm.position(np.asarray(one.q))))
+        q.append(np.asarray(one.q))
+    return _poses_csv(plan.arm, ["observation", "point"], labels, np.concatenate(points), np.concatenate(q))
+
+
+def _label(observation: AbstractObservation) -> Entry | None:
+    """The entry that names what each pose was in."""
+    return next((e for e in observation.entries if e.content == "text" and e.dimensions == ("pose",)), None)
+
+
+def kit_manifest(plan: KitPlan, arm: str) -> str:
+    """A manifest for the readings of a plan with a kit, in which certified values are to be filled in.
+
+    Files hold the joint readings in their first columns and, where something is measured, its numbers in the next.
+    """
+    lines = _manifest_start(
+        arm,
+        "# A calibration, as planned. Fill in certified values and uncertainties (k = 1), record the files (one row a",
+        "# pose, in the order of the plan: joint readings, then what was measured), then: aacmm import THIS.toml -o",
+        "# capture.h5",
+    )
+    for one in plan.observations:
+        lines += ["", *_table(one, plan.arm.joints)]
+    return "\n".join(lines) + "\n"
+
+
+def _table(observation: AbstractObservation, joints: int) -> list[str]:
+    """The table of one observation."""
+    file, stored, label = observation.name.replace("/", "-"), observation.stored(), _label(observation)
+    lines = [f"[[{observation.table}]]", f"name = {_quoted(observation.name)}"]
+    if label is None:
+        lines.append(f"file = {_quoted(file + '.csv')}")
+    else:
+        held = dict.fromkeys(str(text) for text in stored[label.name])
+        files = ", ".join(f"{_quoted(point)} = {_quoted(f'{file}-{point}.csv')}" for point in held)
+        lines.append(f"files = {{ {files} }}")
+    if isinstance(observation, Socket):
+        return lines + ([f"target = {_quoted(observation.target)}"] if observation.target else [])
+    columns, next_column = [], joints + 1
+    for entry in observation.entries:
+        value = stored.get(entry.name)
+        if value is None or entry.name == "q" or entry is label:
+            continue
+        if not entry.dimensions:
+            lines += _single(entry, value)
+        elif entry.dimensions[0] == "pose" and entry.required:
+            # A rotation is recorded as a quaternion.
+            count = 4 if entry.unit == "1" else 3 ** (len(entry.dimensions) - 1)
+            numbers = list(range(next_column, next_column + count))
+            columns.append(f"{entry.name} = {numbers if count > 1 else numbers[0]}")
+            next_column += count
+            lines += ['rotation = "quaternion wxyz"'] if entry.unit == "1" else []
+        elif entry.dimensions[-1] == "axis" and entry.dimensions[0] != "pose":
+            names = [str(name) for name in stored[entry.dimensions[0]]]
+            points = ", ".join(
+                f"{_quoted(name)} = {[round(float(x), 6) for x in point]}"
+                for name, point in zip(names, np.asarray(value), strict=True)
+            )
+            lines.append(f"{entry.name} = {{ {points} }}   # {entry.unit}: {entry.says}")
+    if columns:
+        u = _largest_u(observation)
+        lines += [f"columns = {{ {', '.join(columns)} }}", f"u = {u!r}   # mm: standard uncertainty (k = 1)"]
+    return lines
+
+
+def _single(entry: Entry, value: object) -> list[str]:
+    if entry.content == "text":
+        return [f"{entry.name} = {_quoted(str(value))}"] if value else []
+    if entry.content == "truth":
+        return [f"{entry.name} = true"] if value else []
+    return [f"{entry.name} = {round(float(np.asarray(value)), 9)!r}   # {entry.unit}: {entry.says}"]
+
+
+def _largest_u(observation: AbstractObservation) -> float:
+    """Standard uncertainty of what an instrument measures, mm."""
+    covariance = getattr(observation, "covariance", None)
+    values = np.sqrt(np.asarray(covariance)) if covariance is not None else np.asarray(getattr(observation, "u", 0.0))
+    return round(float(np.max(values)), 9)
 
 
 def _manifest_start(arm: str, *comments: str, acceptance: str | None = None) -> list[str]:

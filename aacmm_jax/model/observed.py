@@ -185,17 +185,26 @@ def linear_rows(
     return found
 
 
+def residual_rows(space: Parameters, observed: Observed, z: Float[AnyArray, " z"]) -> list[Rows]:
+    """The rows of every observation, without derivatives by the parameters."""
+    p = len(space.names)
+    forward, parts = observed.forward(space, z[:p], z[p:]), observed.split(z[p:])
+    return [
+        observation.residual(_tips(forward, rows), parts)
+        for observation, rows in zip(observed.observations, observed.slices, strict=True)
+    ]
+
+
 def observed_rows(
     z: Float[AnyArray, " z"], args: tuple[Parameters, Observed, Whitening, Loss | None]
 ) -> tuple[AnyArray, ...]:
     """Whitened residuals of observations, lengths and certified values; half their sum of squares is what is
     minimised."""
     space, observed, whitening, loss = args
-    p = len(space.names)
-    forward, parts = observed.forward(space, z[:p], z[p:]), observed.split(z[p:])
+    parts = observed.split(z[len(space.names) :])
     found = []
-    for observation, rows, root in zip(observed.observations, observed.slices, whitening.roots, strict=True):
-        values = observation.residual(_tips(forward, rows), parts).values
+    for residual, root in zip(residual_rows(space, observed, z), whitening.roots, strict=True):
+        values = residual.values
         white = namespace(values, root).einsum("mab,bm->am", root, values)
         found.append(white if loss is None else loss.transformed(white))
     length, certified = _relations(observed, whitening, parts)

@@ -38,8 +38,8 @@ from .pose_refinement import refined
 
 Criterion = Literal["length", "A", "D", "E"]
 MORE = 10  # poses added in the prediction `Plan.more`
-_SMALL_ARM = Noise(encoder_arcsec=2.0, seating=0.005)  # a small commercial arm
-_OBJECTIVES: dict[Criterion, tuple[Kind, float]] = {
+SMALL_ARM = Noise(encoder_arcsec=2.0, seating=0.005)  # a small commercial arm
+OBJECTIVES: dict[Criterion, tuple[Kind, float]] = {
     "length": ("functions", 8.0),
     "A": ("trace", 0.0),
     "D": ("determinant", 8.0),
@@ -54,7 +54,7 @@ _RANDOM_SETS, _LOOSE_SETS = 50, 10
 _LOOSE = math.radians(5)
 _U_RANGE = (1e-6, 100.0)  # mm
 
-_Progress = Callable[[str, float], None]
+Progress = Callable[[str, float], None]
 
 
 class Prediction(NamedTuple):
@@ -96,7 +96,7 @@ def plan(
     lengths: Sequence[tuple] = (),
     region: Ranges | None = None,
     space: Parameters | None = None,
-    noise: Noise = _SMALL_ARM,
+    noise: Noise = SMALL_ARM,
     criterion: Criterion = "length",
     margin: float = math.radians(5),
     above: float = 0.0,
@@ -104,7 +104,7 @@ def plan(
     candidates: int = 3000,
     check_length: float | None = None,
     seed: int = 0,
-    progress: _Progress | None = None,
+    progress: Progress | None = None,
 ) -> Plan:
     """Choose the poses that determine an arm best in a joint calibration weighted by ``noise``.
 
@@ -145,11 +145,7 @@ def plan(
         raise InputError("plan takes one arm, not a batch; give one of its arms.")
     space = Parameters.free_of(arm) if space is None else space
     check_length = default_length(arm) if check_length is None else check_length
-    if arm.joints < 3 or total_link_length(arm) == 0:
-        raise InputError("this arm reaches no volume: it needs three joints and a link; there is nothing to plan.")
-    if criterion not in _OBJECTIVES:
-        raise InputError(f"criterion is '{criterion}'; it must be one of {', '.join(_OBJECTIVES)}.")
-    noise.check(arm.joints)
+    check_plannable(arm, criterion, noise)
     _check_counts(sockets, poses, len(space.names), u, lengths)
     ranges = {"z": (0.0, np.inf)} if region is None else region
     own = (length, length) if isinstance(length, int | float) else length
@@ -159,7 +155,7 @@ def plan(
         names = [chr(ord("A") + i) if sockets <= 26 else f"S{i + 1}" for i in range(sockets)]
         placement = None
         _check_ranges(arm, own, lengths, ranges)
-    problem, predicted_functions = _problem(
+    problem, predicted_functions = design_problem(
         search_region(to_numpy(arm), limits, margin, above, seed),
         to_numpy(space),
         to_numpy(noise),
@@ -197,7 +193,7 @@ def plan(
     return found
 
 
-def _problem(
+def design_problem(
     region: SearchRegion, space: Parameters, noise: Noise, criterion: Criterion, sampling: dict[str, Any], seed: int
 ) -> tuple[DesignProblem, Float[np.ndarray, "v p"]]:
     """The problem, and derivatives of other lengths than those of its objective, for predictions."""
@@ -205,7 +201,7 @@ def _problem(
         _length_derivatives(region.arm, space, *sample_lengths(region.arm, count, **sampling, seed=seed + offset))
         for offset, count in ((1, _OBJECTIVE_LENGTHS), (2, _PREDICTION_LENGTHS))
     )
-    kind, power = _OBJECTIVES[criterion]
+    kind, power = OBJECTIVES[criterion]
     return DesignProblem(region, space, noise, Objective(kind, of_objective, power)), of_predictions
 
 
@@ -217,6 +213,27 @@ def _length_derivatives(
     direction = between / np.linalg.norm(between, axis=1, keepdims=True)
     jacobian = jacobian_at(arm, end, space.names) - jacobian_at(arm, start, space.names)
     return np.einsum("vc,vcp->vp", direction, jacobian) * np.asarray(space.scale)
+
+
+def check_plannable(arm: Arm, criterion: str, noise: Noise) -> None:
+    """Raise `InputError` where there is nothing to plan, or no such criterion."""
+    if arm.joints < 3 or total_link_length(arm) == 0:
+        raise InputError("this arm reaches no volume: it needs three joints and a link; there is nothing to plan.")
+    if criterion not in OBJECTIVES:
+        raise InputError(f"criterion is '{criterion}'; it must be one of {', '.join(OBJECTIVES)}.")
+    noise.check(arm.joints)
+
+
+def check_region(ranges: Ranges) -> None:
+    """Raise `InputError` for ranges that are none, or of something else than x, y, z and the distance."""
+    for axis, (low, high) in ranges.items():
+        if not low < high:
+            raise InputError(
+                f"the region's {axis} is {low:g} to {high:g} mm, which is no range; give the lower number first."
+            )
+    unknown = sorted(set(ranges) - {"x", "y", "z", "distance"})
+    if unknown:
+        raise InputError(f"the region has no '{unknown[0]}'; give ranges of x, y, z and distance, in mm.")
 
 
 def _check_counts(sockets: int | Mapping, poses: int, parameters: int, u: float, lengths: Sequence[tuple]) -> None:
@@ -268,14 +285,7 @@ def _check_ranges(arm: Arm, length: tuple[float, float], lengths: Sequence[tuple
     """Raise `InputError` where the sockets cannot be placed."""
     if lengths:
         raise InputError("lengths are between sockets that are given; with a number of sockets, give length and u.")
-    for axis, (low, high) in ranges.items():
-        if not low < high:
-            raise InputError(
-                f"the region's {axis} is {low:g} to {high:g} mm, which is no range; give the lower number first."
-            )
-    unknown = sorted(set(ranges) - {"x", "y", "z", "distance"})
-    if unknown:
-        raise InputError(f"the region has no '{unknown[0]}'; give ranges of x, y, z and distance, in mm.")
+    check_region(ranges)
     low, high = length
     if not 0 < low <= high < 2 * total_link_length(arm):
         raise InputError(
@@ -290,7 +300,7 @@ def _best_placement(
     length: tuple[float, float],
     u: float,
     ranges: Ranges,
-    report: _Progress,
+    report: Progress,
 ) -> FixturePlacement:
     """The best placement found: random ones scored by random poses, the best few by chosen poses, then neighbours."""
     stage = "Placing the sockets"
@@ -339,6 +349,11 @@ def _pool(problem: DesignProblem, placement: FixturePlacement, count: int) -> Po
 
 
 def _sorted(q: Float[np.ndarray, "N n"], owner: Int[np.ndarray, " N"]) -> tuple[np.ndarray, np.ndarray]:
+    order = order_of(q, owner)
+    return q[order], owner[order]
+
+
+def order_of(q: Float[np.ndarray, "N n"], owner: Int[np.ndarray, " N"]) -> list[int]:
     """Socket after socket, and in each from pose to nearest pose, so that the arm moves little."""
     order: list[int] = []
     for socket in range(owner.max() + 1):
@@ -349,7 +364,7 @@ def _sorted(q: Float[np.ndarray, "N n"], owner: Int[np.ndarray, " N"]) -> tuple[
             order.append(current)
             if left:
                 current = min(left, key=lambda i: np.abs(q[i] - q[current]).max())
-    return q[order], owner[order]
+    return order
 
 
 def _predictions(

@@ -13,17 +13,18 @@ _RELAXATION = 0.7  # exponent; 0.5 never makes variances larger, 1 never determi
 
 
 class Candidates(NamedTuple):
-    """Candidate poses: their whitened rows of the design matrix, and the sockets that they belong to.
+    """Candidate poses: their whitened rows of the design matrix, and the sockets (or other places) that they belong to.
 
-    Unknowns are the free parameters in natural steps and, after them, three coordinates of every socket.
+    Unknowns are the free parameters in natural steps and, after them, those of the geometry: three coordinates of every
+    socket. All candidates have as many rows as the one that has most; those that it has not are 0.
     """
 
-    rows: Float[np.ndarray, "c 3 P"]
+    rows: Float[np.ndarray, "c r P"]
     owner: Int[np.ndarray, " c"]
-    base: Float[np.ndarray, "P P"]  # information of the reference lengths and of a weak prior
+    base: Float[np.ndarray, "P P"]  # information of reference lengths, certified values and a weak prior
     parameters: int  # how many of the unknowns are parameters
 
-    def information(self, rows: Float[np.ndarray, "m 3 P"]) -> Float[np.ndarray, "P P"]:
+    def information(self, rows: Float[np.ndarray, "m r P"]) -> Float[np.ndarray, "P P"]:
         """Information of the rows of some poses, with the base."""
         flat = rows.reshape(-1, rows.shape[-1])
         return self.base + flat.T @ flat
@@ -78,12 +79,13 @@ def exchange(
     count: int,
     objective: Objective,
     *,
-    least: int = 2,
+    least: int | Int[np.ndarray, " s"] = 2,
     sweeps: int = 12,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> Int[np.ndarray, " count"]:
-    """Indices of ``count`` candidates, at least ``least`` in every socket: added greedily, then exchanged one by one
-    until a whole sweep improves nothing (Fedorov 1972). ``progress`` is called with the fraction done."""
+    """Indices of ``count`` candidates, at least ``least`` in every socket (one number, or one each): added greedily,
+    then exchanged one by one until a whole sweep improves nothing (Fedorov 1972). ``progress`` is called with the
+    fraction done."""
     chosen: list[int] = []
     taken = np.zeros(len(candidates.owner), dtype=bool)
     information = candidates.base.copy()
@@ -122,11 +124,11 @@ def relaxed_value(candidates: Candidates, count: int, objective: Objective, iter
     of Silvey, Titterington and Torsney 1978): at a hundredth of the cost this ranks sets of candidates as exchange
     does. Without iterations it is the value for random poses.
     """
-    p, unknowns = candidates.parameters, candidates.rows.shape[-1]
+    p, (_, each, unknowns) = candidates.parameters, candidates.rows.shape
     flat = candidates.rows.reshape(-1, unknowns)
     times = np.full(len(candidates.rows), count / len(candidates.rows))
     for iteration in range(iterations + 1):
-        covariance = np.linalg.inv(candidates.base + (flat * np.repeat(times, 3)[:, None]).T @ flat)
+        covariance = np.linalg.inv(candidates.base + (flat * np.repeat(times, each)[:, None]).T @ flat)
         if iteration < iterations:
             root = np.linalg.cholesky(objective.gradient(covariance[:p, :p]))
             gain = np.sum((flat @ (covariance[:, :p] @ root)).reshape(len(times), -1) ** 2, axis=1)
@@ -140,7 +142,9 @@ def covariance_of(information: Float[np.ndarray, "P P"], parameters: int) -> Flo
     return np.linalg.inv(information)[:parameters, :parameters]
 
 
-def _allowed(candidates: Candidates, chosen: list[int], count: int, least: int) -> Bool[np.ndarray, " c"]:
+def _allowed(
+    candidates: Candidates, chosen: list[int], count: int, least: int | Int[np.ndarray, " s"]
+) -> Bool[np.ndarray, " c"]:
     """Candidates that may be taken next, so that every socket can still get its least number."""
     sockets = candidates.owner.max() + 1
     present = np.bincount(candidates.owner[chosen], minlength=sockets) if chosen else np.zeros(sockets, dtype=int)
@@ -152,7 +156,7 @@ def _allowed(candidates: Candidates, chosen: list[int], count: int, least: int) 
 
 def _best(
     candidates: Candidates,
-    components: Float[np.ndarray, "3 c P"],
+    components: Float[np.ndarray, "r c P"],
     information: Float[np.ndarray, "P P"],
     objective: Objective,
     allowed: Bool[np.ndarray, " c"],
@@ -163,6 +167,8 @@ def _best(
     take a tenth of the time of many of three rows.
     """
     inverse, p = np.linalg.inv(information), candidates.parameters
+    if len(components) > 3:
+        return _chosen(_improvement_of_many_rows(components, information, inverse, objective, p), allowed)
     moved = components @ inverse
     inner = _factors(_products(moved, components))
     if objective.kind == "determinant":
@@ -174,11 +180,35 @@ def _best(
         moved = np.ascontiguousarray(moved[:, :, :p])
         outer = _products(moved @ objective.gradient(inverse[:p, :p]), moved)
         improvement = inner.trace_of_quotient(outer)
+    return _chosen(improvement, allowed)
+
+
+def _chosen(improvement: Float[np.ndarray, " c"], allowed: Bool[np.ndarray, " c"]) -> int:
     if not (allowed.any() and np.all(np.isfinite(improvement))):
         raise InputError(
             "there are fewer candidate poses than poses to choose, or they add no information; give more candidates."
         )
     return int(np.argmax(np.where(allowed, improvement, -np.inf)))
+
+
+def _improvement_of_many_rows(
+    components: Float[np.ndarray, "r c P"],
+    information: Float[np.ndarray, "P P"],
+    inverse: Float[np.ndarray, "P P"],
+    objective: Objective,
+    p: int,
+) -> Float[np.ndarray, " c"]:
+    """The same for candidates of more than three rows, such as transforms, by batches of small matrices."""
+    rows, unit = components.transpose(1, 0, 2), np.eye(len(components))
+    moved = rows @ inverse
+    inner = unit + moved @ rows.transpose(0, 2, 1)
+    if objective.kind == "determinant":
+        part = rows[:, :, p:]
+        of_geometry = unit + part @ np.linalg.inv(information[p:, p:]) @ part.transpose(0, 2, 1)
+        return np.linalg.slogdet(inner)[1] - np.linalg.slogdet(of_geometry)[1]
+    moved = moved[:, :, :p]
+    outer = moved @ objective.gradient(inverse[:p, :p]) @ moved.transpose(0, 2, 1)
+    return np.trace(np.linalg.solve(inner, outer), axis1=1, axis2=2)
 
 
 def _products(one: Float[np.ndarray, "3 c k"], other: Float[np.ndarray, "3 c k"]) -> Float[np.ndarray, "3 3 c"]:

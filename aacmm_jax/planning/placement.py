@@ -26,7 +26,7 @@ _ROWS = 2048  # configurations computed at once
 _ITERATIONS = 8  # of the relaxed design: as good a ranking as by a sweep of exchange, in a tenth of the time
 _STEPS = 10  # of inverse kinematics, for a neighbour: enough for configurations that are moved along
 _SHIFT, _ROTATION = 0.05, 0.4  # of a neighbour: relative to the sum of the links; rad
-_PRIOR = 1e-4  # parameters are known to 100 mm or 100 mrad in advance: makes the first information matrices invertible
+PRIOR = 1e-4  # parameters are known to 100 mm or 100 mrad in advance: makes the first information matrices invertible
 
 Ranges = Mapping[str, tuple[float, float]]  # of x, y, z and the distance from the origin, mm
 
@@ -91,7 +91,7 @@ def candidates_of(problem: DesignProblem, placement: FixturePlacement, pool: Poo
     rows[:, :, :p] = pool.jacobian
     for axis in range(3):
         rows[np.arange(len(pool.q)), :, p + 3 * pool.owner + axis] = -pool.roots[:, :, axis]
-    base = _PRIOR * np.eye(unknowns)
+    base = PRIOR * np.eye(unknowns)
     for (start, end), u in zip(placement.ends, placement.u, strict=True):
         between = placement.points[end] - placement.points[start]
         row = np.zeros(unknowns)
@@ -142,8 +142,8 @@ def random_placements(
         size = np.exp(random.uniform(math.log(length[0]), math.log(length[1]), len(middle)))[:, None]
         half = 0.5 * size * direction / np.linalg.norm(direction, axis=1, keepdims=True)
         both = np.stack([middle - half, middle + half], axis=1)
-        both = both[_inside(both, ranges).all(axis=1)]
-        single = middle[_inside(middle, ranges)]
+        both = both[inside(both, ranges).all(axis=1)]
+        single = middle[inside(middle, ranges)]
         for i in range(min(len(both) // max(pairs, 1), len(single))):
             points = both[i * pairs : (i + 1) * pairs].reshape(-1, 3)
             points = np.concatenate([points, single[i : i + sockets % 2]])
@@ -166,7 +166,7 @@ def neighbour(problem: DesignProblem, placement: FixturePlacement, ranges: Range
     shift = random.normal(size=3) * _SHIFT * total_link_length(problem.arm)
     rotation = Rotation.from_rotvec(random.normal(size=3) * _ROTATION)
     points[moved] = middle + shift + rotation.apply(points[moved] - middle)
-    return placement._replace(points=points) if _inside(points, ranges).all() else None
+    return placement._replace(points=points) if inside(points, ranges).all() else None
 
 
 def moved_pool(
@@ -188,7 +188,8 @@ def moved_pool(
     return Pool(*(np.concatenate(parts) for parts in zip(kept, moved, strict=True)))
 
 
-def _inside(points: Float[np.ndarray, "... 3"], ranges: Ranges) -> Bool[np.ndarray, "..."]:
+def inside(points: Float[np.ndarray, "... 3"], ranges: Ranges) -> Bool[np.ndarray, "..."]:
+    """Which points are within the ranges."""
     values = {"x": points[..., 0], "y": points[..., 1], "z": points[..., 2]}
     values["distance"] = np.linalg.norm(points, axis=-1)
     inside = np.ones(points.shape[:-1], dtype=bool)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..calibration.checks import check_enough
+from ..calibration.observed import check_observed
 from ..calibration.scale_anchor import scale_anchor
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG
@@ -141,6 +142,11 @@ class Study:
         return None if self.recording is None else self.recording.capture
 
     @property
+    def observed(self) -> bool:
+        """Whether the capture has observations besides sockets and lengths."""
+        return self.capture is not None and bool(self.capture.observations)
+
+    @property
     def trials(self) -> int:
         """Trials in each cell."""
         return self.specification.trials
@@ -175,6 +181,13 @@ class Study:
             q, names, sizes = np.asarray(self.capture.q), self.capture.names, self.capture.sizes
             lengths = [(r.start, r.end, float(r.value), float(r.u)) for r in self.capture.lengths]
             content += [q.tobytes().hex(), repr((names, sizes, lengths))]
+            for observation in self.capture.observations:
+                content.append(repr((observation.kind, observation.name)))
+                for name, value in observation.stored().items():
+                    array = np.asarray(value)
+                    content.append(
+                        f"{name} {array.shape} {array.tobytes().hex() if array.dtype.kind == 'f' else array.tolist()}"
+                    )
         return hashlib.sha256("\n".join(content).encode()).hexdigest()
 
     @cached_property
@@ -232,11 +245,25 @@ class Study:
         )
 
     def _method(self, cell: Mapping[str, Any]) -> str:
+        if self.observed:
+            return self._observed_method(cell.get("identification.method"))
         if "identification.method" in cell:
             return cell["identification.method"]
         if self.capture is not None:
             return "two-stage" if self.capture.lengths else "stage1"
         return "stage1" if self.specification.reference is None else "two-stage"
+
+    def _observed_method(self, asked: str | None) -> str:
+        """All observations are solved at once: jointly, or as stage 1 where nothing fixes the scale."""
+        assert self.capture is not None
+        fixed = bool(self.capture.lengths) or any(one.fixes_scale for one in self.capture.observations)
+        possible = "joint" if fixed else "stage1"
+        if asked not in (None, possible):
+            raise InputError(
+                f"identification.method is '{asked}', but captures with observations besides sockets are solved at "
+                f"once, {'as they fix the scale' if fixed else 'and these leave the scale open'}; use '{possible}'."
+            )
+        return possible
 
     def _scale_anchor(self, hold: str) -> str | None:
         with _naming("identification.hold"):
@@ -283,7 +310,10 @@ class Study:
         if capture is not None and capture.joints != self.nominal.arm.joints:
             raise InputError("the capture and the arm differ in their number of joints; name the arm that recorded it.")
         unknowns = len(self.space.names) - int(self.space.lengths.any())
-        for setting in dict.fromkeys(self.settings):
+        if capture is not None and self.observed:
+            anchored = any(setting.method == "stage1" for setting in self.settings)
+            check_observed(capture, self.space, self._nominal_vector, len(self.space.names) - anchored)
+        for setting in () if self.observed else dict.fromkeys(self.settings):
             check_enough(setting.sizes, unknowns)
             if setting.method != "stage1" and capture is not None and not capture.lengths:
                 raise InputError("the capture file has no reference length; use method = 'stage1', or another file.")

@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError, nearest
-from ..data.capture import Capture, check_sockets_only
+from ..data.capture import Capture
+from ..data.noise import Noise
 from ..data.recording import Recording
+from ..data.simulation import simulate
 from ..files.arms import load_specification
 from ..files.atomic_write import storable
 from ..files.captures import load_capture
+from ..files.kits import read_kit
 from ..files.outputs import as_path
 from ..files.toml import read_toml
 from ..kinematics.arm import Arm
@@ -36,7 +39,7 @@ def make_study(
     Args:
         arm: The nominal arm, a shipped name or a file.
         trials: Trials in each cell of the grid.
-        capture: A table (``positions_mm``, ``sockets`` with a ``region``, or ``file``), or a `Capture` whose
+        capture: A table (``positions_mm``, ``sockets`` with a ``region``, ``file`` or ``kit``), or a `Capture` whose
             configurations are used.
         seed: Seed of all random numbers.
         name: Title in tables and reports.
@@ -59,12 +62,12 @@ def make_study(
         recording, capture = Recording(capture, nominal), {"file": "(in memory)"}
     elif not isinstance(capture, Mapping):
         raise InputError(
-            f"capture is a {type(capture).__name__}; give a table (positions_mm, sockets or file), or a Capture."
+            f"capture is a {type(capture).__name__}; give a table (positions_mm, sockets, file or kit), or a Capture."
         )
     elif capture.get("file") is not None:
         recording = load_capture(capture["file"])
-    if recording is not None:
-        check_sockets_only(recording.capture, "a study")
+    elif capture.get("kit") is not None:
+        recording = _simulated(capture["kit"], nominal, seed)
     specification = checked(name=storable(name), arm=nominal.name, trials=trials, seed=seed, capture=capture, **tables)
     return Study(specification, nominal, recording)
 
@@ -115,12 +118,20 @@ def _study_of_file(path: Path) -> Study:
         recording = None
         if specification.capture.file is not None:
             recording = load_capture(path.parent / specification.capture.file)
-            check_sockets_only(recording.capture, "a study")
         if recording is not None and not specification.arm:
             return Study(specification, recording.nominal, recording)
-        return Study(specification, _arm(path.parent, specification.arm), recording)
+        nominal = _arm(path.parent, specification.arm)
+        if specification.capture.kit is not None:
+            recording = _simulated(path.parent / specification.capture.kit, nominal, specification.seed)
+        return Study(specification, nominal, recording)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def _simulated(kit: str | os.PathLike, nominal: ArmSpecification, seed: int) -> Recording:
+    """A capture of the nominal arm with a kit, without noise, which the trials draw."""
+    things = [item.simulated for item in read_kit(kit)]
+    return Recording(simulate(nominal.arm, {}, observations=things, noise=Noise(), seed=seed), nominal)
 
 
 def _arm(folder: Path, name: str) -> ArmSpecification:

@@ -122,12 +122,14 @@ class Region(_Table):
 
 
 class CaptureTable(_Table):
-    """``positions_mm`` of sockets, or a number of ``sockets`` at random in a ``region``, or a capture ``file``.
+    """``positions_mm`` of sockets, or a number of ``sockets`` at random in a ``region``, or a capture ``file``, or a
+    ``kit`` of artefacts and instruments (`files.read_kit`), with which a capture is simulated once.
 
     ``poses`` is their number in each socket, ``pool`` the number that the study generates for each socket to draw from.
     """
 
     file: str | None = None
+    kit: str | None = None
     positions_mm: Annotated[list[Points], _levels_of(2), Field(min_length=1), AfterValidator(_different)] | None = None
     sockets: Levels[Annotated[int, Field(ge=1, le=1000)]] | None = None
     poses: Levels[Count] = [70]
@@ -137,16 +139,24 @@ class CaptureTable(_Table):
 
     @model_validator(mode="after")
     def _one(self) -> "CaptureTable":
-        if sum(given is not None for given in (self.file, self.positions_mm, self.sockets)) != 1:
-            raise ValueError("give one of positions_mm, sockets (with a region) and file.")
+        if sum(given is not None for given in (self.file, self.kit, self.positions_mm, self.sockets)) != 1:
+            raise ValueError("give one of positions_mm, sockets (with a region), file and kit.")
         if self.sockets is not None and self.region is None:
             raise ValueError("sockets at random need a region.")
         generated = {"poses", "region", "joint_limits_deg", "pool"} & self.model_fields_set
-        if self.file is not None and generated:
-            raise ValueError(f"{min(generated)} is for generated poses, but file gives them; leave one of the two out.")
+        if self.recorded and generated:
+            source = "kit" if self.file is None else "file"
+            raise ValueError(
+                f"{min(generated)} is for generated poses, but {source} gives them; leave one of the two out."
+            )
         if not 4096 <= self.pool <= MOST_POOL:
             raise ValueError(f"pool is {self.pool}; give 4096 to {MOST_POOL} poses, or leave it out.")
         return self
+
+    @property
+    def recorded(self) -> bool:
+        """Whether the poses are those of one capture."""
+        return self.file is not None or self.kit is not None
 
 
 class NoiseTable(_Table):
@@ -233,7 +243,7 @@ class Specification(_Table):
                 f"{cells} cells of {self.trials:,} trials are more than {MOST_TRIALS:,}; give fewer trials."
             )
         reference, scaled = self.reference, set(self.identification.method or ()) & {"two-stage", "joint"}
-        if reference is None and self.capture.file is None and scaled:
+        if reference is None and not self.capture.recorded and scaled:
             raise ValueError(
                 "method two-stage or joint needs a reference length; add a [reference], or use method = 'stage1'."
             )

@@ -7,13 +7,14 @@ import jax
 import numpy as np
 
 from ..calibration.batch import calibrate_many, identify_many
-from ..calibration.sampling import batch_of_captures
+from ..calibration.redrawn import batch_of_captures
 from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..data.capture import Capture, ReferenceLength
 from ..solver.reason import numbers_of
 from .blocks import Block
 from .definition import Setting, Study
+from .observed_trials import draw_observed
 from .trial_simulation import DrawnTrials, draw, ends_of
 
 
@@ -28,8 +29,8 @@ def run_block(study: Study, block: Block, *, device: Any = None, workers: int | 
     trials = np.tile(np.arange(block.first_trial, block.last_trial), count)
     setting = study.settings[block.first_cell]
     devices = jax.local_devices() if device is None else [device]
-    drawn = draw(study, setting, cells, trials, devices[0])
-    found = _identified(study, setting, drawn, devices, workers)
+    drawn, captures = _drawn(study, setting, cells, trials, devices[0])
+    found = _identified(study, setting, drawn, captures, devices, workers)
     return {name: values.reshape(*block.shape, *values.shape[1:]) for name, values in found.items()}
 
 
@@ -50,12 +51,21 @@ def draw_trials(study: Study, cell: int, trials: Numbers) -> tuple[DrawnTrials, 
     if not 0 <= cell < len(study.settings):
         raise InputError(f"cell is {cell}, but the study has {len(study.settings)} cells; count them from 0.")
     setting, numbers = study.settings[cell], np.atleast_1d(np.asarray(trials))
-    drawn = draw(study, setting, np.full(len(numbers), cell), numbers, jax.local_devices()[0])
+    return _drawn(study, setting, np.full(len(numbers), cell), numbers, jax.local_devices()[0])
+
+
+def _drawn(
+    study: Study, setting: Setting, cells: np.ndarray, trials: np.ndarray, device: Any
+) -> tuple[DrawnTrials, Capture]:
+    """Trials, and their captures as a batch."""
+    if study.observed:
+        return draw_observed(study, setting, cells, trials)
+    drawn = draw(study, setting, cells, trials, device)
     return drawn, _captures_of(study, setting, drawn)
 
 
 def _identified(
-    study: Study, setting: Setting, drawn: DrawnTrials, devices: list[Any], workers: int | None
+    study: Study, setting: Setting, drawn: DrawnTrials, capture: Capture, devices: list[Any], workers: int | None
 ) -> dict[str, np.ndarray]:
     options = {
         "space": study.space,
@@ -64,7 +74,6 @@ def _identified(
         "devices": devices,
         "workers": workers,
     }
-    capture = _captures_of(study, setting, drawn)
     problem = (study.nominal.arm, capture, drawn.lower, drawn.upper, drawn.start)
     if setting.method == "stage1":
         many = stage1 = identify_many(*problem, **options)

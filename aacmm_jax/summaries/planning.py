@@ -7,6 +7,7 @@ import numpy as np
 from ..acceptance.procedure import Procedure
 from ..acceptance.standards import PLANNED
 from ..planning.design import MORE, Plan, Prediction
+from ..planning.kit import KitPlan
 from .calibration import reference_length_rows
 
 
@@ -30,6 +31,40 @@ def plan_summary(plan: Plan, arm: str) -> dict[str, Any]:
         "loose": _prediction(plan.loose),
         "random": _prediction(plan.random),
         "more": _prediction(plan.more),
+        "more_poses": MORE,
+    }
+
+
+def kit_plan_summary(plan: KitPlan, arm: str) -> dict[str, Any]:
+    """Where everything is put, how many poses each gets, the predicted uncertainties, and what each part adds."""
+    rows = []
+    for simulated, one, part in zip(plan.kit, plan.observations, plan.parts, strict=True):
+        held = plan.arm if simulated.offset is None else plan.arm.replace(probe=simulated.offset)
+        tips = np.asarray(held.position(np.asarray(one.q)))
+        places = one.places
+        middles = [tips[places == i].mean(axis=0).tolist() for i in range(int(places.max()) + 1)]
+        rows.append(
+            {
+                "observation": one.name,
+                "kind": one.kind,
+                "part": part,
+                "poses": one.q.shape[0],
+                "places": [
+                    {"position_mm": middle, "poses": int(np.sum(places == i))} for i, middle in enumerate(middles)
+                ],
+            }
+        )
+    return {
+        "kind": "kit plan",
+        "arm": arm,
+        "criterion": plan.criterion,
+        "poses": plan.poses,
+        "observations": rows,
+        "check_length_mm": plan.check_length,
+        "encoder_arcsec": np.asarray(plan.noise.encoder_arcsec).tolist(),
+        "seating_mm": float(plan.noise.seating),
+        **{name: _prediction(getattr(plan, name)) for name in ("predicted", "loose", "random", "more")},
+        "without": {name: _prediction(one) if np.isfinite(one.largest) else None for name, one in plan.without.items()},
         "more_poses": MORE,
     }
 

@@ -142,8 +142,11 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
         ("calibrate tracker.h5 -o x.h5 --method two-stage", ["method='two-stage' is for sockets"]),
         ("calibrate tracker.h5 -o x.h5 --scale nominal", ["--scale nominal is for captures without a scale"]),
         ("calibrate free.h5 -o x.h5 --scale nominal --method joint", ["stage 1 alone; leave out --method"]),
-        ("calibrate tracker.h5 -o x.h5 --monte-carlo", ["--monte-carlo takes sockets"]),
         ("calibrate free.h5 -o x.h5 --scale nominal --cross-validate", ["needs a calibrated scale"]),
+        (
+            "calibrate bad.h5 -o x.h5 --robust huber --monte-carlo",
+            ["--monte-carlo is for calibrations without --robust"],
+        ),
         ("calibrate monday.h5 -o x.h5 --same-probe", ["--same-probe is for several captures"]),
         ("calibrate monday.h5 monday.h5 -o x.h5", ["two captures have the name 'monday'"]),
         ("calibrate monday.h5 -o x.h5 --only-poses 80", ["80 of 80 poses cannot be drawn", "1 to 79"]),
@@ -238,3 +241,19 @@ def test_the_robot_of_the_examples(aacmm, mukca):
     assert (found["poses"], found["other_poses"]["poses"]) == (500, 2272)
     assert found["other_poses"]["rms_mm"] == pytest.approx(0.487, abs=0.001)
     assert "beta_2" in [row["parameter"] for row in found["parameters"]]
+
+
+def test_a_plan_with_a_kit(aacmm, tmp_path):
+    """A bar that stands and a tracker: the plan, its manifest, and what each part adds."""
+    (tmp_path / "kit.toml").write_text(
+        '[[artefact]]\nname = "bar"\npoints = { a = [300, 0, 200], b = [600, 0, 200] }\nu = 0.001\n'
+        '[[points]]\nname = "tracker"\nbox = [[200, -300, 100], [600, 300, 500]]\nu = 0.02\n'
+    )
+    options = ("--kit", "kit.toml", "--poses", 16, "--candidates", 120, "--manifest", "capture.toml")
+    shown = aacmm("plan", "cheng2018-simulation", "-o", "plan.csv", *options).stdout
+    for part in ("bar", "tracker", "without tracker", "16 random poses in the same places"):
+        assert part in shown
+    assert len((tmp_path / "plan.csv").read_text().splitlines()) == 17
+    assert '"a" = "bar-a.csv"' in (tmp_path / "capture.toml").read_text()
+    refused = aacmm("plan", "cheng2018-simulation", "-o", "p.csv", "--kit", "kit.toml", "--sockets", 3, expect=2)
+    assert "--kit names what is used" in refused.stderr

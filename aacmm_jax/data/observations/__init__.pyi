@@ -9,6 +9,7 @@ from .measured_transforms import SimulatedTransforms as SimulatedTransforms
 from .plane import ParallelPlanes as ParallelPlanes
 from .plane import Plane as Plane
 from .plane import SimulatedPlanes as SimulatedPlanes
+from .socket import SimulatedSocket as SimulatedSocket
 from .socket import Socket as Socket
 from .sphere import SimulatedSphere as SimulatedSphere
 from .sphere import Sphere as Sphere

@@ -1,5 +1,6 @@
 """Artefacts of certified points: ball bars, plates of balls or holes, tetrahedra; in each of their placements."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -10,8 +11,8 @@ from jaxtyping import Float
 from ...core.arrays import Numbers
 from ...core.errors import InputError, nearest
 from ...core.numpy_or_jax import AnyArray, namespace
-from ...core.rotations import fitted_frame, rotation_matrix
-from .frames import placed
+from ...core.rotations import fitted_frame, rotation_matrix, rotation_vector
+from .frames import moved, placed
 from .observation import (
     FRAME,
     READINGS,
@@ -223,6 +224,7 @@ class SimulatedArtefact(AbstractSimulated):
         index: Name of the index of a platform.
     """
 
+    table: ClassVar[str] = "artefact"
     name: str = eqx.field(static=True)
     points: dict[str, tuple[float, float, float]] = eqx.field(static=True)
     poses: int = eqx.field(static=True)
@@ -232,6 +234,11 @@ class SimulatedArtefact(AbstractSimulated):
     artefact: str | None = eqx.field(static=True, default=None)
     placement: str | None = eqx.field(static=True, default=None)
     index: str | None = eqx.field(static=True, default=None)
+
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedArtefact":
+        turned = rotation_matrix(frame[:3]) @ rotation_matrix(self.frame[:3])
+        whole = np.concatenate([rotation_vector(turned), moved(frame, self.frame[3:])])
+        return dataclasses.replace(self, name=name, artefact=self.artefact or self.name, frame=whole)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         coordinates = np.repeat(np.array(list(self.points.values())), self.poses, axis=0)

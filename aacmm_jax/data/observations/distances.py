@@ -1,5 +1,6 @@
 """Distances of the tip from an unknown pivot: a telescoping ball bar, a draw wire."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -11,6 +12,7 @@ from ...core.arrays import Numbers, as_floats, is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace
+from .frames import moved
 from .observation import (
     POINT,
     READINGS,
@@ -151,11 +153,15 @@ class SimulatedDistances(AbstractSimulated):
         u: Standard uncertainty of each distance, mm.
     """
 
+    table: ClassVar[str] = "distances"
     name: str = eqx.field(static=True)
     box: np.ndarray = eqx.field(converter=as_numbers)
     poses: int = eqx.field(static=True)
     pivot: np.ndarray = eqx.field(converter=as_numbers)
     u: float = 0.0
+
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedDistances":
+        return dataclasses.replace(self, name=name, pivot=moved(frame, self.pivot))
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         return random.uniform(self.box[0], self.box[1], (self.poses, 3))

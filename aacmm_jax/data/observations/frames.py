@@ -47,3 +47,8 @@ def frame_and_offset(
     found = solution[12:]
     target = origin + xp.einsum("cpm,p->cm", axes, found)
     return fitted_frame(coordinates, target), found
+
+
+def moved(frame: Float[np.ndarray, " 6"], point: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """A point turned by a frame's rotation and moved by its origin, mm."""
+    return np.asarray(rotation_matrix(frame[:3])) @ point + frame[3:]

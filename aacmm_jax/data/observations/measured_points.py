@@ -156,6 +156,7 @@ class SimulatedPoints(AbstractSimulated):
         target: Name of the target, and ``offset``, its true place in the last frame, mm; by default the arm's probe.
     """
 
+    table: ClassVar[str] = "points"
     name: str = eqx.field(static=True)
     box: np.ndarray = eqx.field(converter=as_numbers)
     poses: int = eqx.field(static=True)

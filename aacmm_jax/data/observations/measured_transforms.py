@@ -208,6 +208,7 @@ class SimulatedTransforms(AbstractSimulated):
         u_angle: Standard uncertainty about each axis, rad.
     """
 
+    table: ClassVar[str] = "transforms"
     name: str = eqx.field(static=True)
     box: np.ndarray = eqx.field(converter=as_numbers)
     poses: int = eqx.field(static=True)

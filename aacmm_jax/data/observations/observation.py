@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ...core.arrays import Numbers, as_array, as_floats, is_concrete
 from ...core.errors import InputError
@@ -155,6 +155,14 @@ class AbstractObservation(eqx.Module):
             chosen = tuple(values[i] for i in poses) if isinstance(values, tuple) else values[np.asarray(poses)]
             object.__setattr__(changed, field, chosen)
         return changed
+
+    @property
+    def places(self) -> Int[np.ndarray, " m"]:
+        """A number for each pose, equal for poses that owe the same: of one point of an artefact, of one plane."""
+        static = [values for values in (getattr(self, field) for field in self.by_pose) if isinstance(values, tuple)]
+        rows = list(zip(*static, strict=True)) if static else [()] * self.q.shape[-2]
+        numbers = {row: number for number, row in enumerate(dict.fromkeys(rows))}
+        return np.array([numbers[row] for row in rows])
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         """Raise `InputError` where nearly right tips (mm) cannot determine the unknown geometry."""
@@ -310,13 +318,23 @@ def as_numbers(values: Any) -> np.ndarray:
 
 
 class AbstractSimulated(eqx.Module):
-    """An observation to simulate: the true geometry, where the tip goes, and what is then recorded."""
+    """An observation to simulate: the true geometry, where the tip goes, and what is then recorded.
 
+    ``poses`` is the number of poses, of each place where there are several (points of an artefact, two planes).
+    """
+
+    table: ClassVar[str]  # name of its tables in the file of a kit
     name: eqx.AbstractVar[str]
+    poses: eqx.AbstractVar[int]
 
     @property
     def offset(self) -> Float[np.ndarray, " 3"] | None:
         """The true place of the target in the last frame, mm; None for the arm's own probe."""
+        return None
+
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "AbstractSimulated | None":
+        """The same thing under another name and moved rigidly: by a rotation vector (rad) about the base's origin, and
+        then by a translation (mm). None where there is nothing to place, such as for an instrument that sees all."""
         return None
 
     @abc.abstractmethod

@@ -1,5 +1,6 @@
 """Planes: the tip touches one, or two parallel ones at a certified distance."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -12,6 +13,7 @@ from ...core.errors import InputError
 from ...core.linear_algebra import semidefinite_eigen
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, rotation_derivative, rotation_matrix
+from .frames import moved
 from .observation import (
     READINGS,
     TARGET,
@@ -295,12 +297,17 @@ class SimulatedPlanes(AbstractSimulated):
         u: Standard uncertainty of the certified distance, mm.
     """
 
+    table: ClassVar[str] = "planes"
     name: str = eqx.field(static=True)
     corner: np.ndarray = eqx.field(converter=as_numbers)
     sides: np.ndarray = eqx.field(converter=as_numbers)
     poses: int = eqx.field(static=True)
     distance: float | None = None
     u: float = 0.0
+
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedPlanes":
+        turned = self.sides @ rotation_matrix(frame[:3]).T
+        return dataclasses.replace(self, name=name, corner=moved(frame, self.corner), sides=turned)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         planes = 1 if self.distance is None else 2

@@ -1,5 +1,6 @@
 """A socket: the tip is at one point, whose position is unknown."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -9,15 +10,18 @@ from jaxtyping import Float
 
 from ...core.arrays import Numbers
 from ...core.numpy_or_jax import AnyArray, namespace
+from .frames import moved
 from .observation import (
     POINT,
     READINGS,
     TARGET,
     AbstractObservation,
+    AbstractSimulated,
     Entry,
     Rows,
     Tips,
     Unknowns,
+    as_numbers,
     checked_name,
     checked_readings,
     checked_target,
@@ -80,3 +84,37 @@ class Socket(AbstractObservation):
 def position_of(socket: str) -> str:
     """Name of the unknown position of a socket."""
     return f"position of {socket}"
+
+
+class SimulatedSocket(AbstractSimulated):
+    """Poses with the tip in one socket.
+
+    Args:
+        name: Name of the socket.
+        point: Its position in the base frame ``(3,)``, mm.
+        poses: Number of poses.
+        target: Name of the tip, and ``place``, its true place in the last frame ``(3,)``, mm; by default the arm's own
+            probe.
+    """
+
+    table: ClassVar[str] = "socket"
+    name: str = eqx.field(static=True)
+    point: np.ndarray = eqx.field(converter=as_numbers)
+    poses: int = eqx.field(static=True)
+    target: str = eqx.field(static=True, default="")
+    place: tuple[float, float, float] | None = eqx.field(static=True, default=None)
+
+    @property
+    def offset(self) -> Float[np.ndarray, " 3"] | None:
+        return None if self.place is None else as_numbers(self.place)
+
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedSocket":
+        return dataclasses.replace(self, name=name, point=moved(frame, self.point))
+
+    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+        return np.tile(self.point, (self.poses, 1))
+
+    def recorded(
+        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
+    ) -> Socket:
+        return Socket(self.name, q, target=self.target)

@@ -1,5 +1,6 @@
 """A sphere: the tip touches it, so it is at one distance from an unknown centre."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -11,6 +12,7 @@ from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace
+from .frames import moved
 from .observation import (
     POINT,
     READINGS,
@@ -195,6 +197,7 @@ class SimulatedSphere(AbstractSimulated):
         stylus: Diameter of the tip's ball, mm.
     """
 
+    table: ClassVar[str] = "touched_sphere"
     name: str = eqx.field(static=True)
     centre: np.ndarray = eqx.field(converter=as_numbers)
     diameter: float
@@ -202,6 +205,9 @@ class SimulatedSphere(AbstractSimulated):
     certified: bool = eqx.field(static=True, default=True)
     u: float = 0.0
     stylus: float = 0.0
+
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedSphere":
+        return dataclasses.replace(self, name=name, centre=moved(frame, self.centre))
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         directions = random.normal(size=(self.poses, 3))

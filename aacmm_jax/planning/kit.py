@@ -1,0 +1,323 @@
+"""Plans with artefacts and instruments: where to put what is at hand, and which poses to take with it.
+
+The information of a pose is that of the model's own rows (`model.observed`), so every kind of observation that can be
+simulated can be planned, and nothing here depends on a kind.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..calibration.observed_evaluation import fit_geometry
+from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
+from ..data.capture import Capture
+from ..data.noise import Noise
+from ..data.observations.observation import AbstractObservation, AbstractSimulated
+from ..kinematics.arm import Arm, is_single, joint_limits
+from ..kinematics.parameters import Parameters
+from ..kinematics.workspace import reached, search_region
+from ..model.observed import Observed, certified_and_lengths, linear_rows, whitening_of
+from ..uncertainty.identifiability import observability
+from ..uncertainty.observed_covariance import arm_errors, covariance_of_noise, stacked
+from ..uncertainty.volume import default_length
+from .design import (
+    MORE,
+    SMALL_ARM,
+    Criterion,
+    Prediction,
+    Progress,
+    check_plannable,
+    check_region,
+    design_problem,
+    order_of,
+)
+from .fedorov_exchange import Candidates, covariance_of, exchange
+from .kit_placement import KitItem, place, region_of, set_up
+from .placement import PRIOR, DesignProblem, Ranges
+
+_LEAST_U = 1e-4  # mm: an exact certified value would be a row of infinite weight
+_START_AGREES = 0.1  # mm or rad: a start of the geometry that is farther off is fitted
+_RANDOM_SETS, _LOOSE_SETS = 30, 5
+_LOOSE, _NEAR = math.radians(5), math.radians(12)
+_ROUNDS, _NEIGHBOURS = 2, 12  # of the search about the chosen poses, and its candidates for each
+
+
+class KitPlan(NamedTuple):
+    """Poses to take with a kit of artefacts and instruments. Arrays are of NumPy: q in rad, positions in mm."""
+
+    arm: Arm
+    names: tuple[str, ...]  # free parameters
+    kit: tuple[AbstractSimulated, ...]  # where each thing is, in the order of the observations
+    parts: tuple[str, ...]  # of which item of the kit each is a placement
+    observations: tuple[AbstractObservation, ...]  # the poses, with what would be measured
+    noise: Noise
+    criterion: Criterion
+    check_length: float  # length that predictions are of, mm
+    predicted: Prediction
+    random: Prediction  # median over sets of as many random poses in the same places
+    loose: Prediction  # the same plan with joints off by 5 deg (standard deviation)
+    more: Prediction  # with ten more poses
+    without: dict[str, Prediction]  # by what is left out; infinite where the rest does not determine the arm
+
+    @property
+    def poses(self) -> int:
+        """How many there are."""
+        return sum(observation.q.shape[0] for observation in self.observations)
+
+    def capture(self) -> Capture:
+        """The plan as a capture, whose measured values are those of the nominal arm."""
+        return Capture({}, (), self.observations)
+
+
+def plan_kit(
+    arm: Arm,
+    kit: Sequence[KitItem | AbstractSimulated],
+    *,
+    poses: int = 60,
+    region: Ranges | None = None,
+    space: Parameters | None = None,
+    noise: Noise = SMALL_ARM,
+    criterion: Criterion = "length",
+    margin: float = math.radians(5),
+    above: float = 0.0,
+    limits: Sequence[Sequence[float]] | None = None,
+    candidates: int = 2000,
+    check_length: float | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> KitPlan:
+    """Choose where to put artefacts, and the poses that determine an arm best with them and with instruments.
+
+    Random placements are ranked by random poses and the best by relaxed designs, then moved a little; poses are chosen
+    by Fedorov's exchange (1972), and again among poses near the chosen ones.
+
+    Args:
+        arm: The arm, not a batch.
+        kit: What is at hand: observations to simulate, with their uncertainties, as they stand; or `KitItem`, which are
+            placed. How many poses each has is chosen.
+        poses: Number of poses in all.
+        region: Ranges of ``x``, ``y``, ``z`` and of the ``distance`` from the origin for the tip in what is placed, mm
+            (default: z at least 0).
+        space: Free parameters (default: those of `Parameters.free_of`).
+        noise: Noise of readings and seat.
+        criterion: As in `plan`.
+        margin: Distance of the joints from their limits, rad.
+        above: Height in the base frame below which no joint and no tip comes, mm.
+        limits: Lowest and highest reading of each joint, rad (default: the arm's own).
+        candidates: Number of candidate configurations.
+        check_length: Length that predictions are of, mm.
+        seed: Seed of the search.
+        progress: Called with the name of the stage and the fraction of it that is done.
+
+    Returns:
+        The plan, with predicted uncertainties, also without each part of the kit.
+
+    Raises:
+        InputError: Something cannot be reached, the poses are too few, or nothing determines the parameters.
+    """
+    report = progress or (lambda stage, fraction: None)
+    if not is_single(arm):
+        raise InputError("plan_kit takes one arm, not a batch; give one of its arms.")
+    check_plannable(arm, criterion, noise)
+    items = _checked(kit)
+    ranges = {"z": (0.0, np.inf)} if region is None else region
+    check_region(ranges)
+    space = Parameters.free_of(arm) if space is None else space
+    check_length = default_length(arm) if check_length is None else check_length
+    problem, functions = design_problem(
+        search_region(to_numpy(arm), limits, margin, above, seed),
+        to_numpy(space),
+        to_numpy(noise),
+        criterion,
+        dict(length=check_length, limits=joint_limits(arm, limits)),
+        seed,
+    )
+    placed = place(problem, items, poses, ranges, candidates_of_kit, report)
+    pool = [set_up(problem.region, one, candidates // len(placed.kit)) for one in placed.kit]
+    least = least_poses(pool)
+    if poses < least.sum():
+        raise InputError(
+            f"{poses} poses are too few for this kit; give {least.sum()} at least, or leave something out."
+        )
+    chosen = _chosen(problem, placed.kit, pool, poses, least, report)
+    capture = Capture({}, (), chosen)
+    unseen = observability(arm, capture, space)
+    if unseen.rank < len(space.names):
+        raise InputError(f"this kit does not determine the parameters. {' '.join(unseen.sentences())}")
+    return KitPlan(
+        arm=arm,
+        names=space.names,
+        kit=placed.kit,
+        parts=placed.parts,
+        observations=tuple(chosen),
+        noise=noise,
+        criterion=criterion,
+        check_length=check_length,
+        **_predictions(problem, placed.kit, placed.parts, pool, chosen, functions),
+    )
+
+
+def _checked(kit: Sequence[KitItem | AbstractSimulated]) -> list[KitItem]:
+    items = [item if isinstance(item, KitItem) else KitItem(item, places=0) for item in kit]
+    if not items:
+        raise InputError("the kit is empty; name an artefact or an instrument.")
+    for item in items:
+        if not isinstance(item.simulated, AbstractSimulated):
+            raise InputError(
+                f"{item.simulated!r} cannot be planned; give one of aj.data.observations, such as SimulatedArtefact."
+            )
+        if item.places < 0:
+            raise InputError(f"'{item.simulated.name}' has {item.places} places; give 0, which leaves it, or more.")
+    names = [item.simulated.name for item in items]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise InputError(f"two things of the kit have the name '{twice[0]}'; give each a name of its own.")
+    return items
+
+
+def least_poses(observations: Sequence[AbstractObservation]) -> Int[np.ndarray, " s"]:
+    """For each place of each observation: as many as determine its own unknowns, and two at least."""
+    found = []
+    for one in observations:
+        unknowns = sum(len(units) for units in one.unknowns.values()) + (3 if one.target else 0)
+        places = int(one.places.max()) + 1
+        found += [max(2, math.ceil((unknowns + 1) / (one.rows * places)))] * places
+    return np.array(found)
+
+
+def candidates_of_kit(problem: DesignProblem, observations: Sequence[AbstractObservation]) -> Candidates:
+    """The information that each pose of the observations would add, and that of certified values alone."""
+    observed, space = Observed.of(Capture({}, (), observations)), problem.space
+    vector, p = np.asarray(space.vector()), len(space.names)
+    z = np.concatenate([vector, np.asarray(observed.start(space, vector))])
+    linear = linear_rows(space, observed, z)
+    if max(np.abs(part.rows.values).max() for part in linear) > _START_AGREES:
+        z[p:] = np.asarray(fit_geometry(problem.arm, observed, {}, problem.noise).geometry)
+        linear = linear_rows(space, observed, z)
+    errors = arm_errors(observed.forward(space, z[:p], z[p:]), linear, observed)
+    of_arm = [covariance_of_noise(error, problem.noise) for error in errors]
+    whitening = whitening_of(linear, observed, of_arm, np.asarray(_LEAST_U))
+    steps = np.concatenate([np.asarray(space.scale), observed.steps])
+    parts = stacked(linear, observed, whitening, len(z))
+    rows = np.zeros((len(observed.q), max(3, *(part.shape[1] for part in parts)), len(z)))
+    owner = np.empty(len(observed.q), dtype=int)
+    places = 0
+    for observation, part, poses in zip(observed.observations, parts, observed.slices, strict=True):
+        rows[poses, : part.shape[1]] = np.moveaxis(np.asarray(part) * steps[:, None, None], (0, 1, 2), (2, 1, 0))
+        owner[poses] = places + observation.places
+        places = owner[poses].max() + 1
+    relations, u = certified_and_lengths(observed, z, p)
+    scaled = relations * steps / np.maximum(u, _LEAST_U)[:, None]
+    return Candidates(rows, owner, PRIOR * np.eye(len(z)) + scaled.T @ scaled, p)
+
+
+def _chosen(
+    problem: DesignProblem,
+    kit: Sequence[AbstractSimulated],
+    pool: list[AbstractObservation],
+    poses: int,
+    least: Int[np.ndarray, " s"],
+    report: Progress,
+) -> list[AbstractObservation]:
+    """The best poses of the pool, then the best of these and of poses near them."""
+    best, best_value = None, np.inf
+    for number in range(1 + _ROUNDS):
+        possible = candidates_of_kit(problem, pool)
+        rows = exchange(
+            possible, poses, problem.objective, least=least,
+            progress=lambda done, number=number: report("Choosing poses", (number + done) / (1 + _ROUNDS)),
+        )  # fmt: skip
+        value = problem.objective.value(covariance_of(possible.information(possible.rows[rows]), possible.parameters))
+        if best is None or value < best_value:
+            best, best_value = _taken(pool, rows), value
+        if number < _ROUNDS:
+            pool = [_near(problem, one, chosen) for one, chosen in zip(kit, best, strict=True)]
+    assert best is not None
+    return [one.select(order_of(np.asarray(one.q), one.places)) for one in best]
+
+
+def _taken(pool: Sequence[AbstractObservation], rows: Int[np.ndarray, " N"]) -> list[AbstractObservation]:
+    """The observations with some of the poses of the pool, numbered through."""
+    found, first = [], 0
+    for one in pool:
+        last = first + one.q.shape[0]
+        found.append(one.select(np.sort(rows[(rows >= first) & (rows < last)]) - first))
+        first = last
+    return found
+
+
+def _near(problem: DesignProblem, simulated: AbstractSimulated, chosen: AbstractObservation) -> AbstractObservation:
+    """The poses of an observation, and others near each: joints changed, and the tip brought back."""
+    region, q = region_of(problem.region, simulated), np.asarray(chosen.q)
+    which = np.repeat(np.arange(len(q)), _NEIGHBOURS)
+    starts = q[which] + _NEAR * region.random.normal(size=(len(which), q.shape[1]))
+    moved, good = reached(region, starts, np.asarray(region.arm.position(q))[which])
+    rows = np.concatenate([np.arange(len(q)), which[good]])
+    order = np.argsort(chosen.places[rows], kind="stable")
+    return with_readings(chosen.select(rows[order]), np.concatenate([q, moved[good]])[order])
+
+
+def with_readings(observation: AbstractObservation, q: Float[np.ndarray, "m n"]) -> AbstractObservation:
+    """The same observation read otherwise."""
+    return eqx.tree_at(lambda one: one.q, observation, q)
+
+
+def _loosened(problem: DesignProblem, simulated: AbstractSimulated, chosen: AbstractObservation) -> AbstractObservation:
+    """The same poses, with joints off by some degrees and the tip brought back."""
+    region, q = region_of(problem.region, simulated), np.asarray(chosen.q)
+    moved, good = reached(region, q + _LOOSE * region.random.normal(size=q.shape), np.asarray(region.arm.position(q)))
+    return with_readings(chosen, np.where(good[:, None], moved, q))
+
+
+def _predictions(
+    problem: DesignProblem,
+    kit: Sequence[AbstractSimulated],
+    parts: Sequence[str],
+    pool: list[AbstractObservation],
+    chosen: list[AbstractObservation],
+    functions: Float[np.ndarray, "v p"],
+) -> dict[str, Any]:
+    """For the plan, for random poses, for imprecise and more poses, and without each part of the kit."""
+    random = problem.region.random
+
+    def predicted(candidates: Candidates, rows: Float[np.ndarray, "m r P"]) -> Prediction:
+        covariance = covariance_of(candidates.information(rows), candidates.parameters)
+        u = np.sqrt(np.einsum("vp,pq,vq->v", functions, covariance, functions))
+        return Prediction(float(np.median(u)), float(u.max()))
+
+    def typical(sets: list[Prediction]) -> Prediction:
+        return Prediction(*(float(np.median(column)) for column in zip(*sets, strict=True)))
+
+    def of(observations: Sequence[AbstractObservation]) -> Prediction:
+        candidates = candidates_of_kit(problem, observations)
+        return predicted(candidates, candidates.rows)
+
+    possible, planned = candidates_of_kit(problem, pool), candidates_of_kit(problem, chosen)
+    counts = np.bincount(planned.owner)
+    random_sets = []
+    for _ in range(_RANDOM_SETS):
+        rows = [random.choice(np.flatnonzero(possible.owner == i), count) for i, count in enumerate(counts)]
+        random_sets.append(predicted(possible, possible.rows[np.concatenate(rows)]))
+    loose_sets = [
+        of([_loosened(problem, one, poses) for one, poses in zip(kit, chosen, strict=True)]) for _ in range(_LOOSE_SETS)
+    ]
+    base = planned.information(planned.rows)
+    added = exchange(possible._replace(base=base), MORE, problem.objective, least=0, sweeps=1)
+    without = {}
+    for part in dict.fromkeys(parts) if len(set(parts)) > 1 else ():
+        left = [one for one, of_part in zip(chosen, parts, strict=True) if of_part != part]
+        seen = observability(problem.arm, Capture({}, (), left), problem.space)
+        complete = seen.rank == len(problem.space.names)
+        without[part] = of(left) if complete else Prediction(math.inf, math.inf)
+    return {
+        "predicted": predicted(planned, planned.rows),
+        "random": typical(random_sets),
+        "loose": typical(loose_sets),
+        "more": predicted(planned, np.concatenate([planned.rows, possible.rows[added]])),
+        "without": without,
+    }

@@ -1,0 +1,226 @@
+"""Where to put what is in a kit: random placements, ranked by the poses that they allow, then moved a little."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
+from ..core.rotations import rotation_vector
+from ..data.observations.observation import AbstractObservation, AbstractSimulated
+from ..kinematics.workspace import SearchRegion, reached, total_link_length
+from .fedorov_exchange import Candidates, relaxed_value
+from .placement import DesignProblem, Ranges, inside
+
+_PLACEMENTS, _DESIGNED, _NEIGHBOURS = 120, 8, 60
+_STARTS, _DESIGN_STARTS = 120, 400  # random configurations for each thing: of the first score, and of the second
+_ITERATIONS = 8  # of the relaxed design
+_REACHED = 0.25  # fraction of the starts that must arrive in every place of what is placed
+_LEAST_CANDIDATES = 8  # of every place of what stands where it is
+_TRIES = 200
+_SHIFT, _ROTATION = 0.06, 0.4  # of a neighbour: relative to the sum of the links; rad
+
+CandidatesOf = Callable[[DesignProblem, Sequence[AbstractObservation]], Candidates]
+
+
+class KitItem(NamedTuple):
+    """An artefact or an instrument, and what may be chosen about it."""
+
+    simulated: AbstractSimulated
+    places: int = 1  # how many placements to choose; 0 leaves it where it is
+    turned: Literal["any", "vertical", "not"] = "any"  # about which axes it may be turned
+
+
+class PlacedKit(NamedTuple):
+    """Things in their places, and the item of the kit that each is."""
+
+    kit: tuple[AbstractSimulated, ...]
+    parts: tuple[str, ...]
+
+
+class _Layout(NamedTuple):
+    """One placement of everything: frames of what is placed, None for what stands."""
+
+    kit: tuple[AbstractSimulated, ...]
+    frames: tuple[Float[np.ndarray, " 6"] | None, ...]
+
+
+def region_of(region: SearchRegion, simulated: AbstractSimulated) -> SearchRegion:
+    """The region of the tip that an observation holds."""
+    return region if simulated.offset is None else region._replace(arm=region.arm.replace(probe=simulated.offset))
+
+
+def set_up(region: SearchRegion, simulated: AbstractSimulated, starts: int, share: float = 0.0) -> AbstractObservation:
+    """Poses in one thing from random starts, as the observation that they would give without errors of the arm.
+
+    Raises `InputError` where a place is reached from fewer than this ``share`` of the starts, or hardly ever.
+    """
+    own = region_of(region, simulated)
+    each = max(len(simulated.tips(np.random.default_rng(0))) // simulated.poses, 1)
+    many = dataclasses.replace(simulated, poses=max(starts // each, 2 * _LEAST_CANDIDATES))
+    tips = many.tips(region.random)
+    q, good = reached(own, own.draw(len(tips)), tips)
+    transforms = np.asarray(own.arm.pose(q)).copy()
+    transforms[:, :3, 3] = tips
+    # In NumPy: every number of poses would be another program of JAX.
+    whole = to_numpy(many.recorded(q, transforms, region.random))
+    counts = np.bincount(whole.places[good], minlength=int(whole.places.max()) + 1)
+    tried = np.bincount(whole.places)
+    if np.any(counts < np.maximum(share * tried, _LEAST_CANDIDATES)):
+        where = ", ".join(f"{round(float(x)):.6g}" for x in tips[whole.places == int(np.argmin(counts / tried))][0])
+        raise InputError(
+            f"'{simulated.name}' at ({where}) mm cannot be reached in enough poses within the joint limits and their "
+            "margin; move it, or make its box smaller."
+        )
+    return whole.select(np.flatnonzero(good))
+
+
+def place(
+    problem: DesignProblem,
+    items: Sequence[KitItem],
+    poses: int,
+    ranges: Ranges,
+    candidates_of: CandidatesOf,
+    report: Callable[[str, float], None],
+) -> PlacedKit:
+    """The best placement found of what is to be placed; the rest stands where it is."""
+    parts, movable = [], []
+    for item in items:
+        frames = np.zeros(6)
+        if item.places and item.simulated.placed(item.simulated.name, frames) is None:
+            raise InputError(
+                f"'{item.simulated.name}' is an instrument that is not placed; leave out its number of places."
+            )
+        parts += [item.simulated.name] * max(item.places, 1)
+        movable += [(item, f"{item.simulated.name}/{i + 1}" if item.places > 1 else item.simulated.name)
+                    for i in range(max(item.places, 1))]  # fmt: skip
+    standing = tuple(item.simulated for item in items)
+    if not any(item.places for item in items):
+        return PlacedKit(standing, tuple(parts))
+    search = _Search(problem, movable, poses, ranges, candidates_of)
+    return PlacedKit(search.best(report).kit, tuple(parts))
+
+
+class _Search(NamedTuple):
+    problem: DesignProblem
+    things: list[tuple[KitItem, str]]  # each with the name of its observation
+    poses: int
+    ranges: Ranges
+    candidates_of: CandidatesOf
+
+    def best(self, report: Callable[[str, float], None]) -> _Layout:
+        """Random placements scored by random poses, the best few by relaxed designs, then neighbours of the best."""
+        stage = "Placing the kit"
+        scored: list[tuple[float, int, _Layout]] = []
+        for number in range(_PLACEMENTS):
+            report(stage, 0.4 * number / _PLACEMENTS)
+            layout = self._random()
+            pools = self._pools(layout, _STARTS)
+            if pools is not None:
+                scored.append((self._value(pools, 0), number, layout))
+        if not scored:
+            raise InputError(
+                "no placement of the kit was found that can be reached well; give a region nearer to the arm, or "
+                "fewer places."
+            )
+        best, best_pools, best_value = None, None, np.inf
+        shortlist = [layout for _, _, layout in sorted(scored)[:_DESIGNED]]
+        tries = len(shortlist) + _NEIGHBOURS
+        for number in range(tries):
+            report(stage, 0.4 + 0.6 * number / tries)
+            if number < len(shortlist):
+                layout, pools = shortlist[number], None
+            else:
+                if best is None:
+                    break
+                layout, pools = self._neighbour(best), best_pools
+            pools = self._pools(layout, _DESIGN_STARTS, best if pools else None, pools)
+            value = np.inf if pools is None else self._value(pools, _ITERATIONS)
+            if value < best_value:
+                best, best_pools, best_value = layout, pools, value
+        report(stage, 1.0)
+        return sorted(scored)[0][2] if best is None else best
+
+    def _value(self, pools: Sequence[AbstractObservation], iterations: int) -> float:
+        candidates = self.candidates_of(self.problem, pools)
+        return relaxed_value(candidates, self.poses, self.problem.objective, iterations)
+
+    def _pools(
+        self,
+        layout: _Layout,
+        starts: int,
+        before: _Layout | None = None,
+        known: Sequence[AbstractObservation] | None = None,
+    ) -> list[AbstractObservation] | None:
+        """Poses in everything, those of what has not moved kept; None where something is hard to reach."""
+        found = []
+        for i, (simulated, frame) in enumerate(zip(layout.kit, layout.frames, strict=True)):
+            if before is not None and known is not None and frame is before.frames[i]:
+                found.append(known[i])
+                continue
+            try:
+                found.append(set_up(self.problem.region, simulated, starts, 0.0 if frame is None else _REACHED))
+            except InputError:
+                if frame is None:
+                    raise
+                return None
+        return found
+
+    def _random(self) -> _Layout:
+        frames = [self._random_frame(item) if item.places else None for item, _ in self.things]
+        return self._layout(frames)
+
+    def _layout(self, frames: Sequence[Float[np.ndarray, " 6"] | None]) -> _Layout:
+        kit = []
+        for (item, name), frame in zip(self.things, frames, strict=True):
+            one = item.simulated if frame is None else item.simulated.placed(name, frame)
+            assert one is not None
+            kit.append(one)
+        return _Layout(tuple(kit), tuple(frames))
+
+    def _random_frame(self, item: KitItem) -> Float[np.ndarray, " 6"]:
+        """A rotation, and the middle of the thing where the tip of a random configuration is."""
+        random = self.problem.region.random
+        local = _extent(item.simulated)
+        for _ in range(_TRIES):
+            turn = {
+                "any": Rotation.from_quat(random.normal(size=4)),
+                "vertical": Rotation.from_rotvec([0, 0, random.uniform(-np.pi, np.pi)]),
+                "not": Rotation.identity(),
+            }[item.turned]
+            middle = np.asarray(self.problem.arm.position(self.problem.region.draw(1)))[0]
+            frame = _about(turn, local.mean(axis=0), middle)
+            if inside(turn.apply(local) + frame[3:], self.ranges).all():
+                return frame
+        raise InputError(f"'{item.simulated.name}' does not fit into the region; widen it.")
+
+    def _neighbour(self, layout: _Layout) -> _Layout:
+        """With one thing shifted and turned a little, where that stays in the region."""
+        random = self.problem.region.random
+        which = random.choice([i for i, frame in enumerate(layout.frames) if frame is not None])
+        item, frame = self.things[which][0], layout.frames[which]
+        assert frame is not None
+        axes = {"any": [1, 1, 1], "vertical": [0, 0, 1], "not": [0, 0, 0]}[item.turned]
+        turn = Rotation.from_rotvec(_ROTATION * random.normal(size=3) * axes) * Rotation.from_rotvec(frame[:3])
+        local = _extent(item.simulated)
+        old = Rotation.from_rotvec(frame[:3]).apply(local.mean(axis=0)) + frame[3:]
+        shift = _SHIFT * total_link_length(self.problem.arm) * random.normal(size=3)
+        new = _about(turn, local.mean(axis=0), old + shift)
+        if not inside(turn.apply(local) + new[3:], self.ranges).all():
+            return layout
+        return self._layout([new if i == which else frame for i, frame in enumerate(layout.frames)])
+
+
+def _extent(simulated: AbstractSimulated) -> Float[np.ndarray, "m 3"]:
+    """Some of the points of a thing, where it stands."""
+    return dataclasses.replace(simulated, poses=20).tips(np.random.default_rng(0))
+
+
+def _about(turn: Rotation, middle: Float[np.ndarray, " 3"], to: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 6"]:
+    """The frame that turns a thing and takes its middle to a point."""
+    matrix = turn.as_matrix()
+    return np.concatenate([np.asarray(rotation_vector(matrix)), to - matrix @ middle])

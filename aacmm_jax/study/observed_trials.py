@@ -1,0 +1,128 @@
+"""Trials of captures with observations besides sockets: the poses of a recording, taken by other arms.
+
+A true arm takes each pose of the recording with its tip, and what it carries, where the nominal arm has them as well as
+it can; what it cannot is taken from the residuals (`calibration.redrawn`). So no kind says how it is drawn.
+"""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.special import erf
+
+from ..calibration.observed_evaluation import fit_geometry
+from ..calibration.redrawn import DrawnLengths, ObservedTruth, batch_of_observations, shifted
+from ..core.numpy_or_jax import to_numpy
+from ..data.capture import Capture
+from ..kinematics.chain import sines_cosines
+from ..kinematics.parameters import Parameters
+from ..model.observed import Observed, residual_rows
+from .definition import CellValues, Setting, Study
+from .trial_simulation import DrawnTrials
+
+_ROUNDS = 4  # of the configurations' way to their tips, each of which leaves about a hundredth
+_LONGEST_STEP = 0.1  # rad
+
+
+class _Recorded(NamedTuple):
+    """What all trials share."""
+
+    truth: ObservedTruth  # by the nominal arm
+    space: Parameters
+    inverses: list[Float[np.ndarray, "m n r"]]  # least changes of the readings for each residual
+    geometry: Float[np.ndarray, " g"]
+
+
+@lru_cache(maxsize=4)
+def _recorded(study: Study) -> _Recorded:
+    assert study.capture is not None
+    space = to_numpy(study.space)
+    observed = Observed.of(study.capture)
+    geometry = np.asarray(fit_geometry(study.nominal.arm, observed, {}, None).geometry)
+    truth = ObservedTruth.at(study.capture, space, space.vector(), observed.split(geometry))
+    by_readings = [np.moveaxis(np.asarray(error.by_readings), -1, 0) for error in truth.errors]
+    return _Recorded(truth, space, [np.linalg.pinv(matrix, rcond=1e-6) for matrix in by_readings], geometry)
+
+
+def draw_observed(
+    study: Study, setting: Setting, cells: Int[np.ndarray, " t"], trials: Int[np.ndarray, " t"]
+) -> tuple[DrawnTrials, Capture]:
+    """Trials ``trials`` of cells ``cells``, and their captures as a batch. Each has random numbers of its own."""
+    recorded = _recorded(study)
+    seed = study.specification.seed
+    found = []
+    for cell, trial in zip(cells.tolist(), trials.tolist(), strict=True):
+        values = CellValues(*(column[cell] for column in study.cell_values))
+        found.append(_trial(study, setting, recorded, values, np.random.default_rng([seed, cell, trial])))
+    true, start, q, shifts, certified, lengths = zip(*found, strict=True)
+    truth = recorded.truth
+    readings, value = np.stack(q), np.stack(lengths)
+    stacked = {name: np.stack([one[name] for one in certified]) for name in certified[0]}
+    observations = [
+        shifted(observation, readings[:, rows], np.stack([one[i] for one in shifts]), stacked)
+        for i, (observation, rows) in enumerate(zip(truth.observed.observations, truth.observed.slices, strict=True))
+    ]
+    u = np.broadcast_to(np.asarray(truth.observed.u), value.shape)
+    captures = batch_of_observations(observations, truth.ends, DrawnLengths(value, u))
+    lower, upper = study.cell_values.lower[cells], study.cell_values.upper[cells]
+    return DrawnTrials(readings, np.stack(true), lower, upper, np.stack(start), value, u), captures
+
+
+def _trial(
+    study: Study, setting: Setting, recorded: _Recorded, values: CellValues, random: np.random.Generator
+) -> tuple[Any, ...]:
+    """True parameters, start, readings, shifts of the residuals, certified values and reference lengths."""
+    truth, nominal = recorded.truth, np.asarray(recorded.space.vector())
+    normal = random.normal(size=len(nominal))
+    true = nominal + values.width * np.where(values.normal, normal, erf(normal / np.sqrt(2)))
+    start = nominal
+    fraction = random.uniform(size=len(nominal))
+    if setting.random_start:
+        fixed = np.array([name == setting.hold for name in study.space.names])
+        start = np.where(fixed, nominal, values.lower + fraction * (values.upper - values.lower))
+    q, left = _taken(recorded, true)
+    read = _read(q, truth.reading, values, random)
+    errors = truth.errors_of_rows(1, float(values.seating), random)
+    shifts = [error[0] - rows for error, rows in zip(errors, left, strict=True)]
+    certified = {name: one[0] for name, one in truth.values(1, random).items()}
+    return true, start, read, shifts, certified, truth.lengths(1, random).value[0]
+
+
+def _taken(
+    recorded: _Recorded, true: Float[np.ndarray, " p"]
+) -> tuple[Float[np.ndarray, "M n"], list[Float[np.ndarray, "r m"]]]:
+    """Configurations in which the true arm owes as little as it can, and the residuals that are left."""
+    observed, z = recorded.truth.observed, np.concatenate([true, recorded.geometry])
+    q = np.asarray(observed.q).copy()
+    for number in range(_ROUNDS + 1):
+        now = eqx.tree_at(lambda o: (o.q, o.sines_cosines), observed, (q, sines_cosines(q)))
+        left = [np.asarray(rows.values) for rows in residual_rows(recorded.space, now, z)]
+        if number == _ROUNDS:
+            break
+        for rows, inverse, values in zip(observed.slices, recorded.inverses, left, strict=True):
+            step = np.einsum("mnr,rm->mn", inverse, values)
+            q[rows] -= np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+        q = _agreeing(q, recorded.truth.reading)
+    return q, left
+
+
+def _agreeing(q: Float[np.ndarray, "M n"], reading: Int[np.ndarray, " M"]) -> Float[np.ndarray, "M n"]:
+    """With poses that were read at once still one configuration: their mean."""
+    counts = np.bincount(reading)
+    if len(counts) == len(reading):
+        return q
+    sums = np.stack([np.bincount(reading, weights=column) for column in q.T], axis=1)
+    return (sums / counts[:, None])[reading]
+
+
+def _read(
+    q: Float[np.ndarray, "M n"], reading: Int[np.ndarray, " M"], values: CellValues, random: np.random.Generator
+) -> Float[np.ndarray, "M n"]:
+    """What the encoders show: eccentricity (a first harmonic of the angle), noise and rounding."""
+    harmonics = float(values.eccentricity) * random.normal(size=(2, q.shape[1]))
+    q = q + harmonics[0] * np.sin(q) + harmonics[1] * np.cos(q)
+    q = q + float(values.encoder) * random.normal(size=(reading.max() + 1, q.shape[1]))[reading]
+    step = float(values.resolution)
+    return np.round(q / step) * step if step > 0 else q

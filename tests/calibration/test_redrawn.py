@@ -1,0 +1,134 @@
+"""Captures drawn anew: every kind of observation scatters as it should, by one piece of code."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.calibration.redrawn import truth_of
+from aacmm_jax.calibration.sampling import _RepeatedTask
+from aacmm_jax.data import observations as kinds
+from aacmm_jax.model.observed import Observed, linear_rows, whitening_of
+from aacmm_jax.uncertainty.observed_covariance import covariance_of_noise
+
+from .test_observed import NOISE, SIMULATED
+
+FEW = ("a_2", "d_4", "theta_3")
+
+
+@pytest.fixture(scope="module")
+def bounds(paper_arm):
+    return aj.Bounds.around(paper_arm, aj.Parameters(paper_arm, FEW))
+
+
+def calibrated(arm, bounds, simulated, sockets=(), lengths=(), **options):
+    true = aj.perturbed_arm(bounds.space, length=1.0, angle=np.deg2rad(0.1), seed=1)
+    given = {"poses": 6, "noise": NOISE, "seed": 4, "lengths": lengths, "observations": simulated}
+    capture = aj.simulate(true, dict(sockets), **given)
+    return capture, aj.calibrate(arm, capture, bounds, noise=NOISE, **options)
+
+
+@pytest.mark.parametrize("kind", SIMULATED)
+def test_residuals_scatter_as_the_weights_say(paper_arm, bounds, kind):
+    """Whitened residuals of drawn data, by the arm and the geometry about which they are drawn, have variance 1."""
+    capture, result = calibrated(paper_arm, bounds, SIMULATED[kind])
+    truth = truth_of(result, capture)
+    batch = truth.drawn(10, NOISE, np.random.default_rng(0))
+    space = aj.Parameters(result.arm, FEW)
+    z = np.concatenate([result.parameters, *(truth.geometry[name] for name in truth.observed.blocks)])
+    of_arm = [covariance_of_noise(errors, NOISE) for errors in truth.errors]
+    roots = whitening_of(truth.linear, truth.observed, of_arm, np.asarray(1e-4)).roots
+    squares = []
+    for trial in range(10):
+        one = jax.tree.map(lambda leaf, trial=trial: leaf[trial], batch)
+        for part, root in zip(linear_rows(space, Observed.of(one), z), roots, strict=True):
+            squares.append(np.einsum("mab,bm->am", root, part.rows.values).ravel() ** 2)
+    squares = np.concatenate(squares)
+    assert np.mean(squares) == pytest.approx(1.0, abs=5 * np.sqrt(2 / squares.size))
+
+
+def test_certified_values_are_drawn_once_for_all_that_share_them(paper_arm, bounds):
+    capture, result = calibrated(paper_arm, bounds, SIMULATED["bars"])
+    batch = truth_of(result, capture).drawn(300, NOISE, np.random.default_rng(0))
+    name = "coordinates of bar"
+    values = [observation.values[name] for observation in batch.observations]
+    assert len(values) == 3
+    for other in values[1:]:
+        np.testing.assert_array_equal(values[0], other)
+    np.testing.assert_allclose(values[0].mean(axis=0), result.observed.geometry[name], atol=5e-3 / np.sqrt(300))
+    np.testing.assert_allclose(values[0].std(axis=0), 0.001, rtol=0.2)
+
+
+@pytest.fixture(scope="module")
+def mixed(paper_arm, bounds):
+    """Two sockets at a known distance, a tracker that saw the same arm, and a plate that all share."""
+    few = [dataclasses.replace(one, poses=12) for one in SIMULATED["points"]] + [
+        dataclasses.replace(one, poses=3) for one in SIMULATED["bars"]
+    ]
+    sockets = {"A": (400, 100, 300), "B": (400, 100, 500)}
+    return calibrated(paper_arm, bounds, few, sockets, [("A", "B", 0.002)])
+
+
+# One program is compiled for a capture: a sphere for every run, a mixture of kinds among the slow ones.
+@pytest.fixture(scope="module", params=["sphere", pytest.param("mixed", marks=pytest.mark.slow)])
+def repeated(request, paper_arm, bounds):
+    if request.param == "mixed":
+        return request.getfixturevalue("mixed")
+    return calibrated(paper_arm, bounds, SIMULATED["spheres"][:1])
+
+
+def test_bootstrap_of_observations(repeated):
+    """Poses are drawn within what they owe, and the result scatters about as the noise says."""
+    capture, result = repeated
+    sampled = aj.bootstrap(result, capture, trials=100)
+    assert sampled.failed == 0
+    assert sampled.quantities[: len(FEW)] == FEW
+    assert "k" not in sampled.quantities
+    ratio = sampled.u / sampled.linear_u
+    assert 0.6 < np.median(ratio) < 1.3
+    assert "every parameter and lengths" in " ".join(sampled.sentences()) or not sampled.agrees.all()
+
+
+def test_drawn_solves_scatter_as_the_linear_result(repeated):
+    """The Monte Carlo's own trials, fewer than its adaptive blocks."""
+    capture, result = repeated
+    truth = truth_of(result, capture)
+    found, failed = _RepeatedTask.of(result, capture, None).solved(truth.drawn(200, NOISE, np.random.default_rng(1)))
+    assert failed == 0
+    u = np.sqrt(np.diag(result.covariance))
+    ratio = found[:, : len(FEW)].std(axis=0, ddof=1) / u
+    np.testing.assert_allclose(ratio, 1.0, atol=4 / np.sqrt(2 * 200))
+    assert np.abs(found[:, : len(FEW)].mean(axis=0) - result.parameters).max() < 4 * u.max() / np.sqrt(200)
+
+
+@pytest.mark.slow
+def test_monte_carlo_of_observations(mixed):
+    capture, result = mixed
+    sampled = aj.monte_carlo(result, capture, most=20_000)
+    np.testing.assert_allclose(sampled.u, sampled.linear_u, rtol=0.03)
+
+
+def test_what_cannot_be_drawn(paper_arm, bounds, mixed):
+    capture, result = mixed
+    plate = [dataclasses.replace(SIMULATED["plate"][0], poses=1)]
+    singles, of_singles = calibrated(paper_arm, bounds, plate)
+    with pytest.raises(aj.InputError, match="one pose in each point"):
+        aj.bootstrap(of_singles, singles)
+    with pytest.raises(aj.InputError, match="knows nothing of the placement plate"):
+        aj.monte_carlo(result, singles)
+    points = capture.observations[0]
+    twice = kinds.MeasuredPoints("again", points.q, points.points, u=0.01)
+    both = aj.Capture({}, (), [points, twice])
+    with pytest.raises(aj.InputError, match="exactly the readings of others"):
+        aj.bootstrap(aj.calibrate(paper_arm, both, bounds, noise=NOISE), both)
+
+
+def test_a_robust_loss_is_for_the_bootstrap(paper_arm, bounds, mixed):
+    capture, _ = mixed
+    result = aj.calibrate(paper_arm, capture, bounds, noise=NOISE, robust="tukey")
+    with pytest.raises(aj.InputError, match="took weight from poses"):
+        aj.monte_carlo(result, capture)
+    with pytest.raises(aj.InputError, match="took weight from poses"):
+        aj.bootstrap(result, capture)

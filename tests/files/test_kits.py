@@ -1,0 +1,75 @@
+"""Kits as TOML: every kind that can be simulated, and refusals that say what to do."""
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.files.kits import simulated_kinds
+
+from ..refusals import assert_refused
+
+KIT = """
+[[artefact]]
+name = "bar"
+points = { a = [0.0, 0.0, 0.0], b = [300.0, 0.0, 0.0] }
+u = 0.001
+places = 3
+turned = "vertical"
+
+[[touched_sphere]]
+name = "ball"
+centre = [300, 0, 300]
+diameter = 50.0
+u = 0.001
+
+[[planes]]
+name = "gauge block"
+corner = [0, 0, 0]
+sides = [[100, 0, 0], [0, 50, 0]]
+distance = 150.0
+
+[[points]]
+name = "tracker"
+box = [[200, -300, 100], [600, 300, 500]]
+frame = [0.1, 0.2, 0.3, 1000, 2000, -300]
+u = 0.02
+poses = 7
+target = "reflector"
+place = [0, 10, 40]
+"""
+
+
+def test_what_a_kit_says(tmp_path):
+    (tmp_path / "kit.toml").write_text(KIT)
+    found = {item.simulated.name: item for item in aj.files.read_kit(tmp_path / "kit.toml")}
+    assert set(found) == {"bar", "ball", "gauge block", "tracker"}
+    bar, tracker = found["bar"], found["tracker"].simulated
+    assert (bar.places, bar.turned, bar.simulated.u) == (3, "vertical", 0.001)
+    assert bar.simulated.points == {"a": (0, 0, 0), "b": (300, 0, 0)}
+    assert (found["ball"].places, tracker.poses, tracker.target) == (0, 7, "reflector")
+    np.testing.assert_array_equal(tracker.offset, [0, 10, 40])
+    np.testing.assert_array_equal(found["gauge block"].simulated.sides, [[100, 0, 0], [0, 50, 0]])
+
+
+def test_every_kind_that_can_be_simulated_has_a_table():
+    known = {"artefact", "touched_sphere", "planes", "points", "transforms", "distances", "socket"}
+    assert set(simulated_kinds()) == known
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("", ["names nothing", "[[artefact]]"]),
+        ('[[bar]]\nname = "b"', ["bar"]),
+        (KIT.replace("diameter = 50.0", 'diameter = "50"'), ["touched_sphere", "diameter"]),
+        (KIT.replace("centre = [300, 0, 300]", "centre = [300, 0]"), ["[[touched_sphere]] 'ball'", "do not fit"]),
+        (KIT.replace("centre = [300, 0, 300]\n", ""), ["touched_sphere", "centre", "missing"]),
+        (KIT.replace('turned = "vertical"', 'turned = "up"'), ["turned"]),
+        (KIT.replace("places = 3", "places = -1"), ["places"]),
+        (KIT.replace("b = [300.0, 0.0, 0.0]", "b = [300.0, 0.0]"), ["artefact", "points"]),
+        (KIT.replace("frame = [0.1,", "frame = [nan,"), ["frame"]),
+    ],
+)
+def test_refused(tmp_path, text, parts):
+    (tmp_path / "kit.toml").write_text(text)
+    assert_refused(lambda: aj.files.read_kit(tmp_path / "kit.toml"), tmp_path / "kit.toml", *parts)
