@@ -8,6 +8,7 @@ import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.data.observations.observation import Tips
+from aacmm_jax.files.observations import kinds as known_kinds
 
 RANDOM = np.random.default_rng(1)
 POSES = 12
@@ -45,6 +46,11 @@ def unknowns_of(observation):
     return {name: np.asarray(value) + 1e-2 * random.normal(size=np.shape(value)) for name, value in found.items()}
 
 
+def test_every_kind_is_here():
+    """A new kind needs a row, in the tables of this module and in those of the files."""
+    assert {one.kind for one in ALL.values()} == known_kinds().keys()
+
+
 @pytest.mark.parametrize("name", ALL)
 def test_shapes_and_derivatives(name):
     """Analytic derivatives by the tips, their orientation and every unknown agree with central differences."""
@@ -79,20 +85,25 @@ def test_shapes_and_derivatives(name):
             np.testing.assert_allclose(rows.by_rotation[:, c], (plus - minus) / 2e-5, atol=1e-8)
 
 
+BOX = [[200, -300, 100], [600, 300, 500]]
+FRAME = (0.1, 0.2, 3.0, 1000.0, 2000.0, -300.0)
+BAR = {"a": (0, 0, 0), "b": (300, 0, 0), "c": (0, 200, 0)}
+SIMULATED = [
+    kinds.SimulatedPoints("T", BOX, 12, FRAME, target="smr", place=(10, 20, 80)),
+    kinds.SimulatedTransforms("T6", BOX, 12, (10, 20, 80, 0.1, 0.2, 0.3), FRAME, u_angle=1e-12),
+    kinds.SimulatedSphere("s", (400, 0, 300), 50.0, 12, certified=False),
+    kinds.SimulatedPlanes("f", (300, -100, 200), [(0, 200, 0), (150, 0, 60)], 6),
+    kinds.SimulatedPlanes("p", (300, -100, 200), [(0, 200, 0), (150, 0, 60)], 6, distance=40.0),
+    kinds.SimulatedArtefact("bar", BAR, 4, (0.3, 0, 1.5, 350, -100, 250)),
+    kinds.SimulatedDistances("d", BOX, 12, (900, 300, 100)),
+]
+
+
 def test_starts_are_exact_for_exact_data(paper_arm):
     """Without noise and by the true arm, the closed forms find the geometry, also of targets at an unknown place."""
-    box = [[200, -300, 100], [600, 300, 500]]
-    frame = (0.1, 0.2, 3.0, 1000.0, 2000.0, -300.0)
-    bar = {"a": (0, 0, 0), "b": (300, 0, 0), "c": (0, 200, 0)}
-    simulated = [
-        kinds.SimulatedPoints("T", box, 12, frame, target="smr", place=(10, 20, 80)),
-        kinds.SimulatedTransforms("T6", box, 12, (10, 20, 80, 0.1, 0.2, 0.3), frame, u_angle=1e-12),
-        kinds.SimulatedSphere("s", (400, 0, 300), 50.0, 12, certified=False),
-        kinds.SimulatedPlanes("p", (300, -100, 200), [(0, 200, 0), (150, 0, 60)], 6, distance=40.0),
-        kinds.SimulatedArtefact("bar", bar, 4, (0.3, 0, 1.5, 350, -100, 250)),
-        kinds.SimulatedDistances("d", box, 12, (900, 300, 100)),
-    ]
-    capture = aj.simulate(paper_arm, {}, observations=simulated, seed=3)
+    capture = aj.simulate(paper_arm, {}, observations=SIMULATED, seed=3)
+    # A socket is simulated as one of the capture's own.
+    assert {one.kind for one in capture.observations} == known_kinds().keys() - {"socket"}
     for observation in to_numpy(capture.observations):
         arm = paper_arm
         probe = np.asarray(arm.probe)
