@@ -12,6 +12,7 @@ from ...core.errors import InputError
 from ...core.linear_algebra import semidefinite_eigen
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, rotation_derivative, rotation_matrix
+from .frames import turned_z
 from .observation import (
     READINGS,
     TARGET,
@@ -250,10 +251,7 @@ def fitted_plane(tips: Float[AnyArray, "3 m"]) -> Float[AnyArray, " 3"]:
     _, vectors = semidefinite_eigen(scatter / (xp.trace(scatter) + 1e-300))
     normal = vectors[:, 2] / xp.sqrt(xp.sum(vectors[:, 2] ** 2))
     normal = xp.where(normal[2] < 0, -normal, normal)
-    sine = xp.sqrt(normal[0] ** 2 + normal[1] ** 2)
-    level = sine < 1e-12
-    factor = xp.where(level, 1.0, xp.arctan2(sine, normal[2]) / xp.where(level, 1.0, sine))
-    return xp.stack([-normal[1] * factor, normal[0] * factor, normal @ middle])
+    return xp.concatenate([turned_z(normal), (normal @ middle)[None]])
 
 
 def check_plane(where: str, tips: Float[np.ndarray, "3 m"]) -> None:
