@@ -152,12 +152,13 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     "-" only, so that ``hole_0_pose.csv`` is left alone. ``exclude = ["*_old.csv"]`` in ``[[socket]]`` leaves out the
     files that match such a shell pattern. Angles: reading -> sign * (reading - offset), in the stated unit.
 
-    ``[[points]]``, ``[[transforms]]``, ``[[touched_sphere]]``, ``[[plane]]``, ``[[parallel_planes]]``,
-    ``[[artefact]]`` and ``[[distances]]`` are observations of these kinds. Their ``file`` holds readings and measured
-    values (or ``readings`` is a file of readings with as many rows); ``columns`` picks them by header name, shell
-    pattern or number: ``columns = { q = "q*_rad", points = ["x", "y", "z"] }``. ``units``, ``rotation``,
-    ``coverage_factor``, ``delimiter``, ``decimal`` and ``skip`` say how they are written, ``group`` names a column that
-    divides the table into several observations, and ``preset`` (csv, leica, xyzijk, ipa) fills in what is not stated.
+    ``[[points]]``, ``[[transforms]]``, ``[[touched_sphere]]``, ``[[touched_cylinder]]``, ``[[plane]]``,
+    ``[[parallel_planes]]``, ``[[artefact]]`` and ``[[distances]]`` are observations of these kinds. Their ``file``
+    holds readings and measured values (or ``readings`` is a file of readings with as many rows); ``columns`` picks them
+    by header name, shell pattern or number: ``columns = { q = "q*_rad", points = ["x", "y", "z"] }``. ``units``,
+    ``rotation``, ``coverage_factor``, ``delimiter``, ``decimal`` and ``skip`` say how they are written, ``group`` names
+    a column that divides the table into several observations, and ``preset`` (csv, leica, xyzijk, ipa) fills in what is
+    not stated.
 
     Args:
         path: the manifest (TOML).

@@ -150,18 +150,21 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
     write(tmp_path / "one_a.csv", Q[:3], header=None)
     write(tmp_path / "other_a.csv", Q[3:], header=None)
     write(tmp_path / "ball.csv", Q, header=None)
-    planes, sphere, plane, socket = sorted(
+    planes, sphere, cylinder, plane, socket = sorted(
         read(
             tmp_path,
             '[[parallel_planes]]\nname = "block {x}"\nfiles = { one = "one_{x}.csv", other = "other_{x}.csv" }\n'
             "distance = 100.0\nu = 0.001\nstylus = 6.0\ninside = true\n"
             '[[touched_sphere]]\nfile = "ball.csv"\ndiameter = 1.0\nunits = { diameter = "inch" }\n'
+            '[[touched_cylinder]]\nname = "ring"\nfile = "ball.csv"\ndiameter = 20.0\nstylus = 6.0\n'
+            'inside = true\nform = 2.0\nunits = { form = "um" }\n'
             '[[plane]]\nname = "wall"\nfile = "ball.csv"\n[[socket]]\nname = "z"\nfile = "ball.csv"\ntarget = "T"\n',
         ),
-        key=lambda one: ["parallel planes", "sphere", "plane", "socket"].index(one.kind),
+        key=lambda one: ["parallel planes", "sphere", "cylinder", "plane", "socket"].index(one.kind),
     )
     assert (planes.name, planes.first, float(planes.distance)) == ("block a", 3, 94.0)
     assert float(sphere.radius) == 12.7
+    assert (float(cylinder.radius), float(cylinder.form)) == (7.0, 0.002)
     assert (plane.name, socket.target) == ("wall", "T")
 
 
