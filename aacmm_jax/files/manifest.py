@@ -195,8 +195,13 @@ def read_manifest(path: str | os.PathLike) -> Recording:
 
         sockets, lengths, spheres = recorded(path.parent, model, angles)
 
-        def radians(readings: np.ndarray, unit: str | None, preset: str | None) -> np.ndarray:
-            return _radians(readings, _angles_of(model.angles, unit, preset))
+        def radians(readings: np.ndarray, unit: str | None, preset: str | None, header: str | None) -> np.ndarray:
+            stated = _angles_of(model.angles, unit, header or preset)
+            if header is not None and stated.unit != header:
+                raise InputError(
+                    f"the header of the readings says {header}, but the manifest {stated.unit}; correct one of them."
+                )
+            return _radians(readings, stated)
 
         source = Source(path.parent, opened, joints, columns, radians)
         observations = [*_sockets_of_targets(path.parent, model, sockets), *_observations(model, source)]
