@@ -125,10 +125,9 @@ class Distances(AbstractObservation):
         return Rows((distance - values)[None], direction, by_unknowns, measured)
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
-        if tips.shape[1] < 4:
-            raise InputError(
-                f"observation '{self.name}' has {tips.shape[1]} distances, but its pivot needs four; measure more."
-            )
+        needs = "pivot and constant need five" if self.constant else "pivot needs four"
+        if tips.shape[1] < 4 + self.constant:
+            raise InputError(f"observation '{self.name}' has {tips.shape[1]} distances, but its {needs}; measure more.")
 
 
 def _checked_u(where: str, u: Numbers, poses: int) -> AnyArray:
