@@ -79,10 +79,10 @@ def observed_task(
         hold = None
     anchor = scale_anchor(space, space.base, hold, noise) if not fixed or hold else NO_ANCHOR
     noise_model = check_noise_model(noise_model, noise, arm.joints)
+    observed = Observed.of(capture)
     if is_concrete(*jax.tree.leaves((arm, capture, vector))):
         known, at = to_numpy((space, vector))
-        check_observed(capture, known, at, len(space.names) - (anchor.hold is not None))
-    observed = Observed.of(capture)
+        check_observed(observed, known, at, len(space.names) - (anchor.hold is not None))
     return ObservedTask(
         observed=observed,
         bounds=bounds,
@@ -103,9 +103,8 @@ def configurations(q: Any) -> tuple[int, ...]:
     return tuple(int(i) for i in np.unique(np.asarray(q), axis=0, return_inverse=True)[1].ravel())
 
 
-def check_observed(capture: Capture, space: Parameters, vector: Float[AnyArray, " p"], count: int) -> None:
+def check_observed(observed: Observed, space: Parameters, vector: Float[AnyArray, " p"], count: int) -> None:
     """Raise `InputError` where the observations cannot determine their own unknowns, or these parameters."""
-    observed = Observed.of(capture)
     geometry = space.geometry(vector)
     forward = forward_pass(geometry, observed.sines_cosines)
     for observation, rows in zip(observed.observations, observed.slices, strict=True):

@@ -72,12 +72,13 @@ def solve_observed(
     fixed = bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
     hold = None if fixed and options.hold == "longest" else options.hold
     anchor = scale_anchor(space, arm, hold, noise) if not fixed or hold else NO_ANCHOR
-    check_observed(first[1], first_space, first[2], len(space.names) - (anchor.hold is not None))
+    observed = Observed.of(first[1])
+    check_observed(observed, first_space, first[2], len(space.names) - (anchor.hold is not None))
     form = _Form(
         names=space.names,
         anchor=anchor,
         loss=None if robust is None else Loss(robust),
-        pose=configurations(Observed.of(first[1]).q),
+        pose=configurations(observed.q),
         max_steps=options.max_steps,
         covariance=options.covariance,
         batched=axes,
