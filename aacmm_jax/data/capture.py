@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..core.arguments import items_of, shown
+from ..core.arguments import checked_arguments, items_of, shown
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace
@@ -272,6 +272,7 @@ def _different_lengths(
     return tuple(different), tuple(copies)
 
 
+@checked_arguments
 def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) -> Capture:
     """Join captures that one arm took in several sessions, with its probe remounted in between, or on another base.
 

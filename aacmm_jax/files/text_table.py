@@ -173,9 +173,13 @@ def _stated_unit(header: str) -> str | None:
     return _UNITS.get(unit, unit if unit in _OTHER_UNITS else None)
 
 
-def _plain_name(header: str) -> str:
-    """A column's name without case, quotes, unit in brackets and more than single blanks."""
-    return " ".join(_IN_BRACKETS.sub("", header.strip("\"'")).casefold().split())
+def _plain_name(name: str) -> str:
+    """A column's name, or a pattern, without case, quotes, unit in brackets and more than single blanks."""
+    name = name.strip("\"'")
+    bracketed = _IN_BRACKETS.search(name)
+    if bracketed and _is_unit(bracketed[0].strip()):  # and not the characters of a pattern
+        name = name[: bracketed.start()]
+    return " ".join(name.casefold().split())
 
 
 def _lines(path: str | os.PathLike) -> list[str]:

@@ -53,6 +53,7 @@ def test_every_kind_has_a_table():
         ({"header": None}, NUMBERS, 1.0),
         # Other case, more blanks, quotes, units in brackets or in a line of their own.
         ({"header": [*(f"Q{i} [rad]" for i in range(1, 7)), *NAMES[6:]]}, "", 1.0),
+        ({"header": ["Q1", "Q2", "Q3", "Q4", "Q5", "Q6", *NAMES[6:]]}, ALL.replace("q?", "q[1-6]"), 1.0),
         ({"header": [*NAMES[:6], "X (m)", "Y (m)", "Z (m)", "UX  [mm]", "UY [mm]", '"uz"']}, "", 1000.0),
         ({"header": [*NAMES[:6], "x [\u00b5m]", "y [\u03bcm]", "z [um]", "ux", "uy", "uz"]}, "", 1e-3),
         ({"header": [*NAMES[:6], "x [in]", "y [in]", "z [in]", "ux", "uy", "uz"]}, "", 25.4),

@@ -22,7 +22,6 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
-    as_numbers,
     checked_name,
     checked_readings,
     checked_scalar,
@@ -31,6 +30,7 @@ from .observation import (
     each_pose,
     is_exact,
     no_covariance,
+    numbers,
 )
 
 
@@ -219,7 +219,7 @@ class SimulatedArtefact(AbstractSimulated):
     name: str = eqx.field(static=True)
     points: dict[str, tuple[float, float, float]] = eqx.field(static=True)
     poses: int = eqx.field(static=True)
-    frame: np.ndarray = eqx.field(converter=as_numbers, default=(0.0,) * 6)
+    frame: np.ndarray = eqx.field(converter=numbers("frame", 6), default=(0.0,) * 6)
     errors: np.ndarray | None = None
     u: float = 0.0
     artefact: str | None = eqx.field(static=True, default=None)

@@ -24,12 +24,13 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
-    as_numbers,
     checked_name,
     checked_readings,
     checked_scalar,
     checked_target,
+    checked_truth,
     is_exact,
+    numbers,
 )
 
 AXIS = ("rad", "rad", "mm", "mm")
@@ -107,6 +108,7 @@ class Cylinder(AbstractObservation):
         self.u = checked_scalar(f"u of {where}", u) / 2
         self.form = checked_scalar(f"form of {where}", form)
         self.target = checked_target(target)
+        inside = checked_truth(f"inside of {where}", inside)
         ball = checked_scalar(f"stylus of {where}", stylus)
         self.radius = None
         if diameter is not None:
@@ -345,7 +347,7 @@ class SimulatedCylinder(AbstractSimulated):
     """
 
     name: str = eqx.field(static=True)
-    ends: np.ndarray = eqx.field(converter=as_numbers)
+    ends: np.ndarray = eqx.field(converter=numbers("ends", 2, 3))
     diameter: float
     poses: int = eqx.field(static=True)
     certified: bool = eqx.field(static=True, default=True)

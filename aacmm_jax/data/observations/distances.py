@@ -21,11 +21,12 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
-    as_numbers,
     checked_name,
     checked_readings,
     checked_target,
+    checked_truth,
     checked_values,
+    numbers,
 )
 
 
@@ -78,7 +79,9 @@ class Distances(AbstractObservation):
         self.values = checked_values(f"distances of {where}", values, (self.q.shape[0],))
         self.u = _checked_u(where, u, self.q.shape[0])
         self.target = checked_target(target)
-        self.constant = bool(constant)
+        self.constant = checked_truth(f"constant of {where}", constant)
+        if not self.constant and is_concrete(self.values) and np.any(np.asarray(self.values) <= 0):
+            raise InputError(f"{where} has a distance that is not positive; give distances in mm, or constant=True.")
 
     @property
     def pivot(self) -> str:
@@ -151,9 +154,9 @@ class SimulatedDistances(AbstractSimulated):
     """
 
     name: str = eqx.field(static=True)
-    box: np.ndarray = eqx.field(converter=as_numbers)
+    box: np.ndarray = eqx.field(converter=numbers("box", 2, 3))
     poses: int = eqx.field(static=True)
-    pivot: np.ndarray = eqx.field(converter=as_numbers)
+    pivot: np.ndarray = eqx.field(converter=numbers("pivot", 3))
     u: float = 0.0
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:

@@ -22,13 +22,13 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
-    as_numbers,
     checked_covariances,
     checked_name,
     checked_readings,
     checked_target,
     checked_values,
     each_pose,
+    numbers,
     offset_of,
 )
 
@@ -164,16 +164,16 @@ class SimulatedPoints(AbstractSimulated):
     """
 
     name: str = eqx.field(static=True)
-    box: np.ndarray = eqx.field(converter=as_numbers)
+    box: np.ndarray = eqx.field(converter=numbers("box", 2, 3))
     poses: int = eqx.field(static=True)
-    frame: np.ndarray = eqx.field(converter=as_numbers, default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    frame: np.ndarray = eqx.field(converter=numbers("frame", 6), default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     u: float = 0.0
     target: str = eqx.field(static=True, default="")
     place: tuple[float, float, float] | None = eqx.field(static=True, default=None)
 
     @property
     def offset(self) -> Float[np.ndarray, " 3"] | None:
-        return None if self.place is None else as_numbers(self.place)
+        return None if self.place is None else numbers("place", 3)(self.place)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         return random.uniform(self.box[0], self.box[1], (self.poses, 3))

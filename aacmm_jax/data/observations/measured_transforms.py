@@ -20,12 +20,12 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
-    as_numbers,
     checked_covariances,
     checked_name,
     checked_readings,
     checked_scalar,
     checked_values,
+    numbers,
     offset_of,
 )
 
@@ -185,10 +185,10 @@ class SimulatedTransforms(AbstractSimulated):
     """
 
     name: str = eqx.field(static=True)
-    box: np.ndarray = eqx.field(converter=as_numbers)
+    box: np.ndarray = eqx.field(converter=numbers("box", 2, 3))
     poses: int = eqx.field(static=True)
-    offset_and_orientation: np.ndarray = eqx.field(converter=as_numbers, default=(0.0,) * 6)
-    frame: np.ndarray = eqx.field(converter=as_numbers, default=(0.0,) * 6)
+    offset_and_orientation: np.ndarray = eqx.field(converter=numbers("offset and orientation", 6), default=(0.0,) * 6)
+    frame: np.ndarray = eqx.field(converter=numbers("frame", 6), default=(0.0,) * 6)
     u: float = 0.0
     u_angle: float = 1e-4
 

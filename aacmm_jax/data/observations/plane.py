@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ...core.arrays import Numbers
+from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import semidefinite_eigen
 from ...core.numpy_or_jax import AnyArray, namespace
@@ -22,12 +22,13 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
-    as_numbers,
     checked_name,
     checked_readings,
     checked_scalar,
     checked_target,
+    checked_truth,
     is_exact,
+    numbers,
 )
 
 PLANE = ("rad", "rad", "mm")
@@ -151,7 +152,12 @@ class ParallelPlanes(AbstractObservation):
         self.second = (False,) * sides[0].shape[0] + (True,) * sides[1].shape[0]
         ball = checked_scalar(f"stylus of {where}", stylus)
         between = checked_scalar(f"distance of {where}", distance, positive=True)
-        self.distance = between - ball if inside else between + ball
+        self.distance = between - ball if checked_truth(f"inside of {where}", inside) else between + ball
+        if is_concrete(self.distance) and float(self.distance) <= 0:
+            raise InputError(
+                f"{where} have a stylus of {float(ball):g} mm between planes at {float(between):g} mm; give the "
+                "distance and the diameter of the ball that fits between them, in mm."
+            )
         self.u = checked_scalar(f"u of {where}", u)
         self.form = checked_scalar(f"form of {where}", form)
         self.target = checked_target(target)
@@ -276,8 +282,8 @@ class SimulatedPlanes(AbstractSimulated):
     """
 
     name: str = eqx.field(static=True)
-    corner: np.ndarray = eqx.field(converter=as_numbers)
-    sides: np.ndarray = eqx.field(converter=as_numbers)
+    corner: np.ndarray = eqx.field(converter=numbers("corner", 3))
+    sides: np.ndarray = eqx.field(converter=numbers("sides", 2, 3))
     poses: int = eqx.field(static=True)
     distance: float | None = None
     u: float = 0.0
