@@ -18,7 +18,7 @@ from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import check_joints
 from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Linear, Observed, Whitening, linear_rows, observed_model, observed_rows, whitening_of
-from ..model.robust import LOSSES, Loss, LossName
+from ..model.robust import Loss, LossName, check_loss
 from ..uncertainty import observed_covariance as propagation
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, inverse_information
 from .checks import based_on, check_noise_model, check_start
@@ -70,8 +70,7 @@ def observed_task(
     vector = space.vector() if start is None else as_array(start, "the start")
     if max_steps < 1:
         raise InputError(f"max_steps is {max_steps}; give at least 1.")
-    if robust is not None and robust not in LOSSES:
-        raise InputError(f"robust is {robust!r}; it must be one of {', '.join(LOSSES)}, or None.")
+    check_loss(robust)
     check_joints(capture, space)
     check_start(bounds, vector, "the start" if start is not None else "the arm")
     fixed = bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)

@@ -13,7 +13,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
@@ -21,7 +20,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import check_joints
 from ..model.observed import Observed
-from ..model.robust import LOSSES, Loss
+from ..model.robust import Loss, check_loss
 from ..solver.reason import numbers_of, reasons
 from .checks import based_on, check_noise_model
 from .chunks import default_workers, devices_of, run_chunks
@@ -56,8 +55,7 @@ def solve_observed(
 ) -> ManyIdentifications:
     """All problems of a batch, problem by problem what `identify` does; ``box`` is start, lower and upper bounds."""
     robust, noise = options.robust, options.noise
-    if robust is not None and robust not in LOSSES:
-        raise InputError(f"robust is {robust!r}; it must be one of {', '.join(LOSSES)}, or None.")
+    check_loss(robust)
     check_joints(capture, space)
     space = based_on(space, arm)
     arm, capture = to_numpy((space.base, capture))

@@ -226,6 +226,14 @@ class SimulatedArtefact(AbstractSimulated):
     placement: str | None = eqx.field(static=True, default=None)
     index: str | None = eqx.field(static=True, default=None)
 
+    def __check_init__(self) -> None:
+        if not isinstance(self.points, Mapping) or not self.points:
+            raise InputError(f"points of '{self.name}' are no dictionary; give each point's name and coordinates.")
+        for point, coordinates in self.points.items():
+            numbers(f"point '{checked_name(point, 'a point')}'", 3)(coordinates)
+        if self.errors is not None:
+            numbers("errors of the coordinates", len(self.points), 3)(self.errors)
+
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         coordinates = np.repeat(np.array(list(self.points.values())), self.poses, axis=0)
         return coordinates @ rotation_matrix(self.frame[:3]).T + self.frame[3:]

@@ -160,7 +160,8 @@ class SimulatedPoints(AbstractSimulated):
         poses: Number of points.
         frame: The instrument's frame in the base frame: rotation vector (rad) and origin (mm), ``(6,)``.
         u: Standard uncertainty of each coordinate, mm.
-        target: Name of the target, and ``offset``, its true place in the last frame, mm; by default the arm's probe.
+        target: Name of the target; by default the arm's probe.
+        place: The target's true place in the last frame ``(3,)``, mm.
     """
 
     name: str = eqx.field(static=True)
@@ -173,7 +174,11 @@ class SimulatedPoints(AbstractSimulated):
 
     @property
     def offset(self) -> Float[np.ndarray, " 3"] | None:
-        return None if self.place is None else numbers("place", 3)(self.place)
+        return None if self.place is None else numbers("place of the target", 3)(self.place)
+
+    def __check_init__(self) -> None:
+        if bool(self.target) != (self.offset is not None):
+            raise InputError(f"'{self.name}' needs both, a target and its place in the last frame, or neither.")
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         return random.uniform(self.box[0], self.box[1], (self.poses, 3))
