@@ -43,6 +43,11 @@ SIMULATED: dict[str, list[Any]] = {
     "points": [kinds.SimulatedPoints("T", BOX, 60, FRAME, u=0.01)],
     "transforms": [kinds.SimulatedTransforms("T6", BOX, 60, (10, 20, 80, 0.1, 0.2, 0.3), FRAME, u=0.01, u_angle=1e-4)],
     "spheres": [kinds.SimulatedSphere(f"s{i}", centre, 50.0, 25, u=0.001) for i, centre in enumerate(CENTRES)],
+    "cylinders": [
+        kinds.SimulatedCylinder("ring", [(300, 0, 300), (330, 40, 330)], 80.0, 30, u=0.001, stylus=6.0, inside=True),
+        kinds.SimulatedCylinder("pin", [(500, 200, 150), (500, 200, 250)], 40.0, 30, u=0.001, stylus=6.0),
+        kinds.SimulatedCylinder("bar", [(250, -300, 200), (400, -300, 220)], 50.0, 30, certified=False),
+    ],
     "planes": [
         kinds.SimulatedPlanes("pair", (200, -200, 100), [(300, 0, 0), (0, 400, 0)], 30, distance=150.0, u=0.001),
         kinds.SimulatedPlanes("wall", (300, -200, 100), [(0, 300, 0), (0, 0, 400)], 30),

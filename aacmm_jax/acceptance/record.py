@@ -19,6 +19,7 @@ from ..data.recording import Recording
 from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry
 from ..kinematics.parameters import ArmSpecification, Parameters
+from ..model.observed import Observed
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .all_tests import AcceptanceTest, Measured, checked_limits, measured_by, run, without_stated_uncertainty
 from .decision import Limit
@@ -208,7 +209,7 @@ def _divided(arm: Arm, capture: Capture, known: Collection[bytes]) -> Capture:
 def _check_geometry(arm: Arm, capture: Capture) -> None:
     """Raise `InputError` where observations do not determine their own unknowns."""
     space = to_numpy(Parameters(arm, ("d_1",)))
-    check_observed(capture, space, np.asarray(space.vector()), 0)
+    check_observed(Observed.of(capture), space, np.asarray(space.vector()), 0)
 
 
 def made_for(recording: Recording) -> tuple[Standard, ...]:

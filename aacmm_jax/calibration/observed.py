@@ -18,7 +18,7 @@ from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import check_joints
 from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Linear, Observed, Whitening, linear_rows, observed_model, observed_rows, whitening_of
-from ..model.robust import LOSSES, Loss, LossName
+from ..model.robust import Loss, LossName, check_loss
 from ..uncertainty import observed_covariance as propagation
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, inverse_information
 from .checks import based_on, check_noise_model, check_start
@@ -72,8 +72,7 @@ def observed_task(
     vector = space.vector() if start is None else as_array(start, "the start")
     if max_steps < 1:
         raise InputError(f"max_steps is {max_steps}; give at least 1.")
-    if robust is not None and robust not in LOSSES:
-        raise InputError(f"robust is {robust!r}; it must be one of {', '.join(LOSSES)}, or None.")
+    check_loss(robust)
     check_joints(capture, space)
     check_start(bounds, vector, "the start" if start is not None else "the arm")
     fixed = bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
@@ -81,10 +80,10 @@ def observed_task(
         hold = None
     anchor = scale_anchor(space, space.base, hold, noise) if not fixed or hold else NO_ANCHOR
     noise_model = check_noise_model(noise_model, noise, arm.joints)
+    observed = Observed.of(capture)
     if is_concrete(*jax.tree.leaves((arm, capture, vector))):
         known, at = to_numpy((space, vector))
-        check_observed(capture, known, at, len(space.names) - (anchor.hold is not None))
-    observed = Observed.of(capture)
+        check_observed(observed, known, at, len(space.names) - (anchor.hold is not None))
     return ObservedTask(
         observed=observed,
         bounds=bounds,
@@ -105,9 +104,8 @@ def configurations(q: Any) -> tuple[int, ...]:
     return tuple(int(i) for i in np.unique(np.asarray(q), axis=0, return_inverse=True)[1].ravel())
 
 
-def check_observed(capture: Capture, space: Parameters, vector: Float[AnyArray, " p"], count: int) -> None:
+def check_observed(observed: Observed, space: Parameters, vector: Float[AnyArray, " p"], count: int) -> None:
     """Raise `InputError` where the observations cannot determine their own unknowns, or these parameters."""
-    observed = Observed.of(capture)
     geometry = space.geometry(vector)
     forward = forward_pass(geometry, observed.sines_cosines)
     for observation, rows in zip(observed.observations, observed.slices, strict=True):

@@ -13,7 +13,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
@@ -21,7 +20,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import check_joints
 from ..model.observed import Observed
-from ..model.robust import LOSSES, Loss
+from ..model.robust import Loss, check_loss
 from ..solver.reason import numbers_of, reasons
 from .checks import based_on, check_noise_model
 from .chunks import default_workers, devices_of, run_chunks
@@ -56,8 +55,7 @@ def solve_observed(
 ) -> ManyIdentifications:
     """All problems of a batch, problem by problem what `identify` does; ``box`` is start, lower and upper bounds."""
     robust, noise = options.robust, options.noise
-    if robust is not None and robust not in LOSSES:
-        raise InputError(f"robust is {robust!r}; it must be one of {', '.join(LOSSES)}, or None.")
+    check_loss(robust)
     check_joints(capture, space)
     space = based_on(space, arm)
     arm, capture = to_numpy((space.base, capture))
@@ -72,12 +70,14 @@ def solve_observed(
     fixed = bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
     hold = None if fixed and options.hold == "longest" else options.hold
     anchor = scale_anchor(space, arm, hold, noise) if not fixed or hold else NO_ANCHOR
-    check_observed(first[1], first_space, first[2], len(space.names) - (anchor.hold is not None))
+    observed = Observed.of(first[1])
+    check_observed(observed, first_space, first[2], len(space.names) - (anchor.hold is not None))
     form = _Form(
         names=space.names,
         anchor=anchor,
         loss=None if robust is None else Loss(robust),
-        pose=_poses_read_at_once(first[1], options.covariance),
+        # Only covariances need to know which readings are one, and each answer is a program.
+        pose=configurations(observed.q) if options.covariance else tuple(range(observed.q.shape[0])),
         max_steps=options.max_steps,
         covariance=options.covariance,
         batched=axes,
@@ -103,12 +103,6 @@ def solve_observed(
         anchor=anchor,
         **fields,
     )
-
-
-def _poses_read_at_once(capture: Capture, covariance: bool) -> tuple[int, ...]:
-    """Numbers of the configurations; only covariances need to know which are one, and each answer is a program."""
-    q = Observed.of(capture).q
-    return configurations(q) if covariance else tuple(range(q.shape[0]))
 
 
 def _default_slots(platform: str, poses: int) -> int:

@@ -24,8 +24,8 @@ Function = TypeVar("Function", bound=Callable)
 def checked_arguments(function: Function) -> Function:
     """Decorator: `InputError` for an argument that is not what its annotation says.
 
-    Looked at are annotations of classes of this package, ``int`` and ``float``, also with None; others are the
-    function's own business.
+    Looked at are annotations of classes of this package, ``int``, ``float`` and ``bool``, also with None; others are
+    the function's own business.
     """
     signature = inspect.signature(function)
     kinds = {name: _kinds(parameter.annotation) for name, parameter in signature.parameters.items()}
@@ -59,7 +59,7 @@ def with_options(options: type[tuple]) -> Callable[[Function], Function]:
 def _kinds(annotation: Any) -> tuple[type, ...]:
     """The classes that an annotation allows; none where it allows what is not looked at."""
     kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
-    known = [isinstance(kind, type) and (kind in (int, float, NoneType) or _is_own(kind)) for kind in kinds]
+    known = [isinstance(kind, type) and (kind in (int, float, bool, NoneType) or _is_own(kind)) for kind in kinds]
     return kinds if all(known) else ()
 
 
@@ -70,7 +70,9 @@ def _is_own(kind: type) -> bool:
 def _check(name: str, value: Any, kinds: tuple[type, ...]) -> None:
     if (value is None and NoneType in kinds) or isinstance(value, tuple(kind for kind in kinds if _is_own(kind))):
         return
-    if int in kinds:
+    if bool in kinds:
+        truth_value(value, name)
+    elif int in kinds:
         whole_number(value, name)
     elif float in kinds:
         real_number(value, name)
@@ -78,6 +80,12 @@ def _check(name: str, value: Any, kinds: tuple[type, ...]) -> None:
         wanted = " or ".join(f"{_article(kind.__name__)} {kind.__name__}" for kind in kinds if kind is not NoneType)
         given = type(value).__name__
         raise InputError(f"{name} is {_article(given)} {given}; give {wanted}.")
+
+
+def truth_value(value: Any, what: str) -> None:
+    """Raise `InputError` for what is neither true nor false, such as 1, "yes" or NaN."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{what} is {shown(value)}; give True or False.")
 
 
 def whole_number(value: Any, what: str) -> None:

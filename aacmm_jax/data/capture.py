@@ -2,7 +2,7 @@
 
 import fnmatch
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..core.arguments import items_of, shown
+from ..core.arguments import checked_arguments, items_of, shown
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace
-from ..core.text import pluralise, shorten
+from ..core.text import shorten
+from .copies import NOTHING_REPEATED, Repeated, check_different, observation_without_copies, without_copies
 from .observations.observation import AbstractObservation, checked_name, checked_readings
 from .observations.socket import Socket
 
@@ -57,33 +58,6 @@ class ReferenceLength(eqx.Module):
             )
 
 
-class Repeated(NamedTuple):
-    """Copies of data that a capture leaves out, because a copy is no measurement of its own."""
-
-    poses: tuple[tuple[str, int], ...] = ()  # sockets, and the number of copies in each
-    lengths: tuple[tuple[str, str], ...] = ()  # both ends of each copy
-
-    def sentences(self) -> list[str]:
-        """What was left out, for warnings."""
-        found = []
-        if self.poses:
-            number = pluralise(sum(count for _, count in self.poses), "pose")
-            sockets = shorten([f"{name} ({count})" for name, count in self.poses])
-            found.append(
-                f"Counted once: {number} with exactly the readings of another pose of the same socket: {sockets}; a "
-                "copy is no measurement of its own. Was the arm recorded at rest, or a file pasted twice?"
-            )
-        if self.lengths:
-            ends = shorten([f"{start} - {end}" for start, end in self.lengths])
-            found.append(
-                f"Counted once: reference lengths given again with the same value and u: {ends}; delete the copies."
-            )
-        return found
-
-
-NOTHING_REPEATED = Repeated()
-
-
 class Capture(eqx.Module):
     """Poses grouped by the socket in which the tip rested, reference lengths between sockets, and other observations.
 
@@ -92,8 +66,9 @@ class Capture(eqx.Module):
     together.
 
     A copy adds no information, but would make every uncertainty too small: poses of a socket with the same reading of
-    every joint count once, and so do reference lengths with the same sockets, value and u. ``repeated`` says which were
-    left out. Only known values are compared: a capture made of traced values, and a batch, keep their copies.
+    every joint count once, and so do poses of an observation with the same readings and measured values, and reference
+    lengths with the same sockets, value and u. ``repeated`` says which were left out. Only known values are compared: a
+    capture made of traced values, and a batch, keep their copies.
 
     Args:
         sockets: Socket name -> joint readings, shape ``(m, n)``, rad; m poses may differ from socket to socket.
@@ -103,8 +78,9 @@ class Capture(eqx.Module):
         sessions: Names of the sessions of `join_sessions`; what belongs to one is named ``session/name``.
 
     Raises:
-        InputError: For names that are empty or longer than a line, readings that are not finite or look like degrees,
-            sockets of different joint counts or with the same poses, and lengths that join unknown sockets.
+        InputError: For names that are empty, longer than a line or given twice, readings that are not finite or look
+            like degrees, sockets or observations of different joint counts or with the same poses, and lengths that
+            join unknown sockets.
     """
 
     q: Float[AnyArray, "N n"]
@@ -128,7 +104,7 @@ class Capture(eqx.Module):
                 f"the sockets are a {type(sockets).__name__}; give a dictionary of names and readings: "
                 '{"A": q}, q of shape (poses, joints).'
             )
-        self.observations = _checked_observations(observations)
+        self.observations = _checked_observations(observations, sockets)
         if not sockets and not self.observations:
             raise InputError("a capture needs at least one socket with poses, or another observation.")
         blocks = {
@@ -143,8 +119,11 @@ class Capture(eqx.Module):
                 raise InputError(
                     f"{where} has {block.shape[-1]} columns, but {first} has {width}; give one column a joint."
                 )
-        different = {name: _without_copies(block) for name, block in blocks.items()}
-        _check_different(different)
+        different = {name: without_copies(block) for name, block in blocks.items()}
+        counts = {name: block.shape[0] for name, block in blocks.items()}
+        counts |= {observation.name: observation.q.shape[0] for observation in self.observations}
+        self.observations = tuple(observation_without_copies(observation) for observation in self.observations)
+        check_different(different, self.observations)
         self.q = joined(list(different.values())) if different else jnp.zeros((0, width))
         self.names = tuple(different)
         self.sizes = tuple(block.shape[0] for block in different.values())
@@ -163,8 +142,10 @@ class Capture(eqx.Module):
                     )
         self.lengths, copies = _different_lengths(given)
         poses = dict(repeated.poses)
-        for name, size in zip(self.names, self.sizes, strict=True):
-            poses[name] = poses.get(name, 0) + blocks[name].shape[0] - size
+        sizes = dict(zip(self.names, self.sizes, strict=True))
+        sizes |= {observation.name: observation.q.shape[0] for observation in self.observations}
+        for name, size in sizes.items():
+            poses[name] = poses.get(name, 0) + counts[name] - size
         self.repeated = Repeated(
             tuple((name, count) for name, count in poses.items() if count), (*repeated.lengths, *copies)
         )
@@ -284,7 +265,7 @@ def _matching(names: Sequence[str], patterns: Iterable[str]) -> list[str]:
 
 
 def _checked_observations(
-    observations: Iterable[AbstractObservation] | AbstractObservation,
+    observations: Iterable[AbstractObservation] | AbstractObservation, sockets: Iterable[str]
 ) -> tuple[AbstractObservation, ...]:
     single = isinstance(observations, AbstractObservation)
     checked = (observations,) if single else tuple(items_of(observations, "observations"))
@@ -295,17 +276,9 @@ def _checked_observations(
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two observations have the name '{name}'; give each a name of its own.")
+        if name in sockets:
+            raise InputError(f"a socket and an observation have the name '{name}'; give each a name of its own.")
     return checked
-
-
-def _without_copies(block: AnyArray) -> AnyArray:
-    """The first of each pose, in their order."""
-    if not is_concrete(block):
-        return block
-    first: dict[bytes, int] = {}
-    for i, row in enumerate(np.asarray(block) + 0.0):  # which has no negative zero
-        first.setdefault(row.tobytes(), i)
-    return block if len(first) == block.shape[0] else np.asarray(block)[list(first.values())]
 
 
 def _different_lengths(
@@ -325,16 +298,7 @@ def _different_lengths(
     return tuple(different), tuple(copies)
 
 
-def _check_different(blocks: Mapping[str, Array | np.ndarray]) -> None:
-    """Refuse two sockets with exactly the same poses: one file given twice."""
-    seen: dict[bytes, str] = {}
-    for name, block in blocks.items():
-        if is_concrete(block) and block.shape[0] > 1:
-            twin = seen.setdefault(np.asarray(block).tobytes(), name)
-            if twin != name:
-                raise InputError(f"sockets '{twin}' and '{name}' have exactly the same poses; is one file given twice?")
-
-
+@checked_arguments
 def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) -> Capture:
     """Join captures that one arm took in several sessions, with its probe remounted in between, or on another base.
 

@@ -17,9 +17,7 @@ from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture, ReferenceLength
 from .noise import Noise
-from .observations.observation import AbstractObservation, AbstractSimulated
-
-MOST_POSES = 100_000  # in a socket, as in a study
+from .observations.observation import MOST_POSES, AbstractObservation, AbstractSimulated
 
 
 @checked_arguments

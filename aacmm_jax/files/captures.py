@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..data.capture import Capture, ReferenceLength, Repeated, check_one_capture
+from ..data.capture import Capture, ReferenceLength, check_one_capture
+from ..data.copies import Repeated
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm

@@ -173,12 +173,13 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     "-" only, so that ``hole_0_pose.csv`` is left alone. ``exclude = ["*_old.csv"]`` in ``[[socket]]`` leaves out the
     files that match such a shell pattern. Angles: reading -> sign * (reading - offset), in the stated unit.
 
-    ``[[points]]``, ``[[transforms]]``, ``[[touched_sphere]]``, ``[[plane]]``, ``[[parallel_planes]]``,
-    ``[[artefact]]`` and ``[[distances]]`` are observations of these kinds. Their ``file`` holds readings and measured
-    values (or ``readings`` is a file of readings with as many rows); ``columns`` picks them by header name, shell
-    pattern or number: ``columns = { q = "q*_rad", points = ["x", "y", "z"] }``. ``units``, ``rotation``,
-    ``coverage_factor``, ``delimiter``, ``decimal`` and ``skip`` say how they are written, ``group`` names a column that
-    divides the table into several observations, and ``preset`` (csv, leica, xyzijk, ipa) fills in what is not stated.
+    ``[[points]]``, ``[[transforms]]``, ``[[touched_sphere]]``, ``[[touched_cylinder]]``, ``[[plane]]``,
+    ``[[parallel_planes]]``, ``[[artefact]]`` and ``[[distances]]`` are observations of these kinds. Their ``file``
+    holds readings and measured values (or ``readings`` is a file of readings with as many rows); ``columns`` picks them
+    by header name, shell pattern or number: ``columns = { q = "q*_rad", points = ["x", "y", "z"] }``. ``units``,
+    ``rotation``, ``coverage_factor``, ``delimiter``, ``decimal`` and ``skip`` say how they are written, ``group`` names
+    a column that divides the table into several observations, and ``preset`` (csv, leica, xyzijk, ipa) fills in what is
+    not stated.
 
     ``session = "monday"`` in such tables, with fields in braces if needed, or ``columns = { session = "day" }`` for
     each row, makes sessions of one arm (`data.capture.join_sessions`); names are then ``monday/name``, in lengths too.
@@ -220,8 +221,13 @@ def read_manifest(path: str | os.PathLike) -> Recording:
 
         sockets, lengths, spheres = recorded(path.parent, model, angles)
 
-        def radians(readings: np.ndarray, unit: str | None, preset: str | None) -> np.ndarray:
-            return _radians(readings, _angles_of(model.angles, unit, preset))
+        def radians(readings: np.ndarray, unit: str | None, preset: str | None, header: str | None) -> np.ndarray:
+            stated = _angles_of(model.angles, unit, header or preset)
+            if header is not None and stated.unit != header:
+                raise InputError(
+                    f"the header of the readings says {header}, but the manifest {stated.unit}; correct one of them."
+                )
+            return _radians(readings, stated)
 
         source = Source(path.parent, opened, joints, columns, radians)
         sessions = _sessions_of(path.parent, model)

@@ -32,26 +32,38 @@ _EULER = re.compile("[xyz]{3}|[XYZ]{3}")
 class Preset(NamedTuple):
     """Columns, units and conventions of tables that people have; a manifest may change each of them."""
 
-    columns: Mapping[str, Sequence[Column]]
-    units: Mapping[str, str] = {}
+    columns: Mapping[str, Sequence[Sequence[Column]]]  # the first choice that a table has
+    units: Mapping[str, str] = {}  # where neither the manifest nor the table's header states one
     rotation: str | None = None
     coverage_factor: float = 1.0
 
 
 PRESETS = {
-    # Readings and positions as `aacmm plan` writes them.
-    "csv": Preset({"q": ["q_*_deg"], "points": ["[xyz]_mm"], "u": ["u_[xyz]_mm"]}, {"q": "deg"}),
-    # 6-D export of a laser tracker: U(95) of the coordinates, scalar part of the quaternion first.
+    # Readings and positions as `aacmm plan` writes them, or with plainer names.
+    "csv": Preset(
+        {
+            "q": [["q_*_deg"], ["q*_deg"], ["q*_rad"]],
+            "points": [["[xyz]_mm"], ["x", "y", "z"]],
+            "u": [["u_[xyz]_mm"], ["u_x", "u_y", "u_z"]],
+        },
+        {"q": "deg"},
+    ),
+    # 6-D export of a laser tracker: U(95) of the coordinates, scalar part of the quaternion first. Names as in the
+    # exports of ZhangTeng-Hust/ASTL (T-Mac of 2022): "X  [mm]", "U(95) X  [mm]", "Q0 "; others write "U95 X".
     "leica": Preset(
-        {"points": ["X", "Y", "Z"], "u": ["U95 X", "U95 Y", "U95 Z"], "rotations": ["Q0", "Q1", "Q2", "Q3"]},
+        {
+            "points": [["X", "Y", "Z"]],
+            "u": [["U*95* X", "U*95* Y", "U*95* Z"]],
+            "rotations": [["Q0", "Q1", "Q2", "Q3"]],
+        },
         rotation="quaternion wxyz",
         coverage_factor=2.0,
     ),
     # Point lists with the direction in which a point was probed, which is not needed.
-    "xyzijk": Preset({"points": [1, 2, 3]}),
+    "xyzijk": Preset({"points": [["X", "Y", "Z"], [1, 2, 3]]}),
     # christianlandgraf/ipa-robot-accuracy; R = Rx(rx) Ry(ry) Rz(rz) is the order that agrees with the robot's joints.
     "ipa": Preset(
-        {"q": ["q?_rad"], "points": ["[xyz]_mm"], "u": ["std_[xyz]_mm"], "rotations": ["r[xyz]_deg"]},
+        {"q": [["q?_rad"]], "points": [["[xyz]_mm"]], "u": [["std_[xyz]_mm"]], "rotations": [["r[xyz]_deg"]]},
         {"q": "rad", "rotations": "deg"},
         rotation="XYZ",
     ),
@@ -132,7 +144,8 @@ class Source(NamedTuple):
     open: Callable[[Path], InputFile]
     joints: int
     columns: Sequence[int] | None  # of the readings, by [angles]
-    radians: Callable[[np.ndarray, str | None, str | None], np.ndarray]  # unit of the table, and of its preset
+    # Readings in rad, from the unit that the manifest's table states, its preset's, and that of the file's header.
+    radians: Callable[[np.ndarray, str | None, str | None, str | None], np.ndarray]
 
 
 def observations(
@@ -196,10 +209,11 @@ class _Reader:
             source.open(source.folder / file), delimiter=table.delimiter, decimal=table.decimal, skip=table.skip
         )
         chosen = {key: [x] if isinstance(x, str | int) else x for key, x in table.columns.items()}
-        for key, wanted in self._preset.columns.items():
+        for key, choices in self._preset.columns.items():
             # A preset may name more than a kind needs, or than a table has.
-            if key in self._entries and key not in chosen and getattr(table, key, None) is None and text.has(wanted):
-                chosen[key] = wanted
+            there = next((wanted for wanted in choices if text.has(wanted)), None)
+            if key in self._entries and key not in chosen and getattr(table, key, None) is None and there is not None:
+                chosen[key] = there
         found: dict[str, Any] = {}
         if label:
             chosen.pop(self._label or "", None)
@@ -233,7 +247,7 @@ class _Reader:
                 f"{self._where} picks {numbers.shape[1]} columns for the readings, but the arm has {source.joints} "
                 "joints; give one column a joint."
             )
-        return source.radians(numbers, table.units.get("q"), self._preset.units.get("q"))
+        return source.radians(numbers, table.units.get("q"), self._preset.units.get("q"), text.unit(wanted))
 
     def _column(self, text: TextTable, entry: Entry, wanted: Sequence[Column]) -> np.ndarray:
         if entry.dimensions[:1] != ("pose",):
@@ -243,13 +257,14 @@ class _Reader:
                 raise InputError(f"{self._where}: {entry.name} is in one column; pick one.")
             return text.texts(wanted[0])
         numbers = text.numbers(wanted)
+        header = text.unit(wanted)
         if entry.unit == "1":
-            return self._rotations(entry, numbers)
+            return self._rotations(entry, numbers, header)
         counts = {("pose",): (1,), ("pose", "axis"): (3,), ("pose", "axis", "axis_2"): (9,)}[entry.dimensions]
         if entry.name == "u" and entry.dimensions == ("pose", "axis"):
             counts = (1, 3)
         self._check_count(entry.name, numbers.shape[1], counts)
-        numbers = numbers * self._unit(entry)
+        numbers = numbers * self._unit(entry, header)
         if entry.name == "u":
             numbers = numbers / (self._table.coverage_factor or self._preset.coverage_factor)
         if len(entry.dimensions) == 3:
@@ -261,19 +276,27 @@ class _Reader:
             wanted = " or ".join(map(str, counts))
             raise InputError(f"{self._where}: {name} is in {wanted} columns, but {given} are picked; pick {wanted}.")
 
-    def _unit(self, entry: Entry) -> float:
-        """What a number of the table or manifest is multiplied by."""
+    def _unit(self, entry: Entry, header: str | None = None) -> float:
+        """What a number of the table or manifest is multiplied by; ``header``: the unit that the table states."""
         known = _ANGLES if entry.unit in ("rad", "1") else LENGTHS
-        unit = self._table.units.get(entry.name, self._preset.units.get(entry.name))
+        unit = self._table.units.get(entry.name)
+        if unit is not None and header is not None and unit != header:
+            raise InputError(
+                f"{self._where}: units.{entry.name} is '{unit}', but the header of its columns says {header}; correct "
+                "one of them."
+            )
+        if unit is None:
+            unit = header or self._preset.units.get(entry.name)
         if unit is None:
             if entry.unit == "1":
                 raise InputError(f"{self._where} has angles without a unit; give units = {{ {entry.name} = 'deg' }}.")
             return 1.0
         if unit not in known:
-            raise InputError(f"{self._where}: units.{entry.name} is '{unit}'; it must be one of {', '.join(known)}.")
+            what = f"units.{entry.name} is" if unit != header else f"the header of {entry.name} says"
+            raise InputError(f"{self._where}: {what} '{unit}'; it must be one of {', '.join(known)}.")
         return known[unit] ** (2 if entry.unit == "mm^2" else 1)
 
-    def _rotations(self, entry: Entry, numbers: np.ndarray) -> np.ndarray:
+    def _rotations(self, entry: Entry, numbers: np.ndarray, header: str | None) -> np.ndarray:
         from scipy.spatial.transform import Rotation
 
         convention = self._table.rotation or self._preset.rotation
@@ -289,7 +312,7 @@ class _Reader:
             if not np.allclose(np.linalg.norm(numbers, axis=1), 1, atol=1e-3):
                 raise InputError(f"{self._where} has quaternions that are not of length 1; pick their four columns.")
             return Rotation.from_quat(numbers, scalar_first=convention.endswith("wxyz")).as_matrix()
-        numbers = numbers * self._unit(entry)
+        numbers = numbers * self._unit(entry, header)
         rotations = (
             Rotation.from_rotvec(numbers) if convention == "vector" else Rotation.from_euler(convention, numbers)
         )

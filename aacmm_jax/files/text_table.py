@@ -14,6 +14,13 @@ from .inputs import InputFile
 
 _LARGEST = 1e15  # encoder counts reach 1e10; beyond it squares lose what is measured
 _LIKE_A_NUMBER = re.compile(r"[\"']?\s*[+-]?[.,]?\d")  # digits of any script
+# Units as header lines state them, after a name ("X [mm]", "X (mm)", "x_mm"), and those that cannot be converted.
+_UNITS = {name: name for name in ("mm", "m", "um", "inch", "rad", "deg", "arcsec")} | {
+    "\u00b5m": "um", "\u03bcm": "um", "in": "inch", "\u00b0": "deg",
+}  # fmt: skip
+_OTHER_UNITS = ("cm", "dm", "nm", "ft", "mil", "gon", "grad", "mrad", "counts")
+_IN_BRACKETS = re.compile(r"\s*(?:\[([^\]]*)\]|\(([^)\d]*)\))\s*$")
+_AFTER_NAME = re.compile("_(mm|um|inch|deg|rad|arcsec)$")  # "_m" may mean anything
 _FEW = 3  # rows from which equal columns are no coincidence
 
 
@@ -58,6 +65,8 @@ Column = str | int
 class TextTable:
     """A text table whose columns are picked by header name, shell pattern or number from 1; other columns may be text.
 
+    A name that the header does not have exactly is compared without regard to case, blanks and a unit in brackets.
+
     Args:
         path: The file.
         delimiter: What divides its columns; None finds it.
@@ -77,7 +86,10 @@ class TextTable:
             if cells == [""] or cells[0].startswith("#"):
                 continue
             if not self._rows and not any(_LIKE_A_NUMBER.match(cell) or is_number(cell) for cell in cells):
-                self._header = cells
+                only_units = len(cells) == len(self._header) and all(_is_unit(cell) for cell in cells)
+                self._header = (
+                    [f"{a} [{_unit(b)}]" for a, b in zip(self._header, cells, strict=True)] if only_units else cells
+                )
                 continue
             if self._rows and len(cells) != len(self._rows[0][1]):
                 count = len(self._rows[0][1])
@@ -95,7 +107,21 @@ class TextTable:
             return [column - 1] if 1 <= column <= len(self._rows[0][1]) else []
         if column in self._header:
             return [self._header.index(column)]
-        return [i for i, name in enumerate(self._header) if fnmatch.fnmatchcase(name, column)]
+        exact = [i for i, name in enumerate(self._header) if fnmatch.fnmatchcase(name, column)]
+        wanted = _plain_name(column)
+        return exact or [i for i, name in enumerate(self._header) if fnmatch.fnmatchcase(_plain_name(name), wanted)]
+
+    def unit(self, wanted: Sequence[Column]) -> str | None:
+        """The unit that the header states for these columns, or None. Raises `InputError` for more than one."""
+        stated = {self._header[i]: _stated_unit(self._header[i]) for i in self.pick(wanted) if self._header}
+        found = {unit: name for name, unit in stated.items() if unit is not None}
+        if len(found) > 1:
+            (one, first), (other, second), *_ = found.items()
+            raise InputError(
+                f"{self._path} mixes units: {quoted(first)} is in {one}, {quoted(second)} in {other}; convert one of "
+                "them, and change its header."
+            )
+        return next(iter(found), None)
 
     def pick(self, wanted: Sequence[Column]) -> list[int]:
         """Indices of columns, a pattern in the order of the header. Raises `InputError` for one that is not there."""
@@ -126,6 +152,34 @@ class TextTable:
         """The cells of one column."""
         (index,) = self.pick([column])
         return np.array([cells[index].strip("\"'") for _, cells in self._rows])
+
+
+def _unit(cell: str) -> str:
+    """What is inside the brackets, if there are any."""
+    found = _IN_BRACKETS.fullmatch(cell)
+    return ((found[1] or found[2] or "") if found else cell).strip().casefold()
+
+
+def _is_unit(cell: str) -> bool:
+    """Whether a cell of a header is a unit, or empty."""
+    return _unit(cell) in (*_UNITS, *_OTHER_UNITS, "")
+
+
+def _stated_unit(header: str) -> str | None:
+    """The unit in a column's header, or None where it states none."""
+    name = header.strip("\"'").casefold()
+    bracketed, after = _IN_BRACKETS.search(name), _AFTER_NAME.search(name)
+    unit = _unit(bracketed[0]) if bracketed else after[1] if after else ""
+    return _UNITS.get(unit, unit if unit in _OTHER_UNITS else None)
+
+
+def _plain_name(name: str) -> str:
+    """A column's name, or a pattern, without case, quotes, unit in brackets and more than single blanks."""
+    name = name.strip("\"'")
+    bracketed = _IN_BRACKETS.search(name)
+    if bracketed and _is_unit(bracketed[0].strip()):  # and not the characters of a pattern
+        name = name[: bracketed.start()]
+    return " ".join(name.casefold().split())
 
 
 def _lines(path: str | os.PathLike) -> list[str]:

@@ -10,6 +10,8 @@ from typing import Literal, get_args
 import equinox as eqx
 from jaxtyping import Float
 
+from ..core.arguments import shown
+from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace
 
 LossName = Literal["huber", "cauchy", "tukey"]
@@ -23,6 +25,12 @@ TUNING = {
 }
 # Medians of the chi-square distribution: of the square of a pose's whitened residual.
 MEDIANS = {1: 0.454936, 3: 2.365974, 6: 5.348121}
+
+
+def check_loss(robust: object) -> None:
+    """Raise `InputError` for what is neither the name of a loss nor None."""
+    if robust is not None and not (isinstance(robust, str) and robust in LOSSES):
+        raise InputError(f"robust is {shown(robust)}; it must be one of {', '.join(LOSSES)}, or None.")
 
 
 class Loss(eqx.Module):

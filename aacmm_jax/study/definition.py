@@ -20,6 +20,7 @@ from ..data.recording import Recording
 from ..files.arms import specification_toml
 from ..kinematics.arm import Arm, checked_limits, is_length
 from ..kinematics.parameters import ArmSpecification, Parameters, single
+from ..model.observed import Observed
 from .specification import Point, Region, Specification, label
 
 POOL_PARTS = 32  # independent parts of a pose pool; trial t draws from part t modulo this
@@ -312,7 +313,7 @@ class Study:
         unknowns = len(self.space.names) - int(self.space.lengths.any())
         if capture is not None and self.observed:
             anchored = any(setting.method == "stage1" for setting in self.settings)
-            check_observed(capture, self.space, self._nominal_vector, len(self.space.names) - anchored)
+            check_observed(Observed.of(capture), self.space, self._nominal_vector, len(self.space.names) - anchored)
         for setting in () if self.observed else dict.fromkeys(self.settings):
             check_enough(setting.sizes, unknowns)
             if setting.method != "stage1" and capture is not None and not capture.lengths:

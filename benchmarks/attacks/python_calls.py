@@ -14,6 +14,7 @@ import numpy as np
 import aacmm_jax as aj
 
 from .outcomes import DONE, REFUSED, SILENT, Attempt, ending
+from .samples import SIMULATED
 
 SECONDS = 120
 NEVER: list[Any] = [
@@ -42,7 +43,7 @@ def good_calls() -> dict[str, tuple[Callable, dict[str, Any]]]:
     length = aj.ReferenceLength("A", "B", 200.0, 0.001)
     cloud = np.random.default_rng(0).normal(size=(25, 3))
     cloud = 12.5 * cloud / np.linalg.norm(cloud, axis=1)[:, None]
-    return {
+    return observed_calls(nominal, capture) | {
         "Arm": (aj.Arm, {**angles, "probe": nominal.probe, "limits": [(-3, 3)] * 6}),
         "Arm.position": (nominal.position, {"q": np.zeros((4, 6))}),
         "Arm.jacobian": (nominal.jacobian, {"q": np.zeros((4, 6)), "names": space.names}),
@@ -79,6 +80,53 @@ def good_calls() -> dict[str, tuple[Callable, dict[str, Any]]]:
     }  # fmt: skip
 
 
+def observed_calls(nominal: aj.Arm, sockets: aj.Capture) -> dict[str, tuple[Callable, dict[str, Any]]]:
+    """Calls with observations: the constructor of every kind and of its simulation, and what takes them."""
+    observations = aj.data.observations
+    noise = aj.Noise(encoder_arcsec=2.0, seating=0.005)
+    capture = aj.simulate(nominal, {"A": (400, 200, 300)}, poses=6, observations=SIMULATED, noise=noise)
+    few = aj.Parameters(nominal, ("a_2", "d_4", "theta_2"))
+    calls: dict[str, tuple[Callable, dict[str, Any]]] = {
+        "join_sessions": (aj.join_sessions, {"captures": {"one": sockets, "other": capture}, "own_probe": True}),
+        "stack_captures": (aj.data.stack_captures, {"captures": [capture, capture]}),
+        "Capture of observations": (
+            aj.Capture,
+            {"sockets": dict(capture.sockets), "lengths": (), "observations": capture.observations},
+        ),
+        "simulate observations": (
+            aj.simulate,
+            {"arm": nominal, "sockets": {}, "observations": SIMULATED[2:4], "noise": noise, "seed": 1},
+        ),
+        "calibrate observations": (
+            aj.calibrate,
+            {
+                "arm": nominal,
+                "capture": capture,
+                "bounds": aj.Bounds.around(nominal, few),
+                "robust": "huber",
+                "noise": noise,
+                "max_steps": 20,
+            },
+        ),
+        "Socket": (observations.Socket, {"name": "A", "q": np.zeros((3, 6)), "target": ""}),
+    }
+    for simulated in SIMULATED:
+        fields = dict(vars(simulated))
+        calls[f"{type(simulated).__name__} '{simulated.name}'"] = (type(simulated), fields)
+    for one in capture.observations:
+        kind, stored = type(one), one.stored()
+        if isinstance(one, observations.ParallelPlanes):
+            sides = {"one": one.q[: one.first], "other": one.q[one.first :]}
+            stored = sides | {key: value for key, value in stored.items() if key not in ("q", "side")}
+        if isinstance(one, observations.Artefact):
+            points = dict(zip(one.names, one.coordinates, strict=True))
+            blocks = {name: one.q[5 * i : 5 * i + 5] for i, name in enumerate(one.names)}
+            taken = ("q", "point", "names", "coordinates")
+            stored = {"points": points, "q": blocks} | {k: v for k, v in stored.items() if k not in taken}
+        calls[kind.__name__ + f" '{one.name}'"] = (kind, {"name": one.name, **stored})
+    return calls
+
+
 def not_finite(result: Any) -> bool:
     """Whether a result that claims to be one contains NaN; bounds and limits may be infinite."""
     converged = getattr(result, "converged", True)
@@ -99,6 +147,7 @@ def attack(seed: int, count: int) -> Iterator[Attempt]:
         replaced = choose.choice(list(arguments))
         never = choose.random() < 0.5
         value = choose.choice(NEVER if never else RARELY)
+        never = never and not (isinstance(value, str) and isinstance(arguments[replaced], str))  # any text is a name
         outcome, found = ending(lambda: function(**(arguments | {replaced: value})), SECONDS)  # noqa: B023
         if outcome is None:
             outcome, found = (SILENT, str(found)[:200]) if never or not_finite(found) else (DONE, "")

@@ -38,6 +38,69 @@ to = "plate/1"
 value = 200.125
 u = 0.002
 """
+OBSERVED = """arm = "arm.toml"
+
+[[points]]
+name = "T"
+file = "o.csv"
+preset = "leica"
+columns = { q = "q[1-6]" }
+target = "SMR"
+station = "S1"
+
+[[transforms]]
+name = "T6"
+file = "o.csv"
+columns = { q = "q[1-6]", points = ["x", "y", "z"], rotations = ["q0", "q1q", "q2q", "q3q"] }
+rotation = "quaternion wxyz"
+u = 10.0
+u_angle = 5.0
+units = { u = "um", u_angle = "arcsec" }
+
+[[touched_sphere]]
+name = "sphere"
+file = "o.csv"
+columns = { q = "q[1-6]" }
+diameter = 25.0004
+u = 0.0005
+stylus = 6.0
+
+[[touched_cylinder]]
+name = "ring"
+file = "o.csv"
+columns = { q = "q[1-6]" }
+diameter = 50.01
+stylus = 6.0
+inside = true
+form = 0.002
+
+[[plane]]
+name = "wall"
+file = "o.csv"
+columns = { q = "q[1-6]" }
+group = "Group"
+
+[[parallel_planes]]
+name = "block"
+file = "o.csv"
+columns = { q = "q[1-6]", side = "Side" }
+distance = 100.0
+
+[[artefact]]
+name = "bar"
+file = "o.csv"
+columns = { q = "q[1-6]", point = "Ball" }
+u = 0.001
+placement = "left"
+coordinates = { a = [0.0, 0.0, 0.0], b = [300.5, 0.0, 0.0] }
+
+[[distances]]
+name = "wire"
+file = "o.csv"
+columns = { q = "q[1-6]", values = "d" }
+u = 0.003
+constant = true
+"""
 POINTS = """[points]
 unit = "mm"
 reach = 900.0
@@ -102,13 +165,31 @@ def originals(folder: Path) -> dict[str, Callable[[], object]]:
         points = centre * directions / np.linalg.norm(directions, axis=1)[:, None] + [400, 200, 300]
         points += random_numbers.normal(0, 0.01, points.shape)
         (folder / name).write_text("\n".join(";".join(f"{x:.5f}" for x in row) for row in points) + "\n")
-    for name, text in (("m.toml", MANIFEST), ("p.toml", POINTS), ("s.toml", STUDY), ("l.toml", ABOUT)):
+    header = [*(f"q{i} [deg]" for i in range(1, 7)), "X [mm]", "Y [mm]", "Z [mm]", "U(95) X [mm]", "U(95) Y [mm]"]
+    header += ["U(95) Z [mm]", "Q0", "q1q", "q2q", "q3q", "d", "Group", "Side", "Ball"]
+    rows = []
+    for i in range(6):
+        turn = random_numbers.normal(size=4)
+        values = [*random_numbers.uniform(-90, 90, 6), *random_numbers.uniform(100, 900, 3), 0.01, 0.02, 0.03]
+        values += [*turn / np.linalg.norm(turn), 500.0 + i]
+        rows.append([*(f"{x:.6f}" for x in values), "ab"[i % 2], ["one", "other"][i // 3], "ab"[i % 2]])
+    (folder / "o.csv").write_text("\n".join(",".join(row) for row in [header, *rows]) + "\n")
+    for name, text in (
+        ("m.toml", MANIFEST),
+        ("o.toml", OBSERVED),
+        ("p.toml", POINTS),
+        ("s.toml", STUDY),
+        ("l.toml", ABOUT),
+    ):
         (folder / name).write_text(text)
     about = aj.files.read_administrative_data(folder / "l.toml")
     (folder / "dcc.xml").write_text(aj.certificate.dcc_xml(sample.record, about, created=MADE))
 
     def manifest() -> object:
         return aj.files.read_manifest(folder / "m.toml")._replace(sources=())
+
+    def observed() -> object:
+        return aj.files.read_manifest(folder / "o.toml")._replace(sources=())
 
     def points_file() -> object:
         return aj.files.read_points(folder / "p.toml")._replace(sources=())
@@ -119,6 +200,8 @@ def originals(folder: Path) -> dict[str, Callable[[], object]]:
     return {
         "m.toml": manifest,
         "hole_0.csv": manifest,
+        "o.toml": observed,
+        "o.csv": observed,
         "arm.toml": lambda: aj.files.load_specification(folder / "arm.toml"),
         "p.toml": points_file,
         "points.csv": points_file,

@@ -1,5 +1,6 @@
 """Every kind of observation: derivatives of its residuals, its start, and what it refuses."""
 
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,7 +8,9 @@ from scipy.spatial.transform import Rotation
 import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data import observations as kinds
+from aacmm_jax.data.observations.cylinder import distances, fitted_cylinder
 from aacmm_jax.data.observations.observation import Tips, certified_quantities, stated_quantities
+from aacmm_jax.files.observations import kinds as known_kinds
 
 RANDOM = np.random.default_rng(1)
 POSES = 12
@@ -29,6 +32,9 @@ ALL = {
     "certified sphere": kinds.Sphere("s", Q, diameter=100, u=0.1, stylus=4),
     "exact sphere": kinds.Sphere("s", Q, diameter=100),
     "point": kinds.Sphere("s", Q, diameter=0),
+    "cylinder": kinds.Cylinder("c", Q, form=0.01),
+    "certified cylinder": kinds.Cylinder("c", Q, diameter=100, u=0.1, stylus=4, inside=True),
+    "exact cylinder": kinds.Cylinder("c", Q, diameter=100),
     "plane": kinds.Plane("f", Q, form=0.01),
     "planes": kinds.ParallelPlanes("f", Q[:6], Q[6:], 50.0, u=0.1, stylus=3.0),
     "exact planes": kinds.ParallelPlanes("f", Q[:6], Q[6:], 50.0, inside=True, stylus=3.0),
@@ -43,6 +49,11 @@ def unknowns_of(observation):
     found = observation.start(TIPS, np.zeros(3))
     random = np.random.default_rng(2)
     return {name: np.asarray(value) + 1e-2 * random.normal(size=np.shape(value)) for name, value in found.items()}
+
+
+def test_every_kind_is_here():
+    """A new kind needs a row, in the tables of this module and in those of the files."""
+    assert {one.kind for one in ALL.values()} == known_kinds().keys()
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -79,20 +90,27 @@ def test_shapes_and_derivatives(name):
             np.testing.assert_allclose(rows.by_rotation[:, c], (plus - minus) / 2e-5, atol=1e-8)
 
 
+BOX = [[200, -300, 100], [600, 300, 500]]
+FRAME = (0.1, 0.2, 3.0, 1000.0, 2000.0, -300.0)
+BAR = {"a": (0, 0, 0), "b": (300, 0, 0), "c": (0, 200, 0)}
+SIMULATED = [
+    kinds.SimulatedPoints("T", BOX, 12, FRAME, target="smr", place=(10, 20, 80)),
+    kinds.SimulatedTransforms("T6", BOX, 12, (10, 20, 80, 0.1, 0.2, 0.3), FRAME, u_angle=1e-12),
+    kinds.SimulatedSphere("s", (400, 0, 300), 50.0, 12, certified=False),
+    kinds.SimulatedCylinder("c", [(400, 0, 300), (430, 60, 320)], 50.0, 8, certified=False),
+    kinds.SimulatedCylinder("r", [(400, 0, 300), (400, 0, 320)], 50.0, 8, stylus=6.0, inside=True),
+    kinds.SimulatedPlanes("f", (300, -100, 200), [(0, 200, 0), (150, 0, 60)], 6),
+    kinds.SimulatedPlanes("p", (300, -100, 200), [(0, 200, 0), (150, 0, 60)], 6, distance=40.0),
+    kinds.SimulatedArtefact("bar", BAR, 4, (0.3, 0, 1.5, 350, -100, 250)),
+    kinds.SimulatedDistances("d", BOX, 12, (900, 300, 100)),
+]
+
+
 def test_starts_are_exact_for_exact_data(paper_arm):
     """Without noise and by the true arm, the closed forms find the geometry, also of targets at an unknown place."""
-    box = [[200, -300, 100], [600, 300, 500]]
-    frame = (0.1, 0.2, 3.0, 1000.0, 2000.0, -300.0)
-    bar = {"a": (0, 0, 0), "b": (300, 0, 0), "c": (0, 200, 0)}
-    simulated = [
-        kinds.SimulatedPoints("T", box, 12, frame, target="smr", place=(10, 20, 80)),
-        kinds.SimulatedTransforms("T6", box, 12, (10, 20, 80, 0.1, 0.2, 0.3), frame, u_angle=1e-12),
-        kinds.SimulatedSphere("s", (400, 0, 300), 50.0, 12, certified=False),
-        kinds.SimulatedPlanes("p", (300, -100, 200), [(0, 200, 0), (150, 0, 60)], 6, distance=40.0),
-        kinds.SimulatedArtefact("bar", bar, 4, (0.3, 0, 1.5, 350, -100, 250)),
-        kinds.SimulatedDistances("d", box, 12, (900, 300, 100)),
-    ]
-    capture = aj.simulate(paper_arm, {}, observations=simulated, seed=3)
+    capture = aj.simulate(paper_arm, {}, observations=SIMULATED, seed=3)
+    # A socket is simulated as one of the capture's own.
+    assert {one.kind for one in capture.observations} == known_kinds().keys() - {"socket"}
     for observation in to_numpy(capture.observations):
         arm = paper_arm
         probe = np.asarray(arm.probe)
@@ -170,6 +188,8 @@ def test_a_plane_is_read_by_its_normal():
         (lambda: kinds.MeasuredTransforms("p", Q, POINTS, 2 * MEASURED, u_angle=1e-3), "no rotation"),
         (lambda: kinds.MeasuredTransforms("p", Q, POINTS, MEASURED, u_angle=0.0), "must be positive"),
         (lambda: kinds.Sphere("s", Q, diameter=-1), "zero or positive"),
+        (lambda: kinds.Cylinder("c", Q, diameter=0), "must be positive"),
+        (lambda: kinds.Cylinder("c", Q, diameter=5, stylus=6, inside=True), "stylus of 6 mm inside a diameter of 5"),
         (lambda: kinds.ParallelPlanes("f", Q, Q[:, :5], 10.0), "6 and 5 columns"),
         (lambda: kinds.ParallelPlanes("f", Q, Q, 0.0), "must be positive"),
         (lambda: kinds.Artefact("t", CORNERS, {"d": Q}), "has no coordinates"),
@@ -185,3 +205,45 @@ def test_bad_input(make, message):
         make()
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def touches(cylinder, arc, heights, count=12):
+    """Touches of a cylinder of radius 20, tilted and away from the origin, to 0.04 mm."""
+    random = np.random.default_rng(cylinder)
+    angle, height = np.linspace(0, np.deg2rad(arc), count), np.resize(heights, count)
+    local = np.stack([20 * np.cos(angle), 20 * np.sin(angle), height]) + 0.04 * random.normal(size=(3, count))
+    return Rotation.random(random_state=cylinder).as_matrix() @ local + 400 * random.normal(size=(3, 1))
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("shape", [(330, [0, 20]), (330, [0, 7, 14]), (100, [0, 30]), (330, [0, 130, 260, 400])])
+def test_cylinders_are_found_in_any_direction(shape, known):
+    """Two rings, a spiral, an arc and a long pin: no touch is further from the cylinder than its scatter says."""
+    for cylinder in range(5):
+        tips, radius = touches(cylinder, *shape), np.array(20.0) if known else None
+        axis, found = fitted_cylinder(tips, radius)
+        assert abs(found - 20) < (1e-12 if known else 1.0)
+        assert np.abs(distances(tips, axis)[0] - found).max() < 0.12
+
+
+def test_a_cylinder_is_fitted_under_jit_too():
+    tips = touches(0, 330, [0, 20])
+    axis, radius = fitted_cylinder(tips, None)
+    compiled = jax.jit(lambda tips: fitted_cylinder(tips, None))(tips)
+    np.testing.assert_allclose(np.concatenate([compiled[0], compiled[1][None]]), [*axis, radius], rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("observation", "tips", "message"),
+    [
+        (kinds.Cylinder("c", Q), touches(0, 330, [0, 20], 4), "4 touches, but 5 unknowns"),
+        (kinds.Cylinder("c", Q, diameter=40), touches(0, 330, [0, 20], 3), "3 touches, but 4 unknowns"),
+        (kinds.Cylinder("c", Q), touches(0, 330, [0]), "at one height of its axis"),
+        (kinds.Cylinder("c", Q), touches(0, 20, [0, 10, 20, 30, 40], 25), "cover an arc of 8 degrees"),
+        (kinds.Cylinder("c", Q, diameter=40), touches(0, 0.1, [0, 20]), "too few lines along it"),
+    ],
+)
+def test_touches_that_leave_a_geometry_open(observation, tips, message):
+    with pytest.raises(aj.InputError, match=message) as caught:
+        observation.check_determined(tips)
+    assert "touch it" in str(caught.value)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.data import observations as kinds
 from aacmm_jax.summaries import warnings
 
 
@@ -50,7 +51,7 @@ def test_what_was_left_out_is_reported_and_kept(paper_arm, noisy_capture, copied
     counts = ", ".join(f"{name} ({count})" for name, count in zip(noisy_capture.names, poses, strict=True))
     for found in (recording, aj.files.load_capture(tmp_path / "c.h5")):
         said = warnings.of_capture(found)
-        assert f"exactly the readings of another pose of the same socket: {counts};" in said[0]
+        assert f"of another pose of the same socket or observation: {counts};" in said[0]
         assert said[1].startswith("Counted once: reference lengths given again")
         assert f"{length[::-1]}, {length}; delete" in said[1]
     only = copied.select(only="A")
@@ -80,3 +81,48 @@ def test_only_copies_are_left_out():
     assert aj.data.stack_captures([aj.Capture({"A": q}), aj.Capture({"A": nearly[:3]})]).q.shape == (2, 3, 3)
     # Traced values cannot be compared.
     assert jax.eval_shape(lambda x: aj.Capture({"A": x}).q, q).shape == (4, 3)
+
+
+def observed(name="T", **changes):
+    random = np.random.default_rng(0)
+    values = {"q": random.normal(size=(5, 6)), "points": random.normal(size=(5, 3)), "u": random.uniform(size=(5, 3))}
+    return kinds.MeasuredPoints(name, **(values | changes))
+
+
+def test_copies_within_observations_count_once(paper_arm, tmp_path):
+    """A pose that was measured twice is no copy; one whose measured values are repeated too is."""
+    one = observed()
+    copied = one.select([0, 1, 1, 2, 3, 4, 0])
+    again = eqx.tree_at(lambda o: o.points, one.select([0, 0]), np.asarray(one.points)[:2])
+    again = eqx.tree_at(lambda o: o.q, again, np.asarray(again.q) + 0.1)
+    object.__setattr__(again, "name", "measured again")
+    bar = kinds.Artefact("bar", {"a": (0, 0, 0), "b": (9, 0, 0)}, {"a": one.q[:2], "b": one.q[[0, 3, 3]]})
+    capture = aj.Capture({"A": one.q[[1, 1, 2]] + 0.2}, observations=[copied, again, bar])
+    kept = {observation.name: observation for observation in capture.observations}
+    np.testing.assert_array_equal(kept["T"].points, one.points)
+    np.testing.assert_array_equal(kept["T"].covariance, one.covariance)
+    assert kept["measured again"].q.shape == (2, 6)
+    assert kept["bar"].owner == (0, 0, 1, 1)
+    assert capture.repeated.poses == (("A", 1), ("T", 2), ("bar", 1))
+    specification = aj.kinematics.ArmSpecification(paper_arm, "test")
+    aj.files.save_capture(tmp_path / "c.h5", aj.Recording(capture, specification))
+    loaded = aj.files.load_capture(tmp_path / "c.h5").capture
+    assert loaded.repeated == capture.repeated
+    assert "A (1), T (2), bar (1)" in loaded.repeated.sentences()[0]
+    assert loaded.select(only="T").repeated.poses == (("T", 2),)
+    assert jax.eval_shape(lambda q: aj.Capture({}, [], [kinds.Plane("f", q)]).readings, copied.q).shape == (7, 6)
+
+
+@pytest.mark.parametrize(
+    ("sockets", "observations", "message"),
+    [
+        ({}, [observed(), observed("U")], "observations 'T' and 'U' have exactly the same poses; is one file"),
+        ({"A": observed().q}, [kinds.Socket("B", observed().q)], "sockets 'A' and 'B' have exactly the same poses"),
+        ({"T": observed().q}, [observed()], "a socket and an observation have the name 'T'"),
+    ],
+)
+def test_what_is_given_twice_is_refused(sockets, observations, message):
+    with pytest.raises(aj.InputError, match=message):
+        aj.Capture(sockets, [], observations)
+    # Two stations see the same poses, and surfaces of two kinds may be touched in them.
+    assert len(aj.Capture({}, [], [observed(), observed("U", u=0.1), kinds.Plane("f", observed().q)]).observations) == 3

@@ -17,6 +17,7 @@ P = RANDOM.uniform(-900, 900, (5, 3))
 U = RANDOM.uniform(0.01, 0.1, (5, 3))
 R = Rotation.random(5, random_state=0)
 NAMES = ["q1", "q2", "q3", "q4", "q5", "q6", "x", "y", "z", "ux", "uy", "uz"]
+NUMBERS = "columns = { q = [1, 2, 3, 4, 5, 6], points = [7, 8, 9], u = [10, 11, 12] }\n"
 ALL = 'columns = { q = "q?", points = ["x", "y", "z"], u = ["ux", "uy", "uz"] }\n'
 
 
@@ -47,16 +48,85 @@ def test_every_kind_has_a_table():
         ({"before": "7 points\nof 1.5 m\n"}, "skip = 2\n", 1.0),
         ({}, 'units = { points = "inch", u = "um" }\n', 25.4),
         ({}, 'units = { points = "m" }\ncoverage_factor = 2.0\n', 1000.0),
+        # By number, with a header, or without one.
+        ({}, NUMBERS, 1.0),
+        ({"header": None}, NUMBERS, 1.0),
+        # Other case, more blanks, quotes, units in brackets or in a line of their own.
+        ({"header": [*(f"Q{i} [rad]" for i in range(1, 7)), *NAMES[6:]]}, "", 1.0),
+        ({"header": ["Q1", "Q2", "Q3", "Q4", "Q5", "Q6", *NAMES[6:]]}, ALL.replace("q?", "q[1-6]"), 1.0),
+        ({"header": [*NAMES[:6], "X (m)", "Y (m)", "Z (m)", "UX  [mm]", "UY [mm]", '"uz"']}, "", 1000.0),
+        ({"header": [*NAMES[:6], "x [\u00b5m]", "y [\u03bcm]", "z [um]", "ux", "uy", "uz"]}, "", 1e-3),
+        ({"header": [*NAMES[:6], "x [in]", "y [in]", "z [in]", "ux", "uy", "uz"]}, "", 25.4),
+        ({"before": ",".join(NAMES) + "\n", "header": ["rad"] * 6 + ["m"] * 3 + ["mm"] * 3}, "", 1000.0),
+        # Half the rows, then the other half, by a column of names.
+        ({"groups": True}, 'group = "when"\n', 1.0),
     ],
 )
 def test_tables_of_every_make(tmp_path, table, stated, factor):
-    write(tmp_path / "a.csv", np.hstack([Q, P, U]), **table)
-    (one,) = read(tmp_path, f'[[points]]\nfile = "a.csv"\ntarget = "ball"\n{stated}{ALL}')
-    assert (one.name, one.target, one.kind) == ("a", "ball", "points")
-    assert np.array_equal(one.q, Q)
-    assert np.allclose(one.points, factor * P, rtol=1e-15)
-    scale = 1e-3 if "um" in stated else 0.5 if "coverage" in stated else 1.0
-    assert np.allclose(np.sqrt(np.einsum("mii->mi", one.covariance)), scale * U, rtol=1e-12)
+    rows, options = np.hstack([Q, P, U]).tolist(), {"header": NAMES} | table
+    groups = options.pop("groups", False)
+    if groups:
+        rows, options["header"] = [[*row, "ab"[i % 2]] for i, row in enumerate(rows)], [*NAMES, "when"]
+    write(tmp_path / "a.csv", rows, **options)
+    columns = stated if "columns" in stated else f"{stated}{ALL}"
+    found = read(tmp_path, f'[[points]]\nfile = "a.csv"\ntarget = "ball"\n{columns}')
+    assert [one.name for one in found] == (["a/a", "a/b"] if groups else ["a"])
+    assert {(one.target, one.kind) for one in found} == {("ball", "points")}
+    order = [0, 2, 4, 1, 3] if groups else list(range(5))
+    assert np.array_equal(np.concatenate([one.q for one in found]), Q[order])
+    assert np.allclose(np.concatenate([one.points for one in found]), factor * P[order], rtol=1e-15)
+    scale = 1e-3 if '"um"' in stated else 0.5 if "coverage" in stated else 1.0
+    covariance = np.concatenate([one.covariance for one in found])
+    assert np.allclose(np.sqrt(np.einsum("mii->mi", covariance)), scale * U[order], rtol=1e-12)
+
+
+def test_readings_have_signs_and_offsets(tmp_path):
+    """reading -> sign * (reading - offset), a joint each, in the unit of the table."""
+    sign, offset = np.array([1, -1, 1, 1, -1, 1]), np.array([0, 90, 0, -30, 0, 0.5])
+    write(tmp_path / "a.csv", np.hstack([np.rad2deg(Q), P, U]))
+    angles = f'arm = "cheng2018-simulation"\n[angles]\nunit = "deg"\nsign = {sign.tolist()}\n'
+    text = f'offset = {offset.tolist()}\n[[points]]\nfile = "a.csv"\n{ALL}'
+    (tmp_path / "capture.toml").write_text(angles + text)
+    (one,) = aj.files.read_manifest(tmp_path / "capture.toml").capture.observations
+    assert np.allclose(one.q, sign * (Q - np.deg2rad(offset)), rtol=1e-12)
+    assert np.array_equal(one.points, P)
+
+
+# Header, rows from readings and measured values, and the table of the manifest that names the preset.
+LEICA = ["X  [mm]", "Y  [mm]", "Z  [mm]", "U(95)  [mm]", "U(95) X  [mm]", "U(95) Y  [mm]", "U(95) Z  [mm]"]
+LEICA += ["Tilt  [deg]", "Q0 ", "Q1 ", "Q2 ", "Q3 ", "Image RMS  [\u00b5m]", "Target", "Temperature  [\u00b0C]"]
+PRESETS = {
+    "csv as planned": ([*(f"q_{i}_deg" for i in range(1, 7)), "x_mm", "y_mm", "z_mm", "u_x_mm", "u_y_mm", "u_z_mm"],
+                       lambda i: [*np.rad2deg(Q[i]), *P[i], *U[i]], 'preset = "csv"'),
+    "csv in rad": ([*(f"Q{i}_rad" for i in range(1, 7)), "X", "Y", "Z", "u_x", "u_y", "u_z"],
+                   lambda i: [*Q[i], *P[i], *U[i]], 'preset = "csv"'),
+    "ipa": ([*(f"q{i}_rad" for i in range(1, 7)), "x_mm", "y_mm", "z_mm", "std_x_mm", "std_y_mm", "std_z_mm"],
+            lambda i: [*Q[i], *P[i], *U[i]], 'preset = "ipa"'),
+    "leica": (LEICA, lambda i: [*P[i], 0.01, *2 * U[i], 30.0, *R[i].as_quat(scalar_first=True), 0.2, "TMC 30-B #53",
+                                22.8], 'preset = "leica"\nreadings = "q.csv"'),
+    "older leica": (["Name", "X", "Y", "Z", "U95 X", "U95 Y", "U95 Z"], lambda i: [f"m{i}", *P[i], *2 * U[i]],
+                    'preset = "leica"\nreadings = "q.csv"'),
+    "xyzijk": (["X", "Y", "Z", "I", "J", "K"], lambda i: [*P[i], 0.0, 0.0, 1.0],
+               'preset = "xyzijk"\nreadings = "q.csv"'),
+    "xyzijk after a name": (["Point", "x [mm]", "y [mm]", "z [mm]", "I", "J", "K"],
+                            lambda i: [f"P{i}", *P[i], 0.0, 0.0, 1.0], 'preset = "xyzijk"\nreadings = "q.csv"'),
+    "xyzijk without a header": (None, lambda i: [*P[i], 0.0, 0.0, 1.0], 'preset = "xyzijk"\nreadings = "q.csv"'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("delimiter", [",", ";"])
+def test_presets(tmp_path, name, delimiter):
+    header, row, stated = PRESETS[name]
+    write(tmp_path / "q.csv", Q, header=[f"q{i} [rad]" for i in range(6)])
+    write(tmp_path / "a.csv", [row(i) for i in range(5)], header=header, delimiter=delimiter)
+    text = f'arm = "cheng2018-simulation"\n[[points]]\nfile = "a.csv"\n{stated}\n'  # the unit is in the header
+    (tmp_path / "capture.toml").write_text(text)
+    (one,) = aj.files.read_manifest(tmp_path / "capture.toml").capture.observations
+    assert np.allclose(one.q, Q, rtol=1e-14)
+    assert np.allclose(one.points, P, rtol=1e-14)
+    has_u = not name.startswith("xyzijk")
+    assert np.allclose(np.sqrt(np.einsum("mii->mi", one.covariance)), U if has_u else 0.0)
 
 
 def test_columns_by_number_and_readings_in_a_file_of_their_own(tmp_path):
@@ -150,25 +220,28 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
     write(tmp_path / "one_a.csv", Q[:3], header=None)
     write(tmp_path / "other_a.csv", Q[3:], header=None)
     write(tmp_path / "ball.csv", Q, header=None)
-    planes, sphere, plane, socket = sorted(
+    planes, sphere, cylinder, plane, socket = sorted(
         read(
             tmp_path,
             '[[parallel_planes]]\nname = "block {x}"\nfiles = { one = "one_{x}.csv", other = "other_{x}.csv" }\n'
             "distance = 100.0\nu = 0.001\nstylus = 6.0\ninside = true\n"
             '[[touched_sphere]]\nfile = "ball.csv"\ndiameter = 1.0\nunits = { diameter = "inch" }\n'
+            '[[touched_cylinder]]\nname = "ring"\nfile = "ball.csv"\ndiameter = 20.0\nstylus = 6.0\n'
+            'inside = true\nform = 2.0\nunits = { form = "um" }\n'
             '[[plane]]\nname = "wall"\nfile = "ball.csv"\n[[socket]]\nname = "z"\nfile = "ball.csv"\ntarget = "T"\n',
         ),
-        key=lambda one: ["parallel planes", "sphere", "plane", "socket"].index(one.kind),
+        key=lambda one: ["parallel planes", "sphere", "cylinder", "plane", "socket"].index(one.kind),
     )
     assert (planes.name, planes.first, float(planes.between)) == ("block a", 3, 94.0)
     assert float(sphere.radius) == 12.7
+    assert (float(cylinder.radius), float(cylinder.form)) == (7.0, 0.002)
     assert (plane.name, socket.target) == ("wall", "T")
 
 
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        (ALL.replace('"x"', '"X"'), ["a.csv has no column 'X'", "known are q1, q2"]),
+        (ALL.replace('"x"', '"xx"'), ["a.csv has no column 'xx'", "did you mean 'x'?"]),
         (ALL.replace('"x"', "20"), ["a.csv has 12 columns", "no column 20"]),
         (ALL.replace('"x"', '"y"'), ["one column is picked twice"]),
         (ALL.replace('"q?"', '"q[1-3]"'), ["picks 3 columns for the readings", "6 joints"]),
@@ -176,6 +249,14 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
         (ALL.replace(', "z"]', "]"), ["points is in 3 columns, but 2 are picked"]),
         ('columns = { q = "q?" }', ["no 'points' (measured point)", "pick its columns"]),
         (ALL + 'units = { points = "cm" }', ["units.points is 'cm'", "mm, m, um, inch"]),
+        # Mixed units: in one header, or in header and manifest.
+        (
+            ALL.replace('"x", "y"', '"x [m]", "y [mm]"'),
+            ["mixes units: 'x [m]' is in m, 'y [mm]' in mm", "convert one of them"],
+        ),
+        (ALL.replace('"x", "y"', '"y", "y_mm"') + 'units = { points = "inch" }', ["units.points is 'inch'", "says mm"]),
+        (ALL.replace('"x", "y", "z"', '"a", "b", "c"'), ["the header of points says 'cm'", "one of mm, m, um, inch"]),
+        (ALL.replace('"q?"', '"p?"'), ["the header of the readings says deg, but the manifest rad"]),
         (ALL + 'units = { q = "degrees" }', ["units.q is 'degrees'", "rad, deg"]),
         (ALL + "u = 0.1", ["u is given and also in columns"]),
         (ALL + 'readings = "short.csv"', ["5 rows of 'points'", "2 readings"]),
@@ -191,7 +272,10 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
     ],
 )
 def test_bad_columns(tmp_path, text, parts):
-    write(tmp_path / "a.csv", np.hstack([Q, P, U]))
+    more = ["x [m]", "y [mm]", "y_mm", "a [cm]", "b [cm]", "c [cm]", *(f"p{i} [deg]" for i in range(6))]
+    mixed = "x [m]" in text or "y_mm" in text or '"a"' in text or "p?" in text
+    header = [*NAMES, *more] if mixed else NAMES
+    write(tmp_path / "a.csv", np.hstack([Q, P, U, np.ones((5, len(header) - 12))]), header=header)
     write(tmp_path / "short.csv", np.hstack([Q, P, U])[:2])
     assert_refused(lambda: read(tmp_path, f'[[points]]\nfile = "a.csv"\n{text}\n'), tmp_path / "capture.toml", *parts)
 

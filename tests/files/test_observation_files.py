@@ -37,6 +37,9 @@ def make(kind, draw, some):
     return {
         "socket": lambda: kinds.Socket("x", q, target=target),
         "sphere": lambda: kinds.Sphere("x", q, diameter=25.4 if some else None, u=u, stylus=u / 3, target=target),
+        "cylinder": lambda: kinds.Cylinder(
+            "x", q, diameter=25.4 if some else None, u=u, stylus=u / 3, inside=some, form=u, target=target
+        ),
         "points": lambda: kinds.MeasuredPoints(
             "x", q, draw.normal(size=(m, 3)), station=station, target=target, **covariance
         ),

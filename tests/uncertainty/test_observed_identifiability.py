@@ -11,6 +11,11 @@ BOX = [[200, -300, 100], [600, 300, 500]]
 FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
 CORNER, SIDES = (200, -200, 100), [(300, 0, 0), (0, 400, 0)]
 CENTRES = [(300, 0, 300), (500, 200, 200), (300, -300, 150)]
+CYLINDERS = [
+    [(300, 0, 300), (330, 40, 330)],
+    [(500, 200, 150), (500, 200, 250)],
+    [(250, -300, 200), (400, -300, 220)],
+]
 RIGID = {"d_1", "theta_1"}  # they move the whole arm
 LAST = {"a_6 and theta_6 trade off", "alpha_6 and d_6 trade off"}
 SCALE = "all lengths together: the scale"
@@ -27,6 +32,11 @@ CASES = {
         [kinds.SimulatedSphere(f"s{i}", centre, 50.0, 25, certified=False) for i, centre in enumerate(CENTRES)],
         "centre of s0, centre of s1 and centre of s2",
         False,
+    ),
+    "certified cylinders": (
+        [kinds.SimulatedCylinder(f"c{i}", CYLINDERS[i], 50.0, 30, stylus=6.0, inside=i == 1) for i in range(3)],
+        "axis of c0, axis of c1 and axis of c2",
+        True,
     ),
     "one plane": ([kinds.SimulatedPlanes("wall", CORNER, SIDES, 100)], "plane wall", False),
     "parallel planes": (

@@ -1,5 +1,7 @@
 from .artefact import Artefact as Artefact
 from .artefact import SimulatedArtefact as SimulatedArtefact
+from .cylinder import Cylinder as Cylinder
+from .cylinder import SimulatedCylinder as SimulatedCylinder
 from .distances import Distances as Distances
 from .distances import SimulatedDistances as SimulatedDistances
 from .measured_points import MeasuredPoints as MeasuredPoints

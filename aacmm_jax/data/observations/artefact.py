@@ -24,7 +24,6 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
-    as_numbers,
     checked_name,
     checked_readings,
     checked_scalar,
@@ -33,6 +32,7 @@ from .observation import (
     each_pose,
     is_exact,
     no_covariance,
+    numbers,
 )
 
 
@@ -228,12 +228,20 @@ class SimulatedArtefact(AbstractSimulated):
     name: str = eqx.field(static=True)
     points: dict[str, tuple[float, float, float]] = eqx.field(static=True)
     poses: int = eqx.field(static=True)
-    frame: np.ndarray = eqx.field(converter=as_numbers, default=(0.0,) * 6)
+    frame: np.ndarray = eqx.field(converter=numbers("frame", 6), default=(0.0,) * 6)
     errors: np.ndarray | None = None
     u: float = 0.0
     artefact: str | None = eqx.field(static=True, default=None)
     placement: str | None = eqx.field(static=True, default=None)
     index: str | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        if not isinstance(self.points, Mapping) or not self.points:
+            raise InputError(f"points of '{self.name}' are no dictionary; give each point's name and coordinates.")
+        for point, coordinates in self.points.items():
+            numbers(f"point '{checked_name(point, 'a point')}'", 3)(coordinates)
+        if self.errors is not None:
+            numbers("errors of the coordinates", len(self.points), 3)(self.errors)
 
     def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedArtefact":
         turned = rotation_matrix(frame[:3]) @ rotation_matrix(self.frame[:3])

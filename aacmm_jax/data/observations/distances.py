@@ -23,11 +23,12 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
-    as_numbers,
     checked_name,
     checked_readings,
     checked_target,
+    checked_truth,
     checked_values,
+    numbers,
 )
 
 
@@ -80,7 +81,9 @@ class Distances(AbstractObservation):
         self.values = checked_values(f"distances of {where}", values, (self.q.shape[0],))
         self.u = _checked_u(where, u, self.q.shape[0])
         self.target = checked_target(target)
-        self.constant = bool(constant)
+        self.constant = checked_truth(f"constant of {where}", constant)
+        if not self.constant and is_concrete(self.values) and np.any(np.asarray(self.values) <= 0):
+            raise InputError(f"{where} has a distance that is not positive; give distances in mm, or constant=True.")
 
     @property
     def pivot(self) -> str:
@@ -127,10 +130,9 @@ class Distances(AbstractObservation):
         return Rows((distance - values)[None], direction, by_unknowns, measured)
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
-        if tips.shape[1] < 4:
-            raise InputError(
-                f"observation '{self.name}' has {tips.shape[1]} distances, but its pivot needs four; measure more."
-            )
+        needs = "pivot and constant need five" if self.constant else "pivot needs four"
+        if tips.shape[1] < 4 + self.constant:
+            raise InputError(f"observation '{self.name}' has {tips.shape[1]} distances, but its {needs}; measure more.")
 
 
 def _checked_u(where: str, u: Numbers, poses: int) -> AnyArray:
@@ -155,9 +157,9 @@ class SimulatedDistances(AbstractSimulated):
 
     table: ClassVar[str] = "distances"
     name: str = eqx.field(static=True)
-    box: np.ndarray = eqx.field(converter=as_numbers)
+    box: np.ndarray = eqx.field(converter=numbers("box", 2, 3))
     poses: int = eqx.field(static=True)
-    pivot: np.ndarray = eqx.field(converter=as_numbers)
+    pivot: np.ndarray = eqx.field(converter=numbers("pivot", 3))
     u: float = 0.0
 
     def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedDistances":

@@ -21,6 +21,15 @@ def placed(
     return turned + frame[3:, None], xp.concatenate([xp.stack(by_rotation), identity])
 
 
+def turned_z(direction: Float[AnyArray, " 3"]) -> Float[AnyArray, " 2"]:
+    """The first two components of the rotation vector, whose third is 0, that turns z to a unit vector upwards."""
+    xp = namespace(direction)
+    sine = xp.sqrt(direction[0] ** 2 + direction[1] ** 2)
+    level = sine < 1e-12
+    factor = xp.where(level, 1.0, xp.arctan2(sine, direction[2]) / xp.where(level, 1.0, sine))
+    return xp.stack([-direction[1] * factor, direction[0] * factor])
+
+
 def frame_and_offset(
     coordinates: Float[AnyArray, "3 m"], tips: Tips, offset: Float[AnyArray, " 3"]
 ) -> tuple[Float[AnyArray, " 6"], Float[AnyArray, " 3"]]:

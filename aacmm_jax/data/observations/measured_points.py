@@ -22,22 +22,52 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
-    as_numbers,
     checked_covariances,
     checked_name,
     checked_readings,
     checked_target,
     checked_values,
     each_pose,
+    numbers,
     offset_of,
 )
 
-STATION = Entry("station", "station of the instrument", content="text")
+MEASURED = (
+    READINGS,
+    Entry("points", "measured point", "mm", ("pose", "axis"), required=True),
+    Entry("u", "standard uncertainty of a coordinate", "mm", ("pose", "axis")),
+    Entry("covariance", "covariance of a point", "mm^2", ("pose", "axis", "axis_2")),
+    Entry("station", "station of the instrument", content="text"),
+    TARGET,
+)
 _FLAT = 1e-6  # second singular value of points on a line, of the first
 _SAME = 1e-9  # mm
 
 
-class MeasuredPoints(AbstractObservation):
+class AbstractMeasured(AbstractObservation):
+    """What an instrument measured in a frame of its own, which all observations of one station share."""
+
+    points: eqx.AbstractVar[Float[AnyArray, "m 3"]]
+    station: eqx.AbstractVar[str]
+
+    @property
+    def frame(self) -> str:
+        """Name of the unknown frame of the station."""
+        return f"frame of {self.station}"
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return ("name", "station")
+
+    @property
+    def fixes_scale(self) -> bool:
+        return True
+
+    def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
+        check_spread(f"observation '{self.name}'", np.asarray(self.points).T)
+
+
+class MeasuredPoints(AbstractMeasured):
     """Points of the tip, measured by an instrument in a frame of its own, which is unknown.
 
     Args:
@@ -57,14 +87,7 @@ class MeasuredPoints(AbstractObservation):
     kind: ClassVar[str] = "points"
     by_pose: ClassVar[tuple[str, ...]] = ("q", "points", "covariance")
     table: ClassVar[str] = "points"
-    entries: ClassVar[tuple[Entry, ...]] = (
-        READINGS,
-        Entry("points", "measured point", "mm", ("pose", "axis"), required=True),
-        Entry("u", "standard uncertainty of a coordinate", "mm", ("pose", "axis")),
-        Entry("covariance", "covariance of a point", "mm^2", ("pose", "axis", "axis_2")),
-        STATION,
-        TARGET,
-    )
+    entries: ClassVar[tuple[Entry, ...]] = MEASURED
     rows: ClassVar[int] = 3
     q: Float[AnyArray, "m n"]
     points: Float[AnyArray, "m 3"]
@@ -94,21 +117,8 @@ class MeasuredPoints(AbstractObservation):
         self.target = checked_target(target)
 
     @property
-    def frame(self) -> str:
-        """Name of the unknown frame."""
-        return f"frame of {self.station}"
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return ("name", "station")
-
-    @property
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.frame: FRAME}
-
-    @property
-    def fixes_scale(self) -> bool:
-        return True
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
         if not self.target:
@@ -126,9 +136,6 @@ class MeasuredPoints(AbstractObservation):
             by_unknowns={self.frame: -by_frame},
             measured=rotation @ self.covariance @ rotation.T,
         )
-
-    def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
-        check_spread(f"observation '{self.name}'", np.asarray(self.points).T)
 
 
 def check_spread(where: str, points: Float[np.ndarray, "3 m"]) -> None:
@@ -153,21 +160,26 @@ class SimulatedPoints(AbstractSimulated):
         poses: Number of points.
         frame: The instrument's frame in the base frame: rotation vector (rad) and origin (mm), ``(6,)``.
         u: Standard uncertainty of each coordinate, mm.
-        target: Name of the target, and ``offset``, its true place in the last frame, mm; by default the arm's probe.
+        target: Name of the target; by default the arm's probe.
+        place: The target's true place in the last frame ``(3,)``, mm.
     """
 
     table: ClassVar[str] = "points"
     name: str = eqx.field(static=True)
-    box: np.ndarray = eqx.field(converter=as_numbers)
+    box: np.ndarray = eqx.field(converter=numbers("box", 2, 3))
     poses: int = eqx.field(static=True)
-    frame: np.ndarray = eqx.field(converter=as_numbers, default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    frame: np.ndarray = eqx.field(converter=numbers("frame", 6), default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     u: float = 0.0
     target: str = eqx.field(static=True, default="")
     place: tuple[float, float, float] | None = eqx.field(static=True, default=None)
 
     @property
     def offset(self) -> Float[np.ndarray, " 3"] | None:
-        return None if self.place is None else as_numbers(self.place)
+        return None if self.place is None else numbers("place of the target", 3)(self.place)
+
+    def __check_init__(self) -> None:
+        if bool(self.target) != (self.offset is not None):
+            raise InputError(f"'{self.name}' needs both, a target and its place in the last frame, or neither.")
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         return random.uniform(self.box[0], self.box[1], (self.poses, 3))

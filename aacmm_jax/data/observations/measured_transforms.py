@@ -12,28 +12,25 @@ from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, rotation_derivative, rotation_matrix, rotation_vector
 from .frames import frame_and_offset, placed
-from .measured_points import STATION, check_spread
+from .measured_points import MEASURED, AbstractMeasured
 from .observation import (
     FRAME,
-    READINGS,
-    TARGET,
-    AbstractObservation,
     AbstractSimulated,
     Entry,
     Rows,
     Tips,
     Unknowns,
-    as_numbers,
     checked_covariances,
     checked_name,
     checked_readings,
     checked_scalar,
     checked_values,
+    numbers,
     offset_of,
 )
 
 
-class MeasuredTransforms(AbstractObservation):
+class MeasuredTransforms(AbstractMeasured):
     """Positions and orientations of a target that is fixed to the last frame, measured by an instrument (6-D probe).
 
     Both frames are unknown: the instrument's in the base frame, and the target's in the last frame.
@@ -57,14 +54,9 @@ class MeasuredTransforms(AbstractObservation):
     by_pose: ClassVar[tuple[str, ...]] = ("q", "points", "rotations", "covariance")
     table: ClassVar[str] = "transforms"
     entries: ClassVar[tuple[Entry, ...]] = (
-        READINGS,
-        Entry("points", "measured point", "mm", ("pose", "axis"), required=True),
-        Entry("u", "standard uncertainty of a coordinate", "mm", ("pose", "axis")),
-        Entry("covariance", "covariance of a point", "mm^2", ("pose", "axis", "axis_2")),
+        *MEASURED,
         Entry("rotations", "measured axes of the target, as columns", "1", ("pose", "axis", "axis_2"), required=True),
         Entry("u_angle", "standard uncertainty of an orientation about each axis", "rad", required=True),
-        STATION,
-        TARGET,
     )
     rows: ClassVar[int] = 6
     q: Float[AnyArray, "m n"]
@@ -106,26 +98,13 @@ class MeasuredTransforms(AbstractObservation):
         self.target = checked_name(name if target is None else target, "a target")
 
     @property
-    def frame(self) -> str:
-        """Name of the instrument's frame."""
-        return f"frame of {self.station}"
-
-    @property
     def orientation(self) -> str:
         """Name of the rotation of the target in the last frame."""
         return f"orientation of {self.target}"
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        return ("name", "station")
-
-    @property
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.frame: FRAME, self.orientation: ("rad",) * 3}
-
-    @property
-    def fixes_scale(self) -> bool:
-        return True
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
         xp = namespace(tips, self.points)
@@ -163,9 +142,6 @@ class MeasuredTransforms(AbstractObservation):
             ),
             by_rotation=xp.concatenate([none, left]),
         )
-
-    def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
-        check_spread(f"observation '{self.name}'", np.asarray(self.points).T)
 
 
 def _logarithm(
@@ -210,10 +186,10 @@ class SimulatedTransforms(AbstractSimulated):
 
     table: ClassVar[str] = "transforms"
     name: str = eqx.field(static=True)
-    box: np.ndarray = eqx.field(converter=as_numbers)
+    box: np.ndarray = eqx.field(converter=numbers("box", 2, 3))
     poses: int = eqx.field(static=True)
-    offset_and_orientation: np.ndarray = eqx.field(converter=as_numbers, default=(0.0,) * 6)
-    frame: np.ndarray = eqx.field(converter=as_numbers, default=(0.0,) * 6)
+    offset_and_orientation: np.ndarray = eqx.field(converter=numbers("offset and orientation", 6), default=(0.0,) * 6)
+    frame: np.ndarray = eqx.field(converter=numbers("frame", 6), default=(0.0,) * 6)
     u: float = 0.0
     u_angle: float = 1e-4
 

@@ -7,19 +7,24 @@ calibration) is the same for all kinds.
 
 import abc
 import copy
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from types import NoneType, UnionType
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from ...core.arguments import real_number, shown, truth_value, whole_number
 from ...core.arrays import Numbers, as_array, as_floats, is_concrete
 from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace
 
 # Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
 _MOST_RADIANS = 8 * np.pi
+
+MOST_POSES = 100_000  # to simulate, as in a study
 
 POINT = ("mm",) * 3
 FRAME = ("rad",) * 3 + POINT
@@ -216,13 +221,19 @@ def offset_of(target: str) -> str:
 def checked_name(name: object, what: str) -> str:
     """A name of one line, or `InputError`."""
     if not isinstance(name, str) or not name.strip() or name.splitlines() != [name]:
-        raise InputError(f"{what} has the name {name!r}; give it a name of one line.")
+        raise InputError(f"{what} has the name {shown(name)}; give it a name of one line.")
     return name
 
 
 def checked_target(target: object) -> str:
     """The name of a target, which may be empty, or `InputError`."""
-    return "" if target == "" else checked_name(target, "a target")
+    return "" if isinstance(target, str) and not target else checked_name(target, "a target")
+
+
+def checked_truth(where: str, value: Any) -> bool:
+    """True or False, or `InputError`."""
+    truth_value(value, where)
+    return bool(value)
 
 
 def checked_readings(where: str, readings: Numbers) -> AnyArray:
@@ -312,9 +323,16 @@ def no_covariance(rows: int, poses: int) -> Float[np.ndarray, "m r r"]:
     return np.zeros((poses, rows, rows))
 
 
-def as_numbers(values: Any) -> np.ndarray:
-    """True values of a simulation."""
-    return np.asarray(values, dtype=float)
+def numbers(what: str, *shape: int) -> Callable[[Any], np.ndarray]:
+    """Converter of a field of a simulation: true values of a shape, or `InputError`."""
+
+    def converted(values: Any) -> np.ndarray:
+        array = np.asarray(as_floats(values, f"the {what} to simulate"))
+        if array.shape != shape:
+            raise InputError(f"the {what} to simulate has shape {array.shape}; give {shape}.")
+        return array
+
+    return converted
 
 
 class AbstractSimulated(eqx.Module):
@@ -326,6 +344,26 @@ class AbstractSimulated(eqx.Module):
     table: ClassVar[str]  # name of its tables in the file of a kit
     name: eqx.AbstractVar[str]
     poses: eqx.AbstractVar[int]
+
+    def __check_init__(self) -> None:
+        checked_name(self.name, "an observation to simulate")
+        for field in dataclasses.fields(self):
+            value: Any = getattr(self, field.name)
+            what = f"{field.name} of '{self.name}'"
+            kinds = get_args(field.type) if isinstance(field.type, UnionType) else (field.type,)
+            if value is None and NoneType in kinds:
+                continue
+            if bool in kinds:
+                truth_value(value, what)
+            elif int in kinds:
+                whole_number(value, what)
+                if not 1 <= value <= MOST_POSES:
+                    raise InputError(f"{what} is {value}; give at least one, and {MOST_POSES:,} at most.")
+            elif float in kinds:
+                real_number(value, what)
+                checked_scalar(what, value)
+            elif str in kinds:
+                checked_target(value) if field.name == "target" else checked_name(value, what)
 
     @property
     def offset(self) -> Float[np.ndarray, " 3"] | None:

@@ -8,12 +8,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ...core.arrays import Numbers
+from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import semidefinite_eigen
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, rotation_derivative, rotation_matrix
-from .frames import moved
+from .frames import moved, turned_z
 from .observation import (
     READINGS,
     TARGET,
@@ -24,12 +24,13 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
-    as_numbers,
     checked_name,
     checked_readings,
     checked_scalar,
     checked_target,
+    checked_truth,
     is_exact,
+    numbers,
 )
 
 PLANE = ("rad", "rad", "mm")
@@ -158,7 +159,12 @@ class ParallelPlanes(AbstractObservation):
         self.second = (False,) * sides[0].shape[0] + (True,) * sides[1].shape[0]
         self.stylus = checked_scalar(f"stylus of {where}", stylus)
         self.distance = checked_scalar(f"distance of {where}", distance, positive=True)
-        self.inside = bool(inside)
+        self.inside = checked_truth(f"inside of {where}", inside)
+        if is_concrete(self.between) and float(self.between) <= 0:
+            raise InputError(
+                f"{where} have a stylus of {float(self.stylus):g} mm between planes at {float(self.distance):g} mm; "
+                "give the distance and the diameter of the ball that fits between them, in mm."
+            )
         self.u = checked_scalar(f"u of {where}", u)
         self.form = checked_scalar(f"form of {where}", form)
         self.target = checked_target(target)
@@ -270,10 +276,7 @@ def fitted_plane(tips: Float[AnyArray, "3 m"]) -> Float[AnyArray, " 3"]:
     _, vectors = semidefinite_eigen(scatter / (xp.trace(scatter) + 1e-300))
     normal = vectors[:, 2] / xp.sqrt(xp.sum(vectors[:, 2] ** 2))
     normal = xp.where(normal[2] < 0, -normal, normal)
-    sine = xp.sqrt(normal[0] ** 2 + normal[1] ** 2)
-    level = sine < 1e-12
-    factor = xp.where(level, 1.0, xp.arctan2(sine, normal[2]) / xp.where(level, 1.0, sine))
-    return xp.stack([-normal[1] * factor, normal[0] * factor, normal @ middle])
+    return xp.concatenate([turned_z(normal), (normal @ middle)[None]])
 
 
 def check_plane(where: str, tips: Float[np.ndarray, "3 m"]) -> None:
@@ -299,8 +302,8 @@ class SimulatedPlanes(AbstractSimulated):
 
     table: ClassVar[str] = "planes"
     name: str = eqx.field(static=True)
-    corner: np.ndarray = eqx.field(converter=as_numbers)
-    sides: np.ndarray = eqx.field(converter=as_numbers)
+    corner: np.ndarray = eqx.field(converter=numbers("corner", 3))
+    sides: np.ndarray = eqx.field(converter=numbers("sides", 2, 3))
     poses: int = eqx.field(static=True)
     distance: float | None = None
     u: float = 0.0

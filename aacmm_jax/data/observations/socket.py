@@ -21,12 +21,12 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
-    as_numbers,
     checked_name,
     checked_readings,
     checked_target,
     each_pose,
     no_covariance,
+    numbers,
 )
 
 
@@ -99,14 +99,14 @@ class SimulatedSocket(AbstractSimulated):
 
     table: ClassVar[str] = "socket"
     name: str = eqx.field(static=True)
-    point: np.ndarray = eqx.field(converter=as_numbers)
+    point: np.ndarray = eqx.field(converter=numbers("point", 3))
     poses: int = eqx.field(static=True)
     target: str = eqx.field(static=True, default="")
     place: tuple[float, float, float] | None = eqx.field(static=True, default=None)
 
     @property
     def offset(self) -> Float[np.ndarray, " 3"] | None:
-        return None if self.place is None else as_numbers(self.place)
+        return None if self.place is None else np.asarray(self.place, dtype=float)
 
     def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedSocket":
         return dataclasses.replace(self, name=name, point=moved(frame, self.point))

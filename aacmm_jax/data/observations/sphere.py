@@ -23,7 +23,6 @@ from .observation import (
     Rows,
     Tips,
     Unknowns,
-    as_numbers,
     checked_name,
     checked_readings,
     checked_scalar,
@@ -31,6 +30,7 @@ from .observation import (
     each_pose,
     is_exact,
     no_covariance,
+    numbers,
 )
 
 _SMALLEST_CAP = 20.0  # degrees from its middle: below it, centre and radius can hardly be told apart
@@ -199,7 +199,7 @@ class SimulatedSphere(AbstractSimulated):
 
     table: ClassVar[str] = "touched_sphere"
     name: str = eqx.field(static=True)
-    centre: np.ndarray = eqx.field(converter=as_numbers)
+    centre: np.ndarray = eqx.field(converter=numbers("centre", 3))
     diameter: float
     poses: int = eqx.field(static=True)
     certified: bool = eqx.field(static=True, default=True)
