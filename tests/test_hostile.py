@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 @pytest.mark.parametrize(
     ("attacks", "count"),
     [
-        (("flips", "texts", "calls"), 60),
+        (("flips", "texts", "calls"), 24),
         pytest.param(("writes",), 36, marks=pytest.mark.slow),
         pytest.param(("kills",), 2, marks=pytest.mark.slow),
         pytest.param(("users",), 0, marks=pytest.mark.slow),
