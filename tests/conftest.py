@@ -81,7 +81,7 @@ def aacmm_process(tmp_path, cache):
             env=environment,
             capture_output=True,
             text=True,
-            timeout=300,
+            timeout=600,
         )
         assert done.returncode == expect, done.stdout + done.stderr
         return done

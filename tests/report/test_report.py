@@ -439,6 +439,7 @@ def shown(browser, written):
     def open_(kind: str, width: int):
         context = browser.new_context(viewport={"width": width, "height": 900}, offline=True)
         contexts.append(context)
+        context.set_default_timeout(300_000)  # ms; a busy machine takes longer than Playwright's 30 s
         opened = context.new_page()
         opened.said, opened.asked = [], []
         opened.on("console", lambda message: opened.said.append(message.text))
@@ -446,7 +447,7 @@ def shown(browser, written):
         opened.on("dialog", lambda dialog: opened.said.append(dialog.message))
         opened.on("request", lambda request: opened.asked.append(request.url))
         opened.goto(written.pages[kind].as_uri())
-        opened.wait_for_selector("body[data-ready=yes]", timeout=60_000)
+        opened.wait_for_selector("body[data-ready=yes]")
         return opened
 
     yield open_
