@@ -486,7 +486,7 @@ def test_a_browser_draws_everything_and_asks_for_nothing(shown, written, kind, w
         assert opened.title().startswith("Evaluation of Arm <script>")
 
 
-@pytest.mark.parametrize("kind", ["calibration", "evaluation"])
+@pytest.mark.parametrize("kind", ["calibration", pytest.param("evaluation", marks=pytest.mark.slow)])
 def test_the_arm_turns_under_mouse_keys_and_buttons(shown, kind):
     opened = shown(kind, 1600)
     scene = opened.locator("[data-scene]")
@@ -531,7 +531,7 @@ def test_tables_sort_by_click_and_by_keyboard(shown):
     assert names == sorted(names)
 
 
-@pytest.mark.parametrize("kind", ["calibration", "evaluation", "study"])
+@pytest.mark.parametrize("kind", ["calibration", pytest.param("evaluation", marks=pytest.mark.slow), "study"])
 def test_it_prints_to_pdf(shown, tmp_path, kind):
     opened = shown(kind, 1600)
     content = opened.pdf(path=tmp_path / "report.pdf", format="A4", print_background=True)
