@@ -23,7 +23,7 @@ SELECTION := tests/test_package.py tests/kinematics tests/solver tests/calibrati
 	tests/files/test_storage.py tests/test_real_captures.py
 PANDA := aacmm-demo/panda
 
-.PHONY: demo test test-slow test-newest test-lowest check audit bench peers reproduce clean
+.PHONY: demo test test-slow test-newest install-newest run-newest test-lowest check audit bench peers reproduce clean
 
 demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
@@ -41,12 +41,18 @@ test-slow: .venv/.test
 	$(BIN)/python $(PYTEST) -m "slow and not optimised"
 	$(OPTIMISED) $(BIN)/python $(PYTEST) -m optimised
 
-test-newest:
+test-newest: install-newest
+	$(MAKE) --no-print-directory run-newest
+
+install-newest:
 	rm -rf .venv-newest
 	$(PYTHON) -m venv .venv-newest
 	.venv-newest/bin/python $(INSTALL) --upgrade --upgrade-strategy eager --editable '.[selection]'
+
+# As `make test`, without XLA's optimisations: where the newest jaxlib is the tested one, `make test-slow` has them.
+run-newest:
 	.venv-newest/bin/python -m pip list --disable-pip-version-check
-	$(OPTIMISED) .venv-newest/bin/python $(PYTEST) $(SELECTION)
+	.venv-newest/bin/python $(PYTEST) $(SELECTION)
 
 # Old releases warn of what newer releases of others deprecate.
 test-lowest:

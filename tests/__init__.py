@@ -2,7 +2,7 @@
 the notebooks' kernels.
 
 Compiling is most of the suite's time. XLA without its optimisations compiles in a quarter of the time. What rests on
-optimised code (the marker ``optimised``, `make test-newest`) is tested with an empty XLA_FLAGS, which is left as it is.
+optimised code (the marker ``optimised``, `make test-lowest`) is tested with an empty XLA_FLAGS, which is left as it is.
 The cache is empty when the tests begin and gone when they end.
 """
 

@@ -1,6 +1,7 @@
 """Strictness for all tests: shapes checked at run time, no silent promotion of rank or dtype; and common fixtures."""
 
 import contextlib
+import functools
 import gc
 import io
 import os
@@ -34,38 +35,39 @@ def cache(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("cache")
 
 
-@pytest.fixture
-def aacmm(tmp_path):
-    """Run the command line in this process, in an empty folder; returns exit code, output and error text.
+def command_line(folder: Path, *arguments: object, expect: int = 0) -> subprocess.CompletedProcess[str]:
+    """Run the command line in this process, in a folder; returns exit code, output and error text.
 
     Programs that this process has compiled are used again. A Python warning is an error, as in all tests.
     """
+    output, errors = io.StringIO(), io.StringIO()
+    command = ["aacmm", *map(str, arguments)]
+    thresholds, compile_time = gc.get_threshold(), jax.config.jax_persistent_cache_min_compile_time_secs
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(output),
+        contextlib.redirect_stderr(errors),
+    ):
+        patch.setattr(sys, "argv", list(command))
+        patch.setattr(gc, "freeze", lambda: None)  # for a process that ends; here it would keep garbage for ever
+        patch.setenv("COLUMNS", "110")
+        try:
+            main()
+            code = 0
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        finally:
+            gc.set_threshold(*thresholds)
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", compile_time)
+    assert code == expect, output.getvalue() + errors.getvalue()
+    return subprocess.CompletedProcess(command, code, output.getvalue(), errors.getvalue())
 
-    def run(*arguments: object, expect: int = 0) -> subprocess.CompletedProcess[str]:
-        output, errors = io.StringIO(), io.StringIO()
-        command = ["aacmm", *map(str, arguments)]
-        thresholds, compile_time = gc.get_threshold(), jax.config.jax_persistent_cache_min_compile_time_secs
-        with (
-            pytest.MonkeyPatch.context() as patch,
-            contextlib.chdir(tmp_path),
-            contextlib.redirect_stdout(output),
-            contextlib.redirect_stderr(errors),
-        ):
-            patch.setattr(sys, "argv", list(command))
-            patch.setenv("COLUMNS", "110")
-            try:
-                main()
-                code = 0
-            except SystemExit as ended:
-                code = int(ended.code or 0)
-            finally:
-                gc.set_threshold(*thresholds)
-                gc.unfreeze()
-                jax.config.update("jax_persistent_cache_min_compile_time_secs", compile_time)
-        assert code == expect, output.getvalue() + errors.getvalue()
-        return subprocess.CompletedProcess(command, code, output.getvalue(), errors.getvalue())
 
-    return run
+@pytest.fixture
+def aacmm(tmp_path):
+    """The command line in this process, in an empty folder."""
+    return functools.partial(command_line, tmp_path)
 
 
 @pytest.fixture
@@ -80,7 +82,7 @@ def aacmm_process(tmp_path, cache):
             env=environment,
             capture_output=True,
             text=True,
-            timeout=300,
+            timeout=600,
         )
         assert done.returncode == expect, done.stdout + done.stderr
         return done
@@ -159,29 +161,55 @@ def _few_memory_maps():
 
 # Modules in decreasing order of their run time: a long one started last would keep a single worker busy at the end.
 LONGEST = (
-    "study/test_trials",
-    "acceptance/test_acceptance",
-    "uncertainty/test_uncertainty",
-    "calibration/test_single",
-    "solver/test_solver",
-    "planning/test_planning",
-    "study/test_store",
-    "report/test_report",
-    "drift/test_drift",
-    "cli/test_cli",
-    "calibration/test_sampling",
-    "calibration/test_second_stage",
-    "test_reproduction",
-    "core/test_deadlock",
-    "test_readme",
-    "test_paper",
     "study/test_results",
-    "core/test_numpy_or_jax",
-    "calibration/test_batch",
-    "test_real_captures",
-    "kinematics/test_chain",
+    "study/test_store",
+    "cli/test_cli",
+    "study/test_trials",
+    "solver/test_solver",
+    "calibration/test_observed_batch",
+    "report/test_report",
+    "uncertainty/test_uncertainty",
+    "drift/test_drift",
     "files/test_storage",
+    "calibration/test_observed",
+    "cli/test_observations_cli",
+    "study/test_executors",
+    "core/test_numpy_or_jax",
+    "calibration/test_single",
+    "calibration/test_observed_cross_validation",
+    "calibration/test_batch",
+    "calibration/test_second_stage",
+    "test_hostile",
+    "acceptance/test_acceptance",
+    "kinematics/test_chain",
+    "calibration/test_observed_evaluation",
+    "core/test_linear_algebra",
+    "plot/test_plot",
+    "uncertainty/test_observed_identifiability",
+    "test_package",
+    "test_paper",
+    "certificate/test_document",
+    "calibration/test_sampling",
+    "files/test_observation_files",
+    "cli/test_outputs",
+    "core/test_compilation_cache",
+    "test_real_captures",
+    "uncertainty/test_identifiability",
+    "files/test_content_digest",
+    "model/test_residuals",
+    "test_inputs",
+    "planning/test_planning",
 )
+
+
+def pytest_collection_finish():
+    """Collect garbage less often: walks through all that JAX keeps took 8 % of the CPU.
+
+    What is imported stays to the end, so that the collector leaves it out.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 50)
 
 
 def pytest_collection_modifyitems(items):

@@ -37,7 +37,7 @@ def test_contenders_minimise_the_same_residual(contenders):
 def test_a_part_runs_and_names_who_is_absent(tmp_path):
     options = ["--rounds", "1", "--only", "kinematics", "--results", tmp_path]
     command = [sys.executable, ROOT / "benchmarks/throughput.py", *options]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=tmp_path, timeout=300)
+    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=tmp_path, timeout=600)
     (file,) = tmp_path.glob("throughput-*.json")
     rows = json.loads(file.read_text())["results"]["kinematics"]
     peers = [row for row in rows if "Pinocchio" in row["what"]]

@@ -12,11 +12,12 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 # A small version of what the long ones show is in the other tests.
 SLOW = ("01", "03", "04", "05", "06")
+LONG = (pytest.mark.slow, pytest.mark.optimised)  # they compute more than they compile
 
 
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, marks=pytest.mark.slow if path.stem[:2] in SLOW else ()) for path in NOTEBOOKS],
+    [pytest.param(path, marks=LONG if path.stem[:2] in SLOW else ()) for path in NOTEBOOKS],
     ids=lambda path: path.stem,
 )
 def test_notebook_runs(path):
@@ -27,7 +28,7 @@ def test_notebook_runs(path):
 
         notebook = nbformat.read(path, 4)
         assert all(cell.get("outputs") or not cell.source for cell in notebook.cells[-1:] if cell.cell_type == "code")
-        nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(path.parent)}}).execute()
+        nbclient.NotebookClient(notebook, timeout=1800, resources={"metadata": {"path": str(path.parent)}}).execute()
 
 
 def test_all_are_there_with_their_outputs():

@@ -32,7 +32,7 @@ def test_an_unknown_name_is_an_attribute_error():
     ],
 )
 def test_late_names_in_a_fresh_process(line):
-    done = subprocess.run([sys.executable, "-c", line], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", line], capture_output=True, text=True, timeout=600)
     assert (done.returncode, done.stdout) == (0, "7\n"), done.stderr
 
 
@@ -63,7 +63,7 @@ except jaxtyping.TypeCheckError:
 
 
 def test_a_wrong_shape_is_caught_in_a_module_that_is_imported_late():
-    done = subprocess.run([sys.executable, "-c", LATE], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", LATE], cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert (done.returncode, done.stdout) == (0, "caught\n"), done.stderr
 
 

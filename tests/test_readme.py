@@ -15,6 +15,7 @@ def blocks(language: str) -> list[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.optimised  # it computes more than it compiles
 def test_python_runs(capsys, tmp_path, monkeypatch):
     """The blocks continue one another, so they run as one program."""
     monkeypatch.chdir(tmp_path)

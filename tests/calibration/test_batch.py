@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import equinox as eqx
@@ -167,19 +166,21 @@ def test_the_number_of_devices_changes_nothing(tmp_path):
     for devices in ("1", "2"):
         environment = os.environ | {"PYTHONPATH": str(root)}
         command = [sys.executable, "-c", PROGRAM, devices, str(tmp_path / devices)]
-        subprocess.run(command, check=True, cwd=root, env=environment, timeout=300)
+        subprocess.run(command, check=True, cwd=root, env=environment, timeout=600)
     one, two = (np.load(tmp_path / f"{devices}.npy") for devices in ("1", "2"))
     np.testing.assert_allclose(one, two, rtol=0, atol=1e-9)
 
 
 def test_no_more_chunks_in_work_than_workers_and_a_failure_stops_the_rest():
     at_once, most, ran, lock = 0, 0, [], threading.Lock()
+    two = threading.Barrier(2, timeout=600)  # each chunk waits for another one, of the other worker
 
     def run(piece, device):
         nonlocal at_once, most
         with lock:
             at_once, most = at_once + 1, max(most, at_once + 1)
-        time.sleep(0.02)
+        if device != "alone":
+            two.wait()
         with lock:
             at_once -= 1
             ran.append(piece.start)
@@ -192,5 +193,5 @@ def test_no_more_chunks_in_work_than_workers_and_a_failure_stops_the_rest():
     assert most == 2
     ran.clear()
     with pytest.raises(RuntimeError, match="chunk 1"):
-        chunks.run_chunks(run, pieces, ["one"], 1)
+        chunks.run_chunks(run, pieces, ["alone"], 1)
     assert ran == [0, 1]

@@ -28,7 +28,7 @@ def bounds(paper_arm, space):
 @pytest.fixture(scope="module")
 def captures(space):
     true = aj.perturbed_arm(space, length=1.0, angle=np.deg2rad(0.1), seed=1)
-    return [aj.simulate(true, {}, observations=SIMULATED, noise=NOISE, seed=seed) for seed in range(5)]
+    return [aj.simulate(true, {}, observations=SIMULATED, noise=NOISE, seed=seed) for seed in range(3)]
 
 
 @pytest.mark.parametrize(
@@ -61,8 +61,11 @@ def test_starts_bounds_and_arms(paper_arm, space, bounds, captures):
     np.testing.assert_allclose(many.parameters[1], many.parameters[0], atol=1e-7)
     assert many.active[2, 0] == 1
     assert many.parameters[2, 0] == upper[2, 0]
-    again = aj.identify_many(paper_arm, captures[0], bounds.lower, upper[1:], starts[1:], space=space, noise=NOISE)
-    np.testing.assert_array_equal(again.parameters, many.parameters[1:])
+    order = np.array([2, 0, 1])  # of the same size, which is compiled already
+    again = aj.identify_many(
+        paper_arm, captures[0], bounds.lower, upper[order], starts[order], space=space, noise=NOISE
+    )
+    np.testing.assert_array_equal(again.parameters, many.parameters[order])
     with pytest.raises(aj.InputError, match="covariance=True"):
         _ = many.u
     arms = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), paper_arm)

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -13,6 +14,8 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.data.recording import Recording
+
+from ..conftest import command_line
 
 COMMANDS = ("demo", "simulate", "import", "calibrate", "evaluate", "export", "show", "plan", "compare", "report")
 SIMULATE = (
@@ -261,10 +264,21 @@ def test_plan_refuses(aacmm, arguments, text):
     assert text in refused.stderr
 
 
-def test_the_stored_summary_is_what_is_computed(aacmm, tmp_path):
+SOCKETS = ("--socket", "A=400,0,300", "--socket", "B=300,400,400")
+
+
+@pytest.fixture(scope="module")
+def panda_files(tmp_path_factory):
+    """A folder with a capture of the Panda and its calibration, as the command line writes them."""
+    folder = tmp_path_factory.mktemp("panda")
+    command_line(folder, "simulate", "panda", "-o", "p.h5", *SOCKETS, "--length", "A,B")
+    command_line(folder, "calibrate", "p.h5", "-o", "c.h5", "--no-cross-validate")
+    return folder
+
+
+def test_the_stored_summary_is_what_is_computed(aacmm, panda_files, tmp_path):
     """``show`` prints the summary in the file; without one, or with that of another version, it computes the same."""
-    aacmm("simulate", "panda", "-o", "p.h5", "--socket", "A=400,0,300", "--socket", "B=300,400,400", "--length", "A,B")
-    aacmm("calibrate", "p.h5", "-o", "c.h5", "--no-cross-validate")
+    shutil.copytree(panda_files, tmp_path, dirs_exist_ok=True)
     aacmm("evaluate", "c.h5", "p.h5", "-o", "e.h5")
     for name in ("p.h5", "c.h5", "e.h5"):
         stored = json.loads(aacmm("show", name, "--json").stdout)
@@ -302,12 +316,11 @@ _NEVER_NEEDED = "optimistix lineax jax.experimental.pallas xarray matplotlib"
         ("report c.h5 -o r.html", _NEVER_NEEDED),
     ],
 )
-def test_a_command_imports_and_compiles_no_more_than_it_needs(aacmm, tmp_path, monkeypatch, arguments, absent):
-    aacmm("simulate", "panda", "-o", "p.h5", "--socket", "A=400,0,300", "--socket", "B=300,400,400", "--length", "A,B")
-    aacmm("calibrate", "p.h5", "-o", "c.h5", "--no-cross-validate")
+def test_a_command_imports_and_compiles_no_more_than_it_needs(panda_files, tmp_path, monkeypatch, arguments, absent):
+    shutil.copytree(panda_files, tmp_path, dirs_exist_ok=True)
     monkeypatch.setenv("JAX_LOG_COMPILES", "1")
     command = [sys.executable, "-c", _IMPORTED, *arguments.split()]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     *messages, imported = done.stderr.splitlines()
     assert (done.returncode, [line for line in messages if "ompil" in line]) == (0, [])
     assert set(absent.split()) & set(imported.split()) == set()

@@ -37,7 +37,6 @@ CALLS = {
 }
 
 
-@pytest.mark.optimised
 @pytest.mark.parametrize(
     ("call", "width"),
     [

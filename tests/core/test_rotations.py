@@ -1,5 +1,6 @@
 """Rotation vectors, their derivatives and fitted frames, against SciPy's rotations and finite differences."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -33,6 +34,9 @@ def test_derivative(vectors):
             np.testing.assert_allclose(rotation_derivative(w)[:, k], numerical, atol=1e-8)
 
 
+compiled_frame = jax.jit(fitted_frame)
+
+
 @pytest.mark.parametrize("plane", [False, True])
 def test_fitted_frame(vectors, plane):
     """Exact where there is an exact frame, also of points in a plane; never a mirror image."""
@@ -40,7 +44,7 @@ def test_fitted_frame(vectors, plane):
     points[2] *= not plane
     for w in vectors:
         target = rotation_matrix(w) @ points + np.array([[10.0], [-2000.0], [30.0]])
-        for frame in (fitted_frame(points, target), np.asarray(fitted_frame(jnp.asarray(points), jnp.asarray(target)))):
+        for frame in (fitted_frame(points, target), np.asarray(compiled_frame(points, target))):
             np.testing.assert_allclose(rotation_matrix(frame[:3]) @ points + frame[3:, None], target, atol=1e-8)
     mirrored = fitted_frame(points, points * np.array([[1.0], [1.0], [-1.0]]) if not plane else -points)
     assert np.linalg.det(rotation_matrix(mirrored[:3])) > 0

@@ -27,8 +27,8 @@ def record():
 def made(record, tmp_path_factory):
     uncertainty = aj.uncertainty_of(record)
     study = aj.study.make_study(
-        arm="cheng2018-simulation", trials=4, capture={"positions_mm": [[400, 200, 300]], "poses": [20, 30]},
-        noise={"encoder_arcsec": 2}, identification={"method": "stage1"},
+        arm="cheng2018-simulation", trials=4, capture={"positions_mm": [[400, 200, 300]], "poses": 20},
+        noise={"encoder_arcsec": [2, 4]}, identification={"method": "stage1"},
     )  # fmt: skip
     path = tmp_path_factory.mktemp("plot") / "study.h5"
     aj.study.run_study(study, path)

@@ -539,6 +539,7 @@ def shown(browser, written):
     def open_(kind: str, width: int):
         context = browser.new_context(viewport={"width": width, "height": 900}, offline=True)
         contexts.append(context)
+        context.set_default_timeout(300_000)  # ms; a busy machine takes longer than Playwright's 30 s
         opened = context.new_page()
         opened.said, opened.asked = [], []
         opened.on("console", lambda message: opened.said.append(message.text))
@@ -546,7 +547,7 @@ def shown(browser, written):
         opened.on("dialog", lambda dialog: opened.said.append(dialog.message))
         opened.on("request", lambda request: opened.asked.append(request.url))
         opened.goto(written.pages[kind].as_uri())
-        opened.wait_for_selector("body[data-ready=yes]", timeout=60_000)
+        opened.wait_for_selector("body[data-ready=yes]")
         return opened
 
     yield open_
@@ -585,7 +586,7 @@ def test_a_browser_draws_everything_and_asks_for_nothing(shown, written, kind, w
         assert opened.title().startswith("Evaluation of Arm <script>")
 
 
-@pytest.mark.parametrize("kind", ["calibration", "evaluation"])
+@pytest.mark.parametrize("kind", ["calibration", pytest.param("evaluation", marks=pytest.mark.slow)])
 def test_the_arm_turns_under_mouse_keys_and_buttons(shown, kind):
     opened = shown(kind, 1600)
     scene = opened.locator("[data-scene]")
@@ -630,7 +631,7 @@ def test_tables_sort_by_click_and_by_keyboard(shown):
     assert names == sorted(names)
 
 
-@pytest.mark.parametrize("kind", ["calibration", "evaluation", "study"])
+@pytest.mark.parametrize("kind", ["calibration", pytest.param("evaluation", marks=pytest.mark.slow), "study"])
 def test_it_prints_to_pdf(shown, tmp_path, kind):
     opened = shown(kind, 1600)
     content = opened.pdf(path=tmp_path / "report.pdf", format="A4", print_background=True)

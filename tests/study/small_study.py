@@ -76,7 +76,7 @@ def command(
 
 def until(condition, process: subprocess.Popen) -> None:
     """Wait until something is so, or the process has ended."""
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 600
     while process.poll() is None and time.monotonic() < deadline and not condition():
         time.sleep(0.002)
 

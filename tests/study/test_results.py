@@ -20,7 +20,7 @@ matplotlib.use("Agg")
 def path(tmp_path_factory):
     study = made(
         name="a study",
-        trials=96,
+        trials=64,
         seed=5,
         noise=NOISE,
         reference=REFERENCE | {"u_mm": 0.002},
@@ -127,7 +127,7 @@ def test_factors_are_named_in_words(name, level, text):
 def test_summary_says_what_the_arrays_say(path, summary):
     data = aj.study.open_study(path)
     assert summary["factors"] == {"bounds.length_mm": [0.5, 5.0], "bounds.length_shift_mm": [0.0, 1.0]}
-    assert summary["trials_run"] == 4 * 96
+    assert summary["trials_run"] == 4 * 64
     cell = summary["results"][3]
     assert cell["factors"] == {"bounds.length_mm": 5.0, "bounds.length_shift_mm": 1.0}
     picked = data.sel(bounds_length_mm=5.0, bounds_length_shift_mm=1.0).squeeze()
@@ -163,7 +163,7 @@ def test_labelled_data(path):
     data = aj.study.open_study(path)
     assert data.estimate.dims == ("cell", "trial", "parameter")
     grid = data[["k", "length_error"]].unstack("cell")
-    assert grid.sizes == {"trial": 96, "bounds_length_mm": 2, "bounds_length_shift_mm": 2}
+    assert grid.sizes == {"trial": 64, "bounds_length_mm": 2, "bounds_length_shift_mm": 2}
     assert data.length_error.attrs["units"] == "mm"
     assert data.attrs["seed"] == 5
     assert data.attrs["finished"]
@@ -183,7 +183,7 @@ def test_a_study_that_has_just_begun_is_shown(aacmm, study, tmp_path):
 
 def test_the_terminal_shows_all_of_it(path, aacmm, tmp_path):
     done = aacmm("show", path, "--figures", "figures")
-    assert "a study of Cheng 2018, simulated arm: 4 cells of 96 trials, seed 5" in done.stdout
+    assert "a study of Cheng 2018, simulated arm: 4 cells of 64 trials, seed 5" in done.stdout
     for heading in ("converged", "on a bound", "Deltam [mm]", "angle error", "95 %"):
         assert heading in done.stdout
     drawn = {item.name for item in (tmp_path / "figures").iterdir()}

@@ -351,8 +351,10 @@ class AbstractSimulated(eqx.Module):
             value: Any = getattr(self, field.name)
             what = f"{field.name} of '{self.name}'"
             kinds = get_args(field.type) if isinstance(field.type, UnionType) else (field.type,)
-            if value is None and NoneType in kinds:
-                continue
+            if value is None:
+                if NoneType in kinds:
+                    continue
+                raise InputError(f"{what} is missing; give it.")
             if bool in kinds:
                 truth_value(value, what)
             elif int in kinds:
