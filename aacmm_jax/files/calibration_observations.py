@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -111,6 +112,7 @@ def _tables_of(observed: ObservedMetrics, units: dict[str, tuple[str, ...]]) -> 
                 unit=([units[name][i] for name, i, _ in numbers], "", "unit"),
                 value=([float(value) for *_, value in numbers], "mm or rad, see unit", "value"),
             )
+            | numbering("entry", len(_flat(observed)))
             | {"covariance": Variable(("entry",), _flat(observed), "products of units", "of each part, row by row")}
         ),
         "pose_weights": Table(
@@ -130,7 +132,7 @@ def _flat(observed: ObservedMetrics) -> np.ndarray:
     return np.concatenate(found) if found else np.zeros(0)
 
 
-def _covariances(geometry: Mapping[str, np.ndarray], flat: np.ndarray) -> dict[str, np.ndarray]:
+def _covariances(geometry: Mapping[str, np.ndarray], flat: np.ndarray) -> dict[str, Any]:
     """Of each part, from all of them."""
     ends = np.cumsum([len(values) ** 2 for values in geometry.values()], dtype=int)
     pieces = np.split(flat, ends[:-1]) if len(ends) else []
@@ -152,7 +154,8 @@ def observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> Ob
     attributes = stored.table_attributes["observed"]
     blocks = Observed.of(capture).blocks
     ends = np.cumsum(table["poses"])
-    values = {name: geometry["value"][parts == name] for name in dict.fromkeys(parts.tolist())}
+    names: list[str] = list(dict.fromkeys(parts.tolist()))
+    values: dict[str, Any] = {name: geometry["value"][parts == name] for name in names}
     size = sum(len(part) ** 2 for part in values.values())
     # Files of earlier development versions have none.
     flat = geometry.get("covariance", np.full(size, np.nan))
