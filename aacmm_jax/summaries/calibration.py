@@ -17,7 +17,7 @@ from ..kinematics.parameters import ArmSpecification, Parameters
 from ..model.observed import Observed
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
-from .warnings import observed, of_calibration, of_capture
+from .warnings import observed, of_calibration, of_import
 
 _CORRELATED = 0.95
 _LITTLE_WEIGHT = 0.5
@@ -78,7 +78,7 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
             )
         ],
         "simulated": recording.true is not None,
-        "warnings": of_capture(recording),
+        "warnings": of_import(recording),
     }
 
 
