@@ -1,3 +1,6 @@
+from .contradictions import contradictions_of as contradictions_of
+from .contradictions import remove_contradicting as remove_contradicting
+from .contradictions import session_metrics as session_metrics
 from .evaluation import Evaluation as Evaluation
 from .left_out import CrossValidation as CrossValidation
 from .record import CalibrationRecord as CalibrationRecord

@@ -77,7 +77,8 @@ def groupings(capture: Capture) -> dict[str, dict[str, str | None]]:
             if label is not None:
                 by_label.setdefault(label, []).append(name)
         rest = [name for name, label in labels.items() if label is None]
-        division = frozenset(frozenset(part) for part in [*by_label.values(), *([rest] if rest else [])])
+        parts = [*by_label.values(), *([rest] if rest else [])]
+        division = frozenset(frozenset(part) for part in parts)
         if by_label and len(division) > 1 and division not in seen:
             found[kind] = labels
             seen.add(division)

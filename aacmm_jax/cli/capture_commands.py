@@ -167,12 +167,11 @@ def import_(
     from ..files.captures import save_capture
     from ..files.manifest import read_manifest
     from ..summaries.calibration import capture_summary
-    from ..summaries.warnings import of_import
     from . import calibration_display
 
     with together(output):
         recording = read_manifest(manifest)
-        summary = capture_summary(recording) | {"warnings": of_import(recording)}
+        summary = capture_summary(recording)
         save_capture(output, recording, summary)
     show_summary(summary | {"written": str(output)}, as_json, calibration_display.capture)
 

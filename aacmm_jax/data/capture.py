@@ -149,7 +149,9 @@ class Capture(eqx.Module):
         self.repeated = Repeated(
             tuple((name, count) for name, count in poses.items() if count), (*repeated.lengths, *copies)
         )
-        self.sessions = tuple(dict.fromkeys(checked_name(session, "a session") for session in sessions))
+        self.sessions = tuple(
+            dict.fromkeys(checked_name(session, "a session") for session in items_of(sessions, "sessions"))
+        )
         for name in (*self.names, *(o.name for o in self.observations)) if self.sessions else ():
             self.session_of(name)
 

@@ -112,6 +112,7 @@ def _tables_of(observed: ObservedMetrics, units: dict[str, tuple[str, ...]]) -> 
                 unit=([units[name][i] for name, i, _ in numbers], "", "unit"),
                 value=([float(value) for *_, value in numbers], "mm or rad, see unit", "value"),
             )
+            | numbering("entry", len(_flat(observed)))
             | {"covariance": Variable(("entry",), _flat(observed), "products of units", "of each part, row by row")}
         ),
         "pose_weights": Table(
@@ -153,7 +154,8 @@ def observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> Ob
     attributes = stored.table_attributes["observed"]
     blocks = Observed.of(capture).blocks
     ends = np.cumsum(table["poses"])
-    values: dict[str, Any] = {name: geometry["value"][parts == name] for name in dict.fromkeys(parts.tolist())}
+    names: list[str] = list(dict.fromkeys(parts.tolist()))
+    values: dict[str, Any] = {name: geometry["value"][parts == name] for name in names}
     size = sum(len(part) ** 2 for part in values.values())
     # Files of earlier development versions have none.
     flat = geometry.get("covariance", np.full(size, np.nan))

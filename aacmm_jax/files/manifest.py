@@ -351,7 +351,7 @@ def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
     fields = fields_of(first)
     of_session = fields_of(getattr(entry, "session", None) or "")
     for what, text in (("name", entry.name or ""), *(("file", file) for file in entry.paths[1:])):
-        if fields_of(text) | (of_session if what == "name" else set()) != fields:
+        if fields_of(text) | (of_session & fields if what == "name" else set()) != fields:
             raise InputError(
                 f"{table} {what} '{text}' has {in_braces(fields_of(text))}, but file '{first}' has "
                 f"{in_braces(fields)}; use the same fields in the name and in every file."

@@ -16,7 +16,7 @@ from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .observations import capture_observations, observed_summary
 from .validation import cross_validation_summary
-from .warnings import observed, of_calibration, of_capture
+from .warnings import observed, of_calibration, of_import
 
 _CORRELATED = 0.95
 
@@ -73,7 +73,7 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
             )
         ],
         "simulated": recording.true is not None,
-        "warnings": of_capture(recording),
+        "warnings": of_import(recording),
     }
 
 

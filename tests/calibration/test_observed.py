@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.core.rotations import rotation_matrix
 from aacmm_jax.data import observations as kinds
+from aacmm_jax.summaries.calibration import observed_summary
 
 NOISE = aj.Noise(encoder_arcsec=2, seating=0.005)
 BOX = [[200, -300, 100], [600, 300, 500]]
@@ -289,3 +291,21 @@ def test_what_does_not_know_observations_says_so(paper_arm, bounds, sockets):
     ):
         with pytest.raises(aj.InputError, match=r"other observations \(D\)"):
             function()
+
+
+def test_known_coordinates_register_the_base(paper_arm, true, bounds):
+    """The base in the frame of a plant, with an uncertainty that holds; the plant's coordinates fix the scale."""
+    plant = {"a": (0, 0, 0), "b": (400, 0, 0), "c": (0, 400, 50), "d": (300, 300, 200)}
+    frame = np.array([0, 0, 0.3, 250, -150, 200])
+    simulated = kinds.SimulatedArtefact("plant", plant, 15, frame, u=0.001)
+    capture = aj.simulate(true, {}, observations=[simulated], noise=NOISE, seed=0)
+    specification = aj.kinematics.ArmSpecification(paper_arm, "test")
+    result = aj.calibrate(paper_arm, capture, bounds, check_identifiability=False)
+    record = aj.calibration.record_of(result, aj.Recording(capture, specification))
+    (base,) = observed_summary(record)["base"]
+    expected = -rotation_matrix(frame[:3]).T @ frame[3:]
+    assert base["in"] == "placement plant"
+    error = (np.array(base["position_mm"]) - expected) / base["position_u_mm"]
+    assert np.abs(error).max() < 4
+    assert np.abs((np.array(base["rotation_rad"]) + frame[:3]) / base["rotation_u_rad"]).max() < 4
+    assert 1e-4 < max(base["position_u_mm"]) < 0.01

@@ -121,9 +121,35 @@ def test_sessions_have_a_probe_each(aacmm, folder):
     assert names == [f"{day}/{socket}" for day in ("monday", "tuesday") for socket in "ABCD"]
     assert max(row["rms_after_mm"] for row in found["observations"]) < 0.1
     assert "offset of probe of tuesday" in apart
-    aacmm("calibrate", folder / "monday.h5", folder / "tuesday.h5", "-o", "d.h5", "--same-probe", "--method", "joint")
+    assert [row["session"] for row in found["sessions"]] == ["monday", "tuesday"]
+    assert "contradict" not in " ".join(found["warnings"])
+    both = folder / "monday.h5", folder / "tuesday.h5"
+    said = aacmm("calibrate", *both, "-o", "d.h5", "--same-probe", "--method", "joint", expect=1).stdout
     together = json.loads(aacmm("show", "d.h5", "--json").stdout)
     assert together["calibrated"]["rms_mm"] > 0.1
+    assert "Session tuesday contradicts the other sessions" in together["warnings"][0]
+    assert "the probe seems remounted, elsewhere by +0.3, -0.2, +0.1" in together["warnings"][0]
+    assert "Sessions, RMS distance of poses" in " ".join(said.split())
+    assert all(row["rms_alone_mm"] < 0.02 < 0.1 < row["rms_mm"] for row in together["sessions"])
+
+
+def test_what_contradicts_is_left_out_on_request(aacmm, folder, tmp_path):
+    recording = aj.files.load_capture(folder / "tracker.h5")
+    points, ball = recording.capture.observations
+    parts = [points.select(range(20 * i, 20 * i + 20)) for i in range(3)]
+    renamed = [kinds.MeasuredPoints(f"t{i}", one.q, one.points, u=0.01) for i, one in enumerate(parts)]
+    shifted = kinds.MeasuredPoints("t1", np.asarray(parts[1].q) + 1e-3 * np.eye(6)[2], parts[1].points, u=0.01)
+    for name, second in (("clean", renamed[1]), ("wrong", shifted)):
+        capture = aj.Capture({}, [], [renamed[0], second, renamed[2], ball])
+        aj.files.save_capture(tmp_path / f"{name}.h5", recording._replace(capture=capture))
+    aacmm("calibrate", "clean.h5", "-o", "c.h5", "--remove-contradicting")
+    assert json.loads(aacmm("show", "c.h5", "--json").stdout)["removed"] == []
+    said = aacmm("calibrate", "wrong.h5", "-o", "d.h5", "--remove-contradicting").stdout
+    found = json.loads(aacmm("show", "d.h5", "--json").stdout)
+    assert [(row["group"], row["members"]) for row in found["removed"]] == [("t1", ["t1"])]
+    assert "Left out: " in " ".join(said.split())
+    assert [row["observation"] for row in found["observations"]] == ["t0", "t2", "ball"]
+    assert aj.files.load_calibration(tmp_path / "d.h5").removed[0].probability < 1e-6
 
 
 def test_the_scale_of_the_nominal_arm(aacmm, folder):

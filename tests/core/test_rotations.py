@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aacmm_jax.core.rotations import fitted_frame, rotation_derivative, rotation_matrix, rotation_vector
+from aacmm_jax.core.rotations import fitted_frame, inverse_frame, rotation_derivative, rotation_matrix, rotation_vector
 
 
 @pytest.fixture(params=[1e-9, 1e-4, 0.5, 3.1, np.pi - 1e-7])
@@ -48,3 +48,12 @@ def test_fitted_frame(vectors, plane):
             np.testing.assert_allclose(rotation_matrix(frame[:3]) @ points + frame[3:, None], target, atol=1e-8)
     mirrored = fitted_frame(points, points * np.array([[1.0], [1.0], [-1.0]]) if not plane else -points)
     assert np.linalg.det(rotation_matrix(mirrored[:3])) > 0
+
+
+def test_the_inverse_of_a_frame_and_its_derivatives():
+    frame = np.array([0.3, -0.2, 0.5, 100.0, 200.0, -50.0])
+    inverse, derivative = inverse_frame(frame)
+    np.testing.assert_allclose(inverse_frame(inverse)[0], frame, atol=1e-12)
+    step = 1e-6 * np.eye(6)
+    differences = [(inverse_frame(frame + d)[0] - inverse_frame(frame - d)[0]) / 2e-6 for d in step]
+    np.testing.assert_allclose(derivative, np.transpose(differences), atol=1e-6)

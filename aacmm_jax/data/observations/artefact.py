@@ -39,6 +39,9 @@ from .observation import (
 class Artefact(AbstractObservation):
     """Poses with the tip in the points of an artefact, whose coordinates are certified and whose placement is unknown.
 
+    Sockets of a plant whose coordinates another machine has measured are one with a single placement, which says where
+    the base of the arm is.
+
     Args:
         name: Name of the observation, and of its placement where that has none.
         points: Name of a point -> its certified coordinates ``(3,)``, mm, in the artefact's frame.
