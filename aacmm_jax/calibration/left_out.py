@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.distributions import chance
-from ..core.text import common_label
+from ..core.text import common_labels
 
 LEVEL = 0.01  # probability below which errors beyond their prediction are not put down to chance
+_HALF = LEVEL / 2  # for single groups; the other half is for all of them together
 
 
 class LeftOut(NamedTuple):
@@ -28,11 +29,6 @@ class LeftOut(NamedTuple):
     rms_freedom: float = math.nan
     length_freedom: float = math.nan
     noise_freedom: float = math.inf
-
-    @property
-    def label(self) -> str:
-        """The group in a few words."""
-        return common_label(self.sockets)
 
     @property
     def freedoms(self) -> tuple[float, float]:
@@ -64,6 +60,11 @@ class CrossValidation(NamedTuple):
     """Every group of sockets left out once. The metrics pool the groups that the others can predict."""
 
     groups: tuple[LeftOut, ...]
+
+    @property
+    def labels(self) -> list[str]:
+        """Each group in a few words."""
+        return common_labels([group.sockets for group in self.groups])
 
     @property
     def rms(self) -> float:
@@ -118,18 +119,20 @@ class CrossValidation(NamedTuple):
         return max(self.ratios(), default=float("nan"))
 
     @property
-    def disagreeing(self) -> tuple[LeftOut, ...]:
-        """Groups whose errors exceed their prediction by more than chance does in one case of a hundred, over all
-        groups together; the most improbable first."""
+    def disagreeing(self) -> tuple[int, ...]:
+        """Numbers, from 0, of the groups whose errors exceed their prediction by more than chance does in one case of
+        two hundred, over all groups together; the most improbable first."""
         known = [[p for p in group.probabilities if math.isfinite(p)] for group in self.groups]
         least = {i: min(each) for i, each in enumerate(known) if each}
         count = sum(map(len, known))
-        return tuple(self.groups[i] for i in sorted(least, key=least.__getitem__) if least[i] < LEVEL / count)
+        return tuple(i for i in sorted(least, key=least.__getitem__) if least[i] < _HALF / count)
 
     @property
     def surprising(self) -> bool:
-        """Whether the errors of a group, or of all groups together, exceed their prediction by more than chance."""
-        return bool(self.disagreeing) or any(found < LEVEL / 2 for found in self._pooled_probabilities())
+        """Whether the errors of a group, or of all groups together, exceed their prediction by more than chance does
+        in one case of a hundred."""
+        pooled = self._pooled_probabilities()
+        return bool(self.disagreeing) or any(probability < _HALF / len(pooled) for probability in pooled)
 
     def _pooled_probabilities(self) -> list[float]:
         """Of the errors of all poses, and of all lengths. A sum of squares of independent parts with means T and
