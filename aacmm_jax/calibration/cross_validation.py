@@ -191,7 +191,7 @@ def _left_out(result: Calibration, left: Capture, names: tuple[str, ...]) -> Lef
         length_error=found.length_error,
         length_u=found.length_u,
         converged=bool(result.converged),
-        rms_freedom=poses.degrees_of_freedom,
-        length_freedom=lengths.degrees_of_freedom,
-        noise_freedom=found.noise_degrees_of_freedom,
+        rms_degrees_of_freedom=poses.degrees_of_freedom,
+        length_degrees_of_freedom=lengths.degrees_of_freedom,
+        noise_degrees_of_freedom=found.noise_degrees_of_freedom,
     )

@@ -84,16 +84,16 @@ class UnseenErrors(NamedTuple):
         poses = sum(part.poses for part in parts)
         if not poses:
             return NOTHING
-        trace, freedom = sum(part.trace for part in parts), math.nan
+        trace, effective = sum(part.trace for part in parts), math.nan
         if 0 < trace < math.inf:
             both = np.sum([part.shared for part in parts], axis=0) @ self.common
-            freedom = trace**2 / (sum(part.square for part in parts) + float(np.sum(both * both.T)))
+            effective = trace**2 / (sum(part.square for part in parts) + float(np.sum(both * both.T)))
         turned = [part for part in parts if math.isfinite(part.angles)]
         return Agreement(
             count=poses,
             rms=math.sqrt(sum(part.found for part in parts) / poses),
             predicted=math.sqrt(trace / poses),
-            degrees_of_freedom=freedom,
+            degrees_of_freedom=effective,
             noise_degrees_of_freedom=self.noise_degrees_of_freedom,
             reduced_chi=math.sqrt(sum(part.normalised for part in parts) / sum(part.rows for part in parts)),
             rms_angle=math.sqrt(sum(part.angles for part in turned) / sum(part.poses for part in turned))
