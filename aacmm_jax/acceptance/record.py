@@ -9,12 +9,11 @@ import numpy as np
 
 from ..calibration.evaluation import evaluate
 from ..calibration.observed import check_observed
-from ..calibration.prediction import Comparison, compare
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.second_stage import LARGEST_LOG_K
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
-from ..data.capture import Capture
+from ..data.capture import Capture, names_in
 from ..data.recording import Recording
 from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry
@@ -79,11 +78,6 @@ class EvaluationRecord(NamedTuple):
         """Sockets and observations that the calibration was not identified from."""
         return tuple(name for name in names_in(self.recording.capture) if name not in self.used)
 
-    def compared(self) -> Comparison | None:
-        """Errors of the calibrated arm on the whole capture, found and predicted; only those of held-out data may be
-        compared. None where the uncertainty of the calibration is not known."""
-        return None if self.uncertainty is None else compare(self.uncertainty, self.recording.capture)
-
     def acceptance(self) -> dict[str, list[AcceptanceTest]]:
         """The tests of ``standards``, and those with a limit, as far as the capture allows; as found and as left."""
         arms = self.arms() if self.standards or self.limits else {}
@@ -109,11 +103,6 @@ def _chosen(
 ) -> list[AcceptanceTest]:
     names = {STANDARDS[name] for name in standards if name in STANDARDS}
     return [test for test in tests if test.standard in names or any(metric.name in limits for metric in test.metrics)]
-
-
-def names_in(capture: Capture) -> tuple[str, ...]:
-    """Names of the sockets and the other observations of a capture."""
-    return (*capture.names, *(observation.name for observation in capture.observations))
 
 
 def evaluation_of(
@@ -149,7 +138,7 @@ def evaluation_of(
     known = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
     recording = recording._replace(capture=_divided(record.calibrated.arm, recording.capture, known))
     if recording.capture.observations:
-        _check_geometry(record.calibrated.arm, recording.capture)
+        check_geometry(record.calibrated.arm, recording.capture)
     readings = {name: np.asarray(q) for name, q in recording.capture.sockets.items()}
     readings |= {observation.name: np.asarray(observation.q) for observation in recording.capture.observations}
     shared = {name: sum(row.tobytes() in known for row in q) for name, q in readings.items()}
@@ -198,7 +187,7 @@ def _divided(arm: Arm, capture: Capture, known: Collection[bytes]) -> Capture:
         if seen.any() and not seen.all() and not any(observation.name in (r.start, r.end) for r in capture.lengths):
             unseen = observation.select(np.flatnonzero(~seen)).renamed(f"{observation.name}, unseen")
             try:
-                _check_geometry(arm, Capture({}, [], [unseen]))
+                check_geometry(arm, Capture({}, [], [unseen]))
                 parts = [observation.select(np.flatnonzero(seen)), unseen]
             except InputError:
                 pass  # too few poses: the observation counts as identified from
@@ -206,7 +195,7 @@ def _divided(arm: Arm, capture: Capture, known: Collection[bytes]) -> Capture:
     return Capture(capture.sockets, capture.lengths, found, capture.repeated)
 
 
-def _check_geometry(arm: Arm, capture: Capture) -> None:
+def check_geometry(arm: Arm, capture: Capture) -> None:
     """Raise `InputError` where observations do not determine their own unknowns."""
     space = to_numpy(Parameters(arm, ("d_1",)))
     check_observed(Observed.of(capture), space, np.asarray(space.vector()), 0)

@@ -1,20 +1,21 @@
 """Cross-validation: the arm identified without some of the sockets or observations, and evaluated on those left out."""
 
+from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arguments import checked_arguments
+from ..core.arguments import checked_arguments, items_of
 from ..core.errors import InputError
-from ..data.capture import Capture, part_of
+from ..data.capture import Capture, names_in, part_of
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
 from ..model.observed import Observed
 from ..model.robust import LossName
 from .left_out import CrossValidation, LeftOut
-from .prediction import compare
+from .prediction import unseen_errors
 from .record import uncertainty_of
 from .results import Calibration
 from .single import calibrate
@@ -26,7 +27,7 @@ _POSES_A_REGION = 10
 def groups_of(capture: Capture) -> tuple[tuple[str, ...], ...]:
     """Names of sockets and observations that are left out together: those that reference lengths join, and those that
     share an unknown geometry, such as the frame of a station."""
-    names = [*capture.names, *(observation.name for observation in capture.observations)]
+    names = names_in(capture)
     shared: dict[str, list[str]] = {}
     for observation in capture.observations:
         for part in set(observation.unknowns) - set(observation.certified):
@@ -55,8 +56,9 @@ def can_cross_validate(capture: Capture, parameters: int) -> bool:
 
 def _observed_parts(capture: Capture) -> list[tuple[Capture, Capture, tuple[str, ...]]]:
     """What remains, what is left out, and its names: group by group or, of one group only, region by region."""
-    if len(groups_of(capture)) > 1:
-        return _parts(capture)
+    groups = groups_of(capture)
+    if len(groups) > 1:
+        return _parts(capture, groups)
     if capture.sizes or any(len(o.q) < _REGIONS * _POSES_A_REGION for o in capture.observations):
         return []
     regions = [_regions(np.asarray(observation.q)) for observation in capture.observations]
@@ -105,6 +107,7 @@ def cross_validate(
     hold: str | None = "longest",
     noise: Noise | None = None,
     robust: LossName | None = None,
+    groups: Iterable[str] | None = None,
 ) -> CrossValidation:
     """Calibrate once without each group of sockets and observations, and evaluate the result on that group.
 
@@ -123,6 +126,7 @@ def cross_validate(
         hold: the scale anchor of stage 1, as for `calibrate`.
         noise: standard deviations of readings and seat, as for `calibrate`.
         robust: robust loss of the calibrations, as for `calibrate`; bad poses of what is left out count in full.
+        groups: what to leave out instead, each as a name or a shell pattern: ``["monday/*", "tuesday/*"]``.
 
     Returns:
         Errors of each group, found and predicted, mm.
@@ -130,33 +134,54 @@ def cross_validate(
     Raises:
         InputError: fewer than two groups determine the scale, or too few poses are left without one of them.
     """
-    if not can_cross_validate(capture, len(bounds.space.names)):
+    if groups is not None:
+        parts = _chosen(capture, groups, len(bounds.space.names))
+    elif can_cross_validate(capture, len(bounds.space.names)):
+        parts = _observed_parts(capture) if capture.observations else _parts(capture, groups_of(capture))
+    else:
         raise InputError(
             "cross-validation leaves sockets out with their reference lengths, so it needs two groups of sockets that "
             "each hold a length (or observations that fix the scale), and without the largest of them poses enough for "
             "the parameters; place the reference length somewhere else too, or leave cross-validation out "
             "(--no-cross-validate)."
         )
-    parts = _observed_parts(capture) if capture.observations else _parts(capture)
     solving = {"method": method, "hold": hold, "noise": noise, "robust": robust, "check_identifiability": False}
     return CrossValidation(
         tuple(_left_out(calibrate(arm, rest, bounds, **solving), left, group) for rest, left, group in parts)
     )
 
 
-def _parts(capture: Capture) -> list[tuple[Capture, Capture, tuple[str, ...]]]:
+def _parts(capture: Capture, groups: Iterable[tuple[str, ...]]) -> list[tuple[Capture, Capture, tuple[str, ...]]]:
     """What remains, what is left out, and its names, group by group."""
-    groups = groups_of(capture)
-    every = [name for group in groups for name in group]
+    every = names_in(capture)
     return [
         (part_of(capture, tuple(name for name in every if name not in group)), part_of(capture, group), group)
         for group in groups
     ]
 
 
+def _chosen(
+    capture: Capture, patterns: Iterable[str], parameters: int
+) -> list[tuple[Capture, Capture, tuple[str, ...]]]:
+    """The same of groups by name, or `InputError` where one leaves too little."""
+    given = items_of(patterns, "groups")
+    groups = [names_in(capture.select(pattern)) for pattern in given]
+    for pattern, group in zip(given, groups, strict=True):
+        if len(group) == len(names_in(capture)):
+            raise InputError(f"nothing is left without '{pattern}', so nothing can be calibrated; leave out less.")
+    parts = _parts(capture, groups)
+    for pattern, (rest, _, _) in zip(given, parts, strict=True):
+        if not _determines(rest, parameters):
+            raise InputError(
+                f"without '{pattern}' nothing fixes the scale, or too few poses are left for the parameters; leave out "
+                "less."
+            )
+    return parts
+
+
 def _left_out(result: Calibration, left: Capture, names: tuple[str, ...]) -> LeftOut:
     """How a calibration without a group agrees with it."""
-    found = compare(uncertainty_of(result), left)
+    found = unseen_errors(uncertainty_of(result), left)
     poses, lengths = found.of(found.parts), found.of_lengths()
     return LeftOut(
         sockets=names,
@@ -166,7 +191,7 @@ def _left_out(result: Calibration, left: Capture, names: tuple[str, ...]) -> Lef
         length_error=found.length_error,
         length_u=found.length_u,
         converged=bool(result.converged),
-        rms_freedom=poses.degrees_of_freedom,
-        length_freedom=lengths.degrees_of_freedom,
-        noise_freedom=found.noise_degrees_of_freedom,
+        rms_degrees_of_freedom=poses.degrees_of_freedom,
+        length_degrees_of_freedom=lengths.degrees_of_freedom,
+        noise_degrees_of_freedom=found.noise_degrees_of_freedom,
     )

@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.distributions import chance
-from ..core.text import common_label
+from ..core.text import common_labels
 
 LEVEL = 0.01  # probability below which errors beyond their prediction are not put down to chance
+_HALF = LEVEL / 2  # for single groups; the other half is for all of them together
 
 
 class LeftOut(NamedTuple):
@@ -25,19 +26,14 @@ class LeftOut(NamedTuple):
     converged: bool
     # Effective degrees of freedom of both predictions (`prediction`), and of the noise that they rest on. Where they
     # are not known, those of independent errors.
-    rms_freedom: float = math.nan
-    length_freedom: float = math.nan
-    noise_freedom: float = math.inf
+    rms_degrees_of_freedom: float = math.nan
+    length_degrees_of_freedom: float = math.nan
+    noise_degrees_of_freedom: float = math.inf
 
     @property
-    def label(self) -> str:
-        """The group in a few words."""
-        return common_label(self.sockets)
-
-    @property
-    def freedoms(self) -> tuple[float, float]:
+    def degrees_of_freedom(self) -> tuple[float, float]:
         """Degrees of freedom of the poses and of the lengths."""
-        poses, lengths = self.rms_freedom, self.length_freedom
+        poses, lengths = self.rms_degrees_of_freedom, self.length_degrees_of_freedom
         return (
             poses if math.isfinite(poses) else 3.0 * self.poses,
             lengths if math.isfinite(lengths) else float(_predicted(self).sum()),
@@ -53,10 +49,10 @@ class LeftOut(NamedTuple):
     @property
     def probabilities(self) -> tuple[float, float]:
         """Of such errors of poses, and of lengths, by chance where the predictions are right; NaN where unknown."""
-        poses, lengths = self.freedoms
+        poses, lengths = self.degrees_of_freedom
         return (
-            chance(self.rms, self.rms_predicted, poses, self.noise_freedom),
-            chance(self.length_ratio, 1.0, lengths, self.noise_freedom),
+            chance(self.rms, self.rms_predicted, poses, self.noise_degrees_of_freedom),
+            chance(self.length_ratio, 1.0, lengths, self.noise_degrees_of_freedom),
         )
 
 
@@ -64,6 +60,11 @@ class CrossValidation(NamedTuple):
     """Every group of sockets left out once. The metrics pool the groups that the others can predict."""
 
     groups: tuple[LeftOut, ...]
+
+    @property
+    def labels(self) -> list[str]:
+        """Each group in a few words."""
+        return common_labels([group.sockets for group in self.groups])
 
     @property
     def rms(self) -> float:
@@ -118,33 +119,38 @@ class CrossValidation(NamedTuple):
         return max(self.ratios(), default=float("nan"))
 
     @property
-    def disagreeing(self) -> tuple[LeftOut, ...]:
-        """Groups whose errors exceed their prediction by more than chance does in one case of a hundred, over all
-        groups together; the most improbable first."""
+    def disagreeing(self) -> tuple[int, ...]:
+        """Numbers, from 0, of the groups whose errors exceed their prediction by more than chance does in one case of
+        two hundred, over all groups together; the most improbable first."""
         known = [[p for p in group.probabilities if math.isfinite(p)] for group in self.groups]
         least = {i: min(each) for i, each in enumerate(known) if each}
         count = sum(map(len, known))
-        return tuple(self.groups[i] for i in sorted(least, key=least.__getitem__) if least[i] < LEVEL / count)
+        return tuple(i for i in sorted(least, key=least.__getitem__) if least[i] < _HALF / count)
 
     @property
     def surprising(self) -> bool:
-        """Whether the errors of a group, or of all groups together, exceed their prediction by more than chance."""
-        return bool(self.disagreeing) or any(found < LEVEL / 2 for found in self._pooled_probabilities())
+        """Whether the errors of a group, or of all groups together, exceed their prediction by more than chance does
+        in one case of a hundred."""
+        pooled = self._pooled_probabilities()
+        return bool(self.disagreeing) or any(probability < _HALF / len(pooled) for probability in pooled)
 
     def _pooled_probabilities(self) -> list[float]:
         """Of the errors of all poses, and of all lengths. A sum of squares of independent parts with means T and
         degrees of freedom f has (sum T)^2 / sum (T^2 / f) of them (Satterthwaite)."""
-        poses = [(group.poses, group.rms, group.rms_predicted, group.freedoms[0]) for group in self.groups]
-        lengths = [(int(_predicted(group).sum()), group.length_ratio, 1.0, group.freedoms[1]) for group in self.groups]
+        poses = [(group.poses, group.rms, group.rms_predicted, group.degrees_of_freedom[0]) for group in self.groups]
+        lengths = [
+            (int(_predicted(group).sum()), group.length_ratio, 1.0, group.degrees_of_freedom[1])
+            for group in self.groups
+        ]
         found = []
         for parts in (poses, lengths):
             known = [part for part in parts if part[0] and part[3] > 0 and 0 < part[2] < math.inf]
             if known:
-                count, rms, predicted, freedom = np.array(known).T
+                count, rms, predicted, own = np.array(known).T
                 means = count * predicted**2
                 ratio = math.sqrt(np.sum(count * rms**2) / means.sum())
-                pooled = float(means.sum() ** 2 / np.sum(means**2 / freedom))
-                found.append(chance(ratio, 1.0, pooled, min(group.noise_freedom for group in self.groups)))
+                pooled = float(means.sum() ** 2 / np.sum(means**2 / own))
+                found.append(chance(ratio, 1.0, pooled, min(group.noise_degrees_of_freedom for group in self.groups)))
         return [probability for probability in found if math.isfinite(probability)]
 
 

@@ -64,7 +64,7 @@ class _Part(NamedTuple):
     shared: Float[np.ndarray, "w w"]
 
 
-class Comparison(NamedTuple):
+class UnseenErrors(NamedTuple):
     """Errors of a calibrated arm on a capture that it was not identified from, found and predicted."""
 
     parts: dict[str, _Part]  # of sockets first, then of other observations
@@ -84,16 +84,16 @@ class Comparison(NamedTuple):
         poses = sum(part.poses for part in parts)
         if not poses:
             return NOTHING
-        trace, freedom = sum(part.trace for part in parts), math.nan
+        trace, effective = sum(part.trace for part in parts), math.nan
         if 0 < trace < math.inf:
             both = np.sum([part.shared for part in parts], axis=0) @ self.common
-            freedom = trace**2 / (sum(part.square for part in parts) + float(np.sum(both * both.T)))
+            effective = trace**2 / (sum(part.square for part in parts) + float(np.sum(both * both.T)))
         turned = [part for part in parts if math.isfinite(part.angles)]
         return Agreement(
             count=poses,
             rms=math.sqrt(sum(part.found for part in parts) / poses),
             predicted=math.sqrt(trace / poses),
-            degrees_of_freedom=freedom,
+            degrees_of_freedom=effective,
             noise_degrees_of_freedom=self.noise_degrees_of_freedom,
             reduced_chi=math.sqrt(sum(part.normalised for part in parts) / sum(part.rows for part in parts)),
             rms_angle=math.sqrt(sum(part.angles for part in turned) / sum(part.poses for part in turned))
@@ -120,7 +120,7 @@ class Comparison(NamedTuple):
         )
 
 
-def compare(uncertainty: Uncertainty, capture: Capture) -> Comparison:
+def unseen_errors(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
     """Compare the errors of a calibrated arm on a capture with what its uncertainty predicts; all is NumPy's.
 
     The geometry (positions of sockets, frames, centres) is fitted to the arm. The poses must be others than those that
@@ -137,7 +137,7 @@ def compare(uncertainty: Uncertainty, capture: Capture) -> Comparison:
     return _of_observations(uncertainty, capture) if capture.observations else _of_sockets(uncertainty, capture)
 
 
-def _of_sockets(uncertainty: Uncertainty, capture: Capture) -> Comparison:
+def _of_sockets(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
     """Of sockets and reference lengths: every position is a mean, so nothing is as large as all poses together."""
     arm, owner, sizes = uncertainty.arm, capture.owner, np.asarray(capture.sizes, dtype=float)
     tips, slopes = np.asarray(arm.position(capture.q)), np.asarray(uncertainty.derivatives(capture.q))
@@ -181,10 +181,10 @@ def _of_sockets(uncertainty: Uncertainty, capture: Capture) -> Comparison:
             covariance = covariance + np.where(same, 1.0 if one == other else -1.0, 0.0) * (pulled @ direction.T)
     error = measured - np.array([float(length.value) for length in lengths])
     shared = np.asarray(uncertainty.covariance)
-    return Comparison(parts, shared, error, np.asarray(covariance), uncertainty.degrees_of_freedom)
+    return UnseenErrors(parts, shared, error, np.asarray(covariance), uncertainty.degrees_of_freedom)
 
 
-def _of_observations(uncertainty: Uncertainty, capture: Capture) -> Comparison:
+def _of_observations(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
     """Of observations whose geometry is fitted to the arm.
 
     With whitened derivatives A by the parameters and G by the geometry, and U an orthonormal basis of G, errors dp of
@@ -236,4 +236,4 @@ def _of_observations(uncertainty: Uncertainty, capture: Capture) -> Comparison:
     geometry = observed.split(fitted.geometry)
     measured = np.array([float(np.linalg.norm(geometry[end] - geometry[start])) for start, end in observed.ends])
     error = measured - np.asarray(observed.nominal)
-    return Comparison(parts, common, error, np.asarray(covariance), uncertainty.degrees_of_freedom)
+    return UnseenErrors(parts, common, error, np.asarray(covariance), uncertainty.degrees_of_freedom)

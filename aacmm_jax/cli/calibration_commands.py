@@ -111,6 +111,14 @@ def calibrate(
             "Default: yes, for a recorded capture with several placements of the reference length."
         ),
     ] = None,
+    leave_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="PATTERN",
+            help="With --cross-validate: leave out all that has such a name together ('monday/*' with its session); "
+            "repeatable.",
+        ),
+    ] = None,
     monte_carlo: Annotated[
         bool,
         typer.Option("--monte-carlo", help="Check the uncertainties by Monte Carlo (JCGM 101); takes a minute or two."),
@@ -154,6 +162,8 @@ def calibrate(
             check_format(figure)
         recording = _joined(capture, same_probe)
         recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
+        if leave_out and not cross_validate:
+            raise InputError("--leave-out says what --cross-validate leaves out; give both.")
         others = None
         if only_poses is not None:
             from ..data.drawing import draw_poses
@@ -193,7 +203,7 @@ def calibrate(
                 if scale != "measured":
                     raise InputError("--cross-validate needs a calibrated scale; leave out --scale nominal.")
                 found = with_spinner("Cross-validating", lambda: validated(
-                    bounds.space.base, capture_used, bounds, method=method, robust=robust, **solving,
+                    bounds.space.base, capture_used, bounds, method=method, robust=robust, groups=leave_out, **solving,
                 ))  # fmt: skip
                 record = record._replace(validation=found)
         if monte_carlo:

@@ -48,10 +48,18 @@ def shorten(items: Sequence[str], most: int = 5) -> str:
     return ", ".join(items[:most]) + (f" and {len(items) - most} more" if len(items) > most else "")
 
 
-def common_label(names: Sequence[str]) -> str:
-    """What several names have in common before the last "/", such as a placement; else the first of the names."""
-    folders = {name.rpartition("/")[0] for name in names}
-    return folders.pop() if len(names) > 1 and len(folders) == 1 and "" not in folders else shorten(names, 3)
+def common_labels(groups: Sequence[Sequence[str]]) -> list[str]:
+    """What the names of each group have in common before the last "/", such as a placement; the first of the names
+    where they have nothing in common, or another group has the same."""
+    labels = []
+    for names in groups:
+        folders = {name.rpartition("/")[0] for name in names}
+        alike = len(names) > 1 and len(folders) == 1 and "" not in folders
+        labels.append(folders.pop() if alike else "")
+    return [
+        label if label and labels.count(label) == 1 else shorten(names, 3)
+        for label, names in zip(labels, groups, strict=True)
+    ]
 
 
 def pluralise(number: int, noun: str) -> str:

@@ -227,6 +227,11 @@ class Capture(eqx.Module):
         return Capture(chosen, lengths, others, repeated=repeated, sessions=self.sessions)
 
 
+def names_in(capture: Capture) -> tuple[str, ...]:
+    """Names of the sockets and the other observations of a capture."""
+    return (*capture.names, *(observation.name for observation in capture.observations))
+
+
 def part_of(capture: Capture, names: Collection[str]) -> Capture:
     """Sockets and other observations by their exact names, which `Capture.select` would take for patterns, with the
     reference lengths between them."""

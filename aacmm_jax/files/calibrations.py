@@ -31,7 +31,12 @@ from .hdf5 import (
 )
 from .sense import check_calibration
 
-_FREEDOMS = ("rms_freedom", "length_freedom", "noise_freedom")  # of cross-validation; earlier files have none
+# Of cross-validation; earlier files have none.
+_DEGREES_OF_FREEDOM = {
+    "rms_degrees_of_freedom": "effective degrees of freedom of rms_predicted",
+    "length_degrees_of_freedom": "effective degrees of freedom of length_u",
+    "noise_degrees_of_freedom": "degrees of freedom of the noise behind both",
+}
 
 
 def save_calibration(
@@ -205,9 +210,21 @@ def _validation_table(record: CalibrationRecord) -> Table:
         rms=([group.rms for group in groups], "mm", "RMS distance from the centroid, found"),
         rms_predicted=([group.rms_predicted for group in groups], "mm", "the same, predicted"),
         converged=([int(group.converged) for group in groups], "1", "1: the others converged"),
-        rms_freedom=([group.freedoms[0] for group in groups], "1", "effective degrees of freedom of rms_predicted"),
-        length_freedom=([group.freedoms[1] for group in groups], "1", "effective degrees of freedom of length_u"),
-        noise_freedom=([group.noise_freedom for group in groups], "1", "degrees of freedom of the noise behind both"),
+        rms_degrees_of_freedom=(
+            [group.degrees_of_freedom[0] for group in groups],
+            "1",
+            "effective degrees of freedom of rms_predicted",
+        ),
+        length_degrees_of_freedom=(
+            [group.degrees_of_freedom[1] for group in groups],
+            "1",
+            "effective degrees of freedom of length_u",
+        ),
+        noise_degrees_of_freedom=(
+            [group.noise_degrees_of_freedom for group in groups],
+            "1",
+            "degrees of freedom of the noise behind both",
+        ),
     )
     by_socket = columns(
         "left_out_socket",
@@ -242,7 +259,7 @@ def _validation_of(stored: Stored) -> CrossValidation | None:
                 length_error=table["length_error"][of],
                 length_u=table["length_u"][of],
                 converged=bool(table["converged"][i]),
-                **{name: float(table[name][i]) for name in _FREEDOMS if name in table},
+                **{name: float(table[name][i]) for name in _DEGREES_OF_FREEDOM if name in table},
             )
         )
     return CrossValidation(tuple(groups))

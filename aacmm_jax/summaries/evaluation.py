@@ -4,15 +4,18 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.record import EvaluationRecord, PointsRecord, names_in, unstated_uncertainty_warning
+from ..acceptance.record import EvaluationRecord, PointsRecord, check_geometry, unstated_uncertainty_warning
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from ..calibration.cross_validation import groups_of
 from ..calibration.evaluation import Evaluation, evaluate
-from ..calibration.prediction import NOTHING, Agreement, compare
-from ..core.text import common_label
-from ..data.capture import Capture, part_of
+from ..calibration.prediction import NOTHING, Agreement, unseen_errors
+from ..core.errors import InputError
+from ..core.text import common_labels
+from ..data.capture import Capture, names_in, part_of
 from ..data.noise import Noise
+from ..data.observations.socket import Socket
 from ..kinematics.arm import Arm
+from ..uncertainty.arm_uncertainty import Uncertainty
 from .calibration import length_metrics, metrics, metrics_by_socket_and_length
 from .validation import agreement_row, finite, no_better, surprise
 
@@ -96,8 +99,8 @@ def _add_prediction(
     if record.uncertainty is None:
         return []
     capture, factor = record.recording.capture, record.uncertainty.factor(0.95)
-    compared = None if part is None else compare(record.uncertainty, part)
-    of_lengths = compared if part is capture or not lengths else compare(record.uncertainty, capture)
+    compared = None if part is None else unseen_errors(record.uncertainty, part)
+    of_lengths = compared if part is capture or not lengths else unseen_errors(record.uncertainty, capture)
     each: dict[str, Agreement] = {}
     poses = lengths_found = NOTHING
     if compared is not None and part is not None:
@@ -113,8 +116,8 @@ def _add_prediction(
             for kind, names in kinds.items()
         ]
         group["groups"] = [
-            {"group": common_label(names), "members": list(names)} | agreement_row(compared.of(names))
-            for names in groups_of(part)
+            {"group": label, "members": list(names)} | agreement_row(compared.of(names))
+            for label, names in zip(common_labels(groups_of(part)), groups_of(part), strict=True)
         ]
     if of_lengths is not None and lengths:
         lengths_found = of_lengths.of_lengths(lengths)
@@ -132,7 +135,22 @@ def _add_prediction(
         },
     }
     before, after = (group[stage].get("observed_rms_mm", group[stage].get("rms_mm")) for stage in record.arms())
-    return surprise(poses, lengths_found, each) + no_better(before, after)
+    unseen = surprise(poses, lengths_found, each, lambda: _with_probe_fitted(record.uncertainty, part))
+    return unseen + no_better(before, after)
+
+
+def _with_probe_fitted(uncertainty: Uncertainty | None, part: Capture | None) -> Agreement | None:
+    """How unseen data agree where the place of their probe is unknown; None where they held several, or other tips."""
+    if uncertainty is None or part is None or any(observation.target for observation in part.observations):
+        return None
+    poses = [Socket(name, q) for name, q in part.sockets.items()]
+    capture = Capture({}, [], [one.with_target("probe") for one in (*poses, *part.observations)])
+    try:
+        check_geometry(uncertainty.arm, capture)
+    except InputError:
+        return None
+    found = unseen_errors(uncertainty, capture)
+    return found.of(found.parts)
 
 
 def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = None) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Errors on data that a calibration has not seen, beside those that its uncertainty predicts; for ``--json`` too."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,24 +13,28 @@ from ..core.text import shorten
 
 def cross_validation_summary(validation: CrossValidation) -> dict[str, Any]:
     """All groups together, and every group, the most improbable first; mm."""
-    disagreeing = validation.disagreeing
-    groups = sorted(validation.groups, key=lambda group: min(filter(math.isfinite, group.probabilities), default=2.0))
+    chance = [min(filter(math.isfinite, group.probabilities), default=math.nan) for group in validation.groups]
+    order = sorted(range(len(chance)), key=lambda i: chance[i] if math.isfinite(chance[i]) else 2.0)
     return {
-        "groups": len(groups),
+        "groups": len(order),
         "rms_mm": finite(validation.rms),
         "rms_predicted_mm": finite(validation.rms_predicted),
         "length_error_rms_mm": finite(validation.length_rms),
         "length_u_mm": finite(validation.length_u),
         "excess": finite(validation.excess),
         "surprising": validation.surprising,
-        "left_out": [_group(group, any(group is other for other in disagreeing)) for group in groups],
+        "left_out": [
+            {"group": validation.labels[i]}
+            | _group(validation.groups[i])
+            | {"probability": finite(chance[i]), "disagrees": i in validation.disagreeing}
+            for i in order
+        ],
     }
 
 
-def _group(group: LeftOut, disagrees: bool) -> dict[str, Any]:
+def _group(group: LeftOut) -> dict[str, Any]:
     known = np.isfinite(group.length_u)
     return {
-        "group": group.label,
         "members": list(group.sockets),
         "poses": group.poses,
         "converged": group.converged,
@@ -39,8 +43,6 @@ def _group(group: LeftOut, disagrees: bool) -> dict[str, Any]:
         "lengths": len(group.length_error),
         "length_error_rms_mm": _root_mean_square(group.length_error),
         "length_u_mm": _root_mean_square(group.length_u) if known.all() else None,
-        "probability": finite(min(filter(math.isfinite, group.probabilities), default=math.nan)),
-        "disagrees": disagrees,
     }
 
 
@@ -48,10 +50,10 @@ def contradicted_prediction(validation: CrossValidation) -> list[str]:
     """A sentence on groups whose errors exceed what their prediction allows, where there are any."""
     if not validation.surprising:
         return []
-    groups = validation.disagreeing
-    named = _disagreement(groups)
-    if 0 < len(groups) < len(validation.groups) / 2:
-        others = len(validation.groups) - len(groups)
+    count = len(validation.disagreeing)
+    named = _disagreement(validation)
+    if 0 < count < len(validation.groups) / 2:
+        others = len(validation.groups) - count
         return [
             f"Held out one after the other, some groups disagree with the others by more than predicted: {named}; the "
             f"other {others} agree. Look for what differs there (a socket or tool that moved, a wrong length, poses "
@@ -74,17 +76,18 @@ def contradicted_prediction(validation: CrossValidation) -> list[str]:
     ]
 
 
-def _disagreement(groups: Sequence[LeftOut]) -> str:
+def _disagreement(validation: CrossValidation) -> str:
     """The most improbable groups: by how much their poses, or else their lengths, exceed the prediction."""
     found = []
-    for group in groups:
+    for i in validation.disagreeing:
+        label, group = validation.labels[i], validation.groups[i]
         poses, lengths = group.probabilities
         if not lengths < poses:
             ratio = group.rms / group.rms_predicted
-            found.append(f"{group.label} ({group.rms:.3g} mm RMS, {ratio:.1f} times its prediction)")
+            found.append(f"{label} ({group.rms:.3g} mm RMS, {ratio:.1f} times its prediction)")
         else:
             error = _root_mean_square(group.length_error)
-            found.append(f"{group.label} (lengths off by {error:.3g} mm, {group.length_ratio:.1f} times their u)")
+            found.append(f"{label} (lengths off by {error:.3g} mm, {group.length_ratio:.1f} times their u)")
     return shorten(found, 3)
 
 
@@ -100,9 +103,14 @@ def agreement_row(agreement: Agreement) -> dict[str, Any]:
     }
 
 
-def surprise(poses: Agreement, lengths: Agreement, parts: dict[str, Agreement]) -> list[str]:
-    """A sentence on unseen data that scatter more than predicted, by more than chance does in one case of a hundred;
-    ``parts`` are the sockets and observations, of which the most improbable are named."""
+def surprise(
+    poses: Agreement, lengths: Agreement, parts: dict[str, Agreement], refitted: Callable[[], Agreement | None]
+) -> list[str]:
+    """A sentence on unseen data that scatter more than predicted, by more than chance does in one case of a hundred.
+
+    ``parts`` are the sockets and observations, of which the most improbable are named; ``refitted`` says how all poses
+    agree where the place of the probe is fitted to them: where that removes most of the excess, it is the cause.
+    """
     found = []
     tested = sum(math.isfinite(agreement.probability) for agreement in (poses, lengths))
     if poses.probability < LEVEL / max(tested, 1):
@@ -123,11 +131,19 @@ def surprise(poses: Agreement, lengths: Agreement, parts: dict[str, Agreement]) 
         )
     if not found:
         return []
-    return [
-        f"Data that the calibration has not seen disagree with it by more than chance: {'; '.join(found)}. The arm or "
-        "its probe has changed since (a remounted tip), these data have errors of their own, or the model misses "
-        "effects that poses of the calibration did not show: its uncertainties do not hold here."
-    ]
+    again = refitted() if poses.probability < LEVEL else None
+    cause = (
+        "The arm or its probe has changed since (a remounted tip), these data have errors of their own, or the model "
+        "misses effects that poses of the calibration did not show: its uncertainties do not hold here."
+    )
+    # Most of the excess: more than half of it, in squares.
+    if again is not None and poses.rms**2 - again.rms**2 > (poses.rms**2 - poses.predicted**2) / 2:
+        cause = (
+            f"With the probe's place in the last frame fitted to them, they are {again.rms:.3g} mm RMS: the tip was "
+            "remounted, or is another one. Calibrate such data as a session with a probe of its own (aacmm calibrate "
+            "A.h5 B.h5)."
+        )
+    return [f"Data that the calibration has not seen disagree with it by more than chance: {'; '.join(found)}. {cause}"]
 
 
 def no_better(nominal: float | None, calibrated: float | None) -> list[str]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.prediction import compare
+from aacmm_jax.calibration.prediction import unseen_errors
 from aacmm_jax.core.distributions import chance
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.data.noise import tip_covariances
@@ -37,7 +37,7 @@ def test_sums_of_squares_are_those_of_the_whole_covariance(paper_arm, capture):
     """V of all poses of two sockets as one matrix, from which their means are taken."""
     noise = aj.Noise(encoder_arcsec=3, seating=0.01)
     uncertainty = uncertainty_of(paper_arm, noise)
-    found = compare(uncertainty, capture)
+    found = unseen_errors(uncertainty, capture)
     slopes = np.asarray(paper_arm.jacobian(capture.q, NAMES)).reshape(-1, len(NAMES))
     own = np.moveaxis(np.asarray(tip_covariances(paper_arm.geometry, sines_cosines(capture.q), noise)), -1, 0)
     errors = slopes @ np.asarray(uncertainty.covariance) @ slopes.T
@@ -66,7 +66,7 @@ def test_sockets_as_observations_are_judged_alike(paper_arm, capture):
     """Where all poses have the same weight, whichever code eliminates the positions."""
     uncertainty = uncertainty_of(paper_arm, SEAT, 40.0)
     sockets = [kinds.Socket(name, q) for name, q in capture.sockets.items()]
-    one, other = (compare(uncertainty, c) for c in (capture, aj.Capture({}, capture.lengths, sockets)))
+    one, other = (unseen_errors(uncertainty, c) for c in (capture, aj.Capture({}, capture.lengths, sockets)))
     for names in (["A"], ["B"], ["A", "B", "C"]):
         np.testing.assert_allclose(one.of(names)[:6], other.of(names)[:6], rtol=1e-6)
     np.testing.assert_allclose(one.length_error, other.length_error, atol=1e-9)
@@ -79,7 +79,7 @@ def test_sockets_as_observations_are_judged_alike(paper_arm, capture):
 def test_what_is_open_has_no_prediction(paper_arm, capture):
     uncertainty = uncertainty_of(paper_arm, SEAT)
     free = Uncertainty(paper_arm, uncertainty.covariance, np.eye(len(NAMES)), SEAT, None, NAMES, np.inf)
-    found = compare(free, capture)
+    found = unseen_errors(free, capture)
     assert found.of(["A", "B"]).predicted == math.inf
     assert math.isnan(found.of(["A", "B"]).probability)
     assert found.of_lengths().count == 0
@@ -102,7 +102,7 @@ def test_honest_data_are_as_improbable_as_chance_makes_them(paper_arm):
     for seed in range(30):
         true = space.arm(vector + root @ random.normal(size=len(vector)))
         capture = aj.simulate(true, SOCKETS, poses=6, lengths=LENGTHS, noise=noise, seed=seed)
-        found = compare(uncertainty, capture)
+        found = unseen_errors(uncertainty, capture)
         poses.append(found.of(SOCKETS).probability)
         lengths.append(found.of_lengths().probability)
     for probabilities in (poses, lengths):

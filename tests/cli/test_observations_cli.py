@@ -173,6 +173,9 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
             "calibrate bad.h5 -o x.h5 --robust huber --monte-carlo",
             ["--monte-carlo is for calibrations without --robust"],
         ),
+        ("calibrate monday.h5 -o x.h5 --leave-out A", ["give both"]),
+        ("calibrate monday.h5 -o x.h5 --cross-validate --leave-out '*'", ["nothing is left without '*'"]),
+        ("calibrate monday.h5 -o x.h5 --cross-validate --leave-out [AC]", ["without '[AC]' nothing fixes the scale"]),
         ("calibrate monday.h5 -o x.h5 --same-probe", ["--same-probe is for several captures"]),
         ("calibrate monday.h5 monday.h5 -o x.h5", ["two captures have the name 'monday'"]),
         ("calibrate monday.h5 -o x.h5 --only-poses 80", ["80 of 80 poses cannot be drawn", "1 to 79"]),
@@ -229,6 +232,7 @@ def test_an_evaluation_stands_beside_its_prediction(aacmm, folder, calibrated, t
     (warning,) = moved["warnings"]
     assert "disagree with it by more than chance" in warning
     assert "E (" in warning
+    assert "the tip was remounted, or is another one" in warning
     assert moved["held_out"]["predicted"]["poses"]["probability"] < 1e-6
 
 
@@ -241,16 +245,25 @@ def test_poses_that_a_calibration_did_not_use_are_held_out(aacmm, folder):
     assert found["warnings"] == []
 
 
+@pytest.mark.slow
+def test_a_robust_cross_validation_names_the_group(aacmm, folder):
+    """The group with a bad pose comes first, with a robust loss too."""
+    aacmm("calibrate", folder / "bad.h5", "-o", "c.h5", "--cross-validate", "--robust", "huber")
+    found = json.loads(aacmm("show", "c.h5", "--json").stdout)
+    first, second = found["cross_validation"]["left_out"]
+    assert (first["members"], second["members"]) == (["C", "D"], ["A", "B"])
+    assert first["disagrees"]
+    assert first["rms_mm"] > 5 * first["rms_predicted_mm"]
+    assert any("Held out one after the other" in text and "C, D (" in text for text in found["warnings"])
+
+
 def test_cross_validation_is_printed_group_by_group(aacmm, folder):
-    """The socket with a bad pose comes first, with and without a robust loss."""
-    for loss in ((), ("--robust", "huber")):
-        aacmm("calibrate", folder / "bad.h5", "-o", "c.h5", "--cross-validate", *loss)
-        found = json.loads(aacmm("show", "c.h5", "--json").stdout)
-        first, second = found["cross_validation"]["left_out"]
-        assert (first["members"], second["members"]) == (["C", "D"], ["A", "B"])
-        assert first["disagrees"]
-        assert first["rms_mm"] > 5 * first["rms_predicted_mm"]
-        assert any("Held out one after the other" in text and "C, D (" in text for text in found["warnings"])
+    """What is named, or what shares no geometry and no length."""
+    left = [word for pattern in ("[AB]", "D") for word in ("--leave-out", pattern)]
+    options = (folder / "monday.h5", "-o", "c.h5", "--cross-validate", *left)
+    rows = json.loads(aacmm("calibrate", *options, "--json").stdout)["cross_validation"]["left_out"]
+    assert {row["group"]: row["poses"] for row in rows} == {"A, B": 40, "D": 20}
+    assert all(0.5 < row["rms_mm"] / row["rms_predicted_mm"] < 1.7 for row in rows)
     shown = " ".join(aacmm("calibrate", folder / "tracker.h5", "-o", "c.h5", "--cross-validate").stdout.split())
     assert "held out poses RMS predicted" in shown
     found = json.loads(aacmm("show", "c.h5", "--json").stdout)["cross_validation"]

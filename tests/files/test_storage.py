@@ -441,11 +441,11 @@ def test_names_with_a_comma(tmp_path, good, held, earlier):
             table = file["cross_validation"]
             table["group"][...] = ",".join(names)
             del table["socket_number"], table["left_out_socket"]
-            del table["rms_freedom"], table["length_freedom"], table["noise_freedom"]
+            del table["rms_degrees_of_freedom"], table["length_degrees_of_freedom"], table["noise_degrees_of_freedom"]
     read = aj.files.load_calibration(path)
     assert read.recording.capture.names == names
     assert [found.sockets for found in read.validation.groups] == [names, names]
-    assert [found.freedoms for found in read.validation.groups] == [group.freedoms] * 2
+    assert [found.degrees_of_freedom for found in read.validation.groups] == [group.degrees_of_freedom] * 2
     assert (read.held, read.recording.nominal.held) == (held, held)
 
 

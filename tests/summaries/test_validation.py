@@ -30,9 +30,8 @@ def test_the_placement_that_disagrees_is_named():
     text = said(*others, group("high", 0.38))
     assert "some groups disagree with the others by more than predicted: high (0.38 mm RMS, 3.8 times" in text
     assert "the other 8 agree" in text
-    assert "place_1 (lengths off by 0.05 mm, 5.0 times their u)" in said(
-        group("a"), group("b"), group("place_1", error=0.05)
-    )
+    text = said(group("a"), group("b"), group("place_1", error=0.05))
+    assert "place_1 (lengths off by 0.05 mm, 5.0 times their u)" in text
     # Where most of them do, the model is at fault and not a placement.
     assert "placements have larger errors than predicted" in said(*(group(f"place_{i}", 0.2) for i in range(3)))
 
@@ -41,8 +40,8 @@ def test_few_degrees_of_freedom_allow_more():
     """Poses that share the errors of parameters, and a noise that is an estimate from few residuals."""
     ratio = [group("a", 0.16), group("b"), group("c")]
     assert said(*ratio) != ""
-    assert said(*(one._replace(rms_freedom=4.0) for one in ratio)) == ""
-    assert said(*(one._replace(noise_freedom=5.0) for one in ratio)) == ""
+    assert said(*(one._replace(rms_degrees_of_freedom=4.0) for one in ratio)) == ""
+    assert said(*(one._replace(noise_degrees_of_freedom=5.0) for one in ratio)) == ""
 
 
 def test_the_worst_comes_first():
@@ -59,17 +58,30 @@ def agreement(rms, poses=30, freedom=60.0):
     return Agreement(poses, rms, 0.1, freedom, 200.0)
 
 
+def unknown():
+    return None
+
+
+def test_a_remounted_probe_is_named():
+    """Where most of the excess is gone once the place of the probe is fitted, and only there."""
+    bad = agreement(0.25, 90, 180.0)
+    (text,) = surprise(bad, NOTHING, {}, lambda: agreement(0.1))
+    assert "With the probe's place in the last frame fitted to them, they are 0.1 mm RMS: the tip was remounted" in text
+    (text,) = surprise(bad, NOTHING, {}, lambda: agreement(0.2))
+    assert "the tip was remounted" not in text
+    assert "a remounted tip" in text
+
+
 def test_unseen_data_that_scatter_more_than_predicted():
     parts = {"A": agreement(0.11), "B": agreement(0.35), "C": agreement(0.25)}
-    (text,) = surprise(agreement(0.25, 90, 180.0), NOTHING, parts)
-    assert (
-        "0.25 mm RMS from their geometry, 2.5 times the predicted 0.1 mm, most of all in B (0.35 mm, 3.5 times)" in text
-    )
+    (text,) = surprise(agreement(0.25, 90, 180.0), NOTHING, parts, unknown)
+    assert "0.25 mm RMS from their geometry, 2.5 times the predicted 0.1 mm, most of all in B (0.35 mm, 3.5" in text
     assert "A (" not in text
     assert "reference lengths" not in text
-    assert surprise(agreement(0.11), agreement(0.11), parts) == []
-    assert "reference lengths err by 3.0 times their" in surprise(agreement(0.1), agreement(0.3, 5, 5.0), parts)[0]
-    assert surprise(NOTHING, NOTHING, {}) == []
+    assert surprise(agreement(0.11), agreement(0.11), parts, unknown) == []
+    (text,) = surprise(agreement(0.1), agreement(0.3, 5, 5.0), parts, unknown)
+    assert "reference lengths err by 3.0 times their" in text
+    assert surprise(NOTHING, NOTHING, {}, unknown) == []
 
 
 @pytest.mark.parametrize(("nominal", "calibrated", "told"), [(0.5, 0.6, True), (0.6, 0.5, False), (None, None, False)])

@@ -118,8 +118,8 @@ class Cylinder(AbstractObservation):
         radius = self.radius
         if radius is not None and is_concrete(radius) and float(radius) <= 0:
             raise InputError(
-                f"{where} has a stylus of {float(self.stylus):g} mm, but its radius is {float(self.stylus / 2 + radius):g} "
-                "mm; give the diameters of the bore and of the ball that fits into it, in mm."
+                f"{where} has a stylus of {self.stylus:g} mm inside a diameter of {self.diameter:g} mm; give the "
+                "diameters of the bore and of the ball that fits into it, in mm."
             )
         self.free = radius is None or not is_exact(self.u)
 

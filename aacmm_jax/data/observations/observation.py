@@ -152,6 +152,12 @@ class AbstractObservation(eqx.Module):
         object.__setattr__(changed, "name", name)
         return changed
 
+    def with_target(self, target: str) -> "AbstractObservation":
+        """The same observation with another tip held."""
+        changed = copy.copy(self)
+        object.__setattr__(changed, "target", target)
+        return changed
+
     def select(self, poses: Sequence[int] | np.ndarray) -> "AbstractObservation":
         """The same observation with some of its poses, in their order."""
         changed = copy.copy(self)
