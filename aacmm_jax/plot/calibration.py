@@ -1,12 +1,12 @@
 """Figures of a calibration: distances of the poses, parameters and reference lengths, nominal and calibrated."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..calibration.observation_residuals import ObservationResiduals, distances_of, observation_residuals
+from ..calibration.pose_residuals import ObservationResiduals, distances_of, observation_residuals
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG
@@ -61,7 +61,7 @@ def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
     return axes
 
 
-def residuals(record: CalibrationRecord, unit: str = "mm", axes: Any = None) -> Any:
+def residuals_by_kind(record: CalibrationRecord, unit: str = "mm", axes: Any = None) -> Any:
     """Plot the residual of every pose of a calibration from observations, or with a robust loss, by kind (logarithmic).
 
     Poses that a robust loss took half of their weight from or more have a ring.
@@ -252,11 +252,11 @@ def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
     from matplotlib.figure import Figure
 
     found = observation_residuals(record)
-    draw = [pose_distances]
+    draw: list[Callable[..., Any]] = [pose_distances]
     if found:
-        draw.append(lambda record, axes: residuals(record, "standard deviations", axes))
+        draw.append(lambda record, axes: residuals_by_kind(record, "standard deviations", axes))
     if any(one.angle is not None for one in found):
-        draw.append(lambda record, axes: residuals(record, "deg", axes))
+        draw.append(lambda record, axes: residuals_by_kind(record, "deg", axes))
     if record.recording.true is not None:
         draw.append(length_parameter_errors)
     columns = len(draw) if len(draw) <= _MOST_IN_A_ROW else 2

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..calibration.observation_residuals import distances_of, rms
+from ..calibration.pose_residuals import distances_of, rms
 from ..calibration.results import CrossValidation, LeftOut
 from ..data.capture import Capture
 from ..model.metrics import pose_outliers

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..calibration.observation_residuals import (
+from ..calibration.pose_residuals import (
     ObservationResiduals,
     distances_of,
     observation_residuals,
