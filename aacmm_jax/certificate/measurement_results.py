@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..calibration.observation_residuals import ObservationResiduals, distances_of, observation_residuals
+from ..calibration.pose_residuals import ObservationResiduals, distances_of, observation_residuals
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..data.capture import ReferenceLength
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference

@@ -136,7 +136,7 @@ def _observed(console: Console, summary: dict[str, Any]) -> None:
         parts = [row for row in summary["geometry"] if not row["part"].startswith("position of ")]
         for row in parts[:_MOST_PARTS]:
             for one in row["quantities"]:
-                table.add_row(escape(row["part"]), one["quantity"], quantity_words(one))
+                table.add_row(*map(escape, (row["part"], one["quantity"], quantity_words(one))))
         if parts:
             print_table(console, table)
         hidden = len(summary["geometry"]) - len(parts[:_MOST_PARTS])

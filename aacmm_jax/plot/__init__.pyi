@@ -4,7 +4,7 @@ from .calibration import length_parameter_errors as length_parameter_errors
 from .calibration import parameter_changes as parameter_changes
 from .calibration import pose_distances as pose_distances
 from .calibration import reference_length_errors as reference_length_errors
-from .calibration import residuals as residuals
+from .calibration import residuals_by_kind as residuals_by_kind
 from .calibration import save_calibration_figure as save_calibration_figure
 from .drift import drift_trend as drift_trend
 from .drift import parameter_trend as parameter_trend

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.observation_residuals import ObservationResiduals, distances_of, observation_residuals
+from ..calibration.pose_residuals import ObservationResiduals, distances_of, observation_residuals
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG
@@ -61,7 +61,7 @@ def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
     return axes
 
 
-def residuals(record: CalibrationRecord, unit: str = "mm", axes: Any = None) -> Any:
+def residuals_by_kind(record: CalibrationRecord, unit: str = "mm", axes: Any = None) -> Any:
     """Plot the residual of every pose of a calibration from observations, or with a robust loss, by kind (logarithmic).
 
     Poses that a robust loss took half of their weight from or more have a ring.
@@ -254,9 +254,9 @@ def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
     found = observation_residuals(record)
     draw: list[Callable[..., Any]] = [pose_distances]
     if found:
-        draw.append(lambda record, axes: residuals(record, "standard deviations", axes))
+        draw.append(lambda record, axes: residuals_by_kind(record, "standard deviations", axes))
     if any(one.angle is not None for one in found):
-        draw.append(lambda record, axes: residuals(record, "deg", axes))
+        draw.append(lambda record, axes: residuals_by_kind(record, "deg", axes))
     if record.recording.true is not None:
         draw.append(length_parameter_errors)
     columns = len(draw) if len(draw) <= _MOST_IN_A_ROW else 2

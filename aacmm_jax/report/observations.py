@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.observation_residuals import ObservationResiduals, observation_residuals
+from ..calibration.pose_residuals import ObservationResiduals, observation_residuals
 from ..calibration.record import CalibrationRecord
 from ..core.text import pluralise
 from ..core.units import DEG

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..calibration.evaluation import Evaluation
 from ..calibration.left_out import CrossValidation, LeftOut
-from ..calibration.observation_residuals import distances_of, rms
+from ..calibration.pose_residuals import distances_of, rms
 from ..data.capture import Capture
 from ..model.metrics import pose_outliers
 from ..summaries.tables import METRICS

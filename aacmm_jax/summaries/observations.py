@@ -6,7 +6,7 @@ import numpy as np
 
 from ..calibration.contradictions import session_metrics
 from ..calibration.evaluation import Evaluation
-from ..calibration.observation_residuals import (
+from ..calibration.pose_residuals import (
     ObservationResiduals,
     distances_of,
     observation_residuals,

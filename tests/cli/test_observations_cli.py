@@ -1,5 +1,7 @@
 """The command line with observations: import, calibrate, robust losses, sessions, random parts, and refusals."""
 
+import contextlib
+import io
 import json
 
 import numpy as np
@@ -96,6 +98,28 @@ def test_a_tracker_and_a_sphere(aacmm, folder, tmp_path):
     ]
     assert parts["radius of ball"]["certified"] == pytest.approx([25], abs=0.01)
     assert parts["radius of ball"]["certified_u"] == [0.0005]
+
+
+def test_names_of_points_are_shown_as_they_are(aacmm, folder, observed_record):
+    """Brackets are markup for the terminal's library."""
+    from aacmm_jax.cli import calibration_display
+    from aacmm_jax.summaries.calibration import calibration_summary
+
+    capture = observed_record.recording.capture
+    points = {"[b]near": [0, 0, 0], "[red]far": [300, 0, 0]}
+    bar = kinds.Artefact("[i]bar", points, {name: capture.q[:2] + i for i, name in enumerate(points)}, u=0.001)
+    recording = observed_record.recording._replace(capture=aj.Capture({}, [], [bar]))
+    aj.files.save_capture(folder / "names.h5", recording)
+    shown = aacmm("show", folder / "names.h5").stdout
+    for part in ("[i]bar", "placement [i]bar", "coordinates of [b]near (0.0000", "coordinates of [red]far (300.0000"):
+        assert part in " ".join(shown.split())
+    summary = calibration_summary(observed_record)
+    for row in summary["geometry"]:
+        for quantity in row["quantities"]:
+            quantity["quantity"] = f"[b]{quantity['quantity']}"
+    with contextlib.redirect_stdout(io.StringIO()) as written:
+        calibration_display.calibration(summary)
+    assert "[b]normal" in written.getvalue()
 
 
 def test_a_robust_loss_lists_what_lost_weight(aacmm, folder, tmp_path):

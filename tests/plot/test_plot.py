@@ -61,7 +61,7 @@ FIGURES = [
 )
 def test_residuals_of_observations(observed_record, unit, count):
     """Every pose once, by kind, those that lost weight with a ring, and a legend outside the axes."""
-    axes = aj.plot.residuals(observed_record, unit)
+    axes = aj.plot.residuals_by_kind(observed_record, unit)
     labels = [line.get_label() for line in axes.lines]
     lines = dict(zip(labels, axes.lines, strict=True))
     kinds = ["socket", "transforms", "sphere", "parallel planes", "artefact"] if unit != "deg" else ["transforms"]
@@ -133,9 +133,9 @@ def test_an_arm_is_drawn_in_space(record):
     ("call", "said"),
     [
         (lambda record: aj.plot.parameter_changes(record, "lengths"), "length or angle"),
-        (lambda record: aj.plot.residuals(record, "um"), "mm, standard deviations or deg"),
-        (lambda record: aj.plot.residuals(record), "no observations besides sockets"),
-        (lambda record: aj.plot.residuals(record, "deg"), "no orientations"),
+        (lambda record: aj.plot.residuals_by_kind(record, "um"), "mm, standard deviations or deg"),
+        (lambda record: aj.plot.residuals_by_kind(record), "no observations besides sockets"),
+        (lambda record: aj.plot.residuals_by_kind(record, "deg"), "no orientations"),
         (
             lambda record: aj.plot.acceptance_metrics(aj.acceptance.run(aj.acceptance.Measured({"A": np.eye(3)}))),
             "no metric has a limit",
