@@ -274,9 +274,10 @@ class AbstractSimulated(eqx.Module):
     def __check_init__(self) -> None:
         checked_name(self.name, "an observation to simulate")
         for field in dataclasses.fields(self):
-            value, what = getattr(self, field.name), f"{field.name} of '{self.name}'"
+            value: Any = getattr(self, field.name)
+            what = f"{field.name} of '{self.name}'"
             kinds = get_args(field.type) if isinstance(field.type, UnionType) else (field.type,)
-            if value is None and NoneType in kinds:
+            if NoneType in kinds and getattr(self, field.name) is None:
                 continue
             if bool in kinds:
                 truth_value(value, what)
