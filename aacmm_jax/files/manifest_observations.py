@@ -211,8 +211,10 @@ class _Reader:
         chosen = {key: [x] if isinstance(x, str | int) else x for key, x in table.columns.items()}
         for key, choices in self._preset.columns.items():
             # A preset may name more than a kind needs, or than a table has.
+            if key not in self._entries or key in chosen or getattr(table, key, None) is not None:
+                continue
             there = next((wanted for wanted in choices if text.has(wanted)), None)
-            if key in self._entries and key not in chosen and getattr(table, key, None) is None and there is not None:
+            if there is not None:
                 chosen[key] = there
         found: dict[str, Any] = {}
         if label:

@@ -97,10 +97,20 @@ class TextTable:
             self._rows.append((where, cells))
         if not self._rows:
             raise InputError(f"{path} holds no numbers; give one line a pose.")
+        self._title = self._header  # a line of words that does not name the columns
+        if len(self._header) != len(self._rows[0][1]):
+            self._header = []
 
     def has(self, wanted: Sequence[Column]) -> bool:
-        """Whether every one of these columns is there."""
-        return all(bool(self._matching(column)) for column in wanted)
+        """Whether these columns are there. Raises `InputError` where only some of them are."""
+        missing = [column for column in wanted if not self._matching(column)]
+        if missing and len(missing) < len(wanted):
+            others = shorten([str(column) for column in wanted if column not in missing])
+            raise InputError(
+                f"{self._path} has no column {quoted(str(missing[0]))}, but columns {others}; correct its header, or "
+                "pick the columns by number."
+            )
+        return not missing
 
     def _matching(self, column: Column) -> list[int]:
         if isinstance(column, int):
@@ -131,7 +141,14 @@ class TextTable:
             if not indices and isinstance(column, int):
                 raise InputError(f"{self._path} has {len(self._rows[0][1])} columns, so there is no column {column}.")
             if not indices and isinstance(column, str):
-                known = f"{nearest(column, self._header)}" if self._header else "; it has no header: give numbers."
+                known = "; it has no header: give numbers."
+                if self._header:
+                    known = nearest(column, self._header)
+                elif self._title:
+                    known = (
+                        f": its header has {len(self._title)} names, but its rows {len(self._rows[0][1])} columns; "
+                        "correct the header, or give numbers."
+                    )
                 raise InputError(f"{self._path} has no column {quoted(column)}{known}")
             found += indices
         if len(set(found)) < len(found):

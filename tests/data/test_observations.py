@@ -1,5 +1,8 @@
 """Every kind of observation: derivatives of its residuals, its start, and what it refuses."""
 
+import doctest
+import sys
+
 import jax
 import numpy as np
 import pytest
@@ -249,3 +252,10 @@ def test_touches_that_leave_a_geometry_open(observation, tips, message):
     with pytest.raises(aj.InputError, match=message) as caught:
         observation.check_determined(tips)
     assert "touch it" in str(caught.value)
+
+
+@pytest.mark.parametrize("module", [kinds, sys.modules[kinds.Cylinder.__module__]], ids=lambda module: module.__name__)
+def test_examples_of_docstrings(module):
+    found = doctest.testmod(module)
+    assert found.attempted > 2
+    assert found.failed == 0

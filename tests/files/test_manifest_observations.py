@@ -296,6 +296,20 @@ def test_bad_rotations(tmp_path, text, parts):
     assert_refused(lambda: read(tmp_path, table), tmp_path / "capture.toml", *parts)
 
 
+@pytest.mark.parametrize(
+    ("header", "parts"),
+    [
+        (NAMES[:11], ["no column 'q?': its header has 11 names, but its rows 12 columns", "or give numbers"]),
+        (None, ["no column 'q?'; it has no header: give numbers"]),
+        ([*NAMES[:9], "u_x", "U95 Y", "U(95) Z"], ["no column 'U*95* X', but columns U*95* Y, U*95* Z; correct its"]),
+    ],
+)
+def test_bad_headers(tmp_path, header, parts):
+    write(tmp_path / "a.csv", np.hstack([Q, P, U]), header=header)
+    columns = 'preset = "leica"\ncolumns = { q = "q?" }\n'
+    assert_refused(lambda: read(tmp_path, f'[[points]]\nfile = "a.csv"\n{columns}'), tmp_path / "a.csv", *parts)
+
+
 def test_bad_cells(tmp_path):
     rows = np.hstack([Q, P, U]).tolist()
     rows[2][7] = "n/a"
