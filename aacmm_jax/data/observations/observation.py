@@ -259,12 +259,12 @@ def as_numbers(values: Any) -> np.ndarray:
 class AbstractSimulated(eqx.Module):
     """An observation to simulate: the true geometry, where the tip goes, and what is then recorded.
 
-    ``poses`` is the number of poses, of each place where there are several (points of an artefact, two planes).
+    Every kind has a field ``poses``: the number of poses, of each place where there are several (points of an artefact,
+    two planes).
     """
 
     table: ClassVar[str]  # name of its tables in the file of a kit
     name: eqx.AbstractVar[str]
-    poses: eqx.AbstractVar[int]
 
     @property
     def offset(self) -> Float[np.ndarray, " 3"] | None:
