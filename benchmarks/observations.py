@@ -1,8 +1,8 @@
 """Calibrations from observations of all kinds: coverage of 95 % intervals by kind and pair, platforms, throughput.
 
-``python benchmarks/observations.py coverage [KIND ...] [--pairs] [--trials 2000]``, ``python
-benchmarks/observations.py platform`` (one ball bar on an indexed platform against one alone) and ``python
-benchmarks/observations.py throughput [--rounds 5]`` print a line for each measurement and write
+``python benchmarks/observations.py coverage [KIND ...] [--pairs] [--trials 2000]`` (with two kinds, that pair),
+``python benchmarks/observations.py platform`` (one ball bar on an indexed platform against one alone) and
+``python benchmarks/observations.py throughput [--rounds 5]`` print a line for each measurement and write
 ``results/observations-DATE-PART.json``.
 """
 
@@ -330,8 +330,12 @@ def main() -> None:
 
 
 def write(given: argparse.Namespace, found: Any, part: str) -> None:
-    """Store what was measured."""
+    """Store what was measured; of coverage beside what was measured before on the same day, so that it can be done in
+    parts."""
     path = given.results / f"observations-{datetime.date.today()}-{part}.json"
+    if part.startswith("coverage") and path.exists():
+        new = {(row["kinds"], row["noise"]) for row in found}
+        found = [row for row in json.loads(path.read_text()) if (row["kinds"], row["noise"]) not in new] + found
     path.write_text(json.dumps(found, indent=1) + "\n")
 
 

@@ -33,13 +33,13 @@ def test_no_command_overwrites_an_earlier_result():
 
 
 def test_study_is_read(tmp_path):
-    (tmp_path / "study.toml").write_text(blocks("toml")[4])
+    (tmp_path / "study.toml").write_text(blocks("toml")[5])
     assert len(aj.study.read_study(tmp_path / "study.toml").cells) == 6
 
 
 def test_administrative_data_is_read(tmp_path):
     # The table of conformity is commented out, because few certificates have one.
-    uncommented = re.sub(r"^# (\[conformity\]|\w+ = )", r"\1", blocks("toml")[3], flags=re.MULTILINE)
+    uncommented = re.sub(r"^# (\[conformity\]|\w+ = )", r"\1", blocks("toml")[4], flags=re.MULTILINE)
     (tmp_path / "laboratory.toml").write_text(uncommented)
     data = aj.files.read_administrative_data(tmp_path / "laboratory.toml")
     # The example has every key.
@@ -63,3 +63,11 @@ def test_the_manifest_is_the_one_of_the_examples(mukca):
 @pytest.mark.parametrize("name", re.findall(r"`(cheng2018-\w+|panda|iiwa14)`", README))
 def test_named_arms_ship(name):
     assert name in aj.files.shipped_arms()
+
+
+def test_the_kit_can_be_read(tmp_path):
+    (tmp_path / "kit.toml").write_text(blocks("toml")[3])
+    assert [(item.simulated.name, item.places) for item in aj.files.read_kit(tmp_path / "kit.toml")] == [
+        ("ball bar", 3),
+        ("tracker", 0),
+    ]

@@ -26,6 +26,7 @@ from .placement import (
     Pool,
     Ranges,
     candidates_of,
+    check_region,
     designed_score,
     moved_pool,
     neighbour,
@@ -222,18 +223,6 @@ def check_plannable(arm: Arm, criterion: str, noise: Noise) -> None:
     if criterion not in OBJECTIVES:
         raise InputError(f"criterion is '{criterion}'; it must be one of {', '.join(OBJECTIVES)}.")
     noise.check(arm.joints)
-
-
-def check_region(ranges: Ranges) -> None:
-    """Raise `InputError` for ranges that are none, or of something else than x, y, z and the distance."""
-    for axis, (low, high) in ranges.items():
-        if not low < high:
-            raise InputError(
-                f"the region's {axis} is {low:g} to {high:g} mm, which is no range; give the lower number first."
-            )
-    unknown = sorted(set(ranges) - {"x", "y", "z", "distance"})
-    if unknown:
-        raise InputError(f"the region has no '{unknown[0]}'; give ranges of x, y, z and distance, in mm.")
 
 
 def _check_counts(sockets: int | Mapping, poses: int, parameters: int, u: float, lengths: Sequence[tuple]) -> None:

@@ -32,13 +32,12 @@ from .design import (
     Prediction,
     Progress,
     check_plannable,
-    check_region,
     design_problem,
     order_of,
 )
 from .fedorov_exchange import Candidates, covariance_of, exchange
 from .kit_placement import KitItem, place, region_of, set_up
-from .placement import PRIOR, DesignProblem, Ranges
+from .placement import PRIOR, DesignProblem, Ranges, check_region
 
 _LEAST_U = 1e-4  # mm: an exact certified value would be a row of infinite weight
 _START_AGREES = 0.1  # mm or rad: a start of the geometry that is farther off is fitted

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -60,8 +60,8 @@ def set_up(region: SearchRegion, simulated: AbstractSimulated, starts: int, shar
     Raises `InputError` where a place is reached from fewer than this ``share`` of the starts, or hardly ever.
     """
     own = region_of(region, simulated)
-    each = max(len(simulated.tips(np.random.default_rng(0))) // simulated.poses, 1)
-    many = dataclasses.replace(simulated, poses=max(starts // each, 2 * _LEAST_CANDIDATES))
+    each = len(_repeated(simulated, 1).tips(np.random.default_rng(0)))
+    many = _repeated(simulated, max(starts // each, 2 * _LEAST_CANDIDATES))
     tips = many.tips(region.random)
     q, good = reached(own, own.draw(len(tips)), tips)
     transforms = np.asarray(own.arm.pose(q)).copy()
@@ -217,7 +217,13 @@ class _Search(NamedTuple):
 
 def _extent(simulated: AbstractSimulated) -> Float[np.ndarray, "m 3"]:
     """Some of the points of a thing, where it stands."""
-    return dataclasses.replace(simulated, poses=20).tips(np.random.default_rng(0))
+    return _repeated(simulated, 20).tips(np.random.default_rng(0))
+
+
+def _repeated(simulated: AbstractSimulated, poses: int) -> AbstractSimulated:
+    """With another number of poses in each place."""
+    changed: Any = simulated
+    return dataclasses.replace(changed, poses=poses)
 
 
 def _about(turn: Rotation, middle: Float[np.ndarray, " 3"], to: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 6"]:

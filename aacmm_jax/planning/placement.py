@@ -188,6 +188,18 @@ def moved_pool(
     return Pool(*(np.concatenate(parts) for parts in zip(kept, moved, strict=True)))
 
 
+def check_region(ranges: Ranges) -> None:
+    """Raise `InputError` for ranges that are none, or of something else than x, y, z and the distance."""
+    for axis, (low, high) in ranges.items():
+        if not low < high:
+            raise InputError(
+                f"the region's {axis} is {low:g} to {high:g} mm, which is no range; give the lower number first."
+            )
+    unknown = sorted(set(ranges) - {"x", "y", "z", "distance"})
+    if unknown:
+        raise InputError(f"the region has no '{unknown[0]}'; give ranges of x, y, z and distance, in mm.")
+
+
 def inside(points: Float[np.ndarray, "... 3"], ranges: Ranges) -> Bool[np.ndarray, "..."]:
     """Which points are within the ranges."""
     values = {"x": points[..., 0], "y": points[..., 1], "z": points[..., 2]}

@@ -96,7 +96,7 @@ def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_
         ({"trials": 0}, "'trials' must be greater than or equal to 1, not 0"),
         ({"trials": 10**8, "bounds": {"length_mm": list(range(101))}}, "101 cells of 100,000,000 trials are more than"),
         ({"seed": -1}, "'seed' must be greater than or equal to 0"),
-        ({"capture": {}}, "give one of positions_mm, sockets .* and file"),
+        ({"capture": {}}, "give one of positions_mm, sockets .* file and kit"),
         ({"capture": {"sockets": 2}}, "sockets at random need a region"),
         ({"capture": {"sockets": 2, "region": {"x_mm": [0, 1]}}}, "a region needs distance_mm, or x_mm, y_mm and z_mm"),
         ({"capture": {"sockets": 2, "region": {"distance_mm": [2, 1]}}}, "2 to 1 is no range"),

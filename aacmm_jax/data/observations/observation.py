@@ -344,12 +344,12 @@ def numbers(what: str, *shape: int) -> Callable[[Any], np.ndarray]:
 class AbstractSimulated(eqx.Module):
     """An observation to simulate: the true geometry, where the tip goes, and what is then recorded.
 
-    ``poses`` is the number of poses, of each place where there are several (points of an artefact, two planes).
+    Every kind has a field ``poses``: the number of poses, of each place where there are several (points of an artefact,
+    two planes).
     """
 
     table: ClassVar[str]  # name of its tables in the file of a kit
     name: eqx.AbstractVar[str]
-    poses: eqx.AbstractVar[int]
 
     def __check_init__(self) -> None:
         checked_name(self.name, "an observation to simulate")
