@@ -521,7 +521,7 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
         (('unit = "um"', 'unit = "um"\ncolumns = [1, 1, 2]'), "1 is given twice"),
         (("reach = 1000", "reech = 1000"), "did you mean 'reach'"),
         (("shoulder = [0, 0, 0]", ""), "reach and shoulder together"),
-        (('name = "{end}"', 'name = "{end}"\ntarget = "ball"'), "target is for manifests of poses"),
+        (('name = "{end}"', 'name = "{end}"\ntarget = "ball"'), "target and session are for manifests of poses"),
     ],
 )
 def test_wrong_manifests_of_points(tmp_path, change, said):

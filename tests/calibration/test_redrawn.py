@@ -119,7 +119,7 @@ def test_what_cannot_be_drawn(paper_arm, bounds, mixed):
     with pytest.raises(aj.InputError, match="knows nothing of the placement plate"):
         aj.monte_carlo(result, singles)
     points = capture.observations[0]
-    twice = kinds.MeasuredPoints("again", points.q, points.points, u=0.01)
+    twice = kinds.MeasuredPoints("again", points.q, points.points + 0.01, u=0.01)
     both = aj.Capture({}, (), [points, twice])
     with pytest.raises(aj.InputError, match="exactly the readings of others"):
         aj.bootstrap(aj.calibrate(paper_arm, both, bounds, noise=NOISE), both)

@@ -52,7 +52,7 @@ def test_what_a_kit_says(tmp_path):
 
 
 def test_every_kind_that_can_be_simulated_has_a_table():
-    known = {"artefact", "touched_sphere", "planes", "points", "transforms", "distances", "socket"}
+    known = {"artefact", "touched_sphere", "touched_cylinder", "planes", "points", "transforms", "distances", "socket"}
     assert set(simulated_kinds()) == known
 
 
@@ -62,7 +62,10 @@ def test_every_kind_that_can_be_simulated_has_a_table():
         ("", ["names nothing", "[[artefact]]"]),
         ('[[bar]]\nname = "b"', ["bar"]),
         (KIT.replace("diameter = 50.0", 'diameter = "50"'), ["touched_sphere", "diameter"]),
-        (KIT.replace("centre = [300, 0, 300]", "centre = [300, 0]"), ["[[touched_sphere]] 'ball'", "do not fit"]),
+        (
+            KIT.replace("centre = [300, 0, 300]", "centre = [300, 0]"),
+            ["[[touched_sphere]] 'ball'", "centre", "(2,); give (3,)"],
+        ),
         (KIT.replace("centre = [300, 0, 300]\n", ""), ["touched_sphere", "centre", "missing"]),
         (KIT.replace('turned = "vertical"', 'turned = "up"'), ["turned"]),
         (KIT.replace("places = 3", "places = -1"), ["places"]),

@@ -60,17 +60,20 @@ def written(tmp_path_factory, observed_record):
 
 def with_hostile_names(record):
     """The same calibration, with a socket and an artefact of another name."""
-    capture, found = record.recording.capture, record.observed
+    capture, found, hostile_bar = record.recording.capture, record.observed, f"bar {HOSTILE}"
     bar = copy.copy(capture.observations[-1])
     for field in ("name", "placement", "artefact"):
-        object.__setattr__(bar, field, HOSTILE)
+        object.__setattr__(bar, field, hostile_bar)
     sockets = {HOSTILE if name == "A" else name: q for name, q in capture.sockets.items()}
     capture = aj.Capture(sockets, [], [*capture.observations[:-1], bar])
-    renamed = {"position of A": f"position of {HOSTILE}", "placement bar": f"placement {HOSTILE}"}
-    renamed["coordinates of bar"] = f"coordinates of {HOSTILE}"
-    geometry = {renamed.get(part, part): values for part, values in found.geometry.items()}
-    names = tuple(HOSTILE if name in ("A", "bar") else name for name in found.names)
-    found = dataclasses.replace(found, names=names, geometry=geometry)
+    renamed = {"position of A": f"position of {HOSTILE}", "placement bar": f"placement {hostile_bar}"}
+    renamed["coordinates of bar"] = f"coordinates of {hostile_bar}"
+    parts = {
+        field: {renamed.get(part, part): values for part, values in getattr(found, field).items()}
+        for field in ("geometry", "geometry_covariance")
+    }
+    names = tuple({"A": HOSTILE, "bar": hostile_bar}.get(name, name) for name in found.names)
+    found = dataclasses.replace(found, names=names, **parts)
     return record._replace(recording=record.recording._replace(capture=capture), observed=found)
 
 

@@ -96,7 +96,7 @@ MISTAKES = [
         "orientations are those of the instrument in the target's frame (six)",
     ),
     ("bar 1, bar 2", "coordinates", lambda x: x / 1000, f"{METRES} (bar 1, bar 2)"),
-    ("sphere, bar 1", "radius", lambda x: x / 1000, f"{METRES} (sphere)"),
+    ("sphere, bar 1", "diameter", lambda x: x / 1000, f"{METRES} (sphere)"),
     ("distances, bar 1", "values", lambda x: x / 1000, f"{METRES} (distances)"),
     ("planes, bar 1", "distance", lambda x: x / 1000, f"{METRES} (planes)"),
 ]

@@ -124,7 +124,7 @@ class Cylinder(AbstractObservation):
         self.free = radius is None or not is_exact(self.u)
 
     @property
-    def radius(self) -> Float[AnyArray, ""] | None:
+    def radius(self) -> Float[AnyArray, "*batch"] | None:
         """Certified distance of the tip's centre from the axis, mm."""
         if self.diameter is None:
             return None

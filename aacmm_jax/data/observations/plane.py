@@ -176,7 +176,7 @@ class ParallelPlanes(AbstractObservation):
         return f"plane {self.name}"
 
     @property
-    def between(self) -> Float[AnyArray, ""]:
+    def between(self) -> Float[AnyArray, "*batch"]:
         """Certified distance of the tip's centres on both planes, mm."""
         return self.distance - self.stylus if self.inside else self.distance + self.stylus
 

@@ -93,7 +93,7 @@ class Sphere(AbstractObservation):
         self.free = self.radius is None or not exact
 
     @property
-    def radius(self) -> Float[AnyArray, ""] | None:
+    def radius(self) -> Float[AnyArray, "*batch"] | None:
         """Certified distance of the tip's centre from the centre, mm."""
         return None if self.diameter is None else (self.diameter + self.stylus) / 2
 
