@@ -192,8 +192,7 @@ def _nominal_and_calibrated(
     if record.robust:
         blocks[0] += " Root mean squares count every pose in full, those too that lost weight."
     if summary["cross_validation"] is not None:
-        assert record.validation is not None
-        blocks += validation_tables(summary["cross_validation"], record.validation)
+        blocks += validation_tables(summary["cross_validation"])
     capture, fixed = record.recording.capture, record.fixed_by_one_length
     if record.observed is not None or record.method == REPEATABILITY:
         del stages["stage1"]  # which is the calibrated arm

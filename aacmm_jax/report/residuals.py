@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..calibration.left_out import CrossValidation, LeftOut
-from ..calibration.pose_residuals import distances_of, rms
+from ..calibration.pose_residuals import distances_of
 from ..data.capture import Capture
 from ..model.metrics import pose_outliers
 from ..summaries.tables import METRICS
@@ -193,36 +192,33 @@ def _pose_table(
     return ReportTable(caption, columns, rows)
 
 
-def validation_tables(summary: Mapping[str, Any], validation: CrossValidation) -> list[ReportTable]:
-    """Cross-validation, pooled and group by group, the group that most exceeds its prediction first."""
+def validation_tables(summary: Mapping[str, Any]) -> list[ReportTable]:
+    """Cross-validation, pooled and group by group, the most improbable group first."""
     pooled = [
         [text_cell(title), number_cell(summary[value]), number_cell(summary[predicted])]
         for title, value, predicted in (
             ("RMS distance of poses from their socket's centroid or geometry", "rms_mm", "rms_predicted_mm"),
             ("RMS error of reference lengths", "length_error_rms_mm", "length_u_mm"),
         )
-        if np.isfinite(summary[value])
+        if summary[value] is not None
     ]
-    count, rows = len(validation.groups), sorted(map(_held_out, validation.groups), key=lambda pair: pair[0])
-    caption = f"Cross-validated: each of {count} placements held out once [mm]"
-    columns = ("group held out", "poses", "RMS distance", "predicted", "found / predicted", "RMS length error", "u")
+    columns = ("group held out", "poses", "RMS distance", "predicted", "RMS length error", "u", "by chance [%]", "")
+    caption = f"Cross-validated: each of {summary['groups']} groups held out once [mm]"
+    tables = [ReportTable(caption, ("", "found", "predicted by u"), pooled)]
+    # Files of earlier versions have no groups.
+    if rows := summary.get("left_out"):
+        tables.append(ReportTable("Groups held out [mm]", columns, [_held_out(row) for row in rows]))
+    return tables
+
+
+def _held_out(row: Mapping[str, Any]) -> list[Cell]:
+    chance = row["probability"]
     return [
-        ReportTable(caption, ("", "found", "predicted by u"), pooled),
-        ReportTable("Groups held out [mm]", columns, [row for _, row in rows]),
-    ]
-
-
-def _held_out(group: LeftOut) -> tuple[float, list[Cell]]:
-    """What a group is sorted by, and its row."""
-    ratio = group.rms / group.rms_predicted if group.rms_predicted > 0 else np.nan
-    lengths = (rms(np.asarray(values)) for values in (group.length_error, group.length_u))
-    values = (group.rms, group.rms_predicted)
-    return -ratio if np.isfinite(ratio) else 0.0, [
-        text_cell(", ".join(group.sockets)),
-        number_cell(group.poses, 0),
-        *map(number_cell, values),
-        number_cell(ratio, 2),
-        *map(number_cell, lengths),
+        text_cell(row["group"]),
+        number_cell(row["poses"], 0),
+        *(number_cell(row[key]) for key in ("rms_mm", "rms_predicted_mm", "length_error_rms_mm", "length_u_mm")),
+        number_cell(None if chance is None else 100 * chance, 2),
+        text_cell("disagrees" if row["disagrees"] else ""),
     ]
 
 

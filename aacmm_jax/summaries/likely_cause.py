@@ -16,13 +16,8 @@ from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
 from ..core.units import DEG, INCH, UM, M
 from ..data.capture import Capture
-from ..data.observations.artefact import Artefact
-from ..data.observations.distances import Distances
-from ..data.observations.measured_points import MeasuredPoints
 from ..data.observations.measured_transforms import MeasuredTransforms
 from ..data.observations.observation import AbstractObservation
-from ..data.observations.plane import ParallelPlanes
-from ..data.observations.sphere import Sphere
 from ..kinematics.arm import Arm
 from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Parameters
@@ -36,15 +31,6 @@ _NOMINAL = 0.005  # of the arm's size: a smaller residual is what a nominal arm 
 _POSES, _OBSERVATIONS = 60, 24  # of which as many as these are looked at
 _TURN = 2 * np.pi * 1.02  # rad; readings of few joints go further
 _ROUNDS = 4  # Gauss-Newton steps of the geometry
-# Coordinates, radii and distances that a kind measured.
-_MEASURED: dict[type[AbstractObservation], str] = {
-    MeasuredPoints: "points",
-    MeasuredTransforms: "points",
-    Artefact: "coordinates",
-    ParallelPlanes: "distance",
-    Distances: "values",
-    Sphere: "radius",
-}
 _UNITS = {
     "measured values in m are taken for mm": M,
     "measured values in cm are taken for mm": 10.0,
@@ -129,7 +115,7 @@ class _OfObservations(NamedTuple):
     def corrections(self) -> Iterator[_Tried]:
         q, observations = np.asarray(self.observed.q), self.observed.observations
         yield from _readings(q)
-        concerned = [i for i, one in enumerate(observations) if type(one) in _MEASURED]
+        concerned = [i for i, one in enumerate(observations) if _measured_field(one) is not None]
         alike: dict[tuple[str, str], list[int]] = {}
         for i in concerned:
             for label in ("kind", "station", "artefact"):
@@ -215,13 +201,21 @@ def _readings(q: Float[np.ndarray, "M n"]) -> Iterator[_Tried]:
         yield _Tried("readings in degrees are taken for radians", q * DEG)
 
 
+def _measured_field(observation: AbstractObservation) -> str | None:
+    """Name of the coordinates, distances or sizes in mm that were measured or certified, where there are any."""
+    for entry in observation.entries:
+        measured = bool(entry.uncertainty) or (entry.required and bool(entry.dimensions))
+        if entry.unit == "mm" and measured and getattr(observation, entry.name) is not None:
+            return entry.name
+    return None
+
+
 def _measured(observation: AbstractObservation) -> Iterator[tuple[str, AbstractObservation]]:
     """Corrections of what one observation measured."""
-    name = _MEASURED[type(observation)]
-    values = getattr(observation, name)
-    if values is None:
+    name = _measured_field(observation)
+    if name is None:
         return
-    values = np.asarray(values)
+    values = np.asarray(getattr(observation, name))
 
     def changed(new: np.ndarray, field: str = name) -> Any:
         return eqx.tree_at(lambda o: getattr(o, field), observation, new)

@@ -282,20 +282,20 @@ def test_a_report_of_observations_by_kind_observation_and_pose(observed_record):
 
 
 def test_groups_held_out_are_listed_one_by_one_the_worst_first(written):
-    from aacmm_jax.calibration.results import CrossValidation, LeftOut
+    from aacmm_jax.calibration.left_out import CrossValidation, LeftOut
     from aacmm_jax.report.calibration import calibration_report
 
     def left_out(name, rms, predicted):
-        return LeftOut((name, f"{name}2"), 10, rms, predicted, np.array([0.03, -0.04]), np.array([0.01, 0.01]), True)
+        return LeftOut((name, f"{name}2"), 10, rms, predicted, np.array([0.03, -0.04]), np.array([0.1, 0.1]), True)
 
-    groups = left_out("low", 0.2, 0.2), left_out("high", 1.17, 0.31), left_out("far", 0.2, 0.2)
-    validation = CrossValidation((*groups, left_out("open", 0.2, np.inf)))
-    tables = tables_of(calibration_report(written.record._replace(validation=validation))[0])
+    groups = left_out("low", 0.2, 0.2), left_out("high", 1.17, 0.31), left_out("open", 0.2, np.inf)
+    tables = tables_of(calibration_report(written.record._replace(validation=CrossValidation(groups)))[0])
     rows = tables["Groups held out [mm]"].rows
-    assert [row[0].text for row in rows] == ["high, high2", "low, low2", "far, far2", "open, open2"]
-    assert [cell.value for cell in rows[0][1:5]] == pytest.approx([10, 1.17, 0.31, 1.17 / 0.31])
-    assert rows[0][5].value == pytest.approx(0.025 * math.sqrt(2))
-    assert rows[3][3].text == "not determined"
+    assert rows[0][0].text.startswith("high")
+    assert [cell.value for cell in rows[0][1:5]] == pytest.approx([10, 1.17, 0.31, 0.025 * math.sqrt(2)])
+    assert [row[-1].text for row in rows] == ["disagrees", "", ""]
+    (unknown,) = (row for row in rows if row[0].text.startswith("open"))
+    assert unknown[3].text == "–"
 
 
 def test_a_report_says_where_the_scale_comes_from(observed_record):
