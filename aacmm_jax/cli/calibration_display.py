@@ -36,6 +36,8 @@ def arm(summary: dict[str, Any]) -> None:
     console.print(
         f"Probe {', '.join(formatted(x) for x in summary['probe_mm'])} mm. Fixed: {', '.join(summary['held'])}."
     )
+    if summary["urdf"] is not None:
+        console.print(escape(f"From a URDF: {summary['urdf']['base']} to {summary['urdf']['tip']}."))
 
 
 def capture(summary: dict[str, Any]) -> None:

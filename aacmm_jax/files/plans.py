@@ -13,6 +13,7 @@ from ..acceptance.procedure_items import ProcedureItem
 from ..acceptance.standards import PLANNED
 from ..core.units import DEG
 from ..kinematics.arm import Arm
+from ..kinematics.parameters import UrdfSource
 from ..planning.design import Plan
 from .atomic_write import write_text
 
@@ -42,10 +43,14 @@ def plan_csv(plan: Plan) -> str:
     )
 
 
-def plan_manifest(plan: Plan, arm: str) -> str:
-    """A manifest for the readings of a planned calibration, in which the calibrated lengths are to be filled in."""
+def plan_manifest(plan: Plan, arm: str, urdf: UrdfSource | None = None) -> str:
+    """A manifest for the readings of a planned calibration, in which the calibrated lengths are to be filled in.
+
+    ``urdf``: where the arm is a URDF, its links.
+    """
     lines = _manifest_start(
         arm,
+        urdf,
         "# A calibration, as planned. Fill in the calibrated lengths and uncertainties (k = 1), record a file for each",
         "# socket (one row a pose, in the order of the plan), then: aacmm import THIS.toml -o capture.h5",
     )
@@ -63,10 +68,11 @@ def plan_manifest(plan: Plan, arm: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _manifest_start(arm: str, *comments: str) -> list[str]:
+def _manifest_start(arm: str, urdf: UrdfSource | None, *comments: str) -> list[str]:
     """The first lines of a manifest of readings in degrees."""
     date = "# date = 2026-01-31   # when it was recorded"
-    return [*comments, f"arm = {_quoted(arm)}", date, "", "[angles]", 'unit = "deg"']
+    links = [] if urdf is None else [f"base = {_quoted(urdf.base)}", f"tip = {_quoted(urdf.tip)}"]
+    return [*comments, f"arm = {_quoted(arm)}", *links, date, "", "[angles]", 'unit = "deg"']
 
 
 def procedure_csv(procedure: Procedure) -> str:
@@ -101,10 +107,14 @@ def file_of(procedure: Procedure, item: ProcedureItem) -> str:
     return f"{item.name}/{item.test.replace(' ', '-')}" + (f"-{item.group}" if several else "") + ".csv"
 
 
-def procedure_manifest(procedure: Procedure, arm: str) -> str:
-    """A manifest for the readings of an acceptance test, in which the calibrated values are to be filled in."""
+def procedure_manifest(procedure: Procedure, arm: str, urdf: UrdfSource | None = None) -> str:
+    """A manifest for the readings of an acceptance test, in which the calibrated values are to be filled in.
+
+    ``urdf``: where the arm is a URDF, its links.
+    """
     lines = _manifest_start(
         arm,
+        urdf,
         f"# {PLANNED[procedure.standard]}, as planned. Fill in the calibrated values and uncertainties (k = 1) of your",
         "# artefacts, record a file for each socket and each group of touches (one row a pose, in the order of the",
         "# plan), then: aacmm import THIS.toml -o acceptance.h5",

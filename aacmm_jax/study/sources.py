@@ -9,7 +9,7 @@ from typing import Any
 from ..core.errors import InputError, nearest
 from ..data.capture import Capture, check_sockets_only
 from ..data.recording import Recording
-from ..files.arms import load_specification
+from ..files.arms import arm_beside, load_specification
 from ..files.atomic_write import storable
 from ..files.captures import load_capture
 from ..files.outputs import as_path
@@ -118,11 +118,6 @@ def _study_of_file(path: Path) -> Study:
             check_sockets_only(recording.capture, "a study")
         if recording is not None and not specification.arm:
             return Study(specification, recording.nominal, recording)
-        return Study(specification, _arm(path.parent, specification.arm), recording)
+        return Study(specification, load_specification(arm_beside(path.parent, specification.arm)), recording)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-
-
-def _arm(folder: Path, name: str) -> ArmSpecification:
-    neighbour = folder / name
-    return load_specification(neighbour if name.endswith(".toml") or os.path.isfile(neighbour) else name)
