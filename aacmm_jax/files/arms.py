@@ -125,7 +125,8 @@ def load_arm(
     """The arm of a file.
 
     A table whose nearly parallel axes have frames more than 10 m away, as those of Universal Robots, gets d = 0 and
-    Hayati's beta there, which changes no position (`kinematics.without_far_frames`).
+    Hayati's beta there, which changes no position (`kinematics.without_far_frames`); unless the file proposes an
+    identification, whose names are of the table's own parameters.
 
     The position of an arm from a URDF is in the frame of its base link where the first axis is that frame's z axis,
     and in the first D-H frame otherwise (`files.urdf_chain` has the transform); readings are the URDF's joint values.
@@ -249,7 +250,8 @@ def _arm_of_rows(model: _ArmModel, length: float, angle: float) -> Arm:
         limits=None if rows[0].limits is None else [[angle * x for x in row.limits or ()] for row in rows],
     )
     far = any(abs(float(arm.d[i - 1])) > _FAR for i in nearly_parallel(arm))
-    return without_far_frames(arm) if far else arm
+    # A proposed identification names parameters as the table has them.
+    return without_far_frames(arm) if far and model.identification is None else arm
 
 
 def _chosen(specification: ArmSpecification) -> ArmSpecification:

@@ -71,8 +71,9 @@ def dh_table(arm: Arm, *, convention: str = "standard", units: str = "mm-deg", b
 def zero_offsets(nominal: Arm, calibrated: Arm, q: Float[np.ndarray, "N n"]) -> ZeroOffsets:
     """The restriction of a calibration to zero offsets, for controllers that take nothing else.
 
-    Offsets and probe minimise the distance of the nominal arm's tips from the calibrated arm's over the readings; of
-    what these do not determine, the smallest. The rest of the calibration remains as an error.
+    Offsets and probe minimise the distance of the nominal arm's tips from the calibrated arm's over the readings. The
+    change is the smallest that does: a rotation about the last axis is one of the probe, too. The rest of the
+    calibration remains as an error.
 
     Args:
         nominal: The arm that the controller has.
