@@ -57,7 +57,9 @@ def test_show_and_links(aacmm, robot):
     assert "--base and --tip are links of a URDF" in aacmm("show", "robot.h5", "--tip", "x", expect=2).stderr
 
 
+@pytest.mark.slow
 def test_a_plan_names_the_links(aacmm, tmp_path, robot):
+    """Also where the identification frees a beta that the arm has not had."""
     aacmm("plan", "robot.urdf", "--tip", "tool0", *SOCKETS[:4], "--length", "A,B,0.002", "--poses", "20",
           "--candidates", "100", "-o", "plan.csv", "--manifest", "plan.toml")  # fmt: skip
     text = (tmp_path / "plan.toml").read_text()
