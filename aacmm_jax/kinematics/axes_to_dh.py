@@ -144,9 +144,10 @@ def calibrated_frames(
         frame = after[i] @ turn @ inverse(before[i]) @ was
         point, axis = after[i][:3, 3], after[i][:3, 2]
         frame[:3, 3] = point + ((expected[:3, 3] - point) @ axis) * axis
-        relative = origin if same_transform(frame, expected) else inverse(now) @ frame
-        now = now @ relative
-        found.append(relative)
+        unchanged = same_transform(frame, expected)
+        found.append(origin if unchanged else inverse(now) @ frame)
+        # Not the product with what was found: an inverse by transposition doubles the rounding from joint to joint.
+        now = expected if unchanged else frame
     return found
 
 
