@@ -35,6 +35,7 @@ _JOINTS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 _COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
 _DH = ("dh_theta", "dh_a", "dh_d", "dh_alpha")
 _LIMITS = (-2 * math.pi, 2 * math.pi)  # of every joint of these robots
+_LARGEST = 1e5  # m and rad: frames on nearly parallel axes are hundreds of metres away
 _LINE = re.compile(r"( *)([\w-]+) *:(?: +([^#]*?))?\s*(?:#.*)?")
 
 
@@ -124,8 +125,10 @@ def _of_parameters(entries: dict[str, str]) -> Geometry:
             rows.append([number(part) for part in parts])
         except ValueError as error:
             raise InputError(f"'{name}' is {quoted(entries[name])}; give six numbers.") from error
-        if len(parts) != len(_JOINTS) or not np.all(np.isfinite(rows[-1])):
+        if len(parts) != len(_JOINTS):
             raise InputError(f"'{name}' has {len(parts)} entries; give six numbers.")
+        if not np.all(np.abs(rows[-1]) < _LARGEST):
+            raise InputError(f"'{name}' is {quoted(entries[name])}; give finite numbers below {_LARGEST:g}, m and rad.")
     theta, a, d, alpha = np.array(rows)
     return Geometry(alpha, 1000 * a, 1000 * d, theta, None, np.zeros(3))
 
@@ -137,8 +140,8 @@ def _number(entries: dict[str, str], name: str) -> float:
         value = number(entries[name])
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
-        raise InputError(f"'{name}' is {quoted(entries[name])}; give a number.")
+    if not abs(value) < _LARGEST:
+        raise InputError(f"'{name}' is {quoted(entries[name])}; give a finite number below {_LARGEST:g}, m or rad.")
     return value
 
 

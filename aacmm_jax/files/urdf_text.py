@@ -20,6 +20,7 @@ from ..kinematics.axes_to_dh import Transform
 
 _MOST_CHARACTERS = 20_000_000  # the largest robots of public collections have a twentieth of it
 _DEEPEST = 64  # levels of elements; a URDF has six
+_LARGEST = 1e6  # m and rad, of positions, angles and directions
 _METRE = 1000.0  # mm
 
 
@@ -262,6 +263,8 @@ def _numbers(element: _Element, name: str, what: str, default: tuple[float, ...]
         values = np.array([number(part) for part in text.split()])
     except ValueError:
         values = np.array([])
+    if len(default) == 3 and not np.all(np.abs(values) < _LARGEST):  # limits may be as large as one likes
+        raise InputError(f"line {element.line}: {name} of {what} is {quoted(text)}; it must be below {_LARGEST:g}.")
     if len(values) != len(default) or not np.all(np.isfinite(values)):
         wanted = "a number" if len(default) == 1 else f"{len(default)} numbers"
         raise InputError(f"line {element.line}: {name} of {what} is {quoted(text)}; it must be {wanted}.")

@@ -55,6 +55,22 @@ diameter = 25.0004
 u = 0.0005
 stylus = 6.0
 """
+URDF = """<robot name="two">
+  <link name="base"/>
+  <joint name="one" type="revolute">
+    <parent link="base"/><child link="upper"/>
+    <origin xyz="0 0 0.3" rpy="0 0 0.25"/>
+    <axis xyz="0 0 1"/>
+    <limit lower="-2.5" upper="2.75"/>
+  </joint>
+  <link name="upper"/>
+  <joint name="two" type="continuous">
+    <parent link="upper"/><child link="tip"/>
+    <origin xyz="0.5 0 0.125" rpy="-1.5 0 0"/>
+  </joint>
+  <link name="tip"/>
+</robot>
+"""
 STUDY = """name = "Study"
 arm = "arm.toml"
 trials = 10
@@ -102,8 +118,15 @@ def originals(folder: Path) -> dict[str, Callable[[], object]]:
         points = centre * directions / np.linalg.norm(directions, axis=1)[:, None] + [400, 200, 300]
         points += random_numbers.normal(0, 0.01, points.shape)
         (folder / name).write_text("\n".join(";".join(f"{x:.5f}" for x in row) for row in points) + "\n")
-    for name, text in (("m.toml", MANIFEST), ("p.toml", POINTS), ("s.toml", STUDY), ("l.toml", ABOUT)):
+    for name, text in (
+        ("m.toml", MANIFEST),
+        ("p.toml", POINTS),
+        ("s.toml", STUDY),
+        ("l.toml", ABOUT),
+        ("r.urdf", URDF),
+    ):
         (folder / name).write_text(text)
+    (folder / "kinematics.yaml").write_text(aj.files.ur_kinematics_yaml(sample.arm.arm))
     about = aj.files.read_administrative_data(folder / "l.toml")
     (folder / "dcc.xml").write_text(aj.certificate.dcc_xml(sample.record, about, created=MADE))
 
@@ -120,6 +143,8 @@ def originals(folder: Path) -> dict[str, Callable[[], object]]:
         "m.toml": manifest,
         "hole_0.csv": manifest,
         "arm.toml": lambda: aj.files.load_specification(folder / "arm.toml"),
+        "r.urdf": lambda: aj.load_arm(folder / "r.urdf"),
+        "kinematics.yaml": lambda: aj.load_arm(folder / "kinematics.yaml"),
         "p.toml": points_file,
         "points.csv": points_file,
         "s.toml": lambda: aj.study.read_study(folder / "s.toml").specification,

@@ -101,6 +101,7 @@ def test_origins_of_a_published_table(tmp_path):
         (PARAMETERS.replace("dh_a:", "dh_b:"), ["'dh_a' is missing"]),
         (PARAMETERS.replace("439.140974079901", "four"), ["'dh_d' is", "six numbers"]),
         (PARAMETERS.replace("439.140974079901", ""), ["'dh_d' has 5 entries"]),
+        (PARAMETERS.replace("439.140974079901", "1e300"), ["'dh_d' is", "below 100000"]),
         (PARAMETERS + PARAMETERS, ["'dh_theta' is there twice"]),
         ("kinematics: [1, 2\nx y\n", ["line 2 is no 'key: value'"]),
         ("", ["is missing"]),
@@ -115,6 +116,10 @@ def test_other_refusals(tmp_path):
     text = aj.files.ur_kinematics_yaml(direct())
     tilted = text.replace("roll: 0.0", "roll: 0.1", 1)
     assert_refused(lambda: aj.load_arm(file(tmp_path, tilted)), "first axis is not the z axis")
+    huge = text.replace("x: 0.0", "x: 1e300", 1)
+    assert_refused(lambda: aj.load_arm(file(tmp_path, huge)), "'1e300'", "below 100000")
     wrong = text.replace("roll: 0.0", "roll: none", 1)
-    assert_refused(lambda: aj.load_arm(file(tmp_path, wrong)), "'kinematics.shoulder.roll' is 'none'", "give a number")
+    assert_refused(
+        lambda: aj.load_arm(file(tmp_path, wrong)), "'kinematics.shoulder.roll' is 'none'", "give a finite number"
+    )
     assert_refused(lambda: aj.files.ur_kinematics_yaml(aj.load_arm("panda")), "six joints", "has 7")

@@ -215,6 +215,7 @@ REFUSED = {
     "roots": (ISLAND, {"tip": None}, ["2 roots, 'world', 'island'"]),
     "numbers": (('xyz="0.35 0 0.03"', 'xyz="0.35 0"'), {}, ["line ", "joint 'joint_4'", "'0.35 0'", "3 numbers"]),
     "no number": (('xyz="0.35 0 0.03"', 'xyz="a 0 0"'), {}, ["'a 0 0'"]),
+    "huge": (('rpy="0 -1.5708 0"', 'rpy="1e300 0 0"'), {}, ["'1e300 0 0'", "below 1e+06"]),
     "infinite": (('xyz="0.35 0 0.03"', 'xyz="inf 0 0"'), {}, ["'inf 0 0'"]),
     "mass": (('<mass value="3"/>', '<mass value="-3"/>'), {}, ["the mass of link 'upper' is -3 kg"]),
     "no parent": (('<parent link="wrist_1"/>', ""), {}, ["joint 'joint_5' has no <parent"]),
