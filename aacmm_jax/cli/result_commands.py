@@ -331,7 +331,12 @@ def _show_arm(file: str, base: str | None, tip: str | None, as_json: bool) -> No
     from ..summaries.calibration import arm_summary
     from . import calibration_display
 
-    summary = arm_summary(load_specification(file, base=base, tip=tip))
+    specification = load_specification(file, base=base, tip=tip)
+    summary = arm_summary(specification)
+    if specification.urdf is not None:
+        from ..files.urdf import urdf_chain
+
+        summary["urdf"]["first_frame_in_base_mm"] = urdf_chain(specification.urdf).base.tolist()
     show_summary(summary, as_json, calibration_display.arm)
 
 

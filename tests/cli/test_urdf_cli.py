@@ -49,8 +49,12 @@ def test_urdf_to_calibrated_urdf(aacmm, tmp_path, robot):
 
 def test_show_and_links(aacmm, robot):
     shown = json.loads(aacmm("show", "robot.urdf", "--base", "base_link", "--tip", "tool0", "--json").stdout)
-    assert shown["urdf"] == {"base": "base_link", "tip": "tool0"}
-    assert "From a URDF: world to tool0." in aacmm("show", "robot.urdf", "--tip", "tool0").stdout
+    assert (shown["urdf"]["base"], shown["urdf"]["tip"]) == ("base_link", "tool0")
+    np.testing.assert_array_equal(shown["urdf"]["first_frame_in_base_mm"], np.eye(4))
+    said = aacmm("show", "robot.urdf", "--tip", "tool0").stdout
+    assert "From a URDF: world to tool0; positions are in the frame of world." in said
+    said = " ".join(aacmm("show", "robot.urdf", "--base", "shoulder", "--tip", "tool0").stdout.split())
+    assert "in a frame at (50, 0, 100) mm in shoulder, with its z axis along (0, -1, 0)" in said
     assert "name the tip (tip= or --tip)" in aacmm("show", "robot.urdf", expect=2).stderr
     assert "is no URDF" in aacmm("show", "panda", "--tip", "tool0", expect=2).stderr
     robot.rename(robot.with_suffix(".h5"))
