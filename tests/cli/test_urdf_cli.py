@@ -21,7 +21,7 @@ def robot(tmp_path) -> Path:
 
 def test_urdf_to_calibrated_urdf(aacmm, tmp_path, robot):
     noise = ("--encoder-arcsec", "2", "--seating-mm", "0.005", "--deviate-length-mm", "1", "--deviate-angle-deg", "0.1")
-    aacmm("simulate", "robot.urdf", "--tip", "tool0", *SOCKETS, "--poses", "30", *noise, "-o", "capture.h5")
+    aacmm("simulate", "robot.urdf", "--tip", "tool0", *SOCKETS, "--poses", "15", *noise, "-o", "capture.h5")
     robot.unlink()  # the capture holds it
     aacmm("calibrate", "capture.h5", "-o", "calibration.h5")
     said = aacmm("export", "calibration.h5", "-o", "calibrated.urdf").stdout

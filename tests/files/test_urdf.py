@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yourdfpy
 
 import aacmm_jax as aj
 from aacmm_jax.files.urdf import urdf_chain, urdf_of
@@ -12,7 +13,6 @@ from aacmm_jax.kinematics.axes_to_dh import dh_frames, geometry_of
 
 from ..refusals import assert_refused
 
-yourdfpy = pytest.importorskip("yourdfpy")
 FILE = Path(__file__).with_name("six_axis.urdf")
 TEXT = FILE.read_text()
 JOINTS = [f"joint_{i}" for i in range(1, 7)]
