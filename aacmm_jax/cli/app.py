@@ -40,7 +40,23 @@ Without = Annotated[
 CaptureOutput = Annotated[Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Capture to write (HDF5).")]
 
 NominalArm = Annotated[
-    str, typer.Argument(metavar="ARM", help="Nominal arm: a TOML file, or the name of an arm that ships with aacmm.")
+    str,
+    typer.Argument(
+        metavar="ARM",
+        help="Nominal arm: a TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.",
+    ),
+]
+
+BaseLink = Annotated[
+    str | None,
+    typer.Option("--base", metavar="LINK", help="Of a URDF: the link that does not move. Default: its root."),
+]
+
+TipLink = Annotated[
+    str | None,
+    typer.Option(
+        "--tip", metavar="LINK", help="Of a URDF: the link at the end. Default: the only one with no link after it."
+    ),
 ]
 
 EncoderNoise = Annotated[

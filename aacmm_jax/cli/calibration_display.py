@@ -36,6 +36,13 @@ def arm(summary: dict[str, Any]) -> None:
     console.print(
         f"Probe {', '.join(formatted(x) for x in summary['probe_mm'])} mm. Fixed: {', '.join(summary['held'])}."
     )
+    if summary["urdf"] is not None:
+        base, frame = summary["urdf"]["base"], summary["urdf"]["first_frame_in_base_mm"]
+        where = f"in the frame of {base}"
+        if any(x != (row == column) for row, values in enumerate(frame) for column, x in enumerate(values)):
+            z, origin = (", ".join(f"{values[column]:.6g}" for values in frame[:3]) for column in (2, 3))
+            where = f"in a frame at ({origin}) mm in {base}, with its z axis along ({z})"
+        console.print(escape(f"From a URDF: {base} to {summary['urdf']['tip']}; positions are {where}."))
 
 
 def capture(summary: dict[str, Any]) -> None:

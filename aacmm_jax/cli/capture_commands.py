@@ -12,12 +12,14 @@ from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import together
 from .app import (
+    BaseLink,
     CaptureOutput,
     EncoderNoise,
     Json,
     NominalArm,
     ReferenceLengths,
     SeatingNoise,
+    TipLink,
     app,
     bad_option,
     examples,
@@ -90,6 +92,8 @@ def simulate(
             "ISO 10360-12; artefacts have u = 0.001 mm."
         ),
     ] = None,
+    base: BaseLink = None,
+    tip: TipLink = None,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_INTEGER, metavar="N", help="Seed of poses and noise.")] = 0,
     as_json: Json = False,
 ) -> None:
@@ -103,8 +107,9 @@ def simulate(
     from . import calibration_display
 
     with together(output):
-        nominal = load_specification(arm)
-        true = load_specification(true_arm) if true_arm else nominal
+        nominal = load_specification(arm, base=base, tip=tip)
+        links = {"base": base, "tip": tip} if true_arm and true_arm.lower().endswith(".urdf") else {}
+        true = load_specification(true_arm, **links) if true_arm else nominal
         if true.arm.joints != nominal.arm.joints:
             raise InputError(
                 f"the true arm {true_arm} has {true.arm.joints} joints, but {arm} has {nominal.arm.joints}; "

@@ -13,11 +13,13 @@ from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import together
 from .app import (
+    BaseLink,
     EncoderNoise,
     Json,
     NominalArm,
     ReferenceLengths,
     SeatingNoise,
+    TipLink,
     app,
     examples,
     length_option,
@@ -129,6 +131,8 @@ def plan(
             metavar="FILE.toml", help="Manifest to write, for the import of the readings once they are recorded."
         ),
     ] = None,
+    base: BaseLink = None,
+    tip: TipLink = None,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_INTEGER, metavar="N", help="Seed of the random choices.")] = 0,
     as_json: Json = False,
 ) -> None:
@@ -144,7 +148,7 @@ def plan(
     from . import acceptance_display, plan_display
 
     with together(output, manifest):  # refuses outputs that are inputs or cannot be written, before the work
-        specification = load_specification(arm)
+        specification = load_specification(arm, base=base, tip=tip)
     if socket and sockets is not None:
         raise InputError("--sockets has sockets positioned and --socket gives their positions; give one of the two.")
     if length and not socket:
@@ -188,6 +192,7 @@ def plan(
         "check_length": check_length_mm,
         "seed": seed,
     }
+    urdf = specification.urdf if _is_urdf(arm) else None
     if kit is not None:
         from ..files.kits import read_kit
         from ..planning.kit import plan_kit
@@ -196,7 +201,7 @@ def plan(
             things = read_kit(kit)
         with plan_display.progress() as report_progress:
             planned = plan_kit(specification.arm, things, **shared, progress=report_progress)
-        written = _written(output, kit_csv(planned), manifest, lambda name: kit_manifest(planned, name), arm)
+        written = _written(output, kit_csv(planned), manifest, lambda name: kit_manifest(planned, name, urdf), arm)
         summary = kit_plan_summary(planned, specification.name) | {"written": written}
         show_summary(summary, as_json, plan_display.kit_plan)
         return
@@ -210,8 +215,8 @@ def plan(
             **shared,
             progress=report_progress,
         )
-    written = _written(output, plan_csv(found), manifest, lambda name: plan_manifest(found, name), arm)
-    summary = plan_summary(found, specification.name) | {"written": written}
+    written = _written(output, plan_csv(found), manifest, lambda name: plan_manifest(found, name, urdf), arm)
+    summary: dict[str, Any] = plan_summary(found, specification.name) | {"written": written}
     show_summary(summary, as_json, plan_display.plan)
 
 
@@ -224,8 +229,14 @@ def _procedure(
     from ..summaries.planning import procedure_summary
 
     found = with_spinner("Planning", lambda: plan_procedure(specification.arm, standard, **options))
-    written = _written(output, procedure_csv(found), manifest, lambda name: procedure_manifest(found, name), arm)
+    urdf = specification.urdf if _is_urdf(arm) else None
+    written = _written(output, procedure_csv(found), manifest, lambda name: procedure_manifest(found, name, urdf), arm)
     return procedure_summary(found, specification.name) | {"written": written}
+
+
+def _is_urdf(arm: str) -> bool:
+    """Whether a manifest names the links with the arm; an arm file (TOML) names those of its URDF itself."""
+    return arm.lower().endswith(".urdf")
 
 
 def _written(output: Path, poses: str, manifest: Path | None, manifest_text: Callable[[str], str], arm: str) -> str:

@@ -1,6 +1,5 @@
 """What is done with results: ``evaluate``, ``report``, ``export``, ``show``."""
 
-import json
 import math
 import os
 from pathlib import Path
@@ -9,12 +8,18 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ..core.errors import InputError
+from ..core.text import printable
 from ..files.atomic_write import write_text
 from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
 from ..files.sense import check_shown
-from .app import CalibrationFile, Json, Only, Without, app, examples, show_summary, with_spinner
+from .app import BaseLink, CalibrationFile, Json, Only, TipLink, Without, app, examples, show_summary, with_spinner
+from .export_formats import exported
+
+_ARM_SUFFIXES = ("", ".toml", ".urdf", ".xacro", ".yaml", ".yml")
+_FORMATS = {".urdf": "urdf", ".json": "json", ".csv": "csv", ".yaml": "ur", ".yml": "ur", ".py": "python"}
+_OF_ONE_ARM = ("toml", "urdf", "table", "ur", "python")
 
 About = Annotated[
     Path | None,
@@ -196,61 +201,76 @@ def _evaluated_points(
 @app.command(
     epilog=examples(
         "aacmm export calibration.h5 --format toml -o arm.toml",
+        "aacmm export calibration.h5 -o robot.urdf",
+        "aacmm export calibration.h5 --format table --convention craig --units m-rad",
         "aacmm export calibration.h5 --format dcc --about laboratory.toml -o certificate.xml",
     )
 )
 def export(
     calibration: CalibrationFile,
     form: Annotated[
-        Literal["toml", "json", "csv", "dcc"],
+        Literal["toml", "json", "csv", "dcc", "urdf", "table", "offsets", "ur", "python"] | None,
         typer.Option(
             "--format",
-            help="toml: the arm; json: the whole summary; csv: parameters; dcc: Digital Calibration Certificate (XML).",
+            help="toml: the arm; json: the whole summary; csv: parameters; dcc: Digital Calibration Certificate (XML); "
+            "urdf: the URDF of the nominal arm, with calibrated origins; table: D-H table (CSV); offsets: zero offsets "
+            "of the joints alone, refitted; ur: kinematics.yaml of Universal Robots; python: a program that needs only "
+            "NumPy. Default: by the name of the output (.urdf, .json, .csv, .yaml, .py), else toml.",
         ),
-    ] = "toml",
+    ] = None,
     which: Annotated[
         Literal["calibrated", "nominal", "true"] | None,
         typer.Option(
-            "--arm", help="Which arm to write with --format toml; a simulation has a true one. Default: calibrated."
+            "--arm",
+            help="Which arm to write with --format toml, urdf, table, ur or python; a simulation has a true one. "
+            "Default: calibrated.",
         ),
+    ] = None,
+    convention: Annotated[
+        Literal["standard", "craig"] | None, typer.Option(help="Of --format table. Default: standard.")
+    ] = None,
+    units: Annotated[
+        Literal["mm-deg", "m-rad"] | None, typer.Option(help="Of --format table. Default: mm-deg.")
     ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write. Default: standard output.")
     ] = None,
     about: About = None,
 ) -> None:
-    """Write a calibration for other programs."""
-    if about is not None and form != "dcc":
+    """Write a calibration for other programs, for a robot's controller, or into the URDF that it came from."""
+    written_as: str = form or _FORMATS.get("" if output is None else output.suffix.lower(), "toml")
+    if about is not None and written_as != "dcc":
         raise InputError("--about is for certificates; give it with --format dcc.")
-    if which is not None and form != "toml":
-        raise InputError("--arm is for --format toml; leave it out, since the other formats hold all arms.")
-    which = which or "calibrated"
-    from ..files.arms import specification_toml
+    if which is not None and written_as not in _OF_ONE_ARM:
+        raise InputError(
+            f"--arm is for --format {', '.join(_OF_ONE_ARM)}; leave it out, as {written_as} holds what it needs."
+        )
+    if (convention is not None or units is not None) and written_as != "table":
+        raise InputError("--convention and --units are for tables; give them with --format table.")
     from ..files.calibrations import load_calibration
-    from ..summaries.calibration import calibration_summary, parameters_csv
 
     with together(output):
         record = load_calibration(read := InputFile(calibration))
         arms = {"calibrated": record.calibrated, "nominal": record.recording.nominal, "true": record.recording.true}
-        arm = arms[which]
-        if arm is None:
+        specification = arms[which or "calibrated"]
+        if specification is None:
             raise InputError(f"{calibration} is not of a simulation, so it has no true arm; choose another --arm.")
         if not record.converged or record.implausible_residual:
             reason = "the residual is that of no arm; see aacmm show." if record.converged else record.reason
             typer.echo(f"Warning: {calibration} is not a calibration that can be used: {reason}", err=True)
         source = ""
-        if which == "calibrated":
+        if which in (None, "calibrated"):
             scale = "" if math.isnan(record.k) else f", k = {record.k:.8f}"
             source = f"calibrated from {len(record.recording.capture.readings)} poses, {record.method}{scale}"
-        text = {
-            "toml": lambda: specification_toml(arm, source=source),
-            "json": lambda: json.dumps(calibration_summary(record), indent=2) + "\n",
-            "csv": lambda: parameters_csv(record),
-            "dcc": lambda: _certificate(read, record, about),
-        }[form]()
+        if written_as == "dcc":
+            text, notes = _certificate(read, record, about), ()
+        else:
+            text, notes = exported(record, specification, written_as, source, convention, units)
         if output is not None:
             write_text(output, text)
     typer.echo(text, nl=False) if output is None else typer.echo(f"Written: {output}")
+    for note in notes:
+        typer.echo(printable(note), err=output is None)
 
 
 def _certificate(calibration: InputFile, record: Any, about: Path | None) -> str:
@@ -275,20 +295,25 @@ def show(
         str,
         typer.Argument(
             metavar="FILE",
-            help="Capture, calibration, evaluation or study (HDF5), or an arm: a TOML file or a shipped name.",
+            help="Capture, calibration, evaluation or study (HDF5), or an arm: a TOML file, a URDF, a kinematics.yaml "
+            "or a shipped name.",
         ),
     ],
     cell: Annotated[int | None, typer.Option(min=1, metavar="N", help="Of a study: show this cell in full.")] = None,
     figures: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Of a study: write its figures (PNG) to this folder.")
     ] = None,
+    base: BaseLink = None,
+    tip: TipLink = None,
     as_json: Json = False,
 ) -> None:
     """Print the content of a file."""
     path = Path(file)
-    if path.suffix in ("", ".toml") and not (os.path.isfile(path) and path.suffix == ""):
-        _show_arm(file, as_json)
+    if path.suffix in _ARM_SUFFIXES and not (os.path.isfile(path) and path.suffix == ""):
+        _show_arm(file, base, tip, as_json)
         return
+    if base is not None or tip is not None:
+        raise InputError(f"--base and --tip are links of a URDF, and {file} is none; leave them out.")
     attributes, summary = read_summary(path, ("capture", "calibration", "evaluation", "study"))
     kind = attributes["kind"]
     if kind == "study":
@@ -315,12 +340,18 @@ def show(
     show_summary(summary, as_json, display)
 
 
-def _show_arm(file: str, as_json: bool) -> None:
+def _show_arm(file: str, base: str | None, tip: str | None, as_json: bool) -> None:
     from ..files.arms import load_specification
     from ..summaries.calibration import arm_summary
     from . import calibration_display
 
-    show_summary(arm_summary(load_specification(file)), as_json, calibration_display.arm)
+    specification = load_specification(file, base=base, tip=tip)
+    summary = arm_summary(specification)
+    if specification.urdf is not None:
+        from ..files.urdf import urdf_chain
+
+        summary["urdf"]["first_frame_in_base_mm"] = urdf_chain(specification.urdf).base.tolist()
+    show_summary(summary, as_json, calibration_display.arm)
 
 
 def _summary_of(file: Path, kind: str) -> dict[str, Any]:

@@ -88,6 +88,30 @@ def _vector_of_quaternion(quaternion: Float[AnyArray, " 4"]) -> Float[AnyArray, 
     return xp.where(small, 2 / xp.where(small, real, 1.0), 2 * xp.arctan2(size, real) / size) * imaginary
 
 
+def roll_pitch_yaw_matrix(angles: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation Rz(yaw) Ry(pitch) Rx(roll): about the fixed axes x, y and z, as URDF has it; rad."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def roll_pitch_yaw(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
+    """Roll, pitch and yaw of a rotation, rad; the product is exact also where the pitch is a right angle.
+
+    There roll and yaw have the same axis: yaw is then known badly, but roll is that of what yaw and pitch leave.
+    """
+    yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
+    pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[0, 0], matrix[1, 0]))
+    # The second row of what is left is (0, cos roll, -sin roll).
+    side = np.array([-np.sin(yaw), np.cos(yaw), 0.0]) @ matrix
+    return np.array([np.arctan2(-side[2], side[1]), pitch, yaw])
+
+
 def fitted_frame(coordinates: Float[AnyArray, "3 m"], targets: Float[AnyArray, "3 m"]) -> Float[AnyArray, " 6"]:
     """The frame in which points of these coordinates come closest to their targets, in the sense of least squares.
 

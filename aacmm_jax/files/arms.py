@@ -1,4 +1,4 @@
-"""Arms in TOML files, one row per joint, and the arms that ship with the package."""
+"""Arms in TOML files, one row per joint or a URDF, URDF files, and the arms that ship with the package."""
 
 import math
 import os
@@ -9,20 +9,28 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field, FiniteFloat, PositiveFloat, model_validator
 
+from ..core.arrays import Numbers
 from ..core.errors import InputError, nearest
 from ..core.text import printable
 from ..core.units import DEG
 from ..kinematics.arm import Arm
+from ..kinematics.axes_to_dh import without_far_frames
+from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, Parameters, single
 from .atomic_write import storable, write_text
 from .outputs import as_path
 from .toml import Strict, read_toml
+from .ur_kinematics import read_ur_kinematics
+from .urdf import read_urdf
 
 if TYPE_CHECKING:
     from tomlkit import TOMLDocument
 
 _LENGTH_UNITS = {"mm": 1.0, "m": 1000.0}
 _ANGLE_UNITS = {"rad": 1.0, "deg": DEG}
+_ROBOTS = (".urdf", ".xacro")  # the latter for the message that says how to expand it
+_FAR = 10_000.0  # mm: no link is as long, but frames on nearly parallel axes may be as far away
+_OTHER_FORMATS = (*_ROBOTS, ".yaml", ".yml")
 
 
 class _Joint(Strict):
@@ -56,8 +64,19 @@ class _ArmModel(Strict):
     length_unit: Literal["mm", "m"]
     angle_unit: Literal["rad", "deg"]
     probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3, default_factory=lambda: [0.0, 0.0, 0.0])]
-    joint: Annotated[list[_Joint], Field(min_length=1)]
+    joint: list[_Joint] = Field(default_factory=list)
+    urdf: str | None = None  # instead of rows of joints: a URDF beside this file
+    base: str | None = None  # its links
+    tip: str | None = None
     identification: _Identification | None = None
+
+    @model_validator(mode="after")
+    def _one_description(self) -> "_ArmModel":
+        if bool(self.joint) == (self.urdf is not None):
+            raise ValueError("give either joint, one row a joint, or urdf, the name of a URDF file.")
+        if self.urdf is None and (self.base is not None or self.tip is not None):
+            raise ValueError("base and tip are links of a URDF; leave them out, or give urdf.")
+        return self
 
     @model_validator(mode="after")
     def _unit_of_angles(self) -> "_ArmModel":
@@ -81,6 +100,8 @@ class _ArmModel(Strict):
     def _all_or_none(self) -> "_ArmModel":
         if len({joint.limits is None for joint in self.joint}) > 1:
             raise ValueError("limits are given for some joints only; give them for all or for none.")
+        if not self.joint:
+            return self
         first = self.joint[0]
         if self.convention == "craig" and (first.alpha or first.a):
             raise ValueError(
@@ -98,39 +119,79 @@ def shipped_arms() -> tuple[str, ...]:
     return tuple(sorted(item.name.removesuffix(".toml") for item in folder.iterdir() if item.name.endswith(".toml")))
 
 
-def load_arm(source: str | os.PathLike) -> Arm:
+def load_arm(
+    source: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
+) -> Arm:
     """The arm of a file.
 
+    A table whose nearly parallel axes have frames more than 10 m away, as those of Universal Robots, gets d = 0 and
+    Hayati's beta there, which changes no position (`kinematics.without_far_frames`); unless the file proposes an
+    identification, whose names are of the table's own parameters.
+
+    The position of an arm from a URDF is in the frame of its base link where the first axis is that frame's z axis,
+    and in the first D-H frame otherwise (`files.urdf_chain` has the transform); readings are the URDF's joint values.
+
     Args:
-        source: Name of a shipped arm (``"cheng2018-simulation"``), or path of a TOML file.
+        source: Name of a shipped arm (``"cheng2018-simulation"``), or path of a TOML file, a URDF, or a Universal
+            Robots ``kinematics.yaml``.
+        base: Of a URDF: the link that does not move; by default its root.
+        tip: Of a URDF: the link at the end; by default the only one that has no link after it.
+        probe: Of a URDF or ``kinematics.yaml``: a tool's tip ``(3,)`` in the frame of the last link, mm; by default
+            that frame's origin.
 
     Raises:
         InputError: There is neither, or the file is not an arm's.
     """
-    return _read(source, choose=False).arm
+    return _read(source, base, tip, probe, choose=False).arm
 
 
-def load_specification(source: str | os.PathLike) -> ArmSpecification:
-    """The arm of a file with its name and its proposed identification.
+def load_specification(
+    source: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
+) -> ArmSpecification:
+    """The arm of a file with its name, its proposed identification and, of a URDF, what an export needs.
 
     A file without an ``[identification]`` table gets the parameters that thorough data would determine well, of
     `Parameters.independent`, and the default bounds.
 
     Args:
-        source: Name of a shipped arm, or path of a TOML file.
+        source: As of `load_arm`.
+        base: As of `load_arm`.
+        tip: As of `load_arm`.
+        probe: As of `load_arm`.
 
     Raises:
         InputError: There is neither, or the file is not an arm's.
     """
-    return _read(source, choose=True)
+    return _read(source, base, tip, probe, choose=True)
 
 
-def _read(source: str | os.PathLike, *, choose: bool) -> ArmSpecification:
+def arm_beside(folder: Path, arm: str) -> str | Path:
+    """What a file means by the name of an arm: a file beside it, or a shipped arm."""
+    file = folder / arm
+    return file if arm.endswith((".toml", *_OTHER_FORMATS)) or os.path.isfile(file) else arm
+
+
+def _read(
+    source: str | os.PathLike, base: str | None, tip: str | None, probe: Numbers | None, *, choose: bool
+) -> ArmSpecification:
     """``choose``: whether parameters are chosen for a file that proposes none."""
-    if isinstance(source, str) and source in shipped_arms():
+    shipped = isinstance(source, str) and source in shipped_arms()
+    path = as_path(source)
+    suffix = "" if shipped else path.suffix.lower()
+    if suffix not in _ROBOTS and (base is not None or tip is not None):
+        raise InputError(f"{source} is no URDF, so it has no links; leave out base and tip.")
+    if suffix not in _OTHER_FORMATS and probe is not None:
+        raise InputError(f"{source} states the probe itself; change it there, or with arm.replace(probe=...).")
+    if suffix in _OTHER_FORMATS:
+        found = (
+            read_urdf(path, base=base, tip=tip, probe=probe)
+            if suffix in _ROBOTS
+            else read_ur_kinematics(path, probe=probe)
+        )
+        return _chosen(found) if choose else found
+    if shipped:
         with resources.as_file(resources.files("aacmm_jax.files") / "shipped_arms" / f"{source}.toml") as path:
             return _specification(path, choose)
-    path = as_path(source)
     if not os.path.exists(path) and path.suffix != ".toml":
         raise InputError(
             f"'{source}' is neither a file nor an arm that ships with the package{nearest(str(source), shipped_arms())}"
@@ -141,32 +202,17 @@ def _read(source: str | os.PathLike, *, choose: bool) -> ArmSpecification:
 def _specification(path: Path, choose: bool) -> ArmSpecification:
     model = read_toml(path, _ArmModel)
     length, angle = _LENGTH_UNITS[model.length_unit], _ANGLE_UNITS[model.angle_unit]
-    rows = model.joint
-    links = [(row.alpha, row.a) for row in rows]
-    if model.convention == "craig":
-        # Rx(alpha_{i-1}) Tx(a_{i-1}) Rz Tz: the link after joint i is in row i + 1; there is none after the last joint.
-        links = [*links[1:], (0.0, 0.0)]
-    beta = (
-        None
-        if all(row.beta is None for row in rows)
-        else [angle * (0.0 if row.beta is None else row.beta) for row in rows]
-    )
     try:
-        arm = Arm(
-            alpha=[angle * twist for twist, _ in links],
-            a=[length * a for _, a in links],
-            d=[length * row.d for row in rows],
-            theta=[angle * row.theta for row in rows],
-            beta=beta,
-            probe=[length * x for x in model.probe],
-            limits=None if rows[0].limits is None else [[angle * x for x in row.limits or ()] for row in rows],
-        )
-        name, wanted = model.name or path.stem, model.identification
+        if model.urdf is not None:
+            probe = length * np.array(model.probe)
+            found = read_urdf(path.parent / model.urdf, base=model.base, tip=model.tip, probe=probe)
+            found = found._replace(name=model.name or path.stem)
+        else:
+            found = ArmSpecification(_arm_of_rows(model, length, angle), model.name or path.stem)
+        wanted = model.identification
         if wanted is None:
-            return _chosen(arm, name) if choose else ArmSpecification(arm, name)
-        specification = ArmSpecification(
-            arm=arm,
-            name=name,
+            return _chosen(found) if choose else found
+        specification = found._replace(
             held=None if wanted.held is None else tuple(wanted.held),
             free=tuple(wanted.free),
             length=wanted.length * length,
@@ -182,14 +228,40 @@ def _specification(path: Path, choose: bool) -> ArmSpecification:
     return specification
 
 
-def _chosen(arm: Arm, name: str) -> ArmSpecification:
-    """The identification for an arm whose file proposes none."""
+def _arm_of_rows(model: _ArmModel, length: float, angle: float) -> Arm:
+    """The arm of a table of joints; ``length`` and ``angle`` are its units in mm and rad."""
+    rows = model.joint
+    links = [(row.alpha, row.a) for row in rows]
+    if model.convention == "craig":
+        # Rx(alpha_{i-1}) Tx(a_{i-1}) Rz Tz: the link after joint i is in row i + 1; there is none after the last joint.
+        links = [*links[1:], (0.0, 0.0)]
+    beta = (
+        None
+        if all(row.beta is None for row in rows)
+        else [angle * (0.0 if row.beta is None else row.beta) for row in rows]
+    )
+    arm = Arm(
+        alpha=[angle * twist for twist, _ in links],
+        a=[length * a for _, a in links],
+        d=[length * row.d for row in rows],
+        theta=[angle * row.theta for row in rows],
+        beta=beta,
+        probe=[length * x for x in model.probe],
+        limits=None if rows[0].limits is None else [[angle * x for x in row.limits or ()] for row in rows],
+    )
+    far = any(abs(float(arm.d[i - 1])) > _FAR for i in nearly_parallel(arm))
+    # A proposed identification names parameters as the table has them.
+    return without_far_frames(arm) if far and model.identification is None else arm
+
+
+def _chosen(specification: ArmSpecification) -> ArmSpecification:
+    """The same with the identification for an arm whose file proposes none."""
     try:
-        space = Parameters.independent(arm)
+        space = Parameters.independent(specification.arm)
     except InputError:  # an arm of one or two joints, which has one configuration for each position of the tip
-        return ArmSpecification(arm, name)
+        return specification
     held = tuple(name for name in space.held if not name.startswith("beta_"))
-    return ArmSpecification(arm, name, held, free=tuple(name for name in space.names if name.startswith("beta_")))
+    return specification._replace(held=held, free=tuple(name for name in space.names if name.startswith("beta_")))
 
 
 def save_arm(arm: Arm, path: str | os.PathLike, *, name: str = "", source: str = "") -> None:

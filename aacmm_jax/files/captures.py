@@ -1,4 +1,4 @@
-"""Captures in HDF5: poses, reference lengths, other observations, touched spheres, the nominal and the true arm."""
+"""Captures in HDF5: poses, reference lengths, other observations, touched spheres, nominal and true arm, URDF."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from ..data.copies import Repeated
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm
-from ..kinematics.parameters import ArmSpecification, single
+from ..kinematics.parameters import ArmSpecification, UrdfSource, single
 from .hdf5 import (
     Stored,
     Table,
@@ -106,6 +106,8 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
         ),
         "nominal_arm": arm_table(recording.nominal),
     }
+    if recording.nominal.urdf is not None:
+        tables["urdf"] = _urdf_table(recording.nominal.urdf)
     if recording.true is not None:
         tables["true_arm"] = arm_table(recording.true)
     if recording.spheres:
@@ -200,7 +202,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         raise InputError(f"{path}: {error}") from error
     sources = tuple(stored.attributes.get("sources") or ())
     attributes = stored.attributes
-    nominal = specification_of(path, stored, "nominal_arm")
+    nominal = specification_of(path, stored, "nominal_arm")._replace(urdf=_urdf_of(path, stored))
     check_recording(path, stored)
     return Recording(
         capture,
@@ -221,6 +223,23 @@ def _repeated_of(stored: Stored) -> Repeated:
         tuple(zip(poses.get("repeated_sockets", ()), poses.get("repeated_poses", ()), strict=True)),
         tuple(zip(lengths.get("repeated_start", ()), lengths.get("repeated_end", ()), strict=True)),
     )
+
+
+def _urdf_table(source: UrdfSource) -> Table:
+    """The text of the URDF that the nominal arm was read from, so that an export does not need the file."""
+    lines = source.text.splitlines(keepends=True)
+    variables = numbering("urdf_line", len(lines))
+    variables |= columns("urdf_line", text=(lines, "", "line of the URDF, with its end"))
+    return Table(variables, {"base": source.base, "tip": source.tip})
+
+
+def _urdf_of(path: str | os.PathLike, stored: Stored) -> UrdfSource | None:
+    table = stored.tables.get("urdf")
+    if table is None:
+        return None
+    need(path, table, "text", of="entry")
+    attributes = stored.table_attributes["urdf"]
+    return UrdfSource("".join(map(str, table["text"])), attributes["base"], attributes["tip"])
 
 
 def arm_table(specification: ArmSpecification) -> Table:

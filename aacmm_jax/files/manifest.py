@@ -28,7 +28,7 @@ from ..data.observations.observation import AbstractObservation
 from ..data.observations.socket import Socket
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
-from .arms import load_specification
+from .arms import arm_beside, load_specification
 from .inputs import InputFile, fingerprint
 from .manifest_observations import FIELDS, TABLES, Source, observations
 from .manifest_sessions import in_sessions, session_name
@@ -139,6 +139,9 @@ class _Sessions(Strict):
 
 class _Poses(_Recorded):
     arm: str
+    base: str | None = None  # links of a URDF
+    tip: str | None = None
+    probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None  # mm, from the tip link
     acceptance: Standard | Annotated[list[Standard], AfterValidator(each_once)] = Field(default_factory=list)
     angles: _Angles | None = None
     sessions: _Sessions | None = None
@@ -186,6 +189,9 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     ``[sessions] probe = "same"`` says that the probe was not remounted between them.
     ``acceptance`` (jjf, asme, iso, or a list) says for which standards' acceptance procedure the poses were taken.
 
+    ``arm`` is a shipped name, an arm file (TOML), a URDF, or a ``kinematics.yaml``. Of a URDF, ``base`` and ``tip``
+    name the links at the ends of the chain, and ``probe`` is the tool's tip in the tip link's frame, mm.
+
     Args:
         path: the manifest (TOML).
 
@@ -198,7 +204,8 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     path = as_path(path)
     model = read_toml(manifest := InputFile(path), _Manifest)
     try:
-        nominal = load_specification(_arm_source(path, model.arm))
+        arm = arm_beside(path.parent, model.arm)
+        nominal = load_specification(arm, base=model.base, tip=model.tip, probe=model.probe)
         joints, columns = nominal.arm.joints, model.angles.columns if model.angles else None
         if columns is not None and len(columns) != joints:
             raise InputError(
@@ -314,11 +321,6 @@ def recorded(
         sphere = ProbedSphere(entry.name, entry.test, groups, entry.diameter, entry.u, entry.stylus, entry.form)
         spheres.append(checked_sphere(sphere))
     return sockets, _lengths(model.length, fields, sockets), tuple(spheres)
-
-
-def _arm_source(manifest: Path, arm: str) -> str | Path:
-    file = manifest.parent / arm
-    return file if arm.endswith(".toml") or os.path.isfile(file) else arm
 
 
 def _radians(readings: np.ndarray, angles: _Angles) -> np.ndarray:

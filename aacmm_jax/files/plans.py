@@ -15,6 +15,7 @@ from ..core.units import DEG
 from ..data.observations.observation import AbstractObservation, Entry
 from ..data.observations.socket import Socket
 from ..kinematics.arm import Arm
+from ..kinematics.parameters import UrdfSource
 from ..planning.design import Plan
 from ..planning.kit import KitPlan
 from .atomic_write import write_text
@@ -46,10 +47,14 @@ def plan_csv(plan: Plan) -> str:
     )
 
 
-def plan_manifest(plan: Plan, arm: str) -> str:
-    """A manifest for the readings of a planned calibration, in which the calibrated lengths are to be filled in."""
+def plan_manifest(plan: Plan, arm: str, urdf: UrdfSource | None = None) -> str:
+    """A manifest for the readings of a planned calibration, in which the calibrated lengths are to be filled in.
+
+    ``urdf``: where the arm is a URDF, its links.
+    """
     lines = _manifest_start(
         arm,
+        urdf,
         "# A calibration, as planned. Fill in the calibrated lengths and uncertainties (k = 1), record a file for each",
         "# socket (one row a pose, in the order of the plan), then: aacmm import THIS.toml -o capture.h5",
     )
@@ -85,13 +90,15 @@ def _label(observation: AbstractObservation) -> Entry | None:
     return next((e for e in observation.entries if e.content == "text" and e.dimensions == ("pose",)), None)
 
 
-def kit_manifest(plan: KitPlan, arm: str) -> str:
+def kit_manifest(plan: KitPlan, arm: str, urdf: UrdfSource | None = None) -> str:
     """A manifest for the readings of a plan with a kit, in which certified values are to be filled in.
 
     Files hold the joint readings in their first columns and, where something is measured, its numbers in the next.
+    ``urdf`` says the links where the arm is a URDF.
     """
     lines = _manifest_start(
         arm,
+        urdf,
         "# A calibration, as planned. Fill in certified values and uncertainties (k = 1), record the files (one row a",
         "# pose, in the order of the plan: joint readings, then what was measured), then: aacmm import THIS.toml -o",
         "# capture.h5",
@@ -155,11 +162,12 @@ def _largest_u(observation: AbstractObservation) -> float:
     return round(float(np.max(values)), 9)
 
 
-def _manifest_start(arm: str, *comments: str, acceptance: str | None = None) -> list[str]:
+def _manifest_start(arm: str, urdf: UrdfSource | None, *comments: str, acceptance: str | None = None) -> list[str]:
     """The first lines of a manifest of readings in degrees."""
     date = "# date = 2026-01-31   # when it was recorded"
+    links = [] if urdf is None else [f"base = {_quoted(urdf.base)}", f"tip = {_quoted(urdf.tip)}"]
     made_for = [] if acceptance is None else [f"acceptance = {_quoted(acceptance)}"]
-    return [*comments, f"arm = {_quoted(arm)}", *made_for, date, "", "[angles]", 'unit = "deg"']
+    return [*comments, f"arm = {_quoted(arm)}", *links, *made_for, date, "", "[angles]", 'unit = "deg"']
 
 
 def procedure_csv(procedure: Procedure) -> str:
@@ -194,10 +202,14 @@ def file_of(procedure: Procedure, item: ProcedureItem) -> str:
     return f"{item.name}/{item.test.replace(' ', '-')}" + (f"-{item.group}" if several else "") + ".csv"
 
 
-def procedure_manifest(procedure: Procedure, arm: str) -> str:
-    """A manifest for the readings of an acceptance test, in which the calibrated values are to be filled in."""
+def procedure_manifest(procedure: Procedure, arm: str, urdf: UrdfSource | None = None) -> str:
+    """A manifest for the readings of an acceptance test, in which the calibrated values are to be filled in.
+
+    ``urdf``: where the arm is a URDF, its links.
+    """
     lines = _manifest_start(
         arm,
+        urdf,
         f"# {PLANNED[procedure.standard]}, as planned. Fill in the calibrated values and uncertainties (k = 1) of your",
         "# artefacts, record a file for each socket and each group of touches (one row a pose, in the order of the",
         "# plan), then: aacmm import THIS.toml -o acceptance.h5",

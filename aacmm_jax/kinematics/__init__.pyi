@@ -1,5 +1,6 @@
 from .arm import Arm as Arm
 from .arm import parameter_names as parameter_names
+from .axes_to_dh import without_far_frames as without_far_frames
 from .inverse_kinematics import project_to_targets as project_to_targets
 from .inverse_kinematics import solve_to_targets as solve_to_targets
 from .parameters import ArmSpecification as ArmSpecification

@@ -294,6 +294,20 @@ def perturbed_arm(space: Parameters, *, length: float, angle: float, seed: int =
     return space.arm(space.vector() + width * shift)
 
 
+class UrdfSource(NamedTuple):
+    """The URDF that an arm was read from: what is needed to write one with the calibrated arm.
+
+    Args:
+        text: The whole file.
+        base: Name of the link that does not move.
+        tip: Name of the link at the end of the chain.
+    """
+
+    text: str
+    base: str
+    tip: str
+
+
 class ArmSpecification(NamedTuple):
     """An arm as a file states it, with the identification that the file proposes.
 
@@ -305,6 +319,7 @@ class ArmSpecification(NamedTuple):
         angle: Half-width of the bounds of angles, rad.
         override: Half-widths of single parameters by name, mm or rad.
         free: Names that are free in addition, such as Hayati's ``beta_2``.
+        urdf: The URDF that the arm was read from; None for others.
     """
 
     arm: Arm
@@ -314,6 +329,7 @@ class ArmSpecification(NamedTuple):
     angle: float = 0.0175
     override: Mapping[str, float] = MappingProxyType({})
     free: tuple[str, ...] = ()
+    urdf: UrdfSource | None = None
 
     def space(self) -> Parameters:
         """The free parameters that the file proposes."""

@@ -145,6 +145,8 @@ def plan(
     if not is_single(arm):
         raise InputError("plan takes one arm, not a batch; give one of its arms.")
     space = Parameters.free_of(arm) if space is None else space
+    if arm.beta is None and space.base.beta is not None:  # free, and 0 so far
+        arm = arm.replace(beta=np.zeros(arm.joints))
     check_length = default_length(arm) if check_length is None else check_length
     check_plannable(arm, criterion, noise)
     _check_counts(sockets, poses, len(space.names), u, lengths)

@@ -11,7 +11,7 @@ from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..data.simulation import simulate
-from ..files.arms import load_specification
+from ..files.arms import arm_beside, load_specification
 from ..files.atomic_write import storable
 from ..files.captures import load_capture
 from ..files.kits import read_kit
@@ -120,7 +120,7 @@ def _study_of_file(path: Path) -> Study:
             recording = load_capture(path.parent / specification.capture.file)
         if recording is not None and not specification.arm:
             return Study(specification, recording.nominal, recording)
-        nominal = _arm(path.parent, specification.arm)
+        nominal = load_specification(arm_beside(path.parent, specification.arm))
         if specification.capture.kit is not None:
             recording = _simulated(path.parent / specification.capture.kit, nominal, specification.seed)
         return Study(specification, nominal, recording)
@@ -132,8 +132,3 @@ def _simulated(kit: str | os.PathLike, nominal: ArmSpecification, seed: int) -> 
     """A capture of the nominal arm with a kit, without noise, which the trials draw."""
     things = [item.simulated for item in read_kit(kit)]
     return Recording(simulate(nominal.arm, {}, observations=things, noise=Noise(), seed=seed), nominal)
-
-
-def _arm(folder: Path, name: str) -> ArmSpecification:
-    neighbour = folder / name
-    return load_specification(neighbour if name.endswith(".toml") or os.path.isfile(neighbour) else name)

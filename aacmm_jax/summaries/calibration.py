@@ -42,6 +42,9 @@ def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
         "joints": joints,
         "probe_mm": np.asarray(arm.probe).tolist(),
         "held": list(specification.space().held),
+        "urdf": None
+        if specification.urdf is None
+        else {"base": specification.urdf.base, "tip": specification.urdf.tip},
     }
 
 

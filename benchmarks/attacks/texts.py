@@ -118,6 +118,22 @@ diameter = 25.0004
 u = 0.0005
 stylus = 6.0
 """
+URDF = """<robot name="two">
+  <link name="base"/>
+  <joint name="one" type="revolute">
+    <parent link="base"/><child link="upper"/>
+    <origin xyz="0 0 0.3" rpy="0 0 0.25"/>
+    <axis xyz="0 0 1"/>
+    <limit lower="-2.5" upper="2.75"/>
+  </joint>
+  <link name="upper"/>
+  <joint name="two" type="continuous">
+    <parent link="upper"/><child link="tip"/>
+    <origin xyz="0.5 0 0.125" rpy="-1.5 0 0"/>
+  </joint>
+  <link name="tip"/>
+</robot>
+"""
 STUDY = """name = "Study"
 arm = "arm.toml"
 trials = 10
@@ -180,8 +196,10 @@ def originals(folder: Path) -> dict[str, Callable[[], object]]:
         ("p.toml", POINTS),
         ("s.toml", STUDY),
         ("l.toml", ABOUT),
+        ("r.urdf", URDF),
     ):
         (folder / name).write_text(text)
+    (folder / "kinematics.yaml").write_text(aj.files.ur_kinematics_yaml(sample.arm.arm))
     about = aj.files.read_administrative_data(folder / "l.toml")
     (folder / "dcc.xml").write_text(aj.certificate.dcc_xml(sample.record, about, created=MADE))
 
@@ -203,6 +221,8 @@ def originals(folder: Path) -> dict[str, Callable[[], object]]:
         "o.toml": observed,
         "o.csv": observed,
         "arm.toml": lambda: aj.files.load_specification(folder / "arm.toml"),
+        "r.urdf": lambda: aj.load_arm(folder / "r.urdf"),
+        "kinematics.yaml": lambda: aj.load_arm(folder / "kinematics.yaml"),
         "p.toml": points_file,
         "points.csv": points_file,
         "s.toml": lambda: aj.study.read_study(folder / "s.toml").specification,

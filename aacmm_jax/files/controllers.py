@@ -1,0 +1,180 @@
+"""What a robot's controller or a program takes of a calibrated arm: tables, zero offsets alone, a Python program."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.errors import InputError
+from ..core.rotations import roll_pitch_yaw
+from ..core.units import DEG
+from ..kinematics.arm import Arm, natural_steps, with_arrays
+from ..kinematics.axes_to_dh import Transform, canonical_origins, geometry_of
+from ..kinematics.parameters import single
+
+_UNITS = {"mm-deg": ("mm", "deg", 1.0, 1 / DEG), "m-rad": ("m", "rad", 1e-3, 1.0)}
+_STANDARD = "T_i = Rz(q_i + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)"
+_CRAIG = "T_i = Tx(a) Rx(alpha) Ry(beta) Rz(q_i + theta) Tz(d), with a, alpha and beta of the link before joint i"
+_ENOUGH = 30  # steps of Gauss and Newton, of which some five are needed
+
+
+class ZeroOffsets(NamedTuple):
+    """The zero offsets of the joints with which the nominal arm comes closest to a calibrated one."""
+
+    offsets: Float[np.ndarray, " n"]  # to add to the readings, rad
+    probe: Float[np.ndarray, " 3"]  # the tip in the nominal arm's last frame that goes with them, mm
+    rms_nominal: float  # distance to the calibrated arm without offsets, the probe fitted, mm
+    rms: float  # the same with the offsets, mm
+    largest: float  # mm
+
+
+def dh_table(arm: Arm, *, convention: str = "standard", units: str = "mm-deg", base: Transform | None = None) -> str:
+    """A Denavit-Hartenberg table as CSV, with comments that say what each column is and where base and tip are.
+
+    Args:
+        arm: One arm.
+        convention: ``"standard"``, or ``"craig"`` (modified): the link before each joint instead of that after it.
+        units: ``"mm-deg"`` or ``"m-rad"``.
+        base: The first frame in a robot's base link, mm, where it is another one.
+
+    Raises:
+        InputError: The convention or the units are unknown, or the arm is a batch.
+    """
+    if convention not in ("standard", "craig"):
+        raise InputError(f"the convention is '{convention}'; give standard or craig.")
+    if units not in _UNITS:
+        raise InputError(f"the units are '{units}'; give {' or '.join(_UNITS)}.")
+    length_unit, angle_unit, length, angle = _UNITS[units]
+    geometry = geometry_of(single(arm))
+    beta = np.zeros(arm.joints) if geometry.beta is None else geometry.beta
+    after = np.stack([length * geometry.a, angle * geometry.alpha, angle * beta], axis=1)
+    links, tip = after, length * geometry.probe
+    lines = [f"# {_CRAIG if convention == 'craig' else _STANDARD}"]
+    if base is not None and not np.array_equal(base, np.eye(4)):
+        lines.append(f"# first frame in the base link: {_placed(base, length, angle, length_unit, angle_unit)}")
+    if convention == "craig":
+        links = np.concatenate([np.zeros((1, 3)), after[:-1]])
+        last = canonical_origins(geometry)[-1]
+        lines.append(f"# tip in the last frame: {_placed(last, length, angle, length_unit, angle_unit)}")
+    else:
+        lines.append(f"# tip in the last frame: x y z = {_row(tip, ' ')} {length_unit}")
+    heads = [f"a_{length_unit}", f"alpha_{angle_unit}", f"beta_{angle_unit}"]
+    lines.append(",".join(["joint", f"theta_{angle_unit}", f"d_{length_unit}", *heads]))
+    joints = np.stack([angle * geometry.theta, length * geometry.d], axis=1)
+    lines += [
+        f"{i},{_row((*joint, *link))}" for i, (joint, link) in enumerate(zip(joints, links, strict=True), start=1)
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def zero_offsets(nominal: Arm, calibrated: Arm, q: Float[np.ndarray, "N n"]) -> ZeroOffsets:
+    """The restriction of a calibration to zero offsets, for controllers that take nothing else.
+
+    Offsets and probe minimise the distance of the nominal arm's tips from the calibrated arm's over the readings. The
+    change is the smallest that does: a rotation about the last axis is one of the probe, too. The rest of the
+    calibration remains as an error.
+
+    Args:
+        nominal: The arm that the controller has.
+        calibrated: The calibrated arm.
+        q: Readings, rad: of the capture, or of the poses that matter.
+
+    Raises:
+        InputError: The arms or the readings have other numbers of joints.
+    """
+    nominal, calibrated = single(nominal), single(calibrated)
+    if nominal.joints != calibrated.joints:
+        raise InputError(f"the arms have {nominal.joints} and {calibrated.joints} joints; give arms with as many.")
+    targets, theta, probe = (np.asarray(x) for x in (calibrated.position(q), nominal.theta, calibrated.probe))
+    errors = {}
+    for kinds in (("probe",), ("theta", "probe")):
+        joints = range(1, nominal.joints + 1) if "theta" in kinds else ()
+        names = [*(f"theta_{i}" for i in joints), "probe_x", "probe_y", "probe_z"]
+        steps, arm = natural_steps(names), with_arrays(nominal, probe=probe)
+        for _ in range(_ENOUGH):
+            errors[kinds] = targets - np.asarray(arm.position(q))
+            columns = np.asarray(arm.jacobian(q, names)) * steps
+            change = np.linalg.lstsq(columns.reshape(-1, len(names)), errors[kinds].ravel(), rcond=1e-9)[0] * steps
+            arm = with_arrays(
+                arm, theta=np.asarray(arm.theta) + (change[:-3] if joints else 0.0), probe=arm.probe + change[-3:]
+            )
+            if np.all(np.abs(change / steps) < 1e-10):
+                break
+    distances = {kinds: np.linalg.norm(error, axis=1) for kinds, error in errors.items()}
+    before, after = distances.values()
+    rms_before, rms = (float(np.sqrt(np.mean(values**2))) for values in (before, after))
+    return ZeroOffsets(np.asarray(arm.theta) - theta, np.asarray(arm.probe), rms_before, rms, float(after.max()))
+
+
+def zero_offsets_csv(found: ZeroOffsets) -> str:
+    """Zero offsets as CSV, with the error that remains in comments."""
+    lines = [
+        "# To be added to the joint readings of the nominal arm.",
+        f"# Distance of the tip from the calibrated arm's: RMS {found.rms:.4f} mm, largest {found.largest:.4f} mm; RMS",
+        f"# {found.rms_nominal:.4f} mm without the offsets. Tip in the last frame: {_row(found.probe, ' ')} mm.",
+        "joint,offset_deg,offset_rad",
+    ]
+    lines += [f"{i},{_row((offset / DEG, offset))}" for i, offset in enumerate(found.offsets, start=1)]
+    return "\n".join(lines) + "\n"
+
+
+def python_program(arm: Arm, *, title: str, base: Transform | None = None) -> str:
+    """A Python program of the arm that needs NumPy only: ``position(q)`` and ``pose(q)``, mm and rad.
+
+    Args:
+        arm: One arm.
+        title: The first line of its documentation.
+        base: The first frame in a robot's base link, mm; poses are in the base link then.
+    """
+    geometry = geometry_of(single(arm))
+    beta = np.zeros(arm.joints) if geometry.beta is None else geometry.beta
+    base = np.eye(4) if base is None else base
+    values = {
+        "THETA": geometry.theta, "D": geometry.d, "A": geometry.a, "ALPHA": geometry.alpha, "BETA": beta,
+        "PROBE": geometry.probe,
+    }  # fmt: skip
+    constants = [f"{name} = [{_row(row, ', ')}]" for name, row in values.items()]
+    rows = ",\n".join(f"    [{_row(row, ', ')}]" for row in base)
+    return _PROGRAM.format(title=repr(title), base=rows, constants="\n".join(constants))
+
+
+def _row(values: Iterable[float], separator: str = ",") -> str:
+    return separator.join(repr(float(value)) for value in values)
+
+
+def _placed(transform: Transform, length: float, angle: float, length_unit: str, angle_unit: str) -> str:
+    xyz, rpy = length * transform[:3, 3], angle * roll_pitch_yaw(transform[:3, :3])
+    return f"x y z = {_row(xyz, ' ')} {length_unit}, roll pitch yaw = {_row(rpy, ' ')} {angle_unit}"
+
+
+_PROGRAM = '''# Written by aacmm_jax. Lengths in mm, angles in rad.
+# T_i = Rz(q_i + THETA) Tz(D) Tx(A) Rx(ALPHA) Ry(BETA); the tip is PROBE in the last frame.
+import numpy as np
+
+TITLE = {title}
+BASE = np.array([
+{base},
+])
+{constants}
+
+
+def pose(q):
+    """The transform (4, 4) of the last frame, with the tip as its origin, at the joint readings q."""
+    transform = BASE.copy()
+    for reading, theta, d, a, alpha, beta in zip(q, THETA, D, A, ALPHA, BETA):
+        (cz, sz), (cx, sx), (cy, sy) = [(np.cos(x), np.sin(x)) for x in (reading + theta, alpha, beta)]
+        turn = np.array([[cz, -sz * cx, sz * sx], [sz, cz * cx, -cz * sx], [0.0, sx, cx]])
+        turn = turn @ np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
+        link = np.eye(4)
+        link[:3, :3] = turn
+        link[:3, 3] = a * cz, a * sz, d
+        transform = transform @ link
+    transform[:3, 3] += transform[:3, :3] @ PROBE
+    return transform
+
+
+def position(q):
+    """The tip (3,) at the joint readings q."""
+    return pose(q)[:3, 3]
+'''

@@ -1,0 +1,167 @@
+"""The kinematics of Universal Robots' arms, as their ROS driver and ``ur_description`` exchange it.
+
+``kinematics.yaml`` has the origin (x, y, z in m; roll, pitch, yaw in rad) of every joint in the frame of the joint
+before it. A robot itself has Denavit-Hartenberg parameters by the common normal, ``dh_theta``, ``dh_a``, ``dh_d`` and
+``dh_alpha``, whose frames on the nearly parallel axes 2, 3 and 4 may be hundreds of metres away. Both are read. On
+writing, these frames are put back to where the axis crosses the plane of the frame before, as the driver's calibration
+correction does (UniversalRobots/Universal_Robots_ROS2_Driver, ur_calibration/doc/algorithm.rst).
+"""
+
+import math
+import os
+import re
+
+import numpy as np
+
+from ..core.arrays import Numbers
+from ..core.errors import InputError
+from ..core.rotations import roll_pitch_yaw, roll_pitch_yaw_matrix
+from ..core.text import number, quoted
+from ..kinematics.arm import Arm
+from ..kinematics.axes_to_dh import (
+    Axes,
+    Transform,
+    canonical_origins,
+    dh_of_axes,
+    geometry_of,
+    inverse,
+    without_far_frames,
+)
+from ..kinematics.chain import Geometry
+from ..kinematics.parameters import ArmSpecification, single
+from .inputs import InputFile
+
+_JOINTS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+_COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
+_DH = ("dh_theta", "dh_a", "dh_d", "dh_alpha")
+_LIMITS = (-2 * math.pi, 2 * math.pi)  # of every joint of these robots
+_LARGEST = 1e5  # m and rad: frames on nearly parallel axes are hundreds of metres away
+_LINE = re.compile(r"( *)([\w-]+) *:(?: +([^#]*?))?\s*(?:#.*)?")
+
+
+def read_ur_kinematics(path: str | os.PathLike, *, probe: Numbers | None = None) -> ArmSpecification:
+    """The arm of a ``kinematics.yaml``, or of a YAML file with a robot's D-H parameters.
+
+    Args:
+        path: The file.
+        probe: A tool's tip in the tool flange's frame, mm; by default that frame's origin.
+
+    Returns:
+        The arm, in mm and rad, in the controller's base frame (``base_link_inertia`` of the URDF); its limits are those
+        of these robots' joints, two revolutions.
+
+    Raises:
+        InputError: Naming the file, the line or entry, and what to do.
+    """
+    file = InputFile(path)
+    try:
+        try:
+            text = file.text
+        except UnicodeDecodeError as error:
+            raise InputError("it is not text in UTF-8; name a YAML file.") from error
+        entries = _entries(text)
+        geometry = _of_parameters(entries) if any(name in entries for name in _DH) else _of_origins(entries)
+        arm = without_far_frames(Arm(**geometry._asdict(), limits=[_LIMITS] * len(_JOINTS)))
+        if probe is not None:
+            tool = Arm(alpha=[0.0], a=[0.0], d=[0.0], probe=probe).probe
+            arm = arm.replace(probe=np.asarray(arm.probe) + np.asarray(tool))
+        return ArmSpecification(arm, os.path.splitext(os.path.basename(os.fspath(file)))[0])
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def ur_kinematics_yaml(arm: Arm) -> str:
+    """A ``kinematics.yaml`` of an arm of six joints, for ``ur_description`` and the driver.
+
+    Frames on nearly parallel axes are where the axis crosses the plane of the frame before; the base, the readings and
+    the tip stay. The tip in the tool flange's frame, which the file has no place for, is stated as a comment.
+
+    Raises:
+        InputError: The arm does not have six joints.
+    """
+    if single(arm).joints != len(_JOINTS):
+        raise InputError(f"kinematics.yaml is of six joints, but the arm has {arm.joints}; choose another --format.")
+    *origins, tip = canonical_origins(geometry_of(without_far_frames(arm)))
+    lines = [
+        "# Written by aacmm_jax: origins of the joints of a calibrated arm, m and rad.",
+        "# The driver warns that the hash is not the controller's, as the parameters are not those of the factory.",
+        f"# The tip in the tool flange's frame, for the controller's TCP: {_numbers(tip)}",
+        "kinematics:",
+    ]
+    for name, origin in zip(_JOINTS, origins, strict=True):
+        values = zip(_COORDINATES, _numbers(origin).split(), strict=True)
+        lines += [f"  {name}:", *(f"    {key}: {value}" for key, value in values)]
+    return "\n".join([*lines, "  hash: aacmm_jax_calibration"]) + "\n"
+
+
+def _numbers(transform: Transform) -> str:
+    values = (*transform[:3, 3] / 1000, *roll_pitch_yaw(transform[:3, :3]))
+    return " ".join(repr(float(value) + 0.0) for value in values)  # -0.0 becomes 0.0
+
+
+def _of_origins(entries: dict[str, str]) -> Geometry:
+    directions, points, frame = [], [], np.eye(4)
+    for name in _JOINTS:
+        numbers = np.array([_number(entries, f"kinematics.{name}.{key}") for key in _COORDINATES])
+        origin = np.eye(4)
+        origin[:3, :3] = roll_pitch_yaw_matrix(numbers[3:])
+        origin[:3, 3] = 1000 * numbers[:3]
+        frame = frame @ origin
+        directions.append(frame[:3, 2])
+        points.append(frame[:3, 3])
+    base, geometry = dh_of_axes(Axes(np.array(directions), np.array(points), frame))
+    if np.abs(inverse(base)[:3, :] - np.eye(4)[:3, :]).max() > 1e-9:
+        raise InputError("the first axis is not the z axis of the base (kinematics.shoulder); correct it there.")
+    return geometry
+
+
+def _of_parameters(entries: dict[str, str]) -> Geometry:
+    rows = []
+    for name in _DH:
+        if name not in entries:
+            raise InputError(f"'{name}' is missing; add it.")
+        parts = entries[name].strip("[] ").replace(",", " ").split()
+        try:
+            rows.append([number(part) for part in parts])
+        except ValueError as error:
+            raise InputError(f"'{name}' is {quoted(entries[name])}; give six numbers.") from error
+        if len(parts) != len(_JOINTS):
+            raise InputError(f"'{name}' has {len(parts)} entries; give six numbers.")
+        if not np.all(np.abs(rows[-1]) < _LARGEST):
+            raise InputError(f"'{name}' is {quoted(entries[name])}; give finite numbers below {_LARGEST:g}, m and rad.")
+    theta, a, d, alpha = np.array(rows)
+    return Geometry(alpha, 1000 * a, 1000 * d, theta, None, np.zeros(3))
+
+
+def _number(entries: dict[str, str], name: str) -> float:
+    if name not in entries:
+        raise InputError(f"'{name}' is missing; a kinematics.yaml has it for each of six joints.")
+    try:
+        value = number(entries[name])
+    except ValueError:
+        value = math.nan
+    if not abs(value) < _LARGEST:
+        raise InputError(f"'{name}' is {quoted(entries[name])}; give a finite number below {_LARGEST:g}, m or rad.")
+    return value
+
+
+def _entries(text: str) -> dict[str, str]:
+    """The values of a YAML file of nested keys by dotted name, as text: the part of YAML that these files use."""
+    found: dict[str, str] = {}
+    above: list[tuple[int, str]] = []
+    for count, line in enumerate(text.split("\n"), start=1):
+        if not line.strip() or line.lstrip().startswith(("#", "---")):
+            continue
+        match = _LINE.fullmatch(line)
+        if match is None:
+            raise InputError(f"line {count} is no 'key: value', as kinematics.yaml has; correct it.")
+        indent, key, value = len(match[1]), match[2], match[3] or ""
+        while above and above[-1][0] >= indent:
+            above.pop()
+        name = ".".join([*(part for _, part in above), key])
+        if name in found:
+            raise InputError(f"line {count}: '{name}' is there twice; take one out.")
+        found[name] = value
+        if not value:
+            above.append((indent, key))
+    return found

@@ -1,0 +1,280 @@
+"""The text of a URDF: its joints and links with their places in it, and edits that leave everything else as it is.
+
+The format's specification: wiki.ros.org/urdf/XML. Only direct children of ``<robot>`` count, since transmissions,
+controllers and simulators have elements of the same names. A document type is refused: its entities could name other
+files, or grow to any size.
+"""
+
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+from xml.parsers import expat
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.errors import InputError
+from ..core.rotations import roll_pitch_yaw_matrix
+from ..core.text import is_control, number, quoted
+from ..kinematics.axes_to_dh import Transform
+
+_MOST_CHARACTERS = 20_000_000  # the largest robots of public collections have a twentieth of it
+_DEEPEST = 64  # levels of elements; a URDF has six
+_LARGEST = 1e6  # m and rad, of positions, angles and directions
+_METRE = 1000.0  # mm
+
+
+class Place(NamedTuple):
+    """Where a start tag is in the text, as bytes of its UTF-8."""
+
+    start: int
+    end: int
+
+
+class UrdfJoint(NamedTuple):
+    """A joint as the file states it, in mm and rad."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: Transform  # of the child in the parent at reading 0, mm
+    axis: Float[np.ndarray, " 3"] | None  # of length 1, in the child; None where it is 0
+    limits: tuple[float, float] | None  # rad, or mm of a prismatic joint
+    mimics: str | None
+    place: Place
+    origin_place: Place | None  # where there is an <origin>
+
+
+class UrdfLink(NamedTuple):
+    """A link: its mass in kg and its centre of mass in its frame in mm, or None where the file does not state them."""
+
+    name: str
+    mass: float | None
+    centre: Float[np.ndarray, " 3"] | None
+
+
+class Robot(NamedTuple):
+    """What a URDF says of kinematics and masses."""
+
+    joints: dict[str, UrdfJoint]
+    links: dict[str, UrdfLink]
+    end: int  # where </robot> begins, as bytes of the text in UTF-8
+
+
+class _Element(NamedTuple):
+    name: str
+    attributes: dict[str, str]
+    line: int
+    place: Place
+    children: list["_Element"]
+
+    def child(self, name: str) -> "_Element | None":
+        return next((child for child in self.children if child.name == name), None)
+
+
+def parse_urdf(text: str) -> Robot:
+    """The joints and links of a URDF.
+
+    Args:
+        text: The whole file.
+
+    Raises:
+        InputError: It is no XML or no URDF, a value is no number, or a name is missing or there twice.
+    """
+    root, end = _parsed(text)
+    if root.name != "robot":
+        raise InputError(f"its root element is <{root.name[:40]}>, but that of a URDF is <robot>; name a URDF file.")
+    joints, links = {}, {}
+    for element in root.children:
+        if element.name in ("joint", "link"):
+            name = _attribute(element, "name", f"a {element.name}")
+            found = joints if element.name == "joint" else links
+            if name in found:
+                raise InputError(f"line {element.line}: {element.name} {quoted(name)} is there twice; rename one.")
+            found[name] = (_joint if element.name == "joint" else _link)(element, name)
+    for joint in joints.values():
+        for link in (joint.parent, joint.child):
+            if link not in links:
+                raise InputError(
+                    f"joint {quoted(joint.name)} names the link {quoted(link)}, which is not there; add it."
+                )
+    return Robot(joints, links, end)
+
+
+def edited(text: str, origins: Mapping[str, tuple[str | None, str | None]], robot: Robot, added: str = "") -> str:
+    """The text with other origins, and with elements added at its end; everything else stays to the byte.
+
+    Args:
+        text: The whole file.
+        origins: By joint the new xyz (m) and rpy (rad), each None where it stays.
+        robot: What `parse_urdf` found in the text.
+        added: Elements to add before ``</robot>``.
+    """
+    content = text.encode()
+    changes: list[tuple[int, int, bytes]] = []
+    for name, values in origins.items():
+        joint = robot.joints[name]
+        new = {key: value for key, value in zip(("xyz", "rpy"), values, strict=True) if value is not None}
+        if joint.origin_place is None:
+            written = "".join(f' {key}="{value}"' for key, value in new.items())
+            at = joint.place.end
+            blank = re.match(rb"\s*", content[at:])
+            indent = blank.group().decode() if blank else ""
+            changes.append((at, at, f"{indent}<origin{written}/>".encode()))
+        else:
+            start, end = joint.origin_place
+            changes.append((start, end, _with_attributes(content[start:end].decode(), new).encode()))
+    changes.append((robot.end, robot.end, added.encode()))
+    for start, end, new_content in sorted(changes, reverse=True):
+        content = content[:start] + new_content + content[end:]
+    return content.decode()
+
+
+def _with_attributes(tag: str, values: Mapping[str, str]) -> str:
+    """A start tag with other values of some attributes; those it lacks are added at its end."""
+    for name, value in values.items():
+        pattern = re.compile(rf"""(\s{name}\s*=\s*)("[^"]*"|'[^']*')""")
+        if pattern.search(tag):
+            tag = pattern.sub(lambda found, value=value: f"{found[1]}{found[2][0]}{value}{found[2][0]}", tag, count=1)
+        else:
+            head = re.fullmatch(r"(.*?)(\s*/?>)", tag, re.DOTALL)
+            assert head is not None
+            tag = f'{head[1]} {name}="{value}"{head[2]}'
+    return tag
+
+
+def _parsed(text: str) -> tuple[_Element, int]:
+    """The root element with its direct children and theirs, and where its end tag begins."""
+    if len(text) > _MOST_CHARACTERS:
+        raise InputError(f"it has {len(text):,} characters, and {_MOST_CHARACTERS:,} are the most; name a URDF file.")
+    content = text.encode()
+    parser = expat.ParserCreate("utf-8")
+    stack: list[_Element] = []
+    found: dict[str, Any] = {}
+
+    def start(name: str, attributes: dict[str, str]) -> None:
+        line = parser.CurrentLineNumber
+        if name.startswith("xacro:"):
+            raise InputError(
+                f"line {line} has <{quoted(name)[1:-1]}>, so it is a xacro file; expand it with "
+                "'xacro FILE.xacro > FILE.urdf' and name that."
+            )
+        if len(stack) > _DEEPEST:
+            raise InputError(f"line {line} nests elements too deeply; no URDF has more than {_DEEPEST} levels.")
+        begin = parser.CurrentByteIndex
+        element = _Element(name, attributes, line, Place(begin, _end_of_tag(content, begin)), [])
+        if stack:
+            stack[-1].children.append(element)
+        else:
+            found["root"] = element
+        stack.append(element)
+
+    def end(_: str) -> None:
+        stack.pop()
+        found["end"] = parser.CurrentByteIndex
+
+    def refuse(name: str, *_: object) -> None:
+        raise InputError(f"it has a document type, {quoted(name)}, as no URDF needs; leave it out.")
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.StartDoctypeDeclHandler = start, end, refuse
+    try:
+        parser.Parse(content, True)
+    except expat.ExpatError as error:
+        raise InputError(f"it is not valid XML: {error}; correct it there.") from error
+    return found["root"], found["end"]
+
+
+def _end_of_tag(content: bytes, start: int) -> int:
+    """Where a start tag ends; a ``>`` in a value does not end it."""
+    quote = 0
+    for position in range(start, len(content)):
+        character = content[position]
+        if quote:
+            quote = 0 if character == quote else quote
+        elif character in b"\"'":
+            quote = character
+        elif character == ord(">"):
+            return position + 1
+    return len(content)  # of text that is no XML, which the parser refuses
+
+
+def _joint(element: _Element, name: str) -> UrdfJoint:
+    what = f"joint {quoted(name)}"
+    ends = []
+    for end in ("parent", "child"):
+        child = element.child(end)
+        if child is None:
+            raise InputError(f"line {element.line}: {what} has no <{end} link=...>; add it.")
+        ends.append(_attribute(child, "link", f"the <{end}> of {what}"))
+    kind = _attribute(element, "type", what)
+    origin, axis, limit, mimic = (element.child(part) for part in ("origin", "axis", "limit", "mimic"))
+    direction = np.array([1.0, 0.0, 0.0]) if axis is None else _numbers(axis, "xyz", what, (1.0, 0.0, 0.0))
+    size = float(np.linalg.norm(direction))
+    unit = _METRE if kind == "prismatic" else 1.0
+    limits = None
+    if limit is not None and ("lower" in limit.attributes or "upper" in limit.attributes):
+        low, high = (_numbers(limit, side, what, (0.0,))[0] for side in ("lower", "upper"))
+        limits = (unit * low, unit * high)
+    return UrdfJoint(
+        name=name,
+        kind=kind,
+        parent=ends[0],
+        child=ends[1],
+        origin=_origin(origin, what),
+        axis=direction / size if size > 0 else None,
+        limits=limits,
+        mimics=None if mimic is None else mimic.attributes.get("joint", ""),
+        place=element.place,
+        origin_place=None if origin is None else origin.place,
+    )
+
+
+def _link(element: _Element, name: str) -> UrdfLink:
+    inertial = element.child("inertial")
+    mass = None if inertial is None else inertial.child("mass")
+    if inertial is None or mass is None:
+        return UrdfLink(name, None, None)
+    what = f"link {quoted(name)}"
+    value = _numbers(mass, "value", what, (0.0,))[0]
+    if value < 0:
+        raise InputError(f"line {mass.line}: the mass of {what} is {value:g} kg; it cannot be negative.")
+    return UrdfLink(name, float(value), _origin(inertial.child("origin"), what)[:3, 3])
+
+
+def _origin(element: _Element | None, what: str) -> Transform:
+    transform = np.eye(4)
+    if element is not None:
+        transform[:3, :3] = roll_pitch_yaw_matrix(_numbers(element, "rpy", what, (0.0, 0.0, 0.0)))
+        transform[:3, 3] = _METRE * _numbers(element, "xyz", what, (0.0, 0.0, 0.0))
+    return transform
+
+
+def _numbers(element: _Element, name: str, what: str, default: tuple[float, ...]) -> Float[np.ndarray, " k"]:
+    text = element.attributes.get(name)
+    if text is None:
+        return np.array(default)
+    if "${" in text or "$(" in text:
+        raise InputError(
+            f"line {element.line}: {name} of {what} is {quoted(text)}, so it is a xacro file; expand it with "
+            "'xacro FILE.xacro > FILE.urdf' and name that."
+        )
+    try:
+        values = np.array([number(part) for part in text.split()])
+    except ValueError:
+        values = np.array([])
+    if len(default) == 3 and not np.all(np.abs(values) < _LARGEST):  # limits may be as large as one likes
+        raise InputError(f"line {element.line}: {name} of {what} is {quoted(text)}; it must be below {_LARGEST:g}.")
+    if len(values) != len(default) or not np.all(np.isfinite(values)):
+        wanted = "a number" if len(default) == 1 else f"{len(default)} numbers"
+        raise InputError(f"line {element.line}: {name} of {what} is {quoted(text)}; it must be {wanted}.")
+    return values
+
+
+def _attribute(element: _Element, name: str, what: str) -> str:
+    value = element.attributes.get(name, "")
+    if not value:
+        raise InputError(f"line {element.line}: {what} has no {name}; add it.")
+    if any(is_control(character) for character in value):
+        raise InputError(f"line {element.line}: the {name} of {what} holds a control character; take it out.")
+    return value

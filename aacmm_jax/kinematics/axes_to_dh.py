@@ -1,0 +1,244 @@
+"""From joint axes in space to Denavit-Hartenberg parameters with Hayati's beta, and back to the origins of joints.
+
+A chain is known by its axes at reading 0 (lines with a direction) and by the frame of its tip. Two frames on the same
+axis differ by a rotation about it and a shift along it, which no data on the tip determine: D-H fixes both by rule,
+other descriptions (URDF) by habit. So a conversion keeps both, and `calibrated_frames` goes back with the least change.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from .arm import Arm
+from .chain import Geometry
+from .independence import NEARLY_PARALLEL
+
+Transform = Float[np.ndarray, "4 4"]
+_NO_LENGTH, _NO_ANGLE = 1e-12, 1e-15  # mm and rad: below the rounding of a chain of some metres
+_UNCHANGED = 2e-11, 2e-14  # mm and rad: far above the rounding of a round trip, far below 1e-9 mm at any tip
+
+
+class Axes(NamedTuple):
+    """The joint axes and the tip of a chain at reading 0, in the frame of its base."""
+
+    directions: Float[np.ndarray, "n 3"]  # unit vectors; a reading counts by the right-hand rule
+    points: Float[np.ndarray, "n 3"]  # mm, on each axis; frames stay at them where D-H allows it
+    tip: Transform  # mm
+
+
+def dh_of_axes(axes: Axes, *, keep_points: bool = True) -> tuple[Transform, Geometry]:
+    """Exact D-H parameters of a chain; readings keep their sign, since z of every frame is along its axis.
+
+    Neighbouring axes within about 1 degree of parallel or antiparallel get Hayati's beta, with a ``d`` that is chosen;
+    standard D-H would put the next frame hundreds of metres away. The last frame has the orientation of the tip, by
+    alpha, theta and beta of the last joint. Source: Hayati and Mirmirani 1985.
+
+    Args:
+        axes: Joint axes and tip, mm.
+        keep_points: Whether ``d`` between nearly parallel axes is such that the next frame is at the given point of its
+            axis; otherwise it is 0.
+
+    Returns:
+        The first D-H frame in the frame of the base (the same frame where the first axis is its z axis), and the
+        parameters, mm and rad; ``beta`` is None where it is not needed.
+    """
+    base = _first_frame(axes.directions[0], axes.points[0])
+    frame, rows = base, []
+    for direction, point in zip(axes.directions[1:], axes.points[1:], strict=True):
+        direction = frame[:3, :3].T @ direction
+        point = frame[:3, :3].T @ (point - frame[:3, 3])
+        row = _to_axis(direction, point, keep_points)
+        rows.append(row)
+        frame = frame @ link_transform(*row)
+    row, probe = _to_frame(inverse(frame) @ axes.tip)
+    theta, d, a, alpha, beta = np.array([*rows, row]).T
+    return base, Geometry(alpha, a, d, theta, beta if np.any(beta) else None, probe)
+
+
+def link_transform(theta: float, d: float, a: float, alpha: float, beta: float) -> Transform:
+    """Rz(theta) Tz(d) Tx(a) Rx(alpha) Ry(beta); mm and rad."""
+    link = rotation(2, theta) @ rotation(0, alpha) @ rotation(1, beta)
+    link[:3, 3] = a * math.cos(theta), a * math.sin(theta), d
+    return link
+
+
+def rotation(axis: int, angle: float) -> Transform:
+    """The rotation about the axis x (0), y (1) or z (2) by an angle in rad."""
+    i, j = ((1, 2), (2, 0), (0, 1))[axis]
+    matrix = np.eye(4)
+    matrix[i, i] = matrix[j, j] = math.cos(angle)
+    matrix[j, i] = math.sin(angle)
+    matrix[i, j] = -matrix[j, i]
+    return matrix
+
+
+def inverse(transform: Transform) -> Transform:
+    """The inverse of a rigid transform."""
+    result = np.eye(4)
+    result[:3, :3] = transform[:3, :3].T
+    result[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
+    return result
+
+
+def dh_frames(geometry: Geometry, base: Transform) -> list[Transform]:
+    """The D-H frames 0 to n of one arm at reading 0; ``base`` is frame 0."""
+    beta = np.zeros_like(geometry.alpha) if geometry.beta is None else geometry.beta
+    frames = [base]
+    for row in zip(geometry.theta, geometry.d, geometry.a, geometry.alpha, beta, strict=True):
+        frames.append(frames[-1] @ link_transform(*map(float, row)))
+    return frames
+
+
+def without_far_frames(arm: Arm) -> Arm:
+    """The same arm with d = 0 and Hayati's beta between nearly parallel axes; positions, readings and probe stay.
+
+    A table by the common normal alone puts frames on nearly parallel axes far from the arm (those of Universal Robots
+    hundreds of metres), where parameters trade off with each other and no calibration can tell them apart.
+
+    Args:
+        arm: One arm.
+    """
+    geometry = geometry_of(arm)
+    frames = dh_frames(geometry, np.eye(4))
+    directions, points = (np.array([frame[:3, i] for frame in frames[:-1]]) for i in (2, 3))
+    _, found = dh_of_axes(Axes(directions, points, frames[-1]), keep_points=False)
+    return Arm(**found._replace(probe=found.probe + geometry.probe)._asdict(), limits=arm.limits)
+
+
+def geometry_of(arm: Arm) -> Geometry:
+    """The parameters of an arm as NumPy arrays."""
+    return jax.tree.map(np.asarray, arm.geometry)
+
+
+def tip_frame(geometry: Geometry, base: Transform) -> Transform:
+    """The last D-H frame at reading 0, with the tip as its origin."""
+    tip = dh_frames(geometry, base)[-1].copy()
+    tip[:3, 3] += tip[:3, :3] @ np.asarray(geometry.probe)
+    return tip
+
+
+def calibrated_frames(
+    origins: list[Transform], nominal: Geometry, calibrated: Geometry, base: Transform
+) -> list[Transform]:
+    """Origins of the joints of a calibrated chain, each in the frame of the joint before it, at reading 0.
+
+    A frame on axis i turns about its axis with theta_i, so that a link keeps its shape where only zero offsets changed,
+    and is where the axis passes nearest to the nominal origin, as the calibrated joint before it carries that. An
+    origin that does not change comes back as it was, to the bit.
+
+    Args:
+        origins: Nominal origins, joint by joint, mm; the first in the frame of the base.
+        nominal: The parameters that `dh_of_axes` gave.
+        calibrated: The calibrated parameters.
+        base: The first D-H frame in the frame of the base; calibration does not change it.
+    """
+    before, after = dh_frames(nominal, base), dh_frames(calibrated, base)
+    was, now, found = np.eye(4), np.eye(4), []
+    for i, origin in enumerate(origins):
+        was = was @ origin
+        expected = now @ origin
+        turn = rotation(2, float(calibrated.theta[i] - nominal.theta[i]))
+        frame = after[i] @ turn @ inverse(before[i]) @ was
+        point, axis = after[i][:3, 3], after[i][:3, 2]
+        frame[:3, 3] = point + ((expected[:3, 3] - point) @ axis) * axis
+        unchanged = same_transform(frame, expected)
+        found.append(origin if unchanged else inverse(now) @ frame)
+        # Not the product with what was found: an inverse by transposition doubles the rounding from joint to joint.
+        now = expected if unchanged else frame
+    return found
+
+
+def canonical_origins(geometry: Geometry) -> list[Transform]:
+    """Origins of the joints with z along every axis, as D-H has them: T_i = Tx(a) Rx(alpha) Ry(beta) Rz(theta) Tz(d).
+
+    Length, twist and beta are of the joint before, so that the first origin is Rz(theta_1) Tz(d_1). The transform of
+    the tip in the last joint's frame follows as one more.
+    """
+    beta = np.zeros_like(geometry.alpha) if geometry.beta is None else geometry.beta
+    origins, link = [], np.eye(4)
+    for theta, d, a, alpha, second in zip(geometry.theta, geometry.d, geometry.a, geometry.alpha, beta, strict=True):
+        origins.append(link @ link_transform(float(theta), float(d), 0.0, 0.0, 0.0))
+        link = link_transform(0.0, 0.0, float(a), float(alpha), float(second))
+    tip = link.copy()
+    tip[:3, 3] += tip[:3, :3] @ np.asarray(geometry.probe)
+    return [*origins, tip]
+
+
+def same_transform(one: Transform, other: Transform) -> bool:
+    """Whether two transforms are the same to rounding."""
+    length, angle = _UNCHANGED
+    shift, turn = np.abs(one[:3, 3] - other[:3, 3]), np.abs(one[:3, :3] - other[:3, :3])
+    return bool(shift.max() <= length and turn.max() <= angle)
+
+
+def _first_frame(direction: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 3"]) -> Transform:
+    """The frame with z along the first axis that is rotated least, with its origin nearest to that of the base.
+
+    For an axis that points down, the base is first rotated by pi about x.
+    """
+    frame = np.eye(4)
+    down = direction[2] < 0
+    x, y, z = (direction[0], -direction[1], -direction[2]) if down else direction
+    # Rodrigues' formula about z cross the axis, whose sine is the length of (x, y) and whose cosine is z.
+    frame[:3, :3] = [
+        [1 - x * x / (1 + z), -x * y / (1 + z), x],
+        [-x * y / (1 + z), 1 - y * y / (1 + z), y],
+        [-x, -y, z],
+    ]
+    if down:
+        frame = np.diag([1.0, -1.0, -1.0, 1.0]) @ frame  # pi about x, without the rounding of a sine
+    frame[:3, 3] = point - (point @ direction) * direction
+    return frame + 0.0  # without -0.0
+
+
+def _to_axis(direction: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 3"], keep_point: bool) -> tuple[float, ...]:
+    """theta, d, a, alpha and beta to a frame on the next axis, which is given in the frame on this one."""
+    sine = math.hypot(direction[0], direction[1])
+    if sine < NEARLY_PARALLEL:
+        if not keep_point:
+            point = point - point[2] / direction[2] * direction
+        d, a = float(point[2]), math.hypot(point[0], point[1])
+        theta = math.atan2(point[1], point[0]) if a > _NO_LENGTH else 0.0
+        if abs(theta) > math.pi / 2 + _NO_ANGLE:  # zero offsets of less than a quarter revolution, as tables have them
+            theta, a = theta - math.copysign(math.pi, theta), -a
+        x, y, z = rotation(2, -theta)[:3, :3] @ direction
+        beta = math.atan2(x, math.hypot(y, z))
+        if abs(beta) < _NO_ANGLE:
+            beta = 0.0
+    else:
+        foot = point - (point[:2] @ direction[:2]) / sine**2 * direction
+        normal = np.array([-direction[1], direction[0]]) / sine
+        d, a = float(foot[2]), float(foot[:2] @ normal)
+        theta = math.atan2(normal[1], normal[0])
+        quarter = abs(abs(theta) - math.pi / 2) < _NO_ANGLE
+        if (a < 0 or (a == 0 and theta < 0)) if quarter else abs(theta) > math.pi / 2:
+            theta, a = theta - math.copysign(math.pi, theta), -a
+        beta = 0.0
+        _, y, z = rotation(2, -theta)[:3, :3] @ direction
+    return theta, d, a if abs(a) > _NO_LENGTH else 0.0, math.atan2(-y + 0.0, z), beta  # -0.0 would make -pi of pi
+
+
+def _to_frame(tip: Transform) -> tuple[tuple[float, ...], Float[np.ndarray, " 3"]]:
+    """theta, d, a, alpha and beta to a frame with the orientation of the tip, and the tip in it.
+
+    The orientation is Rz(theta) Rx(alpha) Ry(beta). Every angle is that of what those before it leave, so that the
+    product is exact also where theta and beta have the same axis.
+    """
+    turn = tip[:3, :3]
+    singular = math.hypot(turn[0, 1], turn[1, 1]) < _NO_ANGLE
+    theta = math.atan2(turn[1, 0], turn[0, 0]) if singular else math.atan2(-turn[0, 1], turn[1, 1])
+    choices = []
+    for angle in (theta, theta - math.copysign(math.pi, theta)):
+        left = rotation(2, -angle)[:3, :3] @ turn
+        alpha = math.atan2(left[2, 1], left[1, 1])
+        left = rotation(0, -alpha)[:3, :3] @ left
+        choices.append((angle, alpha, math.atan2(left[0, 2], left[0, 0])))
+    angles = min(choices, key=lambda angles: (abs(angles[2]) > math.pi / 2, abs(angles[0]) > math.pi / 2 + _NO_ANGLE))
+    theta, alpha, beta = (angle if abs(angle) > _NO_ANGLE else 0.0 for angle in angles)
+    x, y, z = rotation(2, -theta)[:3, :3] @ tip[:3, 3]
+    last = (rotation(0, alpha) @ rotation(1, beta))[:3, :3]
+    probe = last.T @ [0.0, y, 0.0] if abs(y) > _NO_LENGTH else np.zeros(3)
+    return (theta, float(z), float(x) if abs(x) > _NO_LENGTH else 0.0, alpha, beta), probe
