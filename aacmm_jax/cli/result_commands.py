@@ -237,7 +237,7 @@ def export(
     ] = None,
     about: About = None,
 ) -> None:
-    """Write a calibration for other programs, for a robot's controller, or into the URDF that it came from."""
+    """Write a calibration for other programs, controllers or as URDF."""
     written_as: str = form or _FORMATS.get("" if output is None else output.suffix.lower(), "toml")
     if about is not None and written_as != "dcc":
         raise InputError("--about is for certificates; give it with --format dcc.")

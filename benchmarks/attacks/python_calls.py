@@ -14,7 +14,7 @@ import numpy as np
 import aacmm_jax as aj
 
 from .outcomes import DONE, REFUSED, SILENT, Attempt, ending
-from .samples import SIMULATED
+from .samples import simulated as all_kinds
 
 SECONDS = 120
 NEVER: list[Any] = [
@@ -84,7 +84,7 @@ def observed_calls(nominal: aj.Arm, sockets: aj.Capture) -> dict[str, tuple[Call
     """Calls with observations: the constructor of every kind and of its simulation, and what takes them."""
     observations = aj.data.observations
     noise = aj.Noise(encoder_arcsec=2.0, seating=0.005)
-    capture = aj.simulate(nominal, {"A": (400, 200, 300)}, poses=6, observations=SIMULATED, noise=noise)
+    capture = aj.simulate(nominal, {"A": (400, 200, 300)}, poses=6, observations=all_kinds(), noise=noise)
     few = aj.Parameters(nominal, ("a_2", "d_4", "theta_2"))
     calls: dict[str, tuple[Callable, dict[str, Any]]] = {
         "join_sessions": (aj.join_sessions, {"captures": {"one": sockets, "other": capture}, "own_probe": True}),
@@ -95,7 +95,7 @@ def observed_calls(nominal: aj.Arm, sockets: aj.Capture) -> dict[str, tuple[Call
         ),
         "simulate observations": (
             aj.simulate,
-            {"arm": nominal, "sockets": {}, "observations": SIMULATED[2:4], "noise": noise, "seed": 1},
+            {"arm": nominal, "sockets": {}, "observations": all_kinds()[2:4], "noise": noise, "seed": 1},
         ),
         "calibrate observations": (
             aj.calibrate,
@@ -110,7 +110,7 @@ def observed_calls(nominal: aj.Arm, sockets: aj.Capture) -> dict[str, tuple[Call
         ),
         "Socket": (observations.Socket, {"name": "A", "q": np.zeros((3, 6)), "target": ""}),
     }
-    for simulated in SIMULATED:
+    for simulated in all_kinds():
         fields = dict(vars(simulated))
         calls[f"{type(simulated).__name__} '{simulated.name}'"] = (type(simulated), fields)
     for one in capture.observations:

@@ -28,17 +28,6 @@ method = "stage1"
 """
 _BOX, _FRAME = [[250, -200, 200], [550, 250, 450]], (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
 _BAR = {"a": (0.0, 0.0, 0.0), "b": (200.0, 0.0, 0.0)}
-# Observations of every kind, to simulate.
-SIMULATED = [
-    aj.data.observations.SimulatedPoints("T", _BOX, 8, _FRAME, u=0.01, target="SMR", place=(10.0, 20.0, 60.0)),
-    aj.data.observations.SimulatedTransforms("T6", _BOX, 8, (10, 20, 80, 0.1, 0.2, 0.3), _FRAME, u=0.01),
-    aj.data.observations.SimulatedSphere("sphere", (400, 0, 300), 50.0, 8, u=0.001, stylus=6.0),
-    aj.data.observations.SimulatedCylinder("ring", [(400, 0, 300), (410, 0, 340)], 80.0, 8, u=0.001, inside=True),
-    aj.data.observations.SimulatedPlanes("wall", (300, -200, 200), [(0, 300, 0), (0, 0, 200)], 8),
-    aj.data.observations.SimulatedPlanes("block", (300, -200, 200), [(200, 0, 0), (0, 300, 0)], 5, 80.0, 0.001),
-    aj.data.observations.SimulatedArtefact("bar", _BAR, 5, (0, 0, 0.3, 350, -100, 250), u=0.001, index="1"),
-    aj.data.observations.SimulatedDistances("wire", _BOX, 8, (900, 300, 100), u=0.003),
-]
 BLOCK = 3  # trials in a block of the study
 
 
@@ -52,6 +41,20 @@ class Results(NamedTuple):
     writers: dict[str, Callable[[Path], Any]]
 
 
+def simulated() -> list[Any]:
+    """Observations of every kind, to simulate. Checking them computes in JAX, which `writes` must not have done."""
+    return [
+        aj.data.observations.SimulatedPoints("T", _BOX, 8, _FRAME, u=0.01, target="SMR", place=(10.0, 20.0, 60.0)),
+        aj.data.observations.SimulatedTransforms("T6", _BOX, 8, (10, 20, 80, 0.1, 0.2, 0.3), _FRAME, u=0.01),
+        aj.data.observations.SimulatedSphere("sphere", (400, 0, 300), 50.0, 8, u=0.001, stylus=6.0),
+        aj.data.observations.SimulatedCylinder("ring", [(400, 0, 300), (410, 0, 340)], 80.0, 8, u=0.001, inside=True),
+        aj.data.observations.SimulatedPlanes("wall", (300, -200, 200), [(0, 300, 0), (0, 0, 200)], 8),
+        aj.data.observations.SimulatedPlanes("block", (300, -200, 200), [(200, 0, 0), (0, 300, 0)], 5, 80.0, 0.001),
+        aj.data.observations.SimulatedArtefact("bar", _BAR, 5, (0, 0, 0.3, 350, -100, 250), u=0.001, index="1"),
+        aj.data.observations.SimulatedDistances("wire", _BOX, 8, (900, 300, 100), u=0.003),
+    ]
+
+
 def results() -> Results:
     """A capture of three sockets and one of every kind of observation, their calibrations, and what is made of them."""
     arm = aj.files.load_specification("cheng2018-simulation")
@@ -62,7 +65,7 @@ def results() -> Results:
     evaluation = aj.acceptance.evaluation_of(record, recording, maxima={"rms_mm": 0.1})
     noise = aj.Noise(encoder_arcsec=2.0, seating=0.005)
     points = {"A": sockets["A"]}
-    observed = aj.simulate(arm.arm, points, poses=8, observations=SIMULATED, noise=noise, seed=1)
+    observed = aj.simulate(arm.arm, points, poses=8, observations=simulated(), noise=noise, seed=1)
     observed_recording = aj.Recording(observed, arm, arm, seed=1)
     few = aj.Parameters(arm.arm, ("a_2", "d_4", "theta_2", "theta_3"))
     found = aj.calibrate(arm.arm, observed, aj.Bounds.around(arm.arm, few), noise=noise)

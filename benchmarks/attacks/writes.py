@@ -9,6 +9,7 @@ import contextlib
 import os
 import pickle
 import resource
+import select
 import shutil
 import signal
 import subprocess
@@ -28,6 +29,7 @@ from .outcomes import LOST, REFUSED, SAME, UNEXPECTED, Attempt, ending, exact
 from .samples import BLOCK, READERS, results, studies, study_results
 
 SECONDS = 120  # of wall time: making all files, on a busy machine
+LOADING = 600  # of wall time: importing and loading, on a very busy machine
 DISK = 2**20  # bytes of the disk that is filled
 PAGE = 4096  # by which it is filled
 
@@ -46,7 +48,8 @@ def targets(folder: Path) -> dict[str, Target]:
     assert forked(nothing, lambda _: made(folder))[0] == "written"
 
     def save(kind: str) -> Callable[[Any, Path], Any]:
-        return lambda loaded, path: getattr(aj.files, f"save_{kind}")(path, loaded)
+        what = {"observations": "capture", "calibration from observations": "calibration"}.get(kind, kind)
+        return lambda loaded, path: getattr(aj.files, f"save_{what}")(path, loaded)
 
     def in_blocks_at(path: Path) -> None:
         shutil.copy(folder / "parts" / "study.h5", path)
@@ -83,6 +86,9 @@ def forked(load: Callable[[], Any], work: Callable[[Any], Any], delay: float | N
         os._exit(0)
     os.close(writing)
     with os.fdopen(reading, "rb") as stream:
+        if not select.select([stream], [], [], LOADING)[0]:
+            os.kill(child, signal.SIGKILL)
+            raise AssertionError("a fork hangs while it loads; has this process computed in JAX?")
         assert stream.read(1), "nothing could be loaded"
         if delay is not None:
             time.sleep(delay)
