@@ -264,10 +264,8 @@ def _expected(parts: list[_Parts], forms: list[Any], covariances: list[Any], inv
     """tr(Q M C M^T), the expectation of w.Qw where e has the covariance C."""
     both, of_form, of_covariance, mixed = 0.0, 0.0, 0.0, 0.0
     for part, form, covariance in zip(parts, forms, covariances, strict=True):
-        xp = namespace(part.rows, form)
-        both = both + xp.sum(form * covariance)
-        by_form = xp.einsum("zam,abm->zbm", part.rows, form)
-        by_covariance = xp.einsum("zam,abm->zbm", part.influence, covariance)
+        both = both + namespace(form, covariance).sum(form * covariance)
+        by_form, by_covariance = _product(part.rows, form), _product(part.influence, covariance)  # both symmetric
         of_form = of_form + _outer(by_form, part.rows)
         of_covariance = of_covariance + _outer(by_covariance, part.influence)
         mixed = mixed + _outer(by_form, by_covariance)
