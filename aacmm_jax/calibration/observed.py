@@ -286,6 +286,7 @@ def _covariance(
     rows = propagation.stacked(state.linear, task.observed, whitening, z.shape[0])
     rows = [scaled[:, None, None] * part for part in rows]
     poses = sum((_flat(part) @ _flat(part).T for part in rows), xp.zeros_like(information))
+    unweighted = rows
     if task.loss is not None:
         rows = _weighted_rows(task.loss, state, whitening, rows)
         plain = observed_model(z, (space, task.observed, whitening, None)).gram * scaled[:, None] * scaled[None, :]
@@ -296,7 +297,10 @@ def _covariance(
     if task.noise_model == "given":
         assert noise is not None
     elif task.noise_model == "estimated":
-        found = propagation.moments(state.linear, state.errors, rows, whitening, inverse, state.sigma)
+        found = propagation.moments(
+            *(state.linear, state.errors, unweighted, rows, whitening, inverse, state.sigma),
+            robust=task.loss is not None,
+        )
         noise = propagation.noise_from(found)
     else:
         noise = propagation.noise_from(propagation.Moments(xp.zeros(()), state.sigma**2))

@@ -8,6 +8,7 @@ from xml.etree.ElementTree import Element
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..core.errors import InputError
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity, held_by_xml
+from ..summaries.contradictions import removals
 from ..summaries.observations import scale_sources
 from ..summaries.warnings import of_calibration
 from .measurement_results import add_results, uncertainty_statement
@@ -90,6 +91,9 @@ def _check_texts(record: CalibrationRecord, sources: Sequence[str], command: str
         for text in texts_of(observation):
             held_by_xml(text, f"{text!r} of observation {observation.name!r}")
         held_by_xml(observation.target, f"the name of target {observation.target!r}")
+    for removed in record.removed:
+        for name in (removed.group, *removed.members):
+            held_by_xml(name, f"the name of {name!r}, which was left out")
     held_by_xml(record.recording.nominal.name, f"the name of arm {record.recording.nominal.name!r}")
     for source in sources:
         held_by_xml(source, f"the name of file {source!r}")
@@ -177,8 +181,12 @@ def _add_statements(
     _add_statement(parent, "Uncertainty", uncertainty_statement(record), norm="JCGM 100:2008")
     if record.sampled_says:
         _add_statement(parent, "Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
+    for sentence, removed in zip(removals(record), record.removed, strict=True):
+        all_of_it = f"{sentence} Sockets and observations left out: {', '.join(removed.members)}."
+        _add_statement(parent, "Data left out", all_of_it)
     for sentence in of_calibration(record):
-        _add_statement(parent, "Warning", sentence)
+        if sentence not in removals(record):
+            _add_statement(parent, "Warning", sentence)
     if sources:
         _add_statement(parent, "Files", ", ".join(sources))
     if given.conformity is not None:

@@ -132,6 +132,11 @@ def _add_methods(parent: Element, record: CalibrationRecord, residuals: tuple[Ob
             f" The robust loss '{record.robust}' took weight from poses with large residuals; "
             f"{len(less_weight(residuals))} have half of their weight or less."
         )
+    if record.removed:
+        groups = ", ".join(f"{removed.kind} {removed.group}" for removed in record.removed)
+        words += (
+            f" Left out, because they contradict the rest by an F test: {groups}; see the statements on data left out."
+        )
     method = add(parent, "usedMethod")
     add_english(method, "name", "Identification of Denavit-Hartenberg parameters")
     add_english(method, "description", words)

@@ -15,6 +15,7 @@ from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import AnyArray, add_at, namespace, to_numpy
 from ..data.capture import Capture, check_one_capture
 from ..data.observations.observation import POINT, AbstractObservation, Rows, Tips, offset_of
+from ..data.observations.platform import platform_frames
 from ..data.observations.socket import Socket, position_of
 from ..kinematics.chain import ForwardPass, SinesCosines, forward_pass, sines_cosines
 from ..kinematics.jacobian import rotation_columns, stacked_jacobian_columns
@@ -118,15 +119,18 @@ class Observed(eqx.Module):
         return forward_pass(arm, self.sines_cosines)
 
     def start(self, space: Parameters, vector: Float[AnyArray, " p"]) -> Float[AnyArray, " g"]:
-        """The unknown geometry as the observations say, one after the other, by an arm that is nearly right."""
+        """The unknown geometry as the observations say, one after the other, by an arm that is nearly right; the frames
+        of a platform as all that stands on it says together."""
         arm = space.geometry(vector)
         forward = forward_pass(arm, self.sines_cosines)
+        tips = [_tips(forward, rows) for rows in self.slices]
         found: dict[str, Any] = {}
-        for observation, rows in zip(self.observations, self.slices, strict=True):
-            new = observation.start(_tips(forward, rows), arm.probe)
+        for observation, own in zip(self.observations, tips, strict=True):
+            new = observation.start(own, arm.probe)
             if observation.target:
                 new = {offset_of(observation.target): arm.probe} | new
             found = new | found  # what another observation has found stays
+        found |= platform_frames(self.observations, tips)
         return namespace(arm, forward).concatenate([found[name] for name in self.blocks])
 
 

@@ -25,6 +25,8 @@ TUNING = {
 }
 # Medians of the chi-square distribution: of the square of a pose's whitened residual.
 MEDIANS = {1: 0.454936, 3: 2.365974, 6: 5.348121}
+# Its 95 % point, and what remains of its expectation, of 1 a row, where larger squares count as one at that point.
+BOUNDED_SQUARES = {1: (3.841459, 0.912972), 3: (7.814728, 0.963499), 6: (12.591587, 0.978234)}
 
 
 def check_loss(robust: object) -> None:

@@ -32,6 +32,7 @@ from .observations import (
     geometry_section,
     observation_tables,
     other_poses_table,
+    removed_tables,
     residuals_section,
     stages_chart,
 )
@@ -163,6 +164,7 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     blocks += observation_tables(record)
     if lengths or not capture.observations:
         blocks.append(ReportTable("Reference lengths", ("between", "calibrated value [mm]", "u [mm]"), lengths))
+    blocks += removed_tables(record)
     blocks.append(_traceability(summary["scale_from"]))
     return Section("data", "What was calibrated, and from which data", blocks)
 

@@ -57,6 +57,29 @@ def observation_tables(record: CalibrationRecord) -> list[ReportTable]:
     return tables
 
 
+def removed_tables(record: CalibrationRecord) -> list[ReportTable]:
+    """What was left out because it contradicts the rest, why, and what that changed."""
+    if not record.removed:
+        return []
+    rows = [
+        [
+            text_cell(one.group),
+            text_cell(one.kind),
+            text_cell(", ".join(one.members)),
+            number_cell(one.ratio, 1),
+            text_cell("{} and {}".format(*one.degrees_of_freedom)),
+            number_cell(one.probability) if one.probability >= 1e-4 else text_cell("< 0.0001"),
+            number_cell(one.rms_with),
+            number_cell(one.rms_without),
+            text_cell(f"{one.changed_most}, by {format_number(one.change, 1)} u"),
+        ]
+        for one in record.removed
+    ]
+    columns = ("group", "kind", "its sockets and observations", "F", "degrees of freedom", "p")
+    changed = ("RMS of the rest, with it [mm]", "without it [mm]", "changed most")
+    return [ReportTable("Left out, because it contradicts the rest", (*columns, *changed), rows)]
+
+
 def _words(quantity: dict[str, Any]) -> str:
     return quantity_words(quantity, u=False).replace("-", "−")
 

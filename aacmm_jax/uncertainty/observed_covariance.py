@@ -17,10 +17,10 @@ from ..data.noise import Noise, noise_of
 from ..kinematics.chain import ForwardPass
 from ..kinematics.jacobian import jacobian_columns
 from ..model.observed import Linear, Observed, Whitening, whitened
-from ..model.robust import MEDIANS
+from ..model.robust import BOUNDED_SQUARES, MEDIANS
 
 _LEAST_SIGMA = 1e-9  # mm
-_ROUNDS, _MEDIAN_ROUNDS = 100, 20
+_ROUNDS, _MEDIAN_ROUNDS, _MOMENT_ROUNDS = 100, 20, 10
 
 
 class ArmErrors(NamedTuple):
@@ -155,56 +155,124 @@ def stacked(
     return found
 
 
+class _Parts(NamedTuple):
+    """What `moments` needs of one observation, in whitened rows."""
+
+    white: Float[AnyArray, "r m"]
+    readings: Float[AnyArray, "r r m"]  # D: covariance for 1 arcsec
+    seat: Float[AnyArray, "r r m"]  # T: for 1 mm
+    measured: Float[AnyArray, "r r m"]  # S: of what was measured
+    rows: Float[AnyArray, "z r m"]  # A
+    influence: Float[AnyArray, "z r m"]  # A W, as the loss of the estimate weights them
+
+
 def moments(
     linear: list[Linear],
     errors: list[ArmErrors],
     rows: list[Float[AnyArray, "_ _ _"]],
+    influence: list[Float[AnyArray, "_ _ _"]],
     whitening: Whitening,
     inverse: Float[AnyArray, "z z"],
     sigma: Float[AnyArray, ""],
+    robust: bool = False,
 ) -> Moments:
-    """Both variances from two moments of the whitened residuals w = M e, M = I - A^T G A a projector.
+    """Both variances from two moments of the whitened residuals w = M e, M = I - A^T G A W.
 
     With D and T the parts of a row's covariance for 1 arcsec and 1 mm, and S that of what was measured,
-    E[w.Dw] = v tr(MDMD) + s tr(MDMT) + tr(MDMS), and likewise with T (Henderson 1953). A negative variance is set to 0
-    and the other taken from the total scatter ``sigma``.
+    E[w.Dw] = v tr(DMDM^T) + s tr(DMTM^T) + tr(DMSM^T), and likewise with T (Henderson 1953). A negative variance is set
+    to 0 and the other taken from the total scatter ``sigma``.
+
+    ``robust``: so that outliers have little influence, the forms are C^-1 D C^-1 and C^-1 T C^-1, with C = v D + s T +
+    S by the variances so far, and a pose with w.C^-1 w above the 95 % point of chi-square counts as one at that point,
+    over the expectation of this for normal errors (Huber's proposal 2 of 1964, here for two variances).
     """
     xp = namespace(inverse, sigma, rows)
-    parts: dict[str, list[Any]] = {"D": [], "T": [], "S": []}
-    white = []
-    for part, error, root in zip(linear, errors, whitening.roots, strict=True):
+    parts = []
+    for part, error, root, j, weighted in zip(linear, errors, whitening.roots, rows, influence, strict=True):
         readings = xp.einsum("mab,bnm->anm", root, error.by_readings * ARCSEC)
         seat = xp.einsum("mab,bnm->anm", root, error.by_seat)
-        parts["D"].append(xp.einsum("anm,bnm->abm", readings, readings))
-        parts["T"].append(xp.einsum("anm,bnm->abm", seat, seat))
-        parts["S"].append(xp.einsum("mab,mbc,mdc->adm", root, part.rows.measured, root))
-        white.append(xp.einsum("mab,bm->am", root, part.rows.values))
+        parts.append(
+            _Parts(
+                white=xp.einsum("mab,bm->am", root, part.rows.values),
+                readings=xp.einsum("anm,bnm->abm", readings, readings),
+                seat=xp.einsum("anm,bnm->abm", seat, seat),
+                measured=xp.einsum("mab,mbc,mdc->adm", root, part.rows.measured, root),
+                rows=j,
+                influence=weighted,
+            )
+        )
+    if not robust:
+        counts = [xp.ones(part.white.shape[1]) for part in parts]
+        return _solved(parts, [part.readings for part in parts], [part.seat for part in parts], counts, inverse, sigma)
 
-    def product(a: str, b: str) -> Any:
-        """tr(MAMB)."""
-        both, ka, kb, kab = 0.0, 0.0, 0.0, 0.0
-        for x, y, j in zip(parts[a], parts[b], rows, strict=True):
-            both = both + xp.sum(x * y)
-            jx, jy = xp.einsum("zam,abm->zbm", j, x), xp.einsum("zam,abm->zbm", j, y)
-            ka = ka + _outer(jx, j)
-            kb = kb + _outer(jy, j)
-            kab = kab + _outer(jx, jy)
-        return both - 2 * xp.sum(inverse * kab) + xp.sum((inverse @ ka) * (inverse @ kb).T)
+    def again(found: Moments, _: Any) -> tuple[Moments, Any]:
+        forms_d, forms_t, counts = [], [], []
+        for part in parts:
+            by_covariance, count = _bounded(part, stop_gradient(found))
+            forms_d.append(xp.einsum("abm,bcm,cdm->adm", by_covariance, part.readings, by_covariance))
+            forms_t.append(xp.einsum("abm,bcm,cdm->adm", by_covariance, part.seat, by_covariance))
+            counts.append(count)
+        return _solved(parts, forms_d, forms_t, counts, inverse, sigma), xp.zeros(())
 
-    def seen(a: str) -> Any:
-        return sum(xp.einsum("am,abm,bm->", w, x, w) for w, x in zip(white, parts[a], strict=True))
+    return scan(again, Moments(xp.zeros(()), sigma**2), length=_MOMENT_ROUNDS)[0]
 
-    dd, dt, tt = product("D", "D"), product("D", "T"), product("T", "T")
-    right_d, right_t = seen("D") - product("D", "S"), seen("T") - product("T", "S")
-    determinant = dd * tt - dt * dt
+
+def _bounded(part: _Parts, found: Moments) -> tuple[Float[AnyArray, "r r m"], Float[AnyArray, " m"]]:
+    """C^-1 of every pose, and how much its square counts."""
+    xp, r = namespace(part.white, found), part.white.shape[0]
+    # A little of the first weights besides, since C has no inverse where two joints are all that errs.
+    covariance = found.encoder * part.readings + found.seat * part.seat + part.measured
+    covariance = covariance + 0.01 * xp.asarray(np.eye(r))[:, :, None]
+    inverse = xp.moveaxis(inverse_positive_definite(xp.moveaxis(covariance, -1, 0)), 0, -1)
+    square = xp.einsum("am,abm,bm->m", part.white, inverse, part.white)
+    most, expected = BOUNDED_SQUARES[r]
+    return inverse, xp.minimum(1.0, most / xp.maximum(square, 1e-300)) / expected
+
+
+def _solved(
+    parts: list[_Parts],
+    forms_d: list[Float[AnyArray, "_ _ _"]],
+    forms_t: list[Float[AnyArray, "_ _ _"]],
+    counts: list[Float[AnyArray, " _"]],
+    inverse: Float[AnyArray, "z z"],
+    sigma: Float[AnyArray, ""],
+) -> Moments:
+    """The variances that explain both sums of quadratic forms of the residuals."""
+    xp = namespace(inverse, sigma)
+    d, t, s = ([getattr(part, name) for part in parts] for name in ("readings", "seat", "measured"))
+
+    def seen(forms: list[Any]) -> Any:
+        each = zip(parts, forms, counts, strict=True)
+        return sum(xp.einsum("am,abm,bm,m->", part.white, form, part.white, count) for part, form, count in each)
+
+    dd, dt, td, tt = (_expected(parts, form, by, inverse) for form in (forms_d, forms_t) for by in (d, t))
+    right_d = seen(forms_d) - _expected(parts, forms_d, s, inverse)
+    right_t = seen(forms_t) - _expected(parts, forms_t, s, inverse)
+    determinant = dd * tt - dt * td
     apart = determinant > 1e-9 * dd * tt
     safe = xp.where(apart, determinant, 1.0)
-    encoder, seat = (tt * right_d - dt * right_t) / safe, (dd * right_t - dt * right_d) / safe
+    encoder, seat = (tt * right_d - dt * right_t) / safe, (dd * right_t - td * right_d) / safe
     alone = xp.maximum(right_d / xp.where(dd > 0, dd, 1.0), 0.0)
     positive = apart & (encoder > 0)
     return Moments(
         xp.where(positive, xp.where(seat > 0, encoder, alone), 0.0),
         xp.where(positive, xp.maximum(seat, 0.0), sigma**2),
+    )
+
+
+def _expected(parts: list[_Parts], forms: list[Any], covariances: list[Any], inverse: Float[AnyArray, "z z"]) -> Any:
+    """tr(Q M C M^T), the expectation of w.Qw where e has the covariance C."""
+    both, of_form, of_covariance, mixed = 0.0, 0.0, 0.0, 0.0
+    for part, form, covariance in zip(parts, forms, covariances, strict=True):
+        both = both + namespace(form, covariance).sum(form * covariance)
+        by_form, by_covariance = _product(part.rows, form), _product(part.influence, covariance)  # both symmetric
+        of_form = of_form + _outer(by_form, part.rows)
+        of_covariance = of_covariance + _outer(by_covariance, part.influence)
+        mixed = mixed + _outer(by_form, by_covariance)
+    return (
+        both
+        - 2 * namespace(mixed).sum(inverse * mixed)
+        + namespace(mixed).sum((inverse @ of_form) * (inverse @ of_covariance).T)
     )
 
 

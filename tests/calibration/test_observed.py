@@ -208,6 +208,37 @@ def test_robust_without_outliers_is_nearly_least_squares(paper_arm, bounds, sock
         np.testing.assert_allclose(u_of(result), u_of(plain), rtol=0.25)
 
 
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    ("robust", "seed"),
+    [
+        ("huber", 0),
+        *(pytest.param("huber", seed, marks=SLOW) for seed in range(1, 5)),
+        pytest.param("tukey", 0, marks=SLOW),
+    ],
+)
+def test_noise_is_estimated_without_its_outliers(paper_arm, true, space, bounds, robust, seed):
+    """Two of 200 tracker points are bad, one by far: the noise, u and the errors in units of u are as without them."""
+    simulated = [kinds.SimulatedPoints("T", BOX, 200, FRAME, u=0.01)]
+    noise = aj.Noise(encoder_arcsec=10, seating=0.005)
+    good = aj.simulate(true, {}, observations=simulated, noise=noise, seed=seed)
+    points = np.array(good.observations[0].points)
+    points[[5, 100]] += [[3.0, -2.0, 1.0], [0.1, 0.0, -0.1]]
+    bad = eqx.tree_at(lambda c: c.observations[0].points, good, points)
+    plain, clean, shifted = (
+        aj.calibrate(paper_arm, capture, bounds, robust=loss, check_identifiability=False)
+        for capture, loss in ((good, None), (good, robust), (bad, robust))
+    )
+    assert float(shifted.noise.encoder_arcsec) == pytest.approx(float(clean.noise.encoder_arcsec), rel=0.15)
+    assert float(clean.noise.encoder_arcsec) == pytest.approx(10, rel=0.15)
+    np.testing.assert_allclose(u_of(shifted), u_of(clean), rtol=0.15)
+    assert np.median(u_of(clean) / u_of(plain)) == pytest.approx(1.0, abs=0.05)
+    errors = (np.asarray(shifted.parameters) - np.asarray(space.vector(true))) / u_of(shifted)
+    assert 0.3 < np.mean(errors**2) < 2.5
+
+
 def test_sessions_with_a_remounted_probe(paper_arm, true, space, bounds, sockets):
     """Two sessions of one arm, the probe 0.3 mm elsewhere in the second: one probe for both does not fit."""
     remounted = true.replace(probe=np.asarray(true.probe) + np.array([0.3, -0.2, 0.1]))

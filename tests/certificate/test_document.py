@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 import aacmm_jax as aj
+from aacmm_jax.calibration.record import Removed
 from aacmm_jax.certificate import dcc_xml, parse_dcc, xml_elements
 from aacmm_jax.files.administrative_data import (
     AdministrativeData,
@@ -423,6 +424,19 @@ def test_nothing_is_made_up(record):
     names = contents(text, "*/dcc:statements/dcc:statement/dcc:name")
     assert not {"Conformity", "Simulation", "Files", "Remarks"} & set(names)
     assert names[:2] == ["Scale", "Uncertainty"]
+
+
+def test_what_was_left_out_is_stated(record):
+    removed = Removed("station", "T2", ("T2/day", "T2/night"), 45.6, (6, 60), 1e-9, 0.2, 0.1, "theta_3", 12.0)
+    text = dcc_xml(record._replace(removed=(removed,)), AdministrativeData(), created=CREATED)
+    (said,) = [one for one in contents(text, "*/dcc:statements") if "T2" in one]
+    assert said.startswith(
+        "Left out: station T2, which contradicts the rest (F = 45.6 with 6 and 60 degrees of freedom"
+    )
+    assert said.endswith("Sockets and observations left out: T2/day, T2/night.")
+    assert sum("rest by an F test: station T2;" in one for one in contents(text, ".//dcc:usedMethods")) == 2
+    hostile = record._replace(removed=(removed._replace(members=("A\x1b",)),))
+    assert_refused(lambda: dcc_xml(hostile, AdministrativeData(), created=CREATED), r"'A\x1b'", "U+001B")
 
 
 def test_warnings_and_simulations_are_stated(record):

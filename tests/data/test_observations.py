@@ -10,9 +10,13 @@ from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
+from aacmm_jax.core.rotations import rotation_matrix
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.data.observations.cylinder import distances, fitted_cylinder
+from aacmm_jax.data.observations.frames import placed
 from aacmm_jax.data.observations.observation import Tips, certified_quantities, stated_quantities
+from aacmm_jax.data.observations.platform import platform_frames
+from aacmm_jax.data.observations.shifted import ShiftedObservation
 from aacmm_jax.files.observations import kinds as known_kinds
 
 RANDOM = np.random.default_rng(1)
@@ -127,6 +131,35 @@ def test_starts_are_exact_for_exact_data(paper_arm):
             moved = tips.position + np.einsum("pcm,p->cm", np.stack(axes), offset - probe)
             tips = tips._replace(position=moved)
         assert np.abs(observation.residual(tips, found).values).max() < 1e-3, observation.kind
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_platform_frames_are_exact_for_exact_data(seed):
+    """Of two bars, which leave a turn about their line open, on indices up to half a revolution and more apart; a plate
+    stands beside the platform and on it, which tells the platform's frame, and errors are added to the residuals."""
+    random = np.random.default_rng(seed)
+    frames = np.concatenate([random.uniform(-1.7, 1.7, (5, 3)), random.uniform(-500, 500, (5, 3))], axis=1)
+    bar = {"a": (0.0, 0.0, 0.0), "b": (300.0, 0.0, 0.0)}
+    plate = {"p": (0.0, 0.0, 0.0), "q": (100.0, 0.0, 0.0), "r": (0.0, 100.0, 0.0)}
+    placements = {"first": (bar, frames[0]), "second": (bar, frames[1]), "plate": (plate, frames[2])}
+    indices = {None: np.zeros(6), "1": frames[3], "2": frames[4]}
+    held = [("plate", None), ("second", "2"), ("first", "1"), ("second", "1"), ("plate", "1"), ("first", "2")]
+    observations, tips = [], []
+    for placement, index in held:
+        points, inner = placements[placement]
+        on_platform = placed(inner, np.array(list(points.values())).T)[0]
+        position = placed(indices[index], on_platform)[0]
+        q = {point: np.zeros((1, 6)) for point in points}
+        artefact = kinds.Artefact(f"{placement} at {index}", points, q, placement=placement, index=index)
+        observations.append(ShiftedObservation(artefact, artefact.q, np.zeros((3, len(q))), {}))
+        tips.append(Tips(position, (position, position, position)))
+    found = platform_frames(observations, tips)
+    assert set(found) == {f"placement {name}" for name in placements} | {"index 1", "index 2"}
+    for observation, own in zip(observations, tips, strict=True):
+        assert np.abs(observation.residual(own, found).values).max() < 1e-4, observation.name
+    expected = rotation_matrix(frames[3][:3])
+    np.testing.assert_allclose(rotation_matrix(found["index 1"][:3]), expected, atol=1e-6)
+    assert platform_frames(observations[:1], tips[:1]) == {}
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from aacmm_jax.model.robust import LOSSES, MEDIANS, TUNING, Loss
+from aacmm_jax.model.robust import BOUNDED_SQUARES, LOSSES, MEDIANS, TUNING, Loss
 
 
 @pytest.mark.parametrize("rows", [1, 3, 6])
@@ -25,6 +25,14 @@ def test_tuning_constants_give_95_percent(name, rows):
     assert a**2 / b == pytest.approx(0.95, abs=2e-3)
     assert MEDIANS[rows] == pytest.approx(stats.chi2(rows).median(), abs=1e-5)
     assert rows in TUNING[name]
+
+
+@pytest.mark.parametrize("rows", [1, 3, 6])
+def test_bounded_squares_of_normal_residuals(rows):
+    most, expected = BOUNDED_SQUARES[rows]
+    distribution = stats.chi2(rows)
+    assert most == pytest.approx(distribution.ppf(0.95), abs=1e-5)
+    assert expected == pytest.approx(distribution.expect(lambda x: np.minimum(x, most)) / rows, abs=1e-5)
 
 
 @pytest.mark.parametrize("name", LOSSES)

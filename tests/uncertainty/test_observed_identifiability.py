@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.core.rotations import rotation_matrix
 from aacmm_jax.data import observations as kinds
 
 NOISE = aj.Noise(encoder_arcsec=2, seating=0.005)
@@ -78,6 +79,30 @@ def test_a_target_takes_the_place_of_the_probe(paper_arm):
         "theta_6, orientation of T6 and offset of T6 trade off",
         "probe_z (changes nothing that is measured)",
     }
+
+
+def test_one_bar_on_a_platform_that_turns_half_a_revolution(paper_arm):
+    """The geometry agrees with any arm that is nearly right, however far apart the indices are."""
+    turns = (0, 180)
+    bar, origin = {"a": (0, 0, 0), "b": (300, 0, 0)}, np.array([-150, 0, 50])
+    observations = [
+        kinds.SimulatedArtefact(
+            f"index {turn}",
+            bar,
+            8,
+            (0, 0, angle + 0.3, *(np.array([350, 0, 200]) + rotation_matrix(np.array([0, 0, angle])) @ origin)),
+            u=0.001,
+            artefact="bar",
+            placement="on the platform",
+            index=str(turn),
+        )
+        for turn, angle in zip(turns, np.deg2rad(turns), strict=True)
+    ]
+    true = aj.perturbed_arm(aj.Parameters.independent(paper_arm), length=1.0, angle=np.deg2rad(0.1), seed=1)
+    capture = aj.simulate(true, {}, observations=observations, noise=NOISE, seed=4)
+    seen = aj.observability(paper_arm, capture, aj.Parameters.independent(paper_arm), noise=NOISE)
+    assert seen.rank == 21
+    assert not seen.undetermined
 
 
 def test_indices_agree_with_eliminated_sockets(paper_arm):

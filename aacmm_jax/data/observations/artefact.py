@@ -179,7 +179,8 @@ class Artefact(AbstractObservation):
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
         xp = namespace(tips, self.coordinates)
         frame = fitted_frame(self.coordinates[np.array(self.owner)].T, tips.position)
-        # Where the platform's frames are unknown too, the placement carries all of it at first.
+        # Where the platform's frames are unknown too, the placement carries all of it: `platform_frames` says more, by
+        # all observations together.
         found = {self.frame: frame}
         if self.index is not None:
             found[self.platform] = xp.zeros(6)
