@@ -110,7 +110,7 @@ def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
     validated = summary["cross_validation"]
     if validated is not None and validated["rms_mm"] is not None:
         rms, predicted = format_number(validated["rms_mm"]), format_number(validated["rms_predicted_mm"])
-        facts.append(("Held-out placements, RMS distance", f"{rms}\u00a0mm (predicted {predicted})"))
+        facts.append(("Held-out groups, RMS distance", f"{rms}\u00a0mm (predicted {predicted})"))
     for key, name in (("de_mm", "DE"), ("deltam_mm", "Deltam")) if "de_mm" in calibrated else ():
         change = f"{format_number(nominal[key])} → {format_number(calibrated[key])}\u00a0mm"
         facts.append((f"{name}, nominal → calibrated", change))
@@ -232,7 +232,7 @@ def _scale(
             f" By the reference lengths, which took no part, k = {k:.8f}." if math.isfinite(k) else ""
         )
     elif math.isnan(k):
-        introduction = f"Fitted with all else at once, the scale comes from {', '.join(summary['scale_from'])}."
+        introduction = f"The scale was fitted together with all else; it comes from {', '.join(summary['scale_from'])}."
     elif record.method == "joint":
         introduction = (
             "Poses and reference lengths were fitted together. The arm that poses alone give measures the lengths as "
