@@ -69,6 +69,9 @@ def of_import(recording: Recording) -> list[str]:
 
 def of_calibration(record: CalibrationRecord, seen: Observability | None = None) -> list[str]:
     """What should be read about a calibration before its numbers; ``seen`` is the result of `observed`, if known."""
+    if not record.plausible_scale:  # a wrong unit, say: what was fitted and predicted with it says nothing
+        ended = [] if record.reason.startswith("Converged") else [record.reason]
+        return [*_scale(record), *ended, *_implausible(record), *of_capture(record.recording)]
     found = [] if record.converged else [record.reason]
     found += removals(record)
     found += _implausible(record)
