@@ -41,11 +41,12 @@ def arm(summary: dict[str, Any]) -> None:
 def capture(summary: dict[str, Any]) -> None:
     """One capture."""
     console = new_console()
+    others = sum(row["kind"] != "socket" for row in summary["observations"])
+    sockets = len(summary["sockets"]) + len(summary["observations"]) - others  # of sessions with an own probe, too
     console.print(
         f"[bold]{escape(summary['arm'])}[/bold]: {pluralise(summary['poses'], 'pose')} of "
         f"{pluralise(summary['joints'], 'joint')} in "
-        f"{observed_words(len(summary['sockets']), len(summary['observations']), len(summary['lengths']))}"
-        + (", simulated" if summary["simulated"] else "")
+        f"{observed_words(sockets, others, len(summary['lengths']))}" + (", simulated" if summary["simulated"] else "")
     )
     print_warnings(console, summary)
     if summary["sockets"]:

@@ -11,6 +11,7 @@ from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_o
 from ..core.text import pluralise
 from ..core.units import ARCSEC, DEG
 from ..summaries.calibration import calibration_summary
+from ..summaries.observations import capture_words
 from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
 from . import charts
@@ -74,20 +75,16 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
         observability_section(observability),
         bounds_section(record, summary),
     ]
-    other = "other " if capture.names else ""
-    groups = [
-        pluralise(len(capture.names), "socket") if capture.names or not capture.observations else "",
-        pluralise(len(capture.observations), f"{other}observation") if capture.observations else "",
-        pluralise(len(capture.lengths), "reference length") if capture.lengths or not capture.observations else "",
-    ]
     method = _OBSERVED if record.method == "joint" and capture.observations else _METHODS[record.method]
     robust = f", robust loss {record.robust}" if record.robust else ""
     verdict, good = record.reason, record.converged and not record.implausible_residual
     if not good:
         verdict = "Not to be used" + (": data and arm do not belong together." if record.converged else f". {verdict}")
+    if not record.plausible_scale:
+        verdict = "Not to be used: the reference lengths give the arm a scale that it cannot have."
     report = Report(
         title="Calibration of " + (record.recording.nominal.name or "an arm"),
-        subtitle=f"{method}{robust}; {pluralise(summary['poses'], 'pose')} in {', '.join(filter(None, groups))}",
+        subtitle=f"{method}{robust}; {pluralise(summary['poses'], 'pose')} in {capture_words(capture)}",
         verdict=verdict,
         verdict_mark="good" if good else "bad",
         warnings=summary["warnings"],
@@ -232,7 +229,7 @@ def _scale(
             f" By the reference lengths, which took no part, k = {k:.8f}." if math.isfinite(k) else ""
         )
     elif math.isnan(k):
-        introduction = f"The scale was fitted together with all else; it comes from {', '.join(summary['scale_from'])}."
+        introduction = f"Fitted with all else at once, the scale comes from {', '.join(summary['scale_from'])}."
     elif record.method == "joint":
         introduction = (
             "Poses and reference lengths were fitted together. The arm that poses alone give measures the lengths as "

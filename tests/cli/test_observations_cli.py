@@ -311,7 +311,8 @@ def test_the_robot_of_the_examples(aacmm, mukca):
     # The nominal arm is as far from its points in both: 1.15 mm where its errors count as noise of the readings.
     assert judged["nominal_rms_mm"] == pytest.approx(found["observations"][0]["rms_before_mm"], rel=1e-4)
     shown = aacmm("show", "c.h5").stdout
-    assert "on 500 poses in 1 observation" in shown and "position [mm]" in shown
+    assert "on 500 poses in 1 observation" in shown
+    assert "position [mm]" in shown
 
 
 def test_a_plan_with_a_kit(aacmm, tmp_path):
