@@ -95,7 +95,7 @@ def plausible(k: float) -> bool:
 def largest_plausible_residual(arm: Arm, noise: Noise | None = None) -> float:
     """RMS distance from the sockets' centroids, mm, above which data and arm do not belong together.
 
-    A hundred times what an arm of this size can be, or what the given noise predicts at its full reach.
+    A hundred times the usual repeatability of an arm of this size, or what the given noise predicts at its full reach.
     """
     size = total_link_length(arm)
     scatter = _RELATIVE_REPEATABILITY * size

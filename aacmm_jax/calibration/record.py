@@ -114,7 +114,7 @@ class CalibrationRecord(NamedTuple):
 
     @property
     def implausible_residual(self) -> bool:
-        """Whether the residual is a hundred times what an arm of this size can be, so that data and arm do not fit."""
+        """Whether the residual is over a hundred times the usual repeatability of such an arm: of other data."""
         arm, capture = self.calibrated.arm, self.recording.capture
         if self.robust is not None and self.observed is not None:
             rms = float(np.sqrt(3) * self.observed.sigma)  # bad poses do not count

@@ -97,7 +97,7 @@ class AbstractSingleResult(AbstractResult):
 
     @property
     def implausible_residual(self) -> bool:
-        """Whether the residual is a hundred times what an arm of this size can be, so that data and arm do not fit."""
+        """Whether the residual is over a hundred times the usual repeatability of such an arm: of other data."""
         self._check_single()
         return float(self.after.rms) > largest_plausible_residual(self.arm, self.given_noise)
 

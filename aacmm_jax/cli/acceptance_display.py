@@ -53,7 +53,7 @@ def _sockets(console: Console, rows: list[dict[str, Any]], predicted: bool) -> N
     if not rows:
         return
     keys = ("de_mm", "deltam_mm", "rms_mm", *(["rms_predicted_mm"] if predicted else []))
-    headings = ("DE [mm]", "Deltam [mm]", "RMS [mm]", *(["predicted"] if predicted else []))
+    headings = ("DE [mm]", "Deltam [mm]", "RMS [mm]", *(["predicted [mm]"] if predicted else []))
     table = new_table("", "socket", "poses", *headings)
     for row in rows:
         table.add_row(escape(row["socket"]), str(row["poses"]), *(formatted(row[key]) for key in keys))
@@ -68,9 +68,9 @@ def _observations(console: Console, part: dict[str, Any], predicted: bool) -> No
         table = new_table(
             "\nObservations, RMS distance of poses from their geometry [mm]", "observation", "kind", "poses", *headings
         )
-        keys = ("nominal_rms_mm", "rms_mm", *(["rms_predicted_mm"] if predicted else []), "reduced_chi")
+        keys = ("nominal_rms_mm", "rms_mm", *(["rms_predicted_mm"] if predicted else []))
         for row in rows:
-            cells = (formatted(row[key]) for key in keys)
+            cells = (*(formatted(row[key]) for key in keys), formatted(row["reduced_chi"], 2))
             table.add_row(escape(row["observation"]), row["kind"], str(row["poses"]), *cells)
         print_table(console, table)
         for row in rows:
@@ -82,10 +82,13 @@ def _observations(console: Console, part: dict[str, Any], predicted: bool) -> No
     for what, key in (("kind", "kinds"), ("group", "groups")):
         alone = all(len(row["members"]) == 1 for row in part[key]) if key == "groups" else not rows
         if len(part[key]) > 1 and not alone:
-            title = "\nBy kind [mm]" if key == "kinds" else "\nBy what shares a length or an unknown geometry [mm]"
+            title = "\nBy kind [mm]" if key == "kinds" else "\nGroups that share a length or an unknown geometry [mm]"
             table = new_table(title, what, "poses", "RMS", "predicted", "in s.d.")
             for row in part[key]:
-                cells = (formatted(row[name]) for name in ("rms_mm", "rms_predicted_mm", "reduced_chi"))
+                cells = (
+                    *(formatted(row[name]) for name in ("rms_mm", "rms_predicted_mm")),
+                    formatted(row["reduced_chi"], 2),
+                )
                 table.add_row(escape(row[what]), str(row["poses"]), *cells)
             print_table(console, table)
     poses = part["predicted"]["poses"]
@@ -95,7 +98,7 @@ def _observations(console: Console, part: dict[str, Any], predicted: bool) -> No
             f"All held-out poses: RMS {formatted(poses['rms_mm'])} mm, predicted "
             + (f"{formatted(prediction)} mm" if prediction is not None else "not, because something is not determined")
             + " by the uncertainty of the calibration"
-            + (" and the noise (s.d.: its standard deviation)." if rows else " and the noise.")
+            + (" and the noise (in s.d.: in standard deviations)." if rows else " and the noise.")
         )
 
 

@@ -8,7 +8,7 @@ from rich.markup import escape
 
 from ..core.text import pluralise, shorten
 from ..core.units import ARCSEC, DEG
-from ..summaries.tables import METRICS, quantity_words, volume_rows
+from ..summaries.tables import METRICS, observed_words, quantity_words, volume_rows
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
 _MOST_PARTS = 12  # rows of a table
@@ -48,12 +48,12 @@ def arm(summary: dict[str, Any]) -> None:
 def capture(summary: dict[str, Any]) -> None:
     """One capture."""
     console = new_console()
+    others = sum(row["kind"] != "socket" for row in summary["observations"])
+    sockets = len(summary["sockets"]) + len(summary["observations"]) - others  # of sessions with an own probe, too
     console.print(
         f"[bold]{escape(summary['arm'])}[/bold]: {pluralise(summary['poses'], 'pose')} of "
-        f"{pluralise(summary['joints'], 'joint')} in {pluralise(len(summary['sockets']), 'socket')}, "
-        + (f"{pluralise(len(summary['observations']), 'other observation')}, " if summary["observations"] else "")
-        + f"{pluralise(len(summary['lengths']), 'reference length')}"
-        + (", simulated" if summary["simulated"] else "")
+        f"{pluralise(summary['joints'], 'joint')} in "
+        f"{observed_words(sockets, others, len(summary['lengths']))}" + (", simulated" if summary["simulated"] else "")
     )
     print_warnings(console, summary)
     if summary["sockets"]:
@@ -94,14 +94,13 @@ def calibration(summary: dict[str, Any]) -> None:
     print_verdict(console, summary)
     anchor = f"scale anchor {summary['hold']}" if summary["hold"] else "no scale anchor"
     if summary["scale_k"] is not None:
-        console.print(
-            f"Scale of stage 1: k = {summary['scale_k']:.8f}, u(k) = {summary['scale_u'] or 0:.1e} ({anchor})"
-        )
+        u = summary["scale_u"] or 0.0
+        console.print(f"Scale of stage 1: k = {summary['scale_k']:.{_decimals(u, 8)}f}, u(k) = {u:.1e} ({anchor})")
     print_warnings(console, summary)
     _validated(console, summary["cross_validation"])
     _sessions(console, summary.get("sessions"))
     _observed(console, summary)
-    stages = ("nominal", "stage1", "calibrated")
+    stages = ("nominal", "calibrated") if summary["method"] == "joint" else ("nominal", "stage1", "calibrated")
     title = "\nOn the poses it was identified from [mm]"
     if summary["nominal"]:
         print_stages(console, title, summary, stages, fitted=summary["fixed_by_one_length"])
@@ -121,10 +120,13 @@ def print_verdict(console: Console, summary: dict[str, Any]) -> None:
     verdict = "[green]converged[/green]" if summary["converged"] else "[red]did not converge[/red]"
     if summary["converged"] and not summary["residual_plausible"]:
         verdict = "[red]ended with a residual that no arm has[/red],"
+    rows = summary["observations"]  # with observations of other kinds, or a probe for each session: sockets too
+    sockets = {*summary["sockets_used"], *(row["observation"] for row in rows if row["kind"] == "socket")}
+    others = sum(row["kind"] != "socket" for row in rows)
     console.print(
         f"[bold]{escape(summary['arm'])}[/bold], {summary['method']}: {verdict} in "
         f"{pluralise(summary['steps'], 'step')} on {pluralise(summary['poses'], 'pose')} in "
-        f"{pluralise(len(summary['sockets_used']), 'socket')}"
+        f"{observed_words(len(sockets), others)}"
     )
 
 
@@ -152,7 +154,10 @@ def _observed(console: Console, summary: dict[str, Any]) -> None:
     _base(console, summary)
     if summary["robust"]:
         rows = summary["less_weight"]
-        console.print(f"Robust loss {summary['robust']}: {pluralise(len(rows), 'pose')} with half the weight or less.")
+        listed = f"; the {_MOST_PARTS} of least weight, all by --json" if len(rows) > _MOST_PARTS else ""
+        console.print(
+            f"Robust loss {summary['robust']}: {pluralise(len(rows), 'pose')} with half the weight or less{listed}."
+        )
         if rows:
             table = new_table("", "observation", "pose", "weight", "residual [mm]", "[standard deviations]")
             for row in rows[:_MOST_PARTS]:
@@ -177,14 +182,18 @@ def _base(console: Console, summary: dict[str, Any]) -> None:
         return
     factor = summary["uncertainty"]["coverage_factor_95"]
     table = new_table("\nBase frame as seen from frames with known coordinates, U (95 %)", "in", "", "x", "y", "z")
+    table.columns[1].justify = "left"
     for row in rows[:_MOST_PARTS]:
         for what, key, of_u, unit in (
             ("position [mm]", "position_mm", "position_u_mm", 1.0),
             ("rotation vector [deg]", "rotation_rad", "rotation_u_rad", 1 / DEG),
         ):
-            pairs = zip(row[key], row[of_u], strict=True)
-            cells = [f"{unit * x:.4f}" + ("" if u is None else f" ± {factor * unit * u:.4f}") for x, u in pairs]
-            table.add_row(escape(row["in"]) if key == "position_mm" else "", what, *cells)
+            expanded = [None if u is None else factor * unit * u for u in row[of_u]]
+            decimals = [_decimals(u, 4) for u in expanded]
+            values = (f"{unit * x:.{digits}f}" for x, digits in zip(row[key], decimals, strict=True))
+            table.add_row(escape(row["in"]) if key == "position_mm" else "", escape(what), *values)
+            known = zip(expanded, decimals, strict=True)
+            table.add_row("", "U", *("-" if u is None else f"{u:.{digits}f}" for u, digits in known))
     print_table(console, table)
 
 
@@ -211,9 +220,10 @@ def _validated(console: Console, found: dict[str, Any] | None) -> None:
         formatted(found["rms_mm"]),
         formatted(found["rms_predicted_mm"]),
     )
-    table.add_row(
-        "RMS error of reference lengths", formatted(found["length_error_rms_mm"]), formatted(found["length_u_mm"])
-    )
+    if found["length_error_rms_mm"] is not None:
+        table.add_row(
+            "RMS error of reference lengths", formatted(found["length_error_rms_mm"]), formatted(found["length_u_mm"])
+        )
     print_table(console, table)
     if "left_out" in found:
         _left_out(console, found["left_out"])
@@ -246,7 +256,8 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
     )
     encoder = found["encoder_arcsec"]
     readings = ", ".join(f"{x:.3g}" for x in encoder) if isinstance(encoder, list) else f"{encoder:.3g}"
-    noise = f"encoders {readings} arcsec, seat {1e3 * found['seating_mm']:.3g} um"
+    seat = "seat" if summary["sockets_used"] else "tip, each coordinate,"
+    noise = f"encoders {readings} arcsec, {seat} {1e3 * found['seating_mm']:.3g} um"
     source = {
         "given": f"Noise as given: {noise}; residuals are {found['misfit'] or 0:.2f} times what it predicts.",
         "estimated": f"Noise estimated from the residuals: {noise} (their sum is better known than each).",
@@ -326,7 +337,7 @@ def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
         factor, unit = (1.0, "mm") if row["unit"] == "mm" else (1 / DEG, "deg")
         nominal, value = factor * row["nominal"], factor * row["calibrated"]
         u = None if row["u"] is None else factor * row["u"]
-        decimals = 4 if u is None else min(max(1 - math.floor(math.log10(u)), 0), 9) if u > 0 else 9
+        decimals = 9 if u == 0 else _decimals(u, 4)
         numbers = (
             f"{nominal:.4f}",
             f"{value:.{decimals}f}",
@@ -335,6 +346,11 @@ def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
         )
         table.add_row(row["parameter"], unit, *numbers, row["bound"] or "")
     print_table(console, table)
+
+
+def _decimals(u: float | None, default: int) -> int:
+    """Decimals that show two significant digits of an uncertainty."""
+    return default if not u else min(max(1 - math.floor(math.log10(u)), 0), 9)
 
 
 def print_lengths(console: Console, rows: list[dict[str, Any]], *, fitted: bool = False) -> None:

@@ -62,9 +62,22 @@ def kit_plan(summary: dict[str, Any]) -> None:
             table.add_row(name, kind, *(f"{value:.0f}" for value in place["position_mm"]), str(place["poses"]))
     print_table(console, table)
     console.print("Positions are those of the points of an artefact; elsewhere the middle of the tips.")
-    rows = [(f"without {escape(name)}", prediction) for name, prediction in summary["without"].items()]
+    rows = [
+        (f"without {escape(name)}: {pluralise(_poses_without(summary, name), 'pose')}", prediction)
+        for name, prediction in summary["without"].items()
+    ]
     _print_predictions(console, summary, "random poses in the same places", rows)
     print_written(console, summary)
+
+
+def _poses_without(summary: dict[str, Any], name: str) -> int:
+    """Poses of a plan but those with one thing of the kit, whose places are named after it."""
+    return sum(
+        place["poses"]
+        for row in summary["observations"]
+        if row["observation"] != name and not row["observation"].startswith(f"{name}/")
+        for place in row["places"]
+    )
 
 
 def _print_predictions(

@@ -130,8 +130,8 @@ def _of_probe(drift: Drift) -> str:
     if not probe.p < 1 - drift.level:
         return f"{start} chance the rest, so the arm has not changed."
     return (
-        f"{start} the rest ({probe.statistic:.0f} with {probe.rank} degrees of freedom) is more than the uncertainties "
-        "explain: errors outside the model, or a small change of the arm."
+        f"{start} the rest (chi-squared {probe.statistic:.0f} with {probe.rank} degrees of freedom) is more than the "
+        "uncertainties explain: errors outside the model, or a small change of the arm."
     )
 
 
@@ -176,9 +176,11 @@ def _of_scale(lengths: LengthChange) -> str:
         return ""
     relation = "beyond" if abs(lengths.scale_change) > lengths.expanded_scale_change else "within"
     word = "longer" if lengths.scale_change > 0 else "shorter"
+    expanded = 1e6 * lengths.expanded_scale_change
+    decimals = 1 if expanded < 10 else 0  # no more than the uncertainty allows
     return (
-        f"On average the same lengths measure {1e6 * abs(lengths.scale_change):.1f} um/m {word} than before "
-        f"(U = {1e6 * lengths.expanded_scale_change:.1f} um/m), which is {relation} the uncertainty."
+        f"On average the same lengths measure {1e6 * abs(lengths.scale_change):.{decimals}f} um/m {word} than before "
+        f"(U = {expanded:.{decimals}f} um/m), which is {relation} the uncertainty."
     )
 
 

@@ -183,7 +183,8 @@ def provenance(kind: str) -> dict[str, Any]:
     """Root attributes of every file: what it is, and what made it."""
     from importlib import metadata
 
-    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]) if sys.argv and sys.argv[0] else "python"
+    program = Path(sys.argv[0]).name if sys.argv and sys.argv[0] else "python"
+    command = shlex.join(["aacmm" if program == "__main__.py" else program, *sys.argv[1:]])  # python -m aacmm_jax
     return {
         "format": FORMAT,
         "kind": kind,

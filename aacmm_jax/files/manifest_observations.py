@@ -343,5 +343,9 @@ class _Reader:
         """Raise `InputError` where something that the kind needs is nowhere."""
         for entry in self._kind.entries:
             if entry.required and entry.name not in given:
-                place = "pick its columns with columns" if entry.dimensions[:1] == ("pose",) else "state it"
+                place = (
+                    f"pick its columns with columns = {{ {entry.name} = ... }}"
+                    if entry.dimensions[:1] == ("pose",)
+                    else "state it"
+                )
                 raise InputError(f"{self._where} has no '{entry.name}' ({entry.says}); {place}.")

@@ -163,7 +163,8 @@ class TextTable:
     def _number(self, where: str, index: int, cell: str) -> float:
         if self._decimal == "," and "." not in cell:
             cell = cell.replace(",", ".")
-        return _number(where, index + 1, cell)
+        advice = 'write it with a decimal point, or state decimal = "," and the delimiter in the manifest'
+        return _number(where, index + 1, cell, advice)
 
     def texts(self, column: Column) -> np.ndarray:
         """The cells of one column."""
@@ -216,12 +217,12 @@ def _cells(line: str, delimiter: str | None = None, decimal: str = ".") -> list[
     return [cell.strip(" \t") for cell in cells]
 
 
-def _number(where: str, column: int, cell: str) -> float:
+def _number(where: str, column: int, cell: str, advice_on_comma: str = "write it with a decimal point") -> float:
     place = f"{where} column {column}: {quoted(cell)}"
     if not is_number(cell):
         advice = "write it without quotes" if cell[:1] in "\"'" and cell else "correct it"
         if re.fullmatch("[+-]?[0-9]*,[0-9]+", cell):
-            advice = "write it with a decimal point"
+            advice = advice_on_comma
         raise InputError(f"{place} is not a number; {advice}.")
     value = number(cell)
     if not math.isfinite(value):

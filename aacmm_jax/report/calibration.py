@@ -11,6 +11,7 @@ from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_o
 from ..core.text import pluralise
 from ..core.units import ARCSEC, DEG
 from ..summaries.calibration import calibration_summary
+from ..summaries.observations import capture_words
 from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
 from . import charts
@@ -75,20 +76,16 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
         observability_section(observability),
         bounds_section(record, summary),
     ]
-    other = "other " if capture.names else ""
-    groups = [
-        pluralise(len(capture.names), "socket") if capture.names or not capture.observations else "",
-        pluralise(len(capture.observations), f"{other}observation") if capture.observations else "",
-        pluralise(len(capture.lengths), "reference length") if capture.lengths or not capture.observations else "",
-    ]
     method = _OBSERVED if record.method == "joint" and capture.observations else _METHODS[record.method]
     robust = f", robust loss {record.robust}" if record.robust else ""
     verdict, good = record.reason, record.converged and not record.implausible_residual
     if not good:
         verdict = "Not to be used" + (": data and arm do not belong together." if record.converged else f". {verdict}")
+    if not record.plausible_scale:
+        verdict = "Not to be used: the reference lengths give the arm a scale that it cannot have."
     report = Report(
         title="Calibration of " + (record.recording.nominal.name or "an arm"),
-        subtitle=f"{method}{robust}; {pluralise(summary['poses'], 'pose')} in {', '.join(filter(None, groups))}",
+        subtitle=f"{method}{robust}; {pluralise(summary['poses'], 'pose')} in {capture_words(capture)}",
         verdict=verdict,
         verdict_mark="good" if good else "bad",
         warnings=summary["warnings"],
@@ -111,7 +108,7 @@ def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
     validated = summary["cross_validation"]
     if validated is not None and validated["rms_mm"] is not None:
         rms, predicted = format_number(validated["rms_mm"]), format_number(validated["rms_predicted_mm"])
-        facts.append(("Held-out placements, RMS distance", f"{rms}\u00a0mm (predicted {predicted})"))
+        facts.append(("Held-out groups, RMS distance", f"{rms}\u00a0mm (predicted {predicted})"))
     for key, name in (("de_mm", "DE"), ("deltam_mm", "Deltam")) if "de_mm" in calibrated else ():
         change = f"{format_number(nominal[key])} → {format_number(calibrated[key])}\u00a0mm"
         facts.append((f"{name}, nominal → calibrated", change))

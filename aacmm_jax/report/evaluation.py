@@ -15,6 +15,7 @@ from ..data.capture import Capture, ReferenceLength
 from ..data.sphere import ProbedSphere
 from ..kinematics.arm import Arm
 from ..summaries.evaluation import evaluation_summary, points_summary
+from ..summaries.observations import capture_words
 from . import charts
 from .arm_view import view_of_arm
 from .elements import ArmView, Cell, Chart, Report, ReportTable, Section, format_number, number_cell, text_cell
@@ -23,7 +24,7 @@ from .residuals import length_rows, metrics_table, pose_distances, residual_char
 _MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}
 _SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
 _STAGES = ("nominal", "calibrated")
-_GROUPS = (("held_out", "Held-out sockets"), ("identified_from", "Sockets used for identification"))
+_GROUPS = (("held_out", "Held-out data"), ("identified_from", "Data used for identification"))
 
 
 def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]:
@@ -36,11 +37,11 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
     residuals = residual_chart(
         "residuals", "Residuals of the calibrated arm", capture, {"calibrated": calibrated}, mark=True
     )
+    residual_tables = [*([socket_table(capture, calibrated)] if capture.names else []), *_observation_tables(summary)]
     report = Report(
         title="Evaluation of " + (record.recording.nominal.name or "an arm"),
-        subtitle=f"{pluralise(sum(capture.sizes), 'pose')} in {pluralise(len(capture.names), 'socket')}, "
-        f"{pluralise(len(capture.lengths), 'reference length')}, "
-        f"{pluralise(len(record.recording.spheres), 'touched sphere')}",
+        subtitle=f"{pluralise(len(capture.readings), 'pose')} in {capture_words(capture)}"
+        + (f", {pluralise(tested, 'touched sphere')}" if (tested := len(record.recording.spheres)) else ""),
         verdict=verdict,
         verdict_mark=mark,
         warnings=summary["warnings"] + [f"Over the limit: {sentence}" for sentence in summary["failed"]],
@@ -49,11 +50,38 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
             _acceptance_section(tests["calibrated"], summary, capture.lengths, record.recording.spheres),
             Section("stages", "Nominal and calibrated arm", _nominal_and_calibrated(record, summary, evaluations)),
             *_lengths(record, tests["calibrated"], evaluations),
-            Section("residuals", "Residuals by socket and pose", [socket_table(capture, calibrated), residuals]),
+            Section("residuals", "Residuals by observation and pose", [*residual_tables, residuals]),
             Section("arm", "The arm in its poses", [_view(record.calibrated.arm, capture, calibrated)]),
         ],
     )
     return report, summary
+
+
+def _observation_tables(summary: dict[str, Any]) -> list[ReportTable]:
+    """Observations besides sockets; of held-out ones, what the calibration predicts too."""
+    columns = (
+        "observation",
+        "kind",
+        "poses",
+        "nominal",
+        "calibrated",
+        "predicted",
+        "calibrated, in standard deviations",
+    )
+    keys = ("nominal_rms_mm", "rms_mm", "rms_predicted_mm")
+    tables = []
+    for group, title in _GROUPS:
+        rows = [
+            [
+                *(text_cell(row["observation"]), text_cell(row["kind"]), number_cell(row["poses"], 0)),
+                *(number_cell(row.get(key)) for key in keys),
+                number_cell(row["reduced_chi"], 2),
+            ]
+            for row in (summary[group] or {}).get("observations", ())
+        ]
+        if rows:
+            tables.append(ReportTable(f"{title}, RMS distance of poses from their geometry [mm]", columns, rows))
+    return tables
 
 
 def _view(arm: Arm, capture: Capture, evaluation: Evaluation) -> ArmView:
@@ -264,7 +292,8 @@ def _nominal_and_calibrated(
         for group, title in _GROUPS
         if summary[group] is not None
     ]
-    title = "Distance of every pose from its socket's centroid"
+    what = "geometry" if record.recording.capture.observations else "socket's centroid"
+    title = f"Distance of every pose from its {what}"
     blocks.append(residual_chart("stages", title, record.recording.capture, evaluations))
     if record.used:
         used = ", ".join(sorted(record.used))

@@ -23,8 +23,8 @@ def _removal(removed: Removed) -> str:
     first, second = removed.degrees_of_freedom
     return (
         f"Left out: {removed.kind} {removed.group}, which contradicts the rest (F = {removed.ratio:.3g} with {first} "
-        f"and {second} degrees of freedom, p {probability}). Without it, the rest is {removed.rms_without:.2g} mm RMS "
-        f"from its geometry instead of {removed.rms_with:.2g} mm, and {removed.changed_most} changed most, by "
+        f"and {second} degrees of freedom, p {probability}). Without it, the rest is {removed.rms_without:.3g} mm RMS "
+        f"from its geometry instead of {removed.rms_with:.3g} mm, and {removed.changed_most} changed most, by "
         f"{removed.change:.2g} standard uncertainties."
     )
 

@@ -38,8 +38,10 @@ def evaluation_summary(
         "arm": record.recording.nominal.name,
         "warnings": list(record.warnings),
     }
-    noise = None if record.uncertainty is None else record.uncertainty.noise
-    whole = {stage: _evaluated(specification.arm, capture, noise) for stage, specification in record.arms().items()}
+    # The nominal arm's errors are not that noise: weighted by it, its distances would not be the least that it reaches.
+    noise = {"calibrated": None if record.uncertainty is None else record.uncertainty.noise}
+    arms = {stage: specification.arm for stage, specification in record.arms().items()}
+    whole = {stage: _evaluated(arm, capture, noise.get(stage)) for stage, arm in arms.items()}
     rows = metrics_by_socket_and_length(capture, whole["calibrated"])
     fixed_scale, held_out = record.length_that_fixed_scale(), record.held_out()
     for group in ("held_out", "identified_from"):
@@ -51,8 +53,12 @@ def evaluation_summary(
             continue
         part = None if not names else capture if len(names) == len(names_in(capture)) else part_of(capture, names)
         found = {
-            stage: whole[stage] if part is capture else None if part is None else _evaluated(arm.arm, part, noise)
-            for stage, arm in record.arms().items()
+            stage: whole[stage]
+            if part is capture
+            else None
+            if part is None
+            else _evaluated(arm, part, noise.get(stage))
+            for stage, arm in arms.items()
         }
         summary[group] = {stage: _grouped(found[stage], whole[stage], lengths) for stage in whole}
         summary[group]["sockets"] = [row for row in rows["sockets"] if row["socket"] in names]

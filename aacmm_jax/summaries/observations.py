@@ -26,6 +26,7 @@ from ..data.observations.observation import (
     stated_quantities,
 )
 from ..model.observed import Observed
+from .tables import observed_words
 
 _LITTLE_WEIGHT = 0.5
 
@@ -51,6 +52,13 @@ def _parts(observation: AbstractObservation) -> dict[str, tuple[str, ...]]:
     """The unknown geometry of an observation, with the place of its target in the last frame."""
     target = {offset_of(observation.target): POINT} if observation.target else {}
     return {**observation.unknowns, **target}
+
+
+def capture_words(capture: Capture) -> str:
+    """How many sockets, other observations and reference lengths a capture has; sockets of a session with a probe of
+    its own are sockets like any other."""
+    sockets = len(capture.names) + sum(one.kind == "socket" for one in capture.observations)
+    return observed_words(sockets, len(capture.names) + len(capture.observations) - sockets, len(capture.lengths))
 
 
 def _row(quantity: Quantity) -> dict[str, Any]:

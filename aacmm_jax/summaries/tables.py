@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from ..core.text import pluralise
+
 # Repeatability and errors of lengths, by their keys in a summary.
 METRICS = (
     ("de_mm", "DE, mean distance of poses from their socket's centroid"),
@@ -13,6 +15,17 @@ METRICS = (
     ("length_error_mean_absolute_mm", "length error, mean absolute"),
     ("length_error_largest_mm", "length error, largest"),
 )
+
+
+def observed_words(sockets: int, others: int, lengths: int | None = None) -> str:
+    """How many sockets, other observations and reference lengths there are; those of which there are none are left
+    out where something else is left to name."""
+    words = [pluralise(sockets, "socket")] if sockets or not others else []
+    if others:
+        words.append(pluralise(others, "other observation" if sockets else "observation"))
+    if lengths or (lengths is not None and not others):
+        words.append(pluralise(lengths, "reference length"))
+    return ", ".join(words)
 
 
 def quantity_words(row: Mapping[str, Any], u: bool = True) -> str:

@@ -69,6 +69,9 @@ def of_import(recording: Recording) -> list[str]:
 
 def of_calibration(record: CalibrationRecord, seen: Observability | None = None) -> list[str]:
     """What should be read about a calibration before its numbers; ``seen`` is the result of `observed`, if known."""
+    if not record.plausible_scale:  # a wrong unit, say: what was fitted and predicted with it says nothing
+        ended = [] if record.reason.startswith("Converged") else [record.reason]
+        return [*_scale(record), *ended, *_implausible(record), *of_capture(record.recording)]
     found = [] if record.converged else [record.reason]
     found += removals(record)
     found += _implausible(record)
@@ -129,14 +132,15 @@ def _implausible(record: CalibrationRecord) -> list[str]:
         worst = int(np.argmax(record.observed.rms_after))
         name, rms = record.observed.names[worst], record.observed.rms_after[worst]
         return [
-            f"Poses of {name} are {rms:.3g} mm RMS from their geometry, over a hundred times what an arm of this size "
-            "can be, so data and arm do not belong together: check columns, units, signs and the arm." + _cause(record)
+            f"Poses of {name} are {rms:.3g} mm RMS from their geometry, over a hundred times the usual repeatability "
+            "of an arm of this size, so data and arm do not belong together: check columns, units, signs and the arm."
+            + _cause(record)
         ]
     rms = float(record.evaluations()["calibrated"].repeatability.rms)
     return [
-        f"The poses of a socket disagree by {rms:.3g} mm RMS, over a hundred times what an arm of this size can be, "
-        "so data and arm do not belong together: check the files, their columns and unit, the sockets and the arm."
-        + _cause(record)
+        f"The poses of a socket disagree by {rms:.3g} mm RMS, over a hundred times the usual repeatability of an "
+        "arm of this size, so data and arm do not belong together: check the files, their columns and unit, the "
+        "sockets and the arm." + _cause(record)
     ]
 
 

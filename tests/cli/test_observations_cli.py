@@ -307,6 +307,12 @@ def test_the_robot_of_the_examples(aacmm, mukca):
     assert (found["poses"], found["other_poses"]["poses"]) == (500, 2272)
     assert found["other_poses"]["rms_mm"] == pytest.approx(0.487, abs=0.001)
     assert "beta_2" in [row["parameter"] for row in found["parameters"]]
+    judged = json.loads(aacmm("evaluate", "c.h5", "ur10.h5", "--json").stdout)["identified_from"]["observations"][0]
+    # The nominal arm is as far from its points in both: 1.15 mm where its errors count as noise of the readings.
+    assert judged["nominal_rms_mm"] == pytest.approx(found["observations"][0]["rms_before_mm"], rel=1e-4)
+    shown = aacmm("show", "c.h5").stdout
+    assert "on 500 poses in 1 observation" in shown
+    assert "position [mm]" in shown
 
 
 def test_a_plan_with_a_kit(aacmm, tmp_path):
@@ -317,7 +323,7 @@ def test_a_plan_with_a_kit(aacmm, tmp_path):
     )
     options = ("--kit", "kit.toml", "--poses", 16, "--candidates", 120, "--manifest", "capture.toml")
     shown = aacmm("plan", "cheng2018-simulation", "-o", "plan.csv", *options).stdout
-    for part in ("bar", "tracker", "without tracker", "16 random poses in the same places"):
+    for part in ("bar", "tracker", "without tracker: ", "16 random poses in the same places"):
         assert part in shown
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 17
     assert '"a" = "bar-a.csv"' in (tmp_path / "capture.toml").read_text()

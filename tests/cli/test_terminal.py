@@ -16,6 +16,7 @@ from aacmm_jax.cli import _FAMILIES, acceptance_display, calibration_display
 from aacmm_jax.cli.app import app, examples, length_option
 from aacmm_jax.cli.display import formatted, new_console, new_table, print_table
 from aacmm_jax.summaries.calibration import calibration_summary
+from aacmm_jax.summaries.tables import observed_words
 from tests.refusals import assert_refused
 
 for family in _FAMILIES:
@@ -133,7 +134,7 @@ def test_a_residual_that_no_arm_has_is_not_called_converged():
     record = aj.calibration.record_of(result, aj.Recording(capture, nominal))
     assert record.implausible_residual
     summary = calibration_summary(record)
-    assert any("a hundred times what an arm of this size can be" in warning for warning in summary["warnings"])
+    assert any("a hundred times the usual repeatability of an arm" in warning for warning in summary["warnings"])
     assert not summary["residual_plausible"]
     assert not any("determine" in warning for warning in summary["warnings"])
 
@@ -149,12 +150,38 @@ def test_a_residual_that_no_arm_has_is_not_called_converged():
 def test_verdict(capsys, converged, plausible, said, unsaid):
     calibration_display.print_verdict(
         new_console(),
-        {"arm": "arm", "method": "joint", "steps": 3, "poses": 9, "sockets_used": ["A"]}
+        {"arm": "arm", "method": "joint", "steps": 3, "poses": 9, "sockets_used": ["A"], "observations": []}
         | {"converged": converged, "residual_plausible": plausible},
     )
     shown = " ".join(capsys.readouterr().out.split())
     assert said in shown
     assert unsaid not in shown
+
+
+@pytest.mark.parametrize(
+    ("counts", "words"),
+    [
+        ((2, 0, 1), "2 sockets, 1 reference length"),
+        ((1, 0, 0), "1 socket, 0 reference lengths"),
+        ((1, 4, 0), "1 socket, 4 other observations"),
+        ((0, 1, 0), "1 observation"),
+        ((18, 0), "18 sockets"),
+        ((0, 3), "3 observations"),
+    ],
+)
+def test_what_was_observed_in_words(counts, words):
+    assert observed_words(*counts) == words
+
+
+def test_base_has_its_units_and_the_digits_of_its_uncertainty(capsys):
+    row = {"in": "tracker", "position_mm": [507.922315, 1.0, 2.0], "position_u_mm": [0.08, 0.0031, None]}
+    row |= {"rotation_rad": [0.1, 0.0, 0.0], "rotation_u_rad": [1e-3, 1e-3, 1e-3]}
+    summary = {"base": [row], "uncertainty": {"coverage_factor_95": 2.0}}
+    calibration_display._base(new_console(), summary)
+    shown = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["tracker", "position", "[mm]", "507.92", "1.0000", "2.0000"] in shown
+    assert ["U", "0.16", "0.0062", "-"] in shown
+    assert ["rotation", "vector", "[deg]", "5.73", "0.00", "0.00"] in shown
 
 
 EXISTING = ("there.h5", "there.toml", "there.csv", "there.html")

@@ -207,6 +207,21 @@ def test_every_number_of_a_geometry_can_be_read(name):
             assert count == len(values) + directions + points
 
 
+@pytest.mark.parametrize(
+    ("name", "part", "certified"),
+    [
+        ("certified sphere", "radius of s", 50.0),
+        ("certified cylinder", "radius of c", 50.0),
+        ("planes", "distance of f", 50.0),
+    ],
+)
+def test_the_size_found_is_that_of_the_artefact(name, part, certified):
+    """Its number in the solve is that of the tip's centre, which the tip's ball makes larger, or smaller inside."""
+    observation = to_numpy(ALL[name])
+    (found,) = observation.quantities(part, np.asarray(observation.certified[part][0]))
+    assert (found.says, found.values.tolist(), found.unit) == ("without the tip's ball", [certified], "mm")
+
+
 def test_a_plane_is_read_by_its_normal():
     """The rotation vector (0, 30 deg, 0) turns z to (sin 30, 0, cos 30)."""
     normal, distance = ALL["plane"].quantities("plane f", np.array([0.0, np.pi / 6, 12.5]))

@@ -275,7 +275,7 @@ def test_an_arm_that_grew_measures_everything_longer(old, new):
     np.testing.assert_allclose(found.lengths.change, 0.06, rtol=1e-6)
     assert found.lengths.scale_change == pytest.approx(2e-4, rel=1e-6)
     assert found.lengths.moved.all()
-    assert "the same lengths measure 200.0 um/m longer than before" in found.sentences()[-1]
+    assert "the same lengths measure 200 um/m longer than before" in found.sentences()[-1]
     # The artefact's 2 um in 469 mm, twice, is all that two angle-perfect arms could differ by; poses add to it.
     assert found.lengths.u_scale_change > math.sqrt(2) * 0.002 / math.dist(*SOCKETS.values())
 

@@ -319,7 +319,7 @@ def test_bad_cells(tmp_path):
     )
     rows[2][7] = "3,5"
     write(tmp_path / "a.csv", rows, delimiter=";")
-    assert_refused(lambda: read(tmp_path, f'[[points]]\nfile = "a.csv"\n{ALL}'), "line 4 column 8", "decimal point")
+    assert_refused(lambda: read(tmp_path, f'[[points]]\nfile = "a.csv"\n{ALL}'), "line 4 column 8", 'decimal = ","')
     (tmp_path / "a.csv").write_text("q1,q2\n")
     assert_refused(lambda: read(tmp_path, f'[[points]]\nfile = "a.csv"\n{ALL}'), "a.csv holds no numbers")
 

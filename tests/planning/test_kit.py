@@ -110,6 +110,19 @@ def test_a_whole_plan(paper_arm, space, monkeypatch):
     assert sum(place["poses"] for row in summary["observations"] for place in row["places"]) == 20
 
 
+@pytest.mark.parametrize(
+    "simulated",
+    [
+        kinds.SimulatedSphere("ball", (300, 0, 300), 50.0, 1, u=0.1, stylus=6.0),
+        kinds.SimulatedCylinder("ring", ((300, 0, 300), (300, 0, 320)), 50.0, 1, u=0.1, stylus=6.0, inside=True),
+    ],
+    ids=["sphere", "cylinder"],
+)
+def test_candidates_have_the_certified_values_that_were_stated(problem, simulated):
+    """Not those of a certificate drawn at random: the plan's manifest repeats them."""
+    assert float(kit_placement.set_up(problem.region, simulated, 4).diameter) == 50.0
+
+
 def test_files_of_every_kind_can_be_imported(paper_arm, tmp_path):
     """The manifest of a plan reads files that hold what it says: readings, and what was measured."""
     capture = aj.simulate(paper_arm, {}, observations=EVERYTHING, noise=aj.Noise(), seed=2)

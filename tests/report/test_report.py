@@ -425,6 +425,19 @@ def test_an_evaluation_report_decides(written):
     assert "it also needs" in text
 
 
+def test_observations_of_an_evaluation_stand_beside_their_prediction():
+    from aacmm_jax.report.evaluation import _observation_tables
+
+    row = {"observation": "bar", "kind": "artefact", "poses": 20, "nominal_rms_mm": 1.25, "rms_mm": 0.02}
+    unseen = row | {"rms_predicted_mm": 0.03, "reduced_chi": 0.67}
+    used = {"observations": [row | {"reduced_chi": 0.9}]}
+    first, second = _observation_tables({"held_out": {"observations": [unseen]}, "identified_from": used})
+    assert "Held-out data" in first.caption
+    assert [cell.text for cell in first.rows[0]] == ["bar", "artefact", "20", "1.2500", "0.0200", "0.0300", "0.67"]
+    assert "used for identification" in second.caption
+    assert _observation_tables({"held_out": None, "identified_from": {"observations": []}}) == []
+
+
 def test_charts_of_an_evaluation(written):
     from aacmm_jax.report.evaluation import evaluation_report
 

@@ -149,6 +149,9 @@ class Cylinder(AbstractObservation):
         return super().stored() | {"u": 2 * self.u}  # twice and half of a number are exact
 
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
+        if part == self.size and float(self.stylus):
+            ball = float(self.stylus) / 2
+            return (Quantity("without the tip's ball", values + ball if self.inside else values - ball, "mm"),)
         if part != self.axis:
             return super().quantities(part, values)
         turned = np.asarray(rotation_matrix(np.append(values[:2], 0.0)))

@@ -208,6 +208,9 @@ class ParallelPlanes(AbstractObservation):
         return {self.place: PLANE} | ({self.separation: ("mm",)} if self.free else {})
 
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
+        if part == self.separation and float(self.stylus):
+            ball = float(self.stylus)
+            return (Quantity("without the tip's ball", values + ball if self.inside else values - ball, "mm"),)
         return _normal_and_distance(values) if part == self.place else super().quantities(part, values)
 
     @property

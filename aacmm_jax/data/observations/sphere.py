@@ -20,6 +20,7 @@ from .observation import (
     AbstractObservation,
     AbstractSimulated,
     Entry,
+    Quantity,
     Rows,
     Tips,
     Unknowns,
@@ -118,6 +119,11 @@ class Sphere(AbstractObservation):
 
     def stored(self) -> dict[str, Any]:
         return super().stored() | {"u": 2 * self.u}  # twice and half of a number are exact
+
+    def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
+        if part != self.size or not float(self.stylus):
+            return super().quantities(part, values)
+        return (Quantity("without the tip's ball", values - float(self.stylus) / 2, "mm"),)
 
     @property
     def fixes_scale(self) -> bool:
