@@ -46,6 +46,7 @@ def made(paper_arm, held, capture, trials=48, **tables):
     return aj.study.make_study(arm=paper_arm, trials=trials, capture=capture, seed=3, **tables)
 
 
+@pytest.mark.slow
 def test_trials_scatter_as_a_calibration_says(paper_arm, held, capture):
     """True arms differ by the deviation, results by u; a trial does not depend on the block that it is in."""
     study = made(paper_arm, held, capture)
