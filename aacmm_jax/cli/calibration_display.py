@@ -8,7 +8,7 @@ from rich.markup import escape
 
 from ..core.text import pluralise, shorten
 from ..core.units import ARCSEC, DEG
-from ..summaries.tables import METRICS, observed_words, quantity_words, volume_rows
+from ..summaries.tables import METRICS, expanded_words, observed_words, quantity_words, volume_rows
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
 _MOST_PARTS = 12  # rows of a table
@@ -141,11 +141,13 @@ def _observed(console: Console, summary: dict[str, Any]) -> None:
             numbers = (formatted(row["rms_before_mm"]), formatted(row["rms_after_mm"]), f"{row['reduced_chi']:.2f}")
             table.add_row(escape(row["observation"]), row["kind"], str(row["poses"]), *numbers)
         print_table(console, table)
-        table = new_table("\nUnknown geometry", "part", "quantity", "found")
+        table = new_table("\nUnknown geometry", "part", "quantity", "found", "U (95 %)")
+        factor = summary["uncertainty"]["coverage_factor_95"]
         parts = [row for row in summary["geometry"] if not row["part"].startswith("position of ")]
         for row in parts[:_MOST_PARTS]:
             for one in row["quantities"]:
-                table.add_row(*map(escape, (row["part"], one["quantity"], quantity_words(one))))
+                words = (row["part"], one["quantity"], quantity_words(one), expanded_words(one, factor))
+                table.add_row(*map(escape, words))
         if parts:
             print_table(console, table)
         hidden = len(summary["geometry"]) - len(parts[:_MOST_PARTS])

@@ -162,7 +162,8 @@ def import_(
     manifest: Annotated[
         Path,
         typer.Argument(
-            metavar="MANIFEST.toml", help="Which files hold the poses of which socket, in which unit, and the lengths."
+            metavar="MANIFEST.toml",
+            help="Which files hold which poses and measured values, in which columns and units.",
         ),
     ],
     output: CaptureOutput,

@@ -10,7 +10,7 @@ from ..core.text import pluralise
 from ..core.units import DEG
 from ..model.metrics import pose_outliers
 from ..summaries.observations import capture_observations
-from ..summaries.tables import quantity_words
+from ..summaries.tables import expanded_words, quantity_words
 from .elements import Cell, Chart, ReportTable, Section, format_number, number_cell, text_cell
 from .residuals import Groups, pose_chart
 
@@ -203,21 +203,22 @@ def geometry_section(summary: dict[str, Any]) -> Section:
     """Every part of the unknown geometry as found, beside what is certified of it."""
     rows = []
     for part in summary["geometry"]:
-        certified = part["certified"]
+        # What is certified has its numbers in the order of the quantities.
+        errors = None if part["certified"] is None else np.abs(np.subtract(part["values"], part["certified"]))
         for quantity in part["quantities"]:
             difference = None
-            if certified is not None:  # in the order of the quantities
+            if errors is not None:
                 count = len(quantity["values"])
-                difference = float(np.abs(np.subtract(quantity["values"], certified[:count])).max())
-                certified = certified[count:]
-            cells = (part["part"], quantity["quantity"], _words(quantity))
+                difference, errors = float(errors[:count].max()), errors[count:]
+            expanded = expanded_words(quantity, summary["uncertainty"]["coverage_factor_95"])
+            cells = (part["part"], quantity["quantity"], _words(quantity), expanded)
             rows.append([*map(text_cell, cells), text_cell("") if difference is None else number_cell(difference)])
     introduction = (
         "The geometry that was unknown, as found with the parameters: positions and frames in the base frame, "
         "rotations as vectors along their axis; offsets and orientations of targets in the last frame; placements on "
-        "an indexed platform in the platform's frame. A radius or distance is that of the tip's centre."
+        "an indexed platform in the platform's frame."
     )
-    columns = ("part", "quantity", "found", "largest difference from the certified values [mm]")
+    columns = ("part", "quantity", "found", "U (95 %)", "largest difference from the certified values [mm]")
     if all(part["certified"] is None for part in summary["geometry"]):
         columns, rows = columns[:-1], [row[:-1] for row in rows]
     return Section("geometry", "Geometry found", [introduction, ReportTable("Geometry found", columns, rows)])

@@ -1,5 +1,7 @@
 """Observations as plain dictionaries with the unit in every key: what they are, how they agree, the geometry found."""
 
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -147,18 +149,33 @@ def _geometry(capture: Capture, metrics: ObservedMetrics) -> list[dict[str, Any]
         for part, units in _parts(observation).items():
             values = np.asarray(metrics.geometry[part])
             own = part in observation.unknowns
-            quantities = observation.quantities(part, values) if own else quantities_by_unit(units, values)
+            read = partial(observation.quantities, part) if own else partial(quantities_by_unit, units)
+            found_u = _u_of_quantities(read, values, metrics.geometry_covariance[part])
             value, u = certified.get(part, (None, None))
             found[part] = {
                 "part": part,
                 "units": list(units),
                 "values": values.tolist(),
                 "u": _known(np.sqrt(np.diag(metrics.geometry_covariance[part]))),
-                "quantities": [_row(quantity) for quantity in quantities],
+                "quantities": [
+                    _row(quantity) | {"u_found": _known(own_u)}
+                    for quantity, own_u in zip(read(values), found_u, strict=True)
+                ],
                 "certified": None if value is None else np.asarray(value).tolist(),
                 "certified_u": None if u is None else np.asarray(u).tolist(),
             }
     return [found[part] for part in observed.blocks]
+
+
+def _u_of_quantities(
+    read: Callable[[np.ndarray], Sequence[Quantity]], values: np.ndarray, covariance: Any
+) -> list[np.ndarray]:
+    """Standard uncertainties of quantities that are functions of the numbers of a part, to first order."""
+    steps = 1e-5 * np.eye(len(values))  # mm, rad
+    ends = [[np.concatenate([one.values for one in read(values + sign * step)]) for sign in (1, -1)] for step in steps]
+    by_numbers = np.stack([(after - before) / 2e-5 for after, before in ends], axis=1)
+    u = np.sqrt(np.diag(by_numbers @ np.asarray(covariance) @ by_numbers.T))
+    return np.split(u, np.cumsum([len(one.values) for one in read(values)])[:-1])
 
 
 def _known(u: np.ndarray) -> list[float | None]:

@@ -41,6 +41,16 @@ def quantity_words(row: Mapping[str, Any], u: bool = True) -> str:
     return f"{words} (exact)" if row["u"] == 0 else f"{words} (u = {factor * row['u']:.4g} {unit})"
 
 
+def expanded_words(row: Mapping[str, Any], factor: float) -> str:
+    """The expanded uncertainties of a quantity that was found, two digits each, angles in deg."""
+    scale, unit = (180 / math.pi, " deg") if row["unit"] == "rad" else (1.0, "" if row["unit"] == "1" else " mm")
+    if any(u is None for u in row["u_found"]):
+        return "not determined"
+    expanded = [factor * scale * u for u in row["u_found"]]
+    words = ", ".join(f"{value:.2g}" if value < 100 else f"{value:.0f}" for value in expanded)
+    return (f"({words})" if len(row["u_found"]) > 1 else words) + unit
+
+
 def volume_rows(volume: Mapping[str, Any], factor: float) -> list[tuple[str, list[float | None]]]:
     """U over the working volume: what it is of, and its median, 95th percentile and largest value, mm."""
     length = f"{volume['length_mm']:g} mm length"
