@@ -71,9 +71,10 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
     """Read a kit: what is at hand for a calibration, with its uncertainties.
 
     Tables are ``[[artefact]]``, ``[[touched_sphere]]``, ``[[touched_cylinder]]``, ``[[planes]]`` (one, or two at a
-    ``distance``), ``[[points]]``, ``[[transforms]]``, ``[[distances]]`` and ``[[socket]]``; their keys are the arguments of the simulated observation, in mm and rad, and
-    ``places`` (how many placements a plan is to choose; 0 leaves the thing where it is stated) and ``turned`` ("any",
-    "vertical" for turns about the vertical alone, or "not").
+    ``distance``), ``[[points]]``, ``[[transforms]]``, ``[[distances]]`` and ``[[socket]]``; their keys are the
+    arguments of the simulated observation, in mm and rad, and ``places`` (how many placements a plan is to choose; 0
+    leaves the thing where it is stated) and ``turned`` ("any", "vertical" for turns about the vertical alone, or
+    "not").
 
     Args:
         path: The TOML file.
