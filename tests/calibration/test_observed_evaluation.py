@@ -65,6 +65,7 @@ def test_a_frame_that_is_kept_shows_a_moved_station(paper_arm):
         aj.evaluate(paper_arm, moved, geometry={"frame of T": np.zeros(3)})
 
 
+@pytest.mark.slow
 def test_a_batch_of_arms_and_derivatives(paper_arm):
     sphere = kinds.SimulatedSphere("s", (400, 0, 300), 50.0, 25, u=0.001)
     capture = aj.simulate(paper_arm, {}, observations=[sphere], noise=NOISE, seed=3)

@@ -40,7 +40,7 @@ CALLS = {
 @pytest.mark.parametrize(
     ("call", "width"),
     [
-        ("two-stage", 10.0),
+        pytest.param("two-stage", 10.0, marks=pytest.mark.slow),
         pytest.param("two-stage", 0.2, marks=pytest.mark.slow),  # on bounds
         ("joint, noise", 0.2),
         pytest.param("joint, noise", 10.0, marks=pytest.mark.slow),

@@ -55,6 +55,7 @@ def test_listening_sockets_are_seen():
         assert len(worker_tasks.listening()) == 1
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_is_replaced(processes, tmp_path, monkeypatch):
     first = processes.submit(os.getpid).result()
     assert processes.submit(worker_tasks.die_once, tmp_path / "marker").result() == "done"

@@ -318,6 +318,7 @@ def test_a_spoilt_block_runs_again(home, study, tmp_path):
     same(home / "whole.h5", path)
 
 
+@pytest.mark.slow
 def test_reading_needs_no_more_files_than_one(home, study, tmp_path):
     """Where a process may open few files, HDF5 would show the others as not run."""
     path = tmp_path / "s.h5"
