@@ -58,12 +58,13 @@ def correct(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Turn commanded poses into joint readings with which the calibrated arm reaches them.
+    """Turn commanded poses into corrected joint readings.
 
     A controller that knows the nominal arm means by joint readings the pose that the nominal arm has at them. The
-    corrected readings put the calibrated arm there: position and orientation in the base frame of both arms (positions
-    with orientations in a file: of a URDF, in its base link). Seven or more joints change as little as possible; fewer
-    than six correct the position alone.
+    corrected readings put the calibrated arm there: position and orientation in the base frame of both arms. Positions
+    with orientations in POSES.csv are in that frame, too; of a URDF, in its base link. Seven or more joints change as
+    little as possible; fewer than six correct the position alone. Rotations of the tool that the calibration's data do
+    not determine stay nominal.
 
     The table written has the columns and the unit of the one that was read. The readings of a row that cannot be
     reached, within the nominal arm's joint limits, are left empty, and the exit code is 1: no arm is to be sent there.
@@ -88,7 +89,7 @@ def correct(
         if commanded.poses is None:
             found = corrected_readings(nominal, calibrated, commanded.q)
         else:
-            found = readings_at_poses(calibrated, commanded.q, _in_first_frame(record, commanded.poses), nominal.limits)
+            found = readings_at_poses(calibrated, commanded.q, in_first_frame(record, commanded.poses), nominal.limits)
         given = {"unit": commanded.unit, "of_readings": commanded.poses is None}
         summary = correction_summary(nominal, calibrated, commanded.q, found, **given)
         write_text(output, corrected_csv(commanded, np.asarray(found.q), np.asarray(found.reached)))
@@ -109,7 +110,7 @@ def _numbers(option: str, text: str, form: str) -> tuple[float, ...]:
     return values
 
 
-def _in_first_frame(record: Any, poses: np.ndarray) -> np.ndarray:
+def in_first_frame(record: Any, poses: np.ndarray) -> np.ndarray:
     """Poses in the frame in which the Denavit-Hartenberg chain begins; of a URDF they are given in its base link."""
     nominal = record.recording.nominal
     if nominal.urdf is None:

@@ -2,17 +2,21 @@
 
 import csv
 import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
+from aacmm_jax.cli.correct_command import in_first_frame
 
 from ..conftest import command_line
 
 Q = np.array([0, 0.3, 0.4, 0, 1.2, 0]) + np.random.default_rng(0).uniform(-1, 1, (6, 6))  # rad
 DEG = np.pi / 180
+URDF = Path(__file__).parents[1] / "files" / "six_axis.urdf"
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +108,18 @@ def test_what_is_not_reached_is_named_by_row_and_left_empty(arms):
     found = json.loads(run(arms, "far.csv", "-o", "out.csv", "--json", expect=1).stdout)
     assert [row["row"] for row in found["not_reached"]] == [2]
     assert found["not_reached"][0]["distance_mm"] > 100
+
+
+def test_poses_of_a_urdf_are_in_its_base_link():
+    specification = aj.files.load_specification(URDF, base="shoulder", tip="tool0")
+    base = aj.files.urdf_chain(specification.urdf).base
+    assert not np.allclose(base, np.eye(4))
+    program: dict = {}
+    exec(aj.files.python_program(specification.arm, title="", base=base), program)
+    record = SimpleNamespace(recording=SimpleNamespace(nominal=specification))
+    q = Q[:, : specification.arm.joints]
+    in_base_link = np.stack([program["pose"](row) for row in q])
+    np.testing.assert_allclose(in_first_frame(record, in_base_link), specification.arm.pose(q), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
