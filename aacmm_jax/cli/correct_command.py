@@ -66,6 +66,9 @@ def correct(
     little as possible; fewer than six correct the position alone. Rotations of the tool that the calibration's data do
     not determine stay nominal.
 
+    Readings are those of the nominal arm, as its joints count them: signs and offsets that a manifest gives for the
+    recorded angles of a capture are not applied.
+
     The table written has the columns and the unit of the one that was read. The readings of a row that cannot be
     reached, within the nominal arm's joint limits, are left empty, and the exit code is 1: no arm is to be sent there.
     """

@@ -85,14 +85,19 @@ def test_fewer_than_six_joints_correct_the_position():
 
 
 def test_a_redundant_joint_at_its_limit_leaves_the_correction_to_the_others():
-    nominal, q = ARMS["panda"], np.array([0.1, 0.3, -0.2, -1.8, 0.2, 1.9, 0.6])
-    calibrated = deviating(nominal, 3)
-    free = aj.kinematics.corrected_readings(nominal, calibrated, q)
-    limits = np.array([(-7.0, 7.0)] * 7)
-    limits[2] = (q[2], 7.0) if free.q[2] < q[2] else (-7.0, q[2])  # the side to which it wants to go is closed
-    found = aj.kinematics.corrected_readings(nominal, calibrated, q, limits.tolist())
-    assert found.reached
-    assert abs(found.q[2] - q[2]) < 1e-5 < abs(free.q[2] - q[2])
+    nominal = ARMS["panda"]
+    calibrated, q = deviating(nominal, 3), within_limits(nominal, 3, 10)
+    free = np.asarray(aj.kinematics.corrected_readings(nominal, calibrated, q).q)
+    reached = 0
+    for start, end in zip(q, free, strict=True):
+        joint = np.argmax(np.abs(end - start))
+        limits = [(-7.0, 7.0)] * 7
+        # The side to which the joint that moves most wants to go is closed.
+        limits[joint] = (start[joint], 7.0) if end[joint] < start[joint] else (-7.0, start[joint])
+        found = aj.kinematics.corrected_readings(nominal, calibrated, start, limits)
+        reached += bool(found.reached)
+        assert limits[joint][0] <= found.q[joint] <= limits[joint][1]
+    assert reached >= 7  # clipping alone, without leaving the joint out, reaches at most one
 
 
 def test_outside_the_reach_is_said_with_the_distance():
