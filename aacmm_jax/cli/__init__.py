@@ -16,6 +16,7 @@ _FAMILIES = (
     "capture_commands",
     "calibration_commands",
     "result_commands",
+    "correct_command",
     "study_commands",
     "plan_commands",
     "compare_commands",

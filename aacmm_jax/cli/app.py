@@ -194,6 +194,13 @@ def length_option(text: str) -> tuple:
         bad_option("--length", text, "A,B or A,B,U with u in mm")
 
 
+def warn_of_unusable(calibration: Path, record: Any) -> None:
+    """Say on standard error that a calibration did not converge, or ended with a residual that no arm has."""
+    if not record.converged or record.implausible_residual:
+        reason = "the residual is that of no arm; see aacmm show." if record.converged else record.reason
+        typer.echo(f"Warning: {calibration} is not a calibration that can be used: {reason}", err=True)
+
+
 def bad_option(option: str, text: str, form: str) -> NoReturn:
     """Refuse the value of an option."""
     raise InputError(f"{option} '{text}' is not of the form {form}.")

@@ -14,7 +14,19 @@ from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
 from ..files.sense import check_shown
-from .app import BaseLink, CalibrationFile, Json, Only, TipLink, Without, app, examples, show_summary, with_spinner
+from .app import (
+    BaseLink,
+    CalibrationFile,
+    Json,
+    Only,
+    TipLink,
+    Without,
+    app,
+    examples,
+    show_summary,
+    warn_of_unusable,
+    with_spinner,
+)
 from .export_formats import exported
 
 _ARM_SUFFIXES = ("", ".toml", ".urdf", ".xacro", ".yaml", ".yml")
@@ -255,9 +267,7 @@ def export(
         specification = arms[which or "calibrated"]
         if specification is None:
             raise InputError(f"{calibration} is not of a simulation, so it has no true arm; choose another --arm.")
-        if not record.converged or record.implausible_residual:
-            reason = "the residual is that of no arm; see aacmm show." if record.converged else record.reason
-            typer.echo(f"Warning: {calibration} is not a calibration that can be used: {reason}", err=True)
+        warn_of_unusable(calibration, record)
         source = ""
         if which in (None, "calibrated"):
             scale = "" if math.isnan(record.k) else f", k = {record.k:.8f}"

@@ -101,6 +101,21 @@ class TextTable:
         if len(self._header) != len(self._rows[0][1]):
             self._header = []
 
+    @property
+    def header(self) -> list[str]:
+        """Names of the columns; empty where the table has none."""
+        return [name.strip("\"'") for name in self._header]
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return len(self._rows[0][1])
+
+    @property
+    def length(self) -> int:
+        """Number of rows."""
+        return len(self._rows)
+
     def has(self, wanted: Sequence[Column]) -> bool:
         """Whether these columns are there. Raises `InputError` where only some of them are."""
         missing = [column for column in wanted if not self._matching(column)]

@@ -17,7 +17,9 @@ from aacmm_jax.data.recording import Recording
 
 from ..conftest import command_line
 
-COMMANDS = ("demo", "simulate", "import", "calibrate", "evaluate", "export", "show", "plan", "compare", "report")
+COMMANDS = (
+    *("demo", "simulate", "import", "calibrate", "evaluate", "export", "correct", "show", "plan", "compare", "report"),
+)
 SIMULATE = (
     *("simulate", "cheng2018-simulation", "-o", "capture.h5", "--seed", 4),
     *("--socket", "A=400,200,300", "--socket", "B=600,200,300", "--socket", "C=500,400,400"),

@@ -1,0 +1,150 @@
+"""``correct``: commanded poses into readings with which a calibrated arm reaches them."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import typer
+from rich.markup import escape
+
+from ..core.errors import InputError
+from ..core.text import number, pluralise
+from ..files.inputs import InputFile
+from ..files.outputs import together
+from .app import CalibrationFile, Json, app, bad_option, examples, show_summary, warn_of_unusable
+from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
+
+_MOST_ROWS = 20  # that are printed
+
+
+@app.command(
+    epilog=examples(
+        "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg",
+        "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg --near 0,-90,90,0,90,0 --probe 0,0,150",
+    )
+)
+def correct(
+    calibration: CalibrationFile,
+    poses: Annotated[
+        Path,
+        typer.Argument(
+            metavar="POSES.csv",
+            help="A row for each commanded pose: the joint readings (columns q_1, q_2, ..., or no others); or position "
+            "x, y, z (mm) with qw, qx, qy, qz (quaternion) or rx, ry, rz (rotation vector).",
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE.csv", help="Table with corrected readings to write.")
+    ],
+    unit: Annotated[
+        Literal["deg", "rad"] | None,
+        typer.Option(help="Of joint readings and rotation vectors; needed where the header does not say it (q_1_deg)."),
+    ] = None,
+    near: Annotated[
+        str | None,
+        typer.Option(
+            metavar="Q1,Q2,...",
+            help="Of positions with orientations: readings to begin with, near which a solution is wanted. Default: "
+            "columns q_1, q_2, ... of the table.",
+        ),
+    ] = None,
+    probe: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="The tool's tip in the last frame, mm, the same for both arms. Default: the nominal and the "
+            "calibrated probe, whose difference is corrected too.",
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Turn commanded poses into corrected joint readings.
+
+    A controller that knows the nominal arm means by joint readings the pose that the nominal arm has at them. The
+    corrected readings put the calibrated arm there: position and orientation in the base frame of both arms. Positions
+    with orientations in POSES.csv are in that frame, too; of a URDF, in its base link. Seven or more joints change as
+    little as possible; fewer than six correct the position alone. Rotations of the tool that the calibration's data do
+    not determine stay nominal.
+
+    Readings are those of the nominal arm, as its joints count them: signs and offsets that a manifest gives for the
+    recorded angles of a capture are not applied.
+
+    The table written has the columns and the unit of the one that was read. The readings of a row that cannot be
+    reached, within the nominal arm's joint limits, are left empty, and the exit code is 1: no arm is to be sent there.
+    """
+    from ..core.numpy_or_jax import to_numpy
+    from ..files.atomic_write import write_text
+    from ..files.calibrations import load_calibration
+    from ..files.commanded_poses import corrected_csv, read_commanded_poses
+    from ..kinematics.correction import corrected_readings, readings_at_poses
+    from ..summaries.correction import correction_summary
+
+    begin = None if near is None else _numbers("--near", near, "Q1,Q2,... with a reading for each joint")
+    with together(output):
+        record = load_calibration(InputFile(calibration))
+        nominal, calibrated = to_numpy((record.recording.nominal.arm, record.calibrated.arm))
+        if probe is not None:
+            tip = _numbers("--probe", probe, "X,Y,Z in mm")
+            if len(tip) != 3:
+                bad_option("--probe", probe, "X,Y,Z in mm")
+            nominal, calibrated = nominal.replace(probe=tip), calibrated.replace(probe=tip)
+        commanded = read_commanded_poses(InputFile(poses), nominal.joints, unit=unit, near=begin)
+        if commanded.poses is None:
+            found = corrected_readings(nominal, calibrated, commanded.q)
+        else:
+            found = readings_at_poses(calibrated, commanded.q, in_first_frame(record, commanded.poses), nominal.limits)
+        given = {"unit": commanded.unit, "of_readings": commanded.poses is None}
+        summary = correction_summary(nominal, calibrated, commanded.q, found, **given)
+        write_text(output, corrected_csv(commanded, np.asarray(found.q), np.asarray(found.reached)))
+        summary["written"] = str(output)
+    warn_of_unusable(calibration, record)
+    show_summary(summary, as_json, _display)
+    if summary["not_reached"]:
+        raise typer.Exit(1)
+
+
+def _numbers(option: str, text: str, form: str) -> tuple[float, ...]:
+    try:
+        values = tuple(number(part.strip()) for part in text.split(","))
+    except ValueError:
+        bad_option(option, text, form)
+    if not np.all(np.isfinite(values)):
+        raise InputError(f"{option} '{text}' holds a value that is not finite; give finite numbers.")
+    return values
+
+
+def in_first_frame(record: Any, poses: np.ndarray) -> np.ndarray:
+    """Poses in the frame in which the Denavit-Hartenberg chain begins; of a URDF they are given in its base link."""
+    nominal = record.recording.nominal
+    if nominal.urdf is None:
+        return poses
+    from ..files.urdf import urdf_chain
+
+    return np.linalg.inv(urdf_chain(nominal.urdf).base) @ poses
+
+
+def _display(summary: dict[str, Any]) -> None:
+    console = new_console()
+    print_warnings(console, summary)
+    rows, missed, largest = summary["rows"], summary["not_reached"], summary["largest_change"]
+    console.print(f"{rows - len(missed)} of {pluralise(rows, 'pose')} reached with corrected readings.")
+    if len(missed) < rows:
+        console.print(f"Largest distance from a pose with them: {formatted(summary['largest_distance_mm'])} mm.")
+    if largest is not None:
+        console.print(f"Without the correction: {formatted(summary['largest_distance_before_mm'])} mm.")
+        console.print(
+            f"Largest change of a reading: {largest['change_deg']:.4f} deg (joint {largest['joint']}, row "
+            f"{largest['row']})."
+        )
+    if missed:
+        shown = f", the first {_MOST_ROWS}, all by --json" if len(missed) > _MOST_ROWS else ""
+        table = new_table(f"\nNot reached{shown}", "row", "distance left [mm]", "angle left [deg]", "joints at a limit")
+        for row in missed[:_MOST_ROWS]:
+            table.add_row(
+                str(row["row"]),
+                formatted(row["distance_mm"]),
+                formatted(row["angle_deg"]),
+                escape(", ".join(map(str, row["joints_at_limit"])) or "-"),
+            )
+        print_table(console, table)
+    print_written(console, summary)

@@ -1,0 +1,171 @@
+"""Tables of commanded poses, as joint readings or as positions with orientations, and of their corrected readings."""
+
+import csv
+import io
+import os
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..core.errors import InputError
+from ..core.rotations import rotation_matrix
+from ..core.units import DEG, INCH, UM, M
+from .text_table import TextTable
+
+_ANGLES = {"deg": DEG, "rad": 1.0}
+_LENGTHS = {"mm": 1.0, "m": M, "um": UM, "inch": INCH}
+# Names of columns that hold the readings of joints 1, 2, ... from left to right.
+_READINGS = ("q_[0-9]*", "q[0-9]*", "joint*[0-9]*", "j[0-9]*", "a[0-9]*")
+_QUATERNION, _ROTATION = ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")
+_ROUNDED = 1e-3  # of a quaternion's length: three decimals at least
+
+
+class CommandedPoses(NamedTuple):
+    """What a table of commanded poses holds."""
+
+    q: Float[np.ndarray, "N n"]  # readings: those commanded, or where the search for a pose begins, rad
+    poses: Float[np.ndarray, "N 4 4"] | None  # in the frame that the file uses, mm; None: those of the readings
+    unit: str  # of the readings, deg or rad
+    table: TextTable
+    columns: tuple[int, ...]  # of the readings, counted from 0; none: `near` was used
+
+
+def read_commanded_poses(
+    path: str | os.PathLike, joints: int, *, unit: str | None = None, near: Sequence[float] | None = None
+) -> CommandedPoses:
+    """Read a table with a row for each commanded pose.
+
+    Either joint readings, in columns named q_1, q_2, ... (or q1, joint_1, j1, a1; with a unit, as q_1_deg, if the
+    header states it), or in all columns of a table without such names. Or positions and orientations: x, y, z (mm, or
+    the header's unit) with qw, qx, qy, qz (quaternion) or rx, ry, rz (rotation vector, in ``unit`` unless the header
+    says it), and the readings to begin with in columns as above, or ``near``.
+
+    Args:
+        path: The table (CSV or other text).
+        joints: Number of joints.
+        unit: ``"deg"`` or ``"rad"``; needed where the header does not say it.
+        near: Readings to begin with, in ``unit``, where the table has none.
+
+    Raises:
+        InputError: Columns are missing, or a unit is missing or differs.
+    """
+    table = TextTable(path)
+    orientation = _orientation(table)
+    columns = _reading_columns(path, table, joints, alone=orientation is None)
+    stated = table.unit([i + 1 for i in columns]) if columns else None
+    if stated is not None and (stated not in _ANGLES or unit not in (None, stated)):
+        raise InputError(f"{path} states {stated} for joint readings; give them in deg or rad, and leave out --unit.")
+    found = stated or unit
+    if found is None:
+        raise InputError(f"{path} does not say the unit of joint readings; give --unit deg or --unit rad.")
+    if columns and near is not None:
+        raise InputError(f"{path} has joint readings in each row; leave out --near.")
+    if not columns and near is None:
+        raise InputError(f"{path} has no joint readings to begin with; add columns q_1 to q_{joints}, or give --near.")
+    if near is not None and len(near) != joints:
+        raise InputError(f"--near has {len(near)} readings, but the arm {joints} joints; give one per joint.")
+    poses = None if orientation is None else _poses(path, table, _ANGLES[found])
+    readings = table.numbers([i + 1 for i in columns]) if near is None else np.tile(near, (table.length, 1))
+    return CommandedPoses(_ANGLES[found] * readings, poses, found, table, columns)
+
+
+def corrected_csv(commanded: CommandedPoses, q: Float[np.ndarray, "N n"], reached: Bool[np.ndarray, " N"]) -> str:
+    """The table with corrected readings in place of those commanded, or after the other columns, in the same unit.
+
+    The readings of rows that are not reached are left empty, so that nobody sends an arm there by mistake.
+
+    Args:
+        commanded: What was read.
+        q: Corrected readings, rad.
+        reached: Which rows have some.
+    """
+    table, angle = commanded.table, _ANGLES[commanded.unit]
+    cells = [[repr(float(x)) if good else "" for x, good in zip(row, reached, strict=True)] for row in q.T / angle]
+    names = [f"q_{i}_{commanded.unit}" for i in range(1, len(cells) + 1)]
+    header, joint_of = table.header, {column: i for i, column in enumerate(commanded.columns)}
+    columns: list[tuple[str, Sequence[str]]] = []
+    for i in range(table.width):
+        if i in joint_of:
+            columns.append((header[i] if header else names[joint_of[i]], cells[joint_of[i]]))
+        else:
+            columns.append((header[i] if header else f"column_{i + 1}", list(table.texts(i + 1))))
+    if not commanded.columns:
+        columns += zip(names, cells, strict=True)
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow([name for name, _ in columns])
+    writer.writerows(zip(*(column for _, column in columns), strict=True))
+    return stream.getvalue()
+
+
+def _found(table: TextTable, names: Sequence[str], units: Sequence[str]) -> tuple[list[str], str | None] | None:
+    """Columns of these names, alone or with a unit after them, and the unit that the header states; None: not there."""
+    if not table.header:
+        return None
+    for unit in ("", *units):
+        wanted = [f"{name}_{unit}" if unit else name for name in names]
+        if table.has(wanted):
+            return wanted, unit or table.unit(wanted)
+    return None
+
+
+def _orientation(table: TextTable) -> tuple[list[str], str | None] | None:
+    """The columns of a quaternion or a rotation vector, and the unit that the header states."""
+    return _found(table, _QUATERNION, ()) or _found(table, _ROTATION, tuple(_ANGLES))
+
+
+def _reading_columns(path: str | os.PathLike, table: TextTable, joints: int, alone: bool) -> tuple[int, ...]:
+    """Columns of joint readings, counted from 0; ``alone``: there are no poses, so there must be some."""
+    numbers = {pattern: table.pick([pattern]) for pattern in _READINGS if table.has([pattern])}
+    for columns in numbers.values():
+        if len(columns) == joints:
+            return tuple(columns)
+    if not alone:
+        return ()
+    if not table.header and table.width == joints:
+        return tuple(range(joints))
+    raise InputError(
+        f"{path} has no columns q_1 to q_{joints} of joint readings, and no positions with orientations (x, y, z with "
+        "qw, qx, qy, qz or rx, ry, rz); name its columns so."
+    )
+
+
+def _poses(path: str | os.PathLike, table: TextTable, angle: float) -> Float[np.ndarray, "N 4 4"]:
+    """Positions, mm, and orientations; ``angle``: the unit of a rotation vector that its header does not state."""
+    position, orientation = _found(table, ("x", "y", "z"), tuple(_LENGTHS)), _orientation(table)
+    if position is None or orientation is None:
+        raise InputError(f"{path} has orientations, but no positions in columns x, y and z; add them.")
+    unit, (names, rotation_unit) = position[1] or "mm", orientation
+    if unit not in _LENGTHS or rotation_unit not in (None, *_ANGLES):
+        raise InputError(
+            f"{path} states positions in {unit}; give one of {', '.join(_LENGTHS)}, and angles in deg or rad."
+        )
+    numbers = table.numbers(names)
+    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    poses[:, :3, 3] = _LENGTHS[unit] * table.numbers(position[0])
+    if len(names) == len(_QUATERNION):
+        poses[:, :3, :3] = _rotations(path, numbers)
+    else:
+        vectors = (angle if rotation_unit is None else _ANGLES[rotation_unit]) * numbers
+        poses[:, :3, :3] = np.stack([rotation_matrix(vector) for vector in vectors])
+    return poses
+
+
+def _rotations(path: str | os.PathLike, quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 3 3"]:
+    """Rotation matrices of quaternions w, x, y, z, whose length may differ from 1 by rounding."""
+    size = np.linalg.norm(quaternions, axis=1)
+    wrong = np.flatnonzero(np.abs(size - 1) > _ROUNDED)
+    if len(wrong):
+        raise InputError(
+            f"{path} row {wrong[0] + 1}: the quaternion has length {size[wrong[0]]:.6g} instead of 1; correct it, or "
+            "its columns."
+        )
+    w, x, y, z = (quaternions / size[:, None]).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)

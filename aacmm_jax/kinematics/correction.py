@@ -1,0 +1,214 @@
+"""Readings with which a calibrated arm reaches poses, for controllers that know the nominal arm only."""
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..core.arrays import Numbers, as_array
+from ..core.errors import InputError
+from ..core.linear_algebra import solve_positive_definite
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, numpy_if_known
+from ..core.rotations import cross
+from .arm import Arm, checked_limits, is_single
+from .chain import ForwardPass, Geometry, forward_pass, sines_cosines
+
+FULL_POSE = 6  # joints from which on the orientation can be reached as well
+_STEPS = 60
+_LEVER = 500.0  # mm: a rotation counts as what it moves at this distance
+_LARGEST_STEP = 0.5  # rad
+_CLOSED = 1e-7  # mm: one more step closes a gap of this size to rounding
+_STILL = 1e-13  # rad: a step of this size changes nothing
+_ARRIVED, _ALIGNED = 1e-6, 1e-9  # mm, rad
+_ROWS = 2048  # of one call: fewer leave much of the time to Python, more do not fit into the processor's cache
+
+
+class ReadingsAtPoses(NamedTuple):
+    """Joint readings found for poses, and what remains between the arm's poses at them and those wanted."""
+
+    q: Float[AnyArray, "... n"]  # rad
+    distance: Float[AnyArray, "..."]  # of the tip, mm
+    angle: Float[AnyArray, "..."]  # of the last frame, rad
+    reached: Bool[AnyArray, "..."]  # within 1 nm and 1 nrad; with fewer than six joints within 1 nm
+
+
+def corrected_readings(
+    nominal: Arm, calibrated: Arm, q: Numbers, limits: Sequence[Sequence[float]] | None = None
+) -> ReadingsAtPoses:
+    """Readings that put the calibrated arm where a controller with the nominal arm believes it to be at ``q``.
+
+    What the controller means by the readings ``q`` is the pose ``nominal.pose(q)``; the readings found make
+    ``calibrated.pose`` equal to it, in the base frame that both arms have in common. See `readings_at_poses`.
+
+    Args:
+        nominal: The arm that the controller has.
+        calibrated: The calibrated arm.
+        q: Commanded joint readings ``(..., n)``, rad.
+        limits: Lowest and highest reading of each joint, n pairs, rad; by default those of the nominal arm, if any.
+
+    Raises:
+        InputError: The arms have other numbers of joints, or one of them is a batch.
+    """
+    if nominal.joints != calibrated.joints:
+        raise InputError(f"the arms have {nominal.joints} and {calibrated.joints} joints; give arms with as many.")
+    return readings_at_poses(calibrated, q, nominal.pose(q), nominal.limits if limits is None else limits)
+
+
+@numpy_if_known
+def readings_at_poses(
+    arm: Arm, q: Numbers, poses: Float[AnyArray, "... 4 4"], limits: Sequence[Sequence[float]] | None = None
+) -> ReadingsAtPoses:
+    """Readings near ``q`` at which the arm has given poses.
+
+    Six joints reach a pose exactly, on the branch of the start. More joints take the least-norm steps, which change
+    the readings least; fewer reach the position alone, and ``angle`` says what remains. Works under jit, vmap and
+    jacfwd.
+
+    Args:
+        arm: One arm.
+        q: Readings to begin with ``(..., n)``, rad.
+        poses: The pose wanted for each, with the tip (mm) as its origin, in the arm's base frame ``(..., 4, 4)``.
+        limits: Lowest and highest reading of each joint, n pairs, rad; by default none.
+
+    Raises:
+        InputError: The arm is a batch, the limits are no pairs, or the shapes differ.
+    """
+    if not is_single(arm):
+        raise InputError("poses are reached by one arm, but this is a batch; use jax.vmap, or take one of it.")
+    q = as_array(q, "q", like=arm.alpha)
+    if q.shape[-1:] != (arm.joints,) or poses.shape != (*q.shape[:-1], 4, 4):
+        raise InputError(
+            f"q has shape {q.shape}, poses {poses.shape} and the arm {arm.joints} joints; give (..., n) and "
+            "(..., 4, 4) with a pose for each configuration."
+        )
+    allowed = np.tile([-np.inf, np.inf], (arm.joints, 1))
+    if limits is not None:
+        allowed = np.asarray(checked_limits(limits, arm.joints))
+    count = math.prod(q.shape[:-1])
+    rows, wanted = q.reshape(count, arm.joints), poses.reshape(count, 4, 4)
+    if namespace(arm.geometry, rows, wanted) is np:
+        starts = range(0, max(count, 1), _ROWS)
+        parts = [
+            solve_to_poses(arm.geometry, rows[first : first + _ROWS], wanted[first : first + _ROWS], allowed)
+            for first in starts
+        ]
+        found, distance, angle = (np.concatenate(part) for part in zip(*parts, strict=True))
+    else:
+        found, distance, angle = solve_to_poses(arm.geometry, rows, wanted, allowed)
+    reached = distance <= _ARRIVED
+    if arm.joints >= FULL_POSE:
+        reached = reached & (angle <= _ALIGNED)
+    shape = q.shape[:-1]
+    return ReadingsAtPoses(found.reshape(q.shape), *(x.reshape(shape) for x in (distance, angle, reached)))
+
+
+@compiled(jit=partial(jax.jit, static_argnames=("steps",)))
+def solve_to_poses(
+    geometry: Geometry,
+    q: Float[AnyArray, "c n"],
+    poses: Float[AnyArray, "c 4 4"],
+    limits: Float[AnyArray, "n 2"],
+    steps: int = _STEPS,
+) -> tuple[Float[AnyArray, "c n"], Float[AnyArray, " c"], Float[AnyArray, " c"]]:
+    """Damped least-norm steps to the poses, within the limits, of at most 0.5 rad a joint; for any jit, vmap or loop.
+
+    The result of a row does not depend on the other rows.
+
+    Args:
+        geometry: The arm's ``geometry``.
+        q: Joint readings to begin with ``(c, n)``, rad.
+        poses: The pose wanted for each ``(c, 4, 4)``, mm.
+        limits: Lowest and highest reading of each joint ``(n, 2)``, rad.
+        steps: Most steps.
+
+    Returns:
+        The readings ``(c, n)``, rad; the distances ``(c,)``, mm, and the angles ``(c,)``, rad, that remain.
+    """
+    xp, whole = namespace(geometry, q, poses), q.shape[-1] >= FULL_POSE
+    low, high = limits[:, :1], limits[:, 1:]
+
+    def step(q: Any, wanted: Any) -> tuple[Any, Any]:
+        """The next readings ``(n, c)``, and which rows need more steps."""
+        forward = forward_pass(geometry, (xp.cos(q)[:, None], xp.sin(q)[:, None]))
+        gap, columns = _gap_and_columns(forward, wanted, whole)
+        change = _least_norm(columns, gap)
+        # A joint at its limit that a step would take beyond stays there, and the others do what they can.
+        stays = ((q <= low) & (change < 0)) | ((q >= high) & (change > 0))
+        if xp is not np or stays.any():
+            change = _least_norm(xp.where(stays[:, None], 0.0, columns), gap)
+        new = xp.clip(q + xp.clip(change, -_LARGEST_STEP, _LARGEST_STEP), low, high)
+        open_gap, moves = xp.any(xp.abs(gap) > _CLOSED, axis=0), xp.any(xp.abs(new - q) > _STILL, axis=0)
+        return new, open_gap & moves
+
+    # A step after the gap was seen to be closed takes what Newton's method leaves to rounding.
+    q, wanted = xp.clip(q.T, low, high), xp.moveaxis(poses[:, :3], 0, -1)
+    if xp is np:
+        under_way = np.arange(q.shape[-1])
+        for _ in range(steps):
+            q[:, under_way], more = step(q[:, under_way], wanted[..., under_way])
+            under_way = under_way[more]
+            if not len(under_way):
+                break
+    else:
+        # A row that has arrived stays as it is, so that it does not depend on how many steps the others take.
+        def body(state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+            count, q, under_way = state
+            new, more = step(q, wanted)
+            return count + 1, xp.where(under_way[None], new, q), under_way & more
+
+        _, q, _ = jax.lax.while_loop(
+            lambda state: (state[0] < steps) & xp.any(state[2]),
+            body,
+            (xp.zeros((), dtype=np.int32), q, xp.ones(q.shape[1:], dtype=bool)),
+        )
+    forward = forward_pass(geometry, sines_cosines(q.T))
+    shift, rotation = _remaining(forward, wanted)
+    return q.T, xp.linalg.norm(shift, axis=0), xp.linalg.norm(rotation, axis=0)
+
+
+def _remaining(
+    forward: ForwardPass, wanted: Float[AnyArray, "3 4 N"]
+) -> tuple[Float[AnyArray, "3 N"], Float[AnyArray, "3 N"]]:
+    """The shift (mm) and the rotation vector (rad) from poses to those wanted.
+
+    With the axes r_k of a frame and w_k of the one wanted, the sum of r_k x w_k is twice the sine times the axis of the
+    rotation between them, and that of r_k . w_k is 1 + 2 cos.
+    """
+    xp = namespace(forward, wanted)
+    pairs = [(forward.frame[k], wanted[:, k]) for k in range(3)]
+    sine = 0.5 * sum(cross(r, w) for r, w in pairs)
+    cosine = 0.5 * (sum(xp.sum(r * w, axis=0) for r, w in pairs) - 1)
+    square = xp.sum(sine**2, axis=0)
+    small = (square < 1e-12) & (cosine > 0)  # there the angle is its sine to 1e-18
+    size = xp.sqrt(xp.where(small, 1.0, square + 1e-300))
+    rotation = sine * xp.where(small, 1.0, xp.arctan2(size, cosine) / size)[None]
+    return wanted[:, 3] - forward.tip, rotation
+
+
+def _gap_and_columns(
+    forward: ForwardPass, wanted: Float[AnyArray, "3 4 N"], whole: bool
+) -> tuple[Float[AnyArray, "m N"], Float[AnyArray, "n m N"]]:
+    """What is left to the poses wanted, in mm, and its derivatives by the readings; of positions alone, or of all."""
+    xp = namespace(forward, wanted)
+    shift, rotation = _remaining(forward, wanted)
+    moved = cross(forward.z_before, forward.tip[None] - forward.origin_before)
+    if not whole:
+        return shift, moved
+    columns = xp.concatenate([moved, _LEVER * forward.z_before], axis=1)
+    return xp.concatenate([shift, _LEVER * rotation]), columns
+
+
+def _least_norm(columns: Float[AnyArray, "n m N"], gap: Float[AnyArray, "m N"]) -> Float[AnyArray, "n N"]:
+    """J^T (J J^T + damping)^-1 gap. The damping vanishes with the gap, so that the last steps are Newton's; what stays
+    of it keeps the matrix positive definite where the arm is singular."""
+    xp = namespace(columns, gap)
+    rows = xp.transpose(columns, (2, 1, 0))
+    matrix = rows @ xp.swapaxes(rows, -1, -2)
+    size = xp.sum(rows**2, axis=(-2, -1))
+    damping = 1e-2 * xp.sum(gap**2, axis=0) + 1e-12 * size + 1e-12
+    matrix = matrix + damping[:, None, None] * xp.asarray(np.eye(gap.shape[0]))[None]
+    return (solve_positive_definite(matrix, gap.T)[:, None] @ rows)[:, 0].T

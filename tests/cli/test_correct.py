@@ -1,0 +1,146 @@
+"""``aacmm correct``: tables of commanded poses, with corrected readings in the same columns and unit."""
+
+import csv
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import aacmm_jax as aj
+from aacmm_jax.cli.correct_command import in_first_frame
+
+from ..conftest import command_line
+
+Q = np.array([0, 0.3, 0.4, 0, 1.2, 0]) + np.random.default_rng(0).uniform(-1, 1, (6, 6))  # rad
+DEG = np.pi / 180
+URDF = Path(__file__).parents[1] / "files" / "six_axis.urdf"
+
+
+@pytest.fixture(scope="module")
+def arms(tmp_path_factory):
+    """A calibration of the paper's simulated arm, and its two arms."""
+    folder = tmp_path_factory.mktemp("correct")
+    sockets = ("--socket", "A=400,200,300", "--socket", "B=600,200,300", "--length", "A,B,0.002")
+    wrong = ("--deviate-length-mm", 1, "--deviate-angle-deg", 0.1, "--poses", 20)
+    command_line(folder, "simulate", "cheng2018-simulation", *sockets, *wrong, "-o", "capture.h5")
+    command_line(folder, "calibrate", "capture.h5", "-o", "calibration.h5")
+    record = aj.files.load_calibration(folder / "calibration.h5")
+    return folder, record.recording.nominal.arm, record.calibrated.arm
+
+
+def table(path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+def run(arms, *arguments, expect=0):
+    return command_line(arms[0], "correct", "calibration.h5", *arguments, expect=expect)
+
+
+def write(path, header: list[str], rows) -> None:
+    lines = [",".join(header)] if header else []
+    path.write_text("\n".join([*lines, *(",".join(map(str, row)) for row in rows)]) + "\n")
+
+
+def test_readings_in_the_columns_and_unit_of_the_table(arms):
+    folder, nominal, calibrated = arms
+    header = ["name", *(f"q_{i}_deg" for i in range(1, 7)), "speed"]
+    write(folder / "in.csv", header, [[f"p{i}", *(q / DEG), 7] for i, q in enumerate(Q)])
+    found = json.loads(run(arms, "in.csv", "-o", "out.csv", "--json").stdout)
+    rows = table(folder / "out.csv")
+    assert list(rows[0]) == header
+    assert [row["name"] for row in rows] == [f"p{i}" for i in range(6)]
+    q = DEG * np.array([[float(row[f"q_{i}_deg"]) for i in range(1, 7)] for row in rows])
+    difference = np.asarray(calibrated.pose(q)) - np.asarray(nominal.pose(Q))
+    assert np.abs(difference[:, :3, 3]).max() < 1e-3
+    assert np.abs(difference[:, :3, :3]).max() < 1e-9
+    before = np.linalg.norm(np.asarray(calibrated.position(Q)) - np.asarray(nominal.position(Q)), axis=1).max()
+    assert found["largest_distance_before_mm"] == pytest.approx(before)
+    assert before > 0.1
+    assert (found["rows"], found["not_reached"], found["unit"]) == (6, [], "deg")
+    change = np.abs(q - Q) / DEG
+    largest = found["largest_change"]
+    assert largest["change_deg"] == pytest.approx(change.max())
+    assert (largest["row"] - 1, largest["joint"] - 1) == np.unravel_index(change.argmax(), change.shape)
+
+
+def test_a_table_without_header_and_a_tool_of_both_arms(arms):
+    folder, nominal, calibrated = arms
+    write(folder / "plain.csv", [], Q)
+    run(arms, "plain.csv", "-o", "out.csv", "--unit", "rad", "--probe", "5,0,300")
+    rows = table(folder / "out.csv")
+    q = np.array([[float(row[f"q_{i}_rad"]) for i in range(1, 7)] for row in rows])
+    tool = [np.asarray(arm.replace(probe=(5, 0, 300)).position(x)) for arm, x in ((nominal, Q), (calibrated, q))]
+    np.testing.assert_allclose(tool[0], tool[1], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("orientation", ["quaternion", "rotation vector"])
+def test_positions_with_orientations(arms, orientation):
+    folder, _, calibrated = arms
+    poses = np.asarray(calibrated.pose(Q[:1] + 0.02 * np.arange(3)[:, None]))
+    rotation = Rotation.from_matrix(poses[:, :3, :3])
+    if orientation == "quaternion":
+        names, numbers = ["qx", "qy", "qz", "qw"], rotation.as_quat()
+    else:
+        names, numbers = ["rx_deg", "ry_deg", "rz_deg"], rotation.as_rotvec() / DEG
+    write(folder / "poses.csv", ["x_m", "y_m", "z_m", *names], np.hstack([poses[:, :3, 3] / 1000, numbers]))
+    near = ",".join(str(x) for x in Q[0] / DEG)
+    run(arms, "poses.csv", "-o", "out.csv", "--unit", "deg", f"--near={near}")
+    q = DEG * np.array([[float(row[f"q_{i}_deg"]) for i in range(1, 7)] for row in table(folder / "out.csv")])
+    np.testing.assert_allclose(calibrated.pose(q), poses, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(q, Q[:1] + 0.02 * np.arange(3)[:, None], rtol=0, atol=1e-9)
+
+
+def test_what_is_not_reached_is_named_by_row_and_left_empty(arms):
+    folder, _, calibrated = arms
+    poses = np.asarray(calibrated.pose(Q[:3])).copy()
+    poses[1, :3, 3] *= 10
+    header = ["x", "y", "z", "rx", "ry", "rz", *(f"q_{i}_rad" for i in range(1, 7))]
+    vectors = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+    write(folder / "far.csv", header, np.hstack([poses[:, :3, 3], vectors, Q[:3]]))
+    said = run(arms, "far.csv", "-o", "out.csv", expect=1).stdout
+    assert "2 of 3 poses reached" in said
+    assert "Not reached" in said
+    rows = table(folder / "out.csv")
+    assert [row["q_1_rad"] == "" for row in rows] == [False, True, False]
+    found = json.loads(run(arms, "far.csv", "-o", "out.csv", "--json", expect=1).stdout)
+    assert [row["row"] for row in found["not_reached"]] == [2]
+    assert found["not_reached"][0]["distance_mm"] > 100
+
+
+def test_poses_of_a_urdf_are_in_its_base_link():
+    specification = aj.files.load_specification(URDF, base="shoulder", tip="tool0")
+    base = aj.files.urdf_chain(specification.urdf).base
+    assert not np.allclose(base, np.eye(4))
+    program: dict = {}
+    exec(aj.files.python_program(specification.arm, title="", base=base), program)
+    record = SimpleNamespace(recording=SimpleNamespace(nominal=specification))
+    q = Q[:, : specification.arm.joints]
+    in_base_link = np.stack([program["pose"](row) for row in q])
+    np.testing.assert_allclose(in_first_frame(record, in_base_link), specification.arm.pose(q), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "options", "part"),
+    [
+        ([], [0] * 6, (), "--unit"),
+        ([], [0] * 5, ("--unit", "deg"), "q_1 to q_6"),
+        ([f"q_{i}_deg" for i in range(1, 7)], [0] * 6, ("--unit", "rad"), "states deg"),
+        ([f"q_{i}_deg" for i in range(1, 7)], [0] * 6, ("--near", "0,0,0,0,0,0"), "leave out --near"),
+        (["x", "y", "z", "qw", "qx", "qy", "qz"], [1, 2, 3, 1, 0, 0, 0], ("--unit", "deg"), "--near"),
+        (
+            ["x", "y", "z", "qw", "qx", "qy", "qz"],
+            [1, 2, 3, 1, 0, 0, 1],
+            ("--unit", "deg", "--near", "0,0,0,0,0,0"),
+            "row 1",
+        ),
+        (["qw", "qx", "qy", "qz"], [1, 0, 0, 0], ("--unit", "deg", "--near", "0,0,0,0,0,0"), "x, y and z"),
+        ([], [0] * 6, ("--unit", "deg", "--probe", "1,2"), "--probe"),
+    ],
+)
+def test_refusals(arms, header, row, options, part):
+    write(arms[0] / "bad.csv", header, [row])
+    assert part in run(arms, "bad.csv", "-o", "no.csv", *options, expect=2).stderr
+    assert not (arms[0] / "no.csv").exists()
