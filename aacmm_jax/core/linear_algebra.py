@@ -16,7 +16,9 @@ from jaxtyping import Array, Float
 from .numpy_or_jax import AnyArray, namespace
 
 _EPSILON = float(np.finfo(np.float64).eps)
-_UNROLLED = 6  # rows of matrices whose factors are written out entry by entry
+# Rows of matrices whose factors are written out entry by entry. With six, XLA fuses pivots into more than one place and
+# rounds them differently there, which costs four digits.
+_UNROLLED = 3
 _MAX_SWEEPS = 30  # of Jacobi rotations; matrices of 40 rows need about 10
 
 
@@ -85,13 +87,17 @@ def _inverse_cholesky(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batc
 def _inverse_cholesky_by_entries(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batch p p"]:
     """The same, entry by entry: for many very small matrices several times as fast as loops over their rows."""
     p = matrix.shape[-1]
+    factor: list[list[Array]] = []  # rows of the Cholesky factor, left of the diagonal
     inverse: list[list[Array]] = []  # rows of W, up to the diagonal
     for i in range(p):
-        # With the rows above, w_k: L[i, k] = w_k . A[i, :], and row i of W follows from that of L by substitution.
-        known = [sum(inverse[k][j] * matrix[..., i, j] for j in range(k + 1)) for k in range(i)]
-        scale = lax.rsqrt(matrix[..., i, i] - sum(value**2 for value in known))
-        row = [-scale * sum(known[k] * inverse[k][j] for k in range(j, i)) for j in range(i)]
-        inverse.append([*row, scale])
+        row: list[Array] = []
+        for k in range(i):
+            rest = matrix[..., i, k] - sum(row[j] * factor[k][j] for j in range(k))
+            row.append(rest * inverse[k][k])
+        scale = lax.rsqrt(matrix[..., i, i] - sum(value**2 for value in row))
+        substituted = [-scale * sum(row[k] * inverse[k][j] for k in range(j, i)) for j in range(i)]
+        factor.append(row)
+        inverse.append([*substituted, scale])
     zero = jnp.zeros(matrix.shape[:-2])
     return jnp.stack([jnp.stack([*row, *[zero] * (p - len(row))], axis=-1) for row in inverse], axis=-2)
 
