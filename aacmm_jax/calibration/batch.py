@@ -18,12 +18,12 @@ from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
-from ..kinematics.parameters import Bounds, Parameters
+from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..model.measurement import check_joints
 from ..model.robust import LossName
 from ..solver.reason import reasons
 from .batch_kernel import Problems, Shape, solve_chunk
-from .checks import based_on, check_enough
+from .checks import check_enough
 from .chunks import cut_into_chunks, default_workers, devices_of, round_up, run_chunks
 from .observed_batch import solve_observed
 from .results import ManyCalibrations, ManyIdentifications

@@ -27,7 +27,7 @@ from ..model.weights import Weights
 from ..solver.active_set import Box, choose
 from ..solver.levenberg_marquardt import advance, begin
 from ..solver.reason import MAX_STEPS, RUNNING
-from .task import RULES
+from .bounded_fit import RULES
 
 
 class Problems(NamedTuple):

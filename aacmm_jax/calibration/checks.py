@@ -2,7 +2,6 @@
 
 import math
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..core.arrays import is_concrete
@@ -11,7 +10,7 @@ from ..core.numpy_or_jax import AnyArray
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm, is_single
-from ..kinematics.parameters import Bounds, Parameters
+from ..kinematics.parameters import Bounds
 from ..kinematics.workspace import total_link_length
 from ..uncertainty.covariance import NOISE_MODELS, NoiseModel
 
@@ -19,13 +18,6 @@ PLAUSIBLE_SCALE = (0.5, 2.0)
 # Repeatability of an arm or robot relative to the sum of its links: the paper's arm reaches 1e-5 (0.026 mm on 2.5 m).
 _RELATIVE_REPEATABILITY = 1e-5
 _IMPLAUSIBLE = 100.0  # residuals larger than that by this factor come from wrong data, not from an arm
-
-
-def based_on(space: Parameters, arm: Arm) -> Parameters:
-    """The free parameters with the fixed values of the arm that is calibrated, and not of the space's base."""
-    if arm.beta is None and space.base.beta is not None:
-        arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
-    return Parameters(base=arm, names=space.names)
 
 
 def check_single(arm: Arm, capture: Capture, bounds: Bounds, many: str) -> None:

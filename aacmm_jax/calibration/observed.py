@@ -14,17 +14,17 @@ from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.chain import forward_pass
-from ..kinematics.parameters import Bounds, Parameters
+from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..model.measurement import check_joints
 from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Linear, Observed, Whitening, linear_rows, observed_model, observed_rows, whitening_of
 from ..model.robust import Loss, LossName, check_loss
 from ..uncertainty import observed_covariance as propagation
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, inverse_information
-from .checks import based_on, check_noise_model, check_start
+from .bounded_fit import RULES, fit
+from .checks import check_noise_model, check_start
 from .results import Calibration, Identification, ObservedMetrics
 from .scale_anchor import ScaleAnchor, scale_anchor
-from .task import RULES, fit
 
 NO_ANCHOR = ScaleAnchor(hold=None, adjusted=None, set_by=(), partners=None)
 # Of the solves whose result only gives the weights of the next, or its start: a few standard uncertainties' millionths.

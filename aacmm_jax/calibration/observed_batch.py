@@ -17,12 +17,12 @@ from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
-from ..kinematics.parameters import Bounds, Parameters
+from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..model.measurement import check_joints
 from ..model.observed import Observed
 from ..model.robust import Loss, check_loss
 from ..solver.reason import numbers_of, reasons
-from .checks import based_on, check_noise_model
+from .checks import check_noise_model
 from .chunks import default_workers, devices_of, run_chunks
 from .observed import NO_ANCHOR, ObservedTask, check_observed, configurations, identify_observed
 from .results import ManyIdentifications

@@ -24,7 +24,7 @@ from ..model.observed import (
 )
 from ..uncertainty import observed_covariance as propagation
 from ..uncertainty.covariance import inverse_information
-from .task import fit
+from .bounded_fit import fit
 
 _MAX_STEPS = 300
 _LEAST = 1e-4  # smallest standard uncertainty of what is certified, of a tip coordinate's standard deviation

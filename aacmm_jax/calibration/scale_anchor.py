@@ -22,10 +22,9 @@ from ..kinematics.arm import (
     parameter_names,
     value_of,
 )
-from ..kinematics.parameters import Parameters
+from ..kinematics.parameters import Parameters, based_on
 from ..kinematics.workspace import total_link_length
 from ..model.scale import Partners
-from .checks import based_on
 
 # Fixed lengths set the scale where repeatability with them would determine it to this relative standard uncertainty ...
 _LARGEST_UNCERTAINTY = 1e-4

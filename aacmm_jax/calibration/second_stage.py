@@ -27,9 +27,10 @@ from ..model.measurement import Measurement
 from ..model.metrics import repeatability
 from ..model.scale import divide_lengths, divisible, scale_of
 from ..solver.reason import SCALE, numbers_of, reasons
+from .bounded_fit import Fit
 from .results import ManyIdentifications
 from .scale_anchor import ScaleAnchor
-from .task import Fit, Task, fit_repeatability
+from .task import Task, fit_repeatability
 
 _ROUNDS = 80  # identifications of one search; nearly always it ends after three, and after 60 bisections at the latest
 _SLOPES = (0.01, 2.0)  # of log k by the log of the anchor: 1 unless bounds or fixed lengths set part of the scale

@@ -16,7 +16,7 @@ from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
-from ..kinematics.parameters import Bounds
+from ..kinematics.parameters import Bounds, based_on
 from ..model.measurement import Measurement, check_joints
 from ..model.metrics import repeatability
 from ..model.residuals import JointWeights, joint_normal_equations, joint_residual
@@ -25,12 +25,13 @@ from ..uncertainty import propagation, scale_uncertainty
 from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
 from ..uncertainty.identifiability import observability
-from .checks import based_on, check_enough, check_noise_model, check_single, check_start
+from .bounded_fit import Fit, fit
+from .checks import check_enough, check_noise_model, check_single, check_start
 from .observed import ObservedTask, calibrate_observed, identify_observed, observed_task
 from .results import Calibration, Identification
 from .scale_anchor import scale_anchor, scale_set_by_clause
 from .second_stage import adjust_anchor, clip_to_bounds, divide_by_k, must_adjust_anchor
-from .task import Fit, Task, fit, fit_repeatability
+from .task import Task, fit_repeatability
 
 _MAX_STEPS = 300
 

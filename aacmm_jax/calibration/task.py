@@ -1,23 +1,18 @@
-"""One identification, checked, and the least squares that both stages and the joint solve share."""
+"""One identification, checked, and stage 1's least squares."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from ..core.numpy_or_jax import AnyArray, namespace, set_at
+from ..core.numpy_or_jax import AnyArray, set_at
 from ..data.noise import Noise
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement
 from ..model.residuals import repeatability_normal_equations, repeatability_residual
-from ..solver.levenberg_marquardt import Rules, minimise
-from ..solver.reason import Reason, reasons
 from ..uncertainty.covariance import NoiseModel
+from .bounded_fit import Fit, fit
 from .scale_anchor import ScaleAnchor
-
-# The boxes of this problem are small against its curvature, so the first steps can be nearly Gauss-Newton's.
-RULES = Rules(rtol=1e-13, initial_damping=1e-6)
 
 
 class Task(NamedTuple):
@@ -35,52 +30,6 @@ class Task(NamedTuple):
     def space(self) -> Parameters:
         """The free parameters, and the fixed ones of the arm."""
         return self.bounds.space
-
-
-class Fit(NamedTuple):
-    """Result of one least squares."""
-
-    parameters: Float[AnyArray, " p"]
-    steps: Int[AnyArray, ""]  # evaluations
-    result: Reason
-    optimality: Float[AnyArray, ""]
-
-
-def fit(
-    residual: Callable,
-    normal: Callable,
-    start: Float[AnyArray, " p"],
-    args: Any,
-    bounds: tuple[Float[AnyArray, " p"], Float[AnyArray, " p"]],
-    scale: Float[AnyArray, " p"],
-    max_steps: int,
-    *,
-    rules: Rules = RULES,
-    differentiable: bool = True,
-) -> Fit:
-    """A least squares within bounds: by Optimistix for arrays of JAX, unless no derivative is needed; else by its bare
-    steps."""
-    lower, upper = bounds
-    if not differentiable or namespace(start, args, bounds) is np:
-        last = minimise(normal, start, args, lower=lower, upper=upper, scale=scale, rules=rules, max_steps=max_steps)
-        return Fit(last.y, last.steps, reasons(last.reason), last.optimality)
-    # Optimistix takes 0.2 s to import, and NumPy needs none of it.
-    from ..solver.bounded import BoundedLevenbergMarquardt, least_squares
-
-    solution = least_squares(
-        residual,
-        start,
-        args,
-        lower=lower,
-        upper=upper,
-        scale=scale,
-        normal=normal,
-        solver=BoundedLevenbergMarquardt(**rules._asdict()),
-        max_steps=max_steps,
-        throw=False,
-    )
-    stats = solution.stats
-    return Fit(solution.value, stats["num_steps"], stats["reason"], stats["optimality"])
 
 
 def fit_repeatability(task: Task, measurement: Measurement, start: Float[AnyArray, " p"], hold: str | None) -> Fit:

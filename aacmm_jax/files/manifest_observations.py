@@ -18,7 +18,7 @@ from ..data.observations.observation import AbstractObservation, Entry
 from ..data.observations.socket import Socket
 from .inputs import InputFile
 from .manifest_sessions import session_name
-from .observations import kinds
+from .observation_kinds import kinds
 from .patterns import check_name, fields_of, fill
 from .text_table import Column, TextTable
 from .toml import Strict, each_once

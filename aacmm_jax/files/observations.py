@@ -6,18 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from .. import data
 from ..core.errors import InputError
 from ..data.observations.observation import AbstractObservation
 from .hdf5 import Stored, Table, Variable, axes, columns, need, numbering
+from .observation_kinds import kinds
 
 _PREFIX = "observation_"
-
-
-def kinds() -> dict[str, type[AbstractObservation]]:
-    """Every kind of observations by its name."""
-    found = (getattr(data.observations, name) for name in dir(data.observations))
-    return {one.kind: one for one in found if isinstance(one, type) and issubclass(one, AbstractObservation)}
 
 
 def observation_tables(observations: Iterable[AbstractObservation]) -> dict[str, Table]:

@@ -194,6 +194,13 @@ def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
     return names
 
 
+def based_on(space: Parameters, arm: Arm) -> Parameters:
+    """The free parameters with the fixed values of the arm that is calibrated, and not of the space's base."""
+    if arm.beta is None and space.base.beta is not None:
+        arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
+    return Parameters(base=arm, names=space.names)
+
+
 class Bounds(eqx.Module):
     """Bounds of the free parameters.
 

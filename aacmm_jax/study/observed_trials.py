@@ -20,7 +20,7 @@ from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed, residual_rows
 from .definition import CellValues, Setting, Study
-from .trial_simulation import DrawnTrials
+from .drawn_trials import DrawnTrials
 
 _ROUNDS = 4  # of the configurations' way to their tips, each of which leaves about a hundredth
 _LONGEST_STEP = 0.1  # rad

@@ -22,23 +22,12 @@ from ..kinematics.inverse_kinematics import damped_inverse
 from ..kinematics.jacobian import jacobian_columns
 from .configuration_pool import Pool, forget_pools, pool_of
 from .definition import POOL_PARTS, CellValues, Setting, Study
+from .drawn_trials import DrawnTrials
 
 _WIDTH = 16  # trials at a time: of one width, so that every trial's arithmetic is the same whatever the chunk
 _SIZES = 64, 256  # trials of one call of the compiled program: few sizes, as each takes 10 s to compile
 _TOLERANCE = 1e-9  # mm: how far from its point a tip may end
 _MOST_STEPS = 40  # deviations of a few microns take 3, the paper's tolerances 5 or 6
-
-
-class DrawnTrials(NamedTuple):
-    """Trials, as `identify_many` takes them; mm and rad. q is NaN where the true arm did not reach its points."""
-
-    q: Float[Any, "t N n"]
-    true: Float[Any, "t p"]
-    lower: Float[Any, "t p"]
-    upper: Float[Any, "t p"]
-    start: Float[Any, "t p"]
-    value: Float[Any, "t l"]  # certified values of the reference lengths
-    u: Float[Any, "t l"]
 
 
 class _Static(NamedTuple):

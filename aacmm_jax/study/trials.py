@@ -14,8 +14,9 @@ from ..data.capture import Capture, ReferenceLength
 from ..solver.reason import numbers_of
 from .blocks import Block
 from .definition import Setting, Study
+from .drawn_trials import DrawnTrials
 from .observed_trials import draw_observed
-from .trial_simulation import DrawnTrials, draw, ends_of
+from .trial_simulation import draw, ends_of
 
 
 def run_block(study: Study, block: Block, *, device: Any = None, workers: int | None = None) -> dict[str, np.ndarray]:

@@ -17,7 +17,7 @@ from aacmm_jax.data.observations.frames import placed
 from aacmm_jax.data.observations.observation import Tips, certified_quantities, stated_quantities
 from aacmm_jax.data.observations.platform import platform_frames
 from aacmm_jax.data.observations.shifted import ShiftedObservation
-from aacmm_jax.files.observations import kinds as known_kinds
+from aacmm_jax.files.observation_kinds import kinds as known_kinds
 
 RANDOM = np.random.default_rng(1)
 POSES = 12

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.files.manifest_observations import TABLES
-from aacmm_jax.files.observations import kinds as known_kinds
+from aacmm_jax.files.observation_kinds import kinds as known_kinds
 from tests.refusals import assert_refused
 
 HEAD = 'arm = "cheng2018-simulation"\n[angles]\nunit = "rad"\n'

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.files.hdf5 import DIGESTS_SINCE
-from aacmm_jax.files.observations import kinds as known_kinds
+from aacmm_jax.files.observation_kinds import kinds as known_kinds
 
 JOINTS = 3
 ARM = aj.kinematics.ArmSpecification(aj.Arm(alpha=[1.5, 0.4, -1.0], a=[10, 400, 300], d=[300, 20, 10]), "small")
