@@ -38,7 +38,7 @@ class EvaluationRecord(NamedTuple):
     limits: Mapping[str, Limit] = MappingProxyType({})  # MPE by the name of a metric (`acceptance.METRICS`)
     u_test: float = 0.0  # standard uncertainty that seat, fixture and temperature add, mm
     maxima: Mapping[str, float] = MappingProxyType({})  # limits of the quantities in `MAXIMA`, mm
-    standards: tuple[str, ...] = tuple(STANDARDS)  # whose acceptance tests are run, beside those with a limit
+    standards: tuple[str, ...] = tuple(STANDARDS)  # whose acceptance tests are run, in addition to those with a limit
     uncertainty: Uncertainty | None = None  # of the calibrated arm; files of earlier versions have none
 
     def arms(self) -> dict[str, ArmSpecification]:
@@ -91,7 +91,7 @@ class PointsRecord(NamedTuple):
     measured: Measured
     limits: Mapping[str, Limit | float] = MappingProxyType({})
     u_test: float = 0.0  # standard uncertainty that seat, fixture and temperature add, mm
-    standards: tuple[str, ...] = tuple(STANDARDS)  # whose acceptance tests are run, beside those with a limit
+    standards: tuple[str, ...] = tuple(STANDARDS)  # whose acceptance tests are run, in addition to those with a limit
 
     def acceptance(self) -> list[AcceptanceTest]:
         """The tests of ``standards``, and those with a limit, as far as the points allow."""

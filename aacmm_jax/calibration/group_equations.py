@@ -30,7 +30,7 @@ class Rows(NamedTuple):
     in_mm: Float[np.ndarray, "m 3 r"]  # the residual's position in mm
 
     def block(self, group: str | None, extra: Sequence[int] = (), concerned: bool = True) -> Block:
-        """For the test; with columns of ``extra`` beside the shared ones, which are 0 where it is not concerned."""
+        """For the test; with columns of ``extra`` after the shared ones, which are 0 where it is not concerned."""
         shared = np.concatenate([self.shared, self.extra[..., list(extra)] * concerned], axis=2)
         flat = (array.reshape(self.residual.size, array.shape[2]) for array in (shared, self.own))
         return Block(self.name, group, self.residual.ravel(), *flat)

@@ -200,7 +200,7 @@ def _base(console: Console, summary: dict[str, Any]) -> None:
 
 
 def _sessions(console: Console, rows: list[dict[str, Any]] | None) -> None:
-    """Each session in the calibration of all, beside what it reaches alone; files of earlier versions do not say."""
+    """Each session in the calibration of all, next to what it reaches alone; files of earlier versions do not say."""
     if not rows:
         return
     title = "\nSessions, RMS distance of poses from their geometry [mm]"
