@@ -198,7 +198,7 @@ def _divided(arm: Arm, capture: Capture, known: Collection[bytes]) -> Capture:
 def check_geometry(arm: Arm, capture: Capture) -> None:
     """Raise `InputError` where observations do not determine their own unknowns."""
     space = to_numpy(Parameters(arm, ("d_1",)))
-    check_observed(Observed.of(capture), space, np.asarray(space.vector()), 0)
+    check_observed(Observed.of(capture, arm), space, np.asarray(space.vector()), 0)
 
 
 def made_for(recording: Recording) -> tuple[Standard, ...]:

@@ -114,7 +114,7 @@ def _prepare_task(
     check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
     noise_model = check_noise_model(noise_model, noise, arm.joints)
     anchor = scale_anchor(space, space.base, hold, noise)
-    return Task(Measurement.of(capture), bounds, vector, noise, anchor, noise_model, max_steps)
+    return Task(Measurement.of(capture, space.base), bounds, vector, noise, anchor, noise_model, max_steps)
 
 
 @checked_arguments

@@ -1,7 +1,7 @@
-"""The arm: a serial chain of revolute joints in standard Denavit-Hartenberg form, with a probe on its last frame."""
+"""The arm: a serial chain of joints in standard Denavit-Hartenberg form, with a probe on its last frame."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,7 @@ from ..core.arrays import Numbers, as_array, as_floats, in_chunks
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace, to_jax, to_numpy
 from ..core.text import pluralise
-from .chain import Geometry, tip_pose
+from .chain import Geometry, JointKinds, tip_pose
 from .jacobian import tip_jacobian, tip_position
 
 # Steps of about 1 mm and 1 mrad are comparable at the tip of an arm of about 1 m.
@@ -26,24 +26,26 @@ _LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a comp
 
 
 class Arm(eqx.Module):
-    """A serial arm of revolute joints, T = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)] each, with a probe.
+    """A serial arm with a probe; T = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)] of each joint, revolute by default.
 
+    A prismatic joint slides along its axis: T = Rz(theta) Tz(q + d) Tx(a) Rx(alpha) [Ry(beta)], with readings in mm.
     Every parameter is ``(..., n)`` for n joints; leading shapes are a batch of arms and broadcast against those of q.
     Source: Denavit and Hartenberg 1955; Cheng et al. 2018, eq. 1.
 
     Args:
         alpha: Link twists ``(..., n)``, rad.
         a: Link lengths ``(..., n)``, mm.
-        d: Link offsets ``(..., n)``, mm.
-        theta: Zero offsets of the joints ``(..., n)``, rad; by default 0.
+        d: Link offsets ``(..., n)``, mm; of a prismatic joint, its zero offset.
+        theta: Zero offsets of the joints ``(..., n)``, rad; by default 0. Of a prismatic joint, a constant angle.
         beta: Hayati and Mirmirani's (1985) additional angles for nearly parallel axes ``(..., n)``, rad; by default
             unused.
         probe: Tip in the last frame ``(..., 3)``, mm.
-        limits: Lowest and highest reading of each joint, n pairs, rad; not calibrated, but respected when poses are
-            made.
+        limits: Lowest and highest reading of each joint, n pairs, rad, or mm of prismatic joints; not calibrated, but
+            respected when poses are made.
+        prismatic: Numbers of the prismatic joints, from 1: ``(1,)`` for an arm on a linear axis.
 
     Raises:
-        InputError: Shapes do not fit together, or a value is not finite.
+        InputError: Shapes do not fit together, a value is not finite, or there is no joint of such a number.
     """
 
     alpha: Float[AnyArray, "... n"]  # link twist, rad
@@ -52,7 +54,8 @@ class Arm(eqx.Module):
     theta: Float[AnyArray, "... n"]  # joint zero offset, rad
     beta: Float[AnyArray, "... n"] | None  # Hayati's angle, rad
     probe: Float[AnyArray, "... 3"]  # tip in the last frame, mm
-    limits: tuple[tuple[float, float], ...] | None = eqx.field(static=True)  # rad
+    limits: tuple[tuple[float, float], ...] | None = eqx.field(static=True)  # rad, or mm of prismatic joints
+    prismatic: tuple[int, ...] = eqx.field(static=True)  # numbers of the prismatic joints, from 1
 
     def __init__(
         self,
@@ -64,6 +67,7 @@ class Arm(eqx.Module):
         beta: Numbers | None = None,
         probe: Numbers = (0.0, 0.0, 0.0),
         limits: Sequence[Sequence[float]] | None = None,
+        prismatic: Iterable[int] = (),
     ):
         self.alpha = as_floats(alpha, "alpha")
         self.a = as_floats(a, "a")
@@ -90,7 +94,8 @@ class Arm(eqx.Module):
             raise InputError(
                 f"the parameters have the batch shapes {', '.join(map(str, batches))}; make them alike."
             ) from error
-        self.limits = None if limits is None else checked_limits(limits, joints)
+        self.prismatic = _joint_numbers(prismatic, joints)
+        self.limits = None if limits is None else checked_limits(limits, joints, self.prismatic)
 
     @property
     def joints(self) -> int:
@@ -99,11 +104,12 @@ class Arm(eqx.Module):
 
     @property
     def geometry(self) -> Geometry:
-        """The parameters without the limits."""
-        return Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe)
+        """The parameters and the kinds of the joints, without the limits."""
+        kinds = JointKinds(tuple(i in self.prismatic for i in range(1, self.joints + 1))) if self.prismatic else None
+        return Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe, kinds)
 
     def position(self, q: Numbers) -> Float[AnyArray, "... 3"]:
-        """Tip in the base frame, mm, at joint angles q in rad: ``(..., n) -> (..., 3)``."""
+        """Tip in the base frame, mm, at readings q, rad, or mm of prismatic joints: ``(..., n) -> (..., 3)``."""
         return self._evaluated(tip_position, q)
 
     def pose(self, q: Numbers) -> Float[AnyArray, "... 4 4"]:
@@ -114,7 +120,7 @@ class Arm(eqx.Module):
         """Exact derivative of the tip by named parameters: analytic, equal to ``jax.jacfwd`` to rounding.
 
         Args:
-            q: Joint angles ``(..., n)``, rad.
+            q: Joint readings ``(..., n)``, rad, or mm of prismatic joints.
             names: Parameter names (``alpha_1`` ... ``probe_z``) or joint readings ``q_1`` ... ``q_n``, or one of
                 them; by default all parameters, in the order of `parameter_names`.
 
@@ -141,7 +147,7 @@ class Arm(eqx.Module):
         Raises:
             InputError: A name is unknown, or the arm that results is refused.
         """
-        whole = ("alpha", "a", "d", "theta", "beta", "probe", "limits")
+        whole = ("alpha", "a", "d", "theta", "beta", "probe", "limits", "prismatic")
         arguments: dict[str, Any] = {key: changes.get(key, getattr(self, key)) for key in whole}
         for name, value in changes.items():
             if name in whole:
@@ -174,25 +180,52 @@ class Arm(eqx.Module):
         return array
 
 
-def checked_limits(limits: Sequence[Sequence[float]], joints: int) -> tuple[tuple[float, float], ...]:
-    """Lowest and highest reading of each joint, rad, or `InputError` that names the joint."""
+def arm_of(geometry: Geometry, limits: Sequence[Sequence[float]] | None = None) -> Arm:
+    """The arm of a geometry."""
+    arrays = geometry._replace(kinds=None)._asdict()
+    del arrays["kinds"]
+    kinds = geometry.kinds
+    return Arm(**arrays, limits=limits, prismatic=() if kinds is None else np.flatnonzero(kinds.mask()) + 1)
+
+
+def _joint_numbers(numbers: Iterable[int], joints: int) -> tuple[int, ...]:
+    """Numbers of joints, from 1, in order, or `InputError`."""
+    given = items_of(numbers, "prismatic")
+    for number in given:
+        if isinstance(number, bool) or not isinstance(number, int | np.integer) or not 1 <= number <= joints:
+            raise InputError(f"prismatic names the joint {shown(number)}; give numbers of joints from 1 to {joints}.")
+    return tuple(sorted({int(number) for number in given}))
+
+
+def reading_unit(arm: Arm, joint: int) -> str:
+    """Unit of the reading of a joint, from 1: ``rad``, or ``mm`` of a prismatic one."""
+    return "mm" if joint in arm.prismatic else "rad"
+
+
+def checked_limits(
+    limits: Sequence[Sequence[float]], joints: int, prismatic: tuple[int, ...] = ()
+) -> tuple[tuple[float, float], ...]:
+    """Lowest and highest reading of each joint, rad or mm, or `InputError` that names the joint."""
     try:
         rows = [tuple(float(reading) for reading in row) for row in limits]
     except (TypeError, ValueError):
         rows = []  # no rows of numbers
     if len(rows) != joints or any(len(row) != 2 for row in rows):
-        raise InputError(f"limits must be {pluralise(joints, 'row')} of (lowest, highest) in rad, one per joint.")
+        units = "rad, of prismatic joints in mm" if prismatic else "rad"
+        raise InputError(f"limits must be {pluralise(joints, 'row')} of (lowest, highest) in {units}, one per joint.")
     for i, (low, high) in enumerate(rows, start=1):
         if not -math.inf < low < high < math.inf:
+            unit = "mm" if i in prismatic else "rad"
             raise InputError(
-                f"limits of joint {i} are {low:g} to {high:g} rad; they must be finite, and the lower below the upper."
+                f"limits of joint {i} are {low:g} to {high:g} {unit}; they must be finite, and the lower below the "
+                "upper."
             )
     return tuple((low, high) for low, high in rows)
 
 
 def is_single(arm: Arm) -> bool:
     """Whether this is one arm and not a batch."""
-    return all(array is None or array.ndim == 1 for array in arm.geometry)
+    return all(array.ndim == 1 for array in jax.tree.leaves(arm.geometry))
 
 
 def parameter_names(arm: Arm) -> tuple[str, ...]:
@@ -224,11 +257,19 @@ def with_arrays(arm: Arm, **changes: AnyArray | None) -> Arm:
 
 
 def joint_limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[np.ndarray, "n 2"]:
-    """Lowest and highest reading of each joint: those given, else the arm's own, else -pi to pi; rad."""
+    """Lowest and highest reading of each joint: those given, else the arm's own, else -pi to pi; rad, or mm.
+
+    Raises `InputError` where a prismatic joint has neither.
+    """
     rows = limits if limits is not None else arm.limits
     if rows is None:
+        if arm.prismatic:
+            raise InputError(
+                f"joint {arm.prismatic[0]} is prismatic, and nothing says how far it slides; give the arm limits "
+                "(limits=, or limits_mm in its file)."
+            )
         rows = [(-math.pi, math.pi)] * arm.joints
-    return np.asarray(checked_limits(rows, arm.joints))
+    return np.asarray(checked_limits(rows, arm.joints, arm.prismatic))
 
 
 def jacobian_at(arm: Arm, q: Float[np.ndarray, "N n"], names: Sequence[str]) -> Float[np.ndarray, "N 3 p"]:

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from .arm import Arm
+from .arm import Arm, arm_of
 from .chain import Geometry
 from .independence import NEARLY_PARALLEL
 
@@ -105,7 +105,7 @@ def without_far_frames(arm: Arm) -> Arm:
     frames = dh_frames(geometry, np.eye(4))
     directions, points = (np.array([frame[:3, i] for frame in frames[:-1]]) for i in (2, 3))
     _, found = dh_of_axes(Axes(directions, points, frames[-1]), keep_points=False)
-    return Arm(**found._replace(probe=found.probe + geometry.probe)._asdict(), limits=arm.limits)
+    return arm_of(found._replace(probe=found.probe + geometry.probe, kinds=geometry.kinds), arm.limits)
 
 
 def geometry_of(arm: Arm) -> Geometry:

@@ -46,9 +46,11 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
 
     Parameters are taken one after the other, and fixed where those taken before can imitate them: nonzero lengths
     first, then angles, lengths that are nominally zero, the probe and the last link; the longest link comes last of
-    all, so that it is fixed where no reference length fixes the scale. Where neighbouring axes are nearly parallel,
-    ``d_i`` is fixed and ``beta_i`` is free. At last the first parameter of every near-degenerate combination is fixed
-    (`near_degeneracy`).
+    all, so that it is fixed where neither a reference length nor a prismatic joint fixes the scale. Where neighbouring
+    axes are nearly parallel, ``d_i`` is fixed and ``beta_i`` is free. Of a prismatic joint i, ``a_i`` and ``d_(i+1)``
+    are fixed rather than others, and ``theta_i`` next to a parallel axis: three angles and ``theta`` of the joint
+    before it, or after it, are all that the orientation of the next axis has. At last the first parameter of every
+    near-degenerate combination is fixed (`near_degeneracy`).
     """
     if arm.joints != capture.joints:
         raise InputError(
@@ -59,19 +61,24 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
         arm = with_arrays(arm, beta=np.zeros_like(arm.alpha))
     order = _order(arm, parallel)
     taken: tuple[str, ...] = ()
-    for _ in range(5):
-        # Without the exact alignments of the nominal arm. Fixed parameters keep their nominal values, which may make
-        # others redundant, so the choice is repeated.
-        neighbour = neighbouring_arm(arm, taken or tuple(order))
-        poses, lengths = equations(neighbour, capture, order, project_to_centroids(neighbour, capture, targets_of=arm))
-        before, taken = taken, _independent(neighbour, order, np.concatenate([poses.reshape(-1, len(order)), lengths]))
-        if taken == before or not taken:
-            break
-    if taken:
+    while order:
+        for _ in range(5):
+            # Without the exact alignments of the nominal arm. Fixed parameters keep their nominal values, which may
+            # make others redundant, so the choice is repeated.
+            neighbour = neighbouring_arm(arm, taken or tuple(order))
+            moved = project_to_centroids(neighbour, capture, targets_of=arm)
+            poses, lengths = equations(neighbour, capture, order, moved)
+            rows = np.concatenate([poses.reshape(-1, len(order)), lengths])
+            before, taken = taken, _independent(neighbour, order, rows)
+            if taken == before or not taken:
+                break
         columns = [order.index(name) for name in taken]
-        rows = tip_movements(poses, lengths) * natural_steps(order)
-        weak = {trade_off.names[0] for trade_off in trade_offs(rows[:, columns], taken)}
-        taken = tuple(name for name in taken if name not in weak)
+        rows = (tip_movements(poses, lengths) * natural_steps(order))[:, columns]
+        weak = {trade_off.names[0] for trade_off in trade_offs(rows, taken)} if taken else set()
+        if not weak:
+            break
+        # What a parameter of a weak combination stood for may be what another, so far redundant, determines well.
+        order = [name for name in order if name not in weak]
     return arm, taken
 
 
@@ -139,9 +146,11 @@ def _order(arm: Arm, parallel: list[int]) -> list[str]:
     values = {kind: np.asarray(getattr(arm, kind)) for kind in ("a", "d")}
     lengths = [(f"{kind}_{i}", values[kind][i - 1]) for i in range(1, n) for kind in ("a", "d")]
     lengths = [(name, value) for name, value in lengths if not (name[0] == "d" and int(name[2:]) in parallel)]
-    nonzero = [name for name, value in lengths if value != 0]
-    zero = [name for name, value in lengths if value == 0]
-    angles = [f"{kind}_{i}" for i in range(1, n) for kind in ("alpha", "theta")]
+    late = {name for i in arm.prismatic for name in (f"a_{i}", f"d_{i + 1}")}
+    late |= {f"theta_{i}" for i in arm.prismatic if {i - 1, i} & set(parallel)}
+    nonzero = [name for name, value in lengths if value != 0 and name not in late]
+    zero = [name for name, value in lengths if value == 0 and name not in late]
+    angles = [f"{kind}_{i}" for i in range(1, n) for kind in ("alpha", "theta") if f"{kind}_{i}" not in late]
     # Of what lies beyond the last joint, the probe comes before the link, since probes are changed.
     tip = {"probe_z": float(arm.probe[2]), f"d_{n}": values["d"][-1]}
     # theta of the last joint is determined by a tip off its axis; near the axis x and y of the probe are.
@@ -151,5 +160,7 @@ def _order(arm: Arm, parallel: list[int]) -> list[str]:
     wrist += [*(name for name, value in tip.items() if value == 0), f"a_{n}", f"alpha_{n}"]
     last = [max(nonzero, key=lambda name: abs(dict(lengths)[name]))] if nonzero else []
     nonzero += [name for name, value in tip.items() if value != 0]
-    order = [*nonzero, *angles, *(f"beta_{i}" for i in parallel), *zero, *wrist, *last]
+    order = [*nonzero, *angles, *(f"beta_{i}" for i in parallel), *zero, *wrist]
+    order += [name for name in (*dict(lengths), *(f"theta_{i}" for i in range(1, n))) if name in late]
+    order = [*dict.fromkeys(order), *last]
     return [name for i, name in enumerate(order) if name not in last or i == len(order) - 1]

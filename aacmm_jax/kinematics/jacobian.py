@@ -18,12 +18,13 @@ from ..core.numpy_or_jax import AnyArray, compiled, namespace
 from .chain import (
     ForwardPass,
     Geometry,
-    SinesCosines,
+    JointKinds,
+    JointMotion,
     components_last,
     forward_pass,
     forward_pass_by_joints,
+    joint_motion,
     joints_first,
-    sines_cosines,
 )
 
 
@@ -33,13 +34,35 @@ def _cross(u: Float[AnyArray, "... 3 N"], v: Float[AnyArray, "... 3 N"]) -> Floa
 
 
 def jacobian_columns(forward: ForwardPass) -> dict[str, Float[AnyArray, "k ... 3 N"]]:
-    """Derivative of the tip by every parameter: kind -> one vector per joint (or probe axis).
-
-    ``theta`` also serves for q, since the two enter only as their sum.
-    """
+    """Derivative of the tip by every parameter: kind -> one vector per joint (or probe axis)."""
     kinds = ("alpha", "a", "d", "theta") if forward.y is None else ("alpha", "a", "d", "theta", "beta")
     columns = {kind: _columns_of(forward, kind, slice(None)) for kind in kinds}
     return columns | {"probe": namespace(forward.tip).stack(forward.frame)}
+
+
+def reading_columns(forward: ForwardPass) -> Float[AnyArray, "n ... 3 N"]:
+    """Derivative of the tip by every joint reading, mm per rad, or mm per mm of a prismatic joint.
+
+    A reading enters only in its sum with ``theta``, or with ``d`` of a prismatic joint.
+    """
+    rotations = _columns_of(forward, "theta", slice(None))
+    if forward.kinds is None:
+        return rotations
+    return namespace(forward).where(forward.kinds.mask(rotations.ndim), forward.z_before, rotations)
+
+
+def reading_rotations(forward: ForwardPass) -> Float[AnyArray, "n ... 3 N"]:
+    """Derivative of the last frame's orientation, as a rotation vector, by every joint reading."""
+    if forward.kinds is None:
+        return forward.z_before
+    return namespace(forward).where(forward.kinds.mask(forward.z_before.ndim), 0.0, forward.z_before)
+
+
+def _parameter_of(kinds: JointKinds | None, kind: str, i: int) -> str:
+    """The kind of the parameter that a reading ``q`` is added to; other kinds as they are."""
+    if kind != "q":
+        return kind
+    return "theta" if kinds is None or not kinds.prismatic[i] else "d"
 
 
 def _columns_of(forward: ForwardPass, kind: str, at: int | slice) -> Float[AnyArray, "... 3 N"]:
@@ -59,9 +82,10 @@ def readings_gradient(forward: ForwardPass, cotangents: dict[str, Float[AnyArray
     """Derivative by the joint readings of a function of the Jacobian columns; ``cotangents`` are its derivatives by
     them, by kind.
 
-    A joint rotates each column that belongs to an axis after it (the change is z x column). Of an axis before it, it
-    moves the tip alone, which changes the column of a rotation about u by u x (dtip/dq). Both sums over the columns
-    are accumulated along the chain, one from the tip, the other from the base.
+    A revolute joint rotates each column that belongs to an axis after it (the change is z x column); a prismatic one
+    moves axis and tip alike. Of an axis before it, either moves the tip alone, which changes the column of a rotation
+    about u by u x (dtip/dq). Both sums over the columns are accumulated along the chain, one from the tip, the other
+    from the base.
     """
     columns, xp = jacobian_columns(forward), namespace(forward, cotangents)
     axes = {"alpha": forward.x, "beta": forward.y, "theta": forward.z_before}
@@ -78,15 +102,15 @@ def readings_gradient(forward: ForwardPass, cotangents: dict[str, Float[AnyArray
             levered = levered + _cross(cotangent, axes[kind])
     after = xp.flip(xp.cumsum(xp.flip(turned, 0), axis=0), 0)  # of this joint and those after it
     before = xp.cumsum(levered, axis=0) - levered
-    return xp.sum(forward.z_before * after + columns["theta"] * before, axis=1)
+    return xp.sum(reading_rotations(forward) * after + reading_columns(forward) * before, axis=1)
 
 
 @compiled(jit=partial(jax.jit, static_argnames=("indices",)))
 def stacked_jacobian_columns(
     forward: ForwardPass, indices: tuple[tuple[str, int], ...]
 ) -> Float[AnyArray, "... p 3 N"]:
-    """The Jacobian columns of some parameters, each a kind (``q`` counts as ``theta``) and a 0-based index."""
-    xp, wanted = namespace(forward), [("theta" if kind == "q" else kind, i) for kind, i in indices]
+    """The Jacobian columns of some parameters, each a kind (or ``q``, a reading) and a 0-based index."""
+    xp, wanted = namespace(forward), [(_parameter_of(forward.kinds, kind, i), i) for kind, i in indices]
     if isinstance(forward.x, tuple):
         chosen = [_columns_of(forward, kind, i) for kind, i in wanted]
     else:
@@ -97,17 +121,15 @@ def stacked_jacobian_columns(
 
 def rotation_columns(forward: ForwardPass, indices: tuple[tuple[str, int], ...]) -> Float[AnyArray, "... p 3 N"]:
     """Derivative of the last frame's orientation, as a rotation vector, by some parameters; 0 for lengths."""
-    axes, xp = (
-        {"alpha": forward.x, "beta": forward.y, "theta": forward.z_before, "q": forward.z_before},
-        namespace(forward),
-    )
+    axes, xp = {"alpha": forward.x, "beta": forward.y, "theta": forward.z_before}, namespace(forward)
     still = xp.zeros_like(forward.tip)
-    chosen = [still if axes.get(kind) is None else axes[kind][i] for kind, i in indices]
+    wanted = [(_parameter_of(forward.kinds, kind, i), i) for kind, i in indices]
+    chosen = [still if axes.get(kind) is None else axes[kind][i] for kind, i in wanted]
     return xp.stack(chosen, axis=-3) if chosen else xp.zeros((*still.shape[:-2], 0, *still.shape[-2:]))
 
 
 def tip_and_columns(
-    geometry: Geometry, sines_cosines: SinesCosines, indices: tuple[tuple[str, int], ...]
+    geometry: Geometry, motion: JointMotion, indices: tuple[tuple[str, int], ...]
 ) -> tuple[Float[AnyArray, "... 3 N"], Float[AnyArray, "... p 3 N"]]:
     """The tip and `stacked_jacobian_columns`, in the way that is fastest for a batch in JAX on each platform."""
 
@@ -117,14 +139,14 @@ def tip_and_columns(
 
     return jax.lax.platform_dependent(
         geometry,
-        sines_cosines,
+        motion,
         cpu=partial(computed, forward_pass_by_joints),
         default=partial(computed, forward_pass),
     )
 
 
 def _plain_tip_position(geometry: Geometry, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3"]:
-    return components_last(forward_pass(geometry, sines_cosines(q)).tip, geometry, q)
+    return components_last(forward_pass(geometry, joint_motion(geometry, q)).tip, geometry, q)
 
 
 _tip_position = jax.custom_jvp(_plain_tip_position)
@@ -133,15 +155,15 @@ _tip_position = jax.custom_jvp(_plain_tip_position)
 def _tip_position_jvp(primals, tangents):
     geometry, q = primals
     geometry_dot, q_dot = tangents
-    forward = forward_pass(geometry, sines_cosines(q))
+    forward = forward_pass(geometry, joint_motion(geometry, q))
     columns = jacobian_columns(forward)
     rank = forward.tip.ndim - 1
-    pairs = [(kind, getattr(geometry_dot, kind)) for kind in columns] + [("theta", q_dot)]
+    pairs = [(column, getattr(geometry_dot, kind)) for kind, column in columns.items()]
     moved = jnp.zeros_like(forward.tip)
-    for kind, tangent in pairs:
+    for column, tangent in [*pairs, (reading_columns(forward), q_dot)]:
         # Unperturbed arguments arrive as symbolic zeros: a derivative by parameters then never touches q.
         if not isinstance(tangent, SymbolicZero):
-            moved = moved + jnp.sum(columns[kind] * joints_first(tangent, rank), axis=0)
+            moved = moved + jnp.sum(column * joints_first(tangent, rank), axis=0)
     return components_last(forward.tip, geometry, q), components_last(moved, geometry, q)
 
 
@@ -162,7 +184,7 @@ def tip_jacobian(
     geometry: Geometry, q: Float[AnyArray, "... n"], indices: tuple[tuple[str, int], ...]
 ) -> Float[AnyArray, "... 3 p"]:
     """Derivative of the tip by some parameters, each a kind (``alpha`` ... ``probe``, or ``q``) and a 0-based index."""
-    stacked = stacked_jacobian_columns(forward_pass(geometry, sines_cosines(q)), indices)
+    stacked = stacked_jacobian_columns(forward_pass(geometry, joint_motion(geometry, q)), indices)
     xp = namespace(stacked)
     columns = xp.moveaxis(stacked, -1, -3)
     batched = max(leaf.ndim for leaf in jax.tree.leaves((geometry, q))) > 1

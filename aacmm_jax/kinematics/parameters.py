@@ -53,9 +53,13 @@ class Parameters(eqx.Module):
         These are all but ``d_1``, ``theta_1`` (they move the base frame), ``a_n``, ``alpha_n`` (redundant with the
         probe), ``probe_x`` and ``probe_y``.
 
+        Of a prismatic joint i only the direction matters, since neighbouring links do not rotate against each other:
+        three of the lengths about it say where the next axis is, and a_i and d_(i+1) are fixed too (``theta_n`` and
+        ``probe_z`` for the last joint). Each prismatic joint leaves two parameters less (Everett and Hollerbach 1988).
+
         Args:
             arm: The arm; it supplies the values of the fixed parameters.
-            held: Names of the fixed parameters, instead of the six above; beta is fixed unless in ``free``.
+            held: Names of the fixed parameters, instead of those above; beta is fixed unless in ``free``.
             free: Names that are free in addition, beta included.
 
         Raises:
@@ -64,7 +68,9 @@ class Parameters(eqx.Module):
         n = arm.joints
         free = (free,) if isinstance(free, str) else tuple(free)
         if held is None:
-            held = ("theta_1", "d_1", f"a_{n}", f"alpha_{n}", "probe_x", "probe_y")
+            held = {"theta_1", "d_1", f"a_{n}", f"alpha_{n}", "probe_x", "probe_y"}
+            held |= {f"a_{i}" for i in arm.prismatic} | {f"d_{i + 1}" for i in arm.prismatic if i < n}
+            held |= {f"theta_{n}", "probe_z"} if n in arm.prismatic else set()
             released = set(free)
             held = [name for name in held if name not in released]
         held, free = _unique_names(arm, held, "held"), _unique_names(arm, free, "free")
@@ -144,7 +150,7 @@ class Parameters(eqx.Module):
                 f"the arm has {arm.joints} joints, but these are parameters of an arm with {self.base.joints}; "
                 "choose the free parameters of this arm (Parameters.free_of)."
             )
-        known = is_concrete(*arm.geometry)
+        known = is_concrete(*jax.tree.leaves(arm.geometry))
         tools: Any = np if known else jnp  # see `joined`
         values = {kind: tools.asarray(getattr(arm, kind)) for kind in ("alpha", "a", "d", "theta", "probe")}
         values["beta"] = tools.zeros_like(values["alpha"]) if arm.beta is None else tools.asarray(arm.beta)

@@ -313,7 +313,8 @@ class Study:
         unknowns = len(self.space.names) - int(self.space.lengths.any())
         if capture is not None and self.observed:
             anchored = any(setting.method == "stage1" for setting in self.settings)
-            check_observed(Observed.of(capture), self.space, self._nominal_vector, len(self.space.names) - anchored)
+            observed = Observed.of(capture, self.nominal.arm)
+            check_observed(observed, self.space, self._nominal_vector, len(self.space.names) - anchored)
         for setting in () if self.observed else dict.fromkeys(self.settings):
             check_enough(setting.sizes, unknowns)
             if setting.method != "stage1" and capture is not None and not capture.lengths:

@@ -14,7 +14,7 @@ from ..core.text import shorten
 from ..core.units import INCH, M
 from ..data.noise import tip_covariances
 from ..data.recording import Recording
-from ..kinematics.chain import sines_cosines
+from ..kinematics.chain import joint_motion
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import pose_outliers
 from ..uncertainty.identifiability import Observability, observability
@@ -118,7 +118,8 @@ def _observations(record: CalibrationRecord) -> list[str]:
 def observed(record: CalibrationRecord) -> Observability:
     """What the data of a calibration determine about the calibrated arm, given its noise and bounds."""
     arm, capture = record.calibrated.arm, record.recording.capture
-    covariances = tip_covariances(*to_numpy((arm.geometry, sines_cosines(np.asarray(capture.readings)), record.noise)))
+    motion = joint_motion(arm.geometry, np.asarray(capture.readings))
+    covariances = tip_covariances(*to_numpy((arm.geometry, motion, record.noise)))
     sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
     space = Parameters(arm, record.names)
     return observability(arm, capture, space, sigma=sigma, bounds=Bounds(space, record.lower, record.upper))
