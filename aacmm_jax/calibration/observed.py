@@ -78,7 +78,7 @@ def observed_task(
     fixed = bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
     if fixed and hold == "longest":
         hold = None
-    anchor = scale_anchor(space, space.base, hold, noise) if not fixed or hold else NO_ANCHOR
+    anchor = scale_anchor(space, space.base, hold, noise, capture) if not fixed or hold else NO_ANCHOR
     noise_model = check_noise_model(noise_model, noise, arm.joints)
     observed = Observed.of(capture, space.base)
     if is_concrete(*jax.tree.leaves((arm, capture, vector))):

@@ -69,7 +69,7 @@ def solve_observed(
     first_space = Parameters(first[0], space.names)
     fixed = bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
     hold = None if fixed and options.hold == "longest" else options.hold
-    anchor = scale_anchor(space, arm, hold, noise) if not fixed or hold else NO_ANCHOR
+    anchor = scale_anchor(space, arm, hold, noise, first[1]) if not fixed or hold else NO_ANCHOR
     observed = Observed.of(first[1], first[0])
     check_observed(observed, first_space, first[2], len(space.names) - (anchor.hold is not None))
     form = _Form(

@@ -8,6 +8,7 @@ from ..core.arrays import Numbers, as_floats, is_concrete
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.units import ARCSEC
+from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry, JointKinds, JointMotion, forward_pass
 from ..kinematics.jacobian import reading_columns
 
@@ -106,6 +107,18 @@ def noise_of(encoder: Float[AnyArray, "..."], seating: Float[AnyArray, ""]) -> N
     Linear encoders are as good as the others at 1 m: what has been estimated is one variance of all readings.
     """
     return eqx.tree_at(lambda noise: (noise.encoder, noise.seating), Noise(), (encoder, seating))
+
+
+def at_tip(noise: Noise, arm: Arm, distance: float) -> tuple[float, float, float]:
+    """What encoders of revolute joints at a distance (mm), those of prismatic joints, and the seat move the tip by; mm.
+
+    Standard deviations, each the root mean square of its joints; 0 without such joints.
+    """
+    kinds = arm.geometry.kinds
+    each = np.broadcast_to(np.asarray(noise.of_readings(kinds)), (arm.joints,))
+    linear = np.zeros(arm.joints, dtype=bool) if kinds is None else kinds.mask()
+    turning, sliding = (float(np.sqrt(np.mean(x**2))) if len(x) else 0.0 for x in (each[~linear], each[linear]))
+    return turning * distance, sliding, float(noise.seating)
 
 
 def one_arcsec(kinds: JointKinds | None) -> Float[np.ndarray, "..."]:

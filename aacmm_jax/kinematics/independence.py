@@ -24,16 +24,19 @@ def equations(
 ) -> tuple[Float[np.ndarray, "N 3 p"], Float[np.ndarray, "l p"]]:
     """Derivatives of tips less their socket's mean, and of reference lengths, at configurations; mm per mm or rad."""
     columns = jacobian_at(arm, q, names)
-    owner, sizes = capture.owner, np.asarray(capture.sizes, dtype=float)
-    starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
-    means = np.add.reduceat(columns, starts, axis=0) / sizes[:, None, None]
-    tips = in_chunks(lambda rows: np.asarray(arm.position(rows)), q)
-    centroids = np.add.reduceat(tips, starts, axis=0) / sizes[:, None]
+    means = _socket_means(columns, capture)
+    centroids = _socket_means(in_chunks(lambda rows: np.asarray(arm.position(rows)), q), capture)
     ends = capture.ends()
     between = centroids[ends[:, 1]] - centroids[ends[:, 0]]
     directions = between / np.linalg.norm(between, axis=1, keepdims=True)
     lengths = np.einsum("lc,lcp->lp", directions, means[ends[:, 1]] - means[ends[:, 0]])
-    return columns - means[owner], lengths
+    return columns - means[capture.owner], lengths
+
+
+def _socket_means(values: Float[np.ndarray, "N ..."], capture: SocketPoses) -> Float[np.ndarray, "s ..."]:
+    starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
+    sums = np.add.reduceat(values, starts, axis=0)
+    return sums / np.reshape(capture.sizes, (-1, *(1,) * (values.ndim - 1)))
 
 
 def nearly_parallel(arm: Arm) -> list[int]:
@@ -90,22 +93,25 @@ def tip_movements(poses: Float[np.ndarray, "N r p"], lengths: Float[np.ndarray, 
 
 
 @dataclass
-class _GenericPoses:
-    """`SocketPoses` all over the workspace; the reference length joins the first two sockets."""
+class PosesInSockets:
+    """`SocketPoses` with a reference length that joins the first two sockets, or a socket to itself."""
 
     q: Float[np.ndarray, "N n"]
     sizes: tuple[int, ...]
 
     @property
     def joints(self) -> int:
+        """Number of joints."""
         return self.q.shape[1]
 
     @property
     def owner(self) -> Int[np.ndarray, " N"]:
+        """Index of the socket of each pose."""
         return np.repeat(np.arange(len(self.sizes)), self.sizes)
 
     def ends(self) -> Int[np.ndarray, "l 2"]:
-        return np.array([[0, 1]])
+        """Socket indices of both ends of the length."""
+        return np.array([[0, min(1, len(self.sizes) - 1)]])
 
 
 def generic_poses(arm: Arm) -> SocketPoses:
@@ -120,7 +126,7 @@ def generic_poses(arm: Arm) -> SocketPoses:
     starts = random.uniform(limits[:, 0], limits[:, 1], (len(owner), arm.joints))
     q, arrived = project_to_targets(arm, starts, np.asarray(arm.position(first))[owner], limits)
     sockets = [np.concatenate([first[i : i + 1], q[arrived & (owner == i)]]) for i in range(_SOCKETS)]
-    return _GenericPoses(np.concatenate(sockets), tuple(len(socket) for socket in sockets))
+    return PosesInSockets(np.concatenate(sockets), tuple(len(socket) for socket in sockets))
 
 
 def _independent(arm: Arm, order: list[str], rows: Float[np.ndarray, "r p"]) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
-from ..data.capture import Capture, check_one_capture, check_sockets_only
+from ..data.capture import Capture, check_one_capture, check_readings, check_sockets_only
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry, JointMotion, joint_motion
@@ -43,6 +43,7 @@ class Measurement(eqx.Module):
         """
         check_one_capture(capture)
         check_sockets_only(capture, "this function")
+        check_readings(capture, arm)
         capture = to_numpy(capture)
         xp = namespace(capture)
         return cls(

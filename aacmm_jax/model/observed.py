@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import AnyArray, add_at, namespace, to_numpy
-from ..data.capture import Capture, check_one_capture
+from ..data.capture import Capture, check_one_capture, check_readings
 from ..data.observations.observation import POINT, AbstractObservation, Rows, Tips, offset_of
 from ..data.observations.platform import platform_frames
 from ..data.observations.socket import Socket, position_of
@@ -44,6 +44,8 @@ class Observed(eqx.Module):
         Raises `InputError` for a batch of captures.
         """
         check_one_capture(capture)
+        if arm is not None:
+            check_readings(capture, arm)
         capture = to_numpy(capture)
         xp = namespace(capture)
         sockets = tuple(Socket(name, readings) for name, readings in capture.sockets.items())

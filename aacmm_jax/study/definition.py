@@ -268,7 +268,9 @@ class Study:
 
     def _scale_anchor(self, hold: str) -> str | None:
         with _naming("identification.hold"):
-            return scale_anchor(self.space, self.nominal.arm, None if hold == "none" else hold).hold
+            return scale_anchor(
+                self.space, self.nominal.arm, None if hold == "none" else hold, capture=self.capture
+            ).hold
 
     def _values_of(self, cell: Mapping[str, Any]) -> tuple:
         """The fields of `CellValues` for one cell."""
