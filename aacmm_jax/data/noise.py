@@ -121,6 +121,14 @@ def at_tip(noise: Noise, arm: Arm, distance: float) -> tuple[float, float, float
     return turning * distance, sliding, float(noise.seating)
 
 
+def linear_encoder_mm(noise: Noise, arm: Arm) -> float | list[float] | None:
+    """Standard deviation of the readings of an arm's prismatic joints, mm, one or one each; None without any."""
+    if not arm.prismatic:
+        return None
+    each = np.asarray(noise.of_readings(arm.geometry.kinds))[np.array(arm.prismatic) - 1].tolist()
+    return each[0] if len(set(each)) == 1 else each
+
+
 def one_arcsec(kinds: JointKinds | None) -> Float[np.ndarray, "..."]:
     """Standard deviations of readings, rad and mm, by encoders of 1 arcsec: the unit of an estimated noise."""
     return np.asarray(ARCSEC) if kinds is None else ARCSEC * kinds.units

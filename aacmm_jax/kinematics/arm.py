@@ -197,9 +197,14 @@ def _joint_numbers(numbers: Iterable[int], joints: int) -> tuple[int, ...]:
     return tuple(sorted({int(number) for number in given}))
 
 
-def reading_unit(arm: Arm, joint: int) -> str:
-    """Unit of the reading of a joint, from 1: ``rad``, or ``mm`` of a prismatic one."""
-    return "mm" if joint in arm.prismatic else "rad"
+def by_joint(arm: Arm, angular: Any, linear: Any) -> list[Any]:
+    """One of two values for each joint: that of revolute joints, or that of prismatic ones."""
+    return [linear if i in arm.prismatic else angular for i in range(1, arm.joints + 1)]
+
+
+def readings_unit(arm: Arm) -> str:
+    """The unit of an array of readings of an arm, in words."""
+    return "rad, mm of prismatic joints" if arm.prismatic else "rad"
 
 
 def checked_limits(

@@ -67,7 +67,7 @@ class Quantity(NamedTuple):
     u: float | None = None  # standard uncertainty of a certified value; 0 where it is taken as exact
 
 
-READINGS = Entry("q", "joint angle as read", "rad", ("pose", "joint"), required=True)
+READINGS = Entry("q", "joint reading", "rad", ("pose", "joint"), required=True)
 TARGET = Entry("target", "tip that was held or seen; empty: the arm's own probe", content="text")
 
 
