@@ -15,13 +15,14 @@ from ..core.arrays import Numbers, as_array, as_floats, in_chunks
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace, to_jax, to_numpy
 from ..core.text import pluralise
-from .chain import Geometry, JointKinds, tip_pose
+from .chain import Corrections, Geometry, JointKinds, tip_pose
 from .jacobian import tip_jacobian, tip_position
 
 # Steps of about 1 mm and 1 mrad are comparable at the tip of an arm of about 1 m.
 _LENGTH_STEP, _ANGLE_STEP = 1.0, 1e-3
 LENGTHS = ("a", "d", "probe")
-_PROBE_AXES = ("x", "y", "z")
+_AXES = ("x", "y", "z")
+_DOWN = (0.0, 0.0, -1.0)
 _LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a compiler
 
 
@@ -43,6 +44,10 @@ class Arm(eqx.Module):
         limits: Lowest and highest reading of each joint, n pairs, rad, or mm of prismatic joints; not calibrated, but
             respected when poses are made.
         prismatic: Numbers of the prismatic joints, from 1: ``(1,)`` for an arm on a linear axis.
+        coefficients: Of the corrections' functions ``(..., k)``; by default 0.
+        gravity: Direction of gravity in the base frame ``(..., 3)``, for corrections by its moments; by default
+            (0, 0, -1).
+        corrections: What joints do besides their readings; `kinematics.with_corrections` makes them.
 
     Raises:
         InputError: Shapes do not fit together, a value is not finite, or there is no joint of such a number.
@@ -56,6 +61,9 @@ class Arm(eqx.Module):
     probe: Float[AnyArray, "... 3"]  # tip in the last frame, mm
     limits: tuple[tuple[float, float], ...] | None = eqx.field(static=True)  # rad, or mm of prismatic joints
     prismatic: tuple[int, ...] = eqx.field(static=True)  # numbers of the prismatic joints, from 1
+    coefficients: Float[AnyArray, "... k"] | None  # of the corrections
+    gravity: Float[AnyArray, "... 3"] | None  # its direction in the base frame
+    corrections: Corrections | None
 
     def __init__(
         self,
@@ -68,6 +76,9 @@ class Arm(eqx.Module):
         probe: Numbers = (0.0, 0.0, 0.0),
         limits: Sequence[Sequence[float]] | None = None,
         prismatic: Iterable[int] = (),
+        coefficients: Numbers | None = None,
+        gravity: Numbers | None = None,
+        corrections: Corrections | None = None,
     ):
         self.alpha = as_floats(alpha, "alpha")
         self.a = as_floats(a, "a")
@@ -86,8 +97,9 @@ class Arm(eqx.Module):
                 )
         if self.probe.shape[-1:] != (3,):
             raise InputError(f"probe has shape {self.probe.shape}; give its three coordinates (x, y, z) in mm.")
-        arrays = [array for array in (self.alpha, self.a, self.d, self.theta, self.beta) if array is not None]
-        batches = [array.shape[:-1] for array in (*arrays, self.probe)]
+        self._correct(coefficients, gravity, corrections)
+        kinds = ("alpha", "a", "d", "theta", "beta", "probe", "coefficients", "gravity")
+        batches = [array.shape[:-1] for array in (getattr(self, kind) for kind in kinds) if array is not None]
         try:
             np.broadcast_shapes(*batches)
         except ValueError as error:
@@ -96,6 +108,25 @@ class Arm(eqx.Module):
             ) from error
         self.prismatic = _joint_numbers(prismatic, joints)
         self.limits = None if limits is None else checked_limits(limits, joints, self.prismatic)
+
+    def _correct(self, coefficients: Numbers | None, gravity: Numbers | None, corrections: Corrections | None) -> None:
+        """Set what the corrections need: of the constructor."""
+        self.corrections = corrections
+        if corrections is None:
+            if coefficients is not None or gravity is not None:
+                raise InputError("coefficients and gravity are of corrections; make the arm by with_corrections first.")
+            self.coefficients = self.gravity = None
+            return
+        count = len(corrections.functions.each)
+        given = np.zeros(count) if coefficients is None else coefficients
+        self.coefficients = as_floats(given, "coefficients")
+        self.gravity = as_floats(_DOWN if gravity is None else gravity, "gravity")
+        if self.coefficients.shape[-1:] != (count,):
+            raise InputError(
+                f"coefficients has shape {self.coefficients.shape}, but the corrections have {count}; give one each."
+            )
+        if self.gravity.shape[-1:] != (3,):
+            raise InputError(f"gravity has shape {self.gravity.shape}; give the three components of its direction.")
 
     @property
     def joints(self) -> int:
@@ -106,7 +137,8 @@ class Arm(eqx.Module):
     def geometry(self) -> Geometry:
         """The parameters and the kinds of the joints, without the limits."""
         kinds = JointKinds(tuple(i in self.prismatic for i in range(1, self.joints + 1))) if self.prismatic else None
-        return Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe, kinds)
+        corrected = (self.coefficients, self.gravity, self.corrections)
+        return Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe, kinds, *corrected)
 
     def position(self, q: Numbers) -> Float[AnyArray, "... 3"]:
         """Tip in the base frame, mm, at readings q, rad, or mm of prismatic joints: ``(..., n) -> (..., 3)``."""
@@ -134,7 +166,7 @@ class Arm(eqx.Module):
             parameter_names(self) if names is None else (names,) if isinstance(names, str) else items_of(names, "names")
         )
         return self._evaluated(
-            partial(tip_jacobian, indices=tuple(locate(self.joints, n, extra=("q",)) for n in names)), q
+            partial(tip_jacobian, indices=tuple(locate(self, n, extra=("q",)) for n in names)), q
         )
 
     def replace(self, **changes: Any) -> "Arm":
@@ -148,11 +180,12 @@ class Arm(eqx.Module):
             InputError: A name is unknown, or the arm that results is refused.
         """
         whole = ("alpha", "a", "d", "theta", "beta", "probe", "limits", "prismatic")
+        whole = (*whole, "coefficients", "gravity", "corrections")
         arguments: dict[str, Any] = {key: changes.get(key, getattr(self, key)) for key in whole}
         for name, value in changes.items():
             if name in whole:
                 continue
-            kind, i = locate(self.joints, name)
+            kind, i = locate(self, name)
             value = as_floats(math.nan if value is None else value, name)
             array = np.zeros(self.alpha.shape) if arguments[kind] is None else as_floats(arguments[kind], kind)
             array, value = to_numpy((array, value))
@@ -234,23 +267,40 @@ def is_single(arm: Arm) -> bool:
 
 
 def parameter_names(arm: Arm) -> tuple[str, ...]:
-    """All parameter names of an arm: alpha, a, d, theta, (beta,) by joint from 1, then probe_x, probe_y, probe_z."""
+    """All parameter names of an arm: alpha, a, d, theta, (beta,) by joint from 1, then probe_x, probe_y, probe_z, and
+    those of its corrections."""
     kinds = ("alpha", "a", "d", "theta") + (() if arm.beta is None else ("beta",))
     by_joint = [f"{kind}_{i}" for kind in kinds for i in range(1, arm.joints + 1)]
-    return (*by_joint, *(f"probe_{axis}" for axis in _PROBE_AXES))
+    return (*by_joint, *(f"probe_{axis}" for axis in _AXES), *correction_names(arm))
 
 
-def locate(joints: int, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
+def correction_names(arm: Arm) -> tuple[str, ...]:
+    """Names of the coefficients of an arm's corrections, and of the components of gravity where some depend on it."""
+    if arm.corrections is None:
+        return ()
+    each = arm.corrections.functions.each
+    by_gravity = any(function.rows == 3 for function in each)
+    return (*(function.name for function in each), *(f"gravity_{axis}" for axis in _AXES if by_gravity))
+
+
+def locate(arm: Arm, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
     """Kind and 0-based index of a parameter name: ``d_3 -> ("d", 2)``; an `InputError` names the nearest spelling."""
+    return located(arm.joints, correction_names(arm), name, extra)
+
+
+def located(joints: int, corrections: tuple[str, ...], name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
+    """`locate` for an arm with so many joints and corrections of these names."""
     kinds = ("alpha", "a", "d", "theta", "beta", *extra)
     kind, _, index = name.rpartition("_") if isinstance(name, str) else ("", "", "")
-    if kind == "probe" and index in _PROBE_AXES:
-        return "probe", _PROBE_AXES.index(index)
+    if (kind == "probe" or name in corrections) and index in _AXES:
+        return kind, _AXES.index(index)
+    if name in corrections:
+        return "coefficients", corrections.index(name)
     if kind in kinds and index.isdecimal() and str(int(index)) == index and 1 <= int(index) <= joints:
         return kind, int(index) - 1
-    known = [f"{k}_{i}" for k in kinds for i in range(1, joints + 1)] + [f"probe_{axis}" for axis in _PROBE_AXES]
+    known = [f"{k}_{i}" for k in kinds for i in range(1, joints + 1)] + [f"probe_{axis}" for axis in _AXES]
     given = name if isinstance(name, str) else shown(name)
-    raise InputError(f"unknown parameter '{given}' of a {joints}-joint arm{nearest(given, known)}")
+    raise InputError(f"unknown parameter '{given}' of a {joints}-joint arm{nearest(given, [*known, *corrections])}")
 
 
 def with_arrays(arm: Arm, **changes: AnyArray | None) -> Arm:
@@ -285,7 +335,7 @@ def jacobian_at(arm: Arm, q: Float[np.ndarray, "N n"], names: Sequence[str]) -> 
 def value_of(arm: Arm, name: str) -> np.ndarray:
     """Value of a named parameter of a concrete arm, mm or rad, with the arm's batch axes."""
     # Read with NumPy: under jit even a constant arm's values become tracers once JAX computes with them.
-    kind, i = locate(arm.joints, name)
+    kind, i = locate(arm, name)
     return np.asarray(getattr(arm, kind))[..., i]
 
 
@@ -322,4 +372,4 @@ def neighbouring_arm(arm: Arm, names: Sequence[str]) -> Arm:
     steps = np.random.default_rng(0).normal(size=len(names)) * natural_steps(names)
     vector = np.array([value_of(arm, name) for name in names]) + steps
     arm = to_numpy(arm)
-    return with_arrays(arm, **with_values(arm.geometry, vector, tuple(locate(arm.joints, name) for name in names)))
+    return with_arrays(arm, **with_values(arm.geometry, vector, tuple(locate(arm, name) for name in names)))

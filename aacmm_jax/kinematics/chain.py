@@ -8,12 +8,12 @@ XLA then computes the chain again for every column. `forward_pass_by_joints` pre
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, scan
 
@@ -40,10 +40,64 @@ class JointKinds:
         return np.asarray(self.prismatic).reshape(-1, *(1,) * (rank - 1))
 
 
+class KnownFunction(Protocol):
+    """A function of the readings that a coefficient multiplies: a term of `kinematics.corrections`; hashable."""
+
+    @property
+    def joint(self) -> int:
+        """The joint that it moves, from 1."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """Name of the coefficient."""
+        ...
+
+    @property
+    def rows(self) -> int:
+        """1, or 3 where the function is the product of the direction of gravity with three rows."""
+        ...
+
+    def values(self, q: Float[AnyArray, "n ... 1 N"], forward: "ForwardPass") -> Float[AnyArray, "rows ... 1 N"]:
+        """Its rows at N configurations, with the nominal arm's frames there."""
+        ...
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class KnownFunctions:
+    """The functions of a chain's corrections, static in every program."""
+
+    each: tuple[KnownFunction, ...]
+
+    @property
+    def term_of_row(self) -> Int[np.ndarray, " rows"]:
+        """The function, from 0, that each row belongs to."""
+        return np.repeat(np.arange(len(self.each)), [function.rows for function in self.each])
+
+    @property
+    def component_of_row(self) -> Int[np.ndarray, " rows"]:
+        """The component of gravity that each row is multiplied by; 3 for those of other functions."""
+        return np.concatenate([np.arange(3) if function.rows == 3 else [3] for function in self.each])
+
+    def joint_of_row(self, joints: int) -> Float[np.ndarray, "n rows"]:
+        """1 where a row moves a joint, else 0."""
+        moved = np.array([self.each[term].joint - 1 for term in self.term_of_row])
+        return (np.arange(joints)[:, None] == moved).astype(float)
+
+
+class Corrections(NamedTuple):
+    """What joints do besides their readings: known functions, and the arm on whose frames they are evaluated."""
+
+    functions: KnownFunctions
+    nominal: "Geometry"  # without corrections
+
+
 class Geometry(NamedTuple):
     """Parameters of a chain as arrays, and the static facts about its joints.
 
-    Lengths mm, angles rad; ``beta`` is None where Hayati's angle is unused, ``kinds`` where all joints are revolute.
+    Lengths mm, angles rad; ``beta`` is None where Hayati's angle is unused, ``kinds`` where all joints are revolute,
+    the last three where joints do what they read.
     """
 
     alpha: Float[AnyArray, "... n"]
@@ -53,18 +107,30 @@ class Geometry(NamedTuple):
     beta: Float[AnyArray, "... n"] | None
     probe: Float[AnyArray, "... 3"]
     kinds: JointKinds | None = None
+    coefficients: Float[AnyArray, "... k"] | None = None  # of the corrections' functions
+    gravity: Float[AnyArray, "... 3"] | None = None  # its direction in the base frame
+    corrections: Corrections | None = None
 
 
 class JointMotion(NamedTuple):
     """What readings do to the joints: all that the chain needs of them, evaluated once a capture.
 
     A revolute joint rotates by its reading, a prismatic one slides by it along its axis. ``slide`` is None for a chain
-    of revolute joints.
+    of revolute joints, ``functions`` for one without corrections.
     """
 
     cos: Float[AnyArray, "n ... 1 N"]
     sin: Float[AnyArray, "n ... 1 N"]
     slide: Float[AnyArray, "n ... 1 N"] | None  # mm
+    functions: Float[AnyArray, "rows ... 1 N"] | None = None  # of the corrections
+
+
+class JointErrors(NamedTuple):
+    """Derivatives of what the corrections add to each joint's theta, or d of a prismatic joint."""
+
+    by_coefficient: Float[AnyArray, "k ... 1 N"]  # of the one joint that it moves
+    by_gravity: Float[AnyArray, "n 3 ... 1 N"]
+    functions: KnownFunctions
 
 
 class ForwardPass(NamedTuple):
@@ -81,6 +147,7 @@ class ForwardPass(NamedTuple):
     y: Float[AnyArray, "n ... 3 N"] | None  # axis of beta
     origin: Float[AnyArray, "n ... 3 N"]
     kinds: JointKinds | None = None
+    errors: JointErrors | None = None  # of a chain with corrections
 
 
 def joints_first(values: Any, rank: int) -> Any:
@@ -101,8 +168,8 @@ def reading_units(geometry: Geometry) -> Float[np.ndarray, " n"]:
 def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion:
     """What readings do to the joints of a chain, for `forward_pass`: computed once for many arms of the same kind.
 
-    Cosines and sines are half of the time of a forward pass. Only the static part of the geometry matters, so that one
-    motion serves every iteration of an identification.
+    Cosines and sines are half of the time of a forward pass. Of the geometry, only what an identification does not
+    change matters: the kinds of the joints, and the nominal arm of its corrections.
 
     Args:
         geometry: The chain, whose parameters may be anything.
@@ -113,12 +180,19 @@ def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion
 
 def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"]) -> JointMotion:
     """`joint_motion` of readings that have the joints first and the configurations last."""
-    xp = namespace(rows)
+    xp, corrections = namespace(rows), geometry.corrections
     if geometry.kinds is None:
-        return JointMotion(xp.cos(rows), xp.sin(rows), None)
-    prismatic = geometry.kinds.mask(rows.ndim)
-    angle = xp.where(prismatic, 0.0, rows)
-    return JointMotion(xp.cos(angle), xp.sin(angle), xp.where(prismatic, rows, 0.0))
+        motion = JointMotion(xp.cos(rows), xp.sin(rows), None)
+    else:
+        prismatic = geometry.kinds.mask(rows.ndim)
+        angle = xp.where(prismatic, 0.0, rows)
+        motion = JointMotion(xp.cos(angle), xp.sin(angle), xp.where(prismatic, rows, 0.0))
+    if corrections is None:
+        return motion
+    forward = forward_pass(corrections.nominal, motion)
+    return motion._replace(
+        functions=xp.concatenate([function.values(rows, forward) for function in corrections.functions.each])
+    )
 
 
 @compiled
@@ -159,18 +233,31 @@ def _unrolled(body: Callable, start: Any, inputs: Any) -> tuple[Any, Any]:
     return carry, jax.tree.map(lambda *leaves: leaves, *outputs)
 
 
+def _with_rank(motion: JointMotion, rank: int) -> JointMotion:
+    """The motion with as many batch axes."""
+    return jax.tree.map(lambda t: t.reshape(t.shape[:1] + (1,) * (rank + 2 - t.ndim) + t.shape[1:]), motion)
+
+
 def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> ForwardPass:
     xp = namespace(geometry, motion)
     rank = max(motion.cos.ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
-    motion = jax.tree.map(lambda t: xp.reshape(t, t.shape[:1] + (1,) * (rank + 2 - t.ndim) + t.shape[1:]), motion)
+    motion = _with_rank(motion, rank)
     parameters = jax.tree.map(lambda leaf: joints_first(leaf, rank), geometry)
-    cos_theta, sin_theta = xp.cos(parameters.theta), xp.sin(parameters.theta)
+    theta, d, errors = parameters.theta, parameters.d, None
+    if motion.slide is not None:
+        d = d + motion.slide
+    if geometry.corrections is not None:
+        added, errors = _joint_errors(parameters, motion, geometry.corrections.functions)
+        mask = np.zeros(()) if geometry.kinds is None else geometry.kinds.mask(added.ndim)
+        theta = theta + (added if geometry.kinds is None else xp.where(mask, 0.0, added))
+        d = d if geometry.kinds is None else d + xp.where(mask, added, 0.0)
+    cos_theta, sin_theta = xp.cos(theta), xp.sin(theta)
     inputs = (
         (motion.cos * cos_theta - motion.sin * sin_theta, motion.sin * cos_theta + motion.cos * sin_theta),
         (xp.cos(parameters.alpha), xp.sin(parameters.alpha)),
         None if parameters.beta is None else (xp.cos(parameters.beta), xp.sin(parameters.beta)),
         parameters.a,
-        parameters.d if motion.slide is None else parameters.d + motion.slide,
+        d,
     )
 
     def joint(frame, row):
@@ -194,7 +281,33 @@ def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> Fo
     (frame, origin), axes = loop(joint, start, inputs)
     probe = parameters.probe
     tip = origin + probe[0] * frame[0] + probe[1] * frame[1] + probe[2] * frame[2]
-    return ForwardPass(frame, tip, *axes, kinds=geometry.kinds)
+    return ForwardPass(frame, tip, *axes, kinds=geometry.kinds, errors=errors)
+
+
+def _joint_errors(
+    parameters: Geometry, motion: JointMotion, functions: KnownFunctions
+) -> tuple[Float[AnyArray, "n ... 1 N"], JointErrors]:
+    """What the corrections add to each joint, and its derivatives; ``parameters`` have the joints first."""
+    xp = namespace(parameters, motion)
+    assert motion.functions is not None and parameters.coefficients is not None and parameters.gravity is not None
+    by_component = xp.concatenate([parameters.gravity, xp.ones_like(parameters.gravity[:1])])
+    component, term = functions.component_of_row, functions.term_of_row
+    joints = functions.joint_of_row(len(parameters.theta))
+    weighted = by_component[component] * motion.functions
+    terms = (np.arange(len(functions.each))[:, None] == term).astype(float)
+    by_coefficient = xp.tensordot(terms, weighted, axes=1)
+    added = xp.tensordot(joints, parameters.coefficients[term] * weighted, axes=1)
+    moments = parameters.coefficients[term] * motion.functions
+    by_gravity = xp.stack([xp.tensordot(joints * (component == i), moments, axes=1) for i in range(3)], axis=1)
+    return added, JointErrors(by_coefficient, by_gravity, functions)
+
+
+def joint_errors(geometry: Geometry, motion: JointMotion) -> Float[AnyArray, "n ... 1 N"]:
+    """What the corrections add to each joint's theta, rad, or to d of a prismatic joint, mm."""
+    assert geometry.corrections is not None
+    rank = max(motion.cos.ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
+    parameters = jax.tree.map(lambda leaf: joints_first(leaf, rank), geometry)
+    return _joint_errors(parameters, _with_rank(motion, rank), geometry.corrections.functions)[0]
 
 
 def components_last(

@@ -138,7 +138,7 @@ def _independent(arm: Arm, order: list[str], rows: Float[np.ndarray, "r p"]) -> 
         for _ in range(2):  # twice is enough for orthogonality to rounding
             column = column - basis @ (basis.T @ column)
         least = 1e-7 * (
-            1.0 if locate(arm.joints, name)[0] in LENGTHS else 1e3
+            1.0 if locate(arm, name)[0] in LENGTHS else 1e3
         )  # small at the tip for steps of 1 mm and 1 mrad
         size = float(np.linalg.norm(column))
         if size > max(_INDEPENDENT * float(np.linalg.norm(whole)), least) and basis.shape[1] < rows.shape[0]:

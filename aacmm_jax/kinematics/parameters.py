@@ -16,7 +16,18 @@ from ..core.arguments import checked_arguments, items_of, real_number
 from ..core.arrays import Numbers, as_array, is_concrete, joined, random_key
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace
-from .arm import Arm, is_length, is_single, locate, natural_steps, parameter_names, with_arrays, with_values
+from .arm import (
+    Arm,
+    correction_names,
+    is_length,
+    is_single,
+    locate,
+    located,
+    natural_steps,
+    parameter_names,
+    with_arrays,
+    with_values,
+)
 from .chain import Geometry
 from .independence import generic_poses, independent_names
 from .inverse_kinematics import SocketPoses
@@ -41,7 +52,7 @@ class Parameters(eqx.Module):
     def __check_init__(self):
         if not isinstance(self.base, Arm) or not isinstance(self.names, tuple) or not self.names:
             raise InputError("Parameters takes an arm and a tuple of the names of its free parameters, at least one.")
-        _indices(self.base.joints, self.names)
+        _indices(self.base, self.names)
         if len(set(self.names)) != len(self.names):
             _unique_names(self.base, self.names, "names")
 
@@ -124,12 +135,12 @@ class Parameters(eqx.Module):
 
     def indices(self) -> tuple[tuple[str, int], ...]:
         """Kind and 0-based index of each free parameter."""
-        return _indices(self.base.joints, self.names)
+        return _indices(self.base, self.names)
 
     def index(self, name: str) -> int:
         """Position of a free parameter in the vector; raises `InputError` if it is not free."""
         if name not in self.names:
-            locate(self.base.joints, name)
+            locate(self.base, name)
             raise InputError(
                 f"parameter '{name}' is held, not free; free it, or name a free one, such as '{self.names[0]}'."
             )
@@ -185,8 +196,12 @@ class Parameters(eqx.Module):
 
 
 @lru_cache(maxsize=256)
-def _indices(joints: int, names: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
-    return tuple(locate(joints, name) for name in names)
+def _located(joints: int, corrections: tuple[str, ...], names: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
+    return tuple(located(joints, corrections, name) for name in names)
+
+
+def _indices(arm: Arm, names: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
+    return _located(arm.joints, correction_names(arm), names)
 
 
 def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
@@ -194,7 +209,7 @@ def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
         names = (names,)
     names = tuple(items_of(names, what))
     for name in names:
-        locate(arm.joints, name)
+        locate(arm, name)
         if names.count(name) > 1:
             raise InputError(f"parameter '{name}' is named twice in {what}; name it once.")
     return names

@@ -139,7 +139,7 @@ def value_and_gradient(
     encoder = np.broadcast_to(np.asarray(problem.noise.of_readings(forward.kinds)), readings.shape[:1])
     cotangents = {"theta": 2 * np.einsum("ncd,kdn->kcn", by_covariance, readings) * encoder[:, None, None] ** 2}
     for index, (name, scale) in enumerate(zip(problem.space.names, np.asarray(problem.space.scale), strict=True)):
-        kind, i = locate(problem.arm.joints, name)
+        kind, i = locate(problem.arm, name)
         cotangents.setdefault(kind, np.zeros((3 if kind == "probe" else len(readings), *readings.shape[1:])))
         cotangents[kind][i] -= 2 * scale * by_rows[:, :, index].T
     gradient = readings_gradient(forward, cotangents)
