@@ -22,7 +22,7 @@ from .jacobian import tip_jacobian, tip_position
 _LENGTH_STEP, _ANGLE_STEP = 1.0, 1e-3
 LENGTHS = ("a", "d", "probe")
 _AXES = ("x", "y", "z")
-_DOWN = (0.0, 0.0, -1.0)
+DOWN = (0.0, 0.0, -1.0)
 _LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a compiler
 
 
@@ -120,7 +120,7 @@ class Arm(eqx.Module):
         count = len(corrections.functions.each)
         given = np.zeros(count) if coefficients is None else coefficients
         self.coefficients = as_floats(given, "coefficients")
-        self.gravity = as_floats(_DOWN if gravity is None else gravity, "gravity")
+        self.gravity = as_floats(DOWN if gravity is None else gravity, "gravity")
         if self.coefficients.shape[-1:] != (count,):
             raise InputError(
                 f"coefficients has shape {self.coefficients.shape}, but the corrections have {count}; give one each."

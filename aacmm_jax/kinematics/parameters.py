@@ -70,8 +70,8 @@ class Parameters(eqx.Module):
 
         Args:
             arm: The arm; it supplies the values of the fixed parameters.
-            held: Names of the fixed parameters, instead of those above; beta is fixed unless in ``free``.
-            free: Names that are free in addition, beta included.
+            held: Names of the fixed parameters, instead of those above; beta is and the direction of gravity are fixed unless in ``free``.
+            free: Names that are free in addition, beta and gravity included.
 
         Raises:
             InputError: The arm has no such parameter, or one is named as held and as free.
@@ -91,7 +91,9 @@ class Parameters(eqx.Module):
         if arm.beta is None and any(name.startswith("beta_") for name in (*held, *free)):
             arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
         wanted = [
-            name for name in parameter_names(arm) if name not in held and (name in free or not name.startswith("beta_"))
+            name
+            for name in parameter_names(arm)
+            if name not in held and (name in free or not name.startswith(("beta_", "gravity_")))
         ]
         if not wanted:
             raise InputError("every parameter is held, so nothing is left to identify; hold fewer.")
@@ -165,6 +167,8 @@ class Parameters(eqx.Module):
         tools: Any = np if known else jnp  # see `joined`
         values = {kind: tools.asarray(getattr(arm, kind)) for kind in ("alpha", "a", "d", "theta", "probe")}
         values["beta"] = tools.zeros_like(values["alpha"]) if arm.beta is None else tools.asarray(arm.beta)
+        if arm.corrections is not None:
+            values |= {"coefficients": tools.asarray(arm.coefficients), "gravity": tools.asarray(arm.gravity)}
         rows = tools.broadcast_arrays(*(values[kind][..., i] for kind, i in self.indices()))
         return np.stack(rows, axis=-1) if namespace(arm) is np else joined(rows, axis=-1, new=True)
 
