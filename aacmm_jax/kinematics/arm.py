@@ -165,9 +165,7 @@ class Arm(eqx.Module):
         names = (
             parameter_names(self) if names is None else (names,) if isinstance(names, str) else items_of(names, "names")
         )
-        return self._evaluated(
-            partial(tip_jacobian, indices=tuple(locate(self, n, extra=("q",)) for n in names)), q
-        )
+        return self._evaluated(partial(tip_jacobian, indices=tuple(locate(self, n, extra=("q",)) for n in names)), q)
 
     def replace(self, **changes: Any) -> "Arm":
         """The same arm with some values replaced, checked as a new arm is; also on traced values.

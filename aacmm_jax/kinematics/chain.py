@@ -8,7 +8,7 @@ XLA then computes the chain again for every column. `forward_pass_by_joints` pre
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +40,7 @@ class JointKinds:
         return np.asarray(self.prismatic).reshape(-1, *(1,) * (rank - 1))
 
 
+@runtime_checkable
 class KnownFunction(Protocol):
     """A function of the readings that a coefficient multiplies: a term of `kinematics.corrections`; hashable."""
 
@@ -289,7 +290,9 @@ def _joint_errors(
 ) -> tuple[Float[AnyArray, "n ... 1 N"], JointErrors]:
     """What the corrections add to each joint, and its derivatives; ``parameters`` have the joints first."""
     xp = namespace(parameters, motion)
-    assert motion.functions is not None and parameters.coefficients is not None and parameters.gravity is not None
+    assert motion.functions is not None
+    assert parameters.coefficients is not None
+    assert parameters.gravity is not None
     by_component = xp.concatenate([parameters.gravity, xp.ones_like(parameters.gravity[:1])])
     component, term = functions.component_of_row, functions.term_of_row
     joints = functions.joint_of_row(len(parameters.theta))

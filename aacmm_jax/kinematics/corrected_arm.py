@@ -54,7 +54,7 @@ def with_corrections(
         found = [term_of(name, plain.joints, loads) if isinstance(name, str) else None for name in names]
         for name, term in zip(names, found, strict=True):
             if term is None:
-                raise InputError(f"'{name}' is no coefficient's name; write one such as cos1_2, or a model (harmonics).")
+                raise InputError(f"'{name}' is no coefficient's name; write one such as cos1_2, or give a model.")
         terms = tuple(dict.fromkeys(term for term in found if term is not None))
     if not terms:
         return plain

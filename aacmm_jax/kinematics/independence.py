@@ -9,7 +9,17 @@ from jaxtyping import Float, Int
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
-from .arm import LENGTHS, Arm, jacobian_at, joint_limits, locate, natural_steps, neighbouring_arm, with_arrays
+from .arm import (
+    LENGTHS,
+    Arm,
+    correction_names,
+    jacobian_at,
+    joint_limits,
+    locate,
+    natural_steps,
+    neighbouring_arm,
+    with_arrays,
+)
 from .inverse_kinematics import SocketPoses, project_to_centroids, project_to_targets
 from .near_degeneracy import trade_offs
 
@@ -49,7 +59,8 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
 
     Parameters are taken one after the other, and fixed where those taken before can imitate them: nonzero lengths
     first, then angles, lengths that are nominally zero, the probe and the last link; the longest link comes last of
-    all, so that it is fixed where neither a reference length nor a prismatic joint fixes the scale. Where neighbouring
+    all, so that it is fixed where neither a reference length nor a prismatic joint fixes the scale. Before it come the
+    coefficients of corrections, since a harmonic may imitate a zero offset, but not replace it. Where neighbouring
     axes are nearly parallel, ``d_i`` is fixed and ``beta_i`` is free. Of a prismatic joint i, ``a_i`` and ``d_(i+1)``
     are fixed rather than others, and ``theta_i`` next to a parallel axis: three angles and ``theta`` of the joint
     before it, or after it, are all that the orientation of the next axis has. At last the first parameter of every
@@ -168,5 +179,6 @@ def _order(arm: Arm, parallel: list[int]) -> list[str]:
     nonzero += [name for name, value in tip.items() if value != 0]
     order = [*nonzero, *angles, *(f"beta_{i}" for i in parallel), *zero, *wrist]
     order += [name for name in (*dict(lengths), *(f"theta_{i}" for i in range(1, n))) if name in late]
-    order = [*dict.fromkeys(order), *last]
+    corrections = [name for name in correction_names(arm) if not name.startswith("gravity_")]
+    order = [*dict.fromkeys(order), *corrections, *last]
     return [name for i, name in enumerate(order) if name not in last or i == len(order) - 1]

@@ -70,7 +70,8 @@ class Parameters(eqx.Module):
 
         Args:
             arm: The arm; it supplies the values of the fixed parameters.
-            held: Names of the fixed parameters, instead of those above; beta is and the direction of gravity are fixed unless in ``free``.
+            held: Names of the fixed parameters, instead of those above; beta and the direction of
+                gravity are fixed unless in ``free``.
             free: Names that are free in addition, beta and gravity included.
 
         Raises:

@@ -74,4 +74,3 @@ def _centres(forward: ForwardPass, loads: Loads) -> list[Float[AnyArray, "... 3 
         axes = (cross(y, z), y, z)
         found.append(forward.origin[j] + sum(loads.centre[j][k] * axes[k] for k in range(3)))
     return found
-
