@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..core.text import pluralise, shorten
-from ..core.units import ARCSEC, DEG
+from ..core.units import ARCSEC, DEG, people_read
 from ..summaries.tables import METRICS, expanded_words, observed_words, quantity_words, volume_rows
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
@@ -345,7 +345,7 @@ def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
         *("parameter", "unit", "nominal", "calibrated", "change", "u", "bound"),
     )
     for row in rows:
-        factor, unit = (1.0, "mm") if row["unit"] == "mm" else (1 / DEG, "deg")
+        factor, unit = people_read(row["unit"])
         nominal, value = factor * row["nominal"], factor * row["calibrated"]
         u = None if row["u"] is None else factor * row["u"]
         decimals = 9 if u == 0 else _decimals(u, 4)

@@ -18,6 +18,7 @@ from ..kinematics.axes_to_dh import without_far_frames
 from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, Parameters, single
 from .atomic_write import storable, write_text
+from .corrections import CorrectionsTable, corrections_toml
 from .outputs import as_path
 from .toml import Strict, each_once, read_toml
 from .ur_kinematics import read_ur_kinematics
@@ -70,6 +71,7 @@ class _ArmModel(Strict):
     base: str | None = None  # its links
     tip: str | None = None
     identification: _Identification | None = None
+    corrections: CorrectionsTable | None = None
 
     @model_validator(mode="after")
     def _one_description(self) -> "_ArmModel":
@@ -219,6 +221,8 @@ def _specification(path: Path, choose: bool) -> ArmSpecification:
             found = found._replace(name=model.name or path.stem)
         else:
             found = ArmSpecification(_arm_of_rows(model, length, angle), model.name or path.stem)
+        if model.corrections is not None:
+            found = found._replace(arm=model.corrections.corrected(found.arm, length, angle))
         wanted = model.identification
         if wanted is None:
             return _chosen(found) if choose else found
@@ -332,4 +336,6 @@ def _document(specification: ArmSpecification, source: str) -> "TOMLDocument":
             row["limits"] = list(arm.limits[i])
         rows.append(row)
     document["joint"] = rows
+    if arm.corrections is not None:
+        document["corrections"] = corrections_toml(arm)
     return document

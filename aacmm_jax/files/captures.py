@@ -13,6 +13,7 @@ from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm, readings_unit
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
+from .corrections import corrected_of, correction_variables
 from .hdf5 import (
     Stored,
     Table,
@@ -259,6 +260,7 @@ def arm_table(specification: ArmSpecification) -> Table:
         if values is not None:
             unit = "mm" if kind in ("a", "d") else "rad"
             variables[kind] = Variable(("joint",), np.asarray(values), unit, long_name)
+    variables |= correction_variables(arm)
     if arm.limits is not None:
         for side, name in enumerate(("lowest", "highest")):
             values = [limit[side] for limit in arm.limits]
@@ -296,6 +298,7 @@ def specification_of(path: str | os.PathLike, stored: Stored, table: str) -> Arm
             limits=limits,
             prismatic=[int(joint) for joint in np.atleast_1d(attributes.get("prismatic", ()))],
         )
+        arm = corrected_of(path, arm, arrays)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     widths = attributes.get("override_half_widths") or []

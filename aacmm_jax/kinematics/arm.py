@@ -342,6 +342,15 @@ def is_length(name: str) -> bool:
     return name.rpartition("_")[0] in LENGTHS
 
 
+def parameter_unit(arm: Arm, name: str) -> str:
+    """Unit of a parameter: mm, rad, or of a correction's coefficient its own; "1" of a pure number."""
+    kind, i = locate(arm, name)
+    if kind == "coefficients" and arm.corrections is not None:
+        function = arm.corrections.functions.each[i]
+        return function.unit.replace("rad", "mm") if function.joint in arm.prismatic else function.unit
+    return "1" if kind == "gravity" else "mm" if kind in LENGTHS else "rad"
+
+
 def with_values(
     geometry: Geometry, vector: Float[AnyArray, "... p"], indices: tuple[tuple[str, int], ...]
 ) -> dict[str, Float[AnyArray, "... n"]]:

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from ..core.errors import InputError
 from .arm import Arm, arm_of
 from .chain import Geometry
 from .independence import NEARLY_PARALLEL
@@ -109,7 +110,16 @@ def without_far_frames(arm: Arm) -> Arm:
 
 
 def geometry_of(arm: Arm) -> Geometry:
-    """The parameters of an arm as NumPy arrays."""
+    """The parameters of an arm as NumPy arrays, for formats that know nothing else.
+
+    Raises:
+        InputError: The arm has joint corrections, which such a format cannot hold.
+    """
+    if arm.corrections is not None:
+        raise InputError(
+            "the arm has joint corrections, which this format cannot hold; write TOML, the joint zero offsets alone "
+            "(--format offsets), or correct the commanded poses (aacmm correct)."
+        )
     return jax.tree.map(np.asarray, arm.geometry)
 
 

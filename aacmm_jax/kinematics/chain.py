@@ -55,6 +55,11 @@ class KnownFunction(Protocol):
         ...
 
     @property
+    def unit(self) -> str:
+        """Unit of the coefficient."""
+        ...
+
+    @property
     def rows(self) -> int:
         """1, or 3 where the function is the product of the direction of gravity with three rows."""
         ...

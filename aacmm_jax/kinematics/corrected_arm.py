@@ -61,6 +61,12 @@ def with_corrections(
     return plain.replace(corrections=Corrections(KnownFunctions(terms), plain.geometry), gravity=down)
 
 
+def corrected_like(corrected: Arm, arm: Arm) -> Arm:
+    """An arm of other parameters with the corrections of a corrected one, and their functions on its nominal arm."""
+    changes = {kind: getattr(corrected, kind) for kind in ("corrections", "coefficients", "gravity")}
+    return arm.replace(**changes)
+
+
 def _loads(arm: Arm, mass: Numbers | None, centre: Numbers | None) -> Loads | None:
     if mass is None and centre is None:
         return None

@@ -11,7 +11,7 @@ from ..calibration.results import active_names
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
-from ..kinematics.arm import by_joint, is_length
+from ..kinematics.arm import by_joint, is_length, parameter_unit
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
@@ -57,7 +57,8 @@ def parameters_csv(record: CalibrationRecord) -> str:
     lines = ["parameter,unit,nominal,calibrated,u"]
     for i, name in enumerate(record.names):
         values = (vectors["nominal"][i], vectors["calibrated"][i], u[i])
-        lines.append(",".join([name, "mm" if is_length(name) else "rad", *(repr(float(value)) for value in values)]))
+        unit = parameter_unit(record.recording.nominal.arm, name)
+        lines.append(",".join([name, unit, *(repr(float(value)) for value in values)]))
     return "\n".join(lines) + "\n"
 
 
@@ -151,7 +152,7 @@ def calibration_summary(
     parameters = [
         {
             "parameter": name,
-            "unit": "mm" if is_length(name) else "rad",
+            "unit": parameter_unit(record.recording.nominal.arm, name),
             "u": float(u[i]) if record.determined[i] and u[i] > 0 else None,
             **{stage: float(vector[i]) for stage, vector in vectors.items()},
             "bound": {-1: "lower", 1: "upper"}.get(int(record.active[i])),

@@ -17,7 +17,6 @@ class Coupling(AbstractCorrection):
     model: ClassVar[str] = "coupled"
     words: ClassVar[tuple[str, ...]] = ("coupled",)
     description: ClassVar[str] = "part of another joint's reading"
-    unit: ClassVar[str] = "1"
     rows: ClassVar[int] = 1
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
@@ -32,6 +31,9 @@ class Coupling(AbstractCorrection):
         if not 1 <= term.number <= joints:
             return f"is of the reading of another joint from 1 to {joints}, as coupled2_3 is"
         return "is of its own reading, which gear is" if term.number == term.joint else ""
+
+    def unit_of(self, term: Term) -> str:
+        return "1"
 
     def values(
         self, term: Term, q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass

@@ -16,7 +16,6 @@ class GearRatio(AbstractCorrection):
     model: ClassVar[str] = "gear"
     words: ClassVar[tuple[str, ...]] = ("gear",)
     description: ClassVar[str] = "relative error of a gear ratio"
-    unit: ClassVar[str] = "1"
     rows: ClassVar[int] = 1
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
@@ -26,6 +25,9 @@ class GearRatio(AbstractCorrection):
 
     def wrong(self, term: Term, joints: int) -> str:
         return "has a number, and takes none" if term.number else ""
+
+    def unit_of(self, term: Term) -> str:
+        return "1"
 
     def values(
         self, term: Term, q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass

@@ -16,12 +16,13 @@ from .kind import AbstractCorrection, Loads, Term
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, by definition
 _METRE = 1e-3  # m/mm
+_KILONEWTON = 1e-3  # kN/N: with rad/(kN m), compliances are about as large as errors of angles
 
 
 class Gravity(AbstractCorrection):
     """The moment of gravity about a joint's axis.
 
-    With known masses, one coefficient a joint, ``compliance_2``, rad/(N m). Without, one for each link after it,
+    With known masses, one coefficient a joint, ``compliance_2``, rad/(kN m). Without, one for each link after it,
     ``compliance3_2``: compliance times the weight of link 3 as if it were in the origin of its frame, of the
     last link in the tip, rad/m; only such products can be found.
     """
@@ -29,7 +30,6 @@ class Gravity(AbstractCorrection):
     model: ClassVar[str] = "gravity"
     words: ClassVar[tuple[str, ...]] = ("compliance",)
     description: ClassVar[str] = "compliance by the moment of gravity"
-    unit: ClassVar[str] = "rad/(N m), or rad/m"
     rows: ClassVar[int] = 3
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
@@ -46,6 +46,9 @@ class Gravity(AbstractCorrection):
             return f"is of a link from {term.joint} to {joints}, as compliance{term.joint}_{term.joint} is"
         return ""
 
+    def unit_of(self, term: Term) -> str:
+        return "rad/m" if term.number else "rad/(kN m)"
+
     def values(
         self, term: Term, q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
     ) -> Float[AnyArray, "rows ... 1 N"]:
@@ -58,7 +61,7 @@ class Gravity(AbstractCorrection):
             assert term.loads is not None
             loads, centres = term.loads, _centres(forward, term.loads)
             moment = sum(
-                _METRE * _STANDARD_GRAVITY * loads.mass[j] * cross(axis, centres[j] - origin)
+                _METRE * _KILONEWTON * _STANDARD_GRAVITY * loads.mass[j] * cross(axis, centres[j] - origin)
                 for j in range(i, len(centres))
             )
         return namespace(moment).moveaxis(moment, -2, 0)[..., None, :]

@@ -22,7 +22,6 @@ class Harmonics(AbstractCorrection):
     model: ClassVar[str] = "harmonics"
     words: ClassVar[tuple[str, ...]] = ("cos", "sin")
     description: ClassVar[str] = "harmonic of an encoder"
-    unit: ClassVar[str] = "rad"
     rows: ClassVar[int] = 1
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
@@ -38,6 +37,9 @@ class Harmonics(AbstractCorrection):
 
     def wrong(self, term: Term, joints: int) -> str:
         return "" if 1 <= term.number <= _HIGHEST else f"has no order from 1 to {_HIGHEST}"
+
+    def unit_of(self, term: Term) -> str:
+        return "rad"
 
     def values(
         self, term: Term, q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass

@@ -36,7 +36,6 @@ class AbstractCorrection(eqx.Module):
     model: eqx.AbstractClassVar[str]  # what a model calls it, as in ``--model dh,harmonics=1``
     words: eqx.AbstractClassVar[tuple[str, ...]]  # with which the names of its coefficients begin
     description: eqx.AbstractClassVar[str]  # of one coefficient
-    unit: eqx.AbstractClassVar[str]  # of its coefficients, for a revolute joint
     rows: eqx.AbstractClassVar[int]  # of `values`: 3 for a function of gravity, one for each component of its direction
 
     @abc.abstractmethod
@@ -55,6 +54,10 @@ class AbstractCorrection(eqx.Module):
     @abc.abstractmethod
     def wrong(self, term: "Term", joints: int) -> str:
         """What is wrong with a term of this kind for an arm of so many joints, in a few words; empty if nothing is."""
+
+    @abc.abstractmethod
+    def unit_of(self, term: "Term") -> str:
+        """Unit of a term's coefficient: of a revolute joint; in place of rad, mm of a prismatic one."""
 
     @abc.abstractmethod
     def values(
@@ -90,6 +93,11 @@ class Term(NamedTuple):
     def name(self) -> str:
         """The coefficient's name as a parameter."""
         return f"{self.word}{self.number or ''}_{self.joint}"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the coefficient."""
+        return self.kind.unit_of(self)
 
     @property
     def rows(self) -> int:
