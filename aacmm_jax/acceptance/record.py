@@ -198,7 +198,7 @@ def _divided(arm: Arm, capture: Capture, known: Collection[bytes]) -> Capture:
 def check_geometry(arm: Arm, capture: Capture) -> None:
     """Raise `InputError` where observations do not determine their own unknowns."""
     space = to_numpy(Parameters(arm, ("d_1",)))
-    check_observed(Observed.of(capture), space, np.asarray(space.vector()), 0)
+    check_observed(Observed.of(capture, arm), space, np.asarray(space.vector()), 0)
 
 
 def made_for(recording: Recording) -> tuple[Standard, ...]:
@@ -218,9 +218,11 @@ def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:
 
 
 def _same(one: Arm, other: Arm) -> bool:
-    """Whether two arms have the same parameters; an arm without beta is one whose beta is zero."""
+    """Whether two arms have the same parameters; without beta it is 0. A model of its joints may come
+    with a calibration."""
 
     def parameters(arm: Arm) -> Geometry:
-        return arm.geometry._replace(beta=np.zeros(arm.joints) if arm.beta is None else arm.beta)
+        plain = arm.geometry._replace(coefficients=None, gravity=None, corrections=None)
+        return plain._replace(beta=np.zeros(arm.joints) if arm.beta is None else arm.beta)
 
     return jax.tree.all(jax.tree.map(np.array_equal, parameters(one), parameters(other)))

@@ -27,7 +27,7 @@ from .checks import check_enough
 from .chunks import cut_into_chunks, default_workers, devices_of, round_up, run_chunks
 from .observed_batch import solve_observed
 from .results import ManyCalibrations, ManyIdentifications
-from .scale_anchor import ScaleAnchor, scale_anchor
+from .scale_anchor import ScaleAnchor, default_method, scale_anchor, scale_from_slides
 from .second_stage import divide_by_k, fix_scale_many, select_problems
 
 # Slots per loop. On a CPU the Jacobian columns of all slots should fit the second-level cache (measured from 20 to
@@ -117,7 +117,8 @@ def calibrate_many(
 
     Args:
         arm: As for `identify_many`, like all arguments that are not named here.
-        capture: Readings and at least one reference length, or another observation that fixes the scale.
+        capture: Readings and at least one reference length, another observation that fixes the scale, or slides of
+            prismatic joints that do.
         method: "two-stage" or "joint", as in `calibrate`; with ``covariance`` it is joint.
 
     Returns:
@@ -127,8 +128,10 @@ def calibrate_many(
         InputError: As `identify_many`, and where nothing fixes the scale.
     """
     given = BatchOptions(**options)
-    general = bool(capture.observations) or given.robust is not None or given.covariance
-    method = ("joint" if general else "two-stage") if method is None else method
+    _, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)
+    by_slides = scale_from_slides(arm, capture, space, given.noise)
+    general = bool(capture.observations) or given.robust is not None or given.covariance or by_slides
+    method = default_method(arm, general) if method is None else method
     if not isinstance(method, str) or method not in ("two-stage", "joint"):
         raise InputError(f"method is {shown(method)}; it must be 'two-stage' or 'joint'.")
     if method == "two-stage" and general:
@@ -136,7 +139,7 @@ def calibrate_many(
             "method='two-stage' is for sockets and reference lengths, without a robust loss and covariances; use "
             "method='joint'."
         )
-    if not capture.lengths and not any(observation.fixes_scale for observation in capture.observations):
+    if not capture.lengths and not by_slides and not any(one.fixes_scale for one in capture.observations):
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many."
         )
@@ -253,7 +256,7 @@ class BatchTask(NamedTuple):
         """Everything checked and laid out. ``anchor`` is one that is known; ``sigma`` is of a joint solve, see
         `Problems`."""
         problems, batched, size = _lay_out(arm, capture, bounds, start, space, sigma)
-        anchor = scale_anchor(space, arm, options.hold, options.noise) if anchor is None else anchor
+        anchor = scale_anchor(space, arm, options.hold, options.noise, capture) if anchor is None else anchor
         check_joints(capture, space)
         _check_options(arm, options)
         check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))

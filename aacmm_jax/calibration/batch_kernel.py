@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..core.numpy_or_jax import AnyArray
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import with_values
-from ..kinematics.chain import Geometry, SinesCosines, forward_pass, sines_cosines
+from ..kinematics.chain import Geometry, JointMotion, forward_pass, joint_motion
 from ..kinematics.jacobian import tip_and_columns
 from ..model.measurement import Measurement
 from ..model.metrics import repeatability
@@ -70,7 +70,7 @@ def solve_chunk(
     problems: Problems, count: Int[Array, ""], noise: Noise | None, shape: Shape, capacity: int
 ) -> tuple[Any, ...]:
     """Solve the first ``count`` of ``capacity`` problems; the fields of `ManyIdentifications` up to ``active``."""
-    batch = _Batch(problems, sines_cosines(problems.q), None, None)
+    batch = _Batch(problems, joint_motion(problems.geometry, problems.q), None, None)
     start = jnp.broadcast_to(problems.start, (capacity, len(shape.solved)))
     if noise is not None:
         batch = batch._replace(weights=_in_groups(partial(_weights, noise), batch, start, shape))
@@ -85,17 +85,17 @@ class _Batch(NamedTuple):
     """A chunk, or a group of problems selected from it."""
 
     problems: Problems
-    sines_cosines: SinesCosines
+    motion: JointMotion
     weights: Weights | None  # of poses, where the noise is given
     joint_weights: tuple[Any, Any] | None  # of a joint solve: sigma and whitening
 
     def selected(self, shape: Shape, index: Int[Array, " w"]) -> "_Batch":
         """The problems of an index, one a slot."""
-        sines_cosines = self.sines_cosines
+        motion = self.motion
         if shape.batched.q:
-            sines_cosines = (sines_cosines[0][:, index], sines_cosines[1][:, index])
+            motion = jax.tree.map(lambda leaf: leaf[:, index], motion)
         rest = jax.tree.map(lambda leaf: leaf[index], (self.weights, self.joint_weights))
-        return _Batch(_selected(self.problems, shape, index), sines_cosines, *rest)
+        return _Batch(_selected(self.problems, shape, index), motion, *rest)
 
 
 def _selected(problems: Problems, shape: Shape, index: Int[Array, " w"]) -> Problems:
@@ -137,7 +137,7 @@ def _solve_all(batch: _Batch, shape: Shape, count: Int[Array, ""], capacity: int
         joint_weights = (
             None if part.joint_weights is None else JointWeights(shape.ends, problems.nominal, *part.joint_weights)
         )
-        tip, columns = tip_and_columns(geometry, part.sines_cosines, indices)
+        tip, columns = tip_and_columns(geometry, part.motion, indices)
         return normal_equations(tip, columns, shape.sizes, joint_weights, part.weights)
 
     def more(carry) -> Bool[Array, ""]:
@@ -181,7 +181,7 @@ def _with_parameters(rows: Geometry, vector: Float[AnyArray, "w p"], indices: tu
 
 def _tips(part: _Batch, parameters: Float[AnyArray, "w p"], shape: Shape) -> Float[AnyArray, "w N 3"]:
     geometry = _with_parameters(part.problems.geometry, parameters, shape.indices)
-    return jnp.swapaxes(forward_pass(geometry, part.sines_cosines).tip, -1, -2)
+    return jnp.swapaxes(forward_pass(geometry, part.motion).tip, -1, -2)
 
 
 def _measurement(
@@ -189,7 +189,7 @@ def _measurement(
 ) -> Measurement:
     """The lengths of one problem; its poses are known by their tips already."""
     empty = jnp.zeros((sum(shape.sizes), 1))
-    return Measurement(empty, sines_cosines(empty), nominal, u, shape.sizes, shape.ends, weights)
+    return Measurement(empty, JointMotion(empty, empty, None), nominal, u, shape.sizes, shape.ends, weights)
 
 
 def _metrics(part: _Batch, parameters: Float[AnyArray, "w p"], shape: Shape) -> tuple[Any, ...]:
@@ -210,7 +210,7 @@ def _metrics(part: _Batch, parameters: Float[AnyArray, "w p"], shape: Shape) -> 
 def _weights(noise: Noise, part: _Batch, start: Float[AnyArray, "w p"], shape: Shape) -> Weights:
     """Weights of poses by the noise, in the arm at the start of one group."""
     geometry = _with_parameters(part.problems.geometry, start, shape.indices)
-    return Weights.of(tip_covariances(geometry, part.sines_cosines, noise), shape.sizes)
+    return Weights.of(tip_covariances(geometry, part.motion, noise), shape.sizes)
 
 
 def _joint_weights(part: _Batch, start: Float[AnyArray, "w p"], shape: Shape) -> tuple[Any, Any]:

@@ -8,7 +8,7 @@ from ..core.arrays import is_concrete
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray
 from ..data.capture import Capture
-from ..data.noise import Noise
+from ..data.noise import Noise, at_tip
 from ..kinematics.arm import Arm, is_single
 from ..kinematics.parameters import Bounds
 from ..kinematics.workspace import total_link_length
@@ -92,6 +92,5 @@ def largest_plausible_residual(arm: Arm, noise: Noise | None = None) -> float:
     size = total_link_length(arm)
     scatter = _RELATIVE_REPEATABILITY * size
     if noise is not None:
-        encoder = float(np.sqrt(np.mean(np.asarray(noise.encoder) ** 2)))
-        scatter = max(scatter, math.sqrt(3) * math.hypot(encoder * size, float(noise.seating)))
+        scatter = max(scatter, math.sqrt(3) * math.hypot(*at_tip(noise, arm, size)))
     return _IMPLAUSIBLE * scatter

@@ -93,7 +93,7 @@ def _regions(q: Float[np.ndarray, "m n"]) -> np.ndarray:
 def _determines(capture: Capture, parameters: int) -> bool:
     """Whether the scale is determined, and enough rows are there for the parameters and the geometry."""
     fixed = bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
-    observed = Observed.of(capture)
+    observed = Observed.of(capture, None)
     return fixed and observed.equations >= parameters + len(observed.steps)
 
 

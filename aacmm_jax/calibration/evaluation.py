@@ -67,7 +67,7 @@ def evaluate(
     work: Callable
     if capture.observations:
         check_finite(noise=noise)
-        observed = Observed.of(capture)
+        observed = Observed.of(capture, arm)
         kept = checked_geometry(observed, geometry)
         subject, work = (observed, len(capture.names), *to_numpy((kept, noise))), _evaluate_observed
     elif geometry is not None or noise is not None:
@@ -76,7 +76,7 @@ def evaluate(
             "position is the mean of its poses."
         )
     else:
-        subject, work = (Measurement.of(capture),), evaluate_measurement
+        subject, work = (Measurement.of(capture, arm),), evaluate_measurement
     shape = np.broadcast_shapes(*(leaf.shape[:-1] for leaf in jax.tree.leaves(arm)))
     if not shape:
         return to_jax(work(*to_numpy((arm, *subject))))

@@ -76,7 +76,8 @@ def equations_of(record: CalibrationRecord) -> Equations:
 def _of_sockets(record: CalibrationRecord, extra: tuple[str, ...]) -> list[Rows]:
     """Of sockets whose positions are eliminated: thousands of them must not take seconds."""
     capture = record.recording.capture
-    arm, measurement, noise = to_numpy((record.calibrated.arm, Measurement.of(capture), record.noise))
+    arm = record.calibrated.arm
+    arm, measurement, noise = to_numpy((arm, Measurement.of(capture, arm), record.noise))
     names = tuple(name for name in record.names if name != scale_anchor_of(record))
     every = (*names, *(name for name in extra if name not in names))
     slopes = np.asarray(arm.jacobian(measurement.q, every)) * np.asarray(Parameters(arm, every).scale)
@@ -98,7 +99,8 @@ def _of_sockets(record: CalibrationRecord, extra: tuple[str, ...]) -> list[Rows]
 
 def _of_observations(record: CalibrationRecord, extra: tuple[str, ...]) -> tuple[list[Rows], list[Block]]:
     assert record.observed is not None
-    observed, arm, noise = to_numpy((Observed.of(record.recording.capture), record.calibrated.arm, record.noise))
+    arm = record.calibrated.arm
+    observed, arm, noise = to_numpy((Observed.of(record.recording.capture, arm), arm, record.noise))
     names = tuple(name for name in record.names if name != record.hold)
     every = (*names, *(name for name in extra if name not in names))
     space, p, free = Parameters(arm, every), len(every), len(names)

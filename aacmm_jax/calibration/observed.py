@@ -78,9 +78,9 @@ def observed_task(
     fixed = bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
     if fixed and hold == "longest":
         hold = None
-    anchor = scale_anchor(space, space.base, hold, noise) if not fixed or hold else NO_ANCHOR
+    anchor = scale_anchor(space, space.base, hold, noise, capture) if not fixed or hold else NO_ANCHOR
     noise_model = check_noise_model(noise_model, noise, arm.joints)
-    observed = Observed.of(capture)
+    observed = Observed.of(capture, space.base)
     if is_concrete(*jax.tree.leaves((arm, capture, vector))):
         known, at = to_numpy((space, vector))
         check_observed(observed, known, at, len(space.names) - (anchor.hold is not None))
@@ -107,7 +107,7 @@ def configurations(q: Any) -> tuple[int, ...]:
 def check_observed(observed: Observed, space: Parameters, vector: Float[AnyArray, " p"], count: int) -> None:
     """Raise `InputError` where the observations cannot determine their own unknowns, or these parameters."""
     geometry = space.geometry(vector)
-    forward = forward_pass(geometry, observed.sines_cosines)
+    forward = forward_pass(geometry, observed.motion)
     for observation, rows in zip(observed.observations, observed.slices, strict=True):
         observation.check_determined(np.asarray(forward.tip[:, rows]))
     _check_targets(observed, forward)

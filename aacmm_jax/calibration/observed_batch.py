@@ -69,8 +69,8 @@ def solve_observed(
     first_space = Parameters(first[0], space.names)
     fixed = bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
     hold = None if fixed and options.hold == "longest" else options.hold
-    anchor = scale_anchor(space, arm, hold, noise) if not fixed or hold else NO_ANCHOR
-    observed = Observed.of(first[1])
+    anchor = scale_anchor(space, arm, hold, noise, first[1]) if not fixed or hold else NO_ANCHOR
+    observed = Observed.of(first[1], first[0])
     check_observed(observed, first_space, first[2], len(space.names) - (anchor.hold is not None))
     form = _Form(
         names=space.names,
@@ -139,7 +139,7 @@ def _solve_one(
     """One problem, traced: the fields of `ManyIdentifications`."""
     bounds = Bounds(Parameters(arm, form.names), lower, upper)
     task = ObservedTask(
-        observed=Observed.of(capture),
+        observed=Observed.of(capture, arm),
         bounds=bounds,
         start=jax.numpy.clip(start, lower, upper),
         noise=noise,

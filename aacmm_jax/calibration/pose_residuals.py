@@ -47,7 +47,7 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
     if metrics is None:
         return ()
     capture, arm = record.recording.capture, to_numpy(record.calibrated.arm)
-    observed, space = Observed.of(capture), Parameters(arm, record.names)
+    observed, space = Observed.of(capture, arm), Parameters(arm, record.names)
     vector = np.asarray(space.vector())
     geometry = np.concatenate([np.asarray(metrics.geometry[part]) for part in observed.blocks])
     z = np.concatenate([vector, geometry])

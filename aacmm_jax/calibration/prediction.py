@@ -19,7 +19,7 @@ from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.noise import tip_covariances
-from ..kinematics.chain import sines_cosines
+from ..kinematics.chain import joint_motion
 from ..model.observed import Observed, certified_and_lengths, linear_rows
 from ..model.socket_sums import means_over_sockets, sums_over_sockets
 from ..uncertainty.arm_uncertainty import Uncertainty
@@ -141,7 +141,8 @@ def _of_sockets(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
     """Of sockets and reference lengths: every position is a mean, so nothing is as large as all poses together."""
     arm, owner, sizes = uncertainty.arm, capture.owner, np.asarray(capture.sizes, dtype=float)
     tips, slopes = np.asarray(arm.position(capture.q)), np.asarray(uncertainty.derivatives(capture.q))
-    noise = np.moveaxis(np.asarray(tip_covariances(arm.geometry, sines_cosines(capture.q), uncertainty.noise)), -1, 0)
+    motion = joint_motion(arm.geometry, capture.q)
+    noise = np.moveaxis(np.asarray(tip_covariances(arm.geometry, motion, uncertainty.noise)), -1, 0)
 
     def over(sums: Any, values: np.ndarray) -> np.ndarray:
         return np.moveaxis(np.asarray(sums(np.moveaxis(values, 0, -1), capture.sizes)), -1, 0)
@@ -191,7 +192,7 @@ def _of_observations(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors
     the parameters and w of the rows leave K (A dp + w) with K = I - U U^T. In mm, with D the inverse of the whitening,
     V = D (K + K A C A^T K) D^T = D (I + W S W^T) D^T, where W = [U, K A] and S = diag(-I, C).
     """
-    observed = Observed.of(capture)
+    observed = Observed.of(capture, uncertainty.arm)
     fitted = fit_geometry(uncertainty.arm, observed, {}, uncertainty.noise)
     space = uncertainty.space
     p = len(space.names)

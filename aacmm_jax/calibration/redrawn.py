@@ -21,6 +21,7 @@ from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.shifted import ShiftedObservation
 from ..kinematics.arm import Arm
+from ..kinematics.chain import reading_units
 from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..model.observed import Linear, Observed, linear_rows
@@ -44,13 +45,16 @@ def trials_of(result: Calibration, capture: Capture, noise: Noise, u: Float[np.n
     # Poses that hold their socket exactly, and the least change of the joints for each mm that the tip shall move.
     exact = project_to_centroids(result.arm, capture)
     by_joints = np.asarray(result.arm.jacobian(exact, [f"q_{i}" for i in range(1, result.arm.joints + 1)]))
-    moves = np.linalg.pinv(by_joints, rcond=1e-8)
+    units = reading_units(result.arm.geometry)
+    moves = units[:, None] * np.linalg.pinv(by_joints * units, rcond=1e-8)
     true_lengths = np.asarray(_lengths_by(result.arm, capture))
 
     def drawn(count: int, random: np.random.Generator, level: Any) -> Capture:
         seats = float(noise.seating) * level * random.normal(size=(count, *exact.shape[:1], 3))
         readings = exact + np.einsum("Nic,tNc->tNi", moves, seats)
-        readings += np.asarray(noise.encoder) * level * random.normal(size=readings.shape)
+        readings += (
+            np.asarray(noise.of_readings(result.arm.geometry.kinds)) * level * random.normal(size=readings.shape)
+        )
         return batch_of_captures(capture, readings, true_lengths + u * random.normal(size=(count, len(u))))
 
     return Trials(exact.size, drawn)
@@ -83,7 +87,7 @@ class ObservedTruth(NamedTuple):
     @classmethod
     def at(cls, capture: Capture, space: Parameters, vector: Any, geometry: Mapping[str, Any]) -> "ObservedTruth":
         """By the arm with these parameters, and the geometry by the names of its parts."""
-        observed, space = to_numpy((Observed.of(capture), space))
+        observed, space = to_numpy((Observed.of(capture, space.base), space))
         numbers = [np.asarray(geometry[name]) for name in observed.blocks]
         z = np.concatenate([np.asarray(vector), *numbers])
         p = len(space.names)
@@ -106,7 +110,8 @@ class ObservedTruth(NamedTuple):
     def drawn(self, count: int, noise: Noise, random: np.random.Generator, level: Any = 1.0) -> Capture:
         """A batch of captures with new errors; ``level`` (t, 1, 1) multiplies the noise of readings and seat."""
         q = np.asarray(self.observed.q)
-        read = np.asarray(noise.encoder) * level * random.normal(size=(count, self.reading.max() + 1, q.shape[1]))
+        encoder = np.asarray(noise.of_readings(self.errors[0].kinds))
+        read = encoder * level * random.normal(size=(count, self.reading.max() + 1, q.shape[1]))
         values = self.values(count, random)
         errors = self.errors_of_rows(count, level * float(noise.seating), random)
         found = []
@@ -179,7 +184,7 @@ def truth_of(result: Calibration, capture: Capture) -> ObservedTruth:
     """The arm and the geometry of a calibration. Raises `InputError` where it is of another capture."""
     assert result.observed is not None
     geometry = result.observed.geometry
-    missing = [name for name in Observed.of(capture).blocks if name not in geometry]
+    missing = [name for name in Observed.of(capture, None).blocks if name not in geometry]
     if missing:
         raise InputError(
             f"the calibration knows nothing of the {missing[0]}; give the capture that it was identified from."

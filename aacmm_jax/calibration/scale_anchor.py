@@ -1,7 +1,14 @@
-"""The scale anchor of stage 1: a free length kept at its start, or fixed lengths that determine the scale well."""
+"""The scale anchor of stage 1: a free length kept at its start, or what determines the scale well without one.
+
+Repeatability does not determine the scale of an arm whose lengths are all free: with every length times k, all tips are
+where they were times k. That ends where something in mm stays as it is. A fixed length is judged by how far tips move
+under a relative change of it, once the free parameters have adapted. Readings of prismatic joints are judged by how
+well the longest free length is determined without an anchor, which depends on the poses: a linear axis that stands
+still says nothing, and neither does the quill of a SCARA, which has one height in every pose of a socket.
+"""
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -10,8 +17,10 @@ from jaxtyping import Float
 from ..core.arguments import shown
 from ..core.arrays import is_concrete
 from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
-from ..data.noise import Noise
+from ..data.capture import Capture
+from ..data.noise import Noise, at_tip
 from ..kinematics.arm import (
     Arm,
     is_length,
@@ -22,13 +31,20 @@ from ..kinematics.arm import (
     parameter_names,
     value_of,
 )
+from ..kinematics.independence import PosesInSockets, equations, generic_poses
+from ..kinematics.inverse_kinematics import SocketPoses, project_to_centroids
 from ..kinematics.parameters import Parameters, based_on
 from ..kinematics.workspace import total_link_length
 from ..model.scale import Partners
 
-# Fixed lengths set the scale where repeatability with them would determine it to this relative standard uncertainty ...
+# Fixed lengths and slides set the scale where repeatability with them would determine it to this relative standard
+# uncertainty ...
 _LARGEST_UNCERTAINTY = 1e-4
-# ... with 200 equations to spare (about 70 poses) and, where the noise is not given, tips that scatter by so many mm.
+# ... and slides contradict an anchor, if its start is wrong by its tolerance, where they would determine it to this: no
+# length is kept then, also where reference lengths are needed besides. (With all lengths free the scale comes out
+# smaller by degrees of freedom times its relative variance: here 2e-4 at most, a fifth of its uncertainty.)
+_LARGEST_OF_SLIDES = 1e-3
+# Both with 200 equations to spare (about 70 poses) and, where the noise is not given, tips that scatter by so many mm.
 _EQUATIONS = 200
 _SCATTER = 0.02
 _CONFIGURATIONS = 100
@@ -43,8 +59,11 @@ class ScaleAnchor(NamedTuple):
     # Length that stage 2 adjusts where it has to identify again; None without a free length, or where neither an anchor
     # nor the values of the arm are known.
     adjusted: str | None
-    set_by: tuple[str, ...]  # fixed lengths that determine the scale well, so that stage 2 changes nothing
-    # Fixed lengths that free ones replace exactly in stage 2; None where some have no such partner, or are not known.
+    # Fixed lengths, and readings ``q_i`` of prismatic joints, that determine the scale well, so that stage 2 changes
+    # nothing.
+    set_by: tuple[str, ...]
+    # Fixed lengths that free ones replace exactly in stage 2; None where some have no such partner, as slides have not,
+    # or are not known.
     partners: Partners | None
 
     @property
@@ -53,14 +72,21 @@ class ScaleAnchor(NamedTuple):
         return not self.set_by and self.adjusted is not None
 
 
-def scale_anchor(space: Parameters, arm: Arm, hold: str | None, noise: Noise | None = None) -> ScaleAnchor:
+def scale_anchor(
+    space: Parameters,
+    arm: Arm,
+    hold: str | None,
+    noise: Noise | None = None,
+    capture: SocketPoses | None = None,
+) -> ScaleAnchor:
     """What sets the scale of stage 1.
 
-    ``hold`` names a free length, or is None for no anchor. "longest" is the longest free link, but for one case: no
-    anchor where fixed lengths determine the scale well, to 1e-4 by repeatability alone (0.02 mm, 70 poses). It is
-    judged by how much a common change of these lengths moves the tips once the free parameters have adapted: d_3 = 750
-    mm, known from a drawing, sets the scale; probe_x = 0.6 mm does not, and d_7 with a free probe along the same axis
-    not at all.
+    ``hold`` names a free length, or is None for no anchor. "longest" is the longest free link, but for two cases: no
+    anchor where fixed lengths determine the scale well, to 1e-4 by repeatability alone (0.02 mm, 70 poses), or slides
+    of prismatic joints to 1e-3. d_3 = 750 mm, known from a drawing, sets the scale; probe_x = 0.6 mm does not, and d_7
+    with a free probe along the same axis not at all.
+
+    ``capture`` is where slides are judged; by default, or where its readings are traced, poses all over the workspace.
 
     Raises `InputError` for an angle, a parameter that is not free, or "longest" with an arm whose values are traced.
     """
@@ -80,22 +106,48 @@ def scale_anchor(space: Parameters, arm: Arm, hold: str | None, noise: Noise | N
         raise InputError(
             "hold='longest' needs an arm with known values; where the arm itself is traced, name the length to hold."
         )
-    fixed = fixed_lengths(arm, space)
-    one = _first(arm) if known and fixed else None
-    columns = None if one is None else _columns_of_both(one, space, fixed)
-    set_by = ()
-    if one is not None and columns is not None and hold in (None, "longest"):
-        set_by = fixed if _sets_scale(one, columns, space, fixed, noise) else ()
+    fixed, slides = fixed_lengths(arm, space), tuple(f"q_{i}" for i in arm.prismatic)
+    one = _first(arm) if known and (fixed or slides) else None
+    set_by, free_of_anchor = (), False
     longest = _longest_link(lengths, arm if known else None)
+    if one is not None and longest is not None and hold in (None, "longest"):
+        poses = _known_poses(one, capture) if slides else None
+        scaling = _of_lengths(one, space, fixed) if poses is None else _of_slides(one, space, longest, poses)
+        least = min(_left_of_scaling(*part) for part in scaling)
+        u = _scatter(one, noise) / (math.sqrt(_EQUATIONS) * max(least, 1e-300))
+        moving = () if poses is None else tuple(name for name in slides if _slides(poses, name))
+        set_by = (moving or fixed) if u <= _LARGEST_UNCERTAINTY else ()
+        free_of_anchor = bool(slides) and u <= _LARGEST_OF_SLIDES
     if hold == "longest":
-        hold = None if set_by else longest
-    partners = _partners(arm, columns, space, fixed) if columns is not None else None if fixed else ((), ())
+        hold = None if set_by or free_of_anchor else longest
+    partners = None if fixed or slides else ((), ())
+    if one is not None and not slides:
+        partners = _partners(arm, _columns_of_both(one, space, fixed), space, fixed)
     adjusted = hold if hold is not None and _carries_scale(hold, longest, arm if known else None) else longest
     return ScaleAnchor(hold, None if hold is None and not known else adjusted, set_by, partners)
 
 
+def default_method(arm: Arm, general: bool) -> Literal["two-stage", "joint"]:
+    """How an arm is calibrated where nobody says: in two stages, but at once where more than lengths fixes the scale.
+
+    ``general``: whether there are observations besides sockets and lengths, or a robust loss.
+    """
+    return "joint" if general or arm.prismatic else "two-stage"
+
+
+def scale_from_slides(arm: Arm, capture: Capture, space: Parameters, noise: Noise | None) -> bool:
+    """Whether slides of prismatic joints determine the scale of a capture that has nothing else to fix it."""
+    if not arm.prismatic or capture.lengths or any(observation.fixes_scale for observation in capture.observations):
+        return False
+    return bool(space.lengths.any()) and scale_anchor(space, arm, "longest", noise, capture).hold is None
+
+
 def scale_set_by_clause(names: tuple[str, ...]) -> str:
-    """The beginning of a warning about fixed lengths that set the scale."""
+    """The beginning of a warning about fixed lengths, or slides, that set the scale."""
+    slides = [name.removeprefix("q_") for name in names if name.startswith("q_")]
+    if slides:
+        joints = "joint" if len(slides) == 1 else "joints"
+        return f"the readings of {joints} {', '.join(slides)} in mm already set the scale"
     verbs = "is fixed and already sets" if len(names) == 1 else "are fixed and already set"
     return f"{shorten(names)} {verbs} the scale"
 
@@ -112,7 +164,12 @@ def _longest_link(lengths: list[str], arm: Arm | None) -> str | None:
     links = [name for name in lengths if not name.startswith("probe") and name != "d_1"] or lengths
     if not links or arm is None:
         return links[0] if links else None
-    return max(links, key=lambda name: np.abs(value_of(arm, name)).max())
+
+    def size(name: str) -> float:
+        return float(np.abs(value_of(arm, name)).max())
+
+    # The links of a gantry are slides, and all that scales with the wrist may be the probe.
+    return max(links if any(map(size, links)) else lengths, key=size)
 
 
 def _carries_scale(name: str, longest: str | None, arm: Arm | None) -> bool:
@@ -143,31 +200,59 @@ def _columns_of_both(arm: Arm, space: Parameters, fixed: tuple[str, ...]) -> lis
     return found
 
 
-def _sets_scale(
-    arm: Arm, columns: list[np.ndarray], space: Parameters, fixed: tuple[str, ...], noise: Noise | None
-) -> bool:
-    """Whether repeatability determines the scale well, given the fixed lengths.
+def _of_lengths(arm: Arm, space: Parameters, fixed: tuple[str, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """How the free parameters, and a common relative change of the fixed lengths, move the tips: rows of both, mm, at
+    the nominal arm and at a neighbouring one."""
+    values, split = np.array([value_of(arm, name) for name in fixed]), len(space.names)
+    steps = natural_steps(space.names)
+    return [(rows[:, :split] * steps, rows[:, split:] @ values) for rows in _columns_of_both(arm, space, fixed)]
 
-    A common relative change of the fixed lengths is imitated by the free parameters as well as they can; the residual,
-    in mm at the tip, is what repeatability sees of the scale. The nominal arm may be in a special position that the
-    real one does not share, so the smaller of two residuals counts: at the nominal arm, and at a neighbouring one.
+
+def _of_slides(arm: Arm, space: Parameters, longest: str, poses: SocketPoses) -> list[tuple[np.ndarray, np.ndarray]]:
+    """How the other free parameters, and a relative change of the longest length, move the tips of every socket apart:
+    at the poses of a capture, brought to their sockets."""
+    others, found = [name for name in space.names if name != longest], []
+    with jax.ensure_compile_time_eval():
+        for one in (to_numpy(arm), neighbouring_arm(arm, space.names)):
+            rows, _ = equations(one, poses, (*others, longest), project_to_centroids(one, poses, targets_of=arm))
+            rows = rows.reshape(-1, len(space.names))
+            found.append((rows[:, :-1] * natural_steps(others), rows[:, -1] * value_of(arm, longest)))
+    return found
+
+
+def _known_poses(arm: Arm, capture: SocketPoses | None) -> SocketPoses:
+    """The poses of a capture, of the first of a batch of captures; else poses all over the workspace."""
+    if capture is not None and capture.sizes and is_concrete(capture.q):
+        q = np.asarray(capture.q)
+        return PosesInSockets(q.reshape(-1, *q.shape[-2:])[0], tuple(capture.sizes))
+    if arm.limits is None:
+        prismatic = np.isin(np.arange(1, arm.joints + 1), arm.prismatic)
+        arm = arm.replace(limits=np.where(prismatic[:, None], [-500.0, 500.0], [-np.pi, np.pi]).tolist())
+    with jax.ensure_compile_time_eval():
+        return generic_poses(arm)
+
+
+def _slides(poses: SocketPoses, name: str) -> bool:
+    """Whether the readings of a prismatic joint, ``q_i``, differ by more than 1 mm."""
+    return float(np.ptp(np.asarray(poses.q)[:, int(name[2:]) - 1])) > 1.0
+
+
+def _left_of_scaling(free: Float[np.ndarray, "rows k"], scaling: Float[np.ndarray, " rows"]) -> float:
+    """What repeatability sees of the scale, mm RMS for a relative change of 1.
+
+    A change of what scales is imitated by the free parameters as well as they can; the residual is what is left. The
+    nominal arm may be in a special position that the real one does not share, so the smaller of two residuals counts:
+    at the nominal arm, and at a neighbouring one.
     """
-    sizes = []
-    values = np.array([value_of(arm, name) for name in fixed])
-    for rows in columns:
-        free = rows[:, : len(space.names)] * natural_steps(space.names)
-        scaling = rows[:, len(space.names) :] @ values
-        residual = scaling - free @ np.linalg.lstsq(free, scaling, rcond=1e-10)[0]
-        sizes.append(float(np.sqrt(np.mean(residual**2))))
-    return _scatter(arm, noise) <= _LARGEST_UNCERTAINTY * math.sqrt(_EQUATIONS) * min(sizes)
+    residual = scaling - free @ np.linalg.lstsq(free, scaling, rcond=1e-10)[0]
+    return float(np.sqrt(np.mean(residual**2)))
 
 
 def _scatter(arm: Arm, noise: Noise | None) -> float:
     """Standard deviation of a tip coordinate, mm, as the noise has it for a tip at half of the arm's reach."""
     if noise is None or not is_concrete(noise.encoder, noise.seating):
         return _SCATTER
-    encoder = float(np.sqrt(np.mean(np.asarray(noise.encoder) ** 2)))
-    return math.hypot(encoder * total_link_length(arm) / 2, float(noise.seating))
+    return math.hypot(*at_tip(noise, arm, total_link_length(arm) / 2))
 
 
 def _partners(arm: Arm, columns: list[np.ndarray], space: Parameters, fixed: tuple[str, ...]) -> Partners | None:

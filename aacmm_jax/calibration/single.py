@@ -29,7 +29,7 @@ from .bounded_fit import Fit, fit
 from .checks import check_enough, check_noise_model, check_single, check_start
 from .observed import ObservedTask, calibrate_observed, identify_observed, observed_task
 from .results import Calibration, Identification
-from .scale_anchor import scale_anchor, scale_set_by_clause
+from .scale_anchor import default_method, scale_anchor, scale_from_slides, scale_set_by_clause
 from .second_stage import adjust_anchor, clip_to_bounds, divide_by_k, must_adjust_anchor
 from .task import Task, fit_repeatability
 
@@ -61,10 +61,11 @@ def identify(
 
     Args:
         arm: the arm to identify; its values are the start, and the fixed parameters stay as it has them.
-        capture: joint readings by socket, rad.
+        capture: joint readings by socket, rad, or mm of prismatic joints.
         bounds: box of the free parameters ``(p,)``, mm and rad.
-        hold: the scale anchor. A free length by name; "longest", the longest free link, or none where fixed lengths
-            determine the scale well; None, no anchor, as in the paper (then expect active bounds).
+        hold: the scale anchor. A free length by name; "longest", the longest free link, or none where fixed lengths or
+            the slides of prismatic joints determine the scale well; None, no anchor, as in the paper (then expect
+            active bounds).
         start: free parameters ``(p,)`` to start from instead of the arm's, mm and rad.
         noise: standard deviations of readings and seat. Where given, every pose is weighted by the inverse covariance
             of its tip, and the covariance of the result follows from it; else both are estimated from the residuals.
@@ -113,8 +114,8 @@ def _prepare_task(
     # Repeatability does not determine the scale: where lengths are free, it determines one parameter less.
     check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
     noise_model = check_noise_model(noise_model, noise, arm.joints)
-    anchor = scale_anchor(space, space.base, hold, noise)
-    return Task(Measurement.of(capture), bounds, vector, noise, anchor, noise_model, max_steps)
+    anchor = scale_anchor(space, space.base, hold, noise, capture)
+    return Task(Measurement.of(capture, space.base), bounds, vector, noise, anchor, noise_model, max_steps)
 
 
 @checked_arguments
@@ -146,10 +147,12 @@ def calibrate(
 
     Args:
         arm: as for `identify`, like all arguments that are not named here.
-        capture: sockets, and at least one reference length, mm.
+        capture: sockets, and at least one reference length, mm; none is needed where the slides of prismatic joints
+            determine the scale.
         bounds: box of the free parameters ``(p,)``, mm and rad.
         method: "two-stage" or "joint"; by default two-stage, but joint where the capture has observations besides
-            sockets and lengths, or the loss is robust.
+            sockets and lengths, the arm has prismatic joints (whose readings say something about the scale too), or the
+            loss is robust.
         hold: the scale anchor of stage 1.
         start: free parameters ``(p,)`` to start from, mm and rad.
         noise: standard deviations of readings and seat.
@@ -166,15 +169,16 @@ def calibrate(
     Raises:
         InputError: as `identify` does, and without a reference length.
     """
-    general = bool(capture.observations) or robust is not None
-    method = ("joint" if general else "two-stage") if method is None else method
+    by_slides = scale_from_slides(arm, capture, bounds.space, noise)
+    general = bool(capture.observations) or robust is not None or by_slides
+    method = default_method(arm, general) if method is None else method
     if not isinstance(method, str) or method not in ("two-stage", "joint"):
         raise InputError(f"method is {shown(method)}; it must be 'two-stage' or 'joint'.")
     if method == "two-stage" and general:
         raise InputError(
-            "method='two-stage' is for sockets and reference lengths, without a robust loss; use method='joint'."
+            "method='two-stage' is for sockets with reference lengths, without a robust loss; use method='joint'."
         )
-    if not capture.lengths and not any(observation.fixes_scale for observation in capture.observations):
+    if not capture.lengths and not by_slides and not any(one.fixes_scale for one in capture.observations):
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, "
             "from Python, identify for stage 1 alone)."
@@ -222,8 +226,8 @@ def _check_scale(task: Task, method: str) -> None:
     """Warn where the reference lengths change nothing."""
     if method == "two-stage" and task.anchor.set_by and not inside_trace():
         sentence = (
-            f"{scale_set_by_clause(task.anchor.set_by)}, so the reference lengths change nothing; free one of these "
-            "lengths, or use both with method='joint'."
+            f"{scale_set_by_clause(task.anchor.set_by)}, so the reference lengths change nothing; "
+            f"{'' if task.space.base.prismatic else 'free one of these lengths, or '}use both with method='joint'."
         )
         warnings.warn(sentence, IdentifiabilityWarning, stacklevel=3)
 

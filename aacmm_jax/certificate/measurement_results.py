@@ -12,7 +12,7 @@ from ..calibration.pose_residuals import ObservationResiduals, distances_of, obs
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..data.capture import ReferenceLength
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
-from ..kinematics.arm import Arm, is_length, parameter_names
+from ..kinematics.arm import Arm, parameter_names, parameter_unit
 from ..kinematics.parameters import Parameters
 from ..summaries.observations import less_weight
 from .observation_results import add_observation_equipment, add_observations
@@ -44,6 +44,13 @@ class _Stage(NamedTuple):
     description: str
     arm: Arm
     evaluation: Evaluation
+
+
+# Metres and newtons only of compliances.
+_UNITS = {"mm": MILLIMETRE, "rad": RADIAN, "1": ONE}
+_UNITS |= {"rad/m": r"\radian\metre\tothe{-1}", "rad/(kN m)": r"\radian\kilo\newton\tothe{-1}\metre\tothe{-1}"}
+_UNITS |= {"mm/m": r"\milli\metre\metre\tothe{-1}"}
+_UNITS |= {"mm/(kN m)": r"\milli\metre\kilo\newton\tothe{-1}\metre\tothe{-1}"}
 
 
 def add_results(
@@ -258,7 +265,7 @@ def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, 
         add_english(quantity, "name", name)
         if note:
             add_english(quantity, "description", note)
-        add_real(quantity, value, MILLIMETRE if is_length(name) else RADIAN, u, factor)
+        add_real(quantity, value, _UNITS[parameter_unit(stage.arm, name)], u, factor)
 
 
 def _values(arm: Arm) -> dict[str, float]:

@@ -39,6 +39,14 @@ def calibrate(
         Literal["huber", "cauchy", "tukey"] | None,
         typer.Option(help="Robust loss, which takes weight from bad poses and lists them."),
     ] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KINDS",
+            help="What joints do besides their readings: dh,gravity,harmonics=1+2,gear,coupled=2-3. Default: the arm "
+            "file's; dh alone for nothing.",
+        ),
+    ] = None,
     scale: Annotated[
         Literal["measured", "nominal"],
         typer.Option(
@@ -170,6 +178,10 @@ def calibrate(
 
             part, others = draw_poses(recording.capture, only_poses, seed)
             recording = recording._replace(capture=part)
+        if model is not None:
+            from ..files.corrections import with_model
+
+            recording = recording._replace(nominal=with_model(recording.nominal, model))
         bounds = _bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])
         recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
         solving = {

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..core.text import pluralise, shorten
-from ..core.units import ARCSEC, DEG
+from ..core.units import ARCSEC, DEG, people_read
 from ..summaries.tables import METRICS, expanded_words, observed_words, quantity_words, volume_rows
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
@@ -22,15 +22,19 @@ def arm(summary: dict[str, Any]) -> None:
     """One arm: its table and what its file proposes."""
     console = new_console()
     beta = any(row["beta_rad"] is not None for row in summary["joints"])
+    slides = any(row["kind"] == "prismatic" for row in summary["joints"])
+    limits_of = "limits of the reading" if slides else "limits [deg]"
     table = new_table(
         f"{summary['name']} (standard D-H)",
-        "joint", "alpha [deg]", "a [mm]", "d [mm]", "theta [deg]", *(["beta [deg]"] if beta else []), "limits [deg]",
+        "joint", "alpha [deg]", "a [mm]", "d [mm]", "theta [deg]", *(["beta [deg]"] if beta else []), limits_of,
     )  # fmt: skip
     for row in summary["joints"]:
-        limits = row["limits_rad"]
+        limits, (factor, unit) = row["limits_rad"], (DEG, " deg" if slides else "")
+        if row["kind"] == "prismatic":
+            limits, factor, unit = row["limits_mm"], 1.0, " mm"
         angles = [row["alpha_rad"] / DEG, row["a_mm"], row["d_mm"], row["theta_rad"] / DEG]
         cells = [formatted(value) for value in angles] + ([formatted((row["beta_rad"] or 0.0) / DEG)] if beta else [])
-        cells.append("-" if limits is None else f"{limits[0] / DEG:.0f} to {limits[1] / DEG:.0f}")
+        cells.append("-" if limits is None else f"{limits[0] / factor:.0f} to {limits[1] / factor:.0f}{unit}")
         table.add_row(str(row["joint"]), *cells)
     print_table(console, table)
     console.print(
@@ -63,9 +67,14 @@ def capture(summary: dict[str, Any]) -> None:
         print_table(console, table)
     if summary["observations"]:
         _observations_of_capture(console, summary["observations"])
-    table = new_table("\nReadings", "joint", "lowest [deg]", "highest [deg]")
+    slides = any("lowest_mm" in row for row in summary["ranges"])
+    table = new_table("\nReadings", "joint", *(["lowest", "highest"] if slides else ["lowest [deg]", "highest [deg]"]))
     for row in summary["ranges"]:
-        table.add_row(str(row["joint"]), *(f"{row[key] / DEG:.3f}" for key in ("lowest_rad", "highest_rad")))
+        if "lowest_mm" in row:
+            table.add_row(str(row["joint"]), *(f"{row[key]:.3f} mm" for key in ("lowest_mm", "highest_mm")))
+            continue
+        unit = " deg" if slides else ""
+        table.add_row(str(row["joint"]), *(f"{row[key] / DEG:.3f}{unit}" for key in ("lowest_rad", "highest_rad")))
     print_table(console, table)
     if summary["lengths"]:
         table = new_table("\nReference lengths", "from", "to", "value [mm]", "u [mm]")
@@ -336,7 +345,7 @@ def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
         *("parameter", "unit", "nominal", "calibrated", "change", "u", "bound"),
     )
     for row in rows:
-        factor, unit = (1.0, "mm") if row["unit"] == "mm" else (1 / DEG, "deg")
+        factor, unit = people_read(row["unit"])
         nominal, value = factor * row["nominal"], factor * row["calibrated"]
         u = None if row["u"] is None else factor * row["u"]
         decimals = 9 if u == 0 else _decimals(u, 4)

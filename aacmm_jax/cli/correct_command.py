@@ -38,7 +38,10 @@ def correct(
     ],
     unit: Annotated[
         Literal["deg", "rad"] | None,
-        typer.Option(help="Of joint readings and rotation vectors; needed where the header does not say it (q_1_deg)."),
+        typer.Option(
+            help="Of joint readings and rotation vectors; needed where the header does not say it (q_1_deg). Readings "
+            "of prismatic joints are in mm."
+        ),
     ] = None,
     near: Annotated[
         str | None,
@@ -88,7 +91,7 @@ def correct(
             if len(tip) != 3:
                 bad_option("--probe", probe, "X,Y,Z in mm")
             nominal, calibrated = nominal.replace(probe=tip), calibrated.replace(probe=tip)
-        commanded = read_commanded_poses(InputFile(poses), nominal.joints, unit=unit, near=begin)
+        commanded = read_commanded_poses(InputFile(poses), nominal, unit=unit, near=begin)
         if commanded.poses is None:
             found = corrected_readings(nominal, calibrated, commanded.q)
         else:
@@ -135,6 +138,11 @@ def _display(summary: dict[str, Any]) -> None:
         console.print(
             f"Largest change of a reading: {largest['change_deg']:.4f} deg (joint {largest['joint']}, row "
             f"{largest['row']})."
+        )
+    if summary["largest_slide"] is not None:
+        slide = summary["largest_slide"]
+        console.print(
+            f"Largest change of a slide: {slide['change_mm']:.4f} mm (joint {slide['joint']}, row {slide['row']})."
         )
     if missed:
         shown = f", the first {_MOST_ROWS}, all by --json" if len(missed) > _MOST_ROWS else ""

@@ -8,3 +8,8 @@ UM = 1e-3  # mm
 DEG = math.pi / 180  # rad
 ARCMIN = math.pi / (180 * 60)  # rad
 ARCSEC = math.pi / (180 * 3600)  # rad
+
+
+def people_read(unit: str) -> tuple[float, str]:
+    """The unit in which people read a value, and the factor to it: degrees for radians, others as they are."""
+    return (1 / DEG, "deg") if unit == "rad" else (1.0, "" if unit == "1" else unit)

@@ -15,6 +15,7 @@ from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.text import shorten
+from ..kinematics.arm import Arm
 from .copies import NOTHING_REPEATED, Repeated, check_different, observation_without_copies, without_copies
 from .observations.observation import AbstractObservation, checked_name, checked_readings
 from .observations.socket import Socket
@@ -58,6 +59,10 @@ class ReferenceLength(eqx.Module):
             )
 
 
+# Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
+_MOST_RADIANS = 8 * np.pi
+
+
 class Capture(eqx.Module):
     """Poses grouped by the socket in which the tip rested, reference lengths between sockets, and other observations.
 
@@ -71,15 +76,16 @@ class Capture(eqx.Module):
     capture made of traced values, and a batch, keep their copies.
 
     Args:
-        sockets: Socket name -> joint readings, shape ``(m, n)``, rad; m poses may differ from socket to socket.
+        sockets: Socket name -> joint readings, shape ``(m, n)``, rad, or mm of prismatic joints; m poses may differ
+            from socket to socket.
         lengths: Reference lengths between these sockets, or one.
         observations: What else ties the tip down (`data.observations`): measured points, spheres, planes, artefacts.
         repeated: Copies that were left out of these data before.
         sessions: Names of the sessions of `join_sessions`; what belongs to one is named ``session/name``.
 
     Raises:
-        InputError: For names that are empty, longer than a line or given twice, readings that are not finite or look
-            like degrees, sockets or observations of different joint counts or with the same poses, and lengths that
+        InputError: For names that are empty, longer than a line or given twice, readings that are not finite,
+            sockets or observations of different joint counts or with the same poses, and lengths that
             join unknown sockets.
     """
 
@@ -386,3 +392,19 @@ def _form(observations: tuple[AbstractObservation, ...]) -> tuple[Any, ...]:
     """What observations must share to be stacked."""
     leaves, structure = jax.tree.flatten(observations)
     return structure, tuple(leaf.shape for leaf in leaves)
+
+
+def check_readings(capture: Capture, arm: Arm) -> None:
+    """Raise `InputError` where known readings of an arm's revolute joints look like degrees."""
+    angular = np.array([i not in arm.prismatic for i in range(1, arm.joints + 1)])
+    of_sockets = [(f"socket '{name}'", readings) for name, readings in capture.sockets.items()]
+    for where, readings in [*of_sockets, *((f"observation '{one.name}'", one.q) for one in capture.observations)]:
+        if not is_concrete(readings) or readings.shape[-1] != arm.joints:
+            continue
+        size = np.where(angular, np.abs(np.asarray(readings)), 0.0).reshape(-1, arm.joints)
+        if size.max() > _MOST_RADIANS:
+            row, column = np.argwhere(size == size.max())[0] + 1
+            raise InputError(
+                f"{where} pose {row} joint {column} is {size.max():g} rad, more than four revolutions: these look like "
+                "degrees; convert with numpy.deg2rad, or state the unit in the manifest."
+            )

@@ -8,10 +8,11 @@ from ..core.arrays import Numbers, as_floats, is_concrete
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.units import ARCSEC
-from ..kinematics.chain import Geometry, SinesCosines, forward_pass
-from ..kinematics.jacobian import jacobian_columns
+from ..kinematics.arm import Arm
+from ..kinematics.chain import Geometry, JointKinds, JointMotion, forward_pass
+from ..kinematics.jacobian import reading_columns
 
-_MOST = {"encoder_arcsec": 36_000.0, "seating": 100.0}  # ten degrees; mm
+_MOST = {"encoder_arcsec": 36_000.0, "linear_encoder": 100.0, "seating": 100.0}  # ten degrees; mm
 
 
 class Noise(eqx.Module):
@@ -19,6 +20,8 @@ class Noise(eqx.Module):
 
     Args:
         encoder_arcsec: Of a reading, arcsec: a scalar for all encoders, or shape ``(n,)``.
+        linear_encoder: Of the reading of a prismatic joint, mm: a scalar for all, or shape ``(n,)``, of which revolute
+            joints use nothing. By default what ``encoder_arcsec`` is at a distance of 1 m: 4.8 um for 1 arcsec.
         seating: Of a coordinate of the tip's centre about the socket's, scalar, mm.
 
     Raises:
@@ -27,13 +30,15 @@ class Noise(eqx.Module):
 
     encoder: Float[AnyArray, "..."]  # rad
     seating: Float[AnyArray, ""]  # mm
+    linear_encoder: Float[AnyArray, "..."] | None  # mm; None: ``encoder`` at 1 m
 
-    def __init__(self, *, encoder_arcsec: Numbers = 0.0, seating: Numbers = 0.0):
+    def __init__(self, *, encoder_arcsec: Numbers = 0.0, seating: Numbers = 0.0, linear_encoder: Numbers | None = None):
         self.encoder = to_jax(to_numpy(as_floats(encoder_arcsec, "encoder_arcsec")) * ARCSEC)
         self.seating = as_floats(seating, "seating")
-        for what, values in (("encoder_arcsec", self.encoder), ("seating", self.seating)):
-            if values.ndim > (what == "encoder_arcsec"):
-                allowed = "one number, or one a joint" if what == "encoder_arcsec" else "one number"
+        self.linear_encoder = None if linear_encoder is None else as_floats(linear_encoder, "linear_encoder")
+        for what, values in self._given(self.encoder):
+            if values.ndim > (what != "seating"):
+                allowed = "one number" if what == "seating" else "one number, or one a joint"
                 raise InputError(f"{what} has shape {values.shape}; give {allowed}.")
             if values.size == 0:
                 raise InputError(f"{what} is empty; give one number, or one a joint.")
@@ -46,6 +51,19 @@ class Noise(eqx.Module):
         """Standard deviation of readings, scalar or ``(n,)``, arcsec."""
         return self.encoder / ARCSEC
 
+    def _given(self, encoder: AnyArray) -> list[tuple[str, AnyArray]]:
+        """The arguments by name; ``encoder`` is that of the first."""
+        given = [("encoder_arcsec", encoder), ("linear_encoder", self.linear_encoder), ("seating", self.seating)]
+        return [(what, values) for what, values in given if values is not None]
+
+    def of_readings(self, kinds: JointKinds | None) -> Float[AnyArray, "..."]:
+        """Standard deviations of the readings of an arm with such joints, scalar or ``(n,)``, rad and mm."""
+        if kinds is None:
+            return self.encoder
+        xp = namespace(self.encoder, self.linear_encoder)
+        angular = self.encoder * xp.asarray(kinds.units)
+        return angular if self.linear_encoder is None else xp.where(kinds.mask(), self.linear_encoder, angular)
+
     def check(self, joints: int) -> None:
         """Check that this noise can weight the poses of an arm.
 
@@ -55,14 +73,13 @@ class Noise(eqx.Module):
         Raises:
             InputError: Where all noise is zero, some is absurdly large, or encoders and joints differ in number.
         """
-        if is_concrete(self.encoder, self.seating) and not (
-            np.any(np.asarray(self.encoder)) or np.any(np.asarray(self.seating))
-        ):
+        given = self._given(self.encoder_arcsec)
+        if is_concrete(*(values for _, values in given)) and not any(np.any(np.asarray(values)) for _, values in given):
             raise InputError(
                 "noise is zero everywhere, so poses cannot be weighted by it; give a standard deviation, or no noise."
             )
         # Not in the constructor: residuals of a failed calibration may be as large, and its file must still be read.
-        for what, values in (("encoder_arcsec", self.encoder_arcsec), ("seating", self.seating)):
+        for what, values in given:
             if is_concrete(values) and np.any(np.asarray(values) > _MOST[what]):
                 raise InputError(f"{what} is over {_MOST[what]:g}, more than any arm's; is it in another unit?")
         self.check_joints(joints)
@@ -74,33 +91,62 @@ class Noise(eqx.Module):
             joints: Number of joints of the arm.
 
         Raises:
-            InputError: Where ``encoder_arcsec`` has neither one value nor one a joint.
+            InputError: Where the encoders have neither one value nor one a joint.
         """
-        if self.encoder.ndim and self.encoder.shape != (joints,):
-            raise InputError(
-                f"encoder_arcsec has {self.encoder.shape[0]} values, but the arm has {joints} joints; give one number, "
-                "or one a joint."
-            )
+        for what, values in self._given(self.encoder):
+            if values.ndim and values.shape != (joints,):
+                raise InputError(
+                    f"{what} has {values.shape[0]} values, but the arm has {joints} joints; give one number, or one a "
+                    "joint."
+                )
 
 
 def noise_of(encoder: Float[AnyArray, "..."], seating: Float[AnyArray, ""]) -> Noise:
-    """Noise of these standard deviations, rad and mm, as computed: nothing is converted or checked."""
+    """Noise of these standard deviations, rad and mm, as computed: nothing is converted or checked.
+
+    Linear encoders are as good as the others at 1 m: what has been estimated is one variance of all readings.
+    """
     return eqx.tree_at(lambda noise: (noise.encoder, noise.seating), Noise(), (encoder, seating))
 
 
-def tip_covariances(geometry: Geometry, sines_cosines: SinesCosines, noise: Noise) -> Float[AnyArray, "... 3 3 N"]:
+def at_tip(noise: Noise, arm: Arm, distance: float) -> tuple[float, float, float]:
+    """What encoders of revolute joints at a distance (mm), those of prismatic joints, and the seat move the tip by; mm.
+
+    Standard deviations, each the root mean square of its joints; 0 without such joints.
+    """
+    kinds = arm.geometry.kinds
+    each = np.broadcast_to(np.asarray(noise.of_readings(kinds)), (arm.joints,))
+    linear = np.zeros(arm.joints, dtype=bool) if kinds is None else kinds.mask()
+    turning, sliding = (float(np.sqrt(np.mean(x**2))) if len(x) else 0.0 for x in (each[~linear], each[linear]))
+    return turning * distance, sliding, float(noise.seating)
+
+
+def linear_encoder_mm(noise: Noise, arm: Arm) -> float | list[float] | None:
+    """Standard deviation of the readings of an arm's prismatic joints, mm, one or one each; None without any."""
+    if not arm.prismatic:
+        return None
+    each = np.asarray(noise.of_readings(arm.geometry.kinds))[np.array(arm.prismatic) - 1].tolist()
+    return each[0] if len(set(each)) == 1 else each
+
+
+def one_arcsec(kinds: JointKinds | None) -> Float[np.ndarray, "..."]:
+    """Standard deviations of readings, rad and mm, by encoders of 1 arcsec: the unit of an estimated noise."""
+    return np.asarray(ARCSEC) if kinds is None else ARCSEC * kinds.units
+
+
+def tip_covariances(geometry: Geometry, motion: JointMotion, noise: Noise) -> Float[AnyArray, "... 3 3 N"]:
     """Covariance of the tip of every pose, mm^2: J_q S J_q^T of the encoders, plus the seat's in every direction."""
     # Plus (1 nm)^2: a pose in which no joint moves the tip in some direction would have an infinite weight.
     seat = (noise.seating**2 + 1e-12) * namespace(geometry, noise).eye(3)[..., None]
-    encoders = encoder_covariances(geometry, sines_cosines, noise.encoder)
+    encoders = encoder_covariances(geometry, motion, noise.of_readings(geometry.kinds))
     return encoders + seat.reshape((1,) * (encoders.ndim - 3) + seat.shape)
 
 
 def encoder_covariances(
-    geometry: Geometry, sines_cosines: SinesCosines, encoder: Float[AnyArray, "..."]
+    geometry: Geometry, motion: JointMotion, encoder: Float[AnyArray, "..."]
 ) -> Float[AnyArray, "... 3 3 N"]:
-    """J_q S J_q^T of every pose, mm^2, for encoders of standard deviation ``encoder`` (scalar or ``(n,)``, rad)."""
-    columns = jacobian_columns(forward_pass(geometry, sines_cosines))["theta"]
+    """J_q S J_q^T of every pose, mm^2, for readings of standard deviation ``encoder``, scalar or ``(n,)``."""
+    columns = reading_columns(forward_pass(geometry, motion))
     xp = namespace(columns, encoder)
     each = xp.broadcast_to(encoder, (columns.shape[0],))
     columns = columns * each.reshape(-1, *(1,) * (columns.ndim - 1))

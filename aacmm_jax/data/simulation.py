@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -31,6 +31,7 @@ def simulate(
     encoder_arcsec: float | None = None,
     seating: float | None = None,
     resolution_arcsec: float = 0.0,
+    linear_resolution: float = 0.0,
     limits: Sequence[Sequence[float]] | None = None,
     observations: Iterable[AbstractSimulated] = (),
     seed: int = 0,
@@ -46,11 +47,14 @@ def simulate(
         poses: Number of poses in each socket, or socket name -> number.
         lengths: `ReferenceLength` objects, taken as they are; or ``("A", "B")`` and ``("A", "B", u)``, whose certified
             value is the true distance plus an error drawn with standard deviation u, mm.
-        noise: Standard deviations of the readings, for all encoders or one a joint, and of the seat.
+        noise: Standard deviations of the readings, for all encoders or one a joint, and of the seat; of prismatic
+            joints too (``Noise.linear_encoder``).
         encoder_arcsec: Short form of ``Noise(encoder_arcsec=...)``.
         seating: Short form of ``Noise(seating=...)``, mm.
         resolution_arcsec: Readings are rounded to multiples of it; 0 for none.
-        limits: Lowest and highest reading of each joint, ``(n, 2)``, rad; by default the arm's own, else +-pi.
+        linear_resolution: The same of prismatic joints, mm.
+        limits: Lowest and highest reading of each joint, ``(n, 2)``, rad, or mm of prismatic joints; by default the
+            arm's own, else +-pi (a prismatic joint has no default).
         observations: Other observations to record (`data.observations`), with their true geometry.
         seed: Seed of poses and noise.
 
@@ -60,7 +64,8 @@ def simulate(
     Raises:
         InputError: For a point out of reach, negative noise, and noise given in both forms.
     """
-    noise = _noise(noise, encoder_arcsec, seating, resolution_arcsec)
+    noise = _noise(noise, encoder_arcsec, seating, resolution_arcsec, linear_resolution)
+    resolution = _Resolution(resolution_arcsec * ARCSEC, linear_resolution)
     if not is_single(arm):
         raise InputError("simulate takes one arm, not a batch; take one of it first.")
     check_finite(arm=arm, noise=noise)
@@ -80,9 +85,9 @@ def simulate(
     references = _reference_lengths(points, lengths, length_key)
     labels = [f"socket '{name}'" for name in owner]
     angles = random_configurations(arm, targets, reach_key, limits_array, labels=labels)
-    angles = _read(angles, noise, encoder_key, resolution_arcsec)
+    angles = _read(arm, angles, noise, encoder_key, resolution)
     others = [
-        _recorded(arm, one, noise, jax.random.fold_in(random_key(seed), number), limits_array, resolution_arcsec)
+        _recorded(arm, one, noise, jax.random.fold_in(random_key(seed), number), limits_array, resolution)
         for number, one in enumerate(simulated)
     ]
     ends = np.cumsum(list(counts.values()))
@@ -90,14 +95,22 @@ def simulate(
     return Capture(readings, references, others)
 
 
+class _Resolution(NamedTuple):
+    """Of the encoders of revolute joints, rad, and of prismatic ones, mm; 0 for exact ones."""
+
+    angular: float
+    linear: float
+
+
 def _read(
-    angles: Float[AnyArray, "m n"], noise: Noise, key: Array, resolution_arcsec: float
+    arm: Arm, q: Float[AnyArray, "m n"], noise: Noise, key: Array, resolution: _Resolution
 ) -> Float[np.ndarray, "m n"]:
     """What the encoders show."""
-    angles = np.asarray(angles + noise.encoder * random_numbers("normal", key, angles.shape))
-    if resolution_arcsec > 0:
-        angles = np.round(angles / (resolution_arcsec * ARCSEC)) * (resolution_arcsec * ARCSEC)
-    return angles
+    kinds = arm.geometry.kinds
+    q = np.asarray(q + noise.of_readings(kinds) * random_numbers("normal", key, q.shape))
+    linear = np.zeros(arm.joints, dtype=bool) if kinds is None else kinds.mask()
+    step = np.where(linear, resolution.linear, resolution.angular)
+    return np.where(step > 0, np.round(q / np.where(step > 0, step, 1.0)) * step, q)
 
 
 def _recorded(
@@ -106,7 +119,7 @@ def _recorded(
     noise: Noise,
     key: Array,
     limits: np.ndarray,
-    resolution_arcsec: float,
+    resolution: _Resolution,
 ) -> AbstractObservation:
     """One simulated observation."""
     if not isinstance(simulated, AbstractSimulated):
@@ -123,14 +136,15 @@ def _recorded(
     transforms = np.asarray(holding.pose(angles)).copy()
     # An instrument sees the tip where it is; what is owed to the seat moves the tip, and not what it is compared with.
     transforms[:, :3, 3] = exact
-    return simulated.recorded(_read(angles, noise, encoder_key, resolution_arcsec), transforms, random)
+    return simulated.recorded(_read(arm, angles, noise, encoder_key, resolution), transforms, random)
 
 
-def _noise(noise: Any, encoder_arcsec: Any, seating: Any, resolution_arcsec: Any) -> Noise:
+def _noise(noise: Any, encoder_arcsec: Any, seating: Any, resolution_arcsec: Any, linear_resolution: Any) -> Noise:
     """The noise in either form, checked."""
     short = {"encoder_arcsec": encoder_arcsec, "seating": seating}
     given = {name: value for name, value in short.items() if value is not None}
-    for what, value in {**given, "resolution_arcsec": resolution_arcsec}.items():
+    resolutions = {"resolution_arcsec": resolution_arcsec, "linear_resolution": linear_resolution}
+    for what, value in {**given, **resolutions}.items():
         if np.ndim(value):
             raise InputError(
                 f"{what} has shape {np.shape(value)}; give one number, or noise=aj.Noise(...) for one a joint."

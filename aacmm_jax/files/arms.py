@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from pydantic import Field, FiniteFloat, PositiveFloat, model_validator
+from pydantic import AfterValidator, Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
 
 from ..core.arrays import Numbers
 from ..core.errors import InputError, nearest
@@ -18,8 +18,9 @@ from ..kinematics.axes_to_dh import without_far_frames
 from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, Parameters, single
 from .atomic_write import storable, write_text
+from .corrections import CorrectionsTable, corrections_toml
 from .outputs import as_path
-from .toml import Strict, read_toml
+from .toml import Strict, each_once, read_toml
 from .ur_kinematics import read_ur_kinematics
 from .urdf import read_urdf
 
@@ -65,10 +66,12 @@ class _ArmModel(Strict):
     angle_unit: Literal["rad", "deg"]
     probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3, default_factory=lambda: [0.0, 0.0, 0.0])]
     joint: list[_Joint] = Field(default_factory=list)
+    prismatic: Annotated[list[PositiveInt], AfterValidator(each_once)] = Field(default_factory=list)  # joints from 1
     urdf: str | None = None  # instead of rows of joints: a URDF beside this file
     base: str | None = None  # its links
     tip: str | None = None
     identification: _Identification | None = None
+    corrections: CorrectionsTable | None = None
 
     @model_validator(mode="after")
     def _one_description(self) -> "_ArmModel":
@@ -100,8 +103,17 @@ class _ArmModel(Strict):
     def _all_or_none(self) -> "_ArmModel":
         if len({joint.limits is None for joint in self.joint}) > 1:
             raise ValueError("limits are given for some joints only; give them for all or for none.")
+        if self.urdf is not None and self.prismatic:
+            raise ValueError("prismatic is for rows of joints, but a URDF says itself which are; leave it out.")
         if not self.joint:
             return self
+        if max(self.prismatic, default=0) > len(self.joint):
+            raise ValueError(f"prismatic names joint {max(self.prismatic)}, but there are {len(self.joint)} joints.")
+        if self.prismatic and self.joint[0].limits is None:
+            raise ValueError(
+                f"joint {min(self.prismatic)} is prismatic, and nothing says how far it slides; give every joint "
+                "limits (in length_unit of prismatic joints)."
+            )
         first = self.joint[0]
         if self.convention == "craig" and (first.alpha or first.a):
             raise ValueError(
@@ -209,6 +221,8 @@ def _specification(path: Path, choose: bool) -> ArmSpecification:
             found = found._replace(name=model.name or path.stem)
         else:
             found = ArmSpecification(_arm_of_rows(model, length, angle), model.name or path.stem)
+        if model.corrections is not None:
+            found = found._replace(arm=model.corrections.corrected(found.arm, length, angle))
         wanted = model.identification
         if wanted is None:
             return _chosen(found) if choose else found
@@ -247,7 +261,12 @@ def _arm_of_rows(model: _ArmModel, length: float, angle: float) -> Arm:
         theta=[angle * row.theta for row in rows],
         beta=beta,
         probe=[length * x for x in model.probe],
-        limits=None if rows[0].limits is None else [[angle * x for x in row.limits or ()] for row in rows],
+        limits=None
+        if rows[0].limits is None
+        else [
+            [(length if i in model.prismatic else angle) * x for x in row.limits or ()] for i, row in enumerate(rows, 1)
+        ],
+        prismatic=model.prismatic,
     )
     far = any(abs(float(arm.d[i - 1])) > _FAR for i in nearly_parallel(arm))
     # A proposed identification names parameters as the table has them.
@@ -304,6 +323,8 @@ def _document(specification: ArmSpecification, source: str) -> "TOMLDocument":
     document["length_unit"] = "mm"
     document["angle_unit"] = "rad"
     document["probe"] = [float(x) for x in np.asarray(arm.probe)]
+    if arm.prismatic:
+        document["prismatic"] = list(arm.prismatic)
     rows = tomlkit.array().multiline(True)
     for i in range(arm.joints):
         row = tomlkit.inline_table()
@@ -315,4 +336,6 @@ def _document(specification: ArmSpecification, source: str) -> "TOMLDocument":
             row["limits"] = list(arm.limits[i])
         rows.append(row)
     document["joint"] = rows
+    if arm.corrections is not None:
+        document["corrections"] = corrections_toml(arm)
     return document

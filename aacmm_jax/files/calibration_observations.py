@@ -18,7 +18,7 @@ def observed_tables(record: CalibrationRecord) -> dict[str, Table]:
     them."""
     found = {}
     if record.observed is not None:
-        found = _tables_of(record.observed, Observed.of(record.recording.capture).blocks)
+        found = _tables_of(record.observed, Observed.of(record.recording.capture, None).blocks)
     others = record.others
     if others is not None:
         found["other_poses"] = Table(
@@ -152,7 +152,7 @@ def observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> Ob
     geometry, weights = stored.tables["geometry"], stored.tables["pose_weights"]
     parts = geometry["part"].astype(str)
     attributes = stored.table_attributes["observed"]
-    blocks = Observed.of(capture).blocks
+    blocks = Observed.of(capture, None).blocks
     ends = np.cumsum(table["poses"])
     names: list[str] = list(dict.fromkeys(parts.tolist()))
     values: dict[str, Any] = {name: geometry["value"][parts == name] for name in names}

@@ -77,6 +77,7 @@ def save_calibration(
         "scale_k": record.k,
         "scale_u": record.u_k,
         "encoder_arcsec": np.asarray(record.noise.encoder_arcsec),
+        "linear_encoder_mm": linear_encoder_attribute(record.noise),
         "seating_mm": float(record.noise.seating),
         "form": record.noise_model,
         "freedom": record.degrees_of_freedom,
@@ -121,6 +122,17 @@ def _scale_set_by(arm: Arm, names: tuple[str, ...], hold: str | None, noise: Noi
     return () if hold is not None else scale_anchor(Parameters(arm, names), arm, None, noise).set_by
 
 
+def linear_encoder_attribute(noise: Noise) -> Any:
+    """Standard deviation of the readings of prismatic joints, mm; None where it follows from the others."""
+    return None if noise.linear_encoder is None else np.asarray(noise.linear_encoder)
+
+
+def linear_encoder_of(attributes: Mapping[str, Any]) -> Any:
+    """What `linear_encoder_attribute` wrote; files of version 2 and before have none."""
+    stored = attributes.get("linear_encoder_mm")
+    return None if stored is None else np.squeeze(np.atleast_1d(stored))
+
+
 def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
     table, attributes = stored.tables["parameters"], stored.attributes
     if attributes.get("stretch_variance", 0.0) and _divided_fixed_lengths(path, stored):
@@ -132,6 +144,7 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
     noise = Noise(
         encoder_arcsec=np.squeeze(np.atleast_1d(attributes.get("encoder_arcsec", 0.0))),
         seating=attributes.get("seating_mm", 0.0),
+        linear_encoder=linear_encoder_of(attributes),
     )
     if "scale_set_by" in attributes:
         scale_set_by = names_in(attributes["scale_set_by"])

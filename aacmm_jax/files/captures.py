@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..data.capture import Capture, ReferenceLength, check_one_capture
+from ..data.capture import Capture, ReferenceLength, check_one_capture, check_readings
 from ..data.copies import Repeated
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, readings_unit
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
+from .corrections import corrected_of, correction_variables
 from .hdf5 import (
     Stored,
     Table,
@@ -82,7 +83,7 @@ def recording_attributes(recording: Recording) -> dict[str, Any]:
 
 def recording_tables(recording: Recording) -> dict[str, Table]:
     """The tables of a recording: ``capture``, ``reference``, ``nominal_arm``, and one for each observation."""
-    capture = recording.capture
+    capture, unit = recording.capture, readings_unit(recording.nominal.arm)
     check_one_capture(capture)
     owner = [capture.names[i] for i in capture.owner]
     poses, lengths = capture.repeated
@@ -90,7 +91,7 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
         "capture": Table(
             numbering("pose", len(owner))
             | numbering("joint", capture.joints)
-            | {"angle": Variable(("pose", "joint"), np.asarray(capture.q), "rad", "joint angle as read")}
+            | {"angle": Variable(("pose", "joint"), np.asarray(capture.q), unit, "joint reading")}
             | columns("pose", socket=(owner, "", "socket that held the tip")),
             {
                 "repeated_sockets": [n for n, _ in poses] or None,
@@ -111,8 +112,8 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     if recording.true is not None:
         tables["true_arm"] = arm_table(recording.true)
     if recording.spheres:
-        tables["sphere"] = sphere_table(recording.spheres)
-    return tables | observation_tables(capture.observations)
+        tables["sphere"] = sphere_table(recording.spheres, unit=unit)
+    return tables | observation_tables(capture.observations, unit)
 
 
 def reference_table(lengths: Sequence[ReferenceLength]) -> Table:
@@ -135,8 +136,11 @@ def lengths_of(path: str | os.PathLike, stored: Stored) -> list[ReferenceLength]
     return [ReferenceLength(str(start), str(end), float(value), float(u)) for start, end, value, u in rows]
 
 
-def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False) -> Table:
-    """Touched spheres, by poses or points, one row a touch; what belongs to a sphere is in every row of it."""
+def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False, unit: str = "rad") -> Table:
+    """Touched spheres, by poses or points, one row a touch; what belongs to a sphere is in every row of it.
+
+    ``unit`` is that of readings.
+    """
     rows = [
         (sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group
     ]
@@ -156,7 +160,7 @@ def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False) -> Ta
         return Table(
             variables | axes() | {"position": Variable(("touch", "axis"), values, "mm", "centre of the probe")}
         )
-    angle = Variable(("touch", "joint"), values, "rad", "joint angle as read")
+    angle = Variable(("touch", "joint"), values, unit, "joint reading")
     return Table(variables | numbering("joint", values.shape[1]) | {"angle": angle})
 
 
@@ -204,6 +208,10 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     attributes = stored.attributes
     nominal = specification_of(path, stored, "nominal_arm")._replace(urdf=_urdf_of(path, stored))
     check_recording(path, stored)
+    try:
+        check_readings(capture, nominal.arm)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
     return Recording(
         capture,
         nominal,
@@ -252,12 +260,14 @@ def arm_table(specification: ArmSpecification) -> Table:
         if values is not None:
             unit = "mm" if kind in ("a", "d") else "rad"
             variables[kind] = Variable(("joint",), np.asarray(values), unit, long_name)
+    variables |= correction_variables(arm)
     if arm.limits is not None:
         for side, name in enumerate(("lowest", "highest")):
             values = [limit[side] for limit in arm.limits]
-            variables[name] = Variable(("joint",), values, "rad", f"{name} reading of the joint")
+            variables[name] = Variable(("joint",), values, readings_unit(arm), f"{name} reading of the joint")
     attributes: dict[str, Any] = {
         "name": specification.name,
+        "prismatic": list(arm.prismatic) or None,
         "half_width_length_mm": specification.length,
         "half_width_angle_rad": specification.angle,
         "override_names": list(specification.override) or None,
@@ -286,7 +296,9 @@ def specification_of(path: str | os.PathLike, stored: Stored, table: str) -> Arm
             beta=arrays.get("beta"),
             probe=arrays["probe"],
             limits=limits,
+            prismatic=[int(joint) for joint in np.atleast_1d(attributes.get("prismatic", ()))],
         )
+        arm = corrected_of(path, arm, arrays)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     widths = attributes.get("override_half_widths") or []

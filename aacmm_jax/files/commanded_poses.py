@@ -12,6 +12,8 @@ from jaxtyping import Bool, Float
 from ..core.errors import InputError
 from ..core.rotations import rotation_matrix
 from ..core.units import DEG, INCH, UM, M
+from ..kinematics.arm import Arm, by_joint
+from .manifest_observations import reading_unit_of
 from .text_table import TextTable
 
 _ANGLES = {"deg": DEG, "rad": 1.0}
@@ -25,15 +27,16 @@ _ROUNDED = 1e-3  # of a quaternion's length: three decimals at least
 class CommandedPoses(NamedTuple):
     """What a table of commanded poses holds."""
 
-    q: Float[np.ndarray, "N n"]  # readings: those commanded, or where the search for a pose begins, rad
+    q: Float[np.ndarray, "N n"]  # readings: those commanded, or where the search for a pose begins, rad and mm
     poses: Float[np.ndarray, "N 4 4"] | None  # in the frame that the file uses, mm; None: those of the readings
-    unit: str  # of the readings, deg or rad
+    unit: str  # of the readings of revolute joints, deg or rad; those of prismatic joints are in mm
+    arm: Arm
     table: TextTable
     columns: tuple[int, ...]  # of the readings, counted from 0; none: `near` was used
 
 
 def read_commanded_poses(
-    path: str | os.PathLike, joints: int, *, unit: str | None = None, near: Sequence[float] | None = None
+    path: str | os.PathLike, arm: Arm, *, unit: str | None = None, near: Sequence[float] | None = None
 ) -> CommandedPoses:
     """Read a table with a row for each commanded pose.
 
@@ -44,17 +47,17 @@ def read_commanded_poses(
 
     Args:
         path: The table (CSV or other text).
-        joints: Number of joints.
-        unit: ``"deg"`` or ``"rad"``; needed where the header does not say it.
+        arm: The nominal arm; readings of its prismatic joints are in mm.
+        unit: ``"deg"`` or ``"rad"`` of the others; needed where the header does not say it.
         near: Readings to begin with, in ``unit``, where the table has none.
 
     Raises:
         InputError: Columns are missing, or a unit is missing or differs.
     """
-    table = TextTable(path)
+    table, joints = TextTable(path), arm.joints
     orientation = _orientation(table)
     columns = _reading_columns(path, table, joints, alone=orientation is None)
-    stated = table.unit([i + 1 for i in columns]) if columns else None
+    stated = reading_unit_of(table, [i + 1 for i in columns], arm) if columns else None
     if stated is not None and (stated not in _ANGLES or unit not in (None, stated)):
         raise InputError(f"{path} states {stated} for joint readings; give them in deg or rad, and leave out --unit.")
     found = stated or unit
@@ -68,7 +71,7 @@ def read_commanded_poses(
         raise InputError(f"--near has {len(near)} readings, but the arm {joints} joints; give one per joint.")
     poses = None if orientation is None else _poses(path, table, _ANGLES[found])
     readings = table.numbers([i + 1 for i in columns]) if near is None else np.tile(near, (table.length, 1))
-    return CommandedPoses(_ANGLES[found] * readings, poses, found, table, columns)
+    return CommandedPoses(np.array(by_joint(arm, _ANGLES[found], 1.0)) * readings, poses, found, arm, table, columns)
 
 
 def corrected_csv(commanded: CommandedPoses, q: Float[np.ndarray, "N n"], reached: Bool[np.ndarray, " N"]) -> str:
@@ -78,12 +81,13 @@ def corrected_csv(commanded: CommandedPoses, q: Float[np.ndarray, "N n"], reache
 
     Args:
         commanded: What was read.
-        q: Corrected readings, rad.
+        q: Corrected readings, rad and mm.
         reached: Which rows have some.
     """
-    table, angle = commanded.table, _ANGLES[commanded.unit]
-    cells = [[repr(float(x)) if good else "" for x, good in zip(row, reached, strict=True)] for row in q.T / angle]
-    names = [f"q_{i}_{commanded.unit}" for i in range(1, len(cells) + 1)]
+    table, arm = commanded.table, commanded.arm
+    rows = (q / np.array(by_joint(arm, _ANGLES[commanded.unit], 1.0))).T
+    cells = [[repr(float(x)) if good else "" for x, good in zip(row, reached, strict=True)] for row in rows]
+    names = [f"q_{i}_{unit}" for i, unit in enumerate(by_joint(arm, commanded.unit, "mm"), start=1)]
     header, joint_of = table.header, {column: i for i, column in enumerate(commanded.columns)}
     columns: list[tuple[str, Sequence[str]]] = []
     for i in range(table.width):

@@ -9,20 +9,22 @@ from jaxtyping import Float
 from ..core.errors import InputError
 from ..core.rotations import roll_pitch_yaw
 from ..core.units import DEG
-from ..kinematics.arm import Arm, natural_steps, with_arrays
+from ..kinematics.arm import Arm, by_joint, natural_steps, with_arrays
 from ..kinematics.axes_to_dh import Transform, canonical_origins, geometry_of
-from ..kinematics.parameters import single
+from ..kinematics.parameters import Parameters, single
 
 _UNITS = {"mm-deg": ("mm", "deg", 1.0, 1 / DEG), "m-rad": ("m", "rad", 1e-3, 1.0)}
 _STANDARD = "T_i = Rz(q_i + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)"
 _CRAIG = "T_i = Tx(a) Rx(alpha) Ry(beta) Rz(q_i + theta) Tz(d), with a, alpha and beta of the link before joint i"
+_SLIDES = "readings of the prismatic joints ({}) are added to d: Rz(theta) Tz(q_i + d)"
 _ENOUGH = 30  # steps of Gauss and Newton, of which some five are needed
 
 
 class ZeroOffsets(NamedTuple):
     """The zero offsets of the joints with which the nominal arm comes closest to a calibrated one."""
 
-    offsets: Float[np.ndarray, " n"]  # to add to the readings, rad
+    offsets: Float[np.ndarray, " n"]  # to add to the readings, rad, or mm of prismatic joints
+    units: tuple[str, ...]  # of each, rad or mm
     probe: Float[np.ndarray, " 3"]  # the tip in the nominal arm's last frame that goes with them, mm
     rms_nominal: float  # distance to the calibrated arm without offsets, the probe fitted, mm
     rms: float  # the same with the offsets, mm
@@ -51,6 +53,8 @@ def dh_table(arm: Arm, *, convention: str = "standard", units: str = "mm-deg", b
     after = np.stack([length * geometry.a, angle * geometry.alpha, angle * beta], axis=1)
     links, tip = after, length * geometry.probe
     lines = [f"# {_CRAIG if convention == 'craig' else _STANDARD}"]
+    if arm.prismatic:
+        lines.append(f"# {_SLIDES.format(', '.join(map(str, arm.prismatic)))}")
     if base is not None and not np.array_equal(base, np.eye(4)):
         lines.append(f"# first frame in the base link: {_placed(base, length, angle, length_unit, angle_unit)}")
     if convention == "craig":
@@ -78,7 +82,7 @@ def zero_offsets(nominal: Arm, calibrated: Arm, q: Float[np.ndarray, "N n"]) -> 
     Args:
         nominal: The arm that the controller has.
         calibrated: The calibrated arm.
-        q: Readings, rad: of the capture, or of the poses that matter.
+        q: Readings, rad, or mm of prismatic joints: of the capture, or of the poses that matter.
 
     Raises:
         InputError: The arms or the readings have other numbers of joints.
@@ -86,25 +90,31 @@ def zero_offsets(nominal: Arm, calibrated: Arm, q: Float[np.ndarray, "N n"]) -> 
     nominal, calibrated = single(nominal), single(calibrated)
     if nominal.joints != calibrated.joints:
         raise InputError(f"the arms have {nominal.joints} and {calibrated.joints} joints; give arms with as many.")
-    targets, theta, probe = (np.asarray(x) for x in (calibrated.position(q), nominal.theta, calibrated.probe))
-    errors = {}
-    for kinds in (("probe",), ("theta", "probe")):
-        joints = range(1, nominal.joints + 1) if "theta" in kinds else ()
-        names = [*(f"theta_{i}" for i in joints), "probe_x", "probe_y", "probe_z"]
-        steps, arm = natural_steps(names), with_arrays(nominal, probe=probe)
+    targets, probe = np.asarray(calibrated.position(q)), np.asarray(calibrated.probe)
+    kinds, tip = by_joint(nominal, "theta", "d"), ["probe_x", "probe_y", "probe_z"]
+    offsets, distances = [f"{kind}_{i}" for i, kind in enumerate(kinds, start=1)], []
+    begin = with_arrays(nominal, probe=probe)
+    for names in (tip, [*offsets, *tip]):
+        space, steps = Parameters(begin, tuple(names)), natural_steps(names)
+        vector = np.asarray(space.vector())
         for _ in range(_ENOUGH):
-            errors[kinds] = targets - np.asarray(arm.position(q))
+            arm = space.arm(vector)
+            errors = targets - np.asarray(arm.position(q))
             columns = np.asarray(arm.jacobian(q, names)) * steps
-            change = np.linalg.lstsq(columns.reshape(-1, len(names)), errors[kinds].ravel(), rcond=1e-9)[0] * steps
-            arm = with_arrays(
-                arm, theta=np.asarray(arm.theta) + (change[:-3] if joints else 0.0), probe=arm.probe + change[-3:]
-            )
-            if np.all(np.abs(change / steps) < 1e-10):
+            change = np.linalg.lstsq(columns.reshape(-1, len(names)), errors.ravel(), rcond=1e-9)[0]
+            vector = vector + change * steps
+            if np.all(np.abs(change) < 1e-10):
                 break
-    distances = {kinds: np.linalg.norm(error, axis=1) for kinds, error in errors.items()}
-    before, after = distances.values()
-    rms_before, rms = (float(np.sqrt(np.mean(values**2))) for values in (before, after))
-    return ZeroOffsets(np.asarray(arm.theta) - theta, np.asarray(arm.probe), rms_before, rms, float(after.max()))
+        distances.append(np.linalg.norm(errors, axis=1))
+    rms_before, rms = (float(np.sqrt(np.mean(values**2))) for values in distances)
+    return ZeroOffsets(
+        vector[:-3] - np.asarray(Parameters(begin, tuple(offsets)).vector()),
+        tuple(by_joint(nominal, "rad", "mm")),
+        vector[-3:],
+        rms_before,
+        rms,
+        float(distances[1].max()),
+    )
 
 
 def zero_offsets_csv(found: ZeroOffsets) -> str:
@@ -113,9 +123,15 @@ def zero_offsets_csv(found: ZeroOffsets) -> str:
         "# To be added to the joint readings of the nominal arm.",
         f"# Distance of the tip from the calibrated arm's: RMS {found.rms:.4f} mm, largest {found.largest:.4f} mm; RMS",
         f"# {found.rms_nominal:.4f} mm without the offsets. Tip in the last frame: {_row(found.probe, ' ')} mm.",
-        "joint,offset_deg,offset_rad",
     ]
-    lines += [f"{i},{_row((offset / DEG, offset))}" for i, offset in enumerate(found.offsets, start=1)]
+    if "mm" in found.units:
+        lines.append("joint,offset_deg,offset_rad,offset_mm")
+    else:
+        lines.append("joint,offset_deg,offset_rad")
+    for i, (offset, unit) in enumerate(zip(found.offsets, found.units, strict=True), start=1):
+        slide = f",,{_row((offset,))}" if unit == "mm" else None
+        angle = _row((offset / DEG, offset)) + ("," if "mm" in found.units else "")
+        lines.append(f"{i},{angle if slide is None else slide}")
     return "\n".join(lines) + "\n"
 
 
@@ -135,6 +151,7 @@ def python_program(arm: Arm, *, title: str, base: Transform | None = None) -> st
         "PROBE": geometry.probe,
     }  # fmt: skip
     constants = [f"{name} = [{_row(row, ', ')}]" for name, row in values.items()]
+    constants.append(f"PRISMATIC = {by_joint(arm, False, True)}")
     rows = ",\n".join(f"    [{_row(row, ', ')}]" for row in base)
     return _PROGRAM.format(title=repr(title), base=rows, constants="\n".join(constants))
 
@@ -148,8 +165,9 @@ def _placed(transform: Transform, length: float, angle: float, length_unit: str,
     return f"x y z = {_row(xyz, ' ')} {length_unit}, roll pitch yaw = {_row(rpy, ' ')} {angle_unit}"
 
 
-_PROGRAM = '''# Written by aacmm_jax. Lengths in mm, angles in rad.
-# T_i = Rz(q_i + THETA) Tz(D) Tx(A) Rx(ALPHA) Ry(BETA); the tip is PROBE in the last frame.
+_PROGRAM = '''# Written by aacmm_jax. Lengths in mm, angles in rad; readings in rad, or mm of prismatic joints.
+# T_i = Rz(q_i + THETA) Tz(D) Tx(A) Rx(ALPHA) Ry(BETA), or Rz(THETA) Tz(q_i + D) Tx(A) Rx(ALPHA) Ry(BETA) of a prismatic
+# joint; the tip is PROBE in the last frame.
 import numpy as np
 
 TITLE = {title}
@@ -162,8 +180,9 @@ BASE = np.array([
 def pose(q):
     """The transform (4, 4) of the last frame, with the tip as its origin, at the joint readings q."""
     transform = BASE.copy()
-    for reading, theta, d, a, alpha, beta in zip(q, THETA, D, A, ALPHA, BETA):
-        (cz, sz), (cx, sx), (cy, sy) = [(np.cos(x), np.sin(x)) for x in (reading + theta, alpha, beta)]
+    for reading, prismatic, theta, d, a, alpha, beta in zip(q, PRISMATIC, THETA, D, A, ALPHA, BETA):
+        angle, d = (theta, reading + d) if prismatic else (reading + theta, d)
+        (cz, sz), (cx, sx), (cy, sy) = [(np.cos(x), np.sin(x)) for x in (angle, alpha, beta)]
         turn = np.array([[cz, -sz * cx, sz * sx], [sz, cz * cx, -cz * sx], [0.0, sx, cx]])
         turn = turn @ np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
         link = np.eye(4)

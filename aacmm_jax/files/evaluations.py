@@ -16,6 +16,7 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm, parameter_names
 from ..kinematics.workspace import Reach
 from ..uncertainty.arm_uncertainty import Uncertainty
+from .calibrations import linear_encoder_attribute, linear_encoder_of
 from .captures import (
     arm_table,
     lengths_of,
@@ -86,6 +87,7 @@ def _uncertainty_table(uncertainty: Uncertainty) -> Table:
         variables,
         {
             "encoder_arcsec": np.asarray(uncertainty.noise.encoder_arcsec),
+            "linear_encoder_mm": linear_encoder_attribute(uncertainty.noise),
             "seating_mm": float(uncertainty.noise.seating),
             "degrees_of_freedom": uncertainty.degrees_of_freedom,
         },
@@ -106,7 +108,9 @@ def _uncertainty_of(path: str | os.PathLike, stored: Stored, calibrated: Arm) ->
         covariance=table["covariance"],
         open=table["open"],
         noise=Noise(
-            encoder_arcsec=np.squeeze(np.atleast_1d(attributes["encoder_arcsec"])), seating=attributes["seating_mm"]
+            encoder_arcsec=np.squeeze(np.atleast_1d(attributes["encoder_arcsec"])),
+            seating=attributes["seating_mm"],
+            linear_encoder=linear_encoder_of(attributes),
         ),
         u_k=None,
         names=names,

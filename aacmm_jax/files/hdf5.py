@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .hdf5_content import Content
 
 FORMAT = "aacmm_jax"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3  # arms may have prismatic joints and joint corrections since 3
 DIGESTS_SINCE = 2  # the first format version whose files contain a SHA-256 of their content
 BLOCK = "block"  # kind of the files of a study's blocks, which carry no provenance of their own
 _IN_MEMORY = 64 * 2**20  # bytes up to which a file is read at once, not in parts

@@ -23,14 +23,15 @@ from pydantic import (
 from ..acceptance.standards import Standard
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG
-from ..data.capture import Capture, ReferenceLength
+from ..data.capture import Capture, ReferenceLength, check_readings
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.socket import Socket
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
+from ..kinematics.arm import Arm, by_joint
 from .arms import arm_beside, load_specification
 from .inputs import InputFile, fingerprint
-from .manifest_observations import FIELDS, TABLES, Source, observations
+from .manifest_observations import FIELDS, LENGTHS, TABLES, Source, observations
 from .manifest_sessions import in_sessions, session_name
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
@@ -47,11 +48,15 @@ class _Angles(Strict):
     sign: Literal[1, -1] | list[Literal[1, -1]] = 1
     offset: FiniteFloat | list[FiniteFloat] = 0.0
     columns: Annotated[list[PositiveInt], AfterValidator(each_once)] | None = None
+    linear_unit: Literal["mm", "m", "um", "inch", "counts"] = "mm"  # of prismatic joints
+    counts_per_mm: _Positive | Annotated[list[_Positive], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
     def _counts(self) -> "_Angles":
         if (self.unit == "counts") != (self.counts_per_turn is not None):
             raise ValueError("give counts_per_turn with unit = 'counts', and only with it.")
+        if (self.linear_unit == "counts") != (self.counts_per_mm is not None):
+            raise ValueError("give counts_per_mm with linear_unit = 'counts', and only with it.")
         return self
 
 
@@ -174,7 +179,8 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     ``to = "{place}/1"`` is measured at every place. A field that makes up a whole folder or file name, such as
     ``{place}``, matches anything but "/"; next to other text in a name, as ``{hole}``, it matches letters, digits and
     "-" only, so that ``hole_0_pose.csv`` is left alone. ``exclude = ["*_old.csv"]`` in ``[[socket]]`` leaves out the
-    files that match such a shell pattern. Angles: reading -> sign * (reading - offset), in the stated unit.
+    files that match such a shell pattern. Angles: reading -> sign * (reading - offset), in the stated unit. Readings of
+    prismatic joints are in ``linear_unit`` of ``[angles]``, by default mm; sign and offset hold for them too.
 
     ``[[points]]``, ``[[transforms]]``, ``[[touched_sphere]]``, ``[[touched_cylinder]]``, ``[[plane]]``,
     ``[[parallel_planes]]``, ``[[artefact]]`` and ``[[distances]]`` are observations of these kinds. Their ``file``
@@ -224,7 +230,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
                     f"{file} has {table.shape[1]} columns, but the arm has {joints} joints; give one column a joint, "
                     "or pick them with columns = [...] in [angles]."
                 )
-            return _radians(table, _angles_of(model.angles))
+            return _readings(table, _angles_of(model.angles), nominal.arm)
 
         sockets, lengths, spheres = recorded(path.parent, model, angles)
 
@@ -234,9 +240,9 @@ def read_manifest(path: str | os.PathLike) -> Recording:
                 raise InputError(
                     f"the header of the readings says {header}, but the manifest {stated.unit}; correct one of them."
                 )
-            return _radians(readings, stated)
+            return _readings(readings, stated, nominal.arm)
 
-        source = Source(path.parent, opened, joints, columns, radians)
+        source = Source(path.parent, opened, nominal.arm, columns, radians)
         sessions = _sessions_of(path.parent, model)
         of_targets = [(sessions.get(one.name, ""), one) for one in _sockets_of_targets(path.parent, model, sockets)]
         observations = [*of_targets, *_observations(model, source)]
@@ -251,6 +257,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
             raise InputError("[sessions] is for tables with a session, but there is none; leave it out.")
         else:
             capture = Capture(sockets, lengths, [observation for _, observation in observations])
+        check_readings(capture, nominal.arm)
         return Recording(
             capture,
             nominal,
@@ -273,7 +280,8 @@ def _angles_of(angles: _Angles | None, unit: str | None = None, preset: str | No
         return angles
     if unit not in _UNITS:
         raise InputError(f"units.q is '{unit}'; it must be one of {', '.join(_UNITS)}.")
-    stated = {} if angles is None else {"sign": angles.sign, "offset": angles.offset}
+    same = ("sign", "offset", "linear_unit", "counts_per_mm")
+    stated = {} if angles is None else {what: getattr(angles, what) for what in same}
     return _Angles(unit=unit, **stated)  # pyright: ignore[reportArgumentType]
 
 
@@ -323,7 +331,8 @@ def recorded(
     return sockets, _lengths(model.length, fields, sockets), tuple(spheres)
 
 
-def _radians(readings: np.ndarray, angles: _Angles) -> np.ndarray:
+def _readings(readings: np.ndarray, angles: _Angles, arm: Arm) -> np.ndarray:
+    """Readings in rad, and in mm of prismatic joints."""
     joints = readings.shape[1]
 
     def a_joint(value: float | list, what: str) -> np.ndarray:
@@ -339,7 +348,9 @@ def _radians(readings: np.ndarray, angles: _Angles) -> np.ndarray:
         if angles.counts_per_turn
         else _UNITS[angles.unit]
     )
-    return a_joint(angles.sign, "sign") * (readings - a_joint(angles.offset, "offset")) * unit
+    linear = 1 / a_joint(angles.counts_per_mm, "counts_per_mm") if angles.counts_per_mm else LENGTHS[angles.linear_unit]
+    units = np.where(by_joint(arm, False, True), linear, unit)
+    return a_joint(angles.sign, "sign") * (readings - a_joint(angles.offset, "offset")) * units
 
 
 def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:

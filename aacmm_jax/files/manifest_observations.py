@@ -16,6 +16,7 @@ from ..core.text import shorten
 from ..core.units import ARCSEC, DEG, INCH, UM, M
 from ..data.observations.observation import AbstractObservation, Entry
 from ..data.observations.socket import Socket
+from ..kinematics.arm import Arm
 from .inputs import InputFile
 from .manifest_sessions import session_name
 from .observation_kinds import kinds
@@ -42,7 +43,7 @@ PRESETS = {
     # Readings and positions as `aacmm plan` writes them, or with plainer names.
     "csv": Preset(
         {
-            "q": [["q_*_deg"], ["q*_deg"], ["q*_rad"]],
+            "q": [["q_*_deg"], ["q*_deg"], ["q*_rad"], ["q_[0-9]*"]],
             "points": [["[xyz]_mm"], ["x", "y", "z"]],
             "u": [["u_[xyz]_mm"], ["u_x", "u_y", "u_z"]],
         },
@@ -137,14 +138,24 @@ FIELDS: dict[str, Any] = {
 }
 
 
+def reading_unit_of(text: TextTable, wanted: Sequence[Column], arm: Arm) -> str | None:
+    """The unit of angles that the header of readings states, or None; it may state mm for prismatic joints."""
+    columns = text.pick(wanted)
+    slides = [columns[i - 1] + 1 for i in arm.prismatic]
+    linear = text.unit(slides) if slides else None
+    if linear not in (None, "mm"):
+        raise InputError(f"{text.path} states {linear} for readings of prismatic joints; convert them to mm.")
+    return text.unit([i + 1 for i in columns if i + 1 not in slides])
+
+
 class Source(NamedTuple):
     """How the files of a manifest are read."""
 
     folder: Path
     open: Callable[[Path], InputFile]
-    joints: int
+    arm: Arm
     columns: Sequence[int] | None  # of the readings, by [angles]
-    # Readings in rad, from the unit that the manifest's table states, its preset's, and that of the file's header.
+    # Readings in rad and mm, from the unit that the manifest's table states, its preset's, and that of the header.
     radians: Callable[[np.ndarray, str | None, str | None, str | None], np.ndarray]
 
 
@@ -213,7 +224,7 @@ class _Reader:
             # A preset may name more than a kind needs, or than a table has.
             if key not in self._entries or key in chosen or getattr(table, key, None) is not None:
                 continue
-            there = next((wanted for wanted in choices if text.has(wanted)), None)
+            there = next((wanted for wanted in choices if text.has(wanted) and self._fits(text, key, wanted)), None)
             if there is not None:
                 chosen[key] = there
         found: dict[str, Any] = {}
@@ -236,20 +247,27 @@ class _Reader:
         group = np.full(len(readings), "") if table.group is None else text.texts(table.group)
         return group, sessions, found
 
+    def _fits(self, text: TextTable, key: str, wanted: Sequence[Column]) -> bool:
+        """Whether columns of a preset can be what is wanted: where slides are in mm, angles alone are not all."""
+        arm = self._source.arm
+        return key != "q" or not arm.prismatic or len(text.pick(wanted)) == arm.joints
+
     def _readings(self, text: TextTable, wanted: Sequence[Column] | None) -> np.ndarray:
         source, table = self._source, self._table
         if table.readings is not None:
             text = TextTable(source.open(source.folder / table.readings), delimiter=table.delimiter,
                              decimal=table.decimal)  # fmt: skip
         if wanted is None:
-            wanted = list(range(1, source.joints + 1)) if source.columns is None else source.columns
+            wanted = list(range(1, source.arm.joints + 1)) if source.columns is None else source.columns
         numbers = text.numbers(wanted)
-        if numbers.shape[1] != source.joints:
+        joints = source.arm.joints
+        if numbers.shape[1] != joints:
             raise InputError(
-                f"{self._where} picks {numbers.shape[1]} columns for the readings, but the arm has {source.joints} "
+                f"{self._where} picks {numbers.shape[1]} columns for the readings, but the arm has {joints} "
                 "joints; give one column a joint."
             )
-        return source.radians(numbers, table.units.get("q"), self._preset.units.get("q"), text.unit(wanted))
+        header = reading_unit_of(text, wanted, source.arm)
+        return source.radians(numbers, table.units.get("q"), self._preset.units.get("q"), header)
 
     def _column(self, text: TextTable, entry: Entry, wanted: Sequence[Column]) -> np.ndarray:
         if entry.dimensions[:1] != ("pose",):

@@ -7,22 +7,23 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..data.observations.observation import AbstractObservation
+from ..data.observations.observation import READINGS, AbstractObservation
 from .hdf5 import Stored, Table, Variable, axes, columns, need, numbering
 from .observation_kinds import kinds
 
 _PREFIX = "observation_"
 
 
-def observation_tables(observations: Iterable[AbstractObservation]) -> dict[str, Table]:
+def observation_tables(observations: Iterable[AbstractObservation], unit: str = "rad") -> dict[str, Table]:
     """A table for each observation: arrays over its poses, and single values as attributes with the unit in the name.
 
-    They are named by number, since names of observations may hold what names of groups may not.
+    They are named by number, since names of observations may hold what names of groups may not. ``unit`` is that of
+    readings.
     """
-    return {f"{_PREFIX}{number}": _table(one) for number, one in enumerate(observations, start=1)}
+    return {f"{_PREFIX}{number}": _table(one, unit) for number, one in enumerate(observations, start=1)}
 
 
-def _table(observation: AbstractObservation) -> Table:
+def _table(observation: AbstractObservation, unit: str) -> Table:
     variables: dict[str, Variable] = {}
     attributes: dict[str, Any] = {"kind": observation.kind, "name": observation.name}
     stored = observation.stored()
@@ -33,7 +34,7 @@ def _table(observation: AbstractObservation) -> Table:
         if not entry.dimensions:
             attributes[_attribute(entry.name, entry.unit)] = value.item()
             continue
-        variables[entry.name] = Variable(entry.dimensions, value, entry.unit, entry.says)
+        variables[entry.name] = Variable(entry.dimensions, value, unit if entry is READINGS else entry.unit, entry.says)
         for dimension, size in zip(entry.dimensions, value.shape, strict=True):
             if dimension not in variables and dimension != entry.name:
                 variables |= _coordinate(dimension, size)

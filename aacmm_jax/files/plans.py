@@ -14,7 +14,7 @@ from ..acceptance.standards import PLANNED
 from ..core.units import DEG
 from ..data.observations.observation import AbstractObservation, Entry
 from ..data.observations.socket import Socket
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, by_joint
 from ..kinematics.parameters import UrdfSource
 from ..planning.design import Plan
 from ..planning.kit import KitPlan
@@ -25,8 +25,8 @@ def save_plan(path: str | os.PathLike, plan: Plan | KitPlan) -> None:
     """Write the poses of a plan as CSV, in the order in which to take them.
 
     Columns: ``pose``, ``socket`` (of a kit: ``observation`` and ``point``), ``x_mm``, ``y_mm``, ``z_mm`` (the socket,
-    or the tip), ``q_1_deg`` and so on (joint readings), ``probe_direction_x``, ``_y``, ``_z`` (the last frame's z
-    axis).
+    or the tip), ``q_1_deg`` and so on (joint readings; ``q_1_mm`` of a prismatic joint), ``probe_direction_x``, ``_y``,
+    ``_z`` (the last frame's z axis).
 
     Args:
         path: the file to write.
@@ -163,7 +163,7 @@ def _largest_u(observation: AbstractObservation) -> float:
 
 
 def _manifest_start(arm: str, urdf: UrdfSource | None, *comments: str, acceptance: str | None = None) -> list[str]:
-    """The first lines of a manifest of readings in degrees."""
+    """The first lines of a manifest of readings in degrees, and of prismatic joints in mm, which is the default."""
     date = "# date = 2026-01-31   # when it was recorded"
     links = [] if urdf is None else [f"base = {_quoted(urdf.base)}", f"tip = {_quoted(urdf.tip)}"]
     made_for = [] if acceptance is None else [f"acceptance = {_quoted(acceptance)}"]
@@ -179,15 +179,15 @@ def procedure_csv(procedure: Procedure) -> str:
 
 
 def _poses_csv(arm: Arm, headings: list[str], labels: Iterable[list[str]], points: Iterable, q: np.ndarray) -> str:
-    """A row for each pose: number, labels, where the tip is (mm), joint readings (deg), direction of the probe."""
+    """A row for each pose: number, labels, where the tip is (mm), readings (deg, or mm), direction of the probe."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    readings = [f"q_{i}_deg" for i in range(1, arm.joints + 1)]
+    readings = [f"q_{i}_{unit}" for i, unit in enumerate(by_joint(arm, "deg", "mm"), start=1)]
     direction = [f"probe_direction_{axis}" for axis in "xyz"]
     writer.writerow(["pose", *headings, "x_mm", "y_mm", "z_mm", *readings, *direction])
     directions = np.asarray(arm.pose(q))[:, :3, 2]
     for number, (label, point, reading, axis) in enumerate(
-        zip(labels, points, q / DEG, directions, strict=True), start=1
+        zip(labels, points, q / np.array(by_joint(arm, DEG, 1.0)), directions, strict=True), start=1
     ):
         numbers = [*(f"{x:.3f}" for x in (*point, *reading)), *(f"{x:.2f}" for x in axis)]
         writer.writerow([number, *label, *numbers])

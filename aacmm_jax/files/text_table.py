@@ -102,6 +102,11 @@ class TextTable:
             self._header = []
 
     @property
+    def path(self) -> str | os.PathLike:
+        """The file."""
+        return self._path
+
+    @property
     def header(self) -> list[str]:
         """Names of the columns; empty where the table has none."""
         return [name.strip("\"'") for name in self._header]

@@ -17,7 +17,7 @@ from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.rotations import roll_pitch_yaw, roll_pitch_yaw_matrix
 from ..core.text import number, quoted
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, arm_of
 from ..kinematics.axes_to_dh import (
     Axes,
     Transform,
@@ -61,7 +61,7 @@ def read_ur_kinematics(path: str | os.PathLike, *, probe: Numbers | None = None)
             raise InputError("it is not text in UTF-8; name a YAML file.") from error
         entries = _entries(text)
         geometry = _of_parameters(entries) if any(name in entries for name in _DH) else _of_origins(entries)
-        arm = without_far_frames(Arm(**geometry._asdict(), limits=[_LIMITS] * len(_JOINTS)))
+        arm = without_far_frames(arm_of(geometry, [_LIMITS] * len(_JOINTS)))
         if probe is not None:
             tool = Arm(alpha=[0.0], a=[0.0], d=[0.0], probe=probe).probe
             arm = arm.replace(probe=np.asarray(arm.probe) + np.asarray(tool))

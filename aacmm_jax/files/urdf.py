@@ -12,7 +12,7 @@ from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.rotations import roll_pitch_yaw
 from ..core.text import quoted
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, arm_of
 from ..kinematics.axes_to_dh import (
     Axes,
     Transform,
@@ -149,7 +149,7 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
     directions = np.array([frame[:3, :3] @ joint.axis for frame, joint in zip(frames, joints, strict=True)])
     base, geometry = dh_of_axes(Axes(directions, np.array([frame[:3, 3] for frame in frames]), tip))
     limits = [_REVOLUTION if joint.kind == "continuous" else joint.limits or _REVOLUTION for joint in joints]
-    arm = Arm(**geometry._asdict(), limits=limits)
+    arm = arm_of(geometry, limits)
     return UrdfChain(arm, base, robot, tuple(joints), tuple(before), tip_before, last)
 
 

@@ -1,6 +1,7 @@
 from .arm import Arm as Arm
 from .arm import parameter_names as parameter_names
 from .axes_to_dh import without_far_frames as without_far_frames
+from .corrected_arm import with_corrections as with_corrections
 from .correction import corrected_readings as corrected_readings
 from .correction import readings_at_poses as readings_at_poses
 from .inverse_kinematics import project_to_targets as project_to_targets

@@ -1,7 +1,7 @@
-"""The arm: a serial chain of revolute joints in standard Denavit-Hartenberg form, with a probe on its last frame."""
+"""The arm: a serial chain of joints in standard Denavit-Hartenberg form, with a probe on its last frame."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -15,35 +15,42 @@ from ..core.arrays import Numbers, as_array, as_floats, in_chunks
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace, to_jax, to_numpy
 from ..core.text import pluralise
-from .chain import Geometry, tip_pose
+from .chain import Corrections, Geometry, JointKinds, tip_pose
 from .jacobian import tip_jacobian, tip_position
 
 # Steps of about 1 mm and 1 mrad are comparable at the tip of an arm of about 1 m.
 _LENGTH_STEP, _ANGLE_STEP = 1.0, 1e-3
 LENGTHS = ("a", "d", "probe")
-_PROBE_AXES = ("x", "y", "z")
+_AXES = ("x", "y", "z")
+DOWN = (0.0, 0.0, -1.0)
 _LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a compiler
 
 
 class Arm(eqx.Module):
-    """A serial arm of revolute joints, T = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)] each, with a probe.
+    """A serial arm with a probe; T = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)] of each joint, revolute by default.
 
+    A prismatic joint slides along its axis: T = Rz(theta) Tz(q + d) Tx(a) Rx(alpha) [Ry(beta)], with readings in mm.
     Every parameter is ``(..., n)`` for n joints; leading shapes are a batch of arms and broadcast against those of q.
     Source: Denavit and Hartenberg 1955; Cheng et al. 2018, eq. 1.
 
     Args:
         alpha: Link twists ``(..., n)``, rad.
         a: Link lengths ``(..., n)``, mm.
-        d: Link offsets ``(..., n)``, mm.
-        theta: Zero offsets of the joints ``(..., n)``, rad; by default 0.
+        d: Link offsets ``(..., n)``, mm; of a prismatic joint, its zero offset.
+        theta: Zero offsets of the joints ``(..., n)``, rad; by default 0. Of a prismatic joint, a constant angle.
         beta: Hayati and Mirmirani's (1985) additional angles for nearly parallel axes ``(..., n)``, rad; by default
             unused.
         probe: Tip in the last frame ``(..., 3)``, mm.
-        limits: Lowest and highest reading of each joint, n pairs, rad; not calibrated, but respected when poses are
-            made.
+        limits: Lowest and highest reading of each joint, n pairs, rad, or mm of prismatic joints; not calibrated, but
+            respected when poses are made.
+        prismatic: Numbers of the prismatic joints, from 1: ``(1,)`` for an arm on a linear axis.
+        coefficients: Of the corrections' functions ``(..., k)``; by default 0.
+        gravity: Direction of gravity in the base frame ``(..., 3)``, for corrections by its moments; by default
+            (0, 0, -1).
+        corrections: What joints do besides their readings; `kinematics.with_corrections` makes them.
 
     Raises:
-        InputError: Shapes do not fit together, or a value is not finite.
+        InputError: Shapes do not fit together, a value is not finite, or there is no joint of such a number.
     """
 
     alpha: Float[AnyArray, "... n"]  # link twist, rad
@@ -52,7 +59,11 @@ class Arm(eqx.Module):
     theta: Float[AnyArray, "... n"]  # joint zero offset, rad
     beta: Float[AnyArray, "... n"] | None  # Hayati's angle, rad
     probe: Float[AnyArray, "... 3"]  # tip in the last frame, mm
-    limits: tuple[tuple[float, float], ...] | None = eqx.field(static=True)  # rad
+    limits: tuple[tuple[float, float], ...] | None = eqx.field(static=True)  # rad, or mm of prismatic joints
+    prismatic: tuple[int, ...] = eqx.field(static=True)  # numbers of the prismatic joints, from 1
+    coefficients: Float[AnyArray, "... k"] | None  # of the corrections
+    gravity: Float[AnyArray, "... 3"] | None  # its direction in the base frame
+    corrections: Corrections | None
 
     def __init__(
         self,
@@ -64,6 +75,10 @@ class Arm(eqx.Module):
         beta: Numbers | None = None,
         probe: Numbers = (0.0, 0.0, 0.0),
         limits: Sequence[Sequence[float]] | None = None,
+        prismatic: Iterable[int] = (),
+        coefficients: Numbers | None = None,
+        gravity: Numbers | None = None,
+        corrections: Corrections | None = None,
     ):
         self.alpha = as_floats(alpha, "alpha")
         self.a = as_floats(a, "a")
@@ -82,15 +97,36 @@ class Arm(eqx.Module):
                 )
         if self.probe.shape[-1:] != (3,):
             raise InputError(f"probe has shape {self.probe.shape}; give its three coordinates (x, y, z) in mm.")
-        arrays = [array for array in (self.alpha, self.a, self.d, self.theta, self.beta) if array is not None]
-        batches = [array.shape[:-1] for array in (*arrays, self.probe)]
+        self._correct(coefficients, gravity, corrections)
+        kinds = ("alpha", "a", "d", "theta", "beta", "probe", "coefficients", "gravity")
+        batches = [array.shape[:-1] for array in (getattr(self, kind) for kind in kinds) if array is not None]
         try:
             np.broadcast_shapes(*batches)
         except ValueError as error:
             raise InputError(
                 f"the parameters have the batch shapes {', '.join(map(str, batches))}; make them alike."
             ) from error
-        self.limits = None if limits is None else checked_limits(limits, joints)
+        self.prismatic = _joint_numbers(prismatic, joints)
+        self.limits = None if limits is None else checked_limits(limits, joints, self.prismatic)
+
+    def _correct(self, coefficients: Numbers | None, gravity: Numbers | None, corrections: Corrections | None) -> None:
+        """Set what the corrections need: of the constructor."""
+        self.corrections = corrections
+        if corrections is None:
+            if coefficients is not None or gravity is not None:
+                raise InputError("coefficients and gravity are of corrections; make the arm by with_corrections first.")
+            self.coefficients = self.gravity = None
+            return
+        count = len(corrections.functions.each)
+        given = np.zeros(count) if coefficients is None else coefficients
+        self.coefficients = as_floats(given, "coefficients")
+        self.gravity = as_floats(DOWN if gravity is None else gravity, "gravity")
+        if self.coefficients.shape[-1:] != (count,):
+            raise InputError(
+                f"coefficients has shape {self.coefficients.shape}, but the corrections have {count}; give one each."
+            )
+        if self.gravity.shape[-1:] != (3,):
+            raise InputError(f"gravity has shape {self.gravity.shape}; give the three components of its direction.")
 
     @property
     def joints(self) -> int:
@@ -99,11 +135,13 @@ class Arm(eqx.Module):
 
     @property
     def geometry(self) -> Geometry:
-        """The parameters without the limits."""
-        return Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe)
+        """The parameters and the kinds of the joints, without the limits."""
+        kinds = JointKinds(tuple(i in self.prismatic for i in range(1, self.joints + 1))) if self.prismatic else None
+        corrected = (self.coefficients, self.gravity, self.corrections)
+        return Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe, kinds, *corrected)
 
     def position(self, q: Numbers) -> Float[AnyArray, "... 3"]:
-        """Tip in the base frame, mm, at joint angles q in rad: ``(..., n) -> (..., 3)``."""
+        """Tip in the base frame, mm, at readings q, rad, or mm of prismatic joints: ``(..., n) -> (..., 3)``."""
         return self._evaluated(tip_position, q)
 
     def pose(self, q: Numbers) -> Float[AnyArray, "... 4 4"]:
@@ -114,7 +152,7 @@ class Arm(eqx.Module):
         """Exact derivative of the tip by named parameters: analytic, equal to ``jax.jacfwd`` to rounding.
 
         Args:
-            q: Joint angles ``(..., n)``, rad.
+            q: Joint readings ``(..., n)``, rad, or mm of prismatic joints.
             names: Parameter names (``alpha_1`` ... ``probe_z``) or joint readings ``q_1`` ... ``q_n``, or one of
                 them; by default all parameters, in the order of `parameter_names`.
 
@@ -127,9 +165,7 @@ class Arm(eqx.Module):
         names = (
             parameter_names(self) if names is None else (names,) if isinstance(names, str) else items_of(names, "names")
         )
-        return self._evaluated(
-            partial(tip_jacobian, indices=tuple(locate(self.joints, n, extra=("q",)) for n in names)), q
-        )
+        return self._evaluated(partial(tip_jacobian, indices=tuple(locate(self, n, extra=("q",)) for n in names)), q)
 
     def replace(self, **changes: Any) -> "Arm":
         """The same arm with some values replaced, checked as a new arm is; also on traced values.
@@ -141,12 +177,13 @@ class Arm(eqx.Module):
         Raises:
             InputError: A name is unknown, or the arm that results is refused.
         """
-        whole = ("alpha", "a", "d", "theta", "beta", "probe", "limits")
+        whole = ("alpha", "a", "d", "theta", "beta", "probe", "limits", "prismatic")
+        whole = (*whole, "coefficients", "gravity", "corrections")
         arguments: dict[str, Any] = {key: changes.get(key, getattr(self, key)) for key in whole}
         for name, value in changes.items():
             if name in whole:
                 continue
-            kind, i = locate(self.joints, name)
+            kind, i = locate(self, name)
             value = as_floats(math.nan if value is None else value, name)
             array = np.zeros(self.alpha.shape) if arguments[kind] is None else as_floats(arguments[kind], kind)
             array, value = to_numpy((array, value))
@@ -174,45 +211,94 @@ class Arm(eqx.Module):
         return array
 
 
-def checked_limits(limits: Sequence[Sequence[float]], joints: int) -> tuple[tuple[float, float], ...]:
-    """Lowest and highest reading of each joint, rad, or `InputError` that names the joint."""
+def arm_of(geometry: Geometry, limits: Sequence[Sequence[float]] | None = None) -> Arm:
+    """The arm of a geometry."""
+    arrays = geometry._replace(kinds=None)._asdict()
+    del arrays["kinds"]
+    kinds = geometry.kinds
+    return Arm(**arrays, limits=limits, prismatic=() if kinds is None else np.flatnonzero(kinds.mask()) + 1)
+
+
+def _joint_numbers(numbers: Iterable[int], joints: int) -> tuple[int, ...]:
+    """Numbers of joints, from 1, in order, or `InputError`."""
+    given = items_of(numbers, "prismatic")
+    for number in given:
+        if isinstance(number, bool) or not isinstance(number, int | np.integer) or not 1 <= number <= joints:
+            raise InputError(f"prismatic names the joint {shown(number)}; give numbers of joints from 1 to {joints}.")
+    return tuple(sorted({int(number) for number in given}))
+
+
+def by_joint(arm: Arm, angular: Any, linear: Any) -> list[Any]:
+    """One of two values for each joint: that of revolute joints, or that of prismatic ones."""
+    return [linear if i in arm.prismatic else angular for i in range(1, arm.joints + 1)]
+
+
+def readings_unit(arm: Arm) -> str:
+    """The unit of an array of readings of an arm, in words."""
+    return "rad, mm of prismatic joints" if arm.prismatic else "rad"
+
+
+def checked_limits(
+    limits: Sequence[Sequence[float]], joints: int, prismatic: tuple[int, ...] = ()
+) -> tuple[tuple[float, float], ...]:
+    """Lowest and highest reading of each joint, rad or mm, or `InputError` that names the joint."""
     try:
         rows = [tuple(float(reading) for reading in row) for row in limits]
     except (TypeError, ValueError):
         rows = []  # no rows of numbers
     if len(rows) != joints or any(len(row) != 2 for row in rows):
-        raise InputError(f"limits must be {pluralise(joints, 'row')} of (lowest, highest) in rad, one per joint.")
+        units = "rad, of prismatic joints in mm" if prismatic else "rad"
+        raise InputError(f"limits must be {pluralise(joints, 'row')} of (lowest, highest) in {units}, one per joint.")
     for i, (low, high) in enumerate(rows, start=1):
         if not -math.inf < low < high < math.inf:
+            unit = "mm" if i in prismatic else "rad"
             raise InputError(
-                f"limits of joint {i} are {low:g} to {high:g} rad; they must be finite, and the lower below the upper."
+                f"limits of joint {i} are {low:g} to {high:g} {unit}; they must be finite, and the lower below the "
+                "upper."
             )
     return tuple((low, high) for low, high in rows)
 
 
 def is_single(arm: Arm) -> bool:
     """Whether this is one arm and not a batch."""
-    return all(array is None or array.ndim == 1 for array in arm.geometry)
+    return all(array.ndim == 1 for array in jax.tree.leaves(arm.geometry))
 
 
 def parameter_names(arm: Arm) -> tuple[str, ...]:
-    """All parameter names of an arm: alpha, a, d, theta, (beta,) by joint from 1, then probe_x, probe_y, probe_z."""
+    """All parameter names of an arm: alpha, a, d, theta, (beta,) by joint from 1, then probe_x, probe_y, probe_z, and
+    those of its corrections."""
     kinds = ("alpha", "a", "d", "theta") + (() if arm.beta is None else ("beta",))
     by_joint = [f"{kind}_{i}" for kind in kinds for i in range(1, arm.joints + 1)]
-    return (*by_joint, *(f"probe_{axis}" for axis in _PROBE_AXES))
+    return (*by_joint, *(f"probe_{axis}" for axis in _AXES), *correction_names(arm))
 
 
-def locate(joints: int, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
+def correction_names(arm: Arm) -> tuple[str, ...]:
+    """Names of the coefficients of an arm's corrections, and of the components of gravity where some depend on it."""
+    if arm.corrections is None:
+        return ()
+    each = arm.corrections.functions.each
+    by_gravity = any(function.rows == 3 for function in each)
+    return (*(function.name for function in each), *(f"gravity_{axis}" for axis in _AXES if by_gravity))
+
+
+def locate(arm: Arm, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
     """Kind and 0-based index of a parameter name: ``d_3 -> ("d", 2)``; an `InputError` names the nearest spelling."""
+    return located(arm.joints, correction_names(arm), name, extra)
+
+
+def located(joints: int, corrections: tuple[str, ...], name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
+    """`locate` for an arm with so many joints and corrections of these names."""
     kinds = ("alpha", "a", "d", "theta", "beta", *extra)
     kind, _, index = name.rpartition("_") if isinstance(name, str) else ("", "", "")
-    if kind == "probe" and index in _PROBE_AXES:
-        return "probe", _PROBE_AXES.index(index)
+    if (kind == "probe" or name in corrections) and index in _AXES:
+        return kind, _AXES.index(index)
+    if name in corrections:
+        return "coefficients", corrections.index(name)
     if kind in kinds and index.isdecimal() and str(int(index)) == index and 1 <= int(index) <= joints:
         return kind, int(index) - 1
-    known = [f"{k}_{i}" for k in kinds for i in range(1, joints + 1)] + [f"probe_{axis}" for axis in _PROBE_AXES]
+    known = [f"{k}_{i}" for k in kinds for i in range(1, joints + 1)] + [f"probe_{axis}" for axis in _AXES]
     given = name if isinstance(name, str) else shown(name)
-    raise InputError(f"unknown parameter '{given}' of a {joints}-joint arm{nearest(given, known)}")
+    raise InputError(f"unknown parameter '{given}' of a {joints}-joint arm{nearest(given, [*known, *corrections])}")
 
 
 def with_arrays(arm: Arm, **changes: AnyArray | None) -> Arm:
@@ -224,11 +310,19 @@ def with_arrays(arm: Arm, **changes: AnyArray | None) -> Arm:
 
 
 def joint_limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[np.ndarray, "n 2"]:
-    """Lowest and highest reading of each joint: those given, else the arm's own, else -pi to pi; rad."""
+    """Lowest and highest reading of each joint: those given, else the arm's own, else -pi to pi; rad, or mm.
+
+    Raises `InputError` where a prismatic joint has neither.
+    """
     rows = limits if limits is not None else arm.limits
     if rows is None:
+        if arm.prismatic:
+            raise InputError(
+                f"joint {arm.prismatic[0]} is prismatic, and nothing says how far it slides; give the arm limits "
+                "(limits=, or limits_mm in its file)."
+            )
         rows = [(-math.pi, math.pi)] * arm.joints
-    return np.asarray(checked_limits(rows, arm.joints))
+    return np.asarray(checked_limits(rows, arm.joints, arm.prismatic))
 
 
 def jacobian_at(arm: Arm, q: Float[np.ndarray, "N n"], names: Sequence[str]) -> Float[np.ndarray, "N 3 p"]:
@@ -239,13 +333,22 @@ def jacobian_at(arm: Arm, q: Float[np.ndarray, "N n"], names: Sequence[str]) -> 
 def value_of(arm: Arm, name: str) -> np.ndarray:
     """Value of a named parameter of a concrete arm, mm or rad, with the arm's batch axes."""
     # Read with NumPy: under jit even a constant arm's values become tracers once JAX computes with them.
-    kind, i = locate(arm.joints, name)
+    kind, i = locate(arm, name)
     return np.asarray(getattr(arm, kind))[..., i]
 
 
 def is_length(name: str) -> bool:
     """Whether a parameter name is a length (a, d, probe) and not an angle."""
     return name.rpartition("_")[0] in LENGTHS
+
+
+def parameter_unit(arm: Arm, name: str) -> str:
+    """Unit of a parameter: mm, rad, or of a correction's coefficient its own; "1" of a pure number."""
+    kind, i = locate(arm, name)
+    if kind == "coefficients" and arm.corrections is not None:
+        function = arm.corrections.functions.each[i]
+        return function.unit.replace("rad", "mm") if function.joint in arm.prismatic else function.unit
+    return "1" if kind == "gravity" else "mm" if kind in LENGTHS else "rad"
 
 
 def with_values(
@@ -276,4 +379,4 @@ def neighbouring_arm(arm: Arm, names: Sequence[str]) -> Arm:
     steps = np.random.default_rng(0).normal(size=len(names)) * natural_steps(names)
     vector = np.array([value_of(arm, name) for name in names]) + steps
     arm = to_numpy(arm)
-    return with_arrays(arm, **with_values(arm.geometry, vector, tuple(locate(arm.joints, name) for name in names)))
+    return with_arrays(arm, **with_values(arm.geometry, vector, tuple(locate(arm, name) for name in names)))

@@ -12,7 +12,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from .arm import Arm
+from ..core.errors import InputError
+from .arm import Arm, arm_of
 from .chain import Geometry
 from .independence import NEARLY_PARALLEL
 
@@ -105,11 +106,20 @@ def without_far_frames(arm: Arm) -> Arm:
     frames = dh_frames(geometry, np.eye(4))
     directions, points = (np.array([frame[:3, i] for frame in frames[:-1]]) for i in (2, 3))
     _, found = dh_of_axes(Axes(directions, points, frames[-1]), keep_points=False)
-    return Arm(**found._replace(probe=found.probe + geometry.probe)._asdict(), limits=arm.limits)
+    return arm_of(found._replace(probe=found.probe + geometry.probe, kinds=geometry.kinds), arm.limits)
 
 
 def geometry_of(arm: Arm) -> Geometry:
-    """The parameters of an arm as NumPy arrays."""
+    """The parameters of an arm as NumPy arrays, for formats that know nothing else.
+
+    Raises:
+        InputError: The arm has joint corrections, which such a format cannot hold.
+    """
+    if arm.corrections is not None:
+        raise InputError(
+            "the arm has joint corrections, which this format cannot hold; write TOML, the joint zero offsets alone "
+            "(--format offsets), or correct the commanded poses (aacmm correct)."
+        )
     return jax.tree.map(np.asarray, arm.geometry)
 
 

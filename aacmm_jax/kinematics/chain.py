@@ -7,20 +7,104 @@ XLA then computes the chain again for every column. `forward_pass_by_joints` pre
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, scan
 
-SinesCosines = tuple[Float[AnyArray, "n ... 1 N"], Float[AnyArray, "n ... 1 N"]]
+_UNIT = 1000.0  # mm: a slide of 1 mm counts as much as a rotation of 1 mrad, like the natural steps of parameters
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class JointKinds:
+    """Which joints of a chain are prismatic: a node without leaves, so that it is static in every program.
+
+    A chain of revolute joints has None in its place: its programs are then those of an arm that knows no other joints.
+    """
+
+    prismatic: tuple[bool, ...]
+
+    @property
+    def units(self) -> Float[np.ndarray, " n"]:
+        """Changes of the readings that count as much as each other: 1 rad, and 1000 mm of prismatic joints."""
+        return np.where(self.mask(), _UNIT, 1.0)
+
+    def mask(self, rank: int = 1) -> Bool[np.ndarray, "n ..."]:
+        """Whether each joint is prismatic, with axes of length 1 after the first up to the given rank."""
+        return np.asarray(self.prismatic).reshape(-1, *(1,) * (rank - 1))
+
+
+@runtime_checkable
+class KnownFunction(Protocol):
+    """A function of the readings that a coefficient multiplies: a term of `kinematics.corrections`; hashable."""
+
+    @property
+    def joint(self) -> int:
+        """The joint that it moves, from 1."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """Name of the coefficient."""
+        ...
+
+    @property
+    def unit(self) -> str:
+        """Unit of the coefficient."""
+        ...
+
+    @property
+    def rows(self) -> int:
+        """1, or 3 where the function is the product of the direction of gravity with three rows."""
+        ...
+
+    def values(self, q: Float[AnyArray, "n ... 1 N"], forward: "ForwardPass") -> Float[AnyArray, "rows ... 1 N"]:
+        """Its rows at N configurations, with the nominal arm's frames there."""
+        ...
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class KnownFunctions:
+    """The functions of a chain's corrections, static in every program."""
+
+    each: tuple[KnownFunction, ...]
+
+    @property
+    def term_of_row(self) -> Int[np.ndarray, " rows"]:
+        """The function, from 0, that each row belongs to."""
+        return np.repeat(np.arange(len(self.each)), [function.rows for function in self.each])
+
+    @property
+    def component_of_row(self) -> Int[np.ndarray, " rows"]:
+        """The component of gravity that each row is multiplied by; 3 for those of other functions."""
+        return np.concatenate([np.arange(3) if function.rows == 3 else [3] for function in self.each])
+
+    def joint_of_row(self, joints: int) -> Float[np.ndarray, "n rows"]:
+        """1 where a row moves a joint, else 0."""
+        moved = np.array([self.each[term].joint - 1 for term in self.term_of_row])
+        return (np.arange(joints)[:, None] == moved).astype(float)
+
+
+class Corrections(NamedTuple):
+    """What joints do besides their readings: known functions, and the arm on whose frames they are evaluated."""
+
+    functions: KnownFunctions
+    nominal: "Geometry"  # without corrections
 
 
 class Geometry(NamedTuple):
-    """Parameters of a chain as arrays. Lengths mm, angles rad; ``beta`` is None where Hayati's angle is unused."""
+    """Parameters of a chain as arrays, and the static facts about its joints.
+
+    Lengths mm, angles rad; ``beta`` is None where Hayati's angle is unused, ``kinds`` where all joints are revolute,
+    the last three where joints do what they read.
+    """
 
     alpha: Float[AnyArray, "... n"]
     a: Float[AnyArray, "... n"]
@@ -28,6 +112,31 @@ class Geometry(NamedTuple):
     theta: Float[AnyArray, "... n"]
     beta: Float[AnyArray, "... n"] | None
     probe: Float[AnyArray, "... 3"]
+    kinds: JointKinds | None = None
+    coefficients: Float[AnyArray, "... k"] | None = None  # of the corrections' functions
+    gravity: Float[AnyArray, "... 3"] | None = None  # its direction in the base frame
+    corrections: Corrections | None = None
+
+
+class JointMotion(NamedTuple):
+    """What readings do to the joints: all that the chain needs of them, evaluated once a capture.
+
+    A revolute joint rotates by its reading, a prismatic one slides by it along its axis. ``slide`` is None for a chain
+    of revolute joints, ``functions`` for one without corrections.
+    """
+
+    cos: Float[AnyArray, "n ... 1 N"]
+    sin: Float[AnyArray, "n ... 1 N"]
+    slide: Float[AnyArray, "n ... 1 N"] | None  # mm
+    functions: Float[AnyArray, "rows ... 1 N"] | None = None  # of the corrections
+
+
+class JointErrors(NamedTuple):
+    """Derivatives of what the corrections add to each joint's theta, or d of a prismatic joint."""
+
+    by_coefficient: Float[AnyArray, "k ... 1 N"]  # of the one joint that it moves
+    by_gravity: Float[AnyArray, "n 3 ... 1 N"]
+    functions: KnownFunctions
 
 
 class ForwardPass(NamedTuple):
@@ -38,11 +147,13 @@ class ForwardPass(NamedTuple):
 
     frame: tuple[Float[AnyArray, "... 3 N"], Float[AnyArray, "... 3 N"], Float[AnyArray, "... 3 N"]]  # x, y, z
     tip: Float[AnyArray, "... 3 N"]
-    z_before: Float[AnyArray, "n ... 3 N"]  # axis of q, theta and d
+    z_before: Float[AnyArray, "n ... 3 N"]  # axis of the reading, theta and d
     origin_before: Float[AnyArray, "n ... 3 N"]
     x: Float[AnyArray, "n ... 3 N"]  # axis of a and alpha
     y: Float[AnyArray, "n ... 3 N"] | None  # axis of beta
     origin: Float[AnyArray, "n ... 3 N"]
+    kinds: JointKinds | None = None
+    errors: JointErrors | None = None  # of a chain with corrections
 
 
 def joints_first(values: Any, rank: int) -> Any:
@@ -55,22 +166,52 @@ def joints_first(values: Any, rank: int) -> Any:
     return moved.reshape(*moved.shape[:1], *batch[:-1], 1, *batch[-1:])
 
 
-def sines_cosines(q: Float[AnyArray, "... n"]) -> SinesCosines:
-    """Cosines and sines of joint angles for `forward_pass`: computed once for many arms, they save half of its time."""
-    rows, xp = joints_first(q, max(q.ndim - 1, 1)), namespace(q)
-    return xp.cos(rows), xp.sin(rows)
+def reading_units(geometry: Geometry) -> Float[np.ndarray, " n"]:
+    """`JointKinds.units`, also for a chain of revolute joints."""
+    return np.ones(geometry.alpha.shape[-1]) if geometry.kinds is None else geometry.kinds.units
+
+
+def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion:
+    """What readings do to the joints of a chain, for `forward_pass`: computed once for many arms of the same kind.
+
+    Cosines and sines are half of the time of a forward pass. Of the geometry, only what an identification does not
+    change matters: the kinds of the joints, and the nominal arm of its corrections.
+
+    Args:
+        geometry: The chain, whose parameters may be anything.
+        q: Readings ``(..., n)``, rad, or mm of prismatic joints.
+    """
+    return joint_motion_of_rows(geometry, joints_first(q, max(q.ndim - 1, 1)))
+
+
+def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"]) -> JointMotion:
+    """`joint_motion` of readings that have the joints first and the configurations last."""
+    xp, corrections = namespace(rows), geometry.corrections
+    if geometry.kinds is None:
+        motion = JointMotion(xp.cos(rows), xp.sin(rows), None)
+    else:
+        prismatic = geometry.kinds.mask(rows.ndim)
+        angle = xp.where(prismatic, 0.0, rows)
+        motion = JointMotion(xp.cos(angle), xp.sin(angle), xp.where(prismatic, rows, 0.0))
+    if corrections is None:
+        return motion
+    forward = forward_pass(corrections.nominal, motion)
+    return motion._replace(
+        functions=xp.concatenate([function.values(rows, forward) for function in corrections.functions.each])
+    )
 
 
 @compiled
-def forward_pass(geometry: Geometry, sines_cosines: SinesCosines) -> ForwardPass:
-    """All frames from the base to the tip: T_i = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)].
+def forward_pass(geometry: Geometry, motion: JointMotion) -> ForwardPass:
+    """All frames from the base to the tip: T_i = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)] of a revolute joint,
+    Rz(theta) Tz(q + d) Tx(a) Rx(alpha) [Ry(beta)] of a prismatic one.
 
-    Batches of the parameters (their leading axes) and of the sines and cosines (configurations last) broadcast.
+    Batches of the parameters (their leading axes) and of the motion (configurations last) broadcast.
     """
-    return _forward_pass(geometry, sines_cosines, scan)
+    return _forward_pass(geometry, motion, scan)
 
 
-def forward_pass_by_joints(geometry: Geometry, sines_cosines: SinesCosines) -> ForwardPass:
+def forward_pass_by_joints(geometry: Geometry, motion: JointMotion) -> ForwardPass:
     """`forward_pass` in JAX without a loop, which fills its outputs with zeros first and copies every joint into them.
 
     With the Jacobian columns it takes half the time on a CPU, but twice as long to compile. The condition, which always
@@ -78,14 +219,14 @@ def forward_pass_by_joints(geometry: Geometry, sines_cosines: SinesCosines) -> F
     an ``optimization_barrier``.)
     """
 
-    def compute(geometry: Geometry, sines_cosines: SinesCosines) -> ForwardPass:
-        return _forward_pass(geometry, sines_cosines, _unrolled)
+    def compute(geometry: Geometry, motion: JointMotion) -> ForwardPass:
+        return _forward_pass(geometry, motion, _unrolled)
 
     def never(*operands: Any) -> ForwardPass:
         return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(compute, *operands))
 
-    possible = ~(sines_cosines[0].ravel()[0] > 2)  # true of every cosine, also of NaN
-    return jax.lax.cond(possible, compute, never, geometry, sines_cosines)
+    possible = ~(motion.cos.ravel()[0] > 2)  # true of every cosine, also of NaN
+    return jax.lax.cond(possible, compute, never, geometry, motion)
 
 
 def _unrolled(body: Callable, start: Any, inputs: Any) -> tuple[Any, Any]:
@@ -98,18 +239,31 @@ def _unrolled(body: Callable, start: Any, inputs: Any) -> tuple[Any, Any]:
     return carry, jax.tree.map(lambda *leaves: leaves, *outputs)
 
 
-def _forward_pass(geometry: Geometry, sines_cosines: SinesCosines, loop: Callable) -> ForwardPass:
-    xp = namespace(geometry, sines_cosines)
-    rank = max(sines_cosines[0].ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
-    cos_q, sin_q = (xp.reshape(t, t.shape[:1] + (1,) * (rank + 2 - t.ndim) + t.shape[1:]) for t in sines_cosines)
+def _with_rank(motion: JointMotion, rank: int) -> JointMotion:
+    """The motion with as many batch axes."""
+    return jax.tree.map(lambda t: t.reshape(t.shape[:1] + (1,) * (rank + 2 - t.ndim) + t.shape[1:]), motion)
+
+
+def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> ForwardPass:
+    xp = namespace(geometry, motion)
+    rank = max(motion.cos.ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
+    motion = _with_rank(motion, rank)
     parameters = jax.tree.map(lambda leaf: joints_first(leaf, rank), geometry)
-    cos_theta, sin_theta = xp.cos(parameters.theta), xp.sin(parameters.theta)
+    theta, d, errors = parameters.theta, parameters.d, None
+    if motion.slide is not None:
+        d = d + motion.slide
+    if geometry.corrections is not None:
+        added, errors = _joint_errors(parameters, motion, geometry.corrections.functions)
+        mask = np.zeros(()) if geometry.kinds is None else geometry.kinds.mask(added.ndim)
+        theta = theta + (added if geometry.kinds is None else xp.where(mask, 0.0, added))
+        d = d if geometry.kinds is None else d + xp.where(mask, added, 0.0)
+    cos_theta, sin_theta = xp.cos(theta), xp.sin(theta)
     inputs = (
-        (cos_q * cos_theta - sin_q * sin_theta, sin_q * cos_theta + cos_q * sin_theta),
+        (motion.cos * cos_theta - motion.sin * sin_theta, motion.sin * cos_theta + motion.cos * sin_theta),
         (xp.cos(parameters.alpha), xp.sin(parameters.alpha)),
         None if parameters.beta is None else (xp.cos(parameters.beta), xp.sin(parameters.beta)),
         parameters.a,
-        parameters.d,
+        d,
     )
 
     def joint(frame, row):
@@ -126,14 +280,42 @@ def _forward_pass(geometry: Geometry, sines_cosines: SinesCosines, loop: Callabl
             new_x, new_z = cos_beta * new_x - sin_beta * new_z, sin_beta * new_x + cos_beta * new_z
         return ((new_x, new_y, new_z), new_origin), axes
 
-    batch = np.broadcast_shapes(*(leaf.shape[1:] for leaf in jax.tree.leaves((sines_cosines, parameters))))
+    batch = np.broadcast_shapes(*(leaf.shape[1:] for leaf in jax.tree.leaves((motion, parameters))))
     shape = (*batch[:-2], 3, batch[-1])
     axes_of_base = [xp.broadcast_to(axis.reshape((1,) * len(batch[:-2]) + (3, 1)), shape) for axis in xp.eye(3)]
     start = ((axes_of_base[0], axes_of_base[1], axes_of_base[2]), xp.zeros(shape))
     (frame, origin), axes = loop(joint, start, inputs)
     probe = parameters.probe
     tip = origin + probe[0] * frame[0] + probe[1] * frame[1] + probe[2] * frame[2]
-    return ForwardPass(frame, tip, *axes)
+    return ForwardPass(frame, tip, *axes, kinds=geometry.kinds, errors=errors)
+
+
+def _joint_errors(
+    parameters: Geometry, motion: JointMotion, functions: KnownFunctions
+) -> tuple[Float[AnyArray, "n ... 1 N"], JointErrors]:
+    """What the corrections add to each joint, and its derivatives; ``parameters`` have the joints first."""
+    xp = namespace(parameters, motion)
+    assert motion.functions is not None
+    assert parameters.coefficients is not None
+    assert parameters.gravity is not None
+    by_component = xp.concatenate([parameters.gravity, xp.ones_like(parameters.gravity[:1])])
+    component, term = functions.component_of_row, functions.term_of_row
+    joints = functions.joint_of_row(len(parameters.theta))
+    weighted = by_component[component] * motion.functions
+    terms = (np.arange(len(functions.each))[:, None] == term).astype(float)
+    by_coefficient = xp.tensordot(terms, weighted, axes=1)
+    added = xp.tensordot(joints, parameters.coefficients[term] * weighted, axes=1)
+    moments = parameters.coefficients[term] * motion.functions
+    by_gravity = xp.stack([xp.tensordot(joints * (component == i), moments, axes=1) for i in range(3)], axis=1)
+    return added, JointErrors(by_coefficient, by_gravity, functions)
+
+
+def joint_errors(geometry: Geometry, motion: JointMotion) -> Float[AnyArray, "n ... 1 N"]:
+    """What the corrections add to each joint's theta, rad, or to d of a prismatic joint, mm."""
+    assert geometry.corrections is not None
+    rank = max(motion.cos.ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
+    parameters = jax.tree.map(lambda leaf: joints_first(leaf, rank), geometry)
+    return _joint_errors(parameters, _with_rank(motion, rank), geometry.corrections.functions)[0]
 
 
 def components_last(
@@ -147,7 +329,7 @@ def components_last(
 @compiled
 def tip_pose(geometry: Geometry, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 4 4"]:
     """Homogeneous pose of the last frame with the tip as its origin (mm), in the base frame."""
-    forward = forward_pass(geometry, sines_cosines(q))
+    forward = forward_pass(geometry, joint_motion(geometry, q))
     columns = [components_last(rows, geometry, q) for rows in (*forward.frame, forward.tip)]
     xp = namespace(geometry, q)
     top = xp.stack(columns, axis=-1)

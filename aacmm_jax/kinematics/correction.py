@@ -15,14 +15,15 @@ from ..core.linear_algebra import solve_positive_definite
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, numpy_if_known
 from ..core.rotations import cross
 from .arm import Arm, checked_limits, is_single
-from .chain import ForwardPass, Geometry, forward_pass, sines_cosines
+from .chain import ForwardPass, Geometry, forward_pass, joint_motion, joint_motion_of_rows, reading_units
+from .jacobian import reading_columns, reading_rotations
 
 FULL_POSE = 6  # joints from which on the orientation can be reached as well
 _STEPS = 60
 _LEVER = 500.0  # mm: a rotation counts as what it moves at this distance
-_LARGEST_STEP = 0.5  # rad
+_LARGEST_STEP = 0.5  # rad, or m of a prismatic joint
 _CLOSED = 1e-7  # mm: one more step closes a gap of this size to rounding
-_STILL = 1e-13  # rad: a step of this size changes nothing
+_STILL = 1e-13  # rad, or m of a prismatic joint: a step of this size changes nothing
 _ARRIVED, _ALIGNED = 1e-6, 1e-9  # mm, rad
 _ROWS = 2048  # of one call: fewer leave much of the time to Python, more do not fit into the processor's cache
 
@@ -87,7 +88,7 @@ def readings_at_poses(
         )
     allowed = np.tile([-np.inf, np.inf], (arm.joints, 1))
     if limits is not None:
-        allowed = np.asarray(checked_limits(limits, arm.joints))
+        allowed = np.asarray(checked_limits(limits, arm.joints, arm.prismatic))
     count = math.prod(q.shape[:-1])
     rows, wanted = q.reshape(count, arm.joints), poses.reshape(count, 4, 4)
     if namespace(arm.geometry, rows, wanted) is np:
@@ -130,18 +131,20 @@ def solve_to_poses(
     """
     xp, whole = namespace(geometry, q, poses), q.shape[-1] >= FULL_POSE
     low, high = limits[:, :1], limits[:, 1:]
+    units = reading_units(geometry)[:, None]
 
     def step(q: Any, wanted: Any) -> tuple[Any, Any]:
         """The next readings ``(n, c)``, and which rows need more steps."""
-        forward = forward_pass(geometry, (xp.cos(q)[:, None], xp.sin(q)[:, None]))
+        forward = forward_pass(geometry, joint_motion_of_rows(geometry, q[:, None]))
         gap, columns = _gap_and_columns(forward, wanted, whole)
+        columns = columns * units[:, None]
         change = _least_norm(columns, gap)
         # A joint at its limit that a step would take beyond stays there, and the others do what they can.
         stays = ((q <= low) & (change < 0)) | ((q >= high) & (change > 0))
         if xp is not np or stays.any():
             change = _least_norm(xp.where(stays[:, None], 0.0, columns), gap)
-        new = xp.clip(q + xp.clip(change, -_LARGEST_STEP, _LARGEST_STEP), low, high)
-        open_gap, moves = xp.any(xp.abs(gap) > _CLOSED, axis=0), xp.any(xp.abs(new - q) > _STILL, axis=0)
+        new = xp.clip(q + units * xp.clip(change, -_LARGEST_STEP, _LARGEST_STEP), low, high)
+        open_gap, moves = xp.any(xp.abs(gap) > _CLOSED, axis=0), xp.any(xp.abs(new - q) > _STILL * units, axis=0)
         return new, open_gap & moves
 
     # A step after the gap was seen to be closed takes what Newton's method leaves to rounding.
@@ -165,7 +168,7 @@ def solve_to_poses(
             body,
             (xp.zeros((), dtype=np.int32), q, xp.ones(q.shape[1:], dtype=bool)),
         )
-    forward = forward_pass(geometry, sines_cosines(q.T))
+    forward = forward_pass(geometry, joint_motion(geometry, q.T))
     shift, rotation = _remaining(forward, wanted)
     return q.T, xp.linalg.norm(shift, axis=0), xp.linalg.norm(rotation, axis=0)
 
@@ -195,10 +198,10 @@ def _gap_and_columns(
     """What is left to the poses wanted, in mm, and its derivatives by the readings; of positions alone, or of all."""
     xp = namespace(forward, wanted)
     shift, rotation = _remaining(forward, wanted)
-    moved = cross(forward.z_before, forward.tip[None] - forward.origin_before)
+    moved = reading_columns(forward)
     if not whole:
         return shift, moved
-    columns = xp.concatenate([moved, _LEVER * forward.z_before], axis=1)
+    columns = xp.concatenate([moved, _LEVER * reading_rotations(forward)], axis=1)
     return xp.concatenate([shift, _LEVER * rotation]), columns
 
 

@@ -9,7 +9,17 @@ from jaxtyping import Float, Int
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
-from .arm import LENGTHS, Arm, jacobian_at, joint_limits, locate, natural_steps, neighbouring_arm, with_arrays
+from .arm import (
+    LENGTHS,
+    Arm,
+    correction_names,
+    jacobian_at,
+    joint_limits,
+    locate,
+    natural_steps,
+    neighbouring_arm,
+    with_arrays,
+)
 from .inverse_kinematics import SocketPoses, project_to_centroids, project_to_targets
 from .near_degeneracy import trade_offs
 
@@ -24,16 +34,19 @@ def equations(
 ) -> tuple[Float[np.ndarray, "N 3 p"], Float[np.ndarray, "l p"]]:
     """Derivatives of tips less their socket's mean, and of reference lengths, at configurations; mm per mm or rad."""
     columns = jacobian_at(arm, q, names)
-    owner, sizes = capture.owner, np.asarray(capture.sizes, dtype=float)
-    starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
-    means = np.add.reduceat(columns, starts, axis=0) / sizes[:, None, None]
-    tips = in_chunks(lambda rows: np.asarray(arm.position(rows)), q)
-    centroids = np.add.reduceat(tips, starts, axis=0) / sizes[:, None]
+    means = _socket_means(columns, capture)
+    centroids = _socket_means(in_chunks(lambda rows: np.asarray(arm.position(rows)), q), capture)
     ends = capture.ends()
     between = centroids[ends[:, 1]] - centroids[ends[:, 0]]
     directions = between / np.linalg.norm(between, axis=1, keepdims=True)
     lengths = np.einsum("lc,lcp->lp", directions, means[ends[:, 1]] - means[ends[:, 0]])
-    return columns - means[owner], lengths
+    return columns - means[capture.owner], lengths
+
+
+def _socket_means(values: Float[np.ndarray, "N ..."], capture: SocketPoses) -> Float[np.ndarray, "s ..."]:
+    starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
+    sums = np.add.reduceat(values, starts, axis=0)
+    return sums / np.reshape(capture.sizes, (-1, *(1,) * (values.ndim - 1)))
 
 
 def nearly_parallel(arm: Arm) -> list[int]:
@@ -46,9 +59,12 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
 
     Parameters are taken one after the other, and fixed where those taken before can imitate them: nonzero lengths
     first, then angles, lengths that are nominally zero, the probe and the last link; the longest link comes last of
-    all, so that it is fixed where no reference length fixes the scale. Where neighbouring axes are nearly parallel,
-    ``d_i`` is fixed and ``beta_i`` is free. At last the first parameter of every near-degenerate combination is fixed
-    (`near_degeneracy`).
+    all, so that it is fixed where neither a reference length nor a prismatic joint fixes the scale. Before it come the
+    coefficients of corrections, since a harmonic may imitate a zero offset, but not replace it. Where neighbouring
+    axes are nearly parallel, ``d_i`` is fixed and ``beta_i`` is free. Of a prismatic joint i, ``a_i`` and ``d_(i+1)``
+    are fixed rather than others, and ``theta_i`` next to a parallel axis: three angles and ``theta`` of the joint
+    before it, or after it, are all that the orientation of the next axis has. At last the first parameter of every
+    near-degenerate combination is fixed (`near_degeneracy`).
     """
     if arm.joints != capture.joints:
         raise InputError(
@@ -59,19 +75,24 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
         arm = with_arrays(arm, beta=np.zeros_like(arm.alpha))
     order = _order(arm, parallel)
     taken: tuple[str, ...] = ()
-    for _ in range(5):
-        # Without the exact alignments of the nominal arm. Fixed parameters keep their nominal values, which may make
-        # others redundant, so the choice is repeated.
-        neighbour = neighbouring_arm(arm, taken or tuple(order))
-        poses, lengths = equations(neighbour, capture, order, project_to_centroids(neighbour, capture, targets_of=arm))
-        before, taken = taken, _independent(neighbour, order, np.concatenate([poses.reshape(-1, len(order)), lengths]))
-        if taken == before or not taken:
-            break
-    if taken:
+    while order:
+        for _ in range(5):
+            # Without the exact alignments of the nominal arm. Fixed parameters keep their nominal values, which may
+            # make others redundant, so the choice is repeated.
+            neighbour = neighbouring_arm(arm, taken or tuple(order))
+            moved = project_to_centroids(neighbour, capture, targets_of=arm)
+            poses, lengths = equations(neighbour, capture, order, moved)
+            rows = np.concatenate([poses.reshape(-1, len(order)), lengths])
+            before, taken = taken, _independent(neighbour, order, rows)
+            if taken == before or not taken:
+                break
         columns = [order.index(name) for name in taken]
-        rows = tip_movements(poses, lengths) * natural_steps(order)
-        weak = {trade_off.names[0] for trade_off in trade_offs(rows[:, columns], taken)}
-        taken = tuple(name for name in taken if name not in weak)
+        rows = (tip_movements(poses, lengths) * natural_steps(order))[:, columns]
+        weak = {trade_off.names[0] for trade_off in trade_offs(rows, taken)} if taken else set()
+        if not weak:
+            break
+        # What a parameter of a weak combination stood for may be what another, so far redundant, determines well.
+        order = [name for name in order if name not in weak]
     return arm, taken
 
 
@@ -83,22 +104,25 @@ def tip_movements(poses: Float[np.ndarray, "N r p"], lengths: Float[np.ndarray, 
 
 
 @dataclass
-class _GenericPoses:
-    """`SocketPoses` all over the workspace; the reference length joins the first two sockets."""
+class PosesInSockets:
+    """`SocketPoses` with a reference length that joins the first two sockets, or a socket to itself."""
 
     q: Float[np.ndarray, "N n"]
     sizes: tuple[int, ...]
 
     @property
     def joints(self) -> int:
+        """Number of joints."""
         return self.q.shape[1]
 
     @property
     def owner(self) -> Int[np.ndarray, " N"]:
+        """Index of the socket of each pose."""
         return np.repeat(np.arange(len(self.sizes)), self.sizes)
 
     def ends(self) -> Int[np.ndarray, "l 2"]:
-        return np.array([[0, 1]])
+        """Socket indices of both ends of the length."""
+        return np.array([[0, min(1, len(self.sizes) - 1)]])
 
 
 def generic_poses(arm: Arm) -> SocketPoses:
@@ -113,7 +137,7 @@ def generic_poses(arm: Arm) -> SocketPoses:
     starts = random.uniform(limits[:, 0], limits[:, 1], (len(owner), arm.joints))
     q, arrived = project_to_targets(arm, starts, np.asarray(arm.position(first))[owner], limits)
     sockets = [np.concatenate([first[i : i + 1], q[arrived & (owner == i)]]) for i in range(_SOCKETS)]
-    return _GenericPoses(np.concatenate(sockets), tuple(len(socket) for socket in sockets))
+    return PosesInSockets(np.concatenate(sockets), tuple(len(socket) for socket in sockets))
 
 
 def _independent(arm: Arm, order: list[str], rows: Float[np.ndarray, "r p"]) -> tuple[str, ...]:
@@ -125,7 +149,7 @@ def _independent(arm: Arm, order: list[str], rows: Float[np.ndarray, "r p"]) -> 
         for _ in range(2):  # twice is enough for orthogonality to rounding
             column = column - basis @ (basis.T @ column)
         least = 1e-7 * (
-            1.0 if locate(arm.joints, name)[0] in LENGTHS else 1e3
+            1.0 if locate(arm, name)[0] in LENGTHS else 1e3
         )  # small at the tip for steps of 1 mm and 1 mrad
         size = float(np.linalg.norm(column))
         if size > max(_INDEPENDENT * float(np.linalg.norm(whole)), least) and basis.shape[1] < rows.shape[0]:
@@ -139,9 +163,11 @@ def _order(arm: Arm, parallel: list[int]) -> list[str]:
     values = {kind: np.asarray(getattr(arm, kind)) for kind in ("a", "d")}
     lengths = [(f"{kind}_{i}", values[kind][i - 1]) for i in range(1, n) for kind in ("a", "d")]
     lengths = [(name, value) for name, value in lengths if not (name[0] == "d" and int(name[2:]) in parallel)]
-    nonzero = [name for name, value in lengths if value != 0]
-    zero = [name for name, value in lengths if value == 0]
-    angles = [f"{kind}_{i}" for i in range(1, n) for kind in ("alpha", "theta")]
+    late = {name for i in arm.prismatic for name in (f"a_{i}", f"d_{i + 1}")}
+    late |= {f"theta_{i}" for i in arm.prismatic if {i - 1, i} & set(parallel)}
+    nonzero = [name for name, value in lengths if value != 0 and name not in late]
+    zero = [name for name, value in lengths if value == 0 and name not in late]
+    angles = [f"{kind}_{i}" for i in range(1, n) for kind in ("alpha", "theta") if f"{kind}_{i}" not in late]
     # Of what lies beyond the last joint, the probe comes before the link, since probes are changed.
     tip = {"probe_z": float(arm.probe[2]), f"d_{n}": values["d"][-1]}
     # theta of the last joint is determined by a tip off its axis; near the axis x and y of the probe are.
@@ -151,5 +177,8 @@ def _order(arm: Arm, parallel: list[int]) -> list[str]:
     wrist += [*(name for name, value in tip.items() if value == 0), f"a_{n}", f"alpha_{n}"]
     last = [max(nonzero, key=lambda name: abs(dict(lengths)[name]))] if nonzero else []
     nonzero += [name for name, value in tip.items() if value != 0]
-    order = [*nonzero, *angles, *(f"beta_{i}" for i in parallel), *zero, *wrist, *last]
+    order = [*nonzero, *angles, *(f"beta_{i}" for i in parallel), *zero, *wrist]
+    order += [name for name in (*dict(lengths), *(f"theta_{i}" for i in range(1, n))) if name in late]
+    corrections = [name for name in correction_names(arm) if not name.startswith("gravity_")]
+    order = [*dict.fromkeys(order), *corrections, *last]
     return [name for i, name in enumerate(order) if name not in last or i == len(order) - 1]

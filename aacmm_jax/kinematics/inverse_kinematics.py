@@ -19,15 +19,15 @@ from ..core.arrays import in_chunks, random_numbers
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from .arm import Arm
-from .chain import Geometry, forward_pass, sines_cosines
-from .jacobian import jacobian_columns
+from .chain import ForwardPass, Geometry, forward_pass, joint_motion, joint_motion_of_rows
+from .jacobian import reading_columns
 
 _BATCH = 256  # candidates per call: one compiled shape for every number of targets
 _ROWS = 2048  # of one call: fewer leave much of the time to Python, more do not fit into the processor's cache
 _ROUNDS = 12
 _STEPS = 60  # of one attempt; five of six random starts converge
 _TOLERANCE, _ARRIVED = 1e-9, 1e-6  # mm
-_LARGEST_STEP = 0.5  # rad
+_LARGEST_STEP = 0.5  # rad, or m of a prismatic joint
 _EXACT = 1e-7  # mm: one more step closes a gap of this size to rounding
 
 
@@ -37,7 +37,7 @@ class SocketPoses(Protocol):
 
     @property
     def q(self) -> Float[AnyArray, "N n"]:
-        """Joint readings, rad."""
+        """Joint readings, rad, or mm of prismatic joints."""
         ...
 
     @property
@@ -70,29 +70,32 @@ def solve_to_targets(
 ) -> tuple[Float[AnyArray, "c n"], Float[AnyArray, " c"]]:
     """Damped least-norm steps to the targets, within the limits, of at most 0.5 rad a joint; for any jit, vmap or loop.
 
-    The result of a row does not depend on the other rows. NumPy leaves out rows that have arrived, most of them after a
-    dozen steps.
+    A slide of 1 mm counts as a rotation of 1 mrad (`JointKinds.units`). The result of a row does not depend on the
+    other rows. NumPy leaves out rows that have arrived, most of them after a dozen steps.
 
     Args:
         geometry: The arm's ``geometry``.
-        q: Joint angles to begin with ``(c, n)``, rad.
+        q: Joint readings to begin with ``(c, n)``, rad, or mm of prismatic joints.
         targets: Positions of the tip, one each ``(c, 3)``, mm.
-        limits: Lowest and highest angle of each joint ``(n, 2)``, rad.
+        limits: Lowest and highest reading of each joint ``(n, 2)``, rad or mm.
         steps: Most steps.
 
     Returns:
-        The joint angles ``(c, n)``, rad, and the final distances from the targets ``(c,)``, mm.
+        The joint readings ``(c, n)``, rad or mm, and the final distances from the targets ``(c,)``, mm.
     """
     xp, low, high = namespace(geometry, q, targets), limits[:, 0, None, None], limits[:, 1, None, None]
+    largest = (
+        _LARGEST_STEP if geometry.kinds is None else _LARGEST_STEP * xp.asarray(geometry.kinds.units)[:, None, None]
+    )
 
     def step(q: Any, wanted: Any) -> tuple[Any, Any]:
-        forward = forward_pass(geometry, (xp.cos(q), xp.sin(q)))
+        forward = forward_pass(geometry, joint_motion_of_rows(geometry, q))
         gap = wanted - forward.tip
         # The damping vanishes with the distance, so that the last steps are Newton's.
         damping = 1e-2 * xp.sum(gap**2, axis=0) + 1e-12
-        inverse = damped_inverse(jacobian_columns(forward)["theta"], damping)
+        inverse = weighted_inverse(forward, damping)
         change = xp.sum(inverse * gap[None], axis=1, keepdims=True)
-        return xp.clip(q + xp.clip(change, -_LARGEST_STEP, _LARGEST_STEP), low, high), gap
+        return xp.clip(q + xp.clip(change, -largest, largest), low, high), gap
 
     # A step after the gap was seen to be closed takes what Newton's method leaves to rounding.
     q, wanted = q.T[:, None, :], targets.T
@@ -109,13 +112,23 @@ def solve_to_targets(
             lambda state: (state[0] + 1, *step(state[1], wanted)),
             (jnp.zeros((), dtype=np.int32), q, jnp.ones_like(wanted)),
         )
-    tip = forward_pass(geometry, (xp.cos(q), xp.sin(q))).tip
+    tip = forward_pass(geometry, joint_motion_of_rows(geometry, q)).tip
     return q[:, 0].T, xp.linalg.norm(wanted - tip, axis=0)
 
 
 def least_norm_inverse(geometry: Geometry, q: Float[AnyArray, "N n"]) -> Float[AnyArray, "n 3 N"]:
-    """Least change of every joint per mm that the tip moves along each axis: the pseudo-inverse of the Jacobian."""
-    return damped_inverse(jacobian_columns(forward_pass(geometry, sines_cosines(q)))["theta"], np.zeros(q.shape[0]))
+    """Least change of every joint per mm that the tip moves along each axis: the pseudo-inverse of the Jacobian, with
+    the readings in their units (`JointKinds.units`)."""
+    return weighted_inverse(forward_pass(geometry, joint_motion(geometry, q)), np.zeros(q.shape[0]))
+
+
+def weighted_inverse(forward: ForwardPass, damping: Float[AnyArray, "... N"]) -> Float[AnyArray, "n ... 3 N"]:
+    """`damped_inverse` by the readings, whose squares are counted in their units; rad and mm per mm."""
+    columns = reading_columns(forward)
+    if forward.kinds is None:
+        return damped_inverse(columns, damping)
+    units = namespace(columns).asarray(forward.kinds.units.reshape(-1, *(1,) * (columns.ndim - 1)))
+    return units * damped_inverse(columns * units, damping)
 
 
 def damped_inverse(
@@ -188,13 +201,13 @@ def project_to_targets(
 
     Args:
         arm: The arm.
-        q: Joint angles to begin with ``(N, n)``, rad.
+        q: Joint readings to begin with ``(N, n)``, rad, or mm of prismatic joints.
         targets: Positions of the tip, one each ``(N, 3)``, mm.
-        limits: Lowest and highest angle of each joint ``(n, 2)``, rad; by default none.
+        limits: Lowest and highest reading of each joint ``(n, 2)``, rad or mm; by default none.
         steps: Most steps of each configuration.
 
     Returns:
-        The joint angles ``(N, n)``, rad, and whether the tip arrived ``(N,)``.
+        The joint readings ``(N, n)``, rad or mm, and whether the tip arrived ``(N,)``.
     """
     allowed = np.tile([-np.inf, np.inf], (arm.joints, 1)) if limits is None else np.asarray(limits)
     geometry = to_numpy(arm.geometry)

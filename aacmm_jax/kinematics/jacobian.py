@@ -18,12 +18,14 @@ from ..core.numpy_or_jax import AnyArray, compiled, namespace
 from .chain import (
     ForwardPass,
     Geometry,
-    SinesCosines,
+    JointKinds,
+    JointMotion,
     components_last,
     forward_pass,
     forward_pass_by_joints,
+    joint_errors,
+    joint_motion,
     joints_first,
-    sines_cosines,
 )
 
 
@@ -33,13 +35,40 @@ def _cross(u: Float[AnyArray, "... 3 N"], v: Float[AnyArray, "... 3 N"]) -> Floa
 
 
 def jacobian_columns(forward: ForwardPass) -> dict[str, Float[AnyArray, "k ... 3 N"]]:
-    """Derivative of the tip by every parameter: kind -> one vector per joint (or probe axis).
-
-    ``theta`` also serves for q, since the two enter only as their sum.
-    """
+    """Derivative of the tip by every parameter: kind -> one vector per joint (or probe axis)."""
     kinds = ("alpha", "a", "d", "theta") if forward.y is None else ("alpha", "a", "d", "theta", "beta")
-    columns = {kind: _columns_of(forward, kind, slice(None)) for kind in kinds}
-    return columns | {"probe": namespace(forward.tip).stack(forward.frame)}
+    xp, columns = namespace(forward.tip), {kind: _columns_of(forward, kind, slice(None)) for kind in kinds}
+    columns["probe"] = xp.stack(forward.frame)
+    if forward.errors is not None:
+        for kind, count in (("coefficients", len(forward.errors.functions.each)), ("gravity", 3)):
+            columns[kind] = xp.stack([_correction_column(forward, kind, i) for i in range(count)])
+    return columns
+
+
+def reading_columns(forward: ForwardPass) -> Float[AnyArray, "n ... 3 N"]:
+    """Derivative of the tip by every joint reading, mm per rad, or mm per mm of a prismatic joint.
+
+    A reading enters only in its sum with ``theta``, or with ``d`` of a prismatic joint. That corrections change with
+    the readings, by as little as a gear ratio errs, is left out here; `tip_jacobian` has it.
+    """
+    rotations = _columns_of(forward, "theta", slice(None))
+    if forward.kinds is None:
+        return rotations
+    return namespace(forward).where(forward.kinds.mask(rotations.ndim), forward.z_before, rotations)
+
+
+def reading_rotations(forward: ForwardPass) -> Float[AnyArray, "n ... 3 N"]:
+    """Derivative of the last frame's orientation, as a rotation vector, by every joint reading."""
+    if forward.kinds is None:
+        return forward.z_before
+    return namespace(forward).where(forward.kinds.mask(forward.z_before.ndim), 0.0, forward.z_before)
+
+
+def _parameter_of(kinds: JointKinds | None, kind: str, i: int) -> str:
+    """The kind of the parameter that a reading ``q`` is added to; other kinds as they are."""
+    if kind != "q":
+        return kind
+    return "theta" if kinds is None or not kinds.prismatic[i] else "d"
 
 
 def _columns_of(forward: ForwardPass, kind: str, at: int | slice) -> Float[AnyArray, "... 3 N"]:
@@ -52,16 +81,38 @@ def _columns_of(forward: ForwardPass, kind: str, at: int | slice) -> Float[AnyAr
     if kind in rotations:
         axis, origin = rotations[kind]
         return _cross(axis[at], (forward.tip if isinstance(at, int) else forward.tip[None]) - origin[at])
+    if kind in ("coefficients", "gravity"):
+        assert isinstance(at, int)
+        return _correction_column(forward, kind, at)
     return {"a": forward.x, "d": forward.z_before, "probe": forward.frame}[kind][at]
+
+
+def _by_corrections(forward: ForwardPass, kind: str, i: int) -> list[tuple[int, Float[AnyArray, "... 1 N"]]]:
+    """The joints that a coefficient, or a component of gravity, moves, and by how much."""
+    assert forward.errors is not None
+    each = forward.errors.functions.each
+    if kind == "coefficients":
+        return [(each[i].joint - 1, forward.errors.by_coefficient[i])]
+    moved = sorted({function.joint - 1 for function in each if function.rows == 3})
+    return [(joint, forward.errors.by_gravity[joint, i]) for joint in moved]
+
+
+def _correction_column(forward: ForwardPass, kind: str, i: int) -> Float[AnyArray, "... 3 N"]:
+    """Derivative of the tip by a coefficient, or by a component of the direction of gravity."""
+    column = namespace(forward.tip).zeros_like(forward.tip)
+    for joint, by in _by_corrections(forward, kind, i):
+        column = column + by * _columns_of(forward, _parameter_of(forward.kinds, "q", joint), joint)
+    return column
 
 
 def readings_gradient(forward: ForwardPass, cotangents: dict[str, Float[AnyArray, "k 3 N"]]) -> Float[AnyArray, "n N"]:
     """Derivative by the joint readings of a function of the Jacobian columns; ``cotangents`` are its derivatives by
     them, by kind.
 
-    A joint rotates each column that belongs to an axis after it (the change is z x column). Of an axis before it, it
-    moves the tip alone, which changes the column of a rotation about u by u x (dtip/dq). Both sums over the columns
-    are accumulated along the chain, one from the tip, the other from the base.
+    A revolute joint rotates each column that belongs to an axis after it (the change is z x column); a prismatic one
+    moves axis and tip alike. Of an axis before it, either moves the tip alone, which changes the column of a rotation
+    about u by u x (dtip/dq). Both sums over the columns are accumulated along the chain, one from the tip, the other
+    from the base.
     """
     columns, xp = jacobian_columns(forward), namespace(forward, cotangents)
     axes = {"alpha": forward.x, "beta": forward.y, "theta": forward.z_before}
@@ -78,15 +129,15 @@ def readings_gradient(forward: ForwardPass, cotangents: dict[str, Float[AnyArray
             levered = levered + _cross(cotangent, axes[kind])
     after = xp.flip(xp.cumsum(xp.flip(turned, 0), axis=0), 0)  # of this joint and those after it
     before = xp.cumsum(levered, axis=0) - levered
-    return xp.sum(forward.z_before * after + columns["theta"] * before, axis=1)
+    return xp.sum(reading_rotations(forward) * after + reading_columns(forward) * before, axis=1)
 
 
 @compiled(jit=partial(jax.jit, static_argnames=("indices",)))
 def stacked_jacobian_columns(
     forward: ForwardPass, indices: tuple[tuple[str, int], ...]
 ) -> Float[AnyArray, "... p 3 N"]:
-    """The Jacobian columns of some parameters, each a kind (``q`` counts as ``theta``) and a 0-based index."""
-    xp, wanted = namespace(forward), [("theta" if kind == "q" else kind, i) for kind, i in indices]
+    """The Jacobian columns of some parameters, each a kind (or ``q``, a reading) and a 0-based index."""
+    xp, wanted = namespace(forward), [(_parameter_of(forward.kinds, kind, i), i) for kind, i in indices]
     if isinstance(forward.x, tuple):
         chosen = [_columns_of(forward, kind, i) for kind, i in wanted]
     else:
@@ -97,17 +148,26 @@ def stacked_jacobian_columns(
 
 def rotation_columns(forward: ForwardPass, indices: tuple[tuple[str, int], ...]) -> Float[AnyArray, "... p 3 N"]:
     """Derivative of the last frame's orientation, as a rotation vector, by some parameters; 0 for lengths."""
-    axes, xp = (
-        {"alpha": forward.x, "beta": forward.y, "theta": forward.z_before, "q": forward.z_before},
-        namespace(forward),
-    )
+    axes, xp = {"alpha": forward.x, "beta": forward.y, "theta": forward.z_before}, namespace(forward)
     still = xp.zeros_like(forward.tip)
-    chosen = [still if axes.get(kind) is None else axes[kind][i] for kind, i in indices]
+
+    def rotation(kind: str, i: int) -> Float[AnyArray, "... 3 N"]:
+        if kind in ("coefficients", "gravity"):
+            moved = [
+                by * forward.z_before[joint]
+                for joint, by in _by_corrections(forward, kind, i)
+                if _parameter_of(forward.kinds, "q", joint) == "theta"
+            ]
+            return sum(moved, still)
+        kind = _parameter_of(forward.kinds, kind, i)
+        return still if axes.get(kind) is None else axes[kind][i]
+
+    chosen = [rotation(kind, i) for kind, i in indices]
     return xp.stack(chosen, axis=-3) if chosen else xp.zeros((*still.shape[:-2], 0, *still.shape[-2:]))
 
 
 def tip_and_columns(
-    geometry: Geometry, sines_cosines: SinesCosines, indices: tuple[tuple[str, int], ...]
+    geometry: Geometry, motion: JointMotion, indices: tuple[tuple[str, int], ...]
 ) -> tuple[Float[AnyArray, "... 3 N"], Float[AnyArray, "... p 3 N"]]:
     """The tip and `stacked_jacobian_columns`, in the way that is fastest for a batch in JAX on each platform."""
 
@@ -117,31 +177,41 @@ def tip_and_columns(
 
     return jax.lax.platform_dependent(
         geometry,
-        sines_cosines,
+        motion,
         cpu=partial(computed, forward_pass_by_joints),
         default=partial(computed, forward_pass),
     )
 
 
 def _plain_tip_position(geometry: Geometry, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3"]:
-    return components_last(forward_pass(geometry, sines_cosines(q)).tip, geometry, q)
+    return components_last(forward_pass(geometry, joint_motion(geometry, q)).tip, geometry, q)
 
 
 _tip_position = jax.custom_jvp(_plain_tip_position)
 
 
+def _errors_by_readings(
+    geometry: Geometry, q: Float[AnyArray, "... n"], q_dot: Float[AnyArray, "... n"]
+) -> Float[AnyArray, "n ... 1 N"]:
+    """How the corrections of each joint change with the readings, by JAX."""
+    errors = lambda readings: joint_errors(geometry, joint_motion(geometry, readings))  # noqa: E731
+    return jax.jvp(errors, (q,), (jnp.broadcast_to(q_dot, q.shape),))[1]
+
+
 def _tip_position_jvp(primals, tangents):
     geometry, q = primals
     geometry_dot, q_dot = tangents
-    forward = forward_pass(geometry, sines_cosines(q))
+    forward = forward_pass(geometry, joint_motion(geometry, q))
     columns = jacobian_columns(forward)
     rank = forward.tip.ndim - 1
-    pairs = [(kind, getattr(geometry_dot, kind)) for kind in columns] + [("theta", q_dot)]
+    pairs = [(column, getattr(geometry_dot, kind)) for kind, column in columns.items()]
     moved = jnp.zeros_like(forward.tip)
-    for kind, tangent in pairs:
+    for column, tangent in [*pairs, (reading_columns(forward), q_dot)]:
         # Unperturbed arguments arrive as symbolic zeros: a derivative by parameters then never touches q.
         if not isinstance(tangent, SymbolicZero):
-            moved = moved + jnp.sum(columns[kind] * joints_first(tangent, rank), axis=0)
+            moved = moved + jnp.sum(column * joints_first(tangent, rank), axis=0)
+    if geometry.corrections is not None and not isinstance(q_dot, SymbolicZero):
+        moved = moved + jnp.sum(reading_columns(forward) * _errors_by_readings(geometry, q, q_dot), axis=0)
     return components_last(forward.tip, geometry, q), components_last(moved, geometry, q)
 
 
@@ -162,8 +232,16 @@ def tip_jacobian(
     geometry: Geometry, q: Float[AnyArray, "... n"], indices: tuple[tuple[str, int], ...]
 ) -> Float[AnyArray, "... 3 p"]:
     """Derivative of the tip by some parameters, each a kind (``alpha`` ... ``probe``, or ``q``) and a 0-based index."""
-    stacked = stacked_jacobian_columns(forward_pass(geometry, sines_cosines(q)), indices)
-    xp = namespace(stacked)
+    forward = forward_pass(geometry, joint_motion(geometry, q))
+    stacked, xp = stacked_jacobian_columns(forward, indices), namespace(geometry, q)
+    if geometry.corrections is not None and any(kind == "q" for kind, _ in indices):
+        units, none = jnp.eye(q.shape[-1]), jnp.zeros_like(forward.tip)
+        columns = reading_columns(forward)
+        added = [
+            jnp.sum(columns * _errors_by_readings(geometry, jnp.asarray(q), units[i]), axis=0) if kind == "q" else none
+            for kind, i in indices
+        ]
+        stacked = stacked + xp.asarray(jnp.stack(added, axis=-3))
     columns = xp.moveaxis(stacked, -1, -3)
     batched = max(leaf.ndim for leaf in jax.tree.leaves((geometry, q))) > 1
     return xp.moveaxis(columns if batched else columns[0], -2, -1)

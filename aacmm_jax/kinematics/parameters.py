@@ -16,7 +16,18 @@ from ..core.arguments import checked_arguments, items_of, real_number
 from ..core.arrays import Numbers, as_array, is_concrete, joined, random_key
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace
-from .arm import Arm, is_length, is_single, locate, natural_steps, parameter_names, with_arrays, with_values
+from .arm import (
+    Arm,
+    correction_names,
+    is_length,
+    is_single,
+    locate,
+    located,
+    natural_steps,
+    parameter_names,
+    with_arrays,
+    with_values,
+)
 from .chain import Geometry
 from .independence import generic_poses, independent_names
 from .inverse_kinematics import SocketPoses
@@ -41,7 +52,7 @@ class Parameters(eqx.Module):
     def __check_init__(self):
         if not isinstance(self.base, Arm) or not isinstance(self.names, tuple) or not self.names:
             raise InputError("Parameters takes an arm and a tuple of the names of its free parameters, at least one.")
-        _indices(self.base.joints, self.names)
+        _indices(self.base, self.names)
         if len(set(self.names)) != len(self.names):
             _unique_names(self.base, self.names, "names")
 
@@ -53,10 +64,15 @@ class Parameters(eqx.Module):
         These are all but ``d_1``, ``theta_1`` (they move the base frame), ``a_n``, ``alpha_n`` (redundant with the
         probe), ``probe_x`` and ``probe_y``.
 
+        Of a prismatic joint i only the direction matters, since neighbouring links do not rotate against each other:
+        three of the lengths about it say where the next axis is, and a_i and d_(i+1) are fixed too (``theta_n`` and
+        ``probe_z`` for the last joint). Each prismatic joint leaves two parameters less (Everett and Hollerbach 1988).
+
         Args:
             arm: The arm; it supplies the values of the fixed parameters.
-            held: Names of the fixed parameters, instead of the six above; beta is fixed unless in ``free``.
-            free: Names that are free in addition, beta included.
+            held: Names of the fixed parameters, instead of those above; beta and the direction of
+                gravity are fixed unless in ``free``.
+            free: Names that are free in addition, beta and gravity included.
 
         Raises:
             InputError: The arm has no such parameter, or one is named as held and as free.
@@ -64,7 +80,9 @@ class Parameters(eqx.Module):
         n = arm.joints
         free = (free,) if isinstance(free, str) else tuple(free)
         if held is None:
-            held = ("theta_1", "d_1", f"a_{n}", f"alpha_{n}", "probe_x", "probe_y")
+            held = {"theta_1", "d_1", f"a_{n}", f"alpha_{n}", "probe_x", "probe_y"}
+            held |= {f"a_{i}" for i in arm.prismatic} | {f"d_{i + 1}" for i in arm.prismatic if i < n}
+            held |= {f"theta_{n}", "probe_z"} if n in arm.prismatic else set()
             released = set(free)
             held = [name for name in held if name not in released]
         held, free = _unique_names(arm, held, "held"), _unique_names(arm, free, "free")
@@ -74,7 +92,9 @@ class Parameters(eqx.Module):
         if arm.beta is None and any(name.startswith("beta_") for name in (*held, *free)):
             arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
         wanted = [
-            name for name in parameter_names(arm) if name not in held and (name in free or not name.startswith("beta_"))
+            name
+            for name in parameter_names(arm)
+            if name not in held and (name in free or not name.startswith(("beta_", "gravity_")))
         ]
         if not wanted:
             raise InputError("every parameter is held, so nothing is left to identify; hold fewer.")
@@ -118,12 +138,12 @@ class Parameters(eqx.Module):
 
     def indices(self) -> tuple[tuple[str, int], ...]:
         """Kind and 0-based index of each free parameter."""
-        return _indices(self.base.joints, self.names)
+        return _indices(self.base, self.names)
 
     def index(self, name: str) -> int:
         """Position of a free parameter in the vector; raises `InputError` if it is not free."""
         if name not in self.names:
-            locate(self.base.joints, name)
+            locate(self.base, name)
             raise InputError(
                 f"parameter '{name}' is held, not free; free it, or name a free one, such as '{self.names[0]}'."
             )
@@ -144,10 +164,12 @@ class Parameters(eqx.Module):
                 f"the arm has {arm.joints} joints, but these are parameters of an arm with {self.base.joints}; "
                 "choose the free parameters of this arm (Parameters.free_of)."
             )
-        known = is_concrete(*arm.geometry)
+        known = is_concrete(*jax.tree.leaves(arm.geometry))
         tools: Any = np if known else jnp  # see `joined`
         values = {kind: tools.asarray(getattr(arm, kind)) for kind in ("alpha", "a", "d", "theta", "probe")}
         values["beta"] = tools.zeros_like(values["alpha"]) if arm.beta is None else tools.asarray(arm.beta)
+        if arm.corrections is not None:
+            values |= {"coefficients": tools.asarray(arm.coefficients), "gravity": tools.asarray(arm.gravity)}
         rows = tools.broadcast_arrays(*(values[kind][..., i] for kind, i in self.indices()))
         return np.stack(rows, axis=-1) if namespace(arm) is np else joined(rows, axis=-1, new=True)
 
@@ -179,8 +201,12 @@ class Parameters(eqx.Module):
 
 
 @lru_cache(maxsize=256)
-def _indices(joints: int, names: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
-    return tuple(locate(joints, name) for name in names)
+def _located(joints: int, corrections: tuple[str, ...], names: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
+    return tuple(located(joints, corrections, name) for name in names)
+
+
+def _indices(arm: Arm, names: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
+    return _located(arm.joints, correction_names(arm), names)
 
 
 def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
@@ -188,7 +214,7 @@ def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
         names = (names,)
     names = tuple(items_of(names, what))
     for name in names:
-        locate(arm.joints, name)
+        locate(arm, name)
         if names.count(name) > 1:
             raise InputError(f"parameter '{name}' is named twice in {what}; name it once.")
     return names

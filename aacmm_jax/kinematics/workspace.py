@@ -11,7 +11,7 @@ from ..core.arrays import in_chunks
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from .arm import Arm, joint_limits
-from .chain import forward_pass, sines_cosines
+from .chain import forward_pass, joint_motion, reading_units
 from .inverse_kinematics import project_to_targets
 
 _STARTS, _SWEEPS = 256, 30
@@ -21,7 +21,7 @@ _REACHING = 25  # steps: seven of ten random starts arrive, and with 60 eight wo
 class Reach(NamedTuple):
     """The smallest ball about the shoulder that contains all positions of the tip, mm."""
 
-    shoulder: Float[np.ndarray, " 3"]  # on the first axis, d_1 above the base
+    shoulder: Float[np.ndarray, " 3"]  # on the first axis, d_1 above the base; amid the travel of a prismatic joint
     radius: float
 
 
@@ -30,18 +30,28 @@ def arm_reach(arm: Arm) -> Reach:
 
     As a function of one joint the squared distance is a constant plus a sinusoid: with the lever r from a point of the
     joint's axis z to the tip, and s from the shoulder to that point, of 2 s . (r - (z . r) z) cos t + 2 s . (z x r) sin
-    t. From many random starts, joint after joint is set to its maximum until nothing changes, the last joint first: a
-    joint moves the tip, but no axis of the joints before it.
+    t. Of a prismatic joint it is convex, so that an end of its travel is the maximum. From many random starts, joint
+    after joint is set to its maximum until nothing changes, the last joint first: a joint moves the tip, but no axis of
+    the joints before it.
     """
-    shoulder = np.array([0.0, 0.0, float(np.asarray(arm.d)[0])])
     limits = np.asarray(joint_limits(arm, None))
+    slides = [joint + 1 in arm.prismatic for joint in range(arm.joints)]
+    shoulder = np.array([0.0, 0.0, float(np.asarray(arm.d)[0]) + (limits[0].mean() if slides[0] else 0.0)])
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_STARTS, arm.joints))
     geometry = to_numpy(arm.geometry)
     best = now = 0.0
     for _ in range(_SWEEPS):
-        forward = forward_pass(geometry, sines_cosines(q))
+        forward = forward_pass(geometry, joint_motion(geometry, q))
         tip = forward.tip.T
-        for joint in range(arm.joints - 1, 0, -1):  # the first rotates the whole arm about the shoulder's axis
+        # The first joint, if it is revolute, rotates the whole arm about the shoulder's axis.
+        for joint in range(arm.joints - 1, -1 if slides[0] else 0, -1):
+            if slides[joint]:
+                axis, (low, high) = forward.z_before[joint].T, limits[joint]
+                ends = [tip + (end - q[:, joint])[:, None] * axis for end in (low, high)]
+                farther = np.linalg.norm(ends[0] - shoulder, axis=1) > np.linalg.norm(ends[1] - shoulder, axis=1)
+                tip = np.where(farther[:, None], *ends)
+                q[:, joint] = np.where(farther, low, high)
+                continue
             axis, origin = forward.z_before[joint].T, forward.origin_before[joint].T
             offset, across = origin - shoulder, np.cross(axis, tip - origin)
             along = np.cross(across, axis)
@@ -67,12 +77,14 @@ def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"
     """Corners of the arm, mm: the base, the end of each joint's offset and of its link, and the tip (c = 2 n + 2)."""
 
     def lines(rows: np.ndarray) -> np.ndarray:
-        forward = forward_pass(*to_numpy((arm.geometry, sines_cosines(rows))))
+        motion = joint_motion(arm.geometry, rows)
+        forward = forward_pass(*to_numpy((arm.geometry, motion)))
         before, after, axis = (
             np.asarray(part).reshape(arm.joints, 3, -1)
             for part in (forward.origin_before, forward.origin, forward.z_before)
         )
-        offset = before + np.asarray(arm.d)[:, None, None] * axis
+        along = np.asarray(arm.d)[:, None, None] + (0.0 if motion.slide is None else np.asarray(motion.slide))
+        offset = before + along * axis
         both = np.stack([offset, after], axis=1).reshape(2 * arm.joints, 3, -1)
         tip = np.asarray(forward.tip).reshape(1, 3, -1)
         return np.concatenate([np.zeros_like(tip), both, tip]).transpose(2, 0, 1)
@@ -84,22 +96,27 @@ def lowest_point(arm: Arm, q: Float[np.ndarray, "c n"]) -> Float[np.ndarray, " c
     """Height of the lowest joint or tip in the base frame, mm, without the base itself, for each configuration."""
 
     def lowest(rows: np.ndarray) -> np.ndarray:
-        forward = forward_pass(*to_numpy((arm.geometry, sines_cosines(rows))))
+        forward = forward_pass(*to_numpy((arm.geometry, joint_motion(arm.geometry, rows))))
         return np.minimum(np.min(forward.origin[:, 2], axis=0), forward.tip[2])
 
     return in_chunks(lowest, q)
 
 
 def total_link_length(arm: Arm) -> float:
-    """Sum of the lengths of the links and the probe, without the base's height d_1, mm."""
-    return float(np.abs(arm.a).sum() + np.abs(np.asarray(arm.d)[1:]).sum() + np.linalg.norm(np.asarray(arm.probe)))
+    """Sum of the lengths of the links and the probe, without the base's height d_1, mm.
+
+    A prismatic joint adds its longest slide by its limits, or 1 m where it has none.
+    """
+    slides = [1000.0 if arm.limits is None else max(map(abs, arm.limits[i - 1])) for i in arm.prismatic]
+    links = np.abs(arm.a).sum() + np.abs(np.asarray(arm.d)[1:]).sum() + np.linalg.norm(np.asarray(arm.probe))
+    return float(links + sum(slides))
 
 
 class SearchRegion(NamedTuple):
     """Where configurations are looked for, and the random numbers that the search uses."""
 
     arm: Arm
-    limits: Float[np.ndarray, "n 2"]  # lowest and highest reading of each joint, rad
+    limits: Float[np.ndarray, "n 2"]  # lowest and highest reading of each joint, rad, or mm of prismatic ones
     above: float  # height in the base frame below which no joint and no tip comes, mm
     random: np.random.Generator
 
@@ -111,15 +128,17 @@ class SearchRegion(NamedTuple):
 def search_region(
     arm: Arm, limits: Sequence[Sequence[float]] | None, margin: float, above: float, seed: int
 ) -> SearchRegion:
-    """The region ``margin`` (rad) inside the joint limits (default: the arm's own) and ``above`` (mm) the table."""
+    """The region ``margin`` (rad, or m of prismatic joints) inside the joint limits (default: the arm's own) and
+    ``above`` (mm) the table."""
     if seed < 0:
         raise InputError(f"seed is {seed}; give zero or a positive number.")
     allowed = np.asarray(joint_limits(arm, limits))
-    if not (math.isfinite(margin) and 0 <= margin < np.min(allowed[:, 1] - allowed[:, 0]) / 2):
+    margins = margin * reading_units(arm.geometry)
+    if not (math.isfinite(margin) and margin >= 0 and np.all(margins < (allowed[:, 1] - allowed[:, 0]) / 2)):
         raise InputError(
             f"a margin of {math.degrees(margin):g} deg leaves a joint no range within its limits; give a smaller one."
         )
-    return SearchRegion(arm, allowed + margin * np.array([1.0, -1.0]), above, np.random.default_rng(seed))
+    return SearchRegion(arm, allowed + margins[:, None] * np.array([1.0, -1.0]), above, np.random.default_rng(seed))
 
 
 def reached(

@@ -6,9 +6,10 @@ from jaxtyping import Float
 
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
-from ..data.capture import Capture, check_one_capture, check_sockets_only
+from ..data.capture import Capture, check_one_capture, check_readings, check_sockets_only
 from ..data.noise import Noise, tip_covariances
-from ..kinematics.chain import Geometry, SinesCosines, sines_cosines
+from ..kinematics.arm import Arm
+from ..kinematics.chain import Geometry, JointMotion, joint_motion
 from ..kinematics.parameters import Parameters
 from .socket_sums import means_over_sockets, to_poses
 from .weights import Weights
@@ -21,12 +22,13 @@ _FEW = 1000  # sockets
 class Measurement(eqx.Module):
     """A capture as arrays: all poses, socket after socket, and the reference lengths.
 
-    ``sizes`` and ``ends`` are static: they fix the shape of the problem, as the number of poses does. ``sines_cosines``
-    are those of q, which every evaluation needs and none changes. With ``weights``, centroids are weighted means.
+    ``sizes`` and ``ends`` are static: they fix the shape of the problem, as the number of poses does. ``motion`` is
+    what q does to the joints, which every evaluation needs and none changes. With ``weights``, centroids are weighted
+    means.
     """
 
     q: Float[AnyArray, "N n"]
-    sines_cosines: SinesCosines
+    motion: JointMotion
     nominal: Float[AnyArray, " l"]  # calibrated values of the reference lengths, mm
     u: Float[AnyArray, " l"]  # their standard uncertainties, mm
     sizes: tuple[int, ...] = eqx.field(static=True)
@@ -34,15 +36,19 @@ class Measurement(eqx.Module):
     weights: Weights | None = None  # None: every pose weighs the same
 
     @classmethod
-    def of(cls, capture: Capture) -> "Measurement":
-        """The measurement of a capture. Raises `InputError` for a batch of captures."""
+    def of(cls, capture: Capture, arm: Arm) -> "Measurement":
+        """The measurement of a capture by an arm with such joints, which may be the nominal one.
+
+        Raises `InputError` for a batch of captures.
+        """
         check_one_capture(capture)
         check_sockets_only(capture, "this function")
+        check_readings(capture, arm)
         capture = to_numpy(capture)
         xp = namespace(capture)
         return cls(
             q=capture.q,
-            sines_cosines=sines_cosines(capture.q),
+            motion=joint_motion(arm.geometry, capture.q),
             nominal=xp.stack([length.value for length in capture.lengths]) if capture.lengths else np.zeros(0),
             u=xp.stack([length.u for length in capture.lengths]) if capture.lengths else np.zeros(0),
             sizes=capture.sizes,
@@ -53,7 +59,7 @@ class Measurement(eqx.Module):
         """The same with weights: the inverse covariances of the tips by ``noise``, for an arm close to this one."""
         if noise is None:
             return self
-        weights = Weights.of(tip_covariances(geometry, self.sines_cosines, noise), self.sizes)
+        weights = Weights.of(tip_covariances(geometry, self.motion, noise), self.sizes)
         return eqx.tree_at(lambda m: m.weights, self, weights, is_leaf=lambda leaf: leaf is None)
 
     def centroids(self, tips: Float[AnyArray, "N 3"]) -> Float[AnyArray, "s 3"]:

@@ -13,11 +13,12 @@ from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import AnyArray, add_at, namespace, to_numpy
-from ..data.capture import Capture, check_one_capture
+from ..data.capture import Capture, check_one_capture, check_readings
 from ..data.observations.observation import POINT, AbstractObservation, Rows, Tips, offset_of
 from ..data.observations.platform import platform_frames
 from ..data.observations.socket import Socket, position_of
-from ..kinematics.chain import ForwardPass, SinesCosines, forward_pass, sines_cosines
+from ..kinematics.arm import Arm
+from ..kinematics.chain import ForwardPass, JointMotion, forward_pass, joint_motion
 from ..kinematics.jacobian import rotation_columns, stacked_jacobian_columns
 from ..kinematics.parameters import Parameters
 from ..solver.active_set import QuadraticModel
@@ -31,15 +32,20 @@ class Observed(eqx.Module):
 
     observations: tuple[AbstractObservation, ...]
     q: Float[AnyArray, "M n"]
-    sines_cosines: SinesCosines
+    motion: JointMotion | None  # None where the arm does not matter, but only what is unknown
     nominal: Float[AnyArray, " l"]  # reference lengths, mm
     u: Float[AnyArray, " l"]
     ends: tuple[tuple[str, str], ...] = eqx.field(static=True)  # names of the positions at their ends
 
     @classmethod
-    def of(cls, capture: Capture) -> "Observed":
-        """What a capture observed. Raises `InputError` for a batch of captures."""
+    def of(cls, capture: Capture, arm: Arm | None) -> "Observed":
+        """What a capture observed, by an arm with such joints; None where only what is unknown matters.
+
+        Raises `InputError` for a batch of captures.
+        """
         check_one_capture(capture)
+        if arm is not None:
+            check_readings(capture, arm)
         capture = to_numpy(capture)
         xp = namespace(capture)
         sockets = tuple(Socket(name, readings) for name, readings in capture.sockets.items())
@@ -49,11 +55,19 @@ class Observed(eqx.Module):
         return cls(
             observations=observations,
             q=q,
-            sines_cosines=sines_cosines(q),
+            motion=None if arm is None else joint_motion(arm.geometry, q),
             nominal=xp.stack([length.value for length in lengths]) if lengths else np.zeros(0),
             u=xp.stack([length.u for length in lengths]) if lengths else np.zeros(0),
             ends=tuple((position_of(length.start), position_of(length.end)) for length in lengths),
         )
+
+    def moved(
+        self, arm: Arm, q: Float[AnyArray, "M n"], observations: tuple[AbstractObservation, ...] | None = None
+    ) -> "Observed":
+        """The same at other readings, and with observations that have changed along."""
+        observations = self.observations if observations is None else observations
+        changed = (observations, q, joint_motion(arm.geometry, q))
+        return eqx.tree_at(lambda o: (o.observations, o.q, o.motion), self, changed)
 
     @property
     def blocks(self) -> dict[str, tuple[str, ...]]:
@@ -116,13 +130,13 @@ class Observed(eqx.Module):
                 for observation in self.observations
             ]
             arm = arm._replace(probe=xp.concatenate(offsets))
-        return forward_pass(arm, self.sines_cosines)
+        return forward_pass(arm, self.motion)
 
     def start(self, space: Parameters, vector: Float[AnyArray, " p"]) -> Float[AnyArray, " g"]:
         """The unknown geometry as the observations say, one after the other, by an arm that is nearly right; the frames
         of a platform as all that stands on it says together."""
         arm = space.geometry(vector)
-        forward = forward_pass(arm, self.sines_cosines)
+        forward = forward_pass(arm, self.motion)
         tips = [_tips(forward, rows) for rows in self.slices]
         found: dict[str, Any] = {}
         for observation, own in zip(self.observations, tips, strict=True):

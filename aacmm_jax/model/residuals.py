@@ -83,7 +83,7 @@ def joint_normal_equations(
 def _tip_and_columns(
     vector: Float[AnyArray, " p"], space: Parameters, measurement: Measurement
 ) -> tuple[Float[AnyArray, "... 3 N"], Float[AnyArray, "... p 3 N"]]:
-    forward = forward_pass(space.geometry(vector), measurement.sines_cosines)
+    forward = forward_pass(space.geometry(vector), measurement.motion)
     return forward.tip, stacked_jacobian_columns(forward, space.indices())
 
 

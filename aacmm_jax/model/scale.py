@@ -111,7 +111,7 @@ def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> Scal
     if sigma is not None and is_concrete(sigma) and not 0 <= sigma < np.inf:
         raise InputError(f"sigma is {float(sigma):g} mm; a standard deviation must be zero or positive, and finite.")
     scatter = None if sigma is None else as_array(sigma, "sigma", like=np.zeros(0))
-    return to_jax(_fixed(*to_numpy((arm, Measurement.of(capture), scatter))))
+    return to_jax(_fixed(*to_numpy((arm, Measurement.of(capture, arm), scatter))))
 
 
 @compiled(jit=eqx.filter_jit)

@@ -191,7 +191,7 @@ def least_poses(observations: Sequence[AbstractObservation]) -> Int[np.ndarray, 
 
 def candidates_of_kit(problem: DesignProblem, observations: Sequence[AbstractObservation]) -> Candidates:
     """The information that each pose of the observations would add, and that of certified values alone."""
-    observed, space = Observed.of(Capture({}, (), observations)), problem.space
+    observed, space = Observed.of(Capture({}, (), observations), problem.arm), problem.space
     vector, p = np.asarray(space.vector()), len(space.names)
     z = np.concatenate([vector, np.asarray(observed.start(space, vector))])
     linear = linear_rows(space, observed, z)

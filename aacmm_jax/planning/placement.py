@@ -13,7 +13,7 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, jacobian_at
-from ..kinematics.chain import Geometry, sines_cosines
+from ..kinematics.chain import Geometry, joint_motion
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import SearchRegion, configurations_at, reached, total_link_length
 from ..model.weights import inverse_root
@@ -102,7 +102,7 @@ def candidates_of(problem: DesignProblem, placement: FixturePlacement, pool: Poo
 
 
 def _whitening(geometry: Geometry, q: Float[np.ndarray, "c n"], noise: Noise) -> Float[np.ndarray, "c 3 3"]:
-    return np.moveaxis(np.asarray(inverse_root(tip_covariances(geometry, sines_cosines(q), noise))), -1, 0)
+    return np.moveaxis(np.asarray(inverse_root(tip_covariances(geometry, joint_motion(geometry, q), noise))), -1, 0)
 
 
 def random_scores(problem: DesignProblem, placements: Sequence[FixturePlacement], poses: int) -> list[float]:

@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 
 from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import locate
-from ..kinematics.chain import ForwardPass, forward_pass, sines_cosines
-from ..kinematics.jacobian import jacobian_columns, readings_gradient
+from ..kinematics.chain import ForwardPass, forward_pass, joint_motion, reading_units
+from ..kinematics.jacobian import reading_columns, readings_gradient
 from ..kinematics.workspace import reached
 from .fedorov_exchange import covariance_of
 from .placement import DesignProblem, FixturePlacement, candidates_of, pool_of
@@ -35,6 +35,7 @@ def refined(
     from scipy import optimize
 
     region, targets = problem.region, placement.points[owner]
+    units = reading_units(problem.arm.geometry)  # the optimiser's variables are alike in size
     sockets = TangentProjection.at(problem, q, targets)
     done = 0
 
@@ -44,15 +45,16 @@ def refined(
         progress(min(done / _ITERATIONS, 1.0))
 
     def of_readings(flat: np.ndarray) -> tuple[float, np.ndarray]:
-        at = sockets.projected(flat.reshape(q.shape))
+        at = sockets.projected(flat.reshape(q.shape) * units)
         value, gradient = value_and_gradient(problem, placement, at, owner)
-        return value, sockets.pulled_back(at, gradient).ravel()
+        return value, (sockets.pulled_back(at, gradient) * units).ravel()
 
     solution = optimize.minimize(
-        of_readings, q.ravel(), jac=True, method="L-BFGS-B", bounds=np.tile(region.limits, (len(q), 1)),
+        of_readings, (q / units).ravel(), jac=True, method="L-BFGS-B",
+        bounds=np.tile(region.limits / units[:, None], (len(q), 1)),
         callback=iterated, options={"maxiter": _ITERATIONS},
     )  # fmt: skip
-    change = sockets.projected(solution.x.reshape(q.shape)) - q
+    change = sockets.projected(solution.x.reshape(q.shape) * units) - q
     best, best_value = q, _value(problem, placement, q, owner)
     for fraction in _FRACTIONS:
         moved, possible = reached(region, q + fraction * change, targets)
@@ -68,14 +70,15 @@ class TangentProjection(NamedTuple):
 
     problem: DesignProblem
     targets: Float[np.ndarray, "N 3"]
-    normals: Float[np.ndarray, "N 3 n"]  # dtip/dq at the start
+    normals: Float[np.ndarray, "N 3 n"]  # dtip/dq at the start, normal where readings are counted in their units
 
     @classmethod
     def at(
         cls, problem: DesignProblem, q: Float[np.ndarray, "N n"], targets: Float[np.ndarray, "N 3"]
     ) -> "TangentProjection":
         """The projection for the neighbourhood of q."""
-        return cls(problem, targets, _tip_columns(_forward(problem, q)))
+        units = reading_units(problem.arm.geometry)
+        return cls(problem, targets, _tip_columns(_forward(problem, q)) * units**2)
 
     def projected(self, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
         """q + normals^T x, with x of each pose such that its tip is in its socket: by Newton's method."""
@@ -100,11 +103,12 @@ class TangentProjection(NamedTuple):
 
 
 def _forward(problem: DesignProblem, q: Float[np.ndarray, "N n"]) -> ForwardPass:
-    return forward_pass(to_numpy(problem.arm.geometry), sines_cosines(q))
+    geometry = to_numpy(problem.arm.geometry)
+    return forward_pass(geometry, joint_motion(geometry, q))
 
 
 def _tip_columns(forward: ForwardPass) -> Float[np.ndarray, "N 3 n"]:
-    return np.asarray(jacobian_columns(forward)["theta"]).transpose(2, 1, 0)
+    return np.asarray(reading_columns(forward)).transpose(2, 1, 0)
 
 
 def _value(problem: DesignProblem, placement: FixturePlacement, q: np.ndarray, owner: np.ndarray) -> float:
@@ -131,11 +135,11 @@ def value_and_gradient(
     by_rows = roots_transposed @ (rows @ weighted)  # W_j A_j H
     by_covariance = by_rows @ np.swapaxes(rows, 1, 2) @ pool.roots
     forward = _forward(problem, q)
-    readings = np.asarray(jacobian_columns(forward)["theta"])
-    encoder = np.broadcast_to(np.asarray(problem.noise.encoder), readings.shape[:1])
+    readings = np.asarray(reading_columns(forward))
+    encoder = np.broadcast_to(np.asarray(problem.noise.of_readings(forward.kinds)), readings.shape[:1])
     cotangents = {"theta": 2 * np.einsum("ncd,kdn->kcn", by_covariance, readings) * encoder[:, None, None] ** 2}
     for index, (name, scale) in enumerate(zip(problem.space.names, np.asarray(problem.space.scale), strict=True)):
-        kind, i = locate(problem.arm.joints, name)
+        kind, i = locate(problem.arm, name)
         cotangents.setdefault(kind, np.zeros((3 if kind == "probe" else len(readings), *readings.shape[1:])))
         cotangents[kind][i] -= 2 * scale * by_rows[:, :, index].T
     gradient = readings_gradient(forward, cotangents)

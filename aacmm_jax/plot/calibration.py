@@ -10,7 +10,7 @@ from ..calibration.pose_residuals import ObservationResiduals, distances_of, obs
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG
-from ..kinematics.arm import is_length
+from ..kinematics.arm import is_length, parameter_unit
 from .style import ACCENT, DARK, LIGHT, axes_or_new, label_axes, label_parameters, logarithmic, save_figure
 
 _STAGES: Mapping[str, Mapping[str, Any]] = {
@@ -180,8 +180,8 @@ def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any
     if kind not in ("length", "angle"):
         raise InputError(f"kind is '{kind}'; it must be length or angle.")
     axes = axes_or_new(axes)
-    uncertainty, vectors = uncertainty_of(record), record.vectors()
-    chosen = [i for i, name in enumerate(record.names) if is_length(name) == (kind == "length")]
+    uncertainty, vectors, wanted = uncertainty_of(record), record.vectors(), "mm" if kind == "length" else "rad"
+    chosen = [i for i, name in enumerate(record.names) if parameter_unit(record.recording.nominal.arm, name) == wanted]
     scale = 1.0 if kind == "length" else 1 / ARCSEC
     change = scale * (vectors["calibrated"] - vectors["nominal"])[chosen]
     expanded = scale * uncertainty.factor() * np.asarray(uncertainty.u)[chosen]

@@ -9,7 +9,7 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.pose_residuals import distances_of, observation_residuals
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise
-from ..core.units import ARCSEC, DEG
+from ..core.units import ARCSEC, people_read
 from ..summaries.calibration import calibration_summary
 from ..summaries.observations import capture_words
 from ..summaries.warnings import observed
@@ -284,7 +284,7 @@ def _length_chart(
 def _parameters(summary: dict[str, Any], factor: float) -> Section:
     rows = []
     for row in summary["parameters"]:
-        scale, unit = (1.0, "mm") if row["unit"] == "mm" else (1 / DEG, "deg")
+        scale, unit = people_read(row["unit"])
         expanded = None if row["u"] is None else factor * scale * row["u"]
         decimals = decimals_for(expanded)
         state = "" if expanded else "only with others"

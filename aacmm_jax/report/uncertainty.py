@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from ..calibration.record import CalibrationRecord
-from ..core.units import DEG
-from ..kinematics.arm import is_length
+from ..core.units import people_read
+from ..kinematics.arm import parameter_unit
 from ..summaries.tables import volume_rows
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
@@ -145,7 +145,7 @@ def bounds_section(record: CalibrationRecord, summary: dict[str, Any]) -> Sectio
     active, stage1 = summary["active"], summary["active_stage1"]
     rows, positions = [], []
     for i, name in enumerate(record.names):
-        scale, unit = (1.0, "mm") if is_length(name) else (1 / DEG, "deg")
+        scale, unit = people_read(parameter_unit(record.recording.nominal.arm, name))
         width = record.upper[i] - record.lower[i]
         bounded = np.isfinite(width) and width > 0
         positions.append(2 * (vector[i] - record.lower[i]) / width - 1 if bounded else math.nan)

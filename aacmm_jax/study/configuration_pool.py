@@ -20,7 +20,7 @@ from ..core.errors import InputError
 from ..kinematics import chain
 from ..kinematics.arm import Arm
 from ..kinematics.inverse_kinematics import damped_inverse, least_norm_inverse, solve_to_targets
-from ..kinematics.jacobian import jacobian_columns
+from ..kinematics.jacobian import reading_columns
 from .definition import POOL_PARTS, Fixture, Setting, Study, pool_capacity
 from .specification import Region
 
@@ -188,7 +188,8 @@ def _solved(arm: Arm, start: np.ndarray, points: np.ndarray, limits: Array) -> t
 @jax.jit
 def _solve(geometry: chain.Geometry, start: Array, points: Array, limits: Array) -> tuple[Array, Array]:
     q, distance = solve_to_targets(geometry, start, points, limits, _STEPS)
-    columns = jacobian_columns(chain.forward_pass(geometry, chain.sines_cosines(q)))["theta"]
+    columns = reading_columns(chain.forward_pass(geometry, chain.joint_motion(geometry, q)))
+    columns = columns * chain.reading_units(geometry)[:, None, None]
     inverse = damped_inverse(columns, jnp.zeros(q.shape[0]))
     condition = jnp.sqrt(jnp.sum(columns**2, axis=(0, 1)) * jnp.sum(inverse**2, axis=(0, 1)))
     return q, (distance <= _TOLERANCE) & (condition <= _MOST_CONDITION)

@@ -268,7 +268,9 @@ class Study:
 
     def _scale_anchor(self, hold: str) -> str | None:
         with _naming("identification.hold"):
-            return scale_anchor(self.space, self.nominal.arm, None if hold == "none" else hold).hold
+            return scale_anchor(
+                self.space, self.nominal.arm, None if hold == "none" else hold, capture=self.capture
+            ).hold
 
     def _values_of(self, cell: Mapping[str, Any]) -> tuple:
         """The fields of `CellValues` for one cell."""
@@ -313,7 +315,8 @@ class Study:
         unknowns = len(self.space.names) - int(self.space.lengths.any())
         if capture is not None and self.observed:
             anchored = any(setting.method == "stage1" for setting in self.settings)
-            check_observed(Observed.of(capture), self.space, self._nominal_vector, len(self.space.names) - anchored)
+            observed = Observed.of(capture, self.nominal.arm)
+            check_observed(observed, self.space, self._nominal_vector, len(self.space.names) - anchored)
         for setting in () if self.observed else dict.fromkeys(self.settings):
             check_enough(setting.sizes, unknowns)
             if setting.method != "stage1" and capture is not None and not capture.lengths:

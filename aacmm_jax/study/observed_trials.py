@@ -7,7 +7,6 @@ it can; what it cannot is taken from the residuals (`calibration.redrawn`). So n
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import erf
@@ -16,7 +15,7 @@ from ..calibration.observed_evaluation import fit_geometry
 from ..calibration.redrawn import DrawnLengths, ObservedTruth, batch_of_observations, shifted
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
-from ..kinematics.chain import sines_cosines
+from ..kinematics.chain import reading_units
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed, residual_rows
 from .definition import CellValues, Setting, Study
@@ -39,11 +38,12 @@ class _Recorded(NamedTuple):
 def _recorded(study: Study) -> _Recorded:
     assert study.capture is not None
     space = to_numpy(study.space)
-    observed = Observed.of(study.capture)
+    observed = Observed.of(study.capture, study.nominal.arm)
     geometry = np.asarray(fit_geometry(study.nominal.arm, observed, {}, None).geometry)
     truth = ObservedTruth.at(study.capture, space, space.vector(), observed.split(geometry))
-    by_readings = [np.moveaxis(np.asarray(error.by_readings), -1, 0) for error in truth.errors]
-    return _Recorded(truth, space, [np.linalg.pinv(matrix, rcond=1e-6) for matrix in by_readings], geometry)
+    units = reading_units(space.base.geometry)
+    by_units = [np.moveaxis(np.asarray(error.by_readings) * units[:, None], -1, 0) for error in truth.errors]
+    return _Recorded(truth, space, [np.linalg.pinv(matrix, rcond=1e-6) for matrix in by_units], geometry)
 
 
 def draw_observed(
@@ -95,15 +95,15 @@ def _taken(
 ) -> tuple[Float[np.ndarray, "M n"], list[Float[np.ndarray, "r m"]]]:
     """Configurations in which the true arm owes as little as it can, and the residuals that are left."""
     observed, z = recorded.truth.observed, np.concatenate([true, recorded.geometry])
-    q = np.asarray(observed.q).copy()
+    q, units = np.asarray(observed.q).copy(), reading_units(recorded.space.base.geometry)
     for number in range(_ROUNDS + 1):
-        now = eqx.tree_at(lambda o: (o.q, o.sines_cosines), observed, (q, sines_cosines(q)))
+        now = observed.moved(recorded.space.base, q)
         left = [np.asarray(rows.values) for rows in residual_rows(recorded.space, now, z)]
         if number == _ROUNDS:
             break
         for rows, inverse, values in zip(observed.slices, recorded.inverses, left, strict=True):
             step = np.einsum("mnr,rm->mn", inverse, values)
-            q[rows] -= np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+            q[rows] -= units * np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
         q = _agreeing(q, recorded.truth.reading)
     return q, left
 

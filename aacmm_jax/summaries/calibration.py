@@ -9,8 +9,9 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import active_names
 from ..data.capture import Capture, ReferenceLength
+from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
-from ..kinematics.arm import is_length
+from ..kinematics.arm import by_joint, is_length, parameter_unit
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
@@ -32,7 +33,9 @@ def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
             "d_mm": float(arm.d[i]),
             "theta_rad": float(arm.theta[i]),
             "beta_rad": None if arm.beta is None else float(arm.beta[i]),
-            "limits_rad": None if arm.limits is None else list(arm.limits[i]),
+            "kind": "prismatic" if i + 1 in arm.prismatic else "revolute",
+            "limits_rad": None if arm.limits is None or i + 1 in arm.prismatic else list(arm.limits[i]),
+            "limits_mm": list(arm.limits[i]) if arm.limits is not None and i + 1 in arm.prismatic else None,
         }
         for i in range(arm.joints)
     ]
@@ -54,13 +57,14 @@ def parameters_csv(record: CalibrationRecord) -> str:
     lines = ["parameter,unit,nominal,calibrated,u"]
     for i, name in enumerate(record.names):
         values = (vectors["nominal"][i], vectors["calibrated"][i], u[i])
-        lines.append(",".join([name, "mm" if is_length(name) else "rad", *(repr(float(value)) for value in values)]))
+        unit = parameter_unit(record.recording.nominal.arm, name)
+        lines.append(",".join([name, unit, *(repr(float(value)) for value in values)]))
     return "\n".join(lines) + "\n"
 
 
 def capture_summary(recording: Recording) -> dict[str, Any]:
     """A capture: sockets with their poses, lengths, the nominal arm."""
-    capture = recording.capture
+    capture, units = recording.capture, by_joint(recording.nominal.arm, "rad", "mm")
     return {
         "kind": "capture",
         "arm": recording.nominal.name,
@@ -70,9 +74,9 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
         "observations": capture_observations(capture),
         "lengths": reference_length_rows(capture.lengths),
         "ranges": [
-            {"joint": i + 1, "lowest_rad": float(low), "highest_rad": float(high)}
-            for i, (low, high) in enumerate(
-                zip(np.min(capture.readings, axis=0), np.max(capture.readings, axis=0), strict=True)
+            {"joint": i + 1, f"lowest_{unit}": float(low), f"highest_{unit}": float(high)}
+            for i, (low, high, unit) in enumerate(
+                zip(np.min(capture.readings, axis=0), np.max(capture.readings, axis=0), units, strict=True)
             )
         ],
         "simulated": recording.true is not None,
@@ -148,7 +152,7 @@ def calibration_summary(
     parameters = [
         {
             "parameter": name,
-            "unit": "mm" if is_length(name) else "rad",
+            "unit": parameter_unit(record.recording.nominal.arm, name),
             "u": float(u[i]) if record.determined[i] and u[i] > 0 else None,
             **{stage: float(vector[i]) for stage, vector in vectors.items()},
             "bound": {-1: "lower", 1: "upper"}.get(int(record.active[i])),
@@ -196,6 +200,7 @@ def uncertainty_summary(
     found = {
         "form": record.noise_model,
         "encoder_arcsec": np.asarray(record.noise.encoder_arcsec).tolist(),
+        "linear_encoder_mm": linear_encoder_mm(record.noise, record.calibrated.arm),
         "seating_mm": float(record.noise.seating),
         "misfit": record.reduced_chi,
         "coverage_factor_95": uncertainty.factor(0.95),

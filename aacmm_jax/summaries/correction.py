@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ..core.text import pluralise, shorten
 from ..core.units import DEG
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, by_joint
 from ..kinematics.correction import FULL_POSE, ReadingsAtPoses
 
 _LARGE_CHANGE = 5.0  # deg: ten times what link errors of 1 mm and 1 mrad take where no axes align
@@ -27,7 +27,7 @@ def correction_summary(
     Args:
         nominal: The arm that the controller has.
         calibrated: The calibrated arm.
-        q: Commanded readings, or those that the search for a pose began with, rad.
+        q: Commanded readings, or those that the search for a pose began with, rad and mm.
         found: The corrected readings.
         unit: Of readings in the tables, deg or rad.
         of_readings: Whether readings were commanded; of positions with orientations nothing is known of the arm
@@ -42,6 +42,7 @@ def correction_summary(
         "largest_distance_mm": None,
         "largest_angle_deg": None,
         "largest_change": None,
+        "largest_slide": None,
         "not_reached": [_missed(nominal, found, row) for row in np.flatnonzero(~reached).tolist()],
         "warnings": [],
     }
@@ -57,9 +58,14 @@ def correction_summary(
     if of_readings:
         before = np.asarray(nominal.position(q[reached])) - np.asarray(calibrated.position(q[reached]))
         summary["largest_distance_before_mm"] = float(np.linalg.norm(before, axis=1).max())
-        change = np.where(reached[:, None], np.abs(np.asarray(found.q) - q) / DEG, 0.0)
-        row, joint = divmod(int(np.argmax(change)), nominal.joints)
-        summary["largest_change"] = {"row": row + 1, "joint": joint + 1, "change_deg": float(change[row, joint])}
+        moved = np.where(reached[:, None], np.abs(np.asarray(found.q) - q), 0.0)
+        change, slide = (moved * np.array(by_joint(nominal, *of)) for of in ((1 / DEG, 0.0), (0.0, 1.0)))
+        if len(nominal.prismatic) < nominal.joints:
+            row, joint = divmod(int(np.argmax(change)), nominal.joints)
+            summary["largest_change"] = {"row": row + 1, "joint": joint + 1, "change_deg": float(change[row, joint])}
+        if nominal.prismatic:
+            row, joint = divmod(int(np.argmax(slide)), nominal.joints)
+            summary["largest_slide"] = {"row": row + 1, "joint": joint + 1, "change_mm": float(slide[row, joint])}
         large = np.flatnonzero(change.max(axis=1) > _LARGE_CHANGE) + 1
         if len(large):
             summary["warnings"].append(

@@ -19,7 +19,6 @@ from ..data.capture import Capture
 from ..data.observations.measured_transforms import MeasuredTransforms
 from ..data.observations.observation import AbstractObservation
 from ..kinematics.arm import Arm
-from ..kinematics.chain import sines_cosines
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import total_link_length
 from ..model.observed import Observed, linear_rows
@@ -103,10 +102,10 @@ class _OfObservations(NamedTuple):
 
     @classmethod
     def by(cls, arm: Arm, capture: Capture) -> "_OfObservations":
-        observed = Observed.of(capture)
+        observed = Observed.of(capture, arm)
         chosen = [observed.observations[i] for i in _evenly(len(observed.observations), _OBSERVATIONS)]
         part = tuple(one.select(_evenly(one.q.shape[0], _POSES)) for one in chosen)
-        return cls(arm, _replaced(eqx.tree_at(lambda o: o.observations, observed, part), part))
+        return cls(arm, observed.moved(arm, _stacked_readings(part), part))
 
     @property
     def given(self) -> _Tried:
@@ -140,7 +139,7 @@ class _OfObservations(NamedTuple):
         if observations is None:
             parts = zip(self.observed.observations, self.observed.slices, strict=True)
             observations = tuple(eqx.tree_at(lambda o: o.q, one, tried.q[rows]) for one, rows in parts)
-        observed = _replaced(self.observed, observations)
+        observed = self.observed.moved(self.arm, _stacked_readings(observations), observations)
         space, lever = Parameters(self.arm, ("d_1",)), total_link_length(self.arm) / 4
         fixed = {name: np.asarray(value) for name, (value, _) in observed.certified().items()}
         free = np.concatenate([np.full(len(units), name not in fixed) for name, units in observed.blocks.items()])
@@ -168,9 +167,8 @@ def _evenly(number: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, number - 1, min(number, most)).astype(int))
 
 
-def _replaced(observed: Observed, observations: tuple[AbstractObservation, ...]) -> Observed:
-    q = np.concatenate([np.asarray(one.q) for one in observations])
-    return eqx.tree_at(lambda o: (o.observations, o.q, o.sines_cosines), observed, (observations, q, sines_cosines(q)))
+def _stacked_readings(observations: tuple[AbstractObservation, ...]) -> Float[np.ndarray, "M n"]:
+    return np.concatenate([np.asarray(one.q) for one in observations])
 
 
 def _roots(shape: tuple[int, ...], lever: float) -> Float[np.ndarray, "m r r"]:

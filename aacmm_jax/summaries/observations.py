@@ -143,7 +143,7 @@ def _agreement(pairs: list[tuple[ObservationResiduals, np.ndarray]]) -> dict[str
 
 def _geometry(capture: Capture, metrics: ObservedMetrics) -> list[dict[str, Any]]:
     """Every part of the geometry with its numbers, in words too, and with the values certified of it."""
-    observed, found = Observed.of(capture), {}
+    observed, found = Observed.of(capture, None), {}
     certified = observed.certified()
     for observation in observed.observations:
         for part, units in _parts(observation).items():

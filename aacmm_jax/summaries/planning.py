@@ -6,6 +6,7 @@ import numpy as np
 
 from ..acceptance.procedure import Procedure
 from ..acceptance.standards import PLANNED
+from ..data.noise import linear_encoder_mm
 from ..planning.design import MORE, Plan, Prediction
 from ..planning.kit import KitPlan
 from .calibration import reference_length_rows
@@ -26,6 +27,7 @@ def plan_summary(plan: Plan, arm: str) -> dict[str, Any]:
         "lengths": reference_length_rows(plan.lengths),
         "check_length_mm": plan.check_length,
         "encoder_arcsec": np.asarray(plan.noise.encoder_arcsec).tolist(),
+        "linear_encoder_mm": linear_encoder_mm(plan.noise, plan.arm),
         "seating_mm": float(plan.noise.seating),
         "predicted": _prediction(plan.predicted),
         "loose": _prediction(plan.loose),
@@ -62,6 +64,7 @@ def kit_plan_summary(plan: KitPlan, arm: str) -> dict[str, Any]:
         "observations": rows,
         "check_length_mm": plan.check_length,
         "encoder_arcsec": np.asarray(plan.noise.encoder_arcsec).tolist(),
+        "linear_encoder_mm": linear_encoder_mm(plan.noise, plan.arm),
         "seating_mm": float(plan.noise.seating),
         **{name: _prediction(getattr(plan, name)) for name in ("predicted", "loose", "random", "more")},
         "without": {name: _prediction(one) if np.isfinite(one.largest) else None for name, one in plan.without.items()},

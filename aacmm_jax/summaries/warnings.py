@@ -14,7 +14,7 @@ from ..core.text import shorten
 from ..core.units import INCH, M
 from ..data.noise import tip_covariances
 from ..data.recording import Recording
-from ..kinematics.chain import sines_cosines
+from ..kinematics.chain import joint_motion, reading_units
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import pose_outliers
 from ..uncertainty.identifiability import Observability, observability
@@ -45,13 +45,16 @@ def of_capture(recording: Recording) -> list[str]:
     A simulation keeps within the limits but for its noise.
     """
     found = []
-    q = np.asarray(recording.capture.readings)
+    q, units = np.asarray(recording.capture.readings), reading_units(recording.nominal.arm.geometry)
     for joint, limits in enumerate(recording.nominal.arm.limits or () if recording.true is None else ()):
-        outside = int(np.sum((q[:, joint] < limits[0] - _TOLERANCE) | (q[:, joint] > limits[1] + _TOLERANCE)))
+        tolerance = _TOLERANCE * units[joint]
+        outside = int(np.sum((q[:, joint] < limits[0] - tolerance) | (q[:, joint] > limits[1] + tolerance)))
         if outside:
-            low, high = (f"{math.degrees(x):.0f}" for x in limits)
+            slides = joint + 1 in recording.nominal.arm.prismatic
+            low, high = (f"{x if slides else math.degrees(x):.0f}" for x in limits)
             found.append(
-                f"Joint {joint + 1}: {outside} of {len(q)} readings lie outside its limits, {low} to {high} deg; "
+                f"Joint {joint + 1}: {outside} of {len(q)} readings lie outside its limits, {low} to {high} "
+                f"{'mm' if slides else 'deg'}; "
                 "is the unit right, and the order of the columns?"
             )
     found += recording.capture.repeated.sentences()
@@ -118,7 +121,8 @@ def _observations(record: CalibrationRecord) -> list[str]:
 def observed(record: CalibrationRecord) -> Observability:
     """What the data of a calibration determine about the calibrated arm, given its noise and bounds."""
     arm, capture = record.calibrated.arm, record.recording.capture
-    covariances = tip_covariances(*to_numpy((arm.geometry, sines_cosines(np.asarray(capture.readings)), record.noise)))
+    motion = joint_motion(arm.geometry, np.asarray(capture.readings))
+    covariances = tip_covariances(*to_numpy((arm.geometry, motion, record.noise)))
     sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
     space = Parameters(arm, record.names)
     return observability(arm, capture, space, sigma=sigma, bounds=Bounds(space, record.lower, record.upper))

@@ -10,7 +10,7 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm
-from ..kinematics.chain import sines_cosines
+from ..kinematics.chain import joint_motion
 from ..kinematics.parameters import Parameters
 
 
@@ -120,7 +120,8 @@ class Uncertainty(eqx.Module):
     def _reading(self, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3 3"]:
         xp = namespace(self, q)
         flat = q.reshape(-1, q.shape[-1])
-        covariance = xp.moveaxis(tip_covariances(self.arm.geometry, sines_cosines(flat), self.noise), -1, 0)
+        geometry = self.arm.geometry
+        covariance = xp.moveaxis(tip_covariances(geometry, joint_motion(geometry, flat), self.noise), -1, 0)
         return covariance.reshape(*q.shape[:-1], 3, 3)
 
     def _is_open(self, derivatives: Float[AnyArray, "... k p"]) -> Bool[AnyArray, "... k"]:

@@ -8,13 +8,14 @@ parameters is the product of both.
 import math
 from typing import Literal, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
 from ..core.linear_algebra import inverse_positive_definite, semidefinite_eigen
 from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.units import ARCSEC
-from ..data.noise import Noise, encoder_covariances, noise_of, tip_covariances
+from ..data.noise import Noise, encoder_covariances, noise_of, one_arcsec, tip_covariances
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
 from ..model.measurement import Measurement, between_ends, length_directions
@@ -184,9 +185,9 @@ def tip_errors(
     geometry = arm.geometry
     if noise_model == "given":
         assert noise is not None
-        return tip_covariances(geometry, measurement.sines_cosines, noise), noise
+        return tip_covariances(geometry, measurement.motion, noise), noise
     if noise_model == "estimated":
-        unit = encoder_covariances(geometry, measurement.sines_cosines, xp.asarray(ARCSEC))
+        unit = encoder_covariances(geometry, measurement.motion, xp.asarray(one_arcsec(geometry.kinds)))
         arcsec2, seat2 = _components(linear, measurement, unit, sigma, inverse)
         found = noise_of(ARCSEC * _root(arcsec2), _root(seat2))
         return arcsec2 * unit + seat2 * xp.asarray(np.eye(3)[:, :, None]), found
@@ -194,8 +195,8 @@ def tip_errors(
     if noise_model == "common":
         if noise is None:
             return common, as_seat
-        covariances = sigma**2 * tip_covariances(geometry, measurement.sines_cosines, noise)
-        return covariances, noise_of(sigma * noise.encoder, sigma * noise.seating)
+        covariances = sigma**2 * tip_covariances(geometry, measurement.motion, noise)
+        return covariances, jax.tree.map(lambda leaf: sigma * leaf, noise)
     redundancy = (
         xp.eye(3)[:, :, None] - linear.centroid_weights + xp.einsum("paN,pbN->abN", linear.columns, sensitivity.tips)
     )

@@ -11,7 +11,7 @@ from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from ..data.capture import Capture, ReferenceLength, check_one_capture
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, joint_limits, neighbouring_arm, with_arrays
-from ..kinematics.chain import sines_cosines
+from ..kinematics.chain import joint_motion
 from ..kinematics.independence import equations, nearly_parallel, tip_movements
 from ..kinematics.inverse_kinematics import project_to_centroids, project_to_targets
 from ..kinematics.near_degeneracy import TradeOff, trade_offs
@@ -135,7 +135,7 @@ def observability(
     if noise is not None:
         noise.check(arm.joints)
         q = np.concatenate([capture.q, *(observation.q for observation in capture.observations)])
-        covariances = tip_covariances(arm.geometry, sines_cosines(q), noise)
+        covariances = tip_covariances(arm.geometry, joint_motion(arm.geometry, q), noise)
         sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
     # Fixed values are those of the arm, not of the space's base.
     base = with_arrays(arm, beta=np.zeros_like(arm.alpha)) if arm.beta is None and space.base.beta is not None else arm
@@ -178,7 +178,7 @@ class _Spectrum(NamedTuple):
 
 def _spectrum(arm: Arm, targets_of: Arm, capture: Capture, space: Parameters, noise: Noise | None) -> _Spectrum:
     if capture.observations:
-        observed = Observed.of(capture)
+        observed = Observed.of(capture, arm)
         agreeing = Agreeing.of(observed, Parameters(arm, space.names))
         plain = agreeing.eliminated()
         rows = plain if noise is None else agreeing.eliminated(noise)
@@ -192,7 +192,9 @@ def _spectrum(arm: Arm, targets_of: Arm, capture: Capture, space: Parameters, no
     if noise is not None:
         moved = Capture({name: q[capture.owner == i] for i, name in enumerate(capture.names)}, capture.lengths)
         rows = np.asarray(
-            whitened_equations(arm, Parameters(arm, space.names), Measurement.of(moved).weighted(arm.geometry, noise))
+            whitened_equations(
+                arm, Parameters(arm, space.names), Measurement.of(moved, arm).weighted(arm.geometry, noise)
+            )
         )
     return _decomposed(rows, poses, lengths)
 

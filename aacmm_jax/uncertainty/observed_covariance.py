@@ -13,9 +13,9 @@ from jaxtyping import Float
 from ..core.linear_algebra import inverse_positive_definite
 from ..core.numpy_or_jax import AnyArray, namespace, scan, stop_gradient, while_loop
 from ..core.units import ARCSEC
-from ..data.noise import Noise, noise_of
-from ..kinematics.chain import ForwardPass
-from ..kinematics.jacobian import jacobian_columns
+from ..data.noise import Noise, noise_of, one_arcsec
+from ..kinematics.chain import ForwardPass, JointKinds
+from ..kinematics.jacobian import reading_columns, reading_rotations
 from ..model.observed import Linear, Observed, Whitening, whitened
 from ..model.robust import BOUNDED_SQUARES, MEDIANS
 
@@ -26,32 +26,34 @@ _ROUNDS, _MEDIAN_ROUNDS, _MOMENT_ROUNDS = 100, 20, 10
 class ArmErrors(NamedTuple):
     """How errors of one observation's poses reach its rows."""
 
-    by_readings: Float[AnyArray, "r n m"]  # mm (or rad) a rad
+    by_readings: Float[AnyArray, "r n m"]  # mm (or rad) a rad, or a mm of prismatic joints
     by_seat: Float[AnyArray, "r c m"]  # of the tip's position, and of its orientation as far as the tip's lever goes
+    kinds: JointKinds | None
 
 
 def arm_errors(forward: ForwardPass, linear: list[Linear], observed: Observed) -> list[ArmErrors]:
     """Of every observation."""
     xp = namespace(forward, [part.jacobian for part in linear])
-    theta = jacobian_columns(forward)["theta"]  # (n, 3, N)
+    readings, rotations = reading_columns(forward), reading_rotations(forward)  # (n, 3, N)
     # An arm whose tips err by s turns them by about s over its size.
     size = xp.sqrt(xp.mean(xp.sum(forward.tip**2, axis=0)))
     found = []
     for part, rows in zip(linear, observed.slices, strict=True):
         by_tip, by_rotation = part.rows.by_tip, part.rows.by_rotation
-        by_readings = _product(by_tip, theta[..., rows])
+        by_readings = _product(by_tip, readings[..., rows])
         by_seat = by_tip
         if by_rotation is not None:
-            by_readings = by_readings + _product(by_rotation, forward.z_before[..., rows])
+            by_readings = by_readings + _product(by_rotation, rotations[..., rows])
             by_seat = xp.concatenate([by_tip, by_rotation / size], axis=1)
-        found.append(ArmErrors(by_readings, by_seat))
+        found.append(ArmErrors(by_readings, by_seat, forward.kinds))
     return found
 
 
 def covariance_of_noise(errors: ArmErrors, noise: Noise) -> Float[AnyArray, "m r r"]:
     """Of one observation's rows by the noise of readings and seat."""
     xp = namespace(errors, noise)
-    moved = errors.by_readings * xp.broadcast_to(noise.encoder, (errors.by_readings.shape[1],))[None, :, None]
+    each = xp.broadcast_to(noise.of_readings(errors.kinds), (errors.by_readings.shape[1],))
+    moved = errors.by_readings * each[None, :, None]
     tip = errors.by_seat[:, :3]
     return _squares(moved) + (noise.seating**2 + 1e-12) * _squares(tip)
 
@@ -189,7 +191,8 @@ def moments(
     xp = namespace(inverse, sigma, rows)
     parts = []
     for part, error, root, j, weighted in zip(linear, errors, whitening.roots, rows, influence, strict=True):
-        readings = xp.einsum("mab,bnm->anm", root, error.by_readings * ARCSEC)
+        of_unit = xp.asarray(np.reshape(one_arcsec(error.kinds), (1, -1, 1)))
+        readings = xp.einsum("mab,bnm->anm", root, error.by_readings * of_unit)
         seat = xp.einsum("mab,bnm->anm", root, error.by_seat)
         parts.append(
             _Parts(
@@ -323,7 +326,7 @@ def propagated(
     readings = xp.concatenate(by_readings, axis=2)
     if len(np.unique(pose)) < len(pose):
         readings = readings @ xp.asarray((pose[:, None] == np.unique(pose)[None, :]).astype(float))
-    each = xp.broadcast_to(noise.encoder, (readings.shape[1],))
+    each = xp.broadcast_to(noise.of_readings(errors[0].kinds), (readings.shape[1],))
     readings = readings * each[None, :, None]
     return inverse @ (total + _outer(readings, readings)) @ inverse
 

@@ -12,7 +12,8 @@ from jaxtyping import Float
 
 from ..core.numpy_or_jax import AnyArray
 from ..data.noise import Noise
-from ..kinematics.chain import sines_cosines
+from ..kinematics.arm import Arm
+from ..kinematics.chain import reading_units
 from ..kinematics.parameters import Parameters
 from ..model.observed import Linear, Observed, Whitening, certified_and_lengths, linear_rows, whitened, whitening_of
 from .observed_covariance import ArmErrors, arm_errors, covariance_of_noise, covariance_of_sigma
@@ -61,7 +62,7 @@ class Agreeing(NamedTuple):
             linear, errors = _linear(observed, space, z)
             if max(np.abs(part.rows.values).max() for part in linear) < _AGREES:
                 break
-            observed = _moved(observed, linear, errors)
+            observed = _moved(observed, space.base, linear, errors)
         relations, u = certified_and_lengths(observed, z, p)
         return cls(observed, space, linear, errors, relations, u)
 
@@ -136,16 +137,16 @@ def dense_rows(
     return np.concatenate(blocks), np.concatenate(values)
 
 
-def _moved(observed: Observed, linear: list[Linear], errors: list[ArmErrors]) -> Observed:
+def _moved(observed: Observed, arm: Arm, linear: list[Linear], errors: list[ArmErrors]) -> Observed:
     """With configurations one step of Gauss and Newton closer to the geometry, of all such steps the shortest."""
-    new = []
+    new, units = [], reading_units(arm.geometry)
     for observation, part, error in zip(observed.observations, linear, errors, strict=True):
-        inverse = np.linalg.pinv(np.moveaxis(np.asarray(error.by_readings), -1, 0), rcond=1e-6)
-        step = np.einsum("mnr,rm->mn", inverse, np.asarray(part.rows.values))
+        by_units = np.moveaxis(np.asarray(error.by_readings) * units[:, None], -1, 0)
+        step = np.einsum("mnr,rm->mn", np.linalg.pinv(by_units, rcond=1e-6), np.asarray(part.rows.values))
         size = np.linalg.norm(step, axis=1, keepdims=True)
-        new.append(np.asarray(observation.q) - step * np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300)))
+        step = step * np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300))
+        new.append(np.asarray(observation.q) - units * step)
     observations = tuple(
         eqx.tree_at(lambda o: o.q, observation, q) for observation, q in zip(observed.observations, new, strict=True)
     )
-    q = np.concatenate(new)
-    return eqx.tree_at(lambda o: (o.observations, o.q, o.sines_cosines), observed, (observations, q, sines_cosines(q)))
+    return observed.moved(arm, np.concatenate(new), observations)

@@ -10,7 +10,7 @@ from aacmm_jax.calibration.prediction import unseen_errors
 from aacmm_jax.core.distributions import chance
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.data.noise import tip_covariances
-from aacmm_jax.kinematics.chain import sines_cosines
+from aacmm_jax.kinematics.chain import joint_motion
 from aacmm_jax.uncertainty.arm_uncertainty import Uncertainty
 
 SOCKETS = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (300, -300, 300)}
@@ -39,7 +39,9 @@ def test_sums_of_squares_are_those_of_the_whole_covariance(paper_arm, capture):
     uncertainty = uncertainty_of(paper_arm, noise)
     found = unseen_errors(uncertainty, capture)
     slopes = np.asarray(paper_arm.jacobian(capture.q, NAMES)).reshape(-1, len(NAMES))
-    own = np.moveaxis(np.asarray(tip_covariances(paper_arm.geometry, sines_cosines(capture.q), noise)), -1, 0)
+    own = np.moveaxis(
+        np.asarray(tip_covariances(paper_arm.geometry, joint_motion(paper_arm.geometry, capture.q), noise)), -1, 0
+    )
     errors = slopes @ np.asarray(uncertainty.covariance) @ slopes.T
     for pose, block in enumerate(own):
         errors[3 * pose : 3 * pose + 3, 3 * pose : 3 * pose + 3] += block

@@ -43,7 +43,7 @@ def test_residuals_scatter_as_the_weights_say(paper_arm, bounds, kind):
     squares = []
     for trial in range(10):
         one = jax.tree.map(lambda leaf, trial=trial: leaf[trial], batch)
-        for part, root in zip(linear_rows(space, Observed.of(one), z), roots, strict=True):
+        for part, root in zip(linear_rows(space, Observed.of(one, space.base), z), roots, strict=True):
             squares.append(np.einsum("mab,bm->am", root, part.rows.values).ravel() ** 2)
     squares = np.concatenate(squares)
     assert np.mean(squares) == pytest.approx(1.0, abs=5 * np.sqrt(2 / squares.size))

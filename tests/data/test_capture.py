@@ -8,8 +8,11 @@ from ..refusals import assert_refused
 
 
 def test_degrees_are_recognized():
+    """Of revolute joints; prismatic ones slide by hundreds of mm."""
     said = ["socket 'A' pose 2 joint 1 is 90 rad", "more than four revolutions", "look like degrees", "numpy.deg2rad"]
-    assert_refused(lambda: aj.Capture({"A": np.array([[0.0, 1.0], [90.0, 2.0]])}), *said)
+    capture, arm = aj.Capture({"A": np.array([[0.0, 1.0], [90.0, 2.0]])}), aj.Arm(alpha=[1, 0], a=[1, 1], d=[0, 0])
+    assert_refused(lambda: aj.evaluate(arm, capture), *said)
+    aj.evaluate(arm.replace(prismatic=(1,)), capture)
 
 
 def test_sockets_of_a_batch():

@@ -102,7 +102,7 @@ BAD = {
     ),
     "empty": (lambda path, source: path.touch(), ["is not an HDF5 file"]),
     "foreign": (make_foreign, ["was not written by aacmm", "name a "]),
-    "newer": (set_attribute("format_version", 3), ["format version 3, newer", "(2)", "update aacmm_jax"]),
+    "newer": (set_attribute("format_version", 4), ["format version 4, newer", "(3)", "update aacmm_jax"]),
     "no version": (edit(lambda file: file.attrs.pop("format_version")), ["damaged", "make it again"]),
     "other kind": (set_attribute("kind", "study"), ["holds a study", "name a "]),
     "no table": (remove("capture"), ["lacks the table 'capture'", "make it again"]),
@@ -526,7 +526,7 @@ def test_files_say_where_they_come_from(good):
     for kind, path in good.files.items():
         with h5py.File(path) as file:
             attributes = dict(file.attrs)
-        assert (attributes["format"], attributes["kind"], attributes["format_version"]) == ("aacmm_jax", kind, 2)
+        assert (attributes["format"], attributes["kind"], attributes["format_version"]) == ("aacmm_jax", kind, 3)
         assert attributes["seed"] == 1
         for name in ("package_version", "created", "command"):
             assert attributes[name]

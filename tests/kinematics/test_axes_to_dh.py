@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 import aacmm_jax as aj
 from aacmm_jax.core.rotations import roll_pitch_yaw, roll_pitch_yaw_matrix
+from aacmm_jax.kinematics.arm import arm_of
 from aacmm_jax.kinematics.axes_to_dh import (
     Axes,
     calibrated_frames,
@@ -61,10 +62,6 @@ def lines_of(origins: list, directions: np.ndarray, tip: np.ndarray) -> Axes:
         frames.append(frame)
     z = np.array([frame[:3, :3] @ axis for frame, axis in zip(frames, directions, strict=True)])
     return Axes(z, np.array([frame[:3, 3] for frame in frames]), frames[-1] @ tip)
-
-
-def arm_of(geometry) -> aj.Arm:
-    return aj.Arm(**geometry._asdict())
 
 
 def assert_same(poses, expected):

@@ -11,7 +11,9 @@ import aacmm_jax as aj
 from aacmm_jax.kinematics import chain, jacobian
 
 
-def random_arm(joints: int, seed: int, *, beta: bool = False, batch: tuple[int, ...] = ()) -> aj.Arm:
+def random_arm(
+    joints: int, seed: int, *, beta: bool = False, batch: tuple[int, ...] = (), prismatic: tuple[int, ...] = ()
+) -> aj.Arm:
     random = np.random.default_rng(seed)
     shape = (*batch, joints)
     return aj.Arm(
@@ -21,7 +23,14 @@ def random_arm(joints: int, seed: int, *, beta: bool = False, batch: tuple[int, 
         theta=random.uniform(-0.1, 0.1, shape),
         beta=random.uniform(-0.1, 0.1, shape) if beta else None,
         probe=random.uniform(-100, 100, (*batch, 3)),
+        prismatic=prismatic,
     )
+
+
+def random_readings(arm: aj.Arm, seed: int, *batch: int) -> np.ndarray:
+    """Rad, or mm of prismatic joints."""
+    random = np.random.default_rng(seed)
+    return random.uniform(-3, 3, (*batch, arm.joints)) * chain.reading_units(arm.geometry)
 
 
 def by_matrices(arm: aj.Arm, q: np.ndarray) -> np.ndarray:
@@ -41,30 +50,33 @@ def by_matrices(arm: aj.Arm, q: np.ndarray) -> np.ndarray:
 
     pose = np.eye(4)
     for i in range(arm.joints):
-        pose = (
-            pose @ turn(2, q[i] + arm.theta[i]) @ slide(0, 0, arm.d[i]) @ slide(arm.a[i], 0, 0) @ turn(0, arm.alpha[i])
-        )
+        angle, along = (0.0, q[i]) if i + 1 in arm.prismatic else (q[i], 0.0)
+        pose = pose @ turn(2, angle + arm.theta[i]) @ slide(0, 0, arm.d[i] + along)
+        pose = pose @ slide(arm.a[i], 0, 0) @ turn(0, arm.alpha[i])
         if arm.beta is not None:
             pose = pose @ turn(1, arm.beta[i])
     return pose @ slide(*np.asarray(arm.probe))
 
 
 @pytest.mark.parametrize("beta", [False, True])
-@pytest.mark.parametrize("joints", [1, 2, 6, 9])
-def test_pose_is_the_textbook_product(joints, beta):
-    arm = random_arm(joints, joints, beta=beta)
-    q = np.random.default_rng(0).uniform(-3, 3, (5, joints))
+@pytest.mark.parametrize(
+    ("joints", "prismatic"), [(1, ()), (2, ()), (6, ()), (9, ()), (1, (1,)), (4, (3,)), (6, (1, 2, 3)), (7, (1, 7))]
+)
+def test_pose_is_the_textbook_product(joints, prismatic, beta):
+    arm = random_arm(joints, joints, beta=beta, prismatic=prismatic)
+    q = random_readings(arm, 0, 5)
     expected = np.stack([by_matrices(arm, row) for row in q])
     np.testing.assert_allclose(arm.pose(q), expected, atol=1e-11)
     np.testing.assert_allclose(arm.position(q), expected[:, :3, 3], atol=1e-11)
 
 
-@pytest.mark.parametrize("beta", [False, True])
-def test_the_tips_and_columns_of_a_batch_are_those_of_the_loop(beta):
-    arm, q = random_arm(6, 1, beta=beta, batch=(4, 1)), np.random.default_rng(0).uniform(-3, 3, (5, 6))
+@pytest.mark.parametrize(("beta", "prismatic"), [(False, ()), (True, ()), (True, (1, 4))])
+def test_the_tips_and_columns_of_a_batch_are_those_of_the_loop(beta, prismatic):
+    arm = random_arm(6, 1, beta=beta, batch=(4, 1), prismatic=prismatic)
+    q = random_readings(arm, 0, 5)
     kinds = ("alpha", "a", "d", "theta", "q", *(("beta",) if beta else ()))
     indices = (*((kind, i) for kind in kinds for i in (0, 3, 5)), ("probe", 2))
-    given = arm.geometry, chain.sines_cosines(q)
+    given = arm.geometry, chain.joint_motion(arm.geometry, q)
     compiled = jax.jit(lambda *given: jacobian.tip_and_columns(*given, indices)).lower(*given).compile()
     forward = chain.forward_pass(*given)
     tip, columns = compiled(*given)
@@ -75,12 +87,13 @@ def test_the_tips_and_columns_of_a_batch_are_those_of_the_loop(beta):
 
 
 @pytest.mark.parametrize(
-    "joints", [2, 6, 7, *(pytest.param(joints, marks=pytest.mark.slow) for joints in (3, 4, 5, 8, 9))]
+    ("joints", "prismatic"),
+    [(2, ()), (6, ()), (4, (1, 3)), *(pytest.param(n, (), marks=pytest.mark.slow) for n in (3, 4, 5, 7, 8, 9))],
 )
-def test_jacobian_is_jax_own_differentiation(joints):
+def test_jacobian_is_jax_own_differentiation(joints, prismatic):
     """Analytic columns; JAX's forward and reverse modes through the custom rule; and the plain chain: all equal."""
-    arm = random_arm(joints, joints, beta=True)
-    q = jnp.asarray(np.random.default_rng(joints).uniform(-3, 3, (4, joints)))
+    arm = random_arm(joints, joints, beta=True, prismatic=prismatic)
+    q = jnp.asarray(random_readings(arm, joints, 4))
     names = (*aj.kinematics.parameter_names(arm), *(f"q_{i}" for i in range(1, joints + 1)))
 
     def flattened(derivative):
@@ -90,7 +103,7 @@ def test_jacobian_is_jax_own_differentiation(joints):
 
     def one(q):
         def plain(geometry, q):
-            return chain.forward_pass(geometry, chain.sines_cosines(q)).tip[:, 0]
+            return chain.forward_pass(geometry, chain.joint_motion(geometry, q)).tip[:, 0]
 
         modes = [
             jax.jacfwd(jacobian.tip_position, (0, 1)),
@@ -108,9 +121,10 @@ def test_jacobian_is_jax_own_differentiation(joints):
 
 
 def test_second_derivatives_pass_through_the_rule():
-    arm = random_arm(3, 1)
-    q = jnp.array([0.3, -0.7, 1.1])
-    plain = jax.hessian(lambda q: jnp.sum(chain.forward_pass(arm.geometry, chain.sines_cosines(q)).tip ** 2))(q)
+    arm = random_arm(3, 1, prismatic=(2,))
+    q = jnp.array([0.3, -70.0, 1.1])
+    geometry = arm.geometry
+    plain = jax.hessian(lambda q: jnp.sum(chain.forward_pass(geometry, chain.joint_motion(geometry, q)).tip ** 2))(q)
     for mode in (jax.hessian, lambda f: jax.jacrev(jax.jacrev(f))):
         np.testing.assert_allclose(mode(lambda q: jnp.sum(arm.position(q) ** 2))(q), plain, rtol=1e-10, atol=1e-9)
 

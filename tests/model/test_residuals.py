@@ -22,10 +22,10 @@ def space(paper_arm) -> aj.Parameters:
 
 
 @pytest.fixture(scope="module")
-def measurement() -> Measurement:
+def measurement(paper_arm) -> Measurement:
     q = np.split(np.random.default_rng(0).uniform(-2, 2, (sum(SIZES), 6)), np.cumsum(SIZES)[:-1])
     lengths = [aj.ReferenceLength("A", "B", 300.0, 0.002), aj.ReferenceLength("B", "C", 500.0, 0.004)]
-    return Measurement.of(aj.Capture(dict(zip("ABC", q, strict=True)), lengths))
+    return Measurement.of(aj.Capture(dict(zip("ABC", q, strict=True)), lengths), paper_arm)
 
 
 def blocks(rows: np.ndarray) -> list[np.ndarray]:
@@ -35,7 +35,7 @@ def blocks(rows: np.ndarray) -> list[np.ndarray]:
 
 def covariances(arm: aj.Arm, measurement: Measurement) -> np.ndarray:
     """Covariance of every tip (N, 3, 3), mm^2."""
-    return np.moveaxis(np.asarray(tip_covariances(arm.geometry, measurement.sines_cosines, NOISE)), -1, 0)
+    return np.moveaxis(np.asarray(tip_covariances(arm.geometry, measurement.motion, NOISE)), -1, 0)
 
 
 def test_repeatability_is_the_distance_from_the_centroid(space, measurement):

@@ -87,7 +87,7 @@ def test_without_errors_every_arm_agrees_with_its_data(paper_arm, held, which):
     for number in range(2):
         one = jax.tree.map(lambda leaf, number=number: leaf[number], batch)
         z = np.concatenate([drawn.true[number], _recorded(study).geometry])
-        for rows in residual_rows(study.space, Observed.of(one), z):
+        for rows in residual_rows(study.space, Observed.of(one, study.nominal.arm), z):
             assert np.abs(rows.values).max() < 1e-9
         # What one configuration can follow, it does: only transforms ask for six things at once.
         assert all(np.abs(one.shift).max() < 1e-3 for one in one.observations if one.kind != "transforms")

@@ -58,7 +58,7 @@ def test_inverse_root_is_that_of_cholesky():
 def test_weighted_solve_is_the_dense_generalised_least_squares(paper_arm, space, bounds, capture, result):
     """At the solution the gradient of the textbook's objective, sockets as unknowns, is zero; its curvature is the
     covariance."""
-    noise = tip_covariances(result.stage1.arm.geometry, Measurement.of(capture).sines_cosines, NOISE)
+    noise = tip_covariances(result.stage1.arm.geometry, Measurement.of(capture, paper_arm).motion, NOISE)
     inverse = jnp.linalg.inv(jnp.moveaxis(noise, -1, 0))
     ends = capture.ends()
 
@@ -119,12 +119,12 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
     stage1, noise_model = found.stage1, "common" if noise is None else "given"
     if method == "joint":
         scaled, sigma = divided_arm(stage1.arm, stage1.scale.value), stage1.after.sigma / stage1.scale.value
-        measurement = Measurement.of(capture).weighted(scaled.geometry, noise)
+        measurement = Measurement.of(capture, paper_arm).weighted(scaled.geometry, noise)
         weights = JointWeights.of(scaled.position(measurement.q), measurement, sigma)
         none = jnp.zeros(21, dtype=bool)
         whole = propagation.propagate_solve(found.arm, space, measurement, none, sigma, noise_model, noise, weights)
     else:
-        measurement = Measurement.of(capture).weighted(paper_arm.geometry, noise)
+        measurement = Measurement.of(capture, paper_arm).weighted(paper_arm.geometry, noise)
         held, sigma = jnp.asarray([name == "d_3" for name in space.names]), stage1.after.sigma
         whole = propagation.propagate_solve(stage1.arm, space, measurement, held, sigma, noise_model, noise)
         whole = scale_uncertainty.propagate_division(
@@ -287,8 +287,8 @@ def test_reduced_chi_shows_that_the_noise_is_wrong(paper_arm, capture, bounds):
 
 def test_socket_bases_are_orthonormal(paper_arm, capture):
     """Sums of B^T B over a socket are the identity, whatever the weights."""
-    sines_cosines = Measurement.of(capture).sines_cosines
-    weights = Weights.of(tip_covariances(paper_arm.geometry, sines_cosines, UNEVEN), capture.sizes)
+    motion = Measurement.of(capture, paper_arm).motion
+    weights = Weights.of(tip_covariances(paper_arm.geometry, motion, UNEVEN), capture.sizes)
     products = np.einsum("abN,acN->Nbc", weights.basis, weights.basis)
     for i in range(3):
         np.testing.assert_allclose(products[capture.owner == i].sum(axis=0), np.eye(3), atol=1e-12)

@@ -21,9 +21,6 @@ from ...core.arrays import Numbers, as_array, as_floats, is_concrete
 from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace
 
-# Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
-_MOST_RADIANS = 8 * np.pi
-
 MOST_POSES = 100_000  # to simulate, as in a study
 
 POINT = ("mm",) * 3
@@ -70,7 +67,7 @@ class Quantity(NamedTuple):
     u: float | None = None  # standard uncertainty of a certified value; 0 where it is taken as exact
 
 
-READINGS = Entry("q", "joint angle as read", "rad", ("pose", "joint"), required=True)
+READINGS = Entry("q", "joint reading", "rad", ("pose", "joint"), required=True)
 TARGET = Entry("target", "tip that was held or seen; empty: the arm's own probe", content="text")
 
 
@@ -243,7 +240,7 @@ def checked_truth(where: str, value: Any) -> bool:
 
 
 def checked_readings(where: str, readings: Numbers) -> AnyArray:
-    """Joint readings ``(m, n)``, rad, or `InputError` that says what is wrong with them."""
+    """Joint readings ``(m, n)``, rad, or mm of prismatic joints, or `InputError` that says what is wrong with them."""
     array = as_array(readings, where, like=np.zeros(0))
     if array.ndim != 2 or 0 in array.shape:
         raise InputError(
@@ -259,14 +256,7 @@ def _check_values(where: str, array: np.ndarray) -> None:
     if len(bad):
         row, column = bad[0] + 1
         raise InputError(
-            f"{where} pose {row} joint {column} is {array[row - 1, column - 1]}; every angle must be finite."
-        )
-    largest = float(np.abs(array).max())
-    if largest > _MOST_RADIANS:
-        row, column = np.argwhere(np.abs(array) == largest)[0] + 1
-        raise InputError(
-            f"{where} pose {row} joint {column} is {largest:g} rad, more than four revolutions: these look like "
-            "degrees; convert with numpy.deg2rad, or state the unit in the manifest."
+            f"{where} pose {row} joint {column} is {array[row - 1, column - 1]}; every reading must be finite."
         )
 
 

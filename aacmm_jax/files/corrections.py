@@ -1,0 +1,143 @@
+"""Joint corrections in arm files: the table ``[corrections]``, and variables of HDF5 files."""
+
+import os
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, FiniteFloat, NonNegativeFloat, model_validator
+
+from ..core.errors import InputError
+from ..kinematics.arm import Arm, correction_names
+from ..kinematics.chain import Geometry
+from ..kinematics.corrected_arm import corrected_like, with_corrections
+from ..kinematics.corrections.kind import Loads
+from ..kinematics.parameters import ArmSpecification
+from .hdf5 import Variable, columns, need
+from .toml import Strict
+
+if TYPE_CHECKING:
+    from tomlkit.items import Table as TomlTable
+
+_Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+_KINDS = ("alpha", "a", "d", "theta", "beta")
+_LENGTHS = ("a", "d", "probe")
+
+
+class CorrectionsTable(Strict):
+    """The table ``[corrections]``: a model, or coefficients by name with the nominal arm that they are of."""
+
+    model: str | None = None
+    coefficients: dict[str, FiniteFloat] = Field(default_factory=dict)  # rad, or mm of a prismatic joint
+    gravity: _Vector = Field(default_factory=lambda: [0.0, 0.0, -1.0])
+    mass: list[NonNegativeFloat] | None = None  # of each link, kg
+    centre: list[_Vector] | None = None  # of its mass in its frame, in the unit of lengths
+    nominal: dict[str, list[FiniteFloat]] = Field(default_factory=dict)  # in the file's units
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> "CorrectionsTable":
+        if (self.model is None) == (not self.coefficients):
+            raise ValueError("give either model, such as 'gravity,harmonics=1', or coefficients by name.")
+        if self.nominal and not self.coefficients:
+            raise ValueError("nominal is of coefficients; leave it out of a model.")
+        unknown = set(self.nominal) - {*_KINDS, "probe"}
+        if unknown:
+            raise ValueError(f"nominal has no '{min(unknown)}'; it has lists of alpha, a, d, theta, beta, and probe.")
+        return self
+
+    def corrected(self, arm: Arm, length: float, angle: float) -> Arm:
+        """The arm with these corrections; ``length`` and ``angle`` are the file's units in mm and rad."""
+        centre = None if self.centre is None else length * np.array(self.centre)
+        options: dict[str, Any] = {"mass": self.mass, "centre": centre, "gravity": self.gravity}
+        if self.model is not None:
+            return with_corrections(arm, self.model, **options)
+        units = {kind: length if kind in _LENGTHS else angle for kind in (*_KINDS, "probe")}
+        nominal = arm.replace(**{kind: units[kind] * np.array(row) for kind, row in self.nominal.items()})
+        corrected = with_corrections(nominal, self.coefficients, **options)
+        values = {"coefficients": list(self.coefficients.values()), "gravity": self.gravity}
+        return corrected_like(corrected, arm).replace(**values)
+
+
+def corrections_toml(arm: Arm) -> "TomlTable":
+    """The table ``[corrections]`` of an arm that has some, mm and rad."""
+    import tomlkit
+
+    assert arm.corrections is not None
+    table = tomlkit.table()
+    table["gravity"] = np.asarray(arm.gravity).tolist()
+    loads = _loads(arm)
+    if loads is not None:
+        table["mass"], table["centre"] = list(loads.mass), [list(centre) for centre in loads.centre]
+    names = correction_names(arm)
+    values = np.asarray(arm.coefficients).tolist()
+    table["coefficients"] = dict(zip(names[: len(values)], values, strict=True))
+    table["nominal"] = {kind: np.asarray(values).tolist() for kind, values in _arrays(arm.corrections.nominal).items()}
+    return table
+
+
+def correction_variables(arm: Arm) -> dict[str, Variable]:
+    """Variables of an arm's table, mm and rad; none for an arm without corrections."""
+    if arm.corrections is None:
+        return {}
+    values = np.asarray(arm.coefficients)
+    names = list(correction_names(arm)[: len(values)])
+    units = [function.unit for function in arm.corrections.functions.each]
+    variables = columns(
+        "coefficient",
+        coefficient=(names, "", "name of the coefficient"),
+        coefficients=(values, "1", "coefficient of a joint correction, in its own unit"),
+        coefficient_unit=(units, "", "unit of the coefficient"),
+    )
+    variables |= columns("axis", gravity=(np.asarray(arm.gravity), "1", "direction of gravity in the base frame"))
+    for kind, array in _arrays(arm.corrections.nominal).items():
+        unit, dimension = "mm" if kind in _LENGTHS else "rad", "axis" if kind == "probe" else "joint"
+        variables[f"nominal_{kind}"] = Variable((dimension,), array, unit, f"{kind} of the arm of the functions")
+    loads = _loads(arm)
+    if loads is not None:
+        variables["mass"] = Variable(("joint",), list(loads.mass), "kg", "mass of the link")
+        variables["centre"] = Variable(("joint", "axis"), np.array(loads.centre), "mm", "centre of mass in its frame")
+    return variables
+
+
+def corrected_of(path: str | os.PathLike, arm: Arm, arrays: Mapping[str, np.ndarray]) -> Arm:
+    """The arm with the corrections of its table in an HDF5 file, if it has any."""
+    if "coefficients" not in arrays:
+        return arm
+    wanted = ("coefficient", "gravity", *(f"nominal_{kind}" for kind in ("alpha", "a", "d", "theta", "probe")))
+    need(path, arrays, *wanted, of="entry")
+    nominal = arm.replace(
+        **{kind: arrays[f"nominal_{kind}"] for kind in (*_KINDS, "probe") if f"nominal_{kind}" in arrays}
+    )
+    names = [str(name) for name in arrays["coefficient"]]
+    masses = {"mass": arrays.get("mass"), "centre": arrays.get("centre")}
+    corrected = corrected_like(with_corrections(nominal, names, **masses), arm)
+    return corrected.replace(coefficients=arrays["coefficients"], gravity=arrays["gravity"])
+
+
+def _arrays(geometry: Geometry) -> dict[str, Float[np.ndarray, "..."]]:
+    arrays = {kind: getattr(geometry, kind) for kind in (*_KINDS, "probe")}
+    return {kind: np.asarray(values) for kind, values in arrays.items() if values is not None}
+
+
+def _loads(arm: Arm) -> Loads | None:
+    assert arm.corrections is not None
+    return next((term.loads for term in arm.corrections.functions.each if getattr(term, "loads", None)), None)
+
+
+def with_model(specification: ArmSpecification, model: str) -> ArmSpecification:
+    """The specification with another model of its joints; masses are those of its URDF, where it has one.
+
+    Raises:
+        InputError: The model names an unknown kind.
+    """
+    from .urdf import link_masses, urdf_chain
+
+    loads: dict[str, Any] = {}
+    if specification.urdf is not None:
+        masses = link_masses(urdf_chain(specification.urdf))
+        if np.any(masses.mass > 0):
+            loads = {"mass": masses.mass, "centre": masses.centre}
+    if not model.strip():
+        raise InputError("the model is empty; name dh alone for an arm without corrections.")
+    return specification._replace(arm=with_corrections(specification.arm, model, **loads))

@@ -1,0 +1,117 @@
+"""An arm with joint corrections: coefficients of known functions of the readings, 0 until they are calibrated."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.arguments import items_of
+from ..core.arrays import Numbers, as_floats
+from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
+from .arm import DOWN, Arm, is_single, joint_limits
+from .chain import Corrections, Geometry, KnownFunctions, forward_pass, joint_motion, joints_first
+from .corrections.kind import Loads, Term
+from .corrections.kinds import term_of, terms_of
+
+_CONFIGURATIONS = 300
+_INDEPENDENT = 1e-6  # of a function's size: what must be left of it beside the constant and those before it
+
+
+def with_corrections(
+    arm: Arm,
+    model: str | Iterable[str],
+    *,
+    mass: Numbers | None = None,
+    centre: Numbers | None = None,
+    gravity: Numbers = DOWN,
+) -> Arm:
+    """The same arm with corrections, whose coefficients are 0: it moves as before, and has more parameters.
+
+    The functions are evaluated on the frames of this arm, also when its parameters change later. A model leaves out
+    functions that are constant, or combinations of others of the same joint, within the limits of the joints: gravity
+    about a vertical axis, for instance.
+
+    Args:
+        arm: The nominal arm; corrections that it has are replaced.
+        model: What the joints do: "gravity,harmonics=1" (kinds of corrections, see `kinematics.corrections`), or names
+            of coefficients, such as ``["cos1_2", "sin1_2", "compliance3_2"]``, all of which are taken.
+        mass: Mass of each link ``(n,)``, kg, for compliances alone; by default unknown.
+        centre: Centre of mass of each link in its D-H frame ``(n, 3)``, mm.
+        gravity: Direction of gravity in the base frame ``(3,)``.
+
+    Raises:
+        InputError: Something in the model is unknown, or numbers do not fit the arm.
+    """
+    if not is_single(arm):
+        raise InputError("corrections are for one arm, but this is a batch; take one of it first.")
+    plain: Arm = to_numpy(arm.replace(coefficients=None, gravity=None, corrections=None))
+    loads, down = _loads(plain, mass, centre), _direction(gravity)
+    if isinstance(model, str):
+        terms = _determined(plain, terms_of(model, plain.joints, loads), down)
+    else:
+        names = items_of(model, "model")
+        found = [term_of(name, plain.joints, loads) if isinstance(name, str) else None for name in names]
+        for name, term in zip(names, found, strict=True):
+            if term is None:
+                raise InputError(f"'{name}' is no coefficient's name; write one such as cos1_2, or give a model.")
+        terms = tuple(dict.fromkeys(term for term in found if term is not None))
+    if not terms:
+        return plain
+    return plain.replace(corrections=Corrections(KnownFunctions(terms), plain.geometry), gravity=down)
+
+
+def corrected_like(corrected: Arm, arm: Arm) -> Arm:
+    """An arm of other parameters with the corrections of a corrected one, and their functions on its nominal arm."""
+    changes = {kind: getattr(corrected, kind) for kind in ("corrections", "coefficients", "gravity")}
+    return arm.replace(**changes)
+
+
+def _loads(arm: Arm, mass: Numbers | None, centre: Numbers | None) -> Loads | None:
+    if mass is None and centre is None:
+        return None
+    if mass is None or centre is None:
+        raise InputError("masses and centres of mass go together; give both mass and centre.")
+    masses, centres = (np.asarray(to_numpy(as_floats(x, what))) for x, what in ((mass, "mass"), (centre, "centre")))
+    if masses.shape != (arm.joints,) or centres.shape != (arm.joints, 3):
+        raise InputError(
+            f"mass has shape {masses.shape} and centre {centres.shape}; give one mass (kg) and one centre (x, y, z in "
+            f"mm) for each of the {arm.joints} links."
+        )
+    return Loads(tuple(masses.tolist()), tuple((x, y, z) for x, y, z in centres.tolist()))
+
+
+def _direction(gravity: Numbers) -> Float[np.ndarray, " 3"]:
+    given = np.asarray(to_numpy(as_floats(gravity, "gravity")))
+    if given.shape != (3,) or not np.linalg.norm(given) > 0:
+        raise InputError("gravity must be a direction in the base frame, three numbers that are not all 0.")
+    return given / np.linalg.norm(given)
+
+
+def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"]) -> tuple[Term, ...]:
+    """The terms whose functions are no combination of a constant and of those before them, joint by joint."""
+    limits = joint_limits(arm, None)
+    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_CONFIGURATIONS, arm.joints))
+    values, taken = function_values(arm.geometry, terms, q, gravity), []
+    for joint in range(1, arm.joints + 1):
+        basis = np.full((_CONFIGURATIONS, 1), _CONFIGURATIONS**-0.5)
+        for term, column in zip(terms, values, strict=True):
+            if term.joint != joint:
+                continue
+            rest = column
+            for _ in range(2):  # twice is enough for orthogonality to rounding
+                rest = rest - basis @ (basis.T @ rest)
+            size = np.linalg.norm(rest)
+            if size > _INDEPENDENT * max(np.linalg.norm(column), 1e-6):
+                taken.append(term)
+                basis = np.hstack([basis, rest[:, None] / size])
+    return tuple(term for term in terms if term in taken)
+
+
+def function_values(
+    nominal: Geometry, terms: Sequence[Term], q: Float[np.ndarray, "N n"], gravity: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "k N"]:
+    """The function of each term at N configurations, in units of its coefficient's effect (rad, or mm)."""
+    rows, forward = joints_first(q, 1), forward_pass(nominal, joint_motion(nominal, q))
+    values = (term.values(rows, forward)[:, 0] for term in terms)
+    return np.array([gravity @ value if len(value) == 3 else value[0] for value in values])

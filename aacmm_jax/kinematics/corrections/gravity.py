@@ -1,0 +1,79 @@
+"""Compliance: a joint, with the link before it, yields to the moment of gravity about its axis.
+
+The moment of a mass m at c about the axis z through o is m g . (z x (c - o)): linear in the direction of gravity, so
+that its three components are functions of the readings alone.
+"""
+
+from typing import ClassVar
+
+from jaxtyping import Float
+
+from ...core.errors import InputError
+from ...core.numpy_or_jax import AnyArray, namespace
+from ...core.rotations import cross
+from ..chain import ForwardPass
+from .kind import AbstractCorrection, Loads, Term
+
+_STANDARD_GRAVITY = 9.80665  # m/s^2, by definition
+_METRE = 1e-3  # m/mm
+_KILONEWTON = 1e-3  # kN/N: with rad/(kN m), compliances are about as large as errors of angles
+
+
+class Gravity(AbstractCorrection):
+    """The moment of gravity about a joint's axis.
+
+    With known masses, one coefficient a joint, ``compliance_2``, rad/(kN m). Without, one for each link after it,
+    ``compliance3_2``: compliance times the weight of link 3 as if it were in the origin of its frame, of the
+    last link in the tip, rad/m; only such products can be found.
+    """
+
+    model: ClassVar[str] = "gravity"
+    words: ClassVar[tuple[str, ...]] = ("compliance",)
+    description: ClassVar[str] = "compliance by the moment of gravity"
+    rows: ClassVar[int] = 3
+
+    def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
+        if option:
+            raise InputError(f"gravity takes no option such as '{option}'; write gravity alone.")
+        if loads is not None:
+            return tuple(Term(self, "compliance", 0, joint, loads) for joint in range(1, joints + 1))
+        return tuple(
+            Term(self, "compliance", link, joint) for joint in range(1, joints + 1) for link in range(joint, joints + 1)
+        )
+
+    def wrong(self, term: Term, joints: int) -> str:
+        if term.number and not term.joint <= term.number <= joints:
+            return f"is of a link from {term.joint} to {joints}, as compliance{term.joint}_{term.joint} is"
+        return ""
+
+    def unit_of(self, term: Term) -> str:
+        return "rad/m" if term.number else "rad/(kN m)"
+
+    def values(
+        self, term: Term, q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
+    ) -> Float[AnyArray, "rows ... 1 N"]:
+        i = term.joint - 1
+        axis, origin = forward.z_before[i], forward.origin_before[i]
+        if term.number:
+            last = term.number == len(forward.origin)
+            moment = _METRE * cross(axis, (forward.tip if last else forward.origin[term.number - 1]) - origin)
+        else:
+            assert term.loads is not None
+            loads, centres = term.loads, _centres(forward, term.loads)
+            moment = sum(
+                _METRE * _KILONEWTON * _STANDARD_GRAVITY * loads.mass[j] * cross(axis, centres[j] - origin)
+                for j in range(i, len(centres))
+            )
+        return namespace(moment).moveaxis(moment, -2, 0)[..., None, :]
+
+
+def _centres(forward: ForwardPass, loads: Loads) -> list[Float[AnyArray, "... 3 N"]]:
+    """Centres of mass of the links in the base frame, mm."""
+    links, found = len(forward.origin), []
+    for j in range(links):
+        z = forward.z_before[j + 1] if j + 1 < links else forward.frame[2]
+        # Hayati's angle turns x and z about y, so that y = z x x holds before it, and x = y x z after it.
+        y = cross(z, forward.x[j]) if forward.y is None else forward.y[j]
+        axes = (cross(y, z), y, z)
+        found.append(forward.origin[j] + sum(loads.centre[j][k] * axes[k] for k in range(3)))
+    return found

@@ -1,0 +1,48 @@
+"""Harmonics of an encoder: its error as a Fourier series of its own reading.
+
+An encoder that is eccentric by e at the radius R errs by e / R times a sine of its reading (10 um at 50 mm: 41 arcsec);
+one that is oval or tilted errs by the second harmonic, and N evenly spaced read heads leave multiples of N only.
+"""
+
+from typing import ClassVar
+
+from jaxtyping import Float
+
+from ...core.errors import InputError
+from ...core.numpy_or_jax import AnyArray, namespace
+from ..chain import ForwardPass
+from .kind import AbstractCorrection, Loads, Term
+
+_HIGHEST = 99
+
+
+class Harmonics(AbstractCorrection):
+    """cos hq and sin hq of every joint; of orders 1 and 2 by default, or of those in the option: ``harmonics=1+3``."""
+
+    model: ClassVar[str] = "harmonics"
+    words: ClassVar[tuple[str, ...]] = ("cos", "sin")
+    description: ClassVar[str] = "harmonic of an encoder"
+    rows: ClassVar[int] = 1
+
+    def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
+        orders = option.split("+") if option else ["1", "2"]
+        if not all(order.isdecimal() and 1 <= int(order) <= _HIGHEST for order in orders):
+            raise InputError(f"harmonics={option} has no orders from 1 to {_HIGHEST}; write harmonics=1 or 1+2.")
+        return tuple(
+            Term(self, word, order, joint)
+            for joint in range(1, joints + 1)
+            for order in sorted({int(order) for order in orders})
+            for word in self.words
+        )
+
+    def wrong(self, term: Term, joints: int) -> str:
+        return "" if 1 <= term.number <= _HIGHEST else f"has no order from 1 to {_HIGHEST}"
+
+    def unit_of(self, term: Term) -> str:
+        return "rad"
+
+    def values(
+        self, term: Term, q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
+    ) -> Float[AnyArray, "rows ... 1 N"]:
+        xp, angle = namespace(q), term.number * q[term.joint - 1]
+        return (xp.cos(angle) if term.word == "cos" else xp.sin(angle))[None]

@@ -1,0 +1,109 @@
+"""What a kind of joint correction says of itself: the names of its coefficients, and the functions they multiply.
+
+What a joint really does is its reading plus coefficients times known functions of all readings,
+
+    theta_i = q_i + theta_i0 + sum_b c_ib phi_b(q),
+
+so the derivative of the tip by a coefficient is the Jacobian column of the joint's theta (of a prismatic joint, of its
+d) times phi. A new kind is one file with one class, and its entry in `kinds.KINDS`.
+"""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+from jaxtyping import Float
+
+from ...core.numpy_or_jax import AnyArray
+from ..chain import ForwardPass
+
+
+class Loads(NamedTuple):
+    """What pulls at the arm, for functions of gravity.
+
+    Args:
+        mass: Of each link, kg.
+        centre: Its centre of mass in its own D-H frame, mm.
+    """
+
+    mass: tuple[float, ...]
+    centre: tuple[tuple[float, float, float], ...]
+
+
+class AbstractCorrection(eqx.Module):
+    """A kind of joint correction, without data of its own: hashable, so that it is static in every program."""
+
+    model: eqx.AbstractClassVar[str]  # what a model calls it, as in ``--model dh,harmonics=1``
+    words: eqx.AbstractClassVar[tuple[str, ...]]  # with which the names of its coefficients begin
+    description: eqx.AbstractClassVar[str]  # of one coefficient
+    rows: eqx.AbstractClassVar[int]  # of `values`: 3 for a function of gravity, one for each component of its direction
+
+    @abc.abstractmethod
+    def terms(self, joints: int, option: str, loads: Loads | None) -> tuple["Term", ...]:
+        """The terms of a model with this option: ``harmonics=2`` has the option "2".
+
+        Args:
+            joints: Number of joints of the arm.
+            option: What follows the name of the kind; empty for the default.
+            loads: Masses of the arm, where known.
+
+        Raises:
+            InputError: The option means nothing here.
+        """
+
+    @abc.abstractmethod
+    def wrong(self, term: "Term", joints: int) -> str:
+        """What is wrong with a term of this kind for an arm of so many joints, in a few words; empty if nothing is."""
+
+    @abc.abstractmethod
+    def unit_of(self, term: "Term") -> str:
+        """Unit of a term's coefficient: of a revolute joint; in place of rad, mm of a prismatic one."""
+
+    @abc.abstractmethod
+    def values(
+        self, term: "Term", q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
+    ) -> Float[AnyArray, "rows ... 1 N"]:
+        """The function of a term at N configurations.
+
+        Args:
+            term: One of this kind's.
+            q: Joint readings, rad (mm of prismatic joints), joints first.
+            forward: The frames of the nominal arm at these readings, mm.
+        """
+
+
+class Term(NamedTuple):
+    """One coefficient and its function: ``cos2_3`` has the word "cos", the number 2 and the joint 3.
+
+    Args:
+        kind: What it is one of.
+        word: Which function.
+        number: Which of them: an order, a link, another joint; 0 where there is only one.
+        joint: The joint that it moves, from 1.
+        loads: Masses of the arm, where the function needs them.
+    """
+
+    kind: AbstractCorrection
+    word: str
+    number: int
+    joint: int
+    loads: Loads | None = None
+
+    @property
+    def name(self) -> str:
+        """The coefficient's name as a parameter."""
+        return f"{self.word}{self.number or ''}_{self.joint}"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the coefficient."""
+        return self.kind.unit_of(self)
+
+    @property
+    def rows(self) -> int:
+        """How many rows `values` has."""
+        return self.kind.rows
+
+    def values(self, q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass) -> Float[AnyArray, "rows ... 1 N"]:
+        """The function at N configurations, of the nominal arm's frames; see `AbstractCorrection.values`."""
+        return self.kind.values(self, q, forward)

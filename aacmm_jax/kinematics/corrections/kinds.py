@@ -1,0 +1,63 @@
+"""All kinds of joint corrections, and the names of their coefficients."""
+
+import re
+
+from ...core.errors import InputError, nearest
+from .coupling import Coupling
+from .gear_ratio import GearRatio
+from .gravity import Gravity
+from .harmonics import Harmonics
+from .kind import AbstractCorrection, Loads, Term
+
+KINDS: tuple[AbstractCorrection, ...] = (Harmonics(), GearRatio(), Gravity(), Coupling())
+_NAME = re.compile(r"([a-z]+)([1-9][0-9]*)?_([1-9][0-9]*)")
+
+
+def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
+    """The term that a coefficient belongs to, or None where this is no coefficient's name.
+
+    Raises:
+        InputError: It is one, but not of an arm with so many joints.
+    """
+    found = _NAME.fullmatch(name)
+    kind = None if found is None else next((kind for kind in KINDS if found[1] in kind.words), None)
+    if found is None or kind is None:
+        return None
+    number = int(found[2] or 0)
+    term = Term(kind, found[1], number, int(found[3]), loads if kind.rows == 3 and not number else None)
+    wrong = f"is of a joint from 1 to {joints}" if term.joint > joints else kind.wrong(term, joints)
+    if wrong:
+        raise InputError(f"the coefficient '{name}' {wrong}; correct its name.")
+    return term
+
+
+def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term, ...]:
+    """The terms of a model: kinds with their options, separated by commas, such as "dh,gravity,harmonics=1".
+
+    Args:
+        model: Names of kinds, each with an option after "=" if need be; "dh" stands for the arm itself.
+        joints: Number of joints of the arm.
+        loads: Masses of the arm, where known.
+
+    Raises:
+        InputError: A kind is unknown or there twice, or an option means nothing.
+    """
+    found: list[Term] = []
+    seen: set[str] = set()
+    for part in model.split(","):
+        name, _, option = part.strip().partition("=")
+        if name in seen:
+            raise InputError(f"the model names '{name}' twice; name it once, as in dh,gravity,harmonics=1+2.")
+        seen.add(name)
+        if name == "dh":
+            continue
+        kinds = [kind for kind in KINDS if kind.model == name]
+        if not kinds:
+            raise InputError(f"unknown model '{name}'{nearest(name, ['dh', *(kind.model for kind in KINDS)])}")
+        terms = kinds[0].terms(joints, option, loads)
+        for term in terms:
+            wrong = kinds[0].wrong(term, joints)
+            if wrong or not 1 <= term.joint <= joints:
+                raise InputError(f"{part.strip()} {wrong or f'names joint {term.joint} of {joints}'}; correct it.")
+        found += terms
+    return tuple(dict.fromkeys(found))

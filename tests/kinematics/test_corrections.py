@@ -1,0 +1,148 @@
+"""Joint corrections: their derivatives, what they mean, and calibrations that find them."""
+
+import jax
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.core.numpy_or_jax import to_numpy
+from aacmm_jax.kinematics import parameter_names, with_corrections
+from aacmm_jax.kinematics.arm import correction_names
+from aacmm_jax.kinematics.chain import forward_pass, joint_motion
+from aacmm_jax.kinematics.corrected_arm import function_values
+from aacmm_jax.kinematics.jacobian import rotation_columns
+
+MODEL = "gravity,harmonics,gear,coupled"
+
+
+@pytest.fixture(scope="module")
+def elbow() -> aj.Arm:
+    """Three axes with Hayati's angles and coefficients of all kinds."""
+    arm = aj.Arm(alpha=[1.5, 0.1, 0.4], a=[50.0, 300.0, 40.0], d=[200.0, 10.0, 250.0], beta=[0.0, 0.1, 0.2])
+    arm = with_corrections(arm.replace(probe=(10, 20, 100)), MODEL)
+    random = np.random.default_rng(1)
+    return arm.replace(coefficients=1e-2 * random.normal(size=len(arm.coefficients)), gravity=(0.1, -0.2, -1.0))
+
+
+@pytest.fixture(scope="module")
+def scara() -> aj.Arm:
+    """Two parallel axes and a prismatic joint, which corrections move along its axis."""
+    arm = aj.Arm(alpha=[0.1, 0.2, 0.3], a=[300.0, 250.0, 20.0], d=[10.0, 0.0, 0.0], probe=(5, 6, 7), prismatic=(3,))
+    names = ["cos1_1", "sin3_2", "gear_3", "coupled1_3", "compliance3_2", "compliance3_3", "cos1_3"]
+    return with_corrections(arm, names).replace(
+        coefficients=[0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07], gravity=(0.1, -0.9, 0.3)
+    )
+
+
+def readings(arm: aj.Arm) -> np.ndarray:
+    return np.random.default_rng(0).uniform(-2, 2, (4, arm.joints))
+
+
+@pytest.mark.parametrize("name", ["elbow", "scara"])
+def test_derivatives_are_exact(name, request):
+    arm = request.getfixturevalue(name)
+    q, names = readings(arm), parameter_names(arm)
+    space = aj.Parameters(arm, names)
+    analytic = np.asarray(arm.jacobian(q, (*names, *(f"q_{i}" for i in range(1, arm.joints + 1)))))
+    vector = np.asarray(space.vector())
+    for i in range(len(names)):
+        step = 1e-5 * np.eye(len(names))[i]
+        central = (np.asarray(space.arm(vector + step).position(q)) - space.arm(vector - step).position(q)) / 2e-5
+        np.testing.assert_allclose(analytic[..., i], central, atol=2e-6)
+    for i in range(arm.joints):
+        step = 1e-6 * np.eye(arm.joints)[i]
+        central = (np.asarray(arm.position(q + step)) - arm.position(q - step)) / 2e-6
+        np.testing.assert_allclose(analytic[..., len(names) + i], central, atol=1e-5)
+    moved = jax.jvp(lambda v, q: space.arm(v).position(q), (vector, q), (np.ones_like(vector), np.ones_like(q)))[1]
+    np.testing.assert_allclose(moved, analytic.sum(-1), rtol=1e-10, atol=1e-9)
+    turned = rotation_columns(forward_pass(*to_numpy((arm.geometry, joint_motion(arm.geometry, q)))), space.indices())
+    for i, name in enumerate(names):
+        if name in correction_names(arm):
+            step = 1e-6 * np.eye(len(names))[i]
+            pairs = [np.asarray(space.arm(vector + sign * step).pose(q))[:, :3, :3] for sign in (1, -1)]
+            spin = pairs[0] @ pairs[1].swapaxes(-1, -2) / 4e-6
+            central = np.stack(
+                [spin[:, 2, 1] - spin[:, 1, 2], spin[:, 0, 2] - spin[:, 2, 0], spin[:, 1, 0] - spin[:, 0, 1]]
+            )
+            np.testing.assert_allclose(turned[i], central, atol=1e-6)
+
+
+def test_moment_of_gravity():
+    """A pendulum: a weight of 2 kg, 300 mm from a horizontal axis, at 30 degrees from the horizontal."""
+    arm = aj.Arm(alpha=[np.pi / 2, 0.0], a=[0.0, 400.0], d=[500.0, 0.0], limits=[(-3, 3)] * 2)
+    q = np.array([[0.7, np.radians(30)]])
+    moment = -2e-3 * 9.80665 * 0.3 * np.cos(np.radians(30))
+    for gravity, expected in (((0, 0, -1), moment), ((0, 0, -3), moment)):
+        loaded = with_corrections(arm, "gravity", mass=[0, 2], centre=[(0, 0, 0), (-100, 0, 0)], gravity=gravity)
+        assert correction_names(loaded)[:-3] == ("compliance_2",)  # the first axis is vertical
+        (found,) = function_values(arm.geometry, loaded.corrections.functions.each, q, np.asarray(loaded.gravity))
+        np.testing.assert_allclose(found, [expected], rtol=1e-12)
+        yielded = loaded.replace(compliance_2=0.1)
+        np.testing.assert_allclose(yielded.position(q), arm.position(q + np.array([0, 0.1 * expected])), rtol=1e-12)
+    unknown = with_corrections(arm, "gravity")
+    (found,) = function_values(arm.geometry, unknown.corrections.functions.each, q, np.asarray(unknown.gravity))
+    np.testing.assert_allclose(found, -0.4 * np.cos(np.radians(30)), rtol=1e-12)
+
+
+def test_functions_of_the_readings():
+    arm = aj.Arm(alpha=[0.3, 0.2, 0.1], a=[100.0, 200.0, 50.0], d=[10.0, 20.0, 30.0])
+    q = readings(arm)
+    for name, function in {
+        "cos1_2": np.cos(q[:, 1]),
+        "sin3_1": np.sin(3 * q[:, 0]),
+        "gear_3": q[:, 2],
+        "coupled2_3": q[:, 1],
+    }.items():
+        corrected = with_corrections(arm, [name]).replace(**{name: 1e-3})
+        moved = q + 1e-3 * function[:, None] * (np.arange(1, 4) == int(name[-1]))
+        np.testing.assert_allclose(corrected.position(q), arm.position(moved), atol=1e-10)
+
+
+def test_the_nominal_arm_decides_the_functions(elbow):
+    """A calibrated length changes no moment: what was calibrated is what is evaluated."""
+    q, longer = readings(elbow), elbow.replace(d_3=400.0)
+    before, after = (joint_motion(arm.geometry, q).functions for arm in (elbow, longer))
+    np.testing.assert_array_equal(before, after)
+
+
+@pytest.mark.parametrize(
+    ("model", "sentence"),
+    [
+        ("harmonic", "unknown model 'harmonic'; did you mean 'harmonics'"),
+        ("gear,gear", "the model names 'gear' twice"),
+        ("harmonics=0", "has no orders from 1 to 99"),
+        ("gear=2", "gear takes no option"),
+        ("coupled=2", "names no joints"),
+        ("coupled=2-9", "names joint 9 of 7"),
+        (["cos1_9"], "is of a joint from 1 to 7"),
+        (["compliance1_2"], "is of a link from 2 to 7"),
+        (["d_3"], "'d_3' is no coefficient's name"),
+    ],
+)
+def test_refused(model, sentence):
+    with pytest.raises(aj.InputError, match=sentence):
+        with_corrections(aj.load_arm("panda"), model)
+
+
+def eccentric() -> tuple[aj.Capture, aj.Bounds, np.ndarray]:
+    """280 poses without noise of a Panda with eccentric encoders and errors of its gears."""
+    arm = with_corrections(aj.load_arm("panda"), "harmonics=1,gear")
+    space = aj.Parameters.independent(arm)
+    true = space.arm(space.vector() + 0.3 * space.scale * np.random.default_rng(0).normal(size=len(space.names)))
+    sockets = {f"s{i}": p for i, p in enumerate([(450, 100, 200), (300, -350, 400), (500, 250, 500), (350, 0, 650)])}
+    capture = aj.simulate(true, sockets, poses=70, lengths=[("s0", "s1"), ("s2", "s3")])
+    return capture, aj.Bounds.around(arm, space), np.asarray(space.vector(true))
+
+
+def test_found_by_a_calibration():
+    capture, bounds, true = eccentric()
+    assert {"cos1_1", "sin1_4", "gear_2"} <= set(bounds.space.names)
+    result = aj.calibrate(bounds.space.base, capture, bounds, method="joint")
+    np.testing.assert_allclose(result.parameters, true, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_found_by_a_batch():
+    capture, bounds, true = eccentric()
+    many = aj.calibrate_many(bounds.space.base, aj.stack_captures([capture] * 2), bounds, method="joint")
+    np.testing.assert_allclose(many.parameters, np.stack([true] * 2), atol=1e-5)
