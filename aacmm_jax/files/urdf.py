@@ -24,6 +24,7 @@ from ..kinematics.axes_to_dh import (
     same_transform,
     tip_frame,
 )
+from ..kinematics.chain import JointKinds
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
 from .atomic_write import write_text
 from .inputs import InputFile
@@ -37,8 +38,9 @@ _LONGEST = 50_000.0  # mm; no serial chain is as long
 class UrdfChain(NamedTuple):
     """The joints that move between base and tip, and the arm that they are.
 
-    ``arm.pose(q)`` takes the joint values of the URDF without a change of sign. ``base @ arm.pose(q)`` is the pose of
-    the tip link in the base link, in mm, as long as the arm has the probe that it was read with.
+    ``arm.pose(q)`` takes the joint values of the URDF without a change of sign, those of prismatic joints in mm.
+    ``base @ arm.pose(q)`` is the pose of the tip link in the base link, in mm, as long as the arm has the probe that it
+    was read with.
     """
 
     arm: Arm
@@ -149,7 +151,8 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
     directions = np.array([frame[:3, :3] @ joint.axis for frame, joint in zip(frames, joints, strict=True)])
     base, geometry = dh_of_axes(Axes(directions, np.array([frame[:3, 3] for frame in frames]), tip))
     limits = [_REVOLUTION if joint.kind == "continuous" else joint.limits or _REVOLUTION for joint in joints]
-    arm = arm_of(geometry, limits)
+    prismatic = tuple(joint.kind == "prismatic" for joint in joints)
+    arm = arm_of(geometry._replace(kinds=JointKinds(prismatic) if any(prismatic) else None), limits)
     return UrdfChain(arm, base, robot, tuple(joints), tuple(before), tip_before, last)
 
 
@@ -182,7 +185,7 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
     """The user's URDF with the origins of a calibrated arm; comments, meshes, order and other numbers stay.
 
     The base link stays, and a joint's frame moves along its axis, and turns about it, no more than the calibration
-    says: no data on the tip determine that. Where the arm has a tool beyond the tip link, or no fixed joint ends at the
+    says: no data on the tip determine that. The zero offset of a prismatic joint shifts its frame along its axis. Where the arm has a tool beyond the tip link, or no fixed joint ends at the
     tip link, the calibrated tip is the origin of a link that is added.
 
     Args:

@@ -6,17 +6,13 @@ from ..core.errors import InputError
 from ..core.text import quoted, shorten
 from .urdf_text import Robot, UrdfJoint
 
-_MOVING = ("revolute", "continuous")
+_MOVING = ("revolute", "continuous", "prismatic")
 _LISTED = 12  # links that a message names
 
 
 def check_moving(joint: UrdfJoint) -> None:
     """Refuse a joint that an arm does not have."""
     what = f"joint {quoted(joint.name)}"
-    if joint.kind == "prismatic":
-        raise InputError(
-            f"{what} is prismatic, and arms have revolute joints only; name links without it between them."
-        )
     if joint.kind not in _MOVING:
         known = joint.kind in ("floating", "planar")
         kind = f"is {joint.kind}" if known else f"has the unknown type {quoted(joint.kind)}"
@@ -27,15 +23,17 @@ def check_moving(joint: UrdfJoint) -> None:
         )
     if joint.axis is None:
         raise InputError(f"{what} has an axis of length 0; correct its <axis xyz=...>.")
-    if joint.kind == "revolute" and (joint.limits is None or not joint.limits[0] < joint.limits[1]):
+    if joint.kind != "continuous" and (joint.limits is None or not joint.limits[0] < joint.limits[1]):
+        unit, factor = ("m", 1e-3) if joint.kind == "prismatic" else ("rad", 1.0)
         state = (
             "has no limits"
             if joint.limits is None
-            else f"has the limits {joint.limits[0]:g} and {joint.limits[1]:g} rad"
+            else f"has the limits {factor * joint.limits[0]:g} and {factor * joint.limits[1]:g} {unit}"
         )
+        other = "" if joint.kind == "prismatic" else ', or type="continuous"'
         raise InputError(
-            f"{what} is revolute and {state}; give it <limit lower=... upper=...> in rad, the lower below the upper, "
-            'or type="continuous".'
+            f"{what} is {joint.kind} and {state}; give it <limit lower=... upper=...> in {unit}, the lower below the "
+            f"upper{other}."
         )
 
 

@@ -215,8 +215,8 @@ def arm_of(geometry: Geometry, limits: Sequence[Sequence[float]] | None = None) 
     """The arm of a geometry."""
     arrays = geometry._replace(kinds=None)._asdict()
     del arrays["kinds"]
-    kinds = geometry.kinds
-    return Arm(**arrays, limits=limits, prismatic=() if kinds is None else np.flatnonzero(kinds.mask()) + 1)
+    prismatic = () if geometry.kinds is None else geometry.kinds.prismatic
+    return Arm(**arrays, limits=limits, prismatic=[i for i, slides in enumerate(prismatic, start=1) if slides])
 
 
 def _joint_numbers(numbers: Iterable[int], joints: int) -> tuple[int, ...]:

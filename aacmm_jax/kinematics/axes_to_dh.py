@@ -25,8 +25,8 @@ _UNCHANGED = 2e-11, 2e-14  # mm and rad: far above the rounding of a round trip,
 class Axes(NamedTuple):
     """The joint axes and the tip of a chain at reading 0, in the frame of its base."""
 
-    directions: Float[np.ndarray, "n 3"]  # unit vectors; a reading counts by the right-hand rule
-    points: Float[np.ndarray, "n 3"]  # mm, on each axis; frames stay at them where D-H allows it
+    directions: Float[np.ndarray, "n 3"]  # unit vectors; a reading counts by the right-hand rule, a slide along them
+    points: Float[np.ndarray, "n 3"]  # mm, on each axis (anywhere, of a slide); frames stay at them where D-H allows it
     tip: Transform  # mm
 
 
@@ -136,8 +136,8 @@ def calibrated_frames(
     """Origins of the joints of a calibrated chain, each in the frame of the joint before it, at reading 0.
 
     A frame on axis i turns about its axis with theta_i, so that a link keeps its shape where only zero offsets changed,
-    and is where the axis passes nearest to the nominal origin, as the calibrated joint before it carries that. An
-    origin that does not change comes back as it was, to the bit.
+    and is where the axis passes nearest to the nominal origin, as the calibrated joint before it carries that; that of
+    a prismatic joint moves on along its axis with d_i, for the same reason (anywhere else would do as well). An origin that does not change comes back as it was, to the bit.
 
     Args:
         origins: Nominal origins, joint by joint, mm; the first in the frame of the base.
@@ -153,7 +153,9 @@ def calibrated_frames(
         turn = rotation(2, float(calibrated.theta[i] - nominal.theta[i]))
         frame = after[i] @ turn @ inverse(before[i]) @ was
         point, axis = after[i][:3, 3], after[i][:3, 2]
-        frame[:3, 3] = point + ((expected[:3, 3] - point) @ axis) * axis
+        slides = nominal.kinds is not None and nominal.kinds.prismatic[i]
+        offset = float(calibrated.d[i] - nominal.d[i]) if slides else 0.0
+        frame[:3, 3] = point + ((expected[:3, 3] - point) @ axis + offset) * axis
         unchanged = same_transform(frame, expected)
         found.append(origin if unchanged else inverse(now) @ frame)
         # Not the product with what was found: an inverse by transposition doubles the rounding from joint to joint.

@@ -9,9 +9,10 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.files.urdf import urdf_chain, urdf_of
 from aacmm_jax.files.urdf_text import parse_urdf
+from aacmm_jax.kinematics.arm import by_joint
 from aacmm_jax.kinematics.parameters import ArmSpecification, UrdfSource
 
-from ..kinematics.test_axes_to_dh import about
+from ..kinematics.test_axes_to_dh import about, along
 
 CONFIGURATIONS = 1000
 # Files that the independent reader cannot read (a robot without a name).
@@ -36,7 +37,7 @@ def ends(robot, tip: str) -> tuple[str, int]:
         joint = to[base]
         limited = joint.kind == "continuous" or (joint.limits is not None and joint.limits[0] < joint.limits[1])
         if joint.kind != "fixed" and not (
-            joint.kind in ("revolute", "continuous") and limited and joint.axis is not None
+            joint.kind in ("revolute", "continuous", "prismatic") and limited and joint.axis is not None
         ):
             break
         if joint.mimics is not None:
@@ -60,7 +61,8 @@ def by_yourdfpy(model, base: str, tip: str, names: list[str], q: np.ndarray) -> 
         if joint.name in names:
             axis = np.array(joint.axis, dtype=float)
             axis /= np.linalg.norm(axis)
-            poses = poses @ np.array([about(axis, angle) for angle in q[:, names.index(joint.name)]])
+            moved = along if joint.type == "prismatic" else about
+            poses = poses @ np.array([moved(axis, reading) for reading in q[:, names.index(joint.name)]])
     return poses
 
 
@@ -73,7 +75,7 @@ def test_every_chain_in_and_out(tmp_path):
     import yourdfpy
 
     random = np.random.default_rng(0)
-    arms, chains = 0, 0
+    arms, chains, slides = 0, 0, 0
     for path in robots():
         text = path.read_text(encoding="utf-8")
         robot = parse_urdf(text)
@@ -87,10 +89,11 @@ def test_every_chain_in_and_out(tmp_path):
             source = UrdfSource(text, base, tip)
             chain = urdf_chain(source)
             names = [joint.name for joint in chain.joints]
-            q = random.uniform(-np.pi, np.pi, (CONFIGURATIONS, moving))
+            slides += bool(chain.arm.prismatic)
+            q = random.uniform(-np.pi, np.pi, (CONFIGURATIONS, moving)) * by_joint(chain.arm, 1.0, 100.0)
             expected = by_yourdfpy(model, base, tip, names, q)
             assert_same(chain.base @ np.asarray(chain.arm.pose(q)), expected)
-            model.update_cfg(dict(zip(names, q[0], strict=True)))
+            model.update_cfg(dict(zip(names, q[0] * by_joint(chain.arm, 1.0, 1e-3), strict=True)))
             np.testing.assert_allclose(model.get_transform(tip, base)[:3, 3] * 1000, expected[0, :3, 3], atol=1e-9)
             nominal = ArmSpecification(chain.arm, urdf=source)
             assert urdf_of(chain.arm, nominal).text == text
@@ -106,6 +109,7 @@ def test_every_chain_in_and_out(tmp_path):
                 assert_same(by_yourdfpy(reread, base, found.tip, names, q[:20]), expected)
     assert arms >= 15
     assert chains >= 100
+    assert slides >= 5
 
 
 def perturbed(arm: aj.Arm, random: np.random.Generator) -> aj.Arm:

@@ -18,6 +18,7 @@ from aacmm_jax.kinematics.axes_to_dh import (
     rotation,
     tip_frame,
 )
+from aacmm_jax.kinematics.chain import JointKinds
 
 # A right angle, as the makers round it, and nearly none: where D-H, Hayati's form or Euler angles are singular.
 ANGLES = st.one_of(
@@ -47,11 +48,17 @@ def about(axis: np.ndarray, angle: float) -> np.ndarray:
     return result
 
 
-def product(origins: list, axes: np.ndarray, tip: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """The tip in the base, by the definition of a chain of joints."""
+def along(axis: np.ndarray, distance: float) -> np.ndarray:
+    result = np.eye(4)
+    result[:3, 3] = distance * axis
+    return result
+
+
+def product(origins: list, axes: np.ndarray, tip: np.ndarray, q: np.ndarray, slides: list | None = None) -> np.ndarray:
+    """The tip in the base, by the definition of a chain of joints, of which some slide."""
     pose = np.eye(4)
-    for origin, axis, angle in zip(origins, axes, q, strict=True):
-        pose = pose @ origin @ about(axis, angle)
+    for origin, axis, reading, slide in zip(origins, axes, q, slides or [False] * len(q), strict=True):
+        pose = pose @ origin @ (along if slide else about)(axis, reading)
     return pose @ tip
 
 
@@ -71,18 +78,20 @@ def assert_same(poses, expected):
 
 @settings(max_examples=60, deadline=None)
 @given(
-    chain=st.lists(st.tuples(TRANSFORMS, DIRECTIONS), min_size=1, max_size=8),
+    chain=st.lists(st.tuples(TRANSFORMS, DIRECTIONS, st.booleans()), min_size=1, max_size=8),
     last=TRANSFORMS,
     seed=st.integers(0, 2**32 - 1),
     keep_points=st.booleans(),
 )
 def test_any_chain_is_an_arm_and_its_calibration_a_chain(chain, last, seed, keep_points):
-    origins, tip = [transform(numbers) for numbers, _ in chain], transform(last)
-    directions = np.array([np.array(axis) / np.linalg.norm(axis) for _, axis in chain])
+    origins, tip = [transform(numbers) for numbers, *_ in chain], transform(last)
+    directions = np.array([np.array(axis) / np.linalg.norm(axis) for _, axis, _ in chain])
+    slides = [slide for *_, slide in chain]
     random = np.random.default_rng(seed)
-    q = random.uniform(-np.pi, np.pi, len(chain))
+    q = random.uniform(-np.pi, np.pi, len(chain)) * np.where(slides, 100.0, 1.0)
     base, geometry = dh_of_axes(lines_of(origins, directions, tip), keep_points=keep_points)
-    assert_same(base @ np.asarray(arm_of(geometry).pose(q)), product(origins, directions, tip, q))
+    geometry = geometry._replace(kinds=JointKinds(tuple(slides)) if any(slides) else None)
+    assert_same(base @ np.asarray(arm_of(geometry).pose(q)), product(origins, directions, tip, q, slides))
     np.testing.assert_allclose(tip_frame(geometry, base), product(origins, directions, tip, 0 * q), atol=1e-9)
     # Nothing changed: the same objects.
     assert all(
@@ -96,7 +105,16 @@ def test_any_chain_is_an_arm_and_its_calibration_a_chain(chain, last, seed, keep
     moved = calibrated_frames(origins, geometry, calibrated, base)
     last_joint = product(moved, directions, np.eye(4), 0 * q)
     new_tip = inverse(last_joint) @ tip_frame(calibrated, base)
-    assert_same(product(moved, directions, new_tip, q), base @ np.asarray(arm_of(calibrated).pose(q)))
+    assert_same(product(moved, directions, new_tip, q, slides), base @ np.asarray(arm_of(calibrated).pose(q)))
+
+
+def test_a_zero_offset_of_a_slide_moves_its_origin_alone():
+    origins = [transform((0, 0, 0, 0, 0, 100)), transform((np.pi / 2, 0, 0, 50, 0, 0)), transform((1, 0, 0, 9, 80, 7))]
+    base, geometry = dh_of_axes(lines_of(origins, np.tile([0.0, 0.0, 1.0], (3, 1)), np.eye(4)))
+    geometry = geometry._replace(kinds=JointKinds((False, True, False)))
+    moved = calibrated_frames(origins, geometry, geometry._replace(d=geometry.d + [0.0, 2.0, 0.0]), base)
+    assert [one is other for one, other in zip(moved, origins, strict=True)] == [True, False, True]
+    np.testing.assert_allclose(inverse(origins[1]) @ moved[1], along(np.array([0.0, 0.0, 1.0]), 2.0), atol=1e-12)
 
 
 def test_each_parameter_moves_one_origin():
