@@ -13,10 +13,12 @@ from ..core.arrays import Numbers
 from ..core.errors import InputError, nearest
 from ..core.text import printable
 from ..core.units import DEG
+from ..data.capture import Capture
 from ..kinematics.arm import Arm
 from ..kinematics.axes_to_dh import without_far_frames
 from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, Parameters, single, with_tool
+from ..uncertainty.target_parameters import independent_of_targets, only_targets
 from .atomic_write import storable, write_text
 from .outputs import as_path
 from .toml import Strict, read_toml
@@ -151,7 +153,12 @@ def load_arm(
 
 
 def load_specification(
-    source: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
+    source: str | os.PathLike,
+    *,
+    base: str | None = None,
+    tip: str | None = None,
+    probe: Numbers | None = None,
+    choose: bool = True,
 ) -> ArmSpecification:
     """The arm of a file with its name, its proposed identification and, of a URDF, what an export needs.
 
@@ -163,11 +170,13 @@ def load_specification(
         base: As of `load_arm`.
         tip: As of `load_arm`.
         probe: As of `load_arm`.
+        choose: Whether to choose parameters where the file names none; otherwise ``held`` is None then, and ``free``
+            empty.
 
     Raises:
         InputError: There is neither, or the file is not an arm's.
     """
-    return _read(source, base, tip, probe, choose=True)
+    return _read(source, base, tip, probe, choose=choose)
 
 
 def arm_beside(folder: Path, arm: str) -> str | Path:
@@ -267,10 +276,25 @@ def _arm_of_rows(model: _ArmModel, length: float, angle: float) -> Arm:
     return without_far_frames(arm) if far and not proposed else arm
 
 
-def _chosen(specification: ArmSpecification) -> ArmSpecification:
+def with_parameters(specification: ArmSpecification, capture: Capture) -> ArmSpecification:
+    """The same with parameters that observations of such kinds determine, where the file names none."""
+    if specification.held is not None or specification.free:
+        return specification
+    found = _chosen(specification, capture)
+    try:
+        found.bounds()
+    except InputError as error:
+        raise InputError(f"{specification.name}: {error}") from error
+    return found
+
+
+def _chosen(specification: ArmSpecification, capture: Capture | None = None) -> ArmSpecification:
     """The same with the identification for an arm whose file proposes none."""
     try:
-        space = Parameters.independent(specification.arm)
+        if capture is not None and only_targets(capture):
+            space = independent_of_targets(specification.arm, capture)
+        else:
+            space = Parameters.independent(specification.arm)
     except InputError:  # an arm of one or two joints, which has one configuration for each position of the tip
         return specification
     held = tuple(name for name in space.held if not name.startswith("beta_"))
