@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 _LENGTH_UNITS = {"mm": 1.0, "m": 1000.0}
 _ANGLE_UNITS = {"rad": 1.0, "deg": DEG}
 _ROBOTS = (".urdf", ".xacro")  # the latter for the message that says how to expand it
+_SMALLEST, _LARGEST = 5.0, 50_000.0  # mm: no arm's tip is always as near its base, or ever as far
 _FAR = 10_000.0  # mm: no link is as long, but frames on nearly parallel axes may be as far away
 _OTHER_FORMATS = (*_ROBOTS, ".yaml", ".yml")
 
@@ -224,7 +225,9 @@ def _specification(path: Path, probe: Numbers | None, choose: bool) -> ArmSpecif
             found = read_urdf(path.parent / model.urdf, base=model.base, tip=model.tip, probe=tool)
             found = found._replace(name=model.name or path.stem)
         else:
-            found = ArmSpecification(_arm_of_rows(model, length, angle), model.name or path.stem)
+            arm = _arm_of_rows(model, length, angle)
+            _check_size(arm, model.length_unit)
+            found = ArmSpecification(arm, model.name or path.stem)
             if probe is not None:
                 found = found._replace(arm=with_tool(found.arm, probe))
         wanted = model.identification
@@ -274,6 +277,18 @@ def _arm_of_rows(model: _ArmModel, length: float, angle: float) -> Arm:
     # A proposed identification names parameters as the table has them.
     proposed = model.identification is not None and model.identification.names_parameters
     return without_far_frames(arm) if far and not proposed else arm
+
+
+def _check_size(arm: Arm, unit: str) -> None:
+    """Refuse lengths that can only be in the other unit."""
+    q = np.random.default_rng(0).uniform(-math.pi, math.pi, (16, arm.joints))
+    reach = float(np.linalg.norm(np.asarray(arm.position(q)), axis=1).max())
+    if 0 < reach < _SMALLEST or reach > _LARGEST:
+        other = "m" if reach < _SMALLEST else "mm"
+        raise InputError(
+            f"with its lengths in {unit}, the tip is at most {reach:.3g} mm from the base; are they in {other}? "
+            "Correct length_unit or the lengths."
+        )
 
 
 def with_parameters(specification: ArmSpecification, capture: Capture) -> ArmSpecification:

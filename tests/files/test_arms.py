@@ -205,12 +205,19 @@ def test_bad_file(tmp_path, old, new, parts):
 def test_radians_stated_as_degrees(tmp_path):
     """Twists of a quarter turn in radians are refused; small ones in degrees are not."""
     head = 'length_unit = "mm"\nangle_unit = "deg"\njoint = ['
-    rows = "{{ alpha = {}, a = 0, d = 1 }}, {{ alpha = 0, a = 1, d = 0 }}, {{ alpha = {}, a = 0, d = 1 }}]"
+    rows = "{{ alpha = {}, a = 0, d = 99 }}, {{ alpha = 0, a = 9, d = 0 }}, {{ alpha = {}, a = 0, d = 9 }}]"
     for twists in ((-1.5708, 1.5708), (1.570796326794897, 3.141592653589793)):
         path = written(tmp_path, head + rows.format(*twists))
         assert_refused(lambda path=path: aj.load_arm(path), path, "multiple of pi/2", "is it in rad?")
     for twists in ((-90, 1.5708), (0.01, -0.02), (1.5, -1.5)):
         aj.load_arm(written(tmp_path, head + rows.format(*twists)))
+
+
+@pytest.mark.parametrize(("stated", "meant", "length"), [("m", "mm", 400.0), ("mm", "m", 0.4)])
+def test_lengths_in_the_other_unit(tmp_path, stated, meant, length):
+    row = f"{{ alpha = 0, a = {length}, d = 0 }}"
+    path = written(tmp_path, f'length_unit = "{stated}"\nangle_unit = "deg"\njoint = [{row}, {row}]')
+    assert_refused(lambda: aj.load_arm(path), path, f"are they in {meant}?", "length_unit")
 
 
 def test_what_is_not_an_arm_file(tmp_path):
