@@ -190,7 +190,8 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     ``acceptance`` (jjf, asme, iso, or a list) says for which standards' acceptance procedure the poses were taken.
 
     ``arm`` is a shipped name, an arm file (TOML), a URDF, or a ``kinematics.yaml``. Of a URDF, ``base`` and ``tip``
-    name the links at the ends of the chain, and ``probe`` is the tool's tip in the tip link's frame, mm.
+    name the links at the ends of the chain; ``probe`` is a tool's tip in the last frame, mm, of an arm that states
+    none. Where the arm's file names no free parameters, they are those that such observations determine.
 
     Args:
         path: the manifest (TOML).
@@ -267,7 +268,10 @@ def _angles_of(angles: _Angles | None, unit: str | None = None, preset: str | No
     """How readings are written: what a table states comes first, then [angles], then the table's preset."""
     unit = unit if unit is not None or angles is not None else preset
     if unit is None and angles is None:
-        raise InputError("'angles' is missing; add it.")
+        raise InputError(
+            "'angles' is missing, so that the unit of the readings is not known; add [angles] with unit = \"deg\" or "
+            '"rad", or state it in the header of the table, as J1 [deg].'
+        )
     if unit is None:
         assert angles is not None
         return angles
