@@ -7,7 +7,7 @@
 # make bench        identifications a second, against every contender that is installed
 # make reproduce    Cheng et al. 2018, recomputed and checked against benchmarks/cheng2018/REPRODUCTION.md (1.5 minutes
 #                   of CPU, 3.5 with an empty compilation cache); make reproduce WRITE=1 rewrites it
-# make peers        install the contenders that need a Python environment of their own
+# make peers        install the contender that needs a Python environment of its own
 # Everything is installed into .venv in this folder (test-newest and test-lowest: .venv-newest, .venv-lowest).
 
 PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
@@ -80,7 +80,7 @@ bench: .venv/.test
 reproduce: .venv/.test
 	$(BIN)/python benchmarks/cheng2018/reproduce.py $(if $(WRITE),--write)
 
-peers: benchmarks/peers/pybotics/.venv/.done benchmarks/peers/pinocchio/.venv/.done
+peers: benchmarks/peers/pybotics/.venv/.done
 
 benchmarks/peers/%/.venv/.done: benchmarks/peers/%/requirements.txt
 	$(PYTHON) -m venv $(@D)

@@ -1,5 +1,6 @@
 """Costs: kinematics per pose, identifications by size of problem, memory, calls and whole processes, arithmetic."""
 
+import importlib.util
 import os
 import statistics
 import subprocess
@@ -12,7 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from contenders import HERE, Task, numpy_functions, ours, peer_python, run_peer
+from contenders import HERE, Task, numpy_functions, ours, run_peer
 
 import aacmm_jax as aj
 
@@ -54,7 +55,7 @@ def kinematics(rounds: int, poses: int = 10_000) -> list[Row]:
         },
         rounds,
     )
-    python = peer_python("pinocchio")
+    python = Path(sys.executable) if importlib.util.find_spec("pinocchio") else None
     named = {
         "position": "tip",
         "jacobian": "Jacobian by q, 6 columns",

@@ -1,5 +1,6 @@
 """The benchmark scripts run, measure the same thing for every contender, and name those that are absent."""
 
+import importlib.util
 import json
 import subprocess
 import sys
@@ -41,7 +42,7 @@ def test_a_part_runs_and_names_who_is_absent(tmp_path):
     (file,) = tmp_path.glob("throughput-*.json")
     rows = json.loads(file.read_text())["results"]["kinematics"]
     peers = [row for row in rows if "Pinocchio" in row["what"]]
-    installed = (ROOT / "benchmarks/peers/pinocchio/.venv/bin/python").exists()
+    installed = importlib.util.find_spec("pinocchio") is not None
     assert len(peers) == 3
     assert all(row.get("absent", False) != installed for row in peers)
     assert ("absent" in done.stdout) != installed

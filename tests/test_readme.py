@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import aacmm_jax as aj
@@ -60,9 +61,24 @@ def test_the_manifest_is_the_one_of_the_examples(mukca):
     assert blocks("toml")[2] == (mukca.parent / "ipa_ur10" / "positions.toml").read_text()
 
 
-@pytest.mark.parametrize("name", re.findall(r"`(cheng2018-\w+|panda|iiwa14)`", README))
-def test_named_arms_ship(name):
-    assert name in aj.files.shipped_arms()
+def test_the_shipped_arms_are_named():
+    (paragraph,) = re.findall(r"^Shipped arms: .*?\n\n", README, flags=re.DOTALL | re.MULTILINE)
+    assert set(re.findall(r"`([a-z0-9-]+)`", paragraph)) == set(aj.files.shipped_arms())
+
+
+def test_the_manifest_of_a_robot_is_read(tmp_path):
+    (manifest,) = re.findall(r"```\n(arm = \"robot.urdf\"\n.*?)```", README, flags=re.DOTALL)
+    (tmp_path / "robot.toml").write_text(manifest)
+    urdf = (Path(__file__).parent / "files" / "six_axis.urdf").read_text()
+    (tmp_path / "robot.urdf").write_text(urdf)
+    random = np.random.default_rng(0)
+    rows = np.hstack([random.uniform(-60, 60, (9, 6)), random.uniform(-500, 500, (9, 3))])
+    header = "J1,J2,J3,J4,J5,J6,x,y,z"
+    np.savetxt(tmp_path / "tracker.csv", rows, delimiter=",", header=header, comments="")
+    recording = aj.files.read_manifest(tmp_path / "robot.toml")
+    (points,) = recording.capture.observations
+    np.testing.assert_allclose(points.q, np.deg2rad(rows[:, :6]))
+    np.testing.assert_allclose(points.covariance, np.broadcast_to(0.02**2 * np.eye(3), (9, 3, 3)))
 
 
 def test_the_kit_can_be_read(tmp_path):

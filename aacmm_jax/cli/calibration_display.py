@@ -350,9 +350,9 @@ def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
         u = None if row["u"] is None else factor * row["u"]
         decimals = 9 if u == 0 else _decimals(u, 4)
         numbers = (
-            f"{nominal:.4f}",
-            f"{value:.{decimals}f}",
-            f"{value - nominal:+.{decimals}f}",
+            f"{nominal:z.4f}",
+            f"{value:z.{decimals}f}",
+            f"{value - nominal:+z.{decimals}f}",
             "-" if u is None else f"{u:.{decimals}f}",
         )
         table.add_row(row["parameter"], unit, *numbers, row["bound"] or "")

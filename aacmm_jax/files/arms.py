@@ -13,10 +13,12 @@ from ..core.arrays import Numbers
 from ..core.errors import InputError, nearest
 from ..core.text import printable
 from ..core.units import DEG
+from ..data.capture import Capture
 from ..kinematics.arm import Arm
 from ..kinematics.axes_to_dh import without_far_frames
 from ..kinematics.independence import nearly_parallel
-from ..kinematics.parameters import ArmSpecification, Parameters, single
+from ..kinematics.parameters import ArmSpecification, Parameters, single, with_tool
+from ..uncertainty.target_parameters import independent_of_targets, only_targets
 from .atomic_write import storable, write_text
 from .corrections import CorrectionsTable, corrections_toml
 from .outputs import as_path
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 _LENGTH_UNITS = {"mm": 1.0, "m": 1000.0}
 _ANGLE_UNITS = {"rad": 1.0, "deg": DEG}
 _ROBOTS = (".urdf", ".xacro")  # the latter for the message that says how to expand it
+_SMALLEST, _LARGEST = 5.0, 50_000.0  # mm: no arm's tip is always as near its base, or ever as far
 _FAR = 10_000.0  # mm: no link is as long, but frames on nearly parallel axes may be as far away
 _OTHER_FORMATS = (*_ROBOTS, ".yaml", ".yml")
 
@@ -56,6 +59,11 @@ class _Identification(Strict):
     length: PositiveFloat = 10.0
     angle: PositiveFloat | None = None
     override: dict[str, PositiveFloat] = Field(default_factory=dict)
+
+    @property
+    def names_parameters(self) -> bool:
+        """Whether it says which parameters are free or fixed, and not only their bounds."""
+        return self.held is not None or bool(self.free)
 
 
 class _ArmModel(Strict):
@@ -148,8 +156,8 @@ def load_arm(
             Robots ``kinematics.yaml``.
         base: Of a URDF: the link that does not move; by default its root.
         tip: Of a URDF: the link at the end; by default the only one that has no link after it.
-        probe: Of a URDF or ``kinematics.yaml``: a tool's tip ``(3,)`` in the frame of the last link, mm; by default
-            that frame's origin.
+        probe: A tool's tip ``(3,)`` in the frame of the last link, mm; by default that frame's origin. Not of an arm
+            file that states one.
 
     Raises:
         InputError: There is neither, or the file is not an arm's.
@@ -158,23 +166,30 @@ def load_arm(
 
 
 def load_specification(
-    source: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
+    source: str | os.PathLike,
+    *,
+    base: str | None = None,
+    tip: str | None = None,
+    probe: Numbers | None = None,
+    choose: bool = True,
 ) -> ArmSpecification:
     """The arm of a file with its name, its proposed identification and, of a URDF, what an export needs.
 
-    A file without an ``[identification]`` table gets the parameters that thorough data would determine well, of
-    `Parameters.independent`, and the default bounds.
+    A file that names no parameters in ``[identification]`` gets those that thorough data would determine well, of
+    `Parameters.independent`, and the default bounds where it states none.
 
     Args:
         source: As of `load_arm`.
         base: As of `load_arm`.
         tip: As of `load_arm`.
         probe: As of `load_arm`.
+        choose: Whether to choose parameters where the file names none; otherwise ``held`` is None then, and ``free``
+            empty.
 
     Raises:
         InputError: There is neither, or the file is not an arm's.
     """
-    return _read(source, base, tip, probe, choose=True)
+    return _read(source, base, tip, probe, choose=choose)
 
 
 def arm_beside(folder: Path, arm: str) -> str | Path:
@@ -192,8 +207,6 @@ def _read(
     suffix = "" if shipped else path.suffix.lower()
     if suffix not in _ROBOTS and (base is not None or tip is not None):
         raise InputError(f"{source} is no URDF, so it has no links; leave out base and tip.")
-    if suffix not in _OTHER_FORMATS and probe is not None:
-        raise InputError(f"{source} states the probe itself; change it there, or with arm.replace(probe=...).")
     if suffix in _OTHER_FORMATS:
         found = (
             read_urdf(path, base=base, tip=tip, probe=probe)
@@ -203,32 +216,42 @@ def _read(
         return _chosen(found) if choose else found
     if shipped:
         with resources.as_file(resources.files("aacmm_jax.files") / "shipped_arms" / f"{source}.toml") as path:
-            return _specification(path, choose)
+            return _specification(path, probe, choose)
     if not os.path.exists(path) and path.suffix != ".toml":
+        known = shipped_arms()
         raise InputError(
-            f"'{source}' is neither a file nor an arm that ships with the package{nearest(str(source), shipped_arms())}"
+            f"'{source}' is neither a file nor an arm that ships with the package"
+            f"{nearest(str(source), known, most=len(known))}"
         )
-    return _specification(path, choose)
+    return _specification(path, probe, choose)
 
 
-def _specification(path: Path, choose: bool) -> ArmSpecification:
+def _specification(path: Path, probe: Numbers | None, choose: bool) -> ArmSpecification:
     model = read_toml(path, _ArmModel)
+    if probe is not None and any(model.probe):
+        raise InputError(f"{path} states the probe itself; change it there, or with arm.replace(probe=...).")
     length, angle = _LENGTH_UNITS[model.length_unit], _ANGLE_UNITS[model.angle_unit]
     try:
         if model.urdf is not None:
-            probe = length * np.array(model.probe)
-            found = read_urdf(path.parent / model.urdf, base=model.base, tip=model.tip, probe=probe)
+            tool = length * np.array(model.probe) if probe is None else probe
+            found = read_urdf(path.parent / model.urdf, base=model.base, tip=model.tip, probe=tool)
             found = found._replace(name=model.name or path.stem)
         else:
-            found = ArmSpecification(_arm_of_rows(model, length, angle), model.name or path.stem)
+            arm = _arm_of_rows(model, length, angle)
+            _check_size(arm, model.length_unit)
+            found = ArmSpecification(arm, model.name or path.stem)
+            if probe is not None:
+                found = found._replace(arm=with_tool(found.arm, probe))
         if model.corrections is not None:
             found = found._replace(arm=model.corrections.corrected(found.arm, length, angle))
         wanted = model.identification
+        if choose and (wanted is None or not wanted.names_parameters):
+            found = _chosen(found)
         if wanted is None:
-            return _chosen(found) if choose else found
+            return found
         specification = found._replace(
-            held=None if wanted.held is None else tuple(wanted.held),
-            free=tuple(wanted.free),
+            held=found.held if wanted.held is None else tuple(wanted.held),
+            free=(*found.free, *wanted.free),
             length=wanted.length * length,
             angle=0.0175 if wanted.angle is None else wanted.angle * angle,
             override={
@@ -236,7 +259,8 @@ def _specification(path: Path, choose: bool) -> ArmSpecification:
                 for name, width in wanted.override.items()
             },
         )
-        specification.bounds()
+        if choose or wanted.names_parameters:
+            specification.bounds()
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return specification
@@ -270,13 +294,41 @@ def _arm_of_rows(model: _ArmModel, length: float, angle: float) -> Arm:
     )
     far = any(abs(float(arm.d[i - 1])) > _FAR for i in nearly_parallel(arm))
     # A proposed identification names parameters as the table has them.
-    return without_far_frames(arm) if far and model.identification is None else arm
+    proposed = model.identification is not None and model.identification.names_parameters
+    return without_far_frames(arm) if far and not proposed else arm
 
 
-def _chosen(specification: ArmSpecification) -> ArmSpecification:
+def _check_size(arm: Arm, unit: str) -> None:
+    """Refuse lengths that can only be in the other unit."""
+    q = np.random.default_rng(0).uniform(-math.pi, math.pi, (16, arm.joints))
+    reach = float(np.linalg.norm(np.asarray(arm.position(q)), axis=1).max())
+    if 0 < reach < _SMALLEST or reach > _LARGEST:
+        other = "m" if reach < _SMALLEST else "mm"
+        raise InputError(
+            f"with its lengths in {unit}, the tip is at most {reach:.3g} mm from the base; are they in {other}? "
+            "Correct length_unit or the lengths."
+        )
+
+
+def with_parameters(specification: ArmSpecification, capture: Capture) -> ArmSpecification:
+    """The same with parameters that observations of such kinds determine, where the file names none."""
+    if specification.held is not None or specification.free:
+        return specification
+    found = _chosen(specification, capture)
+    try:
+        found.bounds()
+    except InputError as error:
+        raise InputError(f"{specification.name}: {error}") from error
+    return found
+
+
+def _chosen(specification: ArmSpecification, capture: Capture | None = None) -> ArmSpecification:
     """The same with the identification for an arm whose file proposes none."""
     try:
-        space = Parameters.independent(specification.arm)
+        if capture is not None and only_targets(capture):
+            space = independent_of_targets(specification.arm, capture)
+        else:
+            space = Parameters.independent(specification.arm)
     except InputError:  # an arm of one or two joints, which has one configuration for each position of the tip
         return specification
     held = tuple(name for name in space.held if not name.startswith("beta_"))

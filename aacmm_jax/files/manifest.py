@@ -29,7 +29,7 @@ from ..data.observations.socket import Socket
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
 from ..kinematics.arm import Arm, by_joint
-from .arms import arm_beside, load_specification
+from .arms import arm_beside, load_specification, with_parameters
 from .inputs import InputFile, fingerprint
 from .manifest_observations import FIELDS, LENGTHS, TABLES, Source, observations
 from .manifest_sessions import in_sessions, session_name
@@ -196,7 +196,8 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     ``acceptance`` (jjf, asme, iso, or a list) says for which standards' acceptance procedure the poses were taken.
 
     ``arm`` is a shipped name, an arm file (TOML), a URDF, or a ``kinematics.yaml``. Of a URDF, ``base`` and ``tip``
-    name the links at the ends of the chain, and ``probe`` is the tool's tip in the tip link's frame, mm.
+    name the links at the ends of the chain; ``probe`` is a tool's tip in the last frame, mm, of an arm that states
+    none. Where the arm's file names no free parameters, they are those that such observations determine.
 
     Args:
         path: the manifest (TOML).
@@ -211,7 +212,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     model = read_toml(manifest := InputFile(path), _Manifest)
     try:
         arm = arm_beside(path.parent, model.arm)
-        nominal = load_specification(arm, base=model.base, tip=model.tip, probe=model.probe)
+        nominal = load_specification(arm, base=model.base, tip=model.tip, probe=model.probe, choose=False)
         joints, columns = nominal.arm.joints, model.angles.columns if model.angles else None
         if columns is not None and len(columns) != joints:
             raise InputError(
@@ -260,7 +261,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         check_readings(capture, nominal.arm)
         return Recording(
             capture,
-            nominal,
+            with_parameters(nominal, capture),
             spheres=spheres,
             sources=sources,
             measured=str(model.date or ""),
@@ -274,7 +275,10 @@ def _angles_of(angles: _Angles | None, unit: str | None = None, preset: str | No
     """How readings are written: what a table states comes first, then [angles], then the table's preset."""
     unit = unit if unit is not None or angles is not None else preset
     if unit is None and angles is None:
-        raise InputError("'angles' is missing; add it.")
+        raise InputError(
+            "'angles' is missing, so that the unit of the readings is not known; add [angles] with unit = \"deg\" or "
+            '"rad", or state it in the header of the table, as J1 [deg].'
+        )
     if unit is None:
         assert angles is not None
         return angles

@@ -28,7 +28,7 @@ from ..kinematics.axes_to_dh import (
     without_far_frames,
 )
 from ..kinematics.chain import Geometry
-from ..kinematics.parameters import ArmSpecification, single
+from ..kinematics.parameters import ArmSpecification, single, with_tool
 from .inputs import InputFile
 
 _JOINTS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -63,8 +63,7 @@ def read_ur_kinematics(path: str | os.PathLike, *, probe: Numbers | None = None)
         geometry = _of_parameters(entries) if any(name in entries for name in _DH) else _of_origins(entries)
         arm = without_far_frames(arm_of(geometry, [_LIMITS] * len(_JOINTS)))
         if probe is not None:
-            tool = Arm(alpha=[0.0], a=[0.0], d=[0.0], probe=probe).probe
-            arm = arm.replace(probe=np.asarray(arm.probe) + np.asarray(tool))
+            arm = with_tool(arm, probe)
         return ArmSpecification(arm, os.path.splitext(os.path.basename(os.fspath(file)))[0])
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

@@ -25,7 +25,7 @@ from ..kinematics.axes_to_dh import (
     tip_frame,
 )
 from ..kinematics.chain import JointKinds
-from ..kinematics.parameters import ArmSpecification, UrdfSource, single
+from ..kinematics.parameters import ArmSpecification, UrdfSource, single, with_tool
 from .atomic_write import write_text
 from .inputs import InputFile
 from .urdf_text import Robot, UrdfJoint, edited, parse_urdf
@@ -107,7 +107,7 @@ def read_urdf(
         source = UrdfSource(text, base, tip)
         arm = urdf_chain(source).arm
         if probe is not None:
-            arm = arm.replace(probe=np.asarray(arm.probe) + np.asarray(Arm(alpha=[0], a=[0], d=[0], probe=probe).probe))
+            arm = with_tool(arm, probe)
         return ArmSpecification(arm, _name(file), urdf=source)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

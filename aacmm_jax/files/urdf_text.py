@@ -7,6 +7,7 @@ files, or grow to any size.
 
 import re
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any, NamedTuple
 from xml.parsers import expat
 
@@ -21,6 +22,7 @@ from ..kinematics.axes_to_dh import Transform
 _MOST_CHARACTERS = 20_000_000  # the largest robots of public collections have a twentieth of it
 _DEEPEST = 64  # levels of elements; a URDF has six
 _LARGEST = 1e6  # m and rad, of positions, angles and directions
+_LARGEST_ANGLE = 6.3  # rad, of roll, pitch and yaw: one revolution
 _METRE = 1000.0  # mm
 
 
@@ -73,6 +75,7 @@ class _Element(NamedTuple):
         return next((child for child in self.children if child.name == name), None)
 
 
+@lru_cache(maxsize=4)  # for the chain, the masses and the export, which each take the text
 def parse_urdf(text: str) -> Robot:
     """The joints and links of a URDF.
 
@@ -245,7 +248,13 @@ def _link(element: _Element, name: str) -> UrdfLink:
 def _origin(element: _Element | None, what: str) -> Transform:
     transform = np.eye(4)
     if element is not None:
-        transform[:3, :3] = roll_pitch_yaw_matrix(_numbers(element, "rpy", what, (0.0, 0.0, 0.0)))
+        angles = _numbers(element, "rpy", what, (0.0, 0.0, 0.0))
+        if np.any(np.abs(angles) > _LARGEST_ANGLE):
+            raise InputError(
+                f"line {element.line}: rpy of {what} is {quoted(element.attributes['rpy'])}, more than a "
+                "revolution, as if in degrees; a URDF is in rad, so convert it."
+            )
+        transform[:3, :3] = roll_pitch_yaw_matrix(angles)
         transform[:3, 3] = _METRE * _numbers(element, "xyz", what, (0.0, 0.0, 0.0))
     return transform
 
@@ -263,7 +272,7 @@ def _numbers(element: _Element, name: str, what: str, default: tuple[float, ...]
         values = np.array([number(part) for part in text.split()])
     except ValueError:
         values = np.array([])
-    if len(default) == 3 and not np.all(np.abs(values) < _LARGEST):  # limits may be as large as one likes
+    if len(default) == 3 and np.any(np.abs(values) >= _LARGEST):  # limits may be as large as one likes
         raise InputError(f"line {element.line}: {name} of {what} is {quoted(text)}; it must be below {_LARGEST:g}.")
     if len(values) != len(default) or not np.all(np.isfinite(values)):
         wanted = "a number" if len(default) == 1 else f"{len(default)} numbers"

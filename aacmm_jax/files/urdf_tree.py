@@ -7,6 +7,7 @@ from ..core.text import quoted, shorten
 from .urdf_text import Robot, UrdfJoint
 
 _MOVING = ("revolute", "continuous", "prismatic")
+_LARGEST, _IN_DEGREES = 15.0, 720.0  # rad: limits of joints end below; those in degrees are mostly between
 _LISTED = 12  # links that a message names
 
 
@@ -34,6 +35,11 @@ def check_moving(joint: UrdfJoint) -> None:
         raise InputError(
             f"{what} is {joint.kind} and {state}; give it <limit lower=... upper=...> in {unit}, the lower below the "
             f"upper{other}."
+        )
+    if joint.kind == "revolute" and joint.limits is not None and _LARGEST < max(map(abs, joint.limits)) <= _IN_DEGREES:
+        low, high = joint.limits
+        raise InputError(
+            f"{what} has the limits {low:g} and {high:g} rad, as if in degrees; a URDF is in rad, so convert them."
         )
 
 
@@ -94,6 +100,10 @@ def base_and_tip(robot: Robot, base: str | None, tip: str | None) -> tuple[str, 
             base = _ancestors(to, tip)[-1].parent
         else:
             roots = [link for link in robot.links if link not in to]
+            if robot.links and not roots:
+                raise InputError("every link has a joint before it, in a circle; a URDF is a tree, so correct it.")
+            if not robot.links:
+                raise InputError("it has no <link>; name the URDF of a robot.")
             if len(roots) != 1:
                 raise InputError(f"it has {len(roots)} roots, {_listed(roots)}; name the base (base= or --base).")
             base = roots[0]

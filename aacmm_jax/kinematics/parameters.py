@@ -378,3 +378,9 @@ def single(arm: Arm) -> Arm:
     if not is_single(arm):
         raise InputError("a file holds one arm, but this is a batch; take one of it first.")
     return arm
+
+
+def with_tool(arm: Arm, tool: Numbers) -> Arm:
+    """The same arm with a tool at its tip, in the frame of the last joint, mm."""
+    checked = Arm(alpha=[0.0], a=[0.0], d=[0.0], probe=tool).probe
+    return arm.replace(probe=np.asarray(arm.probe) + np.asarray(checked))

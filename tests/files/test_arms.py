@@ -103,8 +103,12 @@ def test_robots_are_their_makers(name):
 
 
 def test_every_shipped_arm_loads_and_is_reachable_by_name():
-    assert set(aj.files.shipped_arms()) == {"cheng2018-ra7125", "cheng2018-simulation", "iiwa14", "panda"}
-    for name in aj.files.shipped_arms():
+    measuring, robots = {"cheng2018-ra7125", "cheng2018-simulation"}, {"iiwa14", "panda", "fr3", "irb120", "so100"}
+    robots |= {"ur3e", "ur5e", "ur10", "ur10e", "gen3", "gen3-lite"}
+    assert set(aj.files.shipped_arms()) == measuring | robots
+    for name in measuring | robots:
+        assert aj.load_arm(name).limits is not None or name in measuring
+    for name in (*measuring, "panda", "so100"):  # each with an [identification] of its own
         specification = aj.files.load_specification(name)
         assert specification.name
         assert specification.bounds().space.names
@@ -154,7 +158,7 @@ def test_saved_arm_reads_back_the_same_numbers(tmp_path):
         path = tmp_path / f"{name}.toml"
         aj.files.save_arm(arm, path, name="copy", source="the test")
         assert_same_arm(aj.load_arm(path), arm)
-        assert aj.files.load_specification(str(path)).name == "copy"
+    assert aj.files.load_specification(str(path)).name == "copy"
 
 
 @pytest.mark.parametrize(
@@ -201,12 +205,19 @@ def test_bad_file(tmp_path, old, new, parts):
 def test_radians_stated_as_degrees(tmp_path):
     """Twists of a quarter turn in radians are refused; small ones in degrees are not."""
     head = 'length_unit = "mm"\nangle_unit = "deg"\njoint = ['
-    rows = "{{ alpha = {}, a = 0, d = 1 }}, {{ alpha = 0, a = 1, d = 0 }}, {{ alpha = {}, a = 0, d = 1 }}]"
+    rows = "{{ alpha = {}, a = 0, d = 99 }}, {{ alpha = 0, a = 9, d = 0 }}, {{ alpha = {}, a = 0, d = 9 }}]"
     for twists in ((-1.5708, 1.5708), (1.570796326794897, 3.141592653589793)):
         path = written(tmp_path, head + rows.format(*twists))
         assert_refused(lambda path=path: aj.load_arm(path), path, "multiple of pi/2", "is it in rad?")
     for twists in ((-90, 1.5708), (0.01, -0.02), (1.5, -1.5)):
         aj.load_arm(written(tmp_path, head + rows.format(*twists)))
+
+
+@pytest.mark.parametrize(("stated", "meant", "length"), [("m", "mm", 400.0), ("mm", "m", 0.4)])
+def test_lengths_in_the_other_unit(tmp_path, stated, meant, length):
+    row = f"{{ alpha = 0, a = {length}, d = 0 }}"
+    path = written(tmp_path, f'length_unit = "{stated}"\nangle_unit = "deg"\njoint = [{row}, {row}]')
+    assert_refused(lambda: aj.load_arm(path), path, f"are they in {meant}?", "length_unit")
 
 
 def test_what_is_not_an_arm_file(tmp_path):
@@ -217,7 +228,7 @@ def test_what_is_not_an_arm_file(tmp_path):
     )
     assert_refused(lambda: aj.load_arm(written(tmp_path, craig)), "beta", "standard form", "leave it out")
     assert_refused(lambda: aj.load_arm("pandaa"), "'pandaa' is neither a file nor an arm", "did you mean 'panda'?")
-    assert_refused(lambda: aj.load_arm("zzz"), "'zzz'", "known are cheng2018-ra7125")
+    assert_refused(lambda: aj.load_arm("zzz"), "'zzz'", "known are cheng2018-ra7125", "ur5e.")
     assert_refused(lambda: aj.load_arm("missing.toml"), "missing.toml does not exist", "check the path")
     assert_refused(lambda: aj.load_arm(tmp_path / "folder.toml"), tmp_path, "is a folder", "name a file")
     assert_refused(lambda: aj.load_arm(tmp_path / "binary.toml"), tmp_path, "not text in UTF-8")

@@ -197,7 +197,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL.replace("a.csv", "z.csv"), ["z.csv does not exist", "check the path"]),
         (SMALL.replace("a.csv", "folder"), ["folder is a folder", "name a file"]),
         (SMALL.replace("rad", "grad"), ["'angles.unit' must be 'rad', 'deg', 'arcsec' or 'counts', not 'grad'"]),
-        (HEAD + SOCKET, ["'angles' is missing; add it"]),
+        (HEAD + SOCKET, ["'angles' is missing", "unit of the readings", "add [angles]"]),
         (HEAD + ANGLES, ["neither a [[socket]] nor another observation", "add one"]),
         (SMALL.replace("file", "flie"), ["unknown key 'socket 1.flie'", "did you mean 'file'?"]),
         (SMALL.replace("unit", "unti"), ["unknown key 'angles.unti'", "did you mean 'unit'?"]),

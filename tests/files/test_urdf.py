@@ -209,6 +209,10 @@ REFUSED = {
     "zero axis": (joint("joint_5", axis='<axis xyz="0 0 0"/>'), {}, ["'joint_5'", "axis of length 0"]),
     "no limits": (joint("joint_5", limit=""), {}, ["'joint_5' is revolute and has no limits", "continuous"]),
     "reversed limits": (joint("joint_5", limit='<limit lower="1" upper="-1"/>'), {}, ["limits 1 and -1 rad"]),
+    "limits in degrees": (joint("joint_5", limit='<limit lower="-90" upper="120"/>'), {}, ["-90 and 120 rad"]),
+    "angles in degrees": (('rpy="0 -1.5708 0"', 'rpy="0 -90 0"'), {}, ["rpy of joint", "'0 -90 0'", "in degrees"]),
+    "no root": (('<child link="base_link"/>', BACK), {"tip": None}, ["every link has a joint before it", "a tree"]),
+    "not finite": (('xyz="0.35 0 0.03"', 'xyz="nan 0 0"'), {}, ["'nan 0 0'", "3 numbers"]),
     "millimetres": (('xyz="0.35 0 0.03"', 'xyz="350 0 30"'), {}, ["352 m long", "divide them by 1000"]),
     "two parents": (('<child link="upper_cover"/>', '<child link="forearm"/>'), {}, ["child of two joints"]),
     "circle": (('<child link="base_link"/>', BACK), {"base": "base_link"}, ["form a circle"]),
@@ -252,6 +256,7 @@ BOMB = '<!DOCTYPE robot [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&
         (b"\xff\xfe\x00", "not text in UTF-8"),
         (b"<robot name='\x00'/>", "not valid XML"),
         (b"<robot><link name='a'/></robot>", "no joint after 'a' moves"),
+        (b"<robot/>", "no <link>"),
     ],
 )
 def test_other_files_are_refused(tmp_path, content, part):

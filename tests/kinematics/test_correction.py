@@ -1,7 +1,5 @@
 """Corrected readings: the calibrated arm is where the controller believes the nominal one to be, or the row says no."""
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +12,7 @@ from aacmm_jax.core.numpy_or_jax import to_numpy
 
 from ..refusals import assert_refused
 
-UR10 = Path(__file__).parents[2] / "examples" / "ipa_ur10" / "ur10.toml"
-ARMS = {name: to_numpy(aj.load_arm(name)) for name in ("panda", "cheng2018-simulation", UR10)}
+ARMS = {name: to_numpy(aj.load_arm(name)) for name in ("panda", "cheng2018-simulation", "ur10")}
 MM, RAD = 1e-3, 1e-9  # what is asked of a pose that is reached
 
 

@@ -1,4 +1,4 @@
-"""Pinocchio's kinematics of the same arm, pose by pose, in its own environment: IN.npz OUT.npz.
+"""Pinocchio's kinematics of the same arm, pose by pose, in a process of its own: IN.npz OUT.npz.
 
 Three things are timed, each over all poses in a Python loop, as its Python users call it: the tip; the tip and its
 Jacobian by the joint angles; and the tip with its frame's kinematic regressor, Pinocchio's derivative by small

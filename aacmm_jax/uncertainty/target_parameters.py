@@ -1,0 +1,40 @@
+"""Which parameters of an arm observations of targets alone determine, where its file proposes none."""
+
+import numpy as np
+
+from ..data.capture import Capture
+from ..data.observations.measured_transforms import MeasuredTransforms
+from ..data.observations.observation import offset_of
+from ..kinematics.arm import Arm
+from ..kinematics.parameters import Parameters
+from ..model.observed import Observed
+
+_AROUND = np.array([100.0, 50.0, 0.0])  # mm: an orientation says what points beside the target would say
+
+
+def only_targets(capture: Capture) -> bool:
+    """Whether every pose held a target at an unknown place in the last frame, and none the arm's own tip."""
+    return not capture.sockets and all(observation.target for observation in capture.observations)
+
+
+def independent_of_targets(arm: Arm, capture: Capture) -> Parameters:
+    """`Parameters.independent` for a capture of `only_targets`.
+
+    The unknown places of the targets take the part of the probe, and of the link after the last joint, so that these
+    are fixed. What else is determined depends on how far the target is from the last axis, where the nominal arm finds
+    it.
+
+    Args:
+        arm: The nominal arm.
+        capture: At least one observation, each of a target.
+    """
+    observed, space = Observed.of(capture), Parameters(arm, ("probe_x",))
+    found = observed.split(np.asarray(observed.start(space, np.asarray(space.vector()))))
+    places = [np.asarray(found[offset_of(observation.target)]) for observation in observed.observations]
+    tip = max(places, key=lambda place: float(np.hypot(place[0], place[1])))
+    if any(isinstance(observation, MeasuredTransforms) for observation in observed.observations):
+        tip = tip + _AROUND
+    chosen = Parameters.independent(arm.replace(probe=tip))
+    n = arm.joints
+    fixed = {f"alpha_{n}", f"a_{n}", f"d_{n}", f"theta_{n}", "probe_x", "probe_y", "probe_z"}
+    return Parameters(chosen.base.replace(probe=arm.probe), tuple(name for name in chosen.names if name not in fixed))
