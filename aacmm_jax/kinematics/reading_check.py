@@ -10,17 +10,15 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from ..core.arguments import checked_arguments
 from ..core.arrays import Numbers, as_array
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
-from ..core.text import pluralise
 from ..core.units import DEG, INCH, M
 from .arm import Arm, is_single, joint_limits
 from .jacobian import tip_position
-from .reading_fit import EXACT, Explanation, ReadingFit
+from .reading_fit import Explanation, ReadingFit
 from .reading_search import Evidence, Found, Hypothesis, as_recorded, search
 from .workspace import total_link_length
 
@@ -47,6 +45,7 @@ class ReadingCheck(NamedTuple):
     explained: bool  # whether the best leaves residuals that an arm of this kind has
     size: float  # of the arm, mm: its links together
     poses: int
+    known_positions: bool  # in the base frame
     tried: int  # hypotheses
 
     @property
@@ -100,22 +99,23 @@ def check_readings(
             members.sort(key=lambda one: (fit.outside(one, angle) > 0, one.changes))
             candidates.append((members, angle, length, *fit.with_free_zeros(members[0], angle, length)))
     possible = float(np.abs(evidence.q).max()) <= _NEVER
-    bound = _bound(min([rms for *_, rms in candidates] + [given.rms_fitted] * possible), size)
+    bound = _bound(min([rms for *_, rms in candidates] + [given.rms_fitted] * possible), fit)
     good = [
         (members, fit.needed_zeros(members[0], angle, length, zeros, rms))
         for members, angle, length, zeros, rms in candidates
         if rms <= bound
     ]
     every = [one for _, one in good] + [given] * (possible and given.rms_fitted <= bound)
-    best = min(every, key=lambda one: (one.outside > 0, one.changes, one.rms_fitted))
-    explained = best.rms_fitted <= _EXPLAINED * size
+    explained = min(one.rms_fitted for one in every) <= _EXPLAINED * size
+    simplest = min(every, key=lambda one: (one.outside > 0, one.changes, one.rms_fitted))
+    best = simplest if explained else min(every, key=lambda one: one.rms_fitted)
     others, equal = _others(fit, best, good) if explained else ((), 0)
-    return ReadingCheck(given, best, others, equal, explained, size, len(evidence.q), tried)
+    return ReadingCheck(given, best, others, equal, explained, size, len(evidence.q), evidence.in_base, tried)
 
 
-def _bound(rms: float, size: float) -> float:
+def _bound(rms: float, fit: ReadingFit) -> float:
     """Residuals up to here are as good as these."""
-    return _AS_GOOD * rms + EXACT * size
+    return _AS_GOOD * rms + fit.typical
 
 
 def _evidence(
@@ -134,7 +134,9 @@ def _evidence(
     if sockets is not None:
         names, owner = np.unique(np.asarray(sockets), return_inverse=True)
         if owner.shape != (len(values),):
-            raise InputError(f"sockets has shape {owner.shape}; give one number or name for each of {len(values)} poses.")
+            raise InputError(
+                f"sockets has shape {owner.shape}; give one number or name for each of {len(values)} poses."
+            )
         if np.bincount(owner, minlength=len(names)).max() < 2:
             raise InputError("no socket has two poses, so nothing can be compared; record more poses in a socket.")
         order = np.argsort(owner, kind="stable")
@@ -188,7 +190,7 @@ def _others(
 
     Hypotheses of equal cost are compared as they were tried, with zeros at multiples of 45 degrees.
     """
-    bound, others, equal, own = _bound(best.rms_fitted, fit.size), [], 0, False
+    bound, others, equal, own = _bound(best.rms_fitted, fit), [], 0, False
     for members, one in good:
         of_best = not own and (best.hypothesis in members or best == one)
         own = own or of_best

@@ -23,8 +23,8 @@ _ZERO = 4 * DEG  # a smaller error of a zero is left to calibration
 _STEPS = 20
 _FITTED = 120, 24  # poses of a fit, in all and in one socket
 _MARGIN = 3 * DEG  # of readings beyond their limits
+_EXACT = 1e-5  # of the arm's size: residuals below it do not differ
 _NEARLY = 1.5  # the factor up to which residuals with fewer changed zeros are as good
-EXACT = 1e-5  # of the arm's size: residuals below it do not differ
 
 
 class Explanation(NamedTuple):
@@ -72,6 +72,8 @@ class ReadingFit:
         rows = (3 if evidence.rotations is None else 6) * len(self._few.q)
         unknown = 0 if evidence.in_base else 6 if evidence.own_frame else 3 * (1 + int(self._few.owner.max()))
         self._enough = rows - unknown >= 3 * arm.joints
+        # The residual of parameters that deviate from nominal ones by as much as those of real arms do.
+        self.typical = _TIP * size * math.sqrt(min(rows, len(names)) / len(self._few.q))
 
     def explanation(self, hypothesis: Hypothesis, angle: float, length: float) -> Explanation:
         """With the zeros as they are in the hypothesis."""
@@ -106,7 +108,7 @@ class ReadingFit:
         waiting = [i for i in np.argsort(-np.abs(zeros)).tolist() if abs(zeros[i]) > _ZERO]
         while True:
             found = self.explanation(hypothesis._replace(offsets=tuple(offsets.tolist())), angle, length)
-            if found.rms_fitted <= _NEARLY * rms + EXACT * self.size or not waiting:
+            if found.rms_fitted <= _NEARLY * rms + _EXACT * self.size or not waiting:
                 return found
             joint = waiting.pop(0)
             offset = math.remainder(offsets[joint] + zeros[joint], 2 * math.pi)

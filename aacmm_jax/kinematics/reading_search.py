@@ -1,9 +1,9 @@
 """Which order, signs and zeros of joint readings fit an arm: all of them, by costs of halves of the chain.
 
-The tip is o + R p, with the transform (R, o) of the first joints and the tip p in their last frame, which only the other
-joints change. A sum of squares over the poses is then a product of a matrix that the first half of a hypothesis has
-with one that the other half has. So a few thousand halves give the cost of millions of hypotheses, about 20 million a
-second, without an approximation.
+The tip is o + R p, with the transform (R, o) of the first joints and the tip p in their last frame, which only the
+other joints change. A sum of squares over the poses is then a product of a matrix that the first half of a hypothesis
+has with one that the other half has. So a few thousand halves give the cost of millions of hypotheses, some five
+million a second, without an approximation.
 """
 
 import itertools
@@ -242,7 +242,8 @@ def _half(
 ) -> _Half:
     """All signs and the allowed zeros of joints from ``start`` on, whose columns are in one of these orders.
 
-    ``allowed`` are the step of zeros, in eighths, and how many may be moved; ``end`` is the point in the last of their frames, mm; rotations are left out where they are not needed.
+    ``allowed`` are the step of zeros, in eighths of a revolution, and how many may be moved; ``end`` is the point in
+    the last of their frames, mm. Rotations are left out where they are not needed.
     """
     parts, m, (step, most) = [], len(links.q), allowed
     for order in orders:
