@@ -105,6 +105,10 @@ def arm(
         raise InputError("--joints is for a template; give it with --new.")
     from ..files.arms import load_specification
 
+    if figure is not None:
+        from ..plot.style import check_format
+
+        check_format(figure)
     with together(figure):
         specification = load_specification(file, base=base, tip=tip, probe=_probe(probe))
     if check is not None:

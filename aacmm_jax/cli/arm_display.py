@@ -19,17 +19,18 @@ def survey(summary: dict[str, Any]) -> None:
     table = new_table("\nAxes at zero readings", "joint", "through x [mm]", "y [mm]", "z [mm]", "direction x", "y", "z")
     for row in summary["frames"]:
         name = "tip" if row["joint"] is None else str(row["joint"])
-        numbers = [formatted(x, 3) for x in row["origin_mm"]] + [f"{x:.4f}" for x in row["axis"]]
+        numbers = [formatted(x, 3) for x in row["origin_mm"]] + [f"{round(x, 4) + 0.0:.4f}" for x in row["axis"]]
         table.add_row(name, *numbers)
     print_table(console, table)
     reach = summary["reach_mm"]
     console.print(
-        f"\nReach: {reach['nearest']:.0f} to {reach['farthest']:.0f} mm from the shoulder, on the first axis at height "
-        f"{reach['shoulder'][2]:.0f} mm (self-collision is not considered). The links together measure "
-        f"{reach['links']:.0f} mm."
+        f"\nReach: {reach['nearest']:.0f} to {reach['farthest']:.0f} mm from the shoulder, on the first axis at "
+        f"({', '.join(f'{x:.0f}' for x in reach['shoulder'])}) mm (self-collision is not considered). "
+        f"The links together measure {reach['links']:.0f} mm."
     )
     if summary["determined"]:
         _determined(console, summary)
+    if summary["needed"]:
         _needed(console, summary)
     print_written(console, summary)
 

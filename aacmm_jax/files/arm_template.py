@@ -3,8 +3,10 @@
 from ..core.errors import InputError
 
 _MOST = 20
-# alpha, a, d of a small measuring arm, joint by joint (shoulder, elbow and wrist), as often as needed.
+# alpha, a, d, joint by joint, as often as needed: of a small measuring arm (shoulder, elbow, wrist), and of a shorter
+# chain, whose tip still reaches a volume.
 _ROWS = ((-90, 0, 300), (90, 0, 0), (-90, 0, 400), (90, 0, 0), (-90, 0, 400), (90, 0, 0))
+_FEW_ROWS = ((-90, 0, 300), (90, 300, 0), (-90, 0, 0), (90, 100, 0), (0, 0, 0))
 
 
 def arm_template(joints: int = 6) -> str:
@@ -18,9 +20,8 @@ def arm_template(joints: int = 6) -> str:
     """
     if not 1 <= joints <= _MOST:
         raise InputError(f"an arm of {joints} joints cannot be written; give a number from 1 to {_MOST}.")
-    rows = [_ROWS[i % len(_ROWS)] if i + 1 < joints else (0, 0, 0) for i in range(joints)]
-    if joints > 1 and rows[-2][0] == 0:
-        rows[-2] = (90, *rows[-2][1:])
+    pattern = _FEW_ROWS if joints < len(_ROWS) else _ROWS
+    rows = [pattern[i % len(pattern)] if i + 1 < joints else (0, 0, 0) for i in range(joints)]
     lines = [
         f"  {{ alpha = {alpha:3d}, a = {a:3d}, d = {d:3d}, theta = 0, limits = [-170, 170] }},  # joint {number}"
         for number, (alpha, a, d) in enumerate(rows, start=1)

@@ -6,6 +6,7 @@ that residuals of a few millimetres, which a nominal arm has anyway, do not deci
 """
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -31,6 +32,7 @@ _TURN = 2 * np.pi * 1.02  # rad; readings of few joints go further
 _NEVER = 8 * np.pi
 _LENGTHS = (M, 1 / M, INCH, 1 / INCH)
 _NEAREST, _FARTHEST = 0.05, 1.3  # of the arm's size: distances of known positions from the base
+_APART = 50 * DEG  # zeros that differ by less are adjusted, not confused
 _COMMON = 200  # readings at which two hypotheses are compared
 _ALIKE = 1e-6  # of the arm's size
 
@@ -201,10 +203,19 @@ def _others(
                 equal += same and member != base
                 continue
             found = fit.refitted(member, one.angle, one.length) if of_best else one
-            if found.rms_fitted <= bound and (best.outside > 0 or not found.outside):
+            if found.rms_fitted <= bound and (best.outside > 0 or not found.outside) and _distinct(found, best):
                 others.append((member, found._replace(mirrored=mirrored)))
     found = [other for _, other in others]
     return tuple(sorted(found, key=lambda other: (other.changes, other.rms_fitted))), equal
+
+
+def _distinct(one: Explanation, other: Explanation) -> bool:
+    """Whether two explanations differ by more than zeros that are hardly determined."""
+    if one[:2] != other[:2] or (one.angle, one.length) != (other.angle, other.length):
+        return True
+    return any(
+        abs(math.remainder(x - y, 2 * math.pi)) > _APART for x, y in zip(one.offsets, other.offsets, strict=True)
+    )
 
 
 def _compared(fit: ReadingFit, one: Hypothesis, other: Hypothesis) -> tuple[bool, bool]:

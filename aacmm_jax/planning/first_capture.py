@@ -34,7 +34,7 @@ _DETERMINED = 10.0  # mm: a length known no better follows from the weak prior a
 _PLACEMENTS, _STARTS = 5, 40  # of sockets; and configurations in each socket
 _SOCKETS = (2, 4, 6)  # in pairs at the ends of reference lengths
 _U_LENGTH, _U_TRACKER = 0.002, 0.02  # mm
-_STILL_AT, _FEW = (0.5, 0.25, 0.75), 60  # of a joint's range; and poses that say nothing
+_STILL_AT, _FEW = (0.5, 0.25, 0.75), 40  # of a joint's range; and poses that say nothing
 _POINTS = 240  # poses that a tracker sees
 
 

@@ -34,37 +34,38 @@ def arm_survey(
     """
     arm: Arm = to_numpy(specification.arm)
     reach = arm_reach(arm)
+    base = np.eye(4) if base is None else base
     summary = arm_summary(specification) | {
-        "frames": _frames(arm, np.eye(4) if base is None else base),
+        "frames": _frames(arm, base),
         "reach_mm": {
-            "shoulder": reach.shoulder.tolist(),
+            "shoulder": (base[:3, :3] @ reach.shoulder + base[:3, 3]).tolist(),
             "farthest": reach.radius,
             "nearest": closest_approach(arm),
             "links": total_link_length(arm),
         },
     }
-    warnings = _warnings(arm)
+    empty: dict[str, Any] = {"redundant": [], "weak": [], "parallel": [], "free": [], "fixed": []}
+    empty |= {"determined": [], "still": [], "needed": [], "advice": ""}
+    summary |= empty | {"warnings": _warnings(arm)}
     try:
-        found = determined_by(arm)
-        chosen, still = Parameters.independent(arm), still_joints(arm)
+        found, chosen, still = determined_by(arm), Parameters.independent(arm), still_joints(arm)
+        summary |= {
+            "parameters": len(found[0].seen.names),
+            "redundant": _redundant(found),
+            "weak": [trade_off.text for trade_off in found[1].seen.trade_offs],
+            "parallel": list(found[1].seen.parallel),
+            "free": list(chosen.names),
+            "fixed": [name for name in chosen.held if not name.startswith("beta_")],
+            "determined": [_row(one) for one in found],
+            "still": [{"joint": one.joint, "lost": None if one.lost is None else list(one.lost)} for one in still],
+        }
         noises = CLASSES if noise is None else {"given": noise}
         needed = [first_capture(arm, one, name) for name, one in noises.items()]
+        moving = [one.joint for one in still if one.lost is None or one.lost]
+        summary |= {"needed": [_needed(one) for one in needed], "advice": _advice(needed, moving, arm.joints)}
     except InputError as error:
-        warnings.append(f"Nothing can be said of a calibration: {error}")
-        return summary | {"redundant": [], "determined": [], "still": [], "needed": [], "warnings": warnings}
-    return summary | {
-        "parameters": len(found[0].seen.names),
-        "redundant": _redundant(found),
-        "weak": [trade_off.text for trade_off in found[1].seen.trade_offs],
-        "parallel": list(found[1].seen.parallel),
-        "free": list(chosen.names),
-        "fixed": [name for name in chosen.held if not name.startswith("beta_")],
-        "determined": [_row(one) for one in found],
-        "still": [{"joint": one.joint, "lost": None if one.lost is None else list(one.lost)} for one in still],
-        "needed": [_needed(one) for one in needed],
-        "advice": _advice(needed, [one.joint for one in still if one.lost is None or one.lost], arm.joints),
-        "warnings": warnings,
-    }
+        summary["warnings"].append(f"What a calibration needs cannot be computed for this arm: {error}")
+    return summary
 
 
 def _frames(arm: Arm, base: Transform) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
-from aacmm_jax.kinematics import reading_search
+from aacmm_jax.kinematics import reading_check, reading_search
 from aacmm_jax.kinematics.reading_check import check_readings
 from aacmm_jax.kinematics.reading_search import Evidence, Hypothesis, as_recorded, search
 
@@ -26,7 +26,8 @@ def recorded(q, order, signs, offsets):
 @pytest.fixture
 def few(monkeypatch):
     """A search of one or two mistakes, in a tenth of the time."""
-    monkeypatch.setattr(reading_search, "_MOST", 150_000)
+    monkeypatch.setattr(reading_search, "_MOST", 60_000)
+    monkeypatch.setattr(reading_check, "_REFITTED", 8)
 
 
 @pytest.fixture(scope="module")
