@@ -27,7 +27,7 @@ def arm(
     file: Annotated[
         str | None,
         typer.Argument(
-            metavar="[ARM]",
+            metavar="ARM",
             help="A TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.",
         ),
     ] = None,

@@ -26,7 +26,7 @@ def recorded(q, order, signs, offsets):
 @pytest.fixture
 def few(monkeypatch):
     """A search of one or two mistakes, in a tenth of the time."""
-    monkeypatch.setattr(reading_search, "_MOST", 60_000)
+    monkeypatch.setattr(reading_search, "_MOST", 65_000)
     monkeypatch.setattr(reading_check, "_REFITTED", 8)
 
 
