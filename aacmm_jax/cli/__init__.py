@@ -13,6 +13,7 @@ INTERRUPTED_SENTENCE = "Interrupted; nothing was written that is not whole."
 _CLOSED_PIPE = 141  # as a shell reports of a program whose output is closed (128 + SIGPIPE)
 # Modules of commands, in the order in which ``--help`` lists them.
 _FAMILIES = (
+    "arm_command",
     "capture_commands",
     "calibration_commands",
     "result_commands",

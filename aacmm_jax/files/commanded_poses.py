@@ -1,4 +1,4 @@
-"""Tables of commanded poses, as joint readings or as positions with orientations, and of their corrected readings."""
+"""Tables of poses, as joint readings or as positions with orientations: commanded, with their corrections, or known."""
 
 import csv
 import io
@@ -72,6 +72,67 @@ def read_commanded_poses(
     poses = None if orientation is None else _poses(path, table, _ANGLES[found])
     readings = table.numbers([i + 1 for i in columns]) if near is None else np.tile(near, (table.length, 1))
     return CommandedPoses(np.array(by_joint(arm, _ANGLES[found], 1.0)) * readings, poses, found, arm, table, columns)
+
+
+class KnownPoses(NamedTuple):
+    """Recorded readings with what is known of the tip: where it was, or in which socket."""
+
+    q: Float[np.ndarray, "m n"]  # rad
+    unit: str  # of the readings in the file, deg or rad
+    stated: bool  # whether the file or the caller says the unit
+    positions: Float[np.ndarray, "m 3"] | None  # mm, in the frame that the file uses
+    rotations: Float[np.ndarray, "m 3 3"] | None
+    sockets: tuple[str, ...] | None  # of each pose, where there are no positions
+
+
+def read_known_poses(path: str | os.PathLike, joints: int, *, unit: str | None = None) -> KnownPoses:
+    """Read a table with a row for each recorded pose: joint readings, and where the tip was.
+
+    Readings are in columns named as for `read_commanded_poses`; positions in x, y and z, perhaps with an orientation.
+    Without positions all poses are of one socket, or of those that a column ``socket`` names. A table without header
+    has a column for each joint, and after them perhaps x, y and z.
+
+    Args:
+        path: The table (CSV or other text).
+        joints: Number of joints.
+        unit: ``"deg"`` or ``"rad"``; without it and a header that says it, readings up to a revolution are in rad.
+
+    Raises:
+        InputError: Columns are missing, or units differ.
+    """
+    table = TextTable(path)
+    point: list[int | str] = ["x", "y", "z"]
+    length: str | None = "mm"
+    orientation = None
+    if not table.header and table.width in (joints, joints + 3):
+        columns, has_points = tuple(range(joints)), table.width > joints
+        point = [joints + 1, joints + 2, joints + 3]
+    else:
+        columns = _reading_columns(path, table, joints, alone=True)
+        orientation, position = _orientation(table), _found(table, ("x", "y", "z"), tuple(_LENGTHS))
+        has_points = position is not None
+        point, length = ([*position[0]], position[1] or "mm") if position else (point, length)
+    picked = [i + 1 for i in columns]
+    header = table.unit(picked)
+    if header is not None and (header not in _ANGLES or unit not in (None, header)):
+        raise InputError(f"{path} states {header} for joint readings; give them in deg or rad, and leave out --unit.")
+    readings = table.numbers(picked)
+    found = header or unit or ("deg" if np.abs(readings).max() > 2 * np.pi else "rad")
+    if length not in _LENGTHS:
+        raise InputError(f"{path} states positions in {length}; give one of {', '.join(_LENGTHS)}.")
+    rotations = None
+    if orientation is not None:
+        rotations = _poses(path, table, _ANGLES[found])[:, :3, :3]
+    named = table.has(["socket"]) if table.header else False
+    sockets = tuple(table.texts("socket")) if named else ("A",) * table.length
+    return KnownPoses(
+        _ANGLES[found] * readings,
+        found,
+        (header or unit) is not None,
+        _LENGTHS[length] * table.numbers(point) if has_points else None,
+        rotations,
+        None if has_points else sockets,
+    )
 
 
 def corrected_csv(commanded: CommandedPoses, q: Float[np.ndarray, "N n"], reached: Bool[np.ndarray, " N"]) -> str:

@@ -171,6 +171,11 @@ class PointsManifest(_Recorded):
         return self
 
 
+def manifest_model() -> type[_Poses]:
+    """What a manifest of poses may state."""
+    return _Manifest
+
+
 def read_manifest(path: str | os.PathLike) -> Recording:
     """Read a manifest and every file it names; paths are relative to the manifest.
 

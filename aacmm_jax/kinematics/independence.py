@@ -125,13 +125,14 @@ class PosesInSockets:
         return np.array([[0, min(1, len(self.sizes) - 1)]])
 
 
-def generic_poses(arm: Arm) -> SocketPoses:
+def generic_poses(arm: Arm, limits: Float[np.ndarray, "n 2"] | None = None) -> SocketPoses:
     """What a thorough calibration would record, without noise: poses in several sockets and one reference length.
 
-    The sockets are where random configurations within the limits put the tip; the same arm always gets the same.
+    The sockets are where random configurations within the limits (default: the arm's own) put the tip; the same arm
+    always gets the same.
     """
     random = np.random.default_rng(0)
-    limits = np.asarray(joint_limits(arm, None))
+    limits = np.asarray(joint_limits(arm, None)) if limits is None else limits
     first = random.uniform(limits[:, 0], limits[:, 1], (_SOCKETS, arm.joints))
     owner = np.repeat(np.arange(_SOCKETS), _STARTS)
     starts = random.uniform(limits[:, 0], limits[:, 1], (len(owner), arm.joints))

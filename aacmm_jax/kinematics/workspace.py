@@ -26,20 +26,39 @@ class Reach(NamedTuple):
 
 
 def arm_reach(arm: Arm) -> Reach:
-    """Largest distance of the tip from the shoulder within the joint limits.
+    """Largest distance of the tip from the shoulder within the joint limits."""
+    shoulder = _shoulder(arm)
+    return Reach(shoulder, _extreme_distance(arm, shoulder, farthest=True))
+
+
+def _shoulder(arm: Arm) -> Float[np.ndarray, " 3"]:
+    travel = np.mean(joint_limits(arm, None)[0]) if 1 in arm.prismatic else 0.0
+    return np.array([0.0, 0.0, float(np.asarray(arm.d)[0] + travel)])
+
+
+def closest_approach(arm: Arm) -> float:
+    """Smallest distance of the tip from the shoulder within the joint limits, mm; the arm's own body may be in the way.
+
+    Found from many random starts, so that a smaller one is unlikely, but not excluded.
+    """
+    return _extreme_distance(arm, _shoulder(arm), farthest=False)
+
+
+def _extreme_distance(arm: Arm, shoulder: Float[np.ndarray, " 3"], *, farthest: bool) -> float:
+    """Largest or smallest distance of the tip from the shoulder.
 
     As a function of one joint the squared distance is a constant plus a sinusoid: with the lever r from a point of the
     joint's axis z to the tip, and s from the shoulder to that point, of 2 s . (r - (z . r) z) cos t + 2 s . (z x r) sin
-    t. Of a prismatic joint it is convex, so that an end of its travel is the maximum. From many random starts, joint
-    after joint is set to its maximum until nothing changes, the last joint first: a joint moves the tip, but no axis of
-    the joints before it.
+    t. Of a prismatic joint it is convex: an end of its travel is the maximum, the foot of the perpendicular the
+    minimum. From many random starts, joint after joint is set to its extreme until nothing changes, the last joint
+    first: a joint moves the tip, but no axis of the joints before it.
     """
+    sign = 1.0 if farthest else -1.0
     limits = np.asarray(joint_limits(arm, None))
     slides = [joint + 1 in arm.prismatic for joint in range(arm.joints)]
-    shoulder = np.array([0.0, 0.0, float(np.asarray(arm.d)[0]) + (limits[0].mean() if slides[0] else 0.0)])
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_STARTS, arm.joints))
     geometry = to_numpy(arm.geometry)
-    best = now = 0.0
+    best, now = -np.inf, 0.0
     for _ in range(_SWEEPS):
         forward = forward_pass(geometry, joint_motion(geometry, q))
         tip = forward.tip.T
@@ -47,15 +66,15 @@ def arm_reach(arm: Arm) -> Reach:
         for joint in range(arm.joints - 1, -1 if slides[0] else 0, -1):
             if slides[joint]:
                 axis, (low, high) = forward.z_before[joint].T, limits[joint]
-                ends = [tip + (end - q[:, joint])[:, None] * axis for end in (low, high)]
-                farther = np.linalg.norm(ends[0] - shoulder, axis=1) > np.linalg.norm(ends[1] - shoulder, axis=1)
-                tip = np.where(farther[:, None], *ends)
-                q[:, joint] = np.where(farther, low, high)
+                foot = q[:, joint] - np.sum((tip - shoulder) * axis, axis=1)
+                reading = np.where(foot > (low + high) / 2, low, high) if farthest else np.clip(foot, low, high)
+                tip = tip + (reading - q[:, joint])[:, None] * axis
+                q[:, joint] = reading
                 continue
             axis, origin = forward.z_before[joint].T, forward.origin_before[joint].T
             offset, across = origin - shoulder, np.cross(axis, tip - origin)
             along = np.cross(across, axis)
-            cosine, sine = np.sum(offset * along, axis=1), np.sum(offset * across, axis=1)
+            cosine, sine = sign * np.sum(offset * along, axis=1), sign * np.sum(offset * across, axis=1)
             highest = q[:, joint] + np.arctan2(sine, cosine)
             low, high = limits[joint]
             whole = highest + 2 * np.pi * np.ceil((low - highest) / (2 * np.pi))
@@ -66,11 +85,11 @@ def arm_reach(arm: Arm) -> Reach:
             change = (reading - q[:, joint])[:, None]
             tip = tip + (np.cos(change) - 1) * along + np.sin(change) * across
             q[:, joint] = reading
-        now = float(np.linalg.norm(tip - shoulder, axis=1).max())
-        if now - best <= 1e-12 * now:
+        now = sign * float((sign * np.linalg.norm(tip - shoulder, axis=1)).max())
+        if sign * now - best <= 1e-12 * abs(now):
             break
-        best = now
-    return Reach(shoulder, now)
+        best = sign * now
+    return now
 
 
 def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"]:

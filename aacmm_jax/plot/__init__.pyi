@@ -1,5 +1,8 @@
 from .acceptance import acceptance_metrics as acceptance_metrics
+from .arm import arm_at_zero as arm_at_zero
 from .arm import arm_poses as arm_poses
+from .arm import arm_workspace as arm_workspace
+from .arm import save_arm_figure as save_arm_figure
 from .calibration import length_parameter_errors as length_parameter_errors
 from .calibration import parameter_changes as parameter_changes
 from .calibration import pose_distances as pose_distances

@@ -1,14 +1,19 @@
-"""The figure of an arm in space."""
+"""Figures of an arm in space, and of its reach."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ..core.arrays import Numbers
 from ..core.errors import InputError
-from ..kinematics.arm import Arm
-from ..kinematics.workspace import skeleton
-from .style import ACCENT, DARK, LIGHT
+from ..kinematics.arm import Arm, joint_limits
+from ..kinematics.axes_to_dh import dh_frames, geometry_of
+from ..kinematics.workspace import arm_reach, skeleton
+from .style import ACCENT, DARK, LIGHT, label_axes, save_figure
+
+_TIPS = 4000  # of the picture of the reach
 
 
 def arm_poses(arm: Arm, q: Numbers, axes: Any = None) -> Any:
@@ -25,12 +30,7 @@ def arm_poses(arm: Arm, q: Numbers, axes: Any = None) -> Any:
     Raises:
         InputError: If the axes are not three-dimensional, or ``q`` does not fit the arm.
     """
-    if axes is None:
-        from matplotlib.figure import Figure
-
-        axes = Figure(figsize=(6, 5.4), layout="constrained").add_subplot(projection="3d")
-    elif getattr(axes, "name", "") != "3d":
-        raise InputError("an arm is drawn in space; give axes made with projection='3d'.")
+    axes = _axes_in_space(axes)
     configurations = np.atleast_2d(np.asarray(arm._checked(q)))
     first = {"color": DARK, "linewidth": 3, "marker": "o", "markersize": 4}
     others = {"color": LIGHT, "linewidth": 0.8}
@@ -40,4 +40,98 @@ def arm_poses(arm: Arm, q: Numbers, axes: Any = None) -> Any:
     axes.plot(*tips.T, linestyle="none", marker="+", color=ACCENT, markersize=8)
     axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]")
     axes.set_aspect("equal")
+    return axes
+
+
+def arm_at_zero(arm: Arm, axes: Any = None, *, base: Float[np.ndarray, "4 4"] | None = None) -> Any:
+    """Plot an arm at readings of zero, with the axis of each joint as a numbered arrow, mm.
+
+    Args:
+        arm: The arm.
+        axes: Three-dimensional axes to plot into; new ones if None.
+        base: The first frame in a robot's base link, mm; the plot is in the base link then.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: If the axes are not three-dimensional.
+    """
+    axes = _axes_in_space(axes)
+    base = np.eye(4) if base is None else base
+    line = skeleton(arm, np.zeros((1, arm.joints)))[0] @ base[:3, :3].T + base[:3, 3]
+    axes.plot(*line.T, color=DARK, linewidth=3, marker="o", markersize=3)
+    axes.plot(*line[-1:].T, linestyle="none", marker="+", color=ACCENT, markersize=10)
+    size = 0.12 * max(np.ptp(line, axis=0).max(), 1e-9)
+    for number, frame in enumerate(dh_frames(geometry_of(arm), base)[:-1], start=1):
+        origin, end = frame[:3, 3], frame[:3, 3] + size * frame[:3, 2]
+        axes.quiver(*origin, *(end - origin), color=ACCENT, linewidth=1.2, arrow_length_ratio=0.25)
+        axes.text(*(end + 0.25 * size * frame[:3, 2]), str(number), color=ACCENT, fontsize=9)
+    # A flat arm in a box of its own size would be a line.
+    low, high = line.min(axis=0), line.max(axis=0)
+    half = 0.6 * np.maximum(high - low, 0.6 * np.ptp(line, axis=0).max())[:, None] * [-1, 1]
+    ends = ((low + high) / 2)[:, None] + half
+    axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", xlim=ends[0], ylim=ends[1], zlim=ends[2])
+    axes.set_aspect("equal")
+    return axes
+
+
+def arm_workspace(arm: Arm, axes: Any = None) -> Any:
+    """Plot where random readings within the limits put the tip: distance from the first axis and height, mm.
+
+    Args:
+        arm: The arm.
+        axes: Axes to plot into; new ones if None.
+
+    Returns:
+        The axes.
+    """
+    if axes is None:
+        from matplotlib.figure import Figure
+
+        axes = Figure(figsize=(4.6, 5.4), layout="constrained").subplots()
+    limits = np.asarray(joint_limits(arm, None))
+    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_TIPS, arm.joints))
+    tips, reach = np.asarray(arm.position(q)), arm_reach(arm)
+    axes.plot(np.hypot(tips[:, 0], tips[:, 1]), tips[:, 2], linestyle="none", marker=".", markersize=2, color=LIGHT)
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 181)
+    height = reach.shoulder[2]
+    axes.plot(reach.radius * np.cos(angles), height + reach.radius * np.sin(angles), color=DARK, linewidth=1)
+    axes.plot([0.0], [height], linestyle="none", marker="o", markersize=4, color=DARK)
+    label_axes(axes, "distance from the first axis [mm]", "height [mm]")
+    axes.set_aspect("equal")
+    return axes
+
+
+def save_arm_figure(arm: Arm, path: Path, *, title: str = "", base: Float[np.ndarray, "4 4"] | None = None) -> None:
+    """Write a picture of an arm at zero readings and of its reach, in the format that the name of the file ends in.
+
+    Args:
+        arm: The arm.
+        path: The file to write (.png, .svg or .pdf).
+        title: What the arm is called.
+        base: The first frame in a robot's base link, mm.
+
+    Raises:
+        InputError: The format is none of these, or the file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.4, 5.4), layout="constrained")
+    parts: Any = figure.subfigures(1, 2, width_ratios=(6, 4.4))
+    left, right = parts
+    arm_at_zero(arm, left.add_subplot(projection="3d"), base=base).set_title("at zero readings", fontsize=10)
+    arm_workspace(arm, right.subplots()).set_title(f"reach {arm_reach(arm).radius:.0f} mm", fontsize=10)
+    figure.suptitle(title)
+    save_figure(figure, Path(path))
+
+
+def _axes_in_space(axes: Any) -> Any:
+    """The given axes, or new ones, in three dimensions."""
+    if axes is None:
+        from matplotlib.figure import Figure
+
+        return Figure(figsize=(6, 5.4), layout="constrained").add_subplot(projection="3d")
+    if getattr(axes, "name", "") != "3d":
+        raise InputError("an arm is drawn in space; give axes made with projection='3d'.")
     return axes

@@ -28,6 +28,7 @@ _TOLERANCE = math.radians(0.01)  # beyond a limit: more than the noise of any en
 _APART = 5.0  # RMS of a session among others, over that which it has alone, beyond which they are not of one arm
 _EXACT = 1e-6  # mm: smaller residuals are rounding errors of a simulation without noise
 _EXCESS = 1.5  # ratio of errors to their prediction that is reported
+_TRY_ALL = "aacmm arm ARM --check MANIFEST tries every order and sign of the columns, and the zeros of the joints."
 # By k, which is a length measured by the nominal arm over its reference value: one in m, read as mm, makes k = 1000.
 _MISTAKEN_UNITS = {
     M: "are the reference lengths in m by mistake?",
@@ -169,7 +170,7 @@ def _on_bounds(record: CalibrationRecord, sides: list[str]) -> str:
 
 def _cause(record: CalibrationRecord) -> str:
     cause = likely_cause(record.recording.nominal.arm, record.recording.capture)
-    return f" {cause}" if cause else ""
+    return f" {cause or _TRY_ALL}"
 
 
 def _validation(record: CalibrationRecord) -> list[str]:

@@ -18,7 +18,8 @@ from aacmm_jax.data.recording import Recording
 from ..conftest import command_line
 
 COMMANDS = (
-    *("demo", "simulate", "import", "calibrate", "evaluate", "export", "correct", "show", "plan", "compare", "report"),
+    *("arm", "demo", "simulate", "import", "calibrate", "evaluate", "export", "correct", "show", "plan", "compare"),
+    "report",
 )
 SIMULATE = (
     *("simulate", "cheng2018-simulation", "-o", "capture.h5", "--seed", 4),

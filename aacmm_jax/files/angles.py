@@ -1,0 +1,58 @@
+"""The table ``[angles]`` of a manifest, with what a check of the readings found."""
+
+import os
+
+import numpy as np
+
+from ..core.units import ARCSEC, DEG
+from ..kinematics.reading_fit import Explanation
+from .inputs import InputFile
+from .manifest import manifest_model
+from .outputs import as_path
+from .toml import read_toml
+
+_UNITS = {"rad": 1.0, "deg": DEG, "arcsec": ARCSEC}
+
+
+def angles_toml(found: Explanation, unit: str | None, manifest: str | os.PathLike | None = None) -> str:
+    """The lines that make a manifest read the columns as an explanation has them.
+
+    Args:
+        found: The explanation, of the readings as they were read.
+        unit: Unit that they were read in; None: as the manifest says.
+        manifest: The manifest that they were read with, whose columns, signs and offsets are taken into account.
+    """
+    joints = len(found.order)
+    columns, signs, offsets = np.arange(1, joints + 1), np.ones(joints), np.zeros(joints)
+    counts = None
+    if manifest is not None:
+        stated = read_toml(InputFile(as_path(manifest)), manifest_model()).angles
+        if stated is not None:
+            unit, counts = stated.unit, stated.counts_per_turn
+            columns = columns if stated.columns is None else np.array(stated.columns)
+            signs, offsets = (np.broadcast_to(np.asarray(x, float), joints) for x in (stated.sign, stated.offset))
+    order = list(found.order)
+    if found.angle != 1:
+        unit = "deg" if found.angle < 1 else "rad"
+    size = 2 * np.pi / np.broadcast_to(np.asarray(counts, float), joints)[order] if counts else _UNITS[unit or "rad"]
+    new_signs = np.array(found.signs) * signs[order]
+    new_offsets = offsets[order] - new_signs * np.array(found.offsets) / size
+    lines = ["[angles]", f'unit = "{unit or "rad"}"']
+    if counts is not None:
+        each = np.broadcast_to(np.asarray(counts, float), joints)[order]
+        lines.append(f"counts_per_turn = {_row(each) if np.ndim(counts) else _number(float(each[0]))}")
+    if not np.array_equal(columns[order], np.arange(1, joints + 1)):
+        lines.append(f"columns = {_row(columns[order])}")
+    if np.any(new_signs < 0):
+        lines.append(f"sign = {_row(new_signs)}")
+    if np.any(new_offsets):
+        lines.append(f"offset = {_row(np.round(new_offsets, 9))}")
+    return "\n".join(lines) + "\n"
+
+
+def _row(values: np.ndarray) -> str:
+    return f"[{', '.join(_number(float(value)) for value in values)}]"
+
+
+def _number(value: float) -> str:
+    return str(round(value)) if value == round(value) else repr(value)

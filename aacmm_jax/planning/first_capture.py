@@ -1,0 +1,215 @@
+"""What the data of a first calibration can determine of an arm, and how many of them it needs; before any plan.
+
+All of it follows from the derivatives of random poses over the whole workspace. A plan with positions of sockets and
+chosen poses (`planning.design`) needs fewer poses than the numbers given here.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.numpy_or_jax import to_numpy
+from ..data.capture import Capture, ReferenceLength
+from ..data.noise import Noise, tip_covariances
+from ..data.observations.measured_points import MeasuredPoints
+from ..kinematics.arm import Arm, jacobian_at, joint_limits, parameter_names
+from ..kinematics.chain import sines_cosines
+from ..kinematics.independence import generic_poses
+from ..kinematics.parameters import Parameters
+from ..kinematics.workspace import search_region
+from ..uncertainty.identifiability import Observability, observability
+from ..uncertainty.volume import default_length, sample_lengths
+from .design import SMALL_ARM
+from .fedorov_exchange import Candidates, Objective, covariance_of
+from .placement import PRIOR, DesignProblem, FixturePlacement, candidates_of, pool_at, pool_of
+
+# Repeatability of 0.05 to 0.1 mm by ISO 9283 is about 10 arcsec a joint on an arm of 1 m.
+ROBOT = Noise(encoder_arcsec=10.0, seating=0.02)
+CLASSES = {"measuring arm": SMALL_ARM, "robot": ROBOT}
+COUNTS = (10, 15, 20, 30, 40, 60, 80, 120, 160, 240)  # of poses
+_LENGTHS = 200  # that predictions are of
+_DETERMINED = 10.0  # mm: a length known no better follows from the weak prior alone
+_PLACEMENTS, _STARTS = 5, 40  # of sockets; and configurations in each socket
+_SOCKETS = (2, 4, 6)  # in pairs at the ends of reference lengths
+_U_LENGTH, _U_TRACKER = 0.002, 0.02  # mm
+_STILL_AT, _FEW = (0.5, 0.25, 0.75), 40  # of a joint's range; and poses that say nothing
+_POINTS = 240  # poses that a tracker sees
+
+
+class Determined(NamedTuple):
+    """What data of one kind determine of an arm."""
+
+    data: str  # in words
+    seen: Observability  # of all parameters
+    free: tuple[str, ...]  # a largest set that the data determine well; none where there are no such data
+
+
+class StillJoint(NamedTuple):
+    """What is not determined well any more where one joint does not move."""
+
+    joint: int  # from 1
+    lost: tuple[str, ...] | None  # parameters; None: without the joint the tip cannot stay in a socket
+
+
+class Expected(NamedTuple):
+    """The standard uncertainty of lengths that the calibration adds, from random poses."""
+
+    data: str  # in words
+    sockets: int
+    lengths: int
+    u: dict[int, float]  # number of poses -> median over the volume, mm; infinite where it is not determined
+    enough: int | None  # the fewest poses that add no more than the noise of two readings; None: none of `COUNTS` do
+
+
+class FirstCapture(NamedTuple):
+    """How many poses the noise of one class of arms needs."""
+
+    arm_class: str
+    noise: Noise
+    u_reading: float  # of a length, by the noise of the readings at both ends, median over the volume, mm
+    expected: tuple[Expected, ...]
+
+
+def determined_by(arm: Arm) -> tuple[Determined, ...]:
+    """What sockets, sockets with a reference length, and a tracker determine, at their best.
+
+    Args:
+        arm: One arm that reaches a volume.
+
+    Raises:
+        InputError: The arm has a single configuration for each position of its tip, so that sockets say nothing.
+    """
+    arm = to_numpy(arm)
+    sockets, length, points = _thorough(arm, None)
+    every = Parameters(arm, parameter_names(arm))
+    target = [MeasuredPoints("tracker", one.q, one.points, station="tracker", target="target") for one in points]
+    kinds = {
+        "sockets": Capture(sockets),
+        "sockets and a reference length": Capture(sockets, length),
+        "a tracker, of the probe": Capture({}, observations=points),
+        "a tracker, of a target at an unknown place": Capture({}, observations=target),
+    }
+    found = []
+    for data, capture in kinds.items():
+        free: tuple[str, ...] = ()
+        if not capture.observations:
+            free = Parameters.independent(arm, capture).names
+        found.append(Determined(data, observability(arm, capture, every), free))
+    return tuple(found)
+
+
+def still_joints(arm: Arm) -> tuple[StillJoint, ...]:
+    """What sockets with a reference length do not determine where one joint does not move; joint by joint.
+
+    Args:
+        arm: One arm.
+    """
+    arm = to_numpy(arm)
+    names, limits, found = Parameters.independent(arm).names, np.asarray(joint_limits(arm, None)), []
+    for joint in range(arm.joints):
+        lost = None
+        for share in _STILL_AT:
+            held = limits.copy()
+            held[joint] = limits[joint, 0] + share * np.ptp(limits[joint])
+            sockets, length, _ = _thorough(arm, held)
+            if sum(len(q) for q in sockets.values()) < _FEW:
+                continue
+            left = Parameters.independent(arm, Capture(sockets, length)).names
+            lost = tuple(name for name in names if name not in left)
+            break
+        found.append(StillJoint(joint + 1, lost))
+    return tuple(found)
+
+
+def first_capture(arm: Arm, noise: Noise, arm_class: str = "") -> FirstCapture:
+    """The uncertainty of lengths that calibrations from random poses would add, by what is recorded and how much.
+
+    Sockets are in pairs, at the ends of reference lengths that are anywhere in the workspace; the numbers are medians
+    over a few such placements.
+
+    Args:
+        arm: One arm that reaches a volume.
+        noise: Of its readings, and of the tip in its seat.
+        arm_class: What has such noise, in words.
+
+    Raises:
+        InputError: The noise is none, or no length fits into the workspace.
+    """
+    noise.check(arm.joints)
+    arm, noise = to_numpy((arm, noise))
+    space = Parameters.independent(arm)
+    arm, length = space.base, default_length(arm)
+    start, end = sample_lengths(arm, _LENGTHS, length=length, seed=1)
+    between = np.asarray(arm.position(end)) - np.asarray(arm.position(start))
+    along = between / np.linalg.norm(between, axis=1, keepdims=True)
+    functions = np.einsum(
+        "vc,vcp->vp", along, jacobian_at(arm, end, space.names) - jacobian_at(arm, start, space.names)
+    ) * np.asarray(space.scale)
+    both = sum(np.asarray(tip_covariances(arm.geometry, sines_cosines(q), noise)) for q in (start, end))
+    u_reading = float(np.median(np.sqrt(np.einsum("vc,cdv,vd->v", along, both, along))))
+    problem = DesignProblem(
+        search_region(arm, None, 0.0, -np.inf, 0), space, noise, Objective("functions", functions, 0.0)
+    )
+    rows = []
+    for sockets in _SOCKETS:
+        starts, ends = sample_lengths(arm, _PLACEMENTS * sockets // 2, length=length, seed=2)
+        points = np.stack([np.asarray(arm.position(starts)), np.asarray(arm.position(ends))], axis=1)
+        placed = [_in_sockets(problem, part.reshape(-1, 3)) for part in np.split(points, _PLACEMENTS)]
+        words = f"{sockets} sockets, {sockets // 2} reference length{'s' if sockets > 2 else ''} of {length:.0f} mm"
+        rows.append(_expected(words, sockets, placed, functions, u_reading))
+    rows.append(_expected("a tracker", 0, [_seen(problem)], functions, u_reading))
+    return FirstCapture(arm_class, noise, u_reading, tuple(rows))
+
+
+def _thorough(
+    arm: Arm, limits: Float[np.ndarray, "n 2"] | None
+) -> tuple[dict[str, np.ndarray], list[ReferenceLength], list[MeasuredPoints]]:
+    """Poses all over the workspace: in sockets, with one reference length, and as a tracker sees them."""
+    poses = generic_poses(arm, limits)
+    q, sizes = np.asarray(poses.q), poses.sizes
+    tips, ends = np.asarray(arm.position(q)), np.cumsum(sizes)
+    sockets = {f"S{i}": q[end - size : end] for i, (size, end) in enumerate(zip(sizes, ends, strict=True))}
+    length = ReferenceLength("S0", "S1", float(np.linalg.norm(tips[0] - tips[sizes[0]])), _U_LENGTH)
+    return sockets, [length], [MeasuredPoints("tracker", q, tips, u=_U_TRACKER)]
+
+
+def _in_sockets(problem: DesignProblem, points: Float[np.ndarray, "s 3"]) -> tuple[Candidates, int]:
+    """Random poses in sockets, two by two at the ends of reference lengths, and how many there are."""
+    pairs = tuple((i, i + 1) for i in range(0, len(points), 2))
+    pool = pool_at(problem, points, _STARTS)
+    return candidates_of(problem, FixturePlacement(points, pairs, (_U_LENGTH,) * len(pairs)), pool), len(pool.q)
+
+
+def _seen(problem: DesignProblem) -> tuple[Candidates, int]:
+    """Random poses that a tracker sees from an unknown place."""
+    # A tip that is not seated scatters by its readings, and by the tracker.
+    noise = Noise(encoder_arcsec=np.asarray(problem.noise.encoder_arcsec), seating=_U_TRACKER)
+    q = problem.region.draw(_POINTS)
+    pool = pool_of(problem._replace(noise=to_numpy(noise)), q, np.zeros(len(q), dtype=int))
+    tips = np.asarray(problem.arm.position(q))
+    turned = np.cross(np.eye(3)[None], tips[:, None] / 1000).swapaxes(1, 2)  # mm a mrad about each axis
+    frame = np.concatenate([turned, np.tile(np.eye(3), (len(q), 1, 1))], axis=2)
+    rows = np.concatenate([pool.jacobian, -pool.roots @ frame], axis=2)
+    return Candidates(rows, pool.owner, PRIOR * np.eye(rows.shape[2]), len(problem.space.names)), len(q)
+
+
+def _expected(
+    data: str, sockets: int, placed: Sequence[tuple[Candidates, int]], functions: np.ndarray, u_reading: float
+) -> Expected:
+    u = {}
+    for count in COUNTS:
+        found = []
+        for candidates, number in placed:
+            if not number:
+                found.append(np.inf)
+                continue
+            whole = candidates.information(candidates.rows) - candidates.base
+            covariance = covariance_of(candidates.base + count / number * whole, candidates.parameters)
+            found.append(float(np.median(np.sqrt(np.einsum("vp,pq,vq->v", functions, covariance, functions)))))
+        u[count] = float(np.median(found)) if np.median(found) < _DETERMINED else np.inf
+        if sockets and count < 2 * sockets:
+            u[count] = np.inf
+    enough = next((count for count, value in u.items() if value <= u_reading), None)
+    return Expected(data, sockets, sockets // 2, u, enough)

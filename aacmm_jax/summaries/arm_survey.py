@@ -1,0 +1,144 @@
+"""An arm looked at before its first calibration: joints, reach, what data determine, what a first capture needs."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
+from ..core.text import pluralise, shorten
+from ..core.units import ARCSEC
+from ..data.noise import Noise
+from ..kinematics.arm import Arm
+from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, tip_frame
+from ..kinematics.parameters import ArmSpecification, Parameters
+from ..kinematics.workspace import arm_reach, closest_approach, total_link_length
+from ..planning.first_capture import CLASSES, Determined, FirstCapture, determined_by, first_capture, still_joints
+from .calibration import arm_summary
+
+_SHORTEST, _LONGEST = 20.0, 20_000.0  # mm: of an arm's links together
+_SHOWN = (15, 30, 60, 120)  # poses
+
+
+def arm_survey(
+    specification: ArmSpecification, *, noise: Noise | None = None, base: Transform | None = None
+) -> dict[str, Any]:
+    """Plain values for JSON and display.
+
+    Args:
+        specification: The arm, with the identification that its file proposes.
+        noise: Of its readings and of the seat; by default that of the usual classes of arms.
+        base: The first frame in a robot's base link, mm; frames are in the base link then.
+    """
+    arm: Arm = to_numpy(specification.arm)
+    reach = arm_reach(arm)
+    base = np.eye(4) if base is None else base
+    summary = arm_summary(specification) | {
+        "frames": _frames(arm, base),
+        "reach_mm": {
+            "shoulder": (base[:3, :3] @ reach.shoulder + base[:3, 3]).tolist(),
+            "farthest": reach.radius,
+            "nearest": closest_approach(arm),
+            "links": total_link_length(arm),
+        },
+    }
+    empty: dict[str, Any] = {"redundant": [], "weak": [], "parallel": [], "free": [], "fixed": []}
+    empty |= {"determined": [], "still": [], "needed": [], "advice": ""}
+    summary |= empty | {"warnings": _warnings(arm)}
+    try:
+        found, chosen, still = determined_by(arm), Parameters.independent(arm), still_joints(arm)
+        summary |= {
+            "parameters": len(found[0].seen.names),
+            "redundant": _redundant(found),
+            "weak": [trade_off.text for trade_off in found[1].seen.trade_offs],
+            "parallel": list(found[1].seen.parallel),
+            "free": list(chosen.names),
+            "fixed": [name for name in chosen.held if not name.startswith("beta_")],
+            "determined": [_row(one) for one in found],
+            "still": [{"joint": one.joint, "lost": None if one.lost is None else list(one.lost)} for one in still],
+        }
+        noises = CLASSES if noise is None else {"given": noise}
+        needed = [first_capture(arm, one, name) for name, one in noises.items()]
+        moving = [one.joint for one in still if one.lost is None or one.lost]
+        summary |= {"needed": [_needed(one) for one in needed], "advice": _advice(needed, moving, arm.joints)}
+    except InputError as error:
+        summary["warnings"].append(f"What a calibration needs cannot be computed for this arm: {error}")
+    return summary
+
+
+def _frames(arm: Arm, base: Transform) -> list[dict[str, Any]]:
+    """Where the axis of each joint is at readings of zero, and the tip."""
+    geometry = geometry_of(arm)
+    rows = [
+        {"joint": number, "origin_mm": frame[:3, 3].tolist(), "axis": (np.round(frame[:3, 2], 12) + 0.0).tolist()}
+        for number, frame in enumerate(dh_frames(geometry, base)[:-1], start=1)
+    ]
+    tip = tip_frame(geometry, base)
+    return [*rows, {"joint": None, "origin_mm": tip[:3, 3].tolist(), "axis": (np.round(tip[:3, 2], 12) + 0.0).tolist()}]
+
+
+def _warnings(arm: Arm) -> list[str]:
+    found, links = [], total_link_length(arm)
+    if not _SHORTEST <= links <= _LONGEST:
+        found.append(f"The links together measure {links:.4g} mm; is the unit of the lengths right?")
+    if arm.limits is None:
+        found.append("No joint limits are given, so joints are taken to go from -180 to 180 deg; add them.")
+    return found
+
+
+def _redundant(found: Sequence[Determined]) -> list[str]:
+    """What no data on the tip can separate, whatever is recorded."""
+    seen = found[1].seen
+    return [text for text, always in zip(seen.undetermined, seen.structural, strict=True) if always]
+
+
+def _row(one: Determined) -> dict[str, Any]:
+    seen = one.seen
+    return {
+        "data": one.data,
+        "determined": seen.rank,
+        "well_determined": seen.rank - len(seen.trade_offs),
+        "scale": not any("the scale" in text for text in seen.undetermined),
+        "undetermined": list(seen.undetermined),
+        "hardly_determined": [trade_off.text for trade_off in seen.trade_offs],
+    }
+
+
+def _needed(one: FirstCapture) -> dict[str, Any]:
+    return {
+        "class": one.arm_class,
+        "encoder_arcsec": float(np.max(np.asarray(one.noise.encoder))) / ARCSEC,
+        "seating_mm": float(one.noise.seating),
+        "u_reading_mm": one.u_reading,
+        "rows": [
+            {
+                "data": row.data,
+                "sockets": row.sockets,
+                "lengths": row.lengths,
+                "enough_poses": row.enough,
+                "u_mm": {str(count): row.u[count] if math.isfinite(row.u[count]) else None for count in _SHOWN},
+            }
+            for row in one.expected
+        ],
+    }
+
+
+def _advice(needed: Sequence[FirstCapture], moving: list[int], arm_joints: int) -> str:
+    """What to record, in a sentence or two: the fewest sockets of which some number of poses is enough."""
+    rows = [row for row in needed[0].expected if row.sockets and row.enough is not None]
+    if not rows:
+        return (
+            "Random poses in sockets do not determine this arm well; use a tracker, or see what aacmm plan finds for "
+            "chosen poses."
+        )
+    best = min(rows, key=lambda row: (row.enough or 0, row.sockets))
+    poses = best.enough or 0
+    every = "Every joint must move." if len(moving) == arm_joints else ""
+    joints = every or f"These joints must move: {shorten([str(joint) for joint in moving], 20)}." * bool(moving)
+    return (
+        f"Record {2 * poses} poses, as different as possible, in {best.data}. From {pluralise(poses, 'pose')} on the "
+        "calibration adds less to a measured length than the readings themselves; the others are its check. "
+        f"{joints}"
+    )

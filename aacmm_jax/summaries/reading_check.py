@@ -1,0 +1,162 @@
+"""Joint readings compared with an arm: what is wrong with their order, signs, zeros and units, in words and numbers."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import InputError
+from ..core.units import DEG, INCH, M
+from ..data.capture import Capture
+from ..data.observations.measured_points import AbstractMeasured
+from ..kinematics.arm import Arm
+from ..kinematics.reading_check import ReadingCheck, check_readings
+from ..kinematics.reading_fit import Explanation
+
+_LISTED = 5
+_LENGTH_UNITS = {M: "m", 1 / M: "um", INCH: "inches", 1 / INCH: "mm, and were taken for inches"}
+_QUARTERS = 1e-9  # rad
+
+
+def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
+    """`kinematics.check_readings` of what was recorded in sockets, or as one station of an instrument saw it.
+
+    Args:
+        arm: One arm, nominal.
+        capture: Sockets, or measured points or transforms.
+
+    Raises:
+        InputError: There is neither a socket of two poses nor a measured point.
+    """
+    if any(size > 1 for size in capture.sizes):
+        return check_readings(arm, np.asarray(capture.q), sockets=capture.owner)
+    measured = [one for one in capture.observations if isinstance(one, AbstractMeasured)]
+    if not measured:
+        raise InputError(
+            "readings are checked against poses in a socket, at least two, or measured points; the capture has neither."
+        )
+    first = measured[0]
+    alike = [one for one in measured if (one.station, one.target) == (first.station, first.target)]
+    return check_readings(
+        arm,
+        np.concatenate([np.asarray(one.q) for one in alike]),
+        positions=np.concatenate([np.asarray(one.points) for one in alike]),
+        own_frame=True,
+        free_tip=bool(first.target),
+    )
+
+
+def reading_check_summary(found: ReadingCheck, arm: str, *, unit: str | None = None) -> dict[str, Any]:
+    """Plain values for JSON and display.
+
+    Args:
+        found: What the comparison found.
+        arm: Name of the arm.
+        unit: Unit of the readings that was stated, or taken; None where the file says it for itself.
+    """
+    best = found.best
+    return {
+        "kind": "reading check",
+        "arm": arm,
+        "poses": found.poses,
+        "unit": unit,
+        "fits": found.fits,
+        "explained": found.explained,
+        "sentence": _sentence(found),
+        "given": _row(found.given),
+        "found": _row(best) if found.explained else None,
+        "alternatives": [_row(one) for one in found.others],
+        "equivalent": found.equal,
+        "known_positions": found.known_positions,
+        "hypotheses": found.tried,
+    }
+
+
+def _row(one: Explanation) -> dict[str, Any]:
+    return {
+        "says": explanation_words(one),
+        "columns": [column + 1 for column in one.order],
+        "signs": list(one.signs),
+        "zeros_deg": [offset / DEG for offset in one.offsets],
+        "angle_factor": one.angle,
+        "length_factor": one.length,
+        "rms_mm": one.rms,
+        "rms_fitted_mm": one.rms_fitted,
+        "readings_outside_limits": one.outside,
+        "mirror_image": one.mirrored,
+    }
+
+
+def _sentence(found: ReadingCheck) -> str:
+    given, best = found.given, found.best
+    if not found.explained:
+        return (
+            f"No order, signs and zeros of the columns make these readings fit this arm: {given.rms:.3g} mm RMS as "
+            f"they are, {best.rms:.3g} mm at best. Is it the right arm, do the rows belong to these sockets or "
+            "positions, and was the tip where it is said to have been?"
+        )
+    if found.fits:
+        return (
+            f"The readings fit as they are: {given.rms:.3g} mm RMS by the nominal arm, {given.rms_fitted:.3g} mm with "
+            "parameters as real arms have them."
+        )
+    words = explanation_words(best)
+    return (
+        f"{words[0].upper()}{words[1:]}. So corrected, the residuals by the nominal arm fall from {given.rms:.3g} to "
+        f"{best.rms:.3g} mm RMS ({best.rms_fitted:.3g} mm with parameters as real arms have them)."
+    )
+
+
+def explanation_words(one: Explanation) -> str:
+    """What an explanation changes, in one sentence without its end; empty where nothing."""
+    words = []
+    if one.angle != 1:
+        words.append(
+            "the readings are in degrees, and were taken for radians"
+            if one.angle < 1
+            else "the readings are in radians, and were taken for degrees"
+        )
+    if one.length != 1:
+        words.append(f"the positions are in {_LENGTH_UNITS[one.length]}")
+    words += _order(one.order)
+    wrong = [f"{column + 1}" for column, sign in sorted(zip(one.order, one.signs, strict=True)) if sign < 0]
+    if wrong:
+        words.append(f"column{'s' * (len(wrong) > 1)} {_listed(wrong)} run{'s' * (len(wrong) == 1)} the other way")
+    offsets = [math.remainder(offset, 2 * math.pi) for offset in one.offsets]
+    for joint, offset in enumerate(offsets, start=1):
+        if abs(offset) > _QUARTERS:
+            value = abs(offset) if abs(abs(offset) - math.pi) < _QUARTERS else offset
+            words.append(f"the zero of joint {joint} is {value / DEG:.4g} deg off")
+    return "; ".join(words)
+
+
+def _order(order: tuple[int, ...]) -> list[str]:
+    """Columns that are exchanged, as people say it."""
+    n = len(order)
+    if order == tuple(range(n)):
+        return []
+    moved = [joint for joint in range(n) if order[joint] != joint]
+    if all(order[order[joint]] == joint for joint in moved):
+        if order == tuple(reversed(range(n))) and n > 3:
+            return ["the columns are in reverse order"]
+        pairs = [(joint, order[joint]) for joint in moved if joint < order[joint]]
+        return [f"columns {one + 1} and {other + 1} are exchanged" for one, other in pairs]
+    joints, columns = (_listed([str(i + 1) for i in part]) for part in (moved, [order[joint] for joint in moved]))
+    return [f"joints {joints} are in columns {columns}"]
+
+
+def _listed(items: list[str]) -> str:
+    return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
+
+
+def alternatives_sentence(rows: list[dict[str, Any]], known_positions: bool) -> str:
+    """What these data cannot tell from what was found, and what would; empty where there is nothing."""
+    if not rows:
+        return ""
+    texts = [
+        (f"that {row['says']}" if row["says"] else "that nothing is wrong") + " (a mirror image)" * row["mirror_image"]
+        for row in rows[:_LISTED]
+    ]
+    more = f"; or {len(rows) - _LISTED} further ones" if len(rows) > _LISTED else ""
+    needed = "More poses at known positions" if known_positions else "A pose at a known position"
+    return f"These data fit nearly as well if one assumes {'; or '.join(texts)}{more}. {needed} would tell them apart."

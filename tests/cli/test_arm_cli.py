@@ -1,0 +1,131 @@
+"""``aacmm arm``: an arm looked at, a template, readings compared with an arm."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.kinematics import reading_check, reading_search
+
+URDF = Path(__file__).parents[1] / "files" / "six_axis.urdf"
+Q = np.random.default_rng(1).uniform(-1.4, 1.4, (12, 6))  # rad
+
+
+@pytest.fixture
+def few(monkeypatch):
+    monkeypatch.setattr(reading_search, "_MOST", 20_000)
+    monkeypatch.setattr(reading_check, "_REFITTED", 6)
+
+
+def write(path, header, rows):
+    path.write_text("\n".join([",".join(header)] * bool(header) + [",".join(map(str, row)) for row in rows]) + "\n")
+
+
+def test_a_template_is_written_looked_at_and_not_overwritten(aacmm, tmp_path):
+    assert "Written: my.toml" in aacmm("arm", "--new", "my.toml", "--joints", 4).stdout
+    assert "my.toml exists" in aacmm("arm", "--new", "my.toml", expect=2).stderr
+    said = aacmm("arm", "my.toml", "--figure", "arm.png")
+    assert (tmp_path / "arm.png").read_bytes().startswith(b"\x89PNG")
+    for part in (
+        "Reach: ",
+        "Redundant",
+        "a_4 and probe_x trade off",
+        "sockets and a reference length",
+        "enough",
+        "Record",
+    ):
+        assert part in said.stdout, part
+
+
+def test_a_urdf_in_its_base_link(aacmm):
+    found = json.loads(aacmm("arm", URDF, "--tip", "tool0", "--encoder-arcsec", 5, "--json").stdout)
+    chain = aj.files.urdf_chain(aj.files.load_specification(URDF, tip="tool0").urdf)
+    tip = found["frames"][-1]
+    np.testing.assert_allclose(tip["origin_mm"], (chain.base @ chain.arm.pose(np.zeros(6)))[:3, 3], atol=1e-9)
+    assert [row["joint"] for row in found["frames"]] == [1, 2, 3, 4, 5, 6, None]
+    (needed,) = found["needed"]
+    assert (needed["encoder_arcsec"], needed["seating_mm"]) == (pytest.approx(5), 0.005)
+    assert found["reach_mm"]["nearest"] < found["reach_mm"]["farthest"] < found["reach_mm"]["links"]
+    assert set(found["free"]) | set(found["fixed"]) <= set(aj.kinematics.arm.parameter_names(chain.arm)) | {
+        f"beta_{i}" for i in range(1, 7)
+    }
+
+
+def test_an_arm_of_which_nothing_can_be_said(aacmm):
+    aacmm("arm", "--new", "my.toml", "--joints", 1)
+    assert "cannot be computed for this arm" in aacmm("arm", "my.toml").stdout
+
+
+def test_a_table_of_known_positions(aacmm, tmp_path, few):
+    arm = aj.load_arm("cheng2018-simulation")
+    columns = (Q * [1, 1, -1, 1, 1, 1])[:, [0, 1, 2, 4, 3, 5]]
+    header = [*(f"q_{i}_deg" for i in range(1, 7)), "x_m", "y_m", "z_m"]
+    write(tmp_path / "poses.csv", header, np.hstack([np.rad2deg(columns), np.asarray(arm.position(Q)) / 1000]))
+    said = aacmm("arm", "cheng2018-simulation", "--check", "poses.csv").stdout
+    assert said.startswith("Columns 4 and 5 are exchanged; column 3 runs the other way. So corrected")
+    angles = tomllib.loads(said[said.index("[angles]") : said.index("12 poses")])["angles"]
+    assert angles == {"unit": "deg", "columns": [1, 2, 3, 5, 4, 6], "sign": [1, 1, -1, 1, 1, 1]}
+
+
+def test_poses_of_a_urdf_are_in_its_base_link(aacmm, tmp_path, few):
+    chain = aj.files.urdf_chain(aj.files.load_specification(URDF, base="shoulder", tip="tool0").urdf)
+    q = Q[:, : chain.arm.joints]
+    poses = chain.base @ np.asarray(chain.arm.pose(q))
+    write(tmp_path / "poses.csv", [], np.hstack([q, poses[:, :3, 3]]))
+    options = ("--base", "shoulder", "--tip", "tool0", "--check", "poses.csv", "--unit", "rad", "--json")
+    found = json.loads(aacmm("arm", URDF, *options).stdout)
+    assert (found["fits"], found["angles"]) == (True, None)
+    assert found["given"]["rms_mm"] < 1e-6
+
+
+def test_what_is_found_corrects_the_manifest(aacmm, tmp_path, few):
+    """Columns, signs and offsets that the manifest states already are taken into account."""
+    capture = aj.simulate(aj.load_arm("cheng2018-simulation"), {"A": (400, 200, 300), "B": (600, 0, 400)}, poses=15)
+    for name, q in capture.sockets.items():
+        counts = (q - np.deg2rad([0, 90, 0, 0, 0, 0])) * [1, 1, 1, -1, 1, 1]
+        write(tmp_path / f"{name}.csv", [], np.rad2deg(counts[:, [0, 1, 2, 3, 5, 4]]))
+    sockets = '[[socket]]\nname = "{s}"\nfile = "{s}.csv"\n'
+    stated = "sign = [1, 1, 1, 1, 1, -1]\noffset = [0, 0, 0, 0, 30, 0]\n"
+    (tmp_path / "m.toml").write_text(f'arm = "cheng2018-simulation"\n[angles]\nunit = "deg"\n{stated}{sockets}')
+    found = json.loads(aacmm("arm", "cheng2018-simulation", "--check", "m.toml", "--json").stdout)
+    assert found["explained"]
+    assert not found["fits"]
+    (tmp_path / "m.toml").write_text(f'arm = "cheng2018-simulation"\n{found["angles"]}{sockets}')
+    corrected = aj.files.read_manifest(tmp_path / "m.toml").capture
+    # The arm is known to about a degree, and its mirror image is as good.
+    evaluated = json.loads(aacmm("arm", "cheng2018-simulation", "--check", "m.toml", "--json").stdout)
+    assert evaluated["fits"]
+    assert corrected.joints == 6
+
+
+def test_readings_that_nothing_explains(aacmm, tmp_path, few):
+    write(tmp_path / "poses.csv", [], np.random.default_rng(0).uniform(-3, 3, (30, 6)))
+    said = aacmm("arm", "cheng2018-simulation", "--check", "poses.csv", expect=1)
+    assert said.stdout.startswith("No order, signs and zeros of the columns make these readings fit this arm")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        ((), "name an arm"),
+        (("panda", "--new", "x.toml"), "leave out the arm"),
+        (("panda", "--joints", 6), "give it with --new"),
+        (("panda", "--unit", "deg"), "--check"),
+        (("panda", "--check", "x.csv", "--figure", "a.png"), "leave out --figure"),
+        (("panda", "--check", "x.toml", "--unit", "deg"), "says the unit"),
+        (("panda", "--check", "none.csv"), "none.csv"),
+        (("panda", "--figure", "a.gif"), ".png, .svg or .pdf"),
+        (("panda", "--probe", "1,2"), "--probe"),
+        (("no-arm",), "neither a file"),
+    ],
+)
+def test_refusals(aacmm, arguments, part):
+    assert part in aacmm("arm", *arguments, expect=2).stderr
+
+
+def test_a_capture_of_another_number_of_joints(aacmm, mukca):
+    said = aacmm("arm", "cheng2018-simulation", "--check", mukca / "panda_3.toml", expect=2).stderr
+    assert "7 joints" in said

@@ -1,0 +1,40 @@
+"""The template of an arm file: valid as it stands, with every key that an arm file may have."""
+
+import re
+import tomllib
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.files.arm_template import arm_template
+from aacmm_jax.files.arms import _ArmModel, _Identification, _Joint
+
+
+@pytest.mark.parametrize("joints", [1, 2, 3, 6, 7, 20])
+def test_the_template_loads(tmp_path, joints):
+    (tmp_path / "my.toml").write_text(arm_template(joints))
+    arm = aj.files.load_specification(tmp_path / "my.toml").arm
+    assert arm.joints == joints
+    assert not {i for i in range(joints - 1) if np.sin(float(arm.alpha[i])) == 0}  # no axis is parallel to the next
+
+
+def test_every_key_is_in_it_and_valid(tmp_path):
+    text = arm_template(6)
+    for model in (_ArmModel, _Joint, _Identification):
+        for key in model.model_fields:
+            assert re.search(rf"\b{key}\b", text), key
+    # Keys that are commented out can be used as they are written.
+    uncommented = re.sub(r"^# (\[identification\]|(?:held|free|length|angle|override) = )", r"\1", text, flags=re.M)
+    assert tomllib.loads(uncommented)["identification"].keys() == _Identification.model_fields.keys()
+    (tmp_path / "my.toml").write_text(uncommented)
+    specification = aj.files.load_specification(tmp_path / "my.toml")
+    assert specification.override == {"probe_z": 60.0}
+    # Without its comments it is the same file.
+    assert tomllib.loads(re.sub(r"#.*", "", text)) == tomllib.loads(text)
+
+
+@pytest.mark.parametrize("joints", [0, 21])
+def test_numbers_of_joints_that_no_arm_has(joints):
+    with pytest.raises(aj.InputError, match="from 1 to 20"):
+        arm_template(joints)

@@ -1,0 +1,71 @@
+"""What is wrong with recorded readings, in words."""
+
+import math
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.data import observations as kinds
+from aacmm_jax.kinematics import reading_check, reading_search
+from aacmm_jax.kinematics.reading_fit import Explanation
+from aacmm_jax.summaries.reading_check import check_capture, explanation_words, reading_check_summary
+
+DEG = math.pi / 180
+SIX = tuple(range(6))
+
+
+@pytest.mark.parametrize(
+    ("order", "signs", "offsets", "units", "words"),
+    [
+        (SIX, (1,) * 6, (0,) * 6, (1, 1), ""),
+        (
+            (0, 1, 2, 3, 5, 4),
+            (1, 1, -1, 1, 1, 1),
+            (0, math.pi / 2, 0, 0, 0, 0),
+            (1, 1),
+            "columns 5 and 6 are exchanged; column 3 runs the other way; the zero of joint 2 is 90 deg off",
+        ),
+        # The sign of a column that was moved is that of the column.
+        ((0, 1, 2, 3, 5, 4), (1, 1, 1, 1, 1, -1), (0,) * 6, (1, 1), "columns 5 and 6 are exchanged; column 5 runs"),
+        (SIX, (-1, 1, -1, 1, -1, 1), (0,) * 6, (1, 1), "columns 1, 3 and 5 run the other way"),
+        ((5, 4, 3, 2, 1, 0), (1,) * 6, (0,) * 6, (1, 1), "the columns are in reverse order"),
+        (
+            (1, 0, 3, 2, 4, 5),
+            (1,) * 6,
+            (0,) * 6,
+            (1, 1),
+            "columns 1 and 2 are exchanged; columns 3 and 4 are exchanged",
+        ),
+        ((1, 2, 0, 3, 4, 5), (1,) * 6, (0,) * 6, (1, 1), "joints 1, 2 and 3 are in columns 2, 3 and 1"),
+        (
+            SIX,
+            (1,) * 6,
+            (0, 0, -math.pi, 0, 1.5 * math.pi, 0),
+            (1, 1),
+            "joint 3 is 180 deg off; the zero of joint 5 is -90",
+        ),
+        (SIX, (1,) * 6, (0,) * 6, (DEG, 1), "the readings are in degrees, and were taken for radians"),
+        (SIX, (1,) * 6, (0,) * 6, (1 / DEG, 1000.0), "in radians, and were taken for degrees; the positions are in m"),
+    ],
+)
+def test_words(order, signs, offsets, units, words):
+    said = explanation_words(Explanation(order, signs, offsets, *units, 1.0, 1.0, 0))
+    assert words in said
+    assert bool(said) == bool(words)
+
+
+def test_a_capture_of_a_tracker_and_what_cannot_be_checked(paper_arm, monkeypatch):
+    monkeypatch.setattr(reading_search, "_MOST", 20_000)
+    monkeypatch.setattr(reading_check, "_REFITTED", 6)
+    q = np.random.default_rng(0).uniform(-1.5, 1.5, (20, 6))
+    points = np.asarray(paper_arm.position(q)) + np.array([1000.0, 0, 0])
+    parts = [kinds.MeasuredPoints(name, q[rows] * [1, 1, 1, -1, 1, 1], points[rows], station="s")
+             for name, rows in (("one", slice(0, 12)), ("two", slice(12, 20)))]  # fmt: skip
+    found = check_capture(paper_arm, aj.Capture({}, observations=parts))
+    assert found.poses == 20
+    summary = reading_check_summary(found, "paper's")
+    assert summary["sentence"].startswith("Column 4 runs the other way. So corrected")
+    assert summary["found"]["signs"] == [1, 1, 1, -1, 1, 1]
+    with pytest.raises(aj.InputError, match="at least two"):
+        check_capture(paper_arm, aj.Capture({"A": q[:1], "B": q[1:2]}))
