@@ -183,7 +183,7 @@ def moved_pool(
         starts += [followed, new]
         owner.append(np.full(len(followed) + len(new), socket))
     of = np.concatenate(owner)
-    q, good = reached(problem.region, np.concatenate(starts), after.points[of], _STEPS)
+    q, good = reached(problem.region, np.concatenate(starts), after.points[of], _STEPS, sockets=of)
     moved = pool_of(problem, q[good], of[good])
     return Pool(*(np.concatenate(parts) for parts in zip(kept, moved, strict=True)))
 

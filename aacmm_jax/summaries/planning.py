@@ -6,8 +6,9 @@ import numpy as np
 
 from ..acceptance.procedure import Procedure
 from ..acceptance.standards import PLANNED
-from ..planning.design import MORE, Plan, Prediction
+from ..planning.design import Plan
 from ..planning.kit import KitPlan
+from ..planning.predictions import MORE, Prediction
 from .calibration import reference_length_rows
 
 
