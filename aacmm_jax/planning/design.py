@@ -20,15 +20,17 @@ from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import SearchRegion, search_region, total_link_length
 from ..uncertainty.identifiability import observability
 from ..uncertainty.volume import default_length, sample_lengths
-from .fedorov_exchange import Candidates, Kind, Objective, exchange
+from .fedorov_exchange import Kind, Objective, exchange
 from .motion import Motion, approaches, ordered_motion
 from .placement import (
     LEAST_POSES,
     DesignProblem,
     FixturePlacement,
+    Pool,
     Ranges,
     candidates_of,
     designed_score,
+    in_order,
     moved_pool,
     neighbour,
     pool_at,
@@ -62,7 +64,7 @@ class Plan(NamedTuple):
 
     arm: Arm
     names: tuple[str, ...]  # free parameters
-    sockets: dict[str, tuple[float, float, float]]
+    sockets: dict[str, tuple[float, float, float]]  # in the order in which the arm visits them
     q: Float[np.ndarray, "N n"]
     owner: Int[np.ndarray, " N"]  # index of each pose's socket; the poses of a socket follow each other
     lengths: tuple[ReferenceLength, ...]
@@ -181,9 +183,15 @@ def plan(
     )
     if placement is None:
         placement = _best_placement(problem, len(names), poses, own, u, ranges, report)
-    possible, q, owner = _chosen(problem, placement, names, poses, candidates, retract, report)
+    pool, q, owner = _chosen(problem, placement, names, poses, candidates, retract, report)
     order, motion = ordered_motion(problem.region, q, owner, cones.normals[owner], retract)
-    q, owner = q[order], owner[order]
+    visited = np.array(list(dict.fromkeys(owner[order].tolist())))
+    q, owner = q[order], np.argsort(visited)[owner[order]]
+    placement, cones = in_order(placement, visited), cones.at(visited)
+    if isinstance(sockets, Mapping):  # names of sockets that were placed are given out in their order
+        names = [names[i] for i in visited]
+    problem = problem._replace(region=problem.region._replace(cones=cones))
+    possible = candidates_of(problem, placement, pool._replace(owner=np.argsort(visited)[pool.owner]))
     found = Plan(
         arm=arm,
         names=space.names,
@@ -223,7 +231,7 @@ def _chosen(
     count: int,
     retract: float,
     report: Progress,
-) -> tuple[Candidates, Float[np.ndarray, "N n"], Int[np.ndarray, " N"]]:
+) -> tuple[Pool, Float[np.ndarray, "N n"], Int[np.ndarray, " N"]]:
     """The candidates for a placement, and the best poses found."""
     region = problem.region
 
@@ -243,7 +251,7 @@ def _chosen(
     )
     owner = pool.owner[rows]
     q = refined(problem, placement, pool.q[rows], owner, lambda done: report("Moving poses", done), approachable)
-    return possible, q, owner
+    return pool, q, owner
 
 
 def design_problem(

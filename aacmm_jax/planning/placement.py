@@ -53,6 +53,13 @@ class FixturePlacement(NamedTuple):
     u: tuple[float, ...]
 
 
+def in_order(placement: FixturePlacement, sockets: Int[np.ndarray, " s"]) -> FixturePlacement:
+    """The same sockets in another order."""
+    place = np.argsort(sockets).tolist()
+    ends = tuple((place[start], place[end]) for start, end in placement.ends)
+    return FixturePlacement(placement.points[sockets], ends, placement.u)
+
+
 class Pool(NamedTuple):
     """Configurations in sockets, and what each measures of the parameters: derivatives of the tip, whitened."""
 
