@@ -10,6 +10,7 @@ from .calibrations import load_calibration as load_calibration
 from .calibrations import save_calibration as save_calibration
 from .captures import load_capture as load_capture
 from .captures import save_capture as save_capture
+from .cells import load_cell as load_cell
 from .controllers import dh_table as dh_table
 from .controllers import python_program as python_program
 from .controllers import zero_offsets as zero_offsets
@@ -27,3 +28,4 @@ from .urdf import link_masses as link_masses
 from .urdf import save_urdf as save_urdf
 from .urdf import urdf_chain as urdf_chain
 from .urdf import urdf_of as urdf_of
+from .urdf_body import urdf_body as urdf_body
