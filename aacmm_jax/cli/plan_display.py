@@ -136,8 +136,10 @@ def _print_motion(console: Console, summary: dict[str, Any]) -> None:
     """Tilt, travel, clearance, and what was checked."""
     found, retract = summary["collisions"], summary["retract_mm"]
     by_way = f" by way of approach points {retract:g} mm above the sockets" if retract else ""
+    tilt = summary["largest_tilt_deg"]
+    tilted = "" if tilt is None else f"Largest tilt from a normal {tilt:.0f} deg. "
     console.print(
-        f"Largest tilt from a normal {summary['largest_tilt_deg']:.0f} deg; joint travel {summary['travel_deg']:,.0f} "
+        f"{tilted}Joint travel {summary['travel_deg']:,.0f} "
         f"deg{by_way} ({summary['unordered_travel_deg']:,.0f} before ordering; each joint counts by what it carries)."
     )
     if found is None:

@@ -28,4 +28,4 @@ from .urdf import link_masses as link_masses
 from .urdf import save_urdf as save_urdf
 from .urdf import urdf_chain as urdf_chain
 from .urdf import urdf_of as urdf_of
-from .urdf_body import urdf_body as urdf_body
+from .urdf_shapes import urdf_body as urdf_body

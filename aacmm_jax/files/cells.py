@@ -11,7 +11,7 @@ from ..kinematics.collisions import Box, Cell, HalfSpace, Obstacle, Post, check_
 from ..kinematics.workspace import total_link_length
 from .arms import load_specification, urdf_folder
 from .toml import Strict, read_toml
-from .urdf_body import urdf_body
+from .urdf_shapes import urdf_body
 
 _SLENDER = 0.05  # radius of a link where none is stated, of all links' length
 

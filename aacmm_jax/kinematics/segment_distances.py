@@ -48,9 +48,10 @@ def distance_from_box(
     xp = namespace(start, end, half)
     along = end - start
 
-    def beyond(place: AnyArray) -> AnyArray:
-        point = start + place[..., None, :] * along
-        return point - xp.clip(point, -half, half)
+    def beyond(places: AnyArray) -> AnyArray:
+        """From the box to the points at these places, one more axis in front."""
+        points = start[None] + places[..., None, :] * along[None]
+        return points - xp.clip(points, -half[None], half[None])
 
     still = xp.abs(along) < 1e-9
     safe = xp.where(still, 1.0, along)
@@ -66,7 +67,8 @@ def distance_from_box(
     rise = slope_high - slope_low
     part = xp.clip(-slope_low / xp.where(rise > 0, rise, 1.0), 0.0, 1.0)
     # Without a rise the derivative is 0 all along, inside the box, or the segment is a point.
-    return _length(beyond(low + xp.where(rise > 0, part, 0.0) * (high - low)))
+    place = low + xp.where(rise > 0, part, 0.0) * (high - low)
+    return _length(beyond(place[None])[0])
 
 
 def _dot(one: AnyArray, other: AnyArray) -> AnyArray:

@@ -197,7 +197,10 @@ def _pool(problem: DesignProblem, placed: PlacedKit, count: int, retract: float)
 def _in_order(
     problem: DesignProblem, placed: PlacedKit, chosen: Sequence[AbstractObservation], retract: float
 ) -> tuple[list[AbstractObservation], tuple[Motion, ...]]:
-    """Each observation with its poses in the order in which to take them, place after place, and how the arm moves."""
+    """Each observation with its poses in the order in which to take them, place after place, and how the arm moves.
+
+    What has no cone has no normal either, and its tilts are not numbers.
+    """
     ordered, motions = [], []
     for simulated, item, one in zip(placed.kit, placed.items, chosen, strict=True):
         region, q = region_of(problem.region, simulated, item), np.asarray(one.q)
@@ -205,7 +208,7 @@ def _in_order(
         normals = np.tile(region.cones.normals, (len(q), 1))
         order, motion = ordered_motion(region, q, one.places, normals, retract if item.has_cone else 0.0)
         ordered.append(one.select(order))
-        motions.append(motion)
+        motions.append(motion if item.has_cone else motion._replace(tilt=np.full(len(q), np.nan)))
     return ordered, tuple(motions)
 
 

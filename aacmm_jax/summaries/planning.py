@@ -100,9 +100,10 @@ def _motion_summary(
         for start, motion in zip(first[:-1], motions, strict=True)
         for index, one, other in motion.blocked
     ]
+    tilts = np.concatenate([np.zeros(0), *(motion.tilt[np.isfinite(motion.tilt)] for motion in motions)])
     clearances = [motion.clearance.min() for motion in motions if motion.clearance is not None]
     return {
-        "largest_tilt_deg": max((math.degrees(float(motion.tilt.max())) for motion in motions), default=None),
+        "largest_tilt_deg": float(np.degrees(tilts.max())) if len(tilts) else None,
         "retract_mm": retract,
         "travel_deg": math.degrees(sum(motion.travel for motion in motions)),
         "unordered_travel_deg": math.degrees(sum(motion.unordered for motion in motions)),
