@@ -14,11 +14,9 @@ from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import together
 from .app import (
     BaseLink,
-    EncoderNoise,
     Json,
     NominalArm,
     ReferenceLengths,
-    SeatingNoise,
     TipLink,
     app,
     examples,
@@ -26,6 +24,18 @@ from .app import (
     show_summary,
     sockets_option,
     with_spinner,
+)
+from .plan_options import (
+    CellFile,
+    Collisions,
+    ConeAngles,
+    LinkRadius,
+    Normals,
+    PlanEncoderNoise,
+    PlanSeatingNoise,
+    RetractDistance,
+    ToolAxis,
+    planned_arm,
 )
 
 
@@ -36,6 +46,8 @@ from .app import (
         "aacmm plan my-arm.toml -o plan.csv --poses 25 \\\n"
         "  --socket A=400,200,300 --socket B=700,500,500 --length A,B,0.002",
         "aacmm plan my-arm.toml --kit kit.toml --poses 60 -o plan.csv --manifest capture.toml",
+        "aacmm plan robot.urdf --tip tool0 -o plan.csv --poses 40 --cone-deg 55 --collisions --cell cell.toml",
+        "aacmm plan panda -o plan.csv --poses 40 --cone-deg 55 --link-radius-mm 60 --angles rad --unconstrained",
     )
 )
 def plan(
@@ -43,7 +55,7 @@ def plan(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="FILE.csv", help="Plan to write: one row a pose, joint readings in degrees."
+            "--output", "-o", metavar="FILE.csv", help="Plan to write: one row a pose, in the order to take them."
         ),
     ],
     poses: Annotated[
@@ -69,8 +81,21 @@ def plan(
     u_mm: Annotated[
         float, typer.Option(metavar="MM", help="Standard uncertainty of the reference length to position.")
     ] = 0.002,
-    encoder_arcsec: EncoderNoise = 2.0,
-    seating_mm: SeatingNoise = 0.005,
+    encoder_arcsec: PlanEncoderNoise = None,
+    seating_mm: PlanSeatingNoise = None,
+    cone_deg: ConeAngles = None,
+    normal: Normals = None,
+    tool_axis: ToolAxis = "z",
+    retract_mm: RetractDistance = None,
+    cell: CellFile = None,
+    collisions: Collisions = False,
+    link_radius_mm: LinkRadius = None,
+    unconstrained: Annotated[
+        bool, typer.Option("--unconstrained", help="Predict also without cones, obstacles and approach points.")
+    ] = False,
+    angles: Annotated[
+        Literal["deg", "rad"], typer.Option(help="Unit of the joint readings in the plan and its manifest.")
+    ] = "deg",
     criterion: Annotated[
         Literal["length", "A", "D", "E"],
         typer.Option(
@@ -140,7 +165,6 @@ def plan(
 
     For a calibration: poses, and positions of sockets and reference lengths. For an acceptance test: its poses.
     """
-    from ..data.noise import Noise
     from ..files.arms import load_specification
     from ..files.plans import kit_csv, kit_manifest, plan_csv, plan_manifest
     from ..planning.design import plan as run
@@ -184,14 +208,24 @@ def plan(
         "poses": poses,
         "region": dict(axes) if axes else None,
         "space": specification.space(),
-        "noise": Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm),
         "criterion": criterion,
         "margin": margin_deg * DEG,
         "above": above_mm,
         "candidates": candidates,
         "check_length": check_length_mm,
+        "unconstrained": unconstrained,
         "seed": seed,
     }
+    if kit is not None and (cone_deg or normal):
+        raise InputError("--cone-deg and --normal are of sockets; with --kit, state half_angle_deg and normal in it.")
+    names = list(points) or [chr(ord("A") + i) for i in range(4 if sockets is None else min(sockets, 26))]
+    with together(output, manifest):
+        assumed = planned_arm(
+            arm, {"base": base, "tip": tip}, (encoder_arcsec, seating_mm), (cone_deg, normal), tool_axis, retract_mm,
+            (cell, collisions, link_radius_mm), names,
+        )  # fmt: skip
+    shared |= assumed.options
+    stated = {"noise_source": assumed.noise_source, "notes": list(assumed.notes), "angles": angles}
     urdf = specification.urdf if _is_urdf(arm) else None
     if kit is not None:
         from ..files.kits import read_kit
@@ -201,8 +235,9 @@ def plan(
             things = read_kit(kit)
         with plan_display.progress() as report_progress:
             planned = plan_kit(specification.arm, things, **shared, progress=report_progress)
-        written = _written(output, kit_csv(planned), manifest, lambda name: kit_manifest(planned, name, urdf), arm)
-        summary = kit_plan_summary(planned, specification.name) | {"written": written}
+        text = kit_csv(planned, angles)
+        written = _written(output, text, manifest, lambda name: kit_manifest(planned, name, urdf, angles), arm)
+        summary = kit_plan_summary(planned, specification.name) | stated | {"written": written}
         show_summary(summary, as_json, plan_display.kit_plan)
         return
     with plan_display.progress() as report_progress:
@@ -212,11 +247,13 @@ def plan(
             length=_range("--length-mm", length_mm),
             u=u_mm,
             lengths=[length_option(text) for text in length or ()],
+            cone=assumed.cone,
             **shared,
             progress=report_progress,
         )
-    written = _written(output, plan_csv(found), manifest, lambda name: plan_manifest(found, name, urdf), arm)
-    summary: dict[str, Any] = plan_summary(found, specification.name) | {"written": written}
+    text = plan_csv(found, angles)
+    written = _written(output, text, manifest, lambda name: plan_manifest(found, name, urdf, angles), arm)
+    summary: dict[str, Any] = plan_summary(found, specification.name) | stated | {"written": written}
     show_summary(summary, as_json, plan_display.plan)
 
 

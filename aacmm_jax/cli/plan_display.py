@@ -38,9 +38,16 @@ def plan(summary: dict[str, Any]) -> None:
         f"[bold]{escape(summary['arm'])}[/bold]: {summary['poses']} poses in "
         f"{pluralise(len(summary['sockets']), 'socket')}"
     )
-    table = new_table("", "socket", "x [mm]", "y [mm]", "z [mm]", "poses")
+    table = new_table("", "socket", "x [mm]", "y [mm]", "z [mm]", "poses", "cone [deg]", "largest tilt [deg]")
     for row in summary["sockets"]:
-        table.add_row(escape(row["socket"]), *(f"{value:.0f}" for value in row["position_mm"]), str(row["poses"]))
+        cone = "any" if row["cone_deg"] >= 180 else f"{row['cone_deg']:.0f}"
+        table.add_row(
+            escape(row["socket"]),
+            *(f"{value:.0f}" for value in row["position_mm"]),
+            str(row["poses"]),
+            cone,
+            f"{row['largest_tilt_deg']:.0f}",
+        )
     print_table(console, table)
     for row in summary["lengths"]:
         console.print(
@@ -96,7 +103,10 @@ def _print_predictions(
         ("loose", "this plan, joints kept to about 5 deg only"),
         ("random", f"{summary['poses']} {random}"),
         ("more", f"this plan and {summary['more_poses']} more poses"),
+        ("unconstrained", "as many without cones, obstacles and approach points"),
     ):
+        if summary[key] is None:
+            continue
         table.add_row(text, *(f"{1e3 * summary[key][which]:.1f}" for which in ("median_mm", "largest_mm")))
     for text, prediction in more or []:
         values = (
@@ -106,12 +116,52 @@ def _print_predictions(
         )
         table.add_row(text, *values)
     print_table(console, table)
+    _print_noise(console, summary)
+    _print_motion(console, summary)
+
+
+def _print_noise(console: Console, summary: dict[str, Any]) -> None:
+    """The noise that the plan assumes, and where its numbers come from."""
+    encoders, seat = summary["encoder_arcsec"], summary["seating_mm"]
+    each = isinstance(encoders, list)
+    text = ", ".join(f"{value:.3g}" for value in encoders) if each else f"{encoders:.3g}"
+    options = "" if each else f" (--method joint --encoder-arcsec {encoders:.3g} --seating-mm {seat:g})"
     console.print(
-        f"For a joint calibration with encoders of {summary['encoder_arcsec']:g} arcsec and a seat of "
-        f"{1e3 * summary['seating_mm']:g} um (--method joint --encoder-arcsec {summary['encoder_arcsec']:g} "
-        f"--seating-mm {summary['seating_mm']:g})."
+        f"For a joint calibration with encoders of {text} arcsec and a seat of {1e3 * seat:g} um{options}; "
+        f"{escape(summary['noise_source'])}."
     )
+
+
+def _print_motion(console: Console, summary: dict[str, Any]) -> None:
+    """Tilt, travel, clearance, and what was checked."""
+    found, retract = summary["collisions"], summary["retract_mm"]
+    by_way = f" by way of approach points {retract:g} mm above the sockets" if retract else ""
+    tilt = summary["largest_tilt_deg"]
+    tilted = "" if tilt is None else f"Largest tilt from a normal {tilt:.0f} deg. "
     console.print(
-        "Checked: joint limits, reach, and that nothing comes below the table. Not checked: obstacles, collisions of "
-        "the arm with itself, and from which side a socket can be entered (the plan's file has the probe's direction)."
+        f"{tilted}Joint travel {summary['travel_deg']:,.0f} "
+        f"deg{by_way} ({summary['unordered_travel_deg']:,.0f} before ordering; each joint counts by what it carries)."
     )
+    if found is None:
+        console.print(
+            "Checked: joint limits, reach, cones of approach, and that nothing comes below the table. Not checked: "
+            "obstacles and collisions of the arm with itself (--collisions, --cell, --link-radius-mm)."
+        )
+        return
+    obstacles = ", ".join(escape(name) for name in found["obstacles"]) or "none"
+    console.print(
+        f"Checked: joint limits, reach, cones of approach, the arm's body against itself and obstacles ({obstacles}), "
+        "in each pose and along the straight joint moves between them. Smallest clearance of a pose "
+        f"{found['smallest_clearance_mm']:.0f} mm."
+    )
+    if found["unchecked"]:
+        pairs = "; ".join(f"{escape(one)} and {escape(other)}" for one, other in found["unchecked"])
+        console.print(f"Not checked, since they touch wherever the arm is: {pairs}.")
+    for row in found["blocked_moves"]:
+        one, other = (escape(name) for name in row["between"])
+        console.print(
+            f"[yellow]The straight joint move to pose {row['before_pose']} ({escape(row['at'])}) hits: {one} and "
+            f"{other}; go there by another way.[/yellow]"
+        )
+    for note in summary["notes"]:
+        console.print(f"Note: {escape(note)}")

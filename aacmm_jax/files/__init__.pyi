@@ -1,6 +1,8 @@
 from .administrative_data import AdministrativeData as AdministrativeData
 from .administrative_data import read_administrative_data as read_administrative_data
+from .arm_noise import ArmNoise as ArmNoise
 from .arms import load_arm as load_arm
+from .arms import load_noise as load_noise
 from .arms import load_specification as load_specification
 from .arms import save_arm as save_arm
 from .arms import shipped_arms as shipped_arms
@@ -8,6 +10,7 @@ from .calibrations import load_calibration as load_calibration
 from .calibrations import save_calibration as save_calibration
 from .captures import load_capture as load_capture
 from .captures import save_capture as save_capture
+from .cells import load_cell as load_cell
 from .controllers import dh_table as dh_table
 from .controllers import python_program as python_program
 from .controllers import zero_offsets as zero_offsets
@@ -25,3 +28,4 @@ from .urdf import link_masses as link_masses
 from .urdf import save_urdf as save_urdf
 from .urdf import urdf_chain as urdf_chain
 from .urdf import urdf_of as urdf_of
+from .urdf_shapes import urdf_body as urdf_body

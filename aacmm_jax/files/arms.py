@@ -19,6 +19,7 @@ from ..kinematics.axes_to_dh import without_far_frames
 from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, Parameters, single, with_tool
 from ..uncertainty.target_parameters import independent_of_targets, only_targets
+from .arm_noise import ArmNoise, NoiseTable, stated_noise
 from .atomic_write import storable, write_text
 from .corrections import CorrectionsTable, corrections_toml
 from .outputs import as_path
@@ -80,6 +81,7 @@ class _ArmModel(Strict):
     tip: str | None = None
     identification: _Identification | None = None
     corrections: CorrectionsTable | None = None
+    noise: NoiseTable | None = None
 
     @model_validator(mode="after")
     def _one_description(self) -> "_ArmModel":
@@ -190,6 +192,44 @@ def load_specification(
         InputError: There is neither, or the file is not an arm's.
     """
     return _read(source, base, tip, probe, choose=choose)
+
+
+def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str | None = None) -> ArmNoise:
+    """The noise that plans assume of the arm of a file: that of its ``[noise]`` table, else that of its class.
+
+    A file without the table is that of a measuring arm, or of a robot where it is a URDF, names one, or is a
+    ``kinematics.yaml``; `data.arm_classes` says what that means. A calibration estimates its noise from the data.
+
+    Args:
+        source: As of `load_arm`.
+        base: As of `load_arm`.
+        tip: As of `load_arm`.
+
+    Raises:
+        InputError: There is no such arm, or the numbers are none of this arm.
+    """
+    arm = _read(source, base, tip, None, choose=False).arm
+    shipped = isinstance(source, str) and source in shipped_arms()
+    if not shipped and as_path(source).suffix.lower() in _OTHER_FORMATS:
+        return stated_noise(arm, None, "robot")
+    if shipped:
+        with resources.as_file(resources.files("aacmm_jax.files") / "shipped_arms" / f"{source}.toml") as path:
+            model = read_toml(path, _ArmModel)
+    else:
+        model = read_toml(as_path(source), _ArmModel)
+    try:
+        return stated_noise(arm, model.noise, "measuring arm" if model.urdf is None else "robot")
+    except InputError as error:
+        raise InputError(f"{source}: [noise] {error}") from error
+
+
+def urdf_folder(source: str | os.PathLike) -> Path:
+    """The folder of the URDF of an arm, in which its meshes are looked for: its own, or that of the file naming it."""
+    path = as_path(source)
+    if path.suffix.lower() not in _OTHER_FORMATS and os.path.isfile(path):
+        model = read_toml(path, _ArmModel)
+        path = path if model.urdf is None else path.parent / model.urdf
+    return path.parent
 
 
 def arm_beside(folder: Path, arm: str) -> str | Path:

@@ -4,6 +4,7 @@ Nothing here depends on a kind: the fields of `data.observations.Simulated...` s
 """
 
 import dataclasses
+import math
 import os
 import typing
 from collections.abc import Sequence
@@ -50,6 +51,8 @@ def _model(kind: type[AbstractSimulated]) -> type[Strict]:
         "poses": (PositiveInt, _POSES),
         "places": (NonNegativeInt, 0),
         "turned": (Literal["any", "vertical", "not"], "any"),
+        "half_angle_deg": (Annotated[float, Field(gt=0, le=180)], 180.0),
+        "normal": (_Point, [0.0, 0.0, 1.0]),
     }
     for field in dataclasses.fields(kind):
         stated = _stated(field.type)
@@ -73,8 +76,9 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
     Tables are ``[[artefact]]``, ``[[touched_sphere]]``, ``[[touched_cylinder]]``, ``[[planes]]`` (one, or two at a
     ``distance``), ``[[points]]``, ``[[transforms]]``, ``[[distances]]`` and ``[[socket]]``; their keys are the
     arguments of the simulated observation, in mm and rad, and ``places`` (how many placements a plan is to choose; 0
-    leaves the thing where it is stated) and ``turned`` ("any", "vertical" for turns about the vertical alone, or
-    "not").
+    leaves the thing where it is stated), ``turned`` ("any", "vertical" for turns about the vertical alone, or "not"),
+    and the cone from which the tool comes to it: ``half_angle_deg`` about ``normal``, which points out of its seats, in
+    an artefact's own frame and for everything else in the base frame (by default (0, 0, 1), and all directions).
 
     Args:
         path: The TOML file.
@@ -91,7 +95,10 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
         for entry in getattr(content, table):
             stated = {name: value for name, value in entry if value is not None}
             places, turned = stated.pop("places"), stated.pop("turned")
-            items.append(KitItem(_checked(path, table, kind, stated), places, turned))
+            half_angle, normal = math.radians(stated.pop("half_angle_deg")), stated.pop("normal")
+            if not any(normal):
+                raise InputError(f"{path}: [[{table}]] '{stated['name']}' has the normal (0, 0, 0); give a direction.")
+            items.append(KitItem(_checked(path, table, kind, stated), places, turned, half_angle, tuple(normal)))
     if not items:
         tables = ", ".join(f"[[{table}]]" for table in _KINDS)
         raise InputError(f"{path} names nothing; give tables {tables}.")

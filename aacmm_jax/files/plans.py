@@ -5,6 +5,7 @@ import io
 import json
 import os
 from collections.abc import Iterable
+from typing import Literal
 
 import numpy as np
 
@@ -20,34 +21,40 @@ from ..planning.design import Plan
 from ..planning.kit import KitPlan
 from .atomic_write import write_text
 
+Angles = Literal["deg", "rad"]
 
-def save_plan(path: str | os.PathLike, plan: Plan | KitPlan) -> None:
+
+def save_plan(path: str | os.PathLike, plan: Plan | KitPlan, *, angles: Angles = "deg") -> None:
     """Write the poses of a plan as CSV, in the order in which to take them.
 
-    Columns: ``pose``, ``socket`` (of a kit: ``observation`` and ``point``), ``x_mm``, ``y_mm``, ``z_mm`` (the socket,
-    or the tip), ``q_1_deg`` and so on (joint readings; ``q_1_mm`` of a prismatic joint), ``probe_direction_x``, ``_y``,
-    ``_z`` (the last frame's z axis).
+    Columns: ``pose``, ``move`` (where there are approach points: "approach", "pose" and "retract" for each pose),
+    ``socket`` (of a kit: ``observation`` and ``point``), ``x_mm``, ``y_mm``, ``z_mm`` (the tip), ``q_1_deg`` or
+    ``q_1_rad`` and so on (joint readings; ``q_1_mm`` of a prismatic joint), ``probe_direction_x``, ``_y``, ``_z`` (the
+    last frame's z axis).
 
     Args:
         path: the file to write.
         plan: what `planning.plan` or `planning.plan_kit` returned.
+        angles: the unit of the joint readings.
 
     Raises:
         InputError: the file cannot be written.
     """
-    write_text(path, plan_csv(plan) if isinstance(plan, Plan) else kit_csv(plan))
+    write_text(path, plan_csv(plan, angles) if isinstance(plan, Plan) else kit_csv(plan, angles))
 
 
-def plan_csv(plan: Plan) -> str:
+def plan_csv(plan: Plan, angles: Angles = "deg") -> str:
     """The text of `save_plan`."""
     names = list(plan.sockets)
     owners = [names[owner] for owner in plan.owner]
+    points = np.array([plan.sockets[name] for name in owners])
+    above = points + plan.retract * plan.cones.normals[plan.owner]
     return _poses_csv(
-        plan.arm, ["socket"], ([owner] for owner in owners), [plan.sockets[name] for name in owners], plan.q
+        plan.arm, ["socket"], [[owner] for owner in owners], points, plan.q, angles, plan.motion.approach, above
     )
 
 
-def plan_manifest(plan: Plan, arm: str, urdf: UrdfSource | None = None) -> str:
+def plan_manifest(plan: Plan, arm: str, urdf: UrdfSource | None = None, angles: Angles = "deg") -> str:
     """A manifest for the readings of a planned calibration, in which the calibrated lengths are to be filled in.
 
     ``urdf``: where the arm is a URDF, its links.
@@ -57,6 +64,7 @@ def plan_manifest(plan: Plan, arm: str, urdf: UrdfSource | None = None) -> str:
         urdf,
         "# A calibration, as planned. Fill in the calibrated lengths and uncertainties (k = 1), record a file for each",
         "# socket (one row a pose, in the order of the plan), then: aacmm import THIS.toml -o capture.h5",
+        angles=angles,
     )
     for name in plan.sockets:
         lines += ["", "[[socket]]", f"name = {_quoted(name)}", f"file = {_quoted(name + '.csv')}"]
@@ -72,17 +80,25 @@ def plan_manifest(plan: Plan, arm: str, urdf: UrdfSource | None = None) -> str:
     return "\n".join(lines) + "\n"
 
 
-def kit_csv(plan: KitPlan) -> str:
+def kit_csv(plan: KitPlan, angles: Angles = "deg") -> str:
     """A row for each pose of a plan with a kit: observation, point of an artefact or plane, position, readings."""
-    labels, points, q = [], [], []
-    for simulated, one in zip(plan.kit, plan.observations, strict=True):
-        label = _label(one)
-        held = [""] * one.q.shape[0] if label is None else [str(text) for text in one.stored()[label.name]]
+    labels, points, q, approach, above = [], [], [], [], []
+    motions = plan.motions or (None,) * len(plan.kit)
+    for simulated, one, motion in zip(plan.kit, plan.observations, motions, strict=True):
+        label, readings = _label(one), np.asarray(one.q)
+        held = [""] * len(readings) if label is None else [str(text) for text in one.stored()[label.name]]
         labels += [[one.name, point] for point in held]
         arm = plan.arm if simulated.offset is None else plan.arm.replace(probe=simulated.offset)
-        points.append(np.asarray(arm.position(np.asarray(one.q))))
-        q.append(np.asarray(one.q))
-    return _poses_csv(plan.arm, ["observation", "point"], labels, np.concatenate(points), np.concatenate(q))
+        points.append(np.asarray(arm.position(readings)))
+        q.append(readings)
+        moved = np.full_like(readings, np.nan) if motion is None or motion.approach is None else motion.approach
+        approach.append(moved)
+        above.append(np.asarray(arm.position(moved)))
+    tips, readings = np.concatenate(points), np.concatenate(q)
+    if not plan.retract:
+        return _poses_csv(plan.arm, ["observation", "point"], labels, tips, readings, angles)
+    moved, over = np.concatenate(approach), np.concatenate(above)
+    return _poses_csv(plan.arm, ["observation", "point"], labels, tips, readings, angles, moved, over)
 
 
 def _label(observation: AbstractObservation) -> Entry | None:
@@ -90,7 +106,7 @@ def _label(observation: AbstractObservation) -> Entry | None:
     return next((e for e in observation.entries if e.content == "text" and e.dimensions == ("pose",)), None)
 
 
-def kit_manifest(plan: KitPlan, arm: str, urdf: UrdfSource | None = None) -> str:
+def kit_manifest(plan: KitPlan, arm: str, urdf: UrdfSource | None = None, angles: Angles = "deg") -> str:
     """A manifest for the readings of a plan with a kit, in which certified values are to be filled in.
 
     Files hold the joint readings in their first columns and, where something is measured, its numbers in the next.
@@ -102,6 +118,7 @@ def kit_manifest(plan: KitPlan, arm: str, urdf: UrdfSource | None = None) -> str
         "# A calibration, as planned. Fill in certified values and uncertainties (k = 1), record the files (one row a",
         "# pose, in the order of the plan: joint readings, then what was measured), then: aacmm import THIS.toml -o",
         "# capture.h5",
+        angles=angles,
     )
     for one in plan.observations:
         lines += ["", *_table(one, plan.arm.joints)]
@@ -162,12 +179,14 @@ def _largest_u(observation: AbstractObservation) -> float:
     return round(float(np.max(values)), 9)
 
 
-def _manifest_start(arm: str, urdf: UrdfSource | None, *comments: str, acceptance: str | None = None) -> list[str]:
-    """The first lines of a manifest of readings in degrees, and of prismatic joints in mm, which is the default."""
+def _manifest_start(
+    arm: str, urdf: UrdfSource | None, *comments: str, acceptance: str | None = None, angles: Angles = "deg"
+) -> list[str]:
+    """The first lines of a manifest of readings; those of prismatic joints are in mm, which is the default."""
     date = "# date = 2026-01-31   # when it was recorded"
     links = [] if urdf is None else [f"base = {_quoted(urdf.base)}", f"tip = {_quoted(urdf.tip)}"]
     made_for = [] if acceptance is None else [f"acceptance = {_quoted(acceptance)}"]
-    return [*comments, f"arm = {_quoted(arm)}", *links, *made_for, date, "", "[angles]", 'unit = "deg"']
+    return [*comments, f"arm = {_quoted(arm)}", *links, *made_for, date, "", "[angles]", f'unit = "{angles}"']
 
 
 def procedure_csv(procedure: Procedure) -> str:
@@ -178,19 +197,46 @@ def procedure_csv(procedure: Procedure) -> str:
     return _poses_csv(procedure.arm, ["test", "name", "file"], labels, points, q)
 
 
-def _poses_csv(arm: Arm, headings: list[str], labels: Iterable[list[str]], points: Iterable, q: np.ndarray) -> str:
-    """A row for each pose: number, labels, where the tip is (mm), readings (deg, or mm), direction of the probe."""
+def _poses_csv(
+    arm: Arm,
+    headings: list[str],
+    labels: Iterable[list[str]],
+    points: np.ndarray,
+    q: np.ndarray,
+    angles: Angles = "deg",
+    approach: np.ndarray | None = None,
+    above: np.ndarray | None = None,
+) -> str:
+    """A row for each pose: number, labels, where the tip is (mm), joint readings, direction of the probe.
+
+    With approach configurations, a row for them before and after each pose; not where they are not finite.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    readings = [f"q_{i}_{unit}" for i, unit in enumerate(by_joint(arm, "deg", "mm"), start=1)]
+    readings = [f"q_{i}_{unit}" for i, unit in enumerate(by_joint(arm, angles, "mm"), start=1)]
     direction = [f"probe_direction_{axis}" for axis in "xyz"]
-    writer.writerow(["pose", *headings, "x_mm", "y_mm", "z_mm", *readings, *direction])
-    directions = np.asarray(arm.pose(q))[:, :3, 2]
-    for number, (label, point, reading, axis) in enumerate(
-        zip(labels, points, q / np.array(by_joint(arm, DEG, 1.0)), directions, strict=True), start=1
-    ):
-        numbers = [*(f"{x:.3f}" for x in (*point, *reading)), *(f"{x:.2f}" for x in axis)]
-        writer.writerow([number, *label, *numbers])
+    moves = [] if approach is None else ["move"]
+    writer.writerow(["pose", *moves, *headings, "x_mm", "y_mm", "z_mm", *readings, *direction])
+    unit, digits = (DEG, 3) if angles == "deg" else (1.0, 6)
+    units = np.array(by_joint(arm, unit, 1.0))
+
+    def numbers(at: np.ndarray, tips: np.ndarray) -> list[list[str]]:
+        axes = np.asarray(arm.pose(at))[:, :3, 2]
+        rows = zip(tips, at / units, axes, strict=True)
+        return [
+            [*(f"{x:.3f}" for x in tip), *(f"{x:.{digits}f}" for x in reading), *(f"{x:.2f}" for x in axis)]
+            for tip, reading, axis in rows
+        ]
+
+    found = numbers(q, points)
+    around = None if approach is None or above is None else numbers(approach, above)
+    for number, label in enumerate(labels):
+        pose = [number + 1, *(["pose"] if moves else []), *label, *found[number]]
+        if around is None or approach is None or not np.all(np.isfinite(approach[number])):
+            writer.writerow(pose)
+            continue
+        before, after = ([number + 1, move, *label, *around[number]] for move in ("approach", "retract"))
+        writer.writerows([before, pose, after])
     return text.getvalue()
 
 

@@ -56,6 +56,15 @@ class UrdfLink(NamedTuple):
     centre: Float[np.ndarray, " 3"] | None
 
 
+class UrdfShape(NamedTuple):
+    """A collision shape of a link: a box of three edges, a cylinder (radius, length), a sphere (radius), or a mesh."""
+
+    kind: str
+    origin: Transform  # in the link's frame, mm
+    size: tuple[float, ...]  # mm; of a mesh the scale from its numbers to mm
+    file: str  # of a mesh
+
+
 class Robot(NamedTuple):
     """What a URDF says of kinematics and masses."""
 
@@ -103,6 +112,50 @@ def parse_urdf(text: str) -> Robot:
                     f"joint {quoted(joint.name)} names the link {quoted(link)}, which is not there; add it."
                 )
     return Robot(joints, links, end)
+
+
+def collision_shapes(text: str) -> dict[str, tuple[UrdfShape, ...]]:
+    """The collision shapes of each link that has some; kinds that a URDF does not know are left out.
+
+    Args:
+        text: The whole file, which `parse_urdf` takes.
+
+    Raises:
+        InputError: A shape has no size, or a number is none.
+    """
+    root, _ = _parsed(text)
+    found: dict[str, tuple[UrdfShape, ...]] = {}
+    for link in root.children:
+        if link.name == "link":
+            name = _attribute(link, "name", "a link")
+            shapes = (_shape(child, f"link {quoted(name)}") for child in link.children if child.name == "collision")
+            known = tuple(shape for shape in shapes if shape is not None)
+            if known:
+                found[name] = known
+    return found
+
+
+def _shape(collision: _Element, what: str) -> UrdfShape | None:
+    geometry = collision.child("geometry")
+    if geometry is None or not geometry.children:
+        return None
+    element, origin = geometry.children[0], _origin(collision.child("origin"), what)
+    if element.name == "mesh":
+        scale = _numbers(element, "scale", what, (1.0, 1.0, 1.0))
+        return UrdfShape(
+            "mesh", origin, tuple((_METRE * scale).tolist()), _attribute(element, "filename", f"a mesh of {what}")
+        )
+    sizes = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",)}.get(element.name)
+    if sizes is None:
+        return None
+    missing = (0.0,) * 3 if element.name == "box" else (0.0,)
+    size = np.concatenate([_METRE * _numbers(element, name, what, missing) for name in sizes])
+    if not np.all(size > 0):
+        raise InputError(
+            f"line {element.line}: a collision {element.name} of {what} has no size above 0; give its "
+            f"{' and '.join(sizes)}."
+        )
+    return UrdfShape(element.name, origin, tuple(size.tolist()), "")
 
 
 def edited(text: str, origins: Mapping[str, tuple[str | None, str | None]], robot: Robot, added: str = "") -> str:

@@ -1,6 +1,14 @@
 from .arm import Arm as Arm
 from .arm import parameter_names as parameter_names
 from .axes_to_dh import without_far_frames as without_far_frames
+from .body import Body as Body
+from .body import body_along_links as body_along_links
+from .collisions import Box as Box
+from .collisions import Cell as Cell
+from .collisions import HalfSpace as HalfSpace
+from .collisions import Post as Post
+from .collisions import clearances as clearances
+from .cones import Cone as Cone
 from .corrected_arm import with_corrections as with_corrections
 from .correction import corrected_readings as corrected_readings
 from .correction import readings_at_poses as readings_at_poses

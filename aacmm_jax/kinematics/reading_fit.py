@@ -12,7 +12,7 @@ from ..core.numpy_or_jax import to_numpy
 from ..core.rotations import fitted_frame, rotation_matrix
 from ..core.units import DEG
 from .arm import Arm, is_length, joint_limits, locate, parameter_names, value_of, with_values
-from .chain import forward_pass, sines_cosines
+from .chain import forward_pass, joint_motion
 from .jacobian import rotation_columns, stacked_jacobian_columns
 from .reading_search import Evidence, Hypothesis
 
@@ -155,7 +155,7 @@ class ReadingFit:
         """Residuals, mm, and their derivatives, with the unknown geometry eliminated."""
         geometry = to_numpy(self.arm.geometry)
         geometry = geometry._replace(**with_values(geometry, vector, self._indices))
-        forward = forward_pass(geometry, sines_cosines(readings))
+        forward = forward_pass(geometry, joint_motion(geometry, readings))
         tips = np.asarray(forward.tip).T
         columns = np.moveaxis(np.asarray(stacked_jacobian_columns(forward, self._indices)), -1, 0).swapaxes(1, 2)
         if evidence.points is None:

@@ -12,6 +12,8 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from .arm import Arm, joint_limits
 from .chain import forward_pass, joint_motion, reading_units
+from .collisions import Cell, checked_cell, is_clear
+from .cones import Cones, into_cones
 from .inverse_kinematics import project_to_targets
 
 _STARTS, _SWEEPS = 256, 30
@@ -138,6 +140,8 @@ class SearchRegion(NamedTuple):
     limits: Float[np.ndarray, "n 2"]  # lowest and highest reading of each joint, rad, or mm of prismatic ones
     above: float  # height in the base frame below which no joint and no tip comes, mm
     random: np.random.Generator
+    cones: Cones | None = None  # of approach to each socket; None where the tool may have any direction
+    cell: Cell | None = None  # what the arm may not touch
 
     def draw(self, count: int) -> Float[np.ndarray, "c n"]:
         """Random configurations within the limits."""
@@ -145,10 +149,16 @@ class SearchRegion(NamedTuple):
 
 
 def search_region(
-    arm: Arm, limits: Sequence[Sequence[float]] | None, margin: float, above: float, seed: int
+    arm: Arm,
+    limits: Sequence[Sequence[float]] | None,
+    margin: float,
+    above: float,
+    seed: int,
+    cones: Cones | None = None,
+    cell: Cell | None = None,
 ) -> SearchRegion:
-    """The region ``margin`` (rad, or m of prismatic joints) inside the joint limits (default: the arm's own) and
-    ``above`` (mm) the table."""
+    """The region ``margin`` (rad, or m of prismatic joints) inside the joint limits (default: the arm's own), ``above``
+    (mm) the table, within the cones of approach and clear of the cell's obstacles."""
     if seed < 0:
         raise InputError(f"seed is {seed}; give zero or a positive number.")
     allowed = np.asarray(joint_limits(arm, limits))
@@ -157,21 +167,48 @@ def search_region(
         raise InputError(
             f"a margin of {math.degrees(margin):g} deg leaves a joint no range within its limits; give a smaller one."
         )
-    return SearchRegion(arm, allowed + margins[:, None] * np.array([1.0, -1.0]), above, np.random.default_rng(seed))
+    inner = allowed + margins[:, None] * np.array([1.0, -1.0])
+    cell = None if cell is None else checked_cell(arm, cell, inner)
+    return SearchRegion(arm, inner, above, np.random.default_rng(seed), cones, cell)
 
 
 def reached(
-    region: SearchRegion, starts: Float[np.ndarray, "c n"], targets: Float[np.ndarray, "c 3"], steps: int = _REACHING
+    region: SearchRegion,
+    starts: Float[np.ndarray, "c n"],
+    targets: Float[np.ndarray, "c 3"],
+    steps: int = _REACHING,
+    sockets: Int[np.ndarray, " c"] | None = None,
+    scattered: bool = False,
 ) -> tuple[Float[np.ndarray, "c n"], Bool[np.ndarray, " c"]]:
-    """Configurations moved from their starts to the targets, and which of them arrived and are above the table."""
-    q, arrived = project_to_targets(region.arm, starts, targets, region.limits, steps)
-    return q, arrived & (lowest_point(region.arm, q) >= region.above)
+    """Configurations moved from their starts to the targets, and which of them arrived and can be taken: above the
+    table, within the cone of approach, and clear of obstacles.
+
+    ``sockets`` says which cone belongs to each (by default the first); ``scattered`` brings tools that are outside
+    their cone to angles that fill it, not all to its edge.
+    """
+    if region.cones is None or not region.cones.any:
+        q, good = project_to_targets(region.arm, starts, targets, region.limits, steps)
+    else:
+        cones = region.cones.at(np.zeros(len(starts), dtype=int) if sockets is None else sockets)
+        if scattered:  # the area of a cap about the normal grows with the square of its angle
+            fractions = np.sqrt(region.random.uniform(size=len(starts)))
+            cones = cones._replace(half_angles=cones.half_angles * fractions)
+        q, good = into_cones(region.arm, starts, targets, region.limits, cones, steps)
+    good &= lowest_point(region.arm, q) >= region.above
+    if region.cell is not None:
+        rows = np.flatnonzero(good)
+        good[rows] = is_clear(region.cell, region.arm, q[rows])
+    return q, good
 
 
 def configurations_at(
     region: SearchRegion, points: Float[np.ndarray, "s 3"], each: int
 ) -> tuple[Float[np.ndarray, "c n"], Int[np.ndarray, " c"]]:
-    """Configurations that reach the points from ``each`` random starts a point, and the index of each one's point."""
+    """Configurations that reach the points from ``each`` random starts a point, and the index of each one's point.
+
+    With several cones, point i has the cone i; or modulo their number, for several placements of the same sockets.
+    """
     owner = np.repeat(np.arange(len(points)), each)
-    q, good = reached(region, region.draw(len(owner)), points[owner])
+    sockets = owner % (1 if region.cones is None else len(region.cones.normals))
+    q, good = reached(region, region.draw(len(owner)), points[owner], sockets=sockets, scattered=True)
     return q[good], owner[good]

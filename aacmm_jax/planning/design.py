@@ -5,20 +5,23 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..core.arrays import Numbers
-from ..core.errors import InputError, nearest
+from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
+from ..data.arm_classes import SMALL_ARM
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
-from ..data.simulation import socket_point
 from ..kinematics.arm import Arm, is_single, jacobian_at, joint_limits
+from ..kinematics.collisions import Cell
+from ..kinematics.cones import TOOL_AXIS, Cone, Cones
 from ..kinematics.parameters import Parameters
-from ..kinematics.workspace import SearchRegion, reached, search_region, total_link_length
+from ..kinematics.workspace import SearchRegion, search_region, total_link_length
 from ..uncertainty.identifiability import observability
 from ..uncertainty.volume import default_length, sample_lengths
-from .fedorov_exchange import Candidates, Kind, Objective, covariance_of, exchange
+from .fedorov_exchange import Kind, Objective, exchange
+from .motion import Motion, approaches, ordered_motion
 from .placement import (
     LEAST_POSES,
     DesignProblem,
@@ -26,8 +29,8 @@ from .placement import (
     Pool,
     Ranges,
     candidates_of,
-    check_region,
     designed_score,
+    in_order,
     moved_pool,
     neighbour,
     pool_at,
@@ -35,11 +38,12 @@ from .placement import (
     random_placements,
     random_scores,
 )
+from .plan_arguments import check_counts, check_ranges, check_retract, checked_cones, given_placement, with_table
 from .pose_refinement import refined
+from .predictions import Prediction, prediction_of, predictions
+from .unreachable import explained
 
 Criterion = Literal["length", "A", "D", "E"]
-MORE = 10  # poses added in the prediction `Plan.more`
-SMALL_ARM = Noise(encoder_arcsec=2.0, seating=0.005)  # a small commercial arm
 OBJECTIVES: dict[Criterion, tuple[Kind, float]] = {
     "length": ("functions", 8.0),
     "A": ("trace", 0.0),
@@ -51,28 +55,18 @@ _OBJECTIVE_LENGTHS, _PREDICTION_LENGTHS = 300, 400  # predictions use other leng
 _PLACEMENTS, _DESIGNED, _NEIGHBOURS, _STARTS = 600, 10, 200, 1000
 _BLOCK = 25  # placements scored together
 _LEAST_CANDIDATES = 20  # in a socket
-_RANDOM_SETS, _LOOSE_SETS = 50, 10
-_LOOSE = math.radians(5)
-_U_RANGE = (1e-6, 100.0)  # mm
 
 Progress = Callable[[str, float], None]
 
 
-class Prediction(NamedTuple):
-    """Median and largest standard uncertainty that the calibration would add to lengths over the volume, mm."""
-
-    median: float
-    largest: float
-
-
 class Plan(NamedTuple):
-    """Poses to take. Arrays are of NumPy: q in rad, positions in mm."""
+    """Poses to take, in their order. Arrays are of NumPy: q in rad, positions in mm."""
 
     arm: Arm
     names: tuple[str, ...]  # free parameters
-    sockets: dict[str, tuple[float, float, float]]
+    sockets: dict[str, tuple[float, float, float]]  # in the order in which the arm visits them
     q: Float[np.ndarray, "N n"]
-    owner: Int[np.ndarray, " N"]  # index of each pose's socket
+    owner: Int[np.ndarray, " N"]  # index of each pose's socket; the poses of a socket follow each other
     lengths: tuple[ReferenceLength, ...]
     noise: Noise
     criterion: Criterion
@@ -81,6 +75,11 @@ class Plan(NamedTuple):
     random: Prediction  # median over sets of as many random poses in the same sockets
     loose: Prediction  # the same plan with joints off by 5 deg (standard deviation)
     more: Prediction  # with ten more poses
+    unconstrained: Prediction | None  # for the same sockets without cones, obstacles and approach points
+    cones: Cones  # of approach, in the order of the sockets
+    cell: Cell | None  # what the poses keep clear of
+    retract: float  # distance of the approach points from the sockets, mm; 0 where there are none
+    motion: Motion
 
     def capture(self) -> Capture:
         """The plan as a noise-free capture."""
@@ -102,6 +101,11 @@ def plan(
     margin: float = math.radians(5),
     above: float = 0.0,
     limits: Sequence[Sequence[float]] | None = None,
+    cone: Cone | Mapping[str, Cone] | None = None,
+    tool_axis: tuple[float, float, float] = TOOL_AXIS,
+    cell: Cell | None = None,
+    retract: float = 0.0,
+    unconstrained: bool = False,
     candidates: int = 3000,
     check_length: float | None = None,
     seed: int = 0,
@@ -110,8 +114,9 @@ def plan(
     """Choose the poses that determine an arm best in a joint calibration weighted by ``noise``.
 
     Candidate configurations reach the sockets from random starts; the best set is chosen by Fedorov's exchange (1972)
-    and then refined by a gradient method with the tips kept in their sockets. Obstacles, the arm's own body and the
-    side from which a socket can be entered are not considered.
+    and then refined by a gradient method with the tips kept in their sockets. Poses outside their cone of approach, or
+    that touch an obstacle or the arm itself, are no candidates. The order is one of little joint travel, socket after
+    socket, in which the straight moves of the joints between poses hit nothing where there is such an order.
 
     Args:
         arm: The arm, not a batch.
@@ -129,7 +134,15 @@ def plan(
             covariance in natural steps (1 mm, 1 mrad).
         margin: Distance of the joints from their limits, rad.
         above: Height in the base frame below which no joint and no tip comes (the table), mm; ``-math.inf`` for none.
+            With a ``cell`` the body's capsules stay above it too.
         limits: Lowest and highest reading of each joint, rad (default: the arm's own).
+        cone: Directions from which the tool may come to the sockets: one `Cone` for all or socket name -> `Cone`; by
+            default all directions, with (0, 0, 1) as the normal.
+        tool_axis: Axis of the last frame that points from the tool into a socket.
+        cell: The arm's body and the obstacles that it may not touch; by default nothing is checked.
+        retract: Distance along the normal from the socket to the approach point of each pose, mm; 0 for none.
+        unconstrained: Whether to predict also what poses in the same sockets without cones, cell and approach points
+            would give.
         candidates: Number of candidate configurations.
         check_length: Length that predictions are of, mm (as in `volumetric_uncertainty`).
         seed: Seed of the search.
@@ -149,17 +162,19 @@ def plan(
         arm = arm.replace(beta=np.zeros(arm.joints))
     check_length = default_length(arm) if check_length is None else check_length
     check_plannable(arm, criterion, noise)
-    _check_counts(sockets, poses, len(space.names), u, lengths)
+    check_counts(sockets, poses, len(space.names), u, lengths)
+    check_retract(retract)
     ranges = {"z": (0.0, np.inf)} if region is None else region
     own = (length, length) if isinstance(length, int | float) else length
     if isinstance(sockets, Mapping):
-        names, placement = _given_placement(sockets, u, lengths)
+        names, placement = given_placement(sockets, u, lengths)
     else:
         names = [chr(ord("A") + i) if sockets <= 26 else f"S{i + 1}" for i in range(sockets)]
         placement = None
-        _check_ranges(arm, own, lengths, ranges)
-    problem, predicted_functions = design_problem(
-        search_region(to_numpy(arm), limits, margin, above, seed),
+        check_ranges(arm, own, lengths, ranges)
+    cones = checked_cones(cone, names, tool_axis)
+    problem, functions = design_problem(
+        search_region(to_numpy(arm), limits, margin, above, seed, cones, with_table(cell, above)),
         to_numpy(space),
         to_numpy(noise),
         criterion,
@@ -168,13 +183,15 @@ def plan(
     )
     if placement is None:
         placement = _best_placement(problem, len(names), poses, own, u, ranges, report)
-    pool = _pool(problem, placement, candidates)
-    possible = candidates_of(problem, placement, pool)
-    rows = exchange(
-        possible, poses, problem.objective, least=LEAST_POSES, progress=lambda done: report("Choosing poses", done)
-    )
-    q, owner = _sorted(pool.q[rows], pool.owner[rows])
-    q = refined(problem, placement, q, owner, lambda done: report("Moving poses", done))
+    pool, q, owner = _chosen(problem, placement, names, poses, candidates, retract, report)
+    order, motion = ordered_motion(problem.region, q, owner, cones.normals[owner], retract)
+    visited = np.array(list(dict.fromkeys(owner[order].tolist())))
+    q, owner = q[order], np.argsort(visited)[owner[order]]
+    placement, cones = in_order(placement, visited), cones.at(visited)
+    if isinstance(sockets, Mapping):  # names of sockets that were placed are given out in their order
+        names = [names[i] for i in visited]
+    problem = problem._replace(region=problem.region._replace(cones=cones))
+    possible = candidates_of(problem, placement, pool._replace(owner=np.argsort(visited)[pool.owner]))
     found = Plan(
         arm=arm,
         names=space.names,
@@ -188,12 +205,53 @@ def plan(
         noise=noise,
         criterion=criterion,
         check_length=check_length,
-        **_predictions(problem, placement, possible, q, owner, predicted_functions),
+        **predictions(problem, placement, possible, q, owner, functions),
+        unconstrained=None,
+        cones=cones,
+        cell=problem.region.cell,
+        retract=retract,
+        motion=motion,
     )
     unseen = observability(arm, found.capture(), space)
     if unseen.rank < len(space.names):
         raise InputError(f"no {poses} poses in these sockets determine the parameters. {' '.join(unseen.sentences())}")
+    if unconstrained:
+        free = problem._replace(region=problem.region._replace(cones=None, cell=None))
+        _, q, owner = _chosen(free, placement, names, poses, candidates, 0.0, report)
+        at = candidates_of(free, placement, pool_of(free, q, owner))
+        found = found._replace(unconstrained=prediction_of(at, at.rows, functions))
     return found
+
+
+def _chosen(
+    problem: DesignProblem,
+    placement: FixturePlacement,
+    names: Sequence[str],
+    poses: int,
+    count: int,
+    retract: float,
+    report: Progress,
+) -> tuple[Pool, Float[np.ndarray, "N n"], Int[np.ndarray, " N"]]:
+    """The candidates for a placement, and the best poses found."""
+    region = problem.region
+
+    def approachable(q: np.ndarray, owner: np.ndarray) -> Bool[np.ndarray, " c"]:
+        if not retract or region.cones is None:
+            return np.ones(len(q), dtype=bool)
+        return approaches(region, q, region.cones.normals[owner], retract).possible
+
+    pool = pool_at(problem, placement.points, max(count // len(placement.points), 50))
+    pool = pool.at(approachable(pool.q, pool.owner))
+    few = np.flatnonzero(np.bincount(pool.owner, minlength=len(names)) < _LEAST_CANDIDATES)
+    if len(few):
+        raise InputError(explained(region, names, placement.points, int(few[0]), _LEAST_CANDIDATES, retract))
+    possible = candidates_of(problem, placement, pool)
+    rows = exchange(
+        possible, poses, problem.objective, least=LEAST_POSES, progress=lambda done: report("Choosing poses", done)
+    )
+    owner = pool.owner[rows]
+    q = refined(problem, placement, pool.q[rows], owner, lambda done: report("Moving poses", done), approachable)
+    return pool, q, owner
 
 
 def design_problem(
@@ -227,63 +285,6 @@ def check_plannable(arm: Arm, criterion: str, noise: Noise) -> None:
     noise.check(arm.joints)
 
 
-def _check_counts(sockets: int | Mapping, poses: int, parameters: int, u: float, lengths: Sequence[tuple]) -> None:
-    for own in (u, *(float(pair[2]) for pair in lengths if len(pair) > 2)):
-        if not _U_RANGE[0] <= own <= _U_RANGE[1]:
-            raise InputError(
-                f"u of a reference length is {own:g} mm; give a standard uncertainty from {_U_RANGE[0]:g} to "
-                f"{_U_RANGE[1]:g} mm."
-            )
-    number = len(sockets) if isinstance(sockets, Mapping) else sockets
-    if number < 1 or poses < LEAST_POSES * number:
-        raise InputError(
-            f"{poses} poses are too few for {number} sockets; give one socket or more, and {LEAST_POSES} poses in each."
-        )
-    unknowns = parameters + 3 * number - (len(lengths) if isinstance(sockets, Mapping) else number // 2)
-    if 3 * poses < unknowns:
-        raise InputError(
-            f"{poses} poses in {number} sockets give fewer equations than the {unknowns} unknowns; take "
-            f"{-(-unknowns // 3)} at least."
-        )
-
-
-def _given_placement(
-    sockets: Mapping[str, Numbers], u: float, lengths: Sequence[tuple]
-) -> tuple[list[str], FixturePlacement]:
-    """Names and placement of sockets whose positions are given."""
-    points = {name: np.asarray(socket_point(name, point)) for name, point in sockets.items()}
-    names = list(points)
-    for pair in lengths:
-        for end in pair[:2]:
-            if end not in names:
-                raise InputError(
-                    f"reference length {pair[0]}, {pair[1]} names the unknown socket '{end}'{nearest(end, names)}"
-                )
-    if len({frozenset(pair[:2]) for pair in lengths}) < len(lengths):
-        raise InputError("a reference length is named twice; its certified value counts once, so name it once.")
-    if any(len(set(pair[:2])) < 2 for pair in lengths):
-        raise InputError("a reference length joins a socket to itself; name two different sockets.")
-    for i, one in enumerate(names):
-        for other in names[:i]:
-            if np.linalg.norm(points[one] - points[other]) < 1:
-                raise InputError(f"sockets '{other}' and '{one}' are in the same position; move one, or leave it out.")
-    ends = tuple((names.index(pair[0]), names.index(pair[1])) for pair in lengths)
-    own = tuple(float(pair[2]) if len(pair) > 2 else u for pair in lengths)
-    return names, FixturePlacement(np.array(list(points.values())), ends, own)
-
-
-def _check_ranges(arm: Arm, length: tuple[float, float], lengths: Sequence[tuple], ranges: Ranges) -> None:
-    """Raise `InputError` where the sockets cannot be placed."""
-    if lengths:
-        raise InputError("lengths are between sockets that are given; with a number of sockets, give length and u.")
-    check_region(ranges)
-    low, high = length
-    if not 0 < low <= high < 2 * total_link_length(arm):
-        raise InputError(
-            f"a reference length of {low:g} to {high:g} mm does not fit this arm; give one shorter than its reach."
-        )
-
-
 def _best_placement(
     problem: DesignProblem,
     sockets: int,
@@ -303,8 +304,11 @@ def _best_placement(
         report(stage, 0.4 * len(scores) / len(placements))
     order = [i for i in np.argsort(scores) if np.isfinite(scores[i])][:_DESIGNED]
     if not order:
+        limited = problem.region.cell is not None or (problem.region.cones is not None and problem.region.cones.any)
+        wider = ", wider cones, or fewer obstacles" if limited else ""
         raise InputError(
-            "no placement was found that can be reached well; give a region nearer to the arm, or a shorter length."
+            "no placement was found that can be reached well; give a region nearer to the arm, or a shorter "
+            f"length{wider}."
         )
     each = _STARTS // sockets
     best, best_pool, best_score = placements[order[0]], None, np.inf
@@ -324,76 +328,3 @@ def _best_placement(
             best, best_pool, best_score = placement, pool, score
     report(stage, 1.0)
     return best
-
-
-def _pool(problem: DesignProblem, placement: FixturePlacement, count: int) -> Pool:
-    """Configurations to choose from."""
-    pool = pool_at(problem, placement.points, max(count // len(placement.points), 50))
-    for i, point in enumerate(placement.points):
-        if np.sum(pool.owner == i) < _LEAST_CANDIDATES:
-            where = ", ".join(f"{round(float(x)):.6g}" for x in point)
-            raise InputError(
-                f"socket {i + 1} at ({where}) mm cannot be reached in enough poses within the joint limits and their "
-                "margin; move it."
-            )
-    return pool
-
-
-def _sorted(q: Float[np.ndarray, "N n"], owner: Int[np.ndarray, " N"]) -> tuple[np.ndarray, np.ndarray]:
-    order = order_of(q, owner)
-    return q[order], owner[order]
-
-
-def order_of(q: Float[np.ndarray, "N n"], owner: Int[np.ndarray, " N"]) -> list[int]:
-    """Socket after socket, and in each from pose to nearest pose, so that the arm moves little."""
-    order: list[int] = []
-    for socket in range(owner.max() + 1):
-        left = np.flatnonzero(owner == socket).tolist()
-        current = min(left, key=lambda i: np.abs(q[i]).sum())
-        while left:
-            left.remove(current)
-            order.append(current)
-            if left:
-                current = min(left, key=lambda i: np.abs(q[i] - q[current]).max())
-    return order
-
-
-def _predictions(
-    problem: DesignProblem,
-    placement: FixturePlacement,
-    pool: Candidates,
-    q: Float[np.ndarray, "N n"],
-    owner: Int[np.ndarray, " N"],
-    functions: Float[np.ndarray, "v p"],
-) -> dict[str, Prediction]:
-    """Predictions for the plan, for random poses in its sockets, for imprecise poses, and for ten more poses."""
-    region, random = problem.region, problem.region.random
-
-    def predicted(rows: Float[np.ndarray, "m 3 P"]) -> Prediction:
-        covariance = covariance_of(pool.information(rows), pool.parameters)
-        u = np.sqrt(np.einsum("vp,pq,vq->v", functions, covariance, functions))
-        return Prediction(float(np.median(u)), float(u.max()))
-
-    def typical(sets: list[Prediction]) -> Prediction:
-        return Prediction(*(float(np.median(column)) for column in zip(*sets, strict=True)))
-
-    planned = candidates_of(problem, placement, pool_of(problem, q, owner))
-    counts = np.bincount(owner, minlength=len(placement.points))
-    random_sets = []
-    for _ in range(_RANDOM_SETS):
-        rows = [random.choice(np.flatnonzero(pool.owner == i), count) for i, count in enumerate(counts)]
-        random_sets.append(predicted(pool.rows[np.concatenate(rows)]))
-    starts = np.tile(q, (_LOOSE_SETS, 1)) + _LOOSE * random.normal(size=(_LOOSE_SETS * len(q), q.shape[1]))
-    owners = np.tile(owner, _LOOSE_SETS)
-    near, possible = reached(region, starts, placement.points[owners])
-    near = np.where(possible[:, None], near, np.tile(q, (_LOOSE_SETS, 1)))
-    loose = candidates_of(problem, placement, pool_of(problem, near, owners)).rows
-    loose_sets = [predicted(rows) for rows in np.split(loose, _LOOSE_SETS)]
-    base = planned.information(planned.rows)
-    added = exchange(pool._replace(base=base), MORE, problem.objective, least=0, sweeps=1)
-    return {
-        "predicted": predicted(planned.rows),
-        "random": typical(random_sets),
-        "loose": typical(loose_sets),
-        "more": predicted(np.concatenate([planned.rows, pool.rows[added]])),
-    }

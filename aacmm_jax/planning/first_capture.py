@@ -15,7 +15,7 @@ from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise, tip_covariances
 from ..data.observations.measured_points import MeasuredPoints
 from ..kinematics.arm import Arm, jacobian_at, joint_limits, parameter_names
-from ..kinematics.chain import sines_cosines
+from ..kinematics.chain import joint_motion
 from ..kinematics.independence import generic_poses
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import search_region
@@ -147,7 +147,7 @@ def first_capture(arm: Arm, noise: Noise, arm_class: str = "") -> FirstCapture:
     functions = np.einsum(
         "vc,vcp->vp", along, jacobian_at(arm, end, space.names) - jacobian_at(arm, start, space.names)
     ) * np.asarray(space.scale)
-    both = sum(np.asarray(tip_covariances(arm.geometry, sines_cosines(q), noise)) for q in (start, end))
+    both = sum(np.asarray(tip_covariances(arm.geometry, joint_motion(arm.geometry, q), noise)) for q in (start, end))
     u_reading = float(np.median(np.sqrt(np.einsum("vc,cdv,vd->v", along, both, along))))
     problem = DesignProblem(
         search_region(arm, None, 0.0, -np.inf, 0), space, noise, Objective("functions", functions, 0.0)

@@ -15,29 +15,26 @@ from jaxtyping import Float, Int
 from ..calibration.observed_evaluation import fit_geometry
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
+from ..data.arm_classes import SMALL_ARM
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation, AbstractSimulated
 from ..kinematics.arm import Arm, is_single, joint_limits
+from ..kinematics.collisions import Cell
+from ..kinematics.cones import TOOL_AXIS, Cone, cones_of
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import reached, search_region
 from ..model.observed import Observed, certified_and_lengths, linear_rows, whitening_of
 from ..uncertainty.identifiability import observability
 from ..uncertainty.observed_covariance import arm_errors, covariance_of_noise, stacked
 from ..uncertainty.volume import default_length
-from .design import (
-    MORE,
-    SMALL_ARM,
-    Criterion,
-    Prediction,
-    Progress,
-    check_plannable,
-    design_problem,
-    order_of,
-)
+from .design import Criterion, Progress, check_plannable, design_problem
 from .fedorov_exchange import Candidates, covariance_of, exchange
-from .kit_placement import KitItem, place, region_of, set_up
+from .kit_placement import KitItem, PlacedKit, approachable, place, region_of, set_up
+from .motion import Motion, ordered_motion
 from .placement import PRIOR, DesignProblem, Ranges, check_region
+from .plan_arguments import check_retract, with_table
+from .predictions import MORE, Prediction, prediction_of
 
 _LEAST_U = 1e-4  # mm: an exact certified value would be a row of infinite weight
 _START_AGREES = 0.1  # mm or rad: a start of the geometry that is farther off is fitted
@@ -62,6 +59,10 @@ class KitPlan(NamedTuple):
     loose: Prediction  # the same plan with joints off by 5 deg (standard deviation)
     more: Prediction  # with ten more poses
     without: dict[str, Prediction]  # by what is left out; infinite where the rest does not determine the arm
+    motions: tuple[Motion, ...] = ()  # of each observation, its poses in their order
+    cell: Cell | None = None  # what the poses keep clear of
+    retract: float = 0.0  # distance of approach points, mm
+    unconstrained: Prediction | None = None  # in the same places without cones, obstacles and approach points
 
     @property
     def poses(self) -> int:
@@ -85,6 +86,10 @@ def plan_kit(
     margin: float = math.radians(5),
     above: float = 0.0,
     limits: Sequence[Sequence[float]] | None = None,
+    tool_axis: tuple[float, float, float] = TOOL_AXIS,
+    cell: Cell | None = None,
+    retract: float = 0.0,
+    unconstrained: bool = False,
     candidates: int = 2000,
     check_length: float | None = None,
     seed: int = 0,
@@ -108,6 +113,11 @@ def plan_kit(
         margin: Distance of the joints from their limits, rad.
         above: Height in the base frame below which no joint and no tip comes, mm.
         limits: Lowest and highest reading of each joint, rad (default: the arm's own).
+        tool_axis: Axis of the last frame that points from the tool into a seat, for the cones of the items.
+        cell: The arm's body and the obstacles that it may not touch; by default nothing is checked.
+        retract: Distance of the approach points of items with a cone along their normal, mm; 0 for none.
+        unconstrained: Whether to predict also what poses in the same places without cones, cell and approach points
+            would give.
         candidates: Number of candidate configurations.
         check_length: Length that predictions are of, mm.
         seed: Seed of the search.
@@ -126,10 +136,13 @@ def plan_kit(
     items = _checked(kit)
     ranges = {"z": (0.0, np.inf)} if region is None else region
     check_region(ranges)
+    check_retract(retract)
     space = Parameters.free_of(arm) if space is None else space
     check_length = default_length(arm) if check_length is None else check_length
     problem, functions = design_problem(
-        search_region(to_numpy(arm), limits, margin, above, seed),
+        search_region(
+            to_numpy(arm), limits, margin, above, seed, cones_of([Cone()], tool_axis), with_table(cell, above)
+        ),
         to_numpy(space),
         to_numpy(noise),
         criterion,
@@ -137,18 +150,19 @@ def plan_kit(
         seed,
     )
     placed = place(problem, items, poses, ranges, candidates_of_kit, report)
-    pool = [set_up(problem.region, one, candidates // len(placed.kit)) for one in placed.kit]
+    pool = _pool(problem, placed, candidates, retract)
     least = least_poses(pool)
     if poses < least.sum():
         raise InputError(
             f"{poses} poses are too few for this kit; give {least.sum()} at least, or leave something out."
         )
-    chosen = _chosen(problem, placed.kit, pool, poses, least, report)
+    chosen = _chosen(problem, placed, pool, poses, least, retract, report)
+    chosen, motions = _in_order(problem, placed, chosen, retract)
     capture = Capture({}, (), chosen)
     unseen = observability(arm, capture, space)
     if unseen.rank < len(space.names):
         raise InputError(f"this kit does not determine the parameters. {' '.join(unseen.sentences())}")
-    return KitPlan(
+    found = KitPlan(
         arm=arm,
         names=space.names,
         kit=placed.kit,
@@ -157,8 +171,45 @@ def plan_kit(
         noise=noise,
         criterion=criterion,
         check_length=check_length,
-        **_predictions(problem, placed.kit, placed.parts, pool, chosen, functions),
+        **_predictions(problem, placed, pool, chosen, functions),
+        motions=motions,
+        cell=problem.region.cell,
+        retract=retract,
     )
+    if unconstrained:
+        free = problem._replace(region=problem.region._replace(cell=None))
+        anywhere = placed._replace(items=tuple(item._replace(half_angle=math.pi) for item in placed.items))
+        pool = _pool(free, anywhere, candidates, 0.0)
+        at = candidates_of_kit(free, _chosen(free, anywhere, pool, poses, least, 0.0, report))
+        found = found._replace(unconstrained=prediction_of(at, at.rows, functions))
+    return found
+
+
+def _pool(problem: DesignProblem, placed: PlacedKit, count: int, retract: float) -> list[AbstractObservation]:
+    """Poses to choose from in everything."""
+    each = count // len(placed.kit)
+    return [
+        set_up(problem.region, one, each, item=item, retract=retract)
+        for one, item in zip(placed.kit, placed.items, strict=True)
+    ]
+
+
+def _in_order(
+    problem: DesignProblem, placed: PlacedKit, chosen: Sequence[AbstractObservation], retract: float
+) -> tuple[list[AbstractObservation], tuple[Motion, ...]]:
+    """Each observation with its poses in the order in which to take them, place after place, and how the arm moves.
+
+    What has no cone has no normal either, and its tilts are not numbers.
+    """
+    ordered, motions = [], []
+    for simulated, item, one in zip(placed.kit, placed.items, chosen, strict=True):
+        region, q = region_of(problem.region, simulated, item), np.asarray(one.q)
+        assert region.cones is not None
+        normals = np.tile(region.cones.normals, (len(q), 1))
+        order, motion = ordered_motion(region, q, one.places, normals, retract if item.has_cone else 0.0)
+        ordered.append(one.select(order))
+        motions.append(motion if item.has_cone else motion._replace(tilt=np.full(len(q), np.nan)))
+    return ordered, tuple(motions)
 
 
 def _checked(kit: Sequence[KitItem | AbstractSimulated]) -> list[KitItem]:
@@ -170,6 +221,7 @@ def _checked(kit: Sequence[KitItem | AbstractSimulated]) -> list[KitItem]:
             raise InputError(
                 f"{item.simulated!r} cannot be planned; give one of aj.data.observations, such as SimulatedArtefact."
             )
+        cones_of([Cone(item.half_angle, item.normal)])  # refuses what is no cone
         if item.places < 0:
             raise InputError(f"'{item.simulated.name}' has {item.places} places; give 0, which leaves it, or more.")
     names = [item.simulated.name for item in items]
@@ -217,10 +269,11 @@ def candidates_of_kit(problem: DesignProblem, observations: Sequence[AbstractObs
 
 def _chosen(
     problem: DesignProblem,
-    kit: Sequence[AbstractSimulated],
+    placed: PlacedKit,
     pool: list[AbstractObservation],
     poses: int,
     least: Int[np.ndarray, " s"],
+    retract: float,
     report: Progress,
 ) -> list[AbstractObservation]:
     """The best poses of the pool, then the best of these and of poses near them."""
@@ -235,9 +288,12 @@ def _chosen(
         if best is None or value < best_value:
             best, best_value = _taken(pool, rows), value
         if number < _ROUNDS:
-            pool = [_near(problem, one, chosen) for one, chosen in zip(kit, best, strict=True)]
+            pool = [
+                _near(problem, one, item, chosen, retract)
+                for one, item, chosen in zip(placed.kit, placed.items, best, strict=True)
+            ]
     assert best is not None
-    return [one.select(order_of(np.asarray(one.q), one.places)) for one in best]
+    return best
 
 
 def _taken(pool: Sequence[AbstractObservation], rows: Int[np.ndarray, " N"]) -> list[AbstractObservation]:
@@ -250,12 +306,15 @@ def _taken(pool: Sequence[AbstractObservation], rows: Int[np.ndarray, " N"]) -> 
     return found
 
 
-def _near(problem: DesignProblem, simulated: AbstractSimulated, chosen: AbstractObservation) -> AbstractObservation:
+def _near(
+    problem: DesignProblem, simulated: AbstractSimulated, item: KitItem, chosen: AbstractObservation, retract: float
+) -> AbstractObservation:
     """The poses of an observation, and others near each: joints changed, and the tip brought back."""
-    region, q = region_of(problem.region, simulated), np.asarray(chosen.q)
+    region, q = region_of(problem.region, simulated, item), np.asarray(chosen.q)
     which = np.repeat(np.arange(len(q)), _NEIGHBOURS)
     starts = q[which] + _NEAR * region.random.normal(size=(len(which), q.shape[1]))
     moved, good = reached(region, starts, np.asarray(region.arm.position(q))[which])
+    good[good] = approachable(region, moved[good], item, retract)
     rows = np.concatenate([np.arange(len(q)), which[good]])
     order = np.argsort(chosen.places[rows], kind="stable")
     return with_readings(chosen.select(rows[order]), np.concatenate([q, moved[good]])[order])
@@ -266,17 +325,18 @@ def with_readings(observation: AbstractObservation, q: Float[np.ndarray, "m n"])
     return eqx.tree_at(lambda one: one.q, observation, q)
 
 
-def _loosened(problem: DesignProblem, simulated: AbstractSimulated, chosen: AbstractObservation) -> AbstractObservation:
+def _loosened(
+    problem: DesignProblem, simulated: AbstractSimulated, item: KitItem, chosen: AbstractObservation
+) -> AbstractObservation:
     """The same poses, with joints off by some degrees and the tip brought back."""
-    region, q = region_of(problem.region, simulated), np.asarray(chosen.q)
+    region, q = region_of(problem.region, simulated, item), np.asarray(chosen.q)
     moved, good = reached(region, q + _LOOSE * region.random.normal(size=q.shape), np.asarray(region.arm.position(q)))
     return with_readings(chosen, np.where(good[:, None], moved, q))
 
 
 def _predictions(
     problem: DesignProblem,
-    kit: Sequence[AbstractSimulated],
-    parts: Sequence[str],
+    placed: PlacedKit,
     pool: list[AbstractObservation],
     chosen: list[AbstractObservation],
     functions: Float[np.ndarray, "v p"],
@@ -285,9 +345,7 @@ def _predictions(
     random = problem.region.random
 
     def predicted(candidates: Candidates, rows: Float[np.ndarray, "m r P"]) -> Prediction:
-        covariance = covariance_of(candidates.information(rows), candidates.parameters)
-        u = np.sqrt(np.einsum("vp,pq,vq->v", functions, covariance, functions))
-        return Prediction(float(np.median(u)), float(u.max()))
+        return prediction_of(candidates, rows, functions)
 
     def typical(sets: list[Prediction]) -> Prediction:
         return Prediction(*(float(np.median(column)) for column in zip(*sets, strict=True)))
@@ -303,13 +361,14 @@ def _predictions(
         rows = [random.choice(np.flatnonzero(possible.owner == i), count) for i, count in enumerate(counts)]
         random_sets.append(predicted(possible, possible.rows[np.concatenate(rows)]))
     loose_sets = [
-        of([_loosened(problem, one, poses) for one, poses in zip(kit, chosen, strict=True)]) for _ in range(_LOOSE_SETS)
+        of([_loosened(problem, *parts) for parts in zip(placed.kit, placed.items, chosen, strict=True)])
+        for _ in range(_LOOSE_SETS)
     ]
     base = planned.information(planned.rows)
     added = exchange(possible._replace(base=base), MORE, problem.objective, least=0, sweeps=1)
     without = {}
-    for part in dict.fromkeys(parts) if len(set(parts)) > 1 else ():
-        left = [one for one, of_part in zip(chosen, parts, strict=True) if of_part != part]
+    for part in dict.fromkeys(placed.parts) if len(set(placed.parts)) > 1 else ():
+        left = [one for one, of_part in zip(chosen, placed.parts, strict=True) if of_part != part]
         seen = observability(problem.arm, Capture({}, (), left), problem.space)
         complete = seen.rank == len(problem.space.names)
         without[part] = of(left) if complete else Prediction(math.inf, math.inf)

@@ -1,19 +1,22 @@
 """Where to put what is in a kit: random placements, ranked by the poses that they allow, then moved a little."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.rotations import rotation_vector
 from ..data.observations.observation import AbstractObservation, AbstractSimulated
+from ..kinematics.cones import TOOL_AXIS, Cone, cones_of
 from ..kinematics.workspace import SearchRegion, reached, total_link_length
 from .fedorov_exchange import Candidates, relaxed_value
+from .motion import approaches
 from .placement import DesignProblem, Ranges, inside
 
 _PLACEMENTS, _DESIGNED, _NEIGHBOURS = 120, 8, 60
@@ -33,6 +36,14 @@ class KitItem(NamedTuple):
     simulated: AbstractSimulated
     places: int = 1  # how many placements to choose; 0 leaves it where it is
     turned: Literal["any", "vertical", "not"] = "any"  # about which axes it may be turned
+    half_angle: float = math.pi  # of the cone from which the tool comes to it, rad
+    # Out of its seats: in an artefact's own frame, for everything else in the base frame.
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    @property
+    def has_cone(self) -> bool:
+        """Whether it can be approached from some directions only."""
+        return self.half_angle < math.pi
 
 
 class PlacedKit(NamedTuple):
@@ -40,6 +51,7 @@ class PlacedKit(NamedTuple):
 
     kit: tuple[AbstractSimulated, ...]
     parts: tuple[str, ...]
+    items: tuple[KitItem, ...]
 
 
 class _Layout(NamedTuple):
@@ -56,21 +68,37 @@ class _WithoutErrors(np.random.Generator):
         return loc + 0.0 * scale * np.zeros(() if size is None else size)
 
 
-def region_of(region: SearchRegion, simulated: AbstractSimulated) -> SearchRegion:
-    """The region of the tip that an observation holds."""
-    return region if simulated.offset is None else region._replace(arm=region.arm.replace(probe=simulated.offset))
+def region_of(region: SearchRegion, simulated: AbstractSimulated, item: KitItem | None = None) -> SearchRegion:
+    """The region of the tip that an observation holds, with the cone of its item."""
+    if simulated.offset is not None:
+        region = region._replace(arm=region.arm.replace(probe=simulated.offset))
+    if item is None:
+        return region
+    normal = np.asarray(simulated.orientation) @ np.asarray(item.normal, dtype=float)
+    axis = TOOL_AXIS if region.cones is None else tuple(region.cones.tool_axis.tolist())
+    return region._replace(cones=cones_of([Cone(item.half_angle, tuple(normal.tolist()))], axis))
 
 
-def set_up(region: SearchRegion, simulated: AbstractSimulated, starts: int, share: float = 0.0) -> AbstractObservation:
+def set_up(
+    region: SearchRegion,
+    simulated: AbstractSimulated,
+    starts: int,
+    share: float = 0.0,
+    item: KitItem | None = None,
+    retract: float = 0.0,
+) -> AbstractObservation:
     """Poses in one thing from random starts, as the observation that they would give without errors of the arm.
 
-    Raises `InputError` where a place is reached from fewer than this ``share`` of the starts, or hardly ever.
+    ``item`` says from which cone it is approached, and ``retract`` how far its approach points are, mm. Raises
+    `InputError` where a place is reached from fewer than this ``share`` of the starts, or hardly ever.
     """
-    own = region_of(region, simulated)
+    own = region_of(region, simulated, item)
     each = len(_repeated(simulated, 1).tips(np.random.default_rng(0)))
     many = _repeated(simulated, max(starts // each, 2 * _LEAST_CANDIDATES))
     tips = many.tips(region.random)
-    q, good = reached(own, own.draw(len(tips)), tips)
+    q, good = reached(own, own.draw(len(tips)), tips, scattered=True)
+    if item is not None:
+        good[good] = approachable(own, q[good], item, retract)
     transforms = np.asarray(own.arm.pose(q)).copy()
     transforms[:, :3, 3] = tips
     # In NumPy: every number of poses would be another program of JAX.
@@ -79,11 +107,22 @@ def set_up(region: SearchRegion, simulated: AbstractSimulated, starts: int, shar
     tried = np.bincount(whole.places)
     if np.any(counts < np.maximum(share * tried, _LEAST_CANDIDATES)):
         where = ", ".join(f"{round(float(x)):.6g}" for x in tips[whole.places == int(np.argmin(counts / tried))][0])
+        cone = f", its cone of {math.degrees(item.half_angle):.3g} deg" if item is not None and item.has_cone else ""
+        clear = ", or clear of obstacles and of itself" if region.cell is not None else ""
         raise InputError(
             f"'{simulated.name}' at ({where}) mm cannot be reached in enough poses within the joint limits and their "
-            "margin; move it, or make its box smaller."
+            f"margin{cone}{clear}; move it, or make its {'cone wider' if cone else 'box smaller'}."
         )
     return whole.select(np.flatnonzero(good))
+
+
+def approachable(
+    region: SearchRegion, q: Float[np.ndarray, "c n"], item: KitItem, retract: float
+) -> Bool[np.ndarray, " c"]:
+    """Which poses of an item can be taken by way of their approach points; all where it has none."""
+    if not (retract and item.has_cone and region.cones is not None):
+        return np.ones(len(q), dtype=bool)
+    return approaches(region, q, np.tile(region.cones.normals, (len(q), 1)), retract).possible
 
 
 def place(
@@ -106,10 +145,11 @@ def place(
         movable += [(item, f"{item.simulated.name}/{i + 1}" if item.places > 1 else item.simulated.name)
                     for i in range(max(item.places, 1))]  # fmt: skip
     standing = tuple(item.simulated for item in items)
+    owners = tuple(item for item, _ in movable)
     if not any(item.places for item in items):
-        return PlacedKit(standing, tuple(parts))
+        return PlacedKit(standing, tuple(parts), owners)
     search = _Search(problem, movable, poses, ranges, candidates_of)
-    return PlacedKit(search.best(report).kit, tuple(parts))
+    return PlacedKit(search.best(report).kit, tuple(parts), owners)
 
 
 class _Search(NamedTuple):
@@ -165,12 +205,12 @@ class _Search(NamedTuple):
     ) -> list[AbstractObservation] | None:
         """Poses in everything, those of what has not moved kept; None where something is hard to reach."""
         found = []
-        for i, (simulated, frame) in enumerate(zip(layout.kit, layout.frames, strict=True)):
+        for i, (simulated, frame, (item, _)) in enumerate(zip(layout.kit, layout.frames, self.things, strict=True)):
             if before is not None and known is not None and frame is before.frames[i]:
                 found.append(known[i])
                 continue
             try:
-                found.append(set_up(self.problem.region, simulated, starts, 0.0 if frame is None else _REACHED))
+                found.append(set_up(self.problem.region, simulated, starts, 0.0 if frame is None else _REACHED, item))
             except InputError:
                 if frame is None:
                     raise

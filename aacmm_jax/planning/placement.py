@@ -53,6 +53,13 @@ class FixturePlacement(NamedTuple):
     u: tuple[float, ...]
 
 
+def in_order(placement: FixturePlacement, sockets: Int[np.ndarray, " s"]) -> FixturePlacement:
+    """The same sockets in another order."""
+    place = np.argsort(sockets).tolist()
+    ends = tuple((place[start], place[end]) for start, end in placement.ends)
+    return FixturePlacement(placement.points[sockets], ends, placement.u)
+
+
 class Pool(NamedTuple):
     """Configurations in sockets, and what each measures of the parameters: derivatives of the tip, whitened."""
 
@@ -183,7 +190,7 @@ def moved_pool(
         starts += [followed, new]
         owner.append(np.full(len(followed) + len(new), socket))
     of = np.concatenate(owner)
-    q, good = reached(problem.region, np.concatenate(starts), after.points[of], _STEPS)
+    q, good = reached(problem.region, np.concatenate(starts), after.points[of], _STEPS, sockets=of)
     moved = pool_of(problem, q[good], of[good])
     return Pool(*(np.concatenate(parts) for parts in zip(kept, moved, strict=True)))
 

@@ -25,12 +25,14 @@ def refined(
     q: Float[np.ndarray, "N n"],
     owner: Int[np.ndarray, " N"],
     progress: Callable[[float], None],
+    allowed: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
 ) -> Float[np.ndarray, "N n"]:
     """Configurations within the limits, in their sockets to 1e-6 mm, with an objective no worse than that of ``q``.
 
     The optimiser (L-BFGS-B) moves the readings freely; each pose is then brought back into its socket by a combination
     of the directions that are normal to the socket's configurations at ``q``, so the derivative is exact.
-    ``progress`` is called with the fraction done.
+    ``progress`` is called with the fraction done; ``allowed(q, owner)`` says which poses may be taken, besides what
+    `reached` checks.
     """
     from scipy import optimize
 
@@ -57,7 +59,9 @@ def refined(
     change = sockets.projected(solution.x.reshape(q.shape) * units) - q
     best, best_value = q, _value(problem, placement, q, owner)
     for fraction in _FRACTIONS:
-        moved, possible = reached(region, q + fraction * change, targets)
+        moved, possible = reached(region, q + fraction * change, targets, sockets=owner)
+        if allowed is not None:
+            possible &= allowed(moved, owner)
         moved = np.where(possible[:, None], moved, q)
         value = _value(problem, placement, moved, owner)
         if value < best_value:

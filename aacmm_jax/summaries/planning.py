@@ -1,5 +1,7 @@
 """Plans of poses and of acceptance tests as plain dictionaries with the unit in every key."""
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -7,28 +9,39 @@ import numpy as np
 from ..acceptance.procedure import Procedure
 from ..acceptance.standards import PLANNED
 from ..data.noise import linear_encoder_mm
-from ..planning.design import MORE, Plan, Prediction
+from ..kinematics.collisions import Cell
+from ..planning.design import Plan
 from ..planning.kit import KitPlan
+from ..planning.motion import Motion
+from ..planning.predictions import MORE, Prediction
 from .calibration import reference_length_rows
 
 
 def plan_summary(plan: Plan, arm: str) -> dict[str, Any]:
     """Positions of the sockets, how many poses each gets, and the predicted uncertainties."""
-    counts = np.bincount(plan.owner, minlength=len(plan.sockets))
     return {
         "kind": "plan",
         "arm": arm,
         "criterion": plan.criterion,
         "poses": len(plan.q),
         "sockets": [
-            {"socket": name, "position_mm": list(point), "poses": int(count)}
-            for (name, point), count in zip(plan.sockets.items(), counts, strict=True)
+            {
+                "socket": name,
+                "position_mm": list(point),
+                "poses": int(np.sum(plan.owner == i)),
+                "normal": plan.cones.normals[i].tolist(),
+                "cone_deg": math.degrees(float(plan.cones.half_angles[i])),
+                "largest_tilt_deg": math.degrees(float(plan.motion.tilt[plan.owner == i].max())),
+            }
+            for i, (name, point) in enumerate(plan.sockets.items())
         ],
         "lengths": reference_length_rows(plan.lengths),
         "check_length_mm": plan.check_length,
         "encoder_arcsec": np.asarray(plan.noise.encoder_arcsec).tolist(),
         "linear_encoder_mm": linear_encoder_mm(plan.noise, plan.arm),
         "seating_mm": float(plan.noise.seating),
+        "unconstrained": None if plan.unconstrained is None else _prediction(plan.unconstrained),
+        **_motion_summary([plan.motion], plan.cell, plan.retract, list(plan.sockets), plan.owner),
         "predicted": _prediction(plan.predicted),
         "loose": _prediction(plan.loose),
         "random": _prediction(plan.random),
@@ -66,9 +79,46 @@ def kit_plan_summary(plan: KitPlan, arm: str) -> dict[str, Any]:
         "encoder_arcsec": np.asarray(plan.noise.encoder_arcsec).tolist(),
         "linear_encoder_mm": linear_encoder_mm(plan.noise, plan.arm),
         "seating_mm": float(plan.noise.seating),
+        "unconstrained": None if plan.unconstrained is None else _prediction(plan.unconstrained),
+        **_motion_summary(
+            list(plan.motions),
+            plan.cell,
+            plan.retract,
+            [one.name for one in plan.observations],
+            np.repeat(np.arange(len(plan.observations)), [one.q.shape[0] for one in plan.observations]),
+        ),
         **{name: _prediction(getattr(plan, name)) for name in ("predicted", "loose", "random", "more")},
         "without": {name: _prediction(one) if np.isfinite(one.largest) else None for name, one in plan.without.items()},
         "more_poses": MORE,
+    }
+
+
+def _motion_summary(
+    motions: Sequence[Motion], cell: Cell | None, retract: float, names: Sequence[str], owner: np.ndarray
+) -> dict[str, Any]:
+    """How the arm moves: largest tilt, smallest clearance, travel, and moves that hit something, by pose number."""
+    first = np.cumsum([0, *(len(motion.tilt) for motion in motions)])
+    blocked = [
+        {"before_pose": int(start) + index + 1, "at": names[owner[int(start) + index]], "between": [one, other]}
+        for start, motion in zip(first[:-1], motions, strict=True)
+        for index, one, other in motion.blocked
+    ]
+    tilts = np.concatenate([np.zeros(0), *(motion.tilt[np.isfinite(motion.tilt)] for motion in motions)])
+    clearances = [motion.clearance.min() for motion in motions if motion.clearance is not None]
+    return {
+        "largest_tilt_deg": float(np.degrees(tilts.max())) if len(tilts) else None,
+        "retract_mm": retract,
+        "travel_deg": math.degrees(sum(motion.travel for motion in motions)),
+        "unordered_travel_deg": math.degrees(sum(motion.unordered for motion in motions)),
+        "collisions": None
+        if cell is None
+        else {
+            "smallest_clearance_mm": float(min(clearances)),
+            "allowed_clearance_mm": cell.clearance,
+            "obstacles": [obstacle.name for obstacle in cell.obstacles],
+            "unchecked": [list(pair) for pair in cell.unchecked],
+            "blocked_moves": blocked,
+        },
     }
 
 

@@ -100,7 +100,7 @@ def test_a_whole_plan(paper_arm, space, monkeypatch):
     for simulated, one in zip(found.kit[:2], found.observations[:2], strict=True):
         tips = np.asarray(paper_arm.position(one.q))
         points = dataclasses.replace(simulated, poses=1).tips(np.random.default_rng(0))
-        assert np.abs(tips - points[one.places]).max() < 1e-5
+        assert np.abs(tips - points[list(one.owner)]).max() < 1e-5
     assert found.predicted.largest < found.random.largest
     assert found.more.largest <= found.predicted.largest * 1.001
     assert set(found.without) == {"bar", "tracker"}

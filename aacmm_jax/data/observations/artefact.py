@@ -247,6 +247,10 @@ class SimulatedArtefact(AbstractSimulated):
         if self.errors is not None:
             numbers("errors of the coordinates", len(self.points), 3)(self.errors)
 
+    @property
+    def orientation(self) -> Float[np.ndarray, "3 3"]:
+        return np.asarray(rotation_matrix(self.frame[:3]))
+
     def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedArtefact":
         turned = rotation_matrix(frame[:3]) @ rotation_matrix(self.frame[:3])
         whole = np.concatenate([rotation_vector(turned), moved(frame, self.frame[3:])])

@@ -373,6 +373,11 @@ class AbstractSimulated(eqx.Module):
         then by a translation (mm). None where there is nothing to place, such as for an instrument that sees all."""
         return None
 
+    @property
+    def orientation(self) -> Float[np.ndarray, "3 3"]:
+        """Rotation of its own frame in the base frame; the identity where it has none."""
+        return np.eye(3)
+
     @abc.abstractmethod
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         """Where the tip is, mm, without the noise of the seat."""

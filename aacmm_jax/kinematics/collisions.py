@@ -1,0 +1,178 @@
+"""Obstacles, and how far an arm's body is from them and from itself."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..core.arrays import in_chunks
+from ..core.errors import InputError
+from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
+from ..core.rotations import rotation_matrix
+from .arm import Arm
+from .body import Body, capsule_ends, frames_at
+from .segment_distances import distance_from_box, segment_distance
+
+_ROWS = 1024  # of one call
+_SAMPLES = 500
+_MOSTLY = 0.5  # of random configurations: capsules that touch in so many overlap by their shapes
+
+
+class HalfSpace(NamedTuple):
+    """Everything behind a plane: a table, a wall, a floor.
+
+    ``normal`` points to where the arm is, from the plane through ``point`` (mm); both in the base frame.
+    """
+
+    name: str
+    normal: tuple[float, float, float]
+    point: tuple[float, float, float]
+
+
+class Box(NamedTuple):
+    """A solid box: its centre and whole edges, mm, and its rotation vector (rad), in the base frame."""
+
+    name: str
+    centre: tuple[float, float, float]
+    size: tuple[float, float, float]
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class Post(NamedTuple):
+    """A capsule: all within ``radius`` (mm) of the segment between two points of the base frame."""
+
+    name: str
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radius: float
+
+
+Obstacle = HalfSpace | Box | Post
+
+
+class Cell(NamedTuple):
+    """What an arm may not touch: obstacles and itself."""
+
+    body: Body
+    obstacles: tuple[Obstacle, ...] = ()
+    clearance: float = 0.0  # smallest distance that is allowed, mm
+    unchecked: tuple[tuple[str, str], ...] = ()  # capsule and obstacle, or two capsules, that touch wherever the arm is
+
+
+def check_obstacle(obstacle: Obstacle) -> None:
+    """Raise `InputError` for an obstacle without extent or direction."""
+    numbers = [x for part in obstacle[1:] for x in (part if isinstance(part, tuple | list) else (part,))]
+    if not all(math.isfinite(x) for x in numbers) or any(len(part) != 3 for part in obstacle[1:3]):  # pyright: ignore
+        raise InputError(f"obstacle '{obstacle.name}' needs finite numbers, three for a point or a direction.")
+    if isinstance(obstacle, HalfSpace) and not np.linalg.norm(obstacle.normal) > 0:
+        raise InputError(f"the normal of obstacle '{obstacle.name}' has the length 0; give a direction.")
+    if isinstance(obstacle, Box) and min(obstacle.size) <= 0:
+        raise InputError(f"box '{obstacle.name}' has an edge of {min(obstacle.size):g} mm; give three above 0.")
+    if isinstance(obstacle, Post) and obstacle.radius <= 0:
+        raise InputError(f"capsule '{obstacle.name}' has a radius of {obstacle.radius:g} mm; give one above 0.")
+
+
+def checked_cell(arm: Arm, cell: Cell, limits: Float[np.ndarray, "n 2"]) -> Cell:
+    """The cell without pairs that touch wherever the arm is, which are named in ``unchecked``.
+
+    A body touches itself at its joints, and its foot touches what it stands on. Pairs of capsules that touch in half of
+    random configurations, more than any arm does, and capsules that touch an obstacle in all of them, are left out.
+
+    Args:
+        arm: The arm.
+        cell: Its body and obstacles.
+        limits: Lowest and highest reading of each joint, rad.
+
+    Raises:
+        InputError: An obstacle has no extent, or two have one name.
+    """
+    names = [obstacle.name for obstacle in cell.obstacles]
+    for obstacle in cell.obstacles:
+        check_obstacle(obstacle)
+        if names.count(obstacle.name) > 1:
+            raise InputError(f"two obstacles have the name '{obstacle.name}'; give each one of its own.")
+    if not (math.isfinite(cell.clearance) and cell.clearance >= 0):
+        raise InputError(f"the clearance is {cell.clearance:g} mm; give zero or a positive number.")
+    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_SAMPLES, arm.joints))
+    body = cell.body
+    start, end = capsule_ends(body, frames_at(to_numpy(arm), q))
+    touching = np.mean(_between_capsules(body, start, end) < cell.clearance, axis=1) >= _MOSTLY
+    unchecked = [(body.names[i], body.names[j]) for i, j in body.pairs[touching]]
+    for obstacle in cell.obstacles:
+        always = np.all(_from_obstacle(obstacle, body, start, end) < cell.clearance, axis=1)
+        unchecked += [(body.names[i], obstacle.name) for i in np.flatnonzero(always)]
+    return cell._replace(body=body._replace(pairs=body.pairs[~touching]), unchecked=tuple(unchecked))
+
+
+def clearances(cell: Cell, arm: Arm, q: Float[AnyArray, "N n"]) -> Float[AnyArray, " N"]:
+    """Smallest distance of the body from an obstacle or from itself at each configuration, mm; under jit too.
+
+    Exact where nothing touches; negative where something does, though not by how much. Infinite where nothing is
+    checked.
+    """
+    xp, left_out = namespace(arm, q), set(cell.unchecked)
+    start, end = capsule_ends(cell.body, frames_at(arm, q))
+    found = [xp.full(q.shape[:1], np.inf)[None]]
+    if len(cell.body.pairs):
+        found.append(_between_capsules(cell.body, start, end))
+    for obstacle in cell.obstacles:
+        checked = np.array([(name, obstacle.name) not in left_out for name in cell.body.names])
+        if checked.any():
+            part = cell.body._replace(radius=cell.body.radius[checked])
+            found.append(_from_obstacle(obstacle, part, start[checked], end[checked]))
+    return xp.min(xp.concatenate(found), axis=0)
+
+
+def is_clear(cell: Cell, arm: Arm, q: Float[np.ndarray, "N n"]) -> Bool[np.ndarray, " N"]:
+    """Which configurations keep the clearance, by NumPy."""
+    arm = to_numpy(arm)
+    return in_chunks(lambda rows: np.asarray(clearances(cell, arm, rows)) >= cell.clearance, q, _ROWS)
+
+
+def nearest_contact(cell: Cell, arm: Arm, q: Float[np.ndarray, " n"]) -> tuple[str, str]:
+    """The two things that are nearest to each other at one configuration: capsules, or a capsule and an obstacle."""
+    body, left_out = cell.body, set(cell.unchecked)
+    start, end = capsule_ends(body, frames_at(to_numpy(arm), q[None]))
+    found = []
+    if len(body.pairs):
+        between = _between_capsules(body, start, end)[:, 0]
+        found += [
+            (distance, (body.names[i], body.names[j])) for distance, (i, j) in zip(between, body.pairs, strict=True)
+        ]
+    for obstacle in cell.obstacles:
+        each = _from_obstacle(obstacle, body, start, end)[:, 0]
+        named = [(name, obstacle.name) for name in body.names]
+        found += [row for row in zip(each, named, strict=True) if row[1] not in left_out]
+    return min(found, key=lambda row: row[0])[1]
+
+
+def _between_capsules(
+    body: Body, start: Float[AnyArray, "k 3 N"], end: Float[AnyArray, "k 3 N"]
+) -> Float[AnyArray, "m N"]:
+    one, other = body.pairs.T
+    distance = segment_distance(start[one], end[one], start[other], end[other])
+    return distance - namespace(distance).asarray(body.radius[one] + body.radius[other])[:, None]
+
+
+def _from_obstacle(
+    obstacle: Obstacle, body: Body, start: Float[AnyArray, "k 3 N"], end: Float[AnyArray, "k 3 N"]
+) -> Float[AnyArray, "k N"]:
+    xp = namespace(start, end)
+    radius = xp.asarray(body.radius)[:, None]
+    if isinstance(obstacle, HalfSpace):
+        normal = np.asarray(obstacle.normal, dtype=float)
+        normal = normal / np.linalg.norm(normal)
+        heights = (xp.sum(part * xp.asarray(normal)[None, :, None], axis=1) for part in (start, end))
+        return xp.minimum(*heights) - float(normal @ np.asarray(obstacle.point)) - radius
+    if isinstance(obstacle, Box):
+        rotation = xp.asarray(rotation_matrix(np.asarray(obstacle.rotation, dtype=float)).T)
+        centre = xp.asarray(np.asarray(obstacle.centre, dtype=float))[None, :, None]
+        first, last = (xp.einsum("cd,kdn->kcn", rotation, part - centre) for part in (start, end))
+        half = xp.asarray(np.asarray(obstacle.size, dtype=float) / 2)[None, :, None]
+        return distance_from_box(first, last, half) - radius
+    first, last = (
+        xp.broadcast_to(xp.asarray(np.asarray(point, dtype=float))[None, :, None], start.shape)
+        for point in (obstacle.start, obstacle.end)
+    )
+    return segment_distance(start, end, first, last) - radius - obstacle.radius

@@ -1,0 +1,160 @@
+"""Cones of approach: from which directions a tool may come to a socket, and configurations that keep to them."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..core.arrays import in_chunks
+from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
+from .arm import Arm
+from .chain import ForwardPass, forward_pass, joint_motion, reading_units
+from .inverse_kinematics import damped_inverse
+from .jacobian import reading_columns, reading_rotations
+
+TOOL_AXIS = (0.0, 0.0, 1.0)
+_ROWS = 2048  # of one call
+_LARGEST_STEP, _LARGEST_TURN = 0.5, 0.5  # rad: of a joint, of the tool
+_EXACT, _ARRIVED = 1e-7, 1e-6  # mm
+_INSIDE = 1e-4  # rad: what is brought into a cone ends this far inside it
+_LEVER = 100.0  # mm: a rotation of the tool counts as what it moves at this distance
+
+
+class Cone(NamedTuple):
+    """Directions from which a tool may come to a socket: within ``half_angle`` (rad) of its ``normal``.
+
+    The normal points out of the socket, in the base frame.
+    """
+
+    half_angle: float = math.pi
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+
+class Cones(NamedTuple):
+    """The cones of several sockets, and the axis of the last frame that points from the tool into a socket."""
+
+    normals: Float[np.ndarray, "s 3"]
+    half_angles: Float[np.ndarray, " s"]
+    tool_axis: Float[np.ndarray, " 3"]
+
+    @property
+    def any(self) -> bool:
+        """Whether some cone leaves out directions."""
+        return bool(np.any(self.half_angles < math.pi))
+
+    def at(self, sockets: Int[np.ndarray, " c"]) -> "Cones":
+        """The cone of each of these sockets."""
+        return self._replace(normals=self.normals[sockets], half_angles=self.half_angles[sockets])
+
+
+def cones_of(cones: list[Cone], tool_axis: tuple[float, float, float] = TOOL_AXIS) -> Cones:
+    """The cones with unit vectors.
+
+    Raises:
+        InputError: A direction has the length 0, or a half angle is not above 0.
+    """
+    vectors = np.array([*(cone.normal for cone in cones), tool_axis], dtype=float)
+    sizes = np.linalg.norm(vectors, axis=1, keepdims=True)
+    if vectors.shape[1:] != (3,) or not np.all(np.isfinite(vectors)) or np.any(sizes == 0):
+        raise InputError("a normal or the tool's axis is no direction; give three numbers that are not all 0.")
+    for cone in cones:
+        if not 0 < cone.half_angle <= math.pi:
+            raise InputError(
+                f"a cone of approach has a half angle of {math.degrees(cone.half_angle):g} deg; give one above 0 and "
+                "at most 180."
+            )
+    unit = vectors / sizes
+    return Cones(unit[:-1], np.array([cone.half_angle for cone in cones], dtype=float), unit[-1])
+
+
+def tilts(arm: Arm, q: Float[np.ndarray, "c n"], cones: Cones) -> Float[np.ndarray, " c"]:
+    """Angle between a tool and the normal of its socket, rad: 0 where it comes straight from above the socket.
+
+    ``cones`` has a row for each configuration.
+    """
+    rotations = np.asarray(to_numpy(arm).pose(q))[..., :3, :3]
+    return _angle(rotations @ cones.tool_axis, cones.normals)
+
+
+def into_cones(
+    arm: Arm,
+    q: Float[np.ndarray, "c n"],
+    targets: Float[np.ndarray, "c 3"],
+    limits: Float[np.ndarray, "n 2"],
+    cones: Cones,
+    steps: int,
+) -> tuple[Float[np.ndarray, "c n"], Bool[np.ndarray, " c"]]:
+    """Configurations moved by least-norm steps until the tip is at its target and the tool in its cone.
+
+    Each step closes the gap of the tip, as `solve_to_targets` does, and where the tool is outside its cone turns it
+    there, with what moves the tip least first taken out: the least-norm solution of four equations by elimination.
+
+    Args:
+        arm: One arm.
+        q: Configurations to begin with, rad.
+        targets: Where each tip is to be, mm.
+        limits: Lowest and highest angle of each joint, rad.
+        cones: A cone for each configuration.
+        steps: Most steps.
+
+    Returns:
+        The configurations, and which of them arrived within their cones.
+    """
+    geometry = to_numpy(arm.geometry)
+    low, high = limits[:, :1], limits[:, 1:]
+    units = reading_units(geometry)[:, None]  # steps are in what counts alike: 1 rad, or 1 m
+
+    def step(
+        q: np.ndarray, targets: np.ndarray, normals: np.ndarray, wanted: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The next configurations ``(n, c)``, and which of them need more steps."""
+        forward = forward_pass(geometry, joint_motion(geometry, q.T))
+        gap = targets - forward.tip
+        columns = units[..., None] * np.asarray(reading_columns(forward))
+        inverse = damped_inverse(columns, 1e-2 * np.sum(gap**2, axis=0) + 1e-12)
+        change = np.sum(inverse * gap[None], axis=1)
+        tool = _directions(forward, cones.tool_axis)
+        angle = _angle(tool.T, normals.T)
+        outside = angle > wanted
+        if outside.any():
+            # d angle / dq = z . (tool x normal) / sin(angle): the cosine is -tool . normal.
+            across = np.cross(tool, normals, axis=0) / np.maximum(np.sin(angle), 0.05)
+            row = _LEVER * np.einsum("jcn,cn->jn", units[..., None] * reading_rotations(forward), across) * outside
+            turn = _LEVER * np.clip(wanted - angle, -_LARGEST_TURN, 0.0) * outside
+            free = row - np.sum(inverse * np.einsum("jn,jcn->cn", row, columns)[None], axis=1)
+            size = np.sum(free * row, axis=0)
+            change = change + free * ((turn - np.sum(row * change, axis=0)) / (size + 1e-2 * turn**2 + 1e-6))
+        new = np.clip(q + units * np.clip(change, -_LARGEST_STEP, _LARGEST_STEP), low, high)
+        return new, np.any(np.abs(gap) > _EXACT, axis=0) | outside
+
+    def moved(rows: np.ndarray) -> np.ndarray:
+        n = arm.joints
+        found = rows[:, :n].T.copy()
+        given = rows[:, n : n + 3].T, rows[:, n + 3 : n + 6].T, np.maximum(rows[:, n + 6] - _INSIDE, 0.0)
+        under_way = np.arange(found.shape[1])
+        for _ in range(steps):
+            found[:, under_way], more = step(found[:, under_way], *(part[..., under_way] for part in given))
+            under_way = under_way[more]
+            if not len(under_way):
+                break
+        forward = forward_pass(geometry, joint_motion(geometry, found.T))
+        arrived = np.linalg.norm(given[0] - forward.tip, axis=0) <= _ARRIVED
+        arrived &= _angle(_directions(forward, cones.tool_axis).T, given[1].T) <= rows[:, n + 6]
+        return np.hstack([found.T, arrived[:, None]])
+
+    with np.errstate(all="ignore"):
+        found = in_chunks(moved, np.hstack([q, targets, cones.normals, cones.half_angles[:, None]]), _ROWS)
+    return found[:, :-1], found[:, -1] > 0
+
+
+def _directions(forward: ForwardPass, axis: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 N"]:
+    """A direction of the last frame, in the base frame."""
+    x, y, z = (np.asarray(part) for part in forward.frame)
+    return axis[0] * x + axis[1] * y + axis[2] * z
+
+
+def _angle(tool: Float[np.ndarray, "c 3"], normal: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, " c"]:
+    """Angle between the reversed tool and a normal; by its tangent, so that small ones are exact."""
+    return np.arctan2(np.linalg.norm(np.cross(tool, normal), axis=-1), -np.sum(tool * normal, axis=-1))

@@ -1,0 +1,127 @@
+"""How an arm gets from pose to pose: approach points above the sockets, the order, and whether a move hits anything."""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..kinematics.collisions import clearances, is_clear, nearest_contact
+from ..kinematics.cones import Cone, cones_of, tilts
+from ..kinematics.correction import readings_at_poses
+from ..kinematics.inverse_kinematics import project_to_targets
+from ..kinematics.workspace import SearchRegion, lowest_point
+from .pose_order import joint_weights, short_order, travel
+
+_STEP = np.radians(2.0)  # largest step of a joint between samples of a move
+_ROUNDS = 25  # of ordering and checking
+
+
+class Motion(NamedTuple):
+    """How the arm takes the poses of a plan, in their order. Arrays are of NumPy."""
+
+    approach: Float[np.ndarray, "N n"] | None  # configurations above the sockets, rad; None without approach points
+    tilt: Float[np.ndarray, " N"]  # between the tool and the normal of its socket, rad
+    clearance: Float[np.ndarray, " N"] | None  # from obstacles and of the arm from itself, mm; None where not checked
+    travel: float  # of all joints from pose to pose, by way of the approach points; weighted, rad
+    unordered: float  # likewise, socket after socket in the order in which the poses were chosen
+    blocked: tuple[tuple[int, str, str], ...]  # moves to the pose of this index that hit something, and what touches
+
+
+class MovedPoses(NamedTuple):
+    """Approach configurations of poses, and which of them can be moved to and from there."""
+
+    q: Float[np.ndarray, "N n"]
+    possible: Bool[np.ndarray, " N"]
+
+
+def approaches(
+    region: SearchRegion, q: Float[np.ndarray, "N n"], normals: Float[np.ndarray, "N 3"], retract: float
+) -> MovedPoses:
+    """Configurations with the tip ``retract`` (mm) along the normals, and the orientation kept where the joints allow.
+
+    Possible are those within the limits, above the table, and clear, as is the straight move of the joints there.
+    """
+    poses = np.asarray(region.arm.pose(q)).copy()
+    poses[:, :3, 3] += retract * normals
+    found = readings_at_poses(region.arm, q, poses, region.limits.tolist())
+    above, whole = np.asarray(found.q), np.asarray(found.reached)
+    rows = np.flatnonzero(~whole)
+    good = whole.copy()
+    if len(rows):
+        above = above.copy()
+        above[rows], good[rows] = project_to_targets(region.arm, q[rows], poses[rows, :3, 3], region.limits)
+    good &= lowest_point(region.arm, above) >= region.above
+    rows = np.flatnonzero(good)
+    good[rows] = [hit is None for hit in move_contacts(region, q[rows], above[rows])]
+    return MovedPoses(above, good)
+
+
+def move_contacts(
+    region: SearchRegion, start: Float[np.ndarray, "m n"], end: Float[np.ndarray, "m n"]
+) -> list[tuple[str, str] | None]:
+    """For each straight move of the joints: what touches at the first sample that is not clear, or None."""
+    if region.cell is None or not len(start):
+        return [None] * len(start)
+    counts = np.maximum(np.ceil(np.abs(end - start).max(axis=1) / _STEP).astype(int), 1) + 1
+    move = np.repeat(np.arange(len(start)), counts)
+    fraction = np.concatenate([np.linspace(0, 1, count) for count in counts])[:, None]
+    samples = start[move] + fraction * (end - start)[move]
+    clear = is_clear(region.cell, region.arm, samples)
+    found: list[tuple[str, str] | None] = [None] * len(start)
+    hit = np.flatnonzero(~clear)
+    for which, first in zip(*np.unique(move[hit], return_index=True), strict=True):
+        found[which] = nearest_contact(region.cell, region.arm, samples[hit[first]])
+    return found
+
+
+def ordered_motion(
+    region: SearchRegion,
+    q: Float[np.ndarray, "N n"],
+    owner: Int[np.ndarray, " N"],
+    normals: Float[np.ndarray, "N 3"],
+    retract: float,
+) -> tuple[list[int], Motion]:
+    """The order in which to take poses, and how the arm moves then.
+
+    Moves that hit something are found by samples of 2 deg of the joint that moves most, and avoided by another order
+    where there is one.
+    """
+    weights = joint_weights(region.arm)
+    above = approaches(region, q, normals, retract).q if retract else None
+    through = q if above is None else above
+    contacts: dict[tuple[int, int], tuple[str, str] | None] = {}
+    order: list[int] = []
+    for _ in range(_ROUNDS):
+        order = short_order(through, owner, weights, [pair for pair, contact in contacts.items() if contact])
+        new = [pair for pair in _pairs(order) if pair not in contacts]
+        if region.cell is None or not new:
+            break
+        first, last = np.array(new).T
+        contacts |= dict(zip(new, move_contacts(region, through[first], through[last]), strict=True))
+    hits = ((place + 1, contacts.get(pair)) for place, pair in enumerate(_pairs(order)))
+    given = np.argsort(owner, kind="stable")
+    tool = cones_of([Cone()]) if region.cones is None else region.cones
+    return order, Motion(
+        approach=None if above is None else above[order],
+        tilt=tilts(region.arm, q[order], tool._replace(normals=normals[order])),
+        clearance=None if region.cell is None else np.asarray(clearances(region.cell, region.arm, q[order])),
+        travel=_whole_travel(q, above, order, weights),
+        unordered=_whole_travel(q, above, given.tolist(), weights),
+        blocked=tuple((place, *hit) for place, hit in hits if hit is not None),
+    )
+
+
+def _pairs(order: list[int]) -> list[tuple[int, int]]:
+    """Neighbours in an order, the smaller number first: a move and the way back are the same."""
+    return [(min(i, j), max(i, j)) for i, j in pairwise(order)]
+
+
+def _whole_travel(
+    q: Float[np.ndarray, "N n"], above: Float[np.ndarray, "N n"] | None, order: list[int], weights: np.ndarray
+) -> float:
+    """Travel by way of the approach points: in each socket from them, in between straight."""
+    if above is None:
+        return travel(q[order], weights)
+    visits = np.stack([above[order], q[order], above[order]], axis=1)
+    return travel(visits.reshape(-1, q.shape[1]), weights)

@@ -1,0 +1,75 @@
+"""Options of ``aacmm plan`` that say what the arm can do: cones, obstacles, approach points, noise, units."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+
+PLAN = (
+    *("plan", "panda", "-o", "plan.csv", "--poses", 16, "--candidates", 120),
+    *("--socket", "A=450,100,200", "--socket", "B=450,-300,200", "--length", "A,B,0.002"),
+)
+CELL = '[body]\nradius = 50.0\n[[box]]\nname = "cabinet"\ncentre = [0, 700, 300]\nsize = [400, 200, 600]\n'
+
+
+def test_cones_obstacles_and_radians(aacmm, tmp_path):
+    (tmp_path / "cell.toml").write_text(CELL)
+    options = (
+        *("--cone-deg", 50, "--cone-deg", "A=35", "--normal", "B=0.5,0,1", "--cell", "cell.toml"),
+        *("--angles", "rad", "--unconstrained", "--manifest", "capture.toml", "--retract-mm", 30),
+    )
+    summary = json.loads(aacmm(*PLAN, *options, "--json").stdout)
+    rows = {row["socket"]: row for row in summary["sockets"]}
+    assert {name: row["cone_deg"] for name, row in rows.items()} == pytest.approx({"A": 35, "B": 50})
+    assert all(row["largest_tilt_deg"] <= row["cone_deg"] + 1e-6 for row in rows.values())
+    assert rows["B"]["normal"] == pytest.approx((np.array([0.5, 0, 1]) / np.sqrt(1.25)).tolist())
+    assert summary["collisions"]["obstacles"] == ["table", "cabinet"]
+    assert summary["unconstrained"]["largest_mm"] < summary["predicted"]["largest_mm"]
+    assert summary["encoder_arcsec"] == pytest.approx(9.045, abs=0.01)
+    # Readings as the plan has them come back through its manifest, approach rows left out.
+    with open(tmp_path / "plan.csv", newline="") as file:
+        planned = [row for row in csv.DictReader(file) if row["move"] == "pose"]
+    for name in rows:
+        q = [[row[f"q_{i}_rad"] for i in range(1, 8)] for row in planned if row["socket"] == name]
+        (tmp_path / f"{name}.csv").write_text("\n".join(",".join(row) for row in q))
+    capture = aj.files.read_manifest(tmp_path / "capture.toml").capture
+    assert sum(capture.sizes) == 16
+    tips = np.asarray(aj.load_arm("panda").position(capture.sockets["A"]))
+    np.testing.assert_allclose(tips, np.tile([450, 100, 200], (len(tips), 1)), atol=2e-3)
+
+
+def test_a_robot_by_default(aacmm):
+    """Cones of 60 deg, approach points 50 mm above, the noise of its data sheet; no obstacles unless asked for."""
+    printed = " ".join(aacmm(*PLAN, "--collisions").stdout.split())
+    for text in (
+        "encoders of 9.04 arcsec",
+        "Franka Emika data sheet",
+        "by way of approach points 50 mm above the sockets",
+        "the arm's body against itself and obstacles (table)",
+        "Not checked, since they touch wherever the arm is: offset d_1 and table.",
+        "Note: links are taken as 60 mm in radius",
+    ):
+        assert text in printed
+    assert "60" in printed.split("largest tilt [deg]")[1].split("Reference")[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("--cone-deg", "wide"), "--cone-deg 'wide' is not of the form DEG or NAME=DEG"),
+        (("--cone-deg", "50", "--cone-deg", "40"), "--cone-deg is given twice for all sockets"),
+        (("--cone-deg", "Q=40"), "unknown socket 'Q'"),
+        (("--cone-deg", "200"), "half angle of 200 deg"),
+        (("--normal", "A=1,2"), "--normal 'A=1,2' is not of the form X,Y,Z or NAME=X,Y,Z"),
+        (("--normal", "0,0,0"), "no direction"),
+        (("--tool-axis", "w"), "--tool-axis 'w' is not of the form"),
+        (("--link-radius-mm", "0"), "radius of the arm's links must be above 0"),
+        (("--cell", "none.toml"), "none.toml"),
+        (("--cone-deg", "A=20", "--normal", "A=0,0,-1"), "socket 'A' at (450, 100, 200) mm cannot be reached"),
+    ],
+)
+def test_refused(aacmm, arguments, text):
+    assert text in aacmm(*PLAN, *arguments, expect=2).stderr
