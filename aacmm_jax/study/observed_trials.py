@@ -38,9 +38,8 @@ class _Recorded(NamedTuple):
 @lru_cache(maxsize=4)
 def _recorded(study: Study) -> _Recorded:
     assert study.capture is not None
-    space = to_numpy(study.space)
-    observed = Observed.of(study.capture)
-    geometry = np.asarray(fit_geometry(study.nominal.arm, observed, {}, None).geometry)
+    arm, space, observed = to_numpy((study.nominal.arm, study.space, Observed.of(study.capture)))
+    geometry = fit_geometry(arm, observed, {}, None).geometry
     truth = ObservedTruth.at(study.capture, space, space.vector(), observed.split(geometry))
     by_readings = [np.moveaxis(np.asarray(error.by_readings), -1, 0) for error in truth.errors]
     return _Recorded(truth, space, [np.linalg.pinv(matrix, rcond=1e-6) for matrix in by_readings], geometry)
