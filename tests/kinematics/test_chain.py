@@ -75,7 +75,7 @@ def test_the_tips_and_columns_of_a_batch_are_those_of_the_loop(beta):
 
 
 @pytest.mark.parametrize(
-    "joints", [2, 6, 7, *(pytest.param(joints, marks=pytest.mark.slow) for joints in (3, 4, 5, 8, 9))]
+    "joints", [2, 7, *(pytest.param(joints, marks=pytest.mark.slow) for joints in (3, 4, 5, 6, 8, 9))]
 )
 def test_jacobian_is_jax_own_differentiation(joints):
     """Analytic columns; JAX's forward and reverse modes through the custom rule; and the plain chain: all equal."""
@@ -110,9 +110,17 @@ def test_jacobian_is_jax_own_differentiation(joints):
 def test_second_derivatives_pass_through_the_rule():
     arm = random_arm(3, 1)
     q = jnp.array([0.3, -0.7, 1.1])
-    plain = jax.hessian(lambda q: jnp.sum(chain.forward_pass(arm.geometry, chain.sines_cosines(q)).tip ** 2))(q)
-    for mode in (jax.hessian, lambda f: jax.jacrev(jax.jacrev(f))):
-        np.testing.assert_allclose(mode(lambda q: jnp.sum(arm.position(q) ** 2))(q), plain, rtol=1e-10, atol=1e-9)
+
+    def of_rule(q):
+        return jnp.sum(arm.position(q) ** 2)
+
+    def of_chain(q):
+        return jnp.sum(chain.forward_pass(arm.geometry, chain.sines_cosines(q)).tip ** 2)
+
+    modes = jax.hessian(of_chain), jax.hessian(of_rule), jax.jacrev(jax.jacrev(of_rule))
+    plain, *others = jax.jit(lambda q: [mode(q) for mode in modes])(q)
+    for other in others:
+        np.testing.assert_allclose(other, plain, rtol=1e-10, atol=1e-9)
 
 
 @pytest.mark.parametrize(("arm_batch", "pose_batch"), [((), (2, 3)), ((3,), ()), ((2, 1), (2, 3)), ((2, 3), (3,))])
