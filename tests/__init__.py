@@ -4,14 +4,22 @@ the notebooks' kernels.
 Compiling is most of the suite's time. XLA without its optimisations compiles in a quarter of the time. What rests on
 optimised code (the marker ``optimised``, `make test-lowest`) is tested with an empty XLA_FLAGS, which is left as it is.
 The cache is empty when the tests begin and gone when they end.
+
+The workers and some forty processes that tests start read the byte code of the package, whose preparation takes 2 s
+each time, so it is kept even where the environment says otherwise. OpenBLAS has one thread in each: for matrices of
+this size a second one only waits, at the expense of the other worker.
 """
 
 import atexit
 import os
 import shutil
+import sys
 import tempfile
 from importlib.metadata import version
 
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if version("jaxlib").startswith("0.10."):  # a flag that another release does not know would end the process
     os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:

@@ -17,7 +17,7 @@ from beartype import BeartypeConf, beartype
 
 # Ints are accepted as floats as PEP 484 has it.
 checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
-CALLS = 5  # that are checked, of each function, in each test
+CALLS = 2  # that are checked, of each function, in each test
 RUNS = 10  # of an outer function in which its inner ones are checked, in each process
 _runs: collections.Counter[CodeType] = collections.Counter()
 _counts: list[list[int]] = []

@@ -9,6 +9,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.calibration.redrawn import truth_of
 from aacmm_jax.calibration.sampling import _RepeatedTask
+from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.model.observed import Observed, linear_rows, whitening_of
 from aacmm_jax.uncertainty.observed_covariance import covariance_of_noise
@@ -36,7 +37,7 @@ def test_residuals_scatter_as_the_weights_say(paper_arm, bounds, kind):
     capture, result = calibrated(paper_arm, bounds, SIMULATED[kind])
     truth = truth_of(result, capture)
     batch = truth.drawn(10, NOISE, np.random.default_rng(0))
-    space = aj.Parameters(result.arm, FEW)
+    space = to_numpy(aj.Parameters(result.arm, FEW))  # NumPy compiles nothing
     z = np.concatenate([result.parameters, *(truth.geometry[name] for name in truth.observed.blocks)])
     of_arm = [covariance_of_noise(errors, NOISE) for errors in truth.errors]
     roots = whitening_of(truth.linear, truth.observed, of_arm, np.asarray(1e-4)).roots

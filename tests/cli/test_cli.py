@@ -156,7 +156,7 @@ def test_a_process_of_its_own(aacmm_process, cache, tmp_path, monkeypatch):
     ("arguments", "redirection", "encoding", "code", "error"),
     [
         ("show panda", "| true", "utf-8", 141, ""),
-        ("show panda --json", "| true", "utf-8", 141, ""),
+        pytest.param("show panda --json", "| true", "utf-8", 141, "", marks=pytest.mark.slow),
         ("show panda", "> /dev/full", "utf-8", 1, "Error: standard output cannot be written: no space left"),
         ("show named.toml", "> out.txt", "ascii", 0, ""),
     ],

@@ -88,7 +88,7 @@ def test_the_tips_and_columns_of_a_batch_are_those_of_the_loop(beta, prismatic):
 
 @pytest.mark.parametrize(
     ("joints", "prismatic"),
-    [(2, ()), (6, ()), (4, (1, 3)), *(pytest.param(n, (), marks=pytest.mark.slow) for n in (3, 4, 5, 7, 8, 9))],
+    [(2, ()), (7, ()), (4, (1, 3)), *(pytest.param(n, (), marks=pytest.mark.slow) for n in (3, 4, 5, 6, 8, 9))],
 )
 def test_jacobian_is_jax_own_differentiation(joints, prismatic):
     """Analytic columns; JAX's forward and reverse modes through the custom rule; and the plain chain: all equal."""
@@ -123,10 +123,17 @@ def test_jacobian_is_jax_own_differentiation(joints, prismatic):
 def test_second_derivatives_pass_through_the_rule():
     arm = random_arm(3, 1, prismatic=(2,))
     q = jnp.array([0.3, -70.0, 1.1])
-    geometry = arm.geometry
-    plain = jax.hessian(lambda q: jnp.sum(chain.forward_pass(geometry, chain.joint_motion(geometry, q)).tip ** 2))(q)
-    for mode in (jax.hessian, lambda f: jax.jacrev(jax.jacrev(f))):
-        np.testing.assert_allclose(mode(lambda q: jnp.sum(arm.position(q) ** 2))(q), plain, rtol=1e-10, atol=1e-9)
+
+    def of_rule(q):
+        return jnp.sum(arm.position(q) ** 2)
+
+    def of_chain(q):
+        return jnp.sum(chain.forward_pass(arm.geometry, chain.joint_motion(arm.geometry, q)).tip ** 2)
+
+    modes = jax.hessian(of_chain), jax.hessian(of_rule), jax.jacrev(jax.jacrev(of_rule))
+    plain, *others = jax.jit(lambda q: [mode(q) for mode in modes])(q)
+    for other in others:
+        np.testing.assert_allclose(other, plain, rtol=1e-10, atol=1e-9)
 
 
 @pytest.mark.parametrize(("arm_batch", "pose_batch"), [((), (2, 3)), ((3,), ()), ((2, 1), (2, 3)), ((2, 3), (3,))])

@@ -130,7 +130,7 @@ def _by_steps(data):
 
 
 # Compiling all of them takes minutes; BoxBOD and MGH10 are the hardest (see `levenberg_marquardt`).
-_COMPILED = ("BoxBOD", "MGH10", "Misra1a")
+_COMPILED = ("BoxBOD", "MGH10")
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.model.observed import Observed, residual_rows
 from aacmm_jax.study.blocks import Block
@@ -84,10 +85,11 @@ def test_without_errors_every_arm_agrees_with_its_data(paper_arm, held, which):
     )
     study = made(paper_arm, held, capture, noise={})
     drawn, batch = draw_trials(study, 0, [0, 7])
+    space, batch = to_numpy((study.space, batch))  # NumPy compiles nothing
     for number in range(2):
         one = jax.tree.map(lambda leaf, number=number: leaf[number], batch)
         z = np.concatenate([drawn.true[number], _recorded(study).geometry])
-        for rows in residual_rows(study.space, Observed.of(one, study.nominal.arm), z):
+        for rows in residual_rows(space, Observed.of(one, study.nominal.arm), z):
             assert np.abs(rows.values).max() < 1e-9
         # What one configuration can follow, it does: only transforms ask for six things at once.
         assert all(np.abs(one.shift).max() < 1e-3 for one in one.observations if one.kind != "transforms")

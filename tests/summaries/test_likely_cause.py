@@ -102,7 +102,16 @@ MISTAKES = [
 ]
 
 
-@pytest.mark.parametrize(("names", "field", "mistake", "cause"), MISTAKES, ids=[f"{x[0]}-{x[3]}" for x in MISTAKES])
+def marked(rows):
+    """The first mistake in each field of each observation, and the others among the slow tests."""
+    seen = set()
+    for names, field, mistake, cause in rows:
+        marks = pytest.mark.slow if (names, field) in seen else ()
+        seen.add((names, field))
+        yield pytest.param(names, field, mistake, cause, marks=marks, id=f"{names}-{cause}")
+
+
+@pytest.mark.parametrize(("names", "field", "mistake", "cause"), list(marked(MISTAKES)))
 def test_observations(paper_arm, captures, names, field, mistake, cause):
     def concerned(capture):
         return [getattr(one, field) for one in capture.observations if one.name in cause or field == "q"]

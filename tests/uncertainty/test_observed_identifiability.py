@@ -8,6 +8,7 @@ from aacmm_jax.core.rotations import rotation_matrix
 from aacmm_jax.data import observations as kinds
 
 NOISE = aj.Noise(encoder_arcsec=2, seating=0.005)
+SLOW = pytest.mark.slow
 BOX = [[200, -300, 100], [600, 300, 500]]
 FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
 CORNER, SIDES = (200, -200, 100), [(300, 0, 0), (0, 400, 0)]
@@ -49,8 +50,16 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("noise", [None, NOISE], ids=["plain", "whitened"])
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    ("case", "noise"),
+    [
+        *(pytest.param(case, None, id=f"{case}-plain") for case in CASES),
+        *(
+            pytest.param(case, NOISE, id=f"{case}-whitened", marks=() if case in ("points", "spheres") else SLOW)
+            for case in CASES
+        ),
+    ],
+)
 def test_what_a_kind_alone_determines(paper_arm, case, noise):
     """Of 25 parameters four never; the scale only where a size is certified. The arm is 1 mm and 0.1 degrees off."""
     simulated, geometry, has_scale = CASES[case]
