@@ -6,7 +6,7 @@ of gravity about the axis where the joint or the link behind it bends, a zero th
 moves and an arm that grows meanwhile move the tip itself.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -17,7 +17,14 @@ from ..kinematics.chain import ForwardPass, forward_pass, sines_cosines
 from .group_equations import Rows
 
 Kind = Literal[
-    "zero", "first harmonic", "second harmonic", "gear ratio", "gravity", "drifting zero", "drifting base", "growing arm"
+    "zero",
+    "first harmonic",
+    "second harmonic",
+    "gear ratio",
+    "gravity",
+    "drifting zero",
+    "drifting base",
+    "growing arm",
 ]
 
 
@@ -28,11 +35,20 @@ class MissingTerm(NamedTuple):
     joint: int | None  # from 1; None: of the tip
     values: Float[np.ndarray, "N _k"] | Float[np.ndarray, "N 3 _k"]  # pose by pose, for coefficients of 1
 
-    def columns(self, rows: Rows, zeros: Float[np.ndarray, "m r n"]) -> Float[np.ndarray, "R _k"]:
-        """Its columns in one observation's rows, of which ``zeros`` are the derivatives by the joints' zeros."""
-        values = self.values[rows.poses]
-        by = rows.by_tip @ values if self.joint is None else zeros[..., self.joint - 1, None] * values[:, None]
-        return by.reshape(-1, by.shape[2])
+
+def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows], joints: int) -> list[Float[np.ndarray, "R _k"]]:
+    """The columns of each term in the rows of all poses."""
+    of_joints = [term for term in terms if term.joint is not None]
+    of_tip = [term for term in terms if term.joint is None]
+    owner = np.array([term.joint for term in of_joints for _ in range(term.values.shape[1])], dtype=int) - 1
+    factors, moves = (np.concatenate([term.values for term in some], axis=-1) for some in (of_joints, of_tip))
+    blocks = []
+    for each in rows:
+        by_joints = each.extra[..., :joints][..., owner] * factors[each.poses][:, None]
+        both = np.concatenate([by_joints, each.by_tip @ moves[each.poses]], axis=2)
+        blocks.append(both.reshape(-1, both.shape[2]))
+    ends = np.cumsum([term.values.shape[-1] for term in (*of_joints, *of_tip)])
+    return np.split(np.concatenate(blocks), ends[:-1], axis=1)
 
 
 def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:

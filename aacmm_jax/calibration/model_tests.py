@@ -18,13 +18,12 @@ from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
-from ..kinematics.parameters import ArmSpecification, Parameters
-from ..model.measurement import Measurement, length_covariance
-from ..model.observed import Observed
-from ..model.residuals import measured_lengths
-from ..uncertainty.residual_tests import Form, FormTest, Part, Residuals, ScoreTest, consistency, form_test, score_tests
-from .group_equations import LEAST_U, Rows, equations_of, scale_anchor_of
-from .missing_terms import Kind, MissingTerm, missing_terms
+from ..kinematics.parameters import ArmSpecification
+from ..uncertainty.group_test import Block
+from ..uncertainty.residual_tests import Form, FormTest, Residuals, ScoreTest, form_test, score_tests
+from .group_equations import Rows, equations_of
+from .length_test import Lengths, length_test
+from .missing_terms import Kind, MissingTerm, columns_of, missing_terms
 from .record import CalibrationRecord, record_of
 from .results import Calibration, Identification
 
@@ -48,17 +47,6 @@ class Misfit(NamedTuple):
     probability: float  # of a ratio as far from 1, where the noise is right; of the class: as large
     of_class: bool
     noise: Noise
-
-
-class Lengths(NamedTuple):
-    """Reference lengths and certified values against each other, by the arm that the poses determine."""
-
-    birge_ratio: float
-    degrees_of_freedom: int
-    probability: float
-    number: int
-    odd: str = ""  # the one without which the others agree
-    difference: float = 0.0  # of that one from what the others say, mm
 
 
 class NoisyObservation(NamedTuple):
@@ -112,12 +100,17 @@ class ModelTests(NamedTuple):
     @property
     def warns(self) -> bool:
         """Whether something is wrong."""
-        probabilities = [one.probability for one in (self.misfit, self.lengths, self.noisy_joint, self.successive) if one]
+        probabilities = [
+            one.probability for one in (self.misfit, self.lengths, self.noisy_joint, self.successive) if one
+        ]
         return bool(self.terms or self.noisy_observations or any(p < LEVEL for p in probabilities))
 
 
 def model_tests(
-    result: Calibration | Identification | CalibrationRecord, capture: Capture | None = None, *, class_noise: Noise | None = None
+    result: Calibration | Identification | CalibrationRecord,
+    capture: Capture | None = None,
+    *,
+    class_noise: Noise | None = None,
 ) -> ModelTests:
     """Test model and noise of a calibration by its residuals. It takes some milliseconds.
 
@@ -144,12 +137,14 @@ def model_tests(
 
 def _tests(record: CalibrationRecord, class_noise: Noise | None) -> ModelTests:
     rows, relations = _equations(record)
-    if not rows or _rms(rows) < _EXACT:
+    if not rows:
         return ModelTests()
-    left = Residuals.of([*map(_part, rows), *relations])
+    left = Residuals.of([*(each.block("") for each in rows), *relations])
     if left.degrees_of_freedom < _FEWEST:
         return ModelTests()
-    lengths = _lengths(record, rows, relations, left)
+    lengths = length_test(record, rows, relations, left.degrees_of_freedom)
+    if _rms(rows) < _EXACT:
+        return ModelTests(lengths=lengths)
     terms, explained = _terms(record, rows, left)
     if record.robust is not None:  # its weights make residuals smaller, and less scattered, than any noise
         return ModelTests(lengths=lengths, terms=terms)
@@ -163,7 +158,7 @@ def _tests(record: CalibrationRecord, class_noise: Noise | None) -> ModelTests:
     )
 
 
-def _equations(record: CalibrationRecord) -> tuple[list[Rows], list[Part]]:
+def _equations(record: CalibrationRecord) -> tuple[list[Rows], list[Block]]:
     """The equations of poses in chunks, or of very many an even choice of these, and those of relations.
 
     Unknowns of an observation that is divided become shared ones.
@@ -185,15 +180,9 @@ def _equations(record: CalibrationRecord) -> tuple[list[Rows], list[Part]]:
             of = slice(start, start + _CHUNK)
             chunks.append(whole._replace(**{name: getattr(whole, name)[of] for name in Rows._fields if name != "name"}))
     step = -(-sum(len(each.poses) for each in chunks) // _MOST_POSES)
-    relations = [
-        Part(block.residual, np.pad(block.shared, ((0, 0), (0, added))), block.own) for block in equations.relations
-    ]
+    wider = ((0, 0), (0, added))
+    relations = [block._replace(shared=np.pad(block.shared, wider)) for block in equations.relations]
     return chunks[:: max(step, 1)], relations
-
-
-def _part(rows: Rows) -> Part:
-    block = rows.block("")
-    return Part(block.residual, block.shared, block.own)
 
 
 def _rms(rows: Sequence[Rows]) -> float:
@@ -210,80 +199,9 @@ def _misfit(record: CalibrationRecord, left: Residuals, class_noise: Noise | Non
     if class_noise is None:
         return None
     rows, relations = _equations(record._replace(noise=class_noise))
-    left = Residuals.of([*map(_part, rows), *relations])
+    left = Residuals.of([*(each.block("") for each in rows), *relations])
     spare, ratio = left.degrees_of_freedom, left.cost / left.degrees_of_freedom
     return Misfit(float(np.sqrt(ratio)), spare, f_tail(ratio, spare, CLASS_DEGREES_OF_FREEDOM), True, class_noise)
-
-
-def _lengths(
-    record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Part], left: Residuals
-) -> Lengths | None:
-    """Lengths and certified values against the arm as the poses alone determine it, but for its scale."""
-    capture, parts = record.recording.capture, [_part(each) for each in rows]
-    names = [f"{length.start} - {length.end}" for length in capture.lengths]
-    anchor = scale_anchor_of(record)
-    if record.observed is None:
-        if not names:
-            return None
-        related, covariance, by_anchor = _lengths_of_sockets(record, anchor)
-        units, direction = np.ones(len(names)), None
-        if anchor is not None:
-            arm, q = to_numpy((record.calibrated.arm, capture.q))
-            slope = np.asarray(arm.jacobian(q, (anchor,)))
-            direction = np.concatenate([(each.by_tip @ slope[each.poses]).ravel() for each in rows]), by_anchor
-    else:
-        if not relations:
-            return None
-        related, covariance, direction = relations[0], np.eye(len(relations[0].residual)), None
-        certified = Observed.of(capture).certified()
-        names += [part for part, (value, _) in certified.items() for _ in np.asarray(value)]
-        own = [length.u for length in capture.lengths] + [u for _, of in certified.values() for u in np.asarray(of)]
-        units = np.maximum(np.array(own, dtype=float), LEAST_U)
-        measured = any(one.fixes_scale and not one.certified for one in capture.observations)
-        if anchor is not None and record.hold is None and not measured:
-            column = record.names.index(anchor)
-            direction = np.concatenate([part.shared[:, column] for part in parts]), related.shared[:, column]
-            parts = [part._replace(shared=np.delete(part.shared, column, axis=1)) for part in parts]
-            related = related._replace(shared=np.delete(related.shared, column, axis=1))
-    found = consistency(parts, related, covariance, direction)
-    if found.degrees_of_freedom < 1:
-        return None
-
-    def probability(square: float, spare: int) -> float:
-        if record.given_noise is not None:
-            return chi_square_tail(square, spare)
-        return f_tail(square / spare, spare, left.degrees_of_freedom)
-
-    worst, spare = int(np.argmax(found.gains)), found.degrees_of_freedom
-    rest = max(found.square - found.gains[worst], 0.0)
-    clear = spare > 1 and probability(rest, spare - 1) > 0.05 and 9.0 * rest < found.square
-    return Lengths(
-        birge_ratio=float(np.sqrt(max(found.square, 0.0) / spare)),
-        degrees_of_freedom=spare,
-        probability=probability(max(found.square, 0.0), spare),
-        number=len(names),
-        odd=names[worst] if clear else "",
-        difference=float(found.shifts[worst] * units[worst]) if clear else 0.0,
-    )
-
-
-def _lengths_of_sockets(
-    record: CalibrationRecord, anchor: str | None
-) -> tuple[Part, Float[np.ndarray, "l l"], Float[np.ndarray, " l"]]:
-    """Errors of the lengths and their derivatives by the parameters but the anchor, mm; their covariance by their own u
-    and the scatter of the poses; and their derivatives by the anchor."""
-    arm, measurement, noise = to_numpy(
-        (record.calibrated.arm, Measurement.of(record.recording.capture), record.noise)
-    )
-    measurement, space = measurement.weighted(arm.geometry, noise), Parameters(arm, record.names)
-    distance, slopes = measured_lengths(np.asarray(space.vector()), space, measurement)
-    slopes = np.asarray(slopes) * np.asarray(space.scale)
-    centroids = measurement.centroids(np.asarray(arm.position(measurement.q)))
-    covariance = np.asarray(length_covariance(centroids, measurement, np.ones(())))
-    kept = np.array([name != anchor for name in record.names])
-    error = np.asarray(distance - measurement.nominal)
-    by_anchor = slopes[:, ~kept].sum(axis=1)
-    return Part(error, slopes[:, kept], np.zeros((len(error), 0))), covariance, by_anchor
 
 
 def _noisy_observations(
@@ -291,7 +209,7 @@ def _noisy_observations(
 ) -> tuple[NoisyObservation, ...]:
     """Those of a calibration with other observations than sockets."""
     names = list(dict.fromkeys(each.name for each in rows))
-    if not record.recording.capture.observations or len(names) < 2 and record.given_noise is None:
+    if not record.recording.capture.observations or (len(names) < 2 and record.given_noise is None):
         return ()
     tests = []
     for name in names:
@@ -315,17 +233,12 @@ def _form(
     return Form((*columns, *none), (*kernel, *none))
 
 
-def _terms(
-    record: CalibrationRecord, rows: Sequence[Rows], left: Residuals
-) -> tuple[tuple[FoundTerm, ...], Residuals]:
+def _terms(record: CalibrationRecord, rows: Sequence[Rows], left: Residuals) -> tuple[tuple[FoundTerm, ...], Residuals]:
     """Terms that the model lacks, the one that explains most first; and the residuals with them in the model."""
     arm, q = to_numpy((record.calibrated.arm, record.recording.capture.readings))
-    candidates = missing_terms(arm, q)
-    empty = np.zeros((left.slices[-1].stop - left.slices[len(rows) - 1].stop, 1))
-    columns = []
-    for term in candidates:
-        own = np.concatenate([term.columns(each, each.extra[..., : arm.joints]) for each in rows])
-        columns.append(np.concatenate([own, np.broadcast_to(empty, (len(empty), own.shape[1]))]))
+    candidates = missing_terms(arm, np.asarray(q))
+    relations = left.slices[-1].stop - left.slices[len(rows) - 1].stop
+    columns = [np.pad(each, ((0, relations), (0, 0))) for each in columns_of(candidates, rows, arm.joints)]
     chosen: list[tuple[int, ScoreTest, float, list[int]]] = []
     explained = left
     for _ in range(_MOST_TERMS):

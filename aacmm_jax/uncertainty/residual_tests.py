@@ -16,17 +16,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.distributions import chi_square_tail, f_tail
+from .group_test import Block
 
 _NULL = 1e-5  # singular values of scaled columns below this, of the largest, are zero
 _EXPLAINED = 1e-8  # squared part of a column that the model leaves, below which it counts as the model's own
-
-
-class Part(NamedTuple):
-    """Equations of one fixture: residuals in standard deviations, and their derivatives."""
-
-    residual: Float[np.ndarray, " r"]
-    shared: Float[np.ndarray, "r p"]  # by the parameters, and by what several fixtures share
-    own: Float[np.ndarray, "r k"]  # by what only this fixture has, such as the position of a socket
 
 
 class Residuals(NamedTuple):
@@ -38,7 +31,7 @@ class Residuals(NamedTuple):
     values: Float[np.ndarray, " R"]
 
     @classmethod
-    def of(cls, parts: Sequence[Part]) -> "Residuals":
+    def of(cls, parts: Sequence[Block]) -> "Residuals":
         """The least squares of some equations."""
         ends = np.cumsum([len(part.residual) for part in parts])
         slices = tuple(slice(end - len(part.residual), end) for part, end in zip(parts, ends, strict=True))
@@ -66,14 +59,14 @@ class Residuals(NamedTuple):
 
     def extended(self, columns: Float[np.ndarray, "R c"]) -> "Residuals":
         """The least squares with further unknowns, whose columns are given."""
-        added = _orthonormal(self.unexplained(columns), np.linalg.norm(columns, axis=0))
+        added = _orthonormal(self.unexplained(columns), columns)
         basis = np.concatenate([self.basis, added], axis=1)
         return self._replace(basis=basis, values=self.values - added @ (added.T @ self.values))
 
 
-def _orthonormal(columns: Float[np.ndarray, "R c"], lengths: Float[np.ndarray, " c"] | None = None) -> np.ndarray:
-    """A basis of some columns, whose ``lengths`` were larger before something was taken from them."""
-    lengths = np.linalg.norm(columns, axis=0) if lengths is None else lengths
+def _orthonormal(columns: Float[np.ndarray, "R c"], before: Float[np.ndarray, "R c"] | None = None) -> np.ndarray:
+    """A basis of some columns, which were those ``before`` something was taken from them."""
+    lengths = np.linalg.norm(columns if before is None else before, axis=0)
     scaled = columns / np.where(lengths > 0, lengths, 1.0)
     vectors, values, _ = np.linalg.svd(scaled, full_matrices=False)
     return vectors[:, values > _NULL * values.max(initial=0.0)]
@@ -89,8 +82,8 @@ class Consistency(NamedTuple):
 
 
 def consistency(
-    parts: Sequence[Part],
-    relations: Part,
+    parts: Sequence[Block],
+    relations: Block,
     covariance: Float[np.ndarray, "l l"],
     open_direction: tuple[Float[np.ndarray, " R"], Float[np.ndarray, " l"]] | None = None,
 ) -> Consistency:
@@ -125,7 +118,9 @@ def consistency(
     pulled, diagonal = weight @ residual, np.diag(weight)
     tested = diagonal > _EXPLAINED * np.diag(root.T @ root)
     shifts = np.where(tested, pulled / np.where(tested, diagonal, 1.0), 0.0)
-    return Consistency(float(residual @ pulled), len(root) - basis.shape[1], shifts, shifts * np.where(tested, pulled, 0))
+    return Consistency(
+        float(residual @ pulled), len(root) - basis.shape[1], shifts, shifts * np.where(tested, pulled, 0)
+    )
 
 
 class ScoreTest(NamedTuple):
@@ -213,8 +208,8 @@ def form_test(left: Residuals, form: Form, relative: bool) -> FormTest:
 def _value_and_traces(left: Residuals, form: Form) -> tuple[float, tuple[float, float, float]]:
     """r'A r, and the traces of the first powers of MA.
 
-    With W = Z' M Z = V - B B', V of the parts less their own unknowns and B = Z' times the basis, tr (MA)^k = tr (KW)^k.
-    V is block by block, so that only V's blocks and the small products with B are formed.
+    With W = Z' M Z = V - B B', V of the parts less their own unknowns and B = Z' times the basis, tr (MA)^k is
+    tr (KW)^k. V is block by block, so that only V's blocks and the small products with B are formed.
     """
     size = left.basis.shape[1]
     g, h, h2 = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size))
