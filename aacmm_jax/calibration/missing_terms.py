@@ -36,7 +36,7 @@ class MissingTerm(NamedTuple):
     values: Float[np.ndarray, "N _k"] | Float[np.ndarray, "N 3 _k"]  # pose by pose, for coefficients of 1
 
 
-def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows], joints: int) -> list[Float[np.ndarray, "R _k"]]:
+def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows], joints: int) -> list[Float[np.ndarray, "R _"]]:
     """The columns of each term in the rows of all poses."""
     of_joints = [term for term in terms if term.joint is not None]
     of_tip = [term for term in terms if term.joint is None]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..calibration.model_tests import model_tests
+from ..calibration.model_errors import model_tests
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import active_names
 from ..data.capture import Capture, ReferenceLength
@@ -15,7 +15,7 @@ from ..kinematics.arm import is_length
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
-from .model_tests import tests_summary
+from .model_errors import summary_of_tests
 from .observations import capture_observations, observed_summary
 from .validation import cross_validation_summary
 from .warnings import observed, of_calibration, of_import
@@ -181,7 +181,7 @@ def calibration_summary(
         "uncertainty": uncertainty_summary(record, observability, volume),
         "cross_validation": None if record.validation is None else cross_validation_summary(record.validation),
         "monte_carlo": record.sampled_says,
-        "model_tests": None if tests is None else tests_summary(tests),
+        "model_tests": None if tests is None else summary_of_tests(tests),
         "warnings": of_calibration(record, observability, tests),
         **observed_summary(record, evaluations["nominal"]),
     }

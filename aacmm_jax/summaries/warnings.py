@@ -6,7 +6,7 @@ import numpy as np
 
 from ..calibration.checks import plausible
 from ..calibration.contradictions import session_metrics
-from ..calibration.model_tests import ModelTests, model_tests
+from ..calibration.model_errors import ModelTests, model_tests
 from ..calibration.record import REPEATABILITY, CalibrationRecord, record_of
 from ..calibration.results import Calibration, Identification, active_names
 from ..calibration.scale_anchor import scale_set_by_clause
@@ -22,7 +22,7 @@ from ..model.metrics import pose_outliers
 from ..uncertainty.identifiability import Observability, observability
 from .contradictions import contradictions, removals
 from .likely_cause import likely_cause
-from .model_tests import sentences_of_tests
+from .model_errors import sentences_of_tests
 from .validation import contradicted_prediction
 
 _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a reference length is wrong

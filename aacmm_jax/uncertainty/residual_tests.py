@@ -133,7 +133,7 @@ class ScoreTest(NamedTuple):
     coefficients: Float[np.ndarray, " c"]
 
 
-def score_tests(left: Residuals, candidates: Sequence[Float[np.ndarray, "R c"]]) -> list[ScoreTest]:
+def score_tests(left: Residuals, candidates: Sequence[Float[np.ndarray, "R _"]]) -> list[ScoreTest]:
     """Each candidate against the model, whatever the level of the noise is.
 
     Args:

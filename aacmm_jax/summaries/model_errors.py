@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 from ..calibration.missing_terms import Kind
-from ..calibration.model_tests import LEVEL, FoundTerm, Lengths, Misfit, ModelTests
+from ..calibration.model_errors import LEVEL, FoundTerm, Lengths, Misfit, ModelTests
 from ..calibration.record import REPEATABILITY
 from ..core.text import shorten
 from ..core.units import ARCSEC
@@ -106,7 +106,7 @@ def _chance(probability: float) -> str:
     return "p < 0.0001" if probability < 1e-4 else f"p = {probability:.1g}"
 
 
-def tests_summary(tests: ModelTests) -> dict[str, Any]:
+def summary_of_tests(tests: ModelTests) -> dict[str, Any]:
     """The tests as JSON has them: probabilities where nothing is wrong, and what was found; mm, rad."""
     misfit, lengths, noisy, successive = tests.misfit, tests.lengths, tests.noisy_joint, tests.successive
     return {

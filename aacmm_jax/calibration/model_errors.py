@@ -22,7 +22,7 @@ from ..kinematics.parameters import ArmSpecification
 from ..uncertainty.group_test import Block
 from ..uncertainty.residual_tests import Form, FormTest, Residuals, ScoreTest, form_test, score_tests
 from .group_equations import Rows, equations_of
-from .length_test import Lengths, length_test
+from .length_consistency import Lengths, length_test
 from .missing_terms import Kind, MissingTerm, columns_of, missing_terms
 from .record import CalibrationRecord, record_of
 from .results import Calibration, Identification
