@@ -18,6 +18,8 @@ from .group_equations import LEAST_U, Rows, scale_anchor_of
 from .record import CalibrationRecord
 
 _EXACT = 1e-6  # mm: smaller errors are rounding errors of a simulation without noise
+# A length is named where chi-square falls below a ninth without it, to what chance exceeds in over 5 % of cases.
+_CLEAR, _AGREE = 9.0, 0.05
 
 
 class Lengths(NamedTuple):
@@ -59,12 +61,13 @@ def length_test(
         return f_tail(square / number, number, spare)
 
     worst, number = int(np.argmax(found.gains)), found.degrees_of_freedom
-    rest = max(found.square - found.gains[worst], 0.0)
-    clear = number > 1 and probability(rest, number - 1) > 0.05 and 9.0 * rest < found.square
+    square = max(found.square, 0.0)
+    rest = max(square - found.gains[worst], 0.0)
+    clear = number > 1 and probability(rest, number - 1) > _AGREE and _CLEAR * rest < square
     return Lengths(
-        birge_ratio=float(np.sqrt(max(found.square, 0.0) / number)),
+        birge_ratio=float(np.sqrt(square / number)),
         degrees_of_freedom=number,
-        probability=probability(max(found.square, 0.0), number),
+        probability=probability(square, number),
         number=len(names),
         odd=names[worst] if clear else "",
         difference=float(found.shifts[worst] * units[worst]) if clear else 0.0,

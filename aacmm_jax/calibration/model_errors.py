@@ -31,7 +31,7 @@ LEVEL = 0.01
 # Of the noise of a class: its members differ by a quarter or so, which is what 8 degrees of freedom say (JCGM 100,
 # G.4.2), so that only an arm whose residuals are over twice as large is outside its class.
 CLASS_DEGREES_OF_FREEDOM = 8.0
-_MOST_TERMS = 4  # that are looked for one after the other
+_MOST_TERMS = 6  # that are looked for one after the other
 _AS_WELL = 6.0  # difference of the information criterion (Akaike 1974) below which another term explains as much
 _FEWEST = 6  # degrees of freedom below which residuals say nothing
 _MOST_POSES = 2000  # that are looked at: more would only find errors that do not matter
@@ -153,7 +153,8 @@ def _tests(record: CalibrationRecord, class_noise: Noise | None) -> ModelTests:
         lengths=lengths,
         noisy_observations=_noisy_observations(record, rows, left),
         terms=terms,
-        noisy_joint=_noisy_joint(record.calibrated.arm.joints, rows, explained),
+        # Where even these terms do not explain the residuals, what they miss looks like noise.
+        noisy_joint=None if len(terms) == _MOST_TERMS else _noisy_joint(record.calibrated.arm.joints, rows, explained),
         successive=_successive(rows, explained),
     )
 
@@ -277,6 +278,8 @@ def _amplitude(term: MissingTerm, coefficients: Float[np.ndarray, " k"]) -> floa
     if term.kind == "gear ratio":
         return float(abs(coefficients[0])) * 1e-3
     added = term.values @ coefficients
+    if term.kind == "zero":
+        return float(abs(coefficients[0])) * 1e-3
     half = float(np.linalg.norm(np.ptp(added.reshape(len(added), -1), axis=0))) / 2
     return half if term.joint is None else half * 1e-3
 

@@ -55,26 +55,29 @@ def sentences_of_tests(tests: ModelTests, method: str = "") -> list[str]:
 
 
 def _terms(terms: tuple[FoundTerm, ...]) -> str:
-    named = [
-        f"{_TERMS[term.kind][0].format(i=term.joint)} ({_amplitude(term)}, {_chance(term.probability)})"
-        for term in terms
-    ]
-    kinds = {kind for term in terms for kind, _ in ((term.kind, term.joint), *term.alternatives)}
-    causes = [cause for kind, (_, cause, _) in _TERMS.items() if kind in kinds]
-    others = list(dict.fromkeys(_TERMS[kind][0].format(i=i) for term in terms for kind, i in term.alternatives))
-    as_well = f" The data do not tell these from {shorten(others, 3)}." if others else ""
-    options = list(dict.fromkeys(option for kind, (_, _, option) in _TERMS.items() if kind in kinds and option))
+    named = [f"{_TERMS[term.kind][0].format(i=term.joint)} ({_amplitude(term)})" for term in terms]
+    kinds = dict.fromkeys(term.kind for term in terms)
+    options = list(dict.fromkeys(_TERMS[kind][2] for kind in kinds if _TERMS[kind][2]))
     hint = f"; try {MODEL_OPTION} {','.join(options)}" if MODEL_OPTION and options else ""
+    found = {(term.kind, term.joint) for term in terms}
+    others = dict.fromkeys(other for term in terms for other in term.alternatives if other not in found)
+    as_well = [_TERMS[kind][0].format(i=joint) for kind, joint in others]
     return (
-        f"Residuals follow {shorten(named, 4)}, which the model lacks: {' or '.join(causes)}{hint}.{as_well} "
-        "Every u is too small."
+        f"Residuals follow {shorten(named, 3)} ({_chance(max(term.probability for term in terms))}), which the model "
+        f"lacks: {', '.join(_TERMS[kind][1] for kind in kinds)}{hint}. "
+        + (f"As good an explanation: {shorten(as_well, 3)}. " if as_well else "")
+        + "Every u is too small."
     )
 
 
 def _amplitude(term: FoundTerm) -> str:
     if term.kind == "gear ratio":
-        return f"{100 * term.amplitude:.2g} %"
-    return f"{term.amplitude:.2g} mm" if term.joint is None else f"{term.amplitude / ARCSEC:.2g} arcsec"
+        return f"{_rounded(100 * term.amplitude)} %"
+    return f"{_rounded(term.amplitude)} mm" if term.joint is None else f"{_rounded(term.amplitude / ARCSEC)} arcsec"
+
+
+def _rounded(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def _misfit(misfit: Misfit) -> str:

@@ -1,4 +1,4 @@
-"""What a model lacks, and noise that is not as stated, is noticed and named; where nothing is wrong, nothing is said."""
+"""What a model lacks, and noise that is not as stated, is named; where nothing is wrong, nothing is said."""
 
 import sys
 from pathlib import Path
@@ -205,8 +205,8 @@ def test_rates_of_false_alarms_and_of_warnings(monkeypatch):
     import model_warnings
 
     trials = model_warnings.Trials(model_warnings.PAPER, 3)
-    right = model_warnings.rates(trials, 160, None)
+    right = model_warnings.rates(trials, 160)
     assert right["any"] < 0.12
-    wrong = model_warnings.rates(trials, 32, None, errors=model_warnings.eccentric(10.0))
+    wrong = model_warnings.rates(trials, 32, errors=model_warnings.eccentric(10.0))
     assert wrong["missing term"] > 0.9
     sys.modules.pop("model_warnings")
