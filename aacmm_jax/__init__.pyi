@@ -42,5 +42,6 @@ from .model.scale import fix_scale as fix_scale
 from .model.scale import scale_from_lengths as scale_from_lengths
 from .solver.bounded import least_squares as least_squares
 from .solver.reason import Reason as Reason
+from .summaries.warnings import warnings_of as warnings_of
 from .uncertainty.identifiability import observability as observability
 from .uncertainty.volume import volumetric_uncertainty as volumetric_uncertainty

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import is_length, value_of
@@ -16,7 +16,7 @@ from ..uncertainty.observed_covariance import arm_errors, covariance_of_noise
 from .record import CalibrationRecord
 
 PROBE = ("probe_x", "probe_y", "probe_z")
-_LEAST = 1e-6  # mm: smallest standard deviation of a length or certified value
+LEAST_U = 1e-6  # mm: smallest standard deviation of a length or certified value
 
 
 class Rows(NamedTuple):
@@ -28,6 +28,8 @@ class Rows(NamedTuple):
     own: Float[np.ndarray, "m r k"]  # by the geometry of this observation alone
     extra: Float[np.ndarray, "m r e"]  # by what may be wrong in some of the poses: `Equations.extra`
     in_mm: Float[np.ndarray, "m 3 r"]  # the residual's position in mm
+    by_tip: Float[np.ndarray, "m r 3"]  # derivatives by the tip's position
+    poses: Int[np.ndarray, " m"]  # their numbers among all poses: sockets first, then other observations
 
     def block(self, group: str | None, extra: Sequence[int] = (), concerned: bool = True) -> Block:
         """For the test; with columns of ``extra`` after the shared ones, which are 0 where it is not concerned."""
@@ -93,7 +95,8 @@ def _of_sockets(record: CalibrationRecord, extra: tuple[str, ...]) -> list[Rows]
         of = slice(end - size, end)
         if size > 1:
             shared = by[of][..., : len(names)]
-            found.append(Rows(name, residual[of], shared, root[of], by[of][..., columns], inverse[of]))
+            extra_of, poses = by[of][..., columns], np.arange(end - size, end)
+            found.append(Rows(name, residual[of], shared, root[of], extra_of, inverse[of], root[of], poses))
     return found
 
 
@@ -109,27 +112,29 @@ def _of_observations(record: CalibrationRecord, extra: tuple[str, ...]) -> tuple
     linear = linear_rows(space, observed, z)
     errors = arm_errors(observed.forward(space, z[:p], z[p:]), linear, observed)
     whitening = whitening_of(
-        linear, observed, [covariance_of_noise(error, noise) for error in errors], np.array(_LEAST)
+        linear, observed, [covariance_of_noise(error, noise) for error in errors], np.array(LEAST_U)
     )
     steps = np.concatenate([np.asarray(space.scale), observed.steps])
     common = np.concatenate([np.arange(free), p + _common(observed)])
     columns = np.array([every.index(name) for name in extra])
     rows = []
-    for name, part, root, weights in zip(
-        record.observed.names, linear, whitening.roots, record.observed.weights, strict=True
+    for name, part, root, weights, of in zip(
+        record.observed.names, linear, whitening.roots, record.observed.weights, observed.slices, strict=True
     ):
         root = np.sqrt(np.asarray(weights))[:, None, None] * np.asarray(root)
         own = np.array([i for i in part.indices if i >= p and i not in common], dtype=int)
         white, by = _in_columns(part, root, steps)
         in_mm = np.linalg.pinv(root)[:, :3]
-        rows.append(Rows(name, white, by(common), by(own), by(columns), in_mm))
+        by_tip = root @ np.moveaxis(np.asarray(part.rows.by_tip), -1, 0)
+        poses = np.arange(of.start, of.stop)
+        rows.append(Rows(name, white, by(common), by(own), by(columns), in_mm, by_tip, poses))
     derivatives, u = certified_and_lengths(observed, z, p)
     parts = observed.split(z[p:])
     residual = [np.linalg.norm(parts[end] - parts[start]) for start, end in observed.ends] - np.asarray(
         observed.nominal
     )
     residual = [residual, *(parts[name] - np.asarray(value) for name, (value, _) in observed.certified().items())]
-    u = np.maximum(u, _LEAST)
+    u = np.maximum(u, LEAST_U)
     every_row = Block(
         "", None, np.concatenate(residual) / u, (derivatives * steps)[:, common] / u[:, None], np.zeros((len(u), 0))
     )

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
+from ..calibration.model_errors import model_tests
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import active_names
 from ..data.capture import Capture, ReferenceLength
@@ -15,6 +16,7 @@ from ..kinematics.arm import by_joint, is_length, parameter_unit
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
+from .model_errors import summary_of_tests
 from .observations import capture_observations, observed_summary
 from .validation import cross_validation_summary
 from .warnings import observed, of_calibration, of_import
@@ -147,6 +149,7 @@ def calibration_summary(
     ``observability`` (`warnings.observed`) and ``volume`` (`volumetric_uncertainty`) are computed if not given.
     """
     observability = observed(record) if observability is None else observability
+    tests = None if record.implausible_residual or not record.plausible_scale else model_tests(record)
     evaluations, vectors = record.evaluations(), record.vectors()
     u = np.sqrt(np.diag(record.covariance))
     parameters = [
@@ -182,7 +185,8 @@ def calibration_summary(
         "uncertainty": uncertainty_summary(record, observability, volume),
         "cross_validation": None if record.validation is None else cross_validation_summary(record.validation),
         "monte_carlo": record.sampled_says,
-        "warnings": of_calibration(record, observability),
+        "model_tests": None if tests is None else summary_of_tests(tests),
+        "warnings": of_calibration(record, observability, tests),
         **observed_summary(record, evaluations["nominal"]),
     }
     if "true" in vectors:

@@ -6,28 +6,29 @@ import numpy as np
 
 from ..calibration.checks import plausible
 from ..calibration.contradictions import session_metrics
-from ..calibration.record import REPEATABILITY, CalibrationRecord
-from ..calibration.results import active_names
+from ..calibration.model_errors import ModelTests, model_tests
+from ..calibration.record import REPEATABILITY, CalibrationRecord, record_of
+from ..calibration.results import Calibration, Identification, active_names
 from ..calibration.scale_anchor import scale_set_by_clause
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
 from ..core.units import INCH, M
+from ..data.capture import Capture
 from ..data.noise import tip_covariances
 from ..data.recording import Recording
 from ..kinematics.chain import joint_motion, reading_units
-from ..kinematics.parameters import Bounds, Parameters
+from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
 from ..model.metrics import pose_outliers
 from ..uncertainty.identifiability import Observability, observability
 from .contradictions import contradictions, removals
 from .likely_cause import likely_cause
+from .model_errors import sentences_of_tests
 from .validation import contradicted_prediction
 
 _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a reference length is wrong
-_LENGTH_OUTLIER = 8.0  # in standard uncertainties: real arms reach 6 through errors outside the D-H model
 _TOLERANCE = math.radians(0.01)  # beyond a limit: more than the noise of any encoder
 _APART = 5.0  # RMS of a session among others, over that which it has alone, beyond which they are not of one arm
 _EXACT = 1e-6  # mm: smaller residuals are rounding errors of a simulation without noise
-_EXCESS = 1.5  # ratio of errors to their prediction that is reported
 _TRY_ALL = "aacmm arm ARM --check MANIFEST tries every order and sign of the columns, and the zeros of the joints."
 # By k, which is a length measured by the nominal arm over its reference value: one in m, read as mm, makes k = 1000.
 _MISTAKEN_UNITS = {
@@ -71,8 +72,26 @@ def of_import(recording: Recording) -> list[str]:
     return [*([cause] if cause else []), *of_capture(recording)]
 
 
-def of_calibration(record: CalibrationRecord, seen: Observability | None = None) -> list[str]:
-    """What should be read about a calibration before its numbers; ``seen`` is the result of `observed`, if known."""
+def warnings_of(result: Calibration | Identification, capture: Capture) -> list[str]:
+    """What should be read about a calibration before its numbers: one sentence each, the most serious first.
+
+    The command line prints the same. The numbers behind the tests of model and noise: `calibration.model_tests`.
+
+    Args:
+        result: What `calibrate` or `identify` returned.
+        capture: What it was calibrated from.
+
+    Returns:
+        The sentences; none where nothing is to be said.
+    """
+    return of_calibration(record_of(result, Recording(capture, ArmSpecification(result.space.base))))
+
+
+def of_calibration(
+    record: CalibrationRecord, seen: Observability | None = None, tests: ModelTests | None = None
+) -> list[str]:
+    """What should be read about a calibration before its numbers; ``seen`` is the result of `observed`, and ``tests``
+    that of `model_tests`, if known."""
     if not record.plausible_scale:  # a wrong unit, say: what was fitted and predicted with it says nothing
         ended = [] if record.reason.startswith("Converged") else [record.reason]
         return [*_scale(record), *ended, *_implausible(record), *of_capture(record.recording)]
@@ -80,12 +99,13 @@ def of_calibration(record: CalibrationRecord, seen: Observability | None = None)
     found += removals(record)
     found += _implausible(record)
     found += contradictions(record)
+    found += [] if record.validation is None else contradicted_prediction(record.validation)
+    if not record.implausible_residual:
+        found += sentences_of_tests(model_tests(record) if tests is None else tests, record.method)
     if record.recording.capture.observations:
-        found += [] if record.validation is None else contradicted_prediction(record.validation)
-        found += [*_observations(record), *_scale(record), *of_capture(record.recording)]
+        found += [*_on_bounds_observed(record), *_scale(record), *of_capture(record.recording)]
         seen = observed(record) if seen is None else seen
         return found if record.implausible_residual else found + _identifiability(record, seen)
-    found += _validation(record)
     found += [*_scale(record), *of_capture(record.recording)]
     seen = observed(record) if seen is None else seen
     if record.implausible_residual:
@@ -93,21 +113,9 @@ def of_calibration(record: CalibrationRecord, seen: Observability | None = None)
     return [*found, *_bounds(record, seen), *_data(record), *_identifiability(record, seen)]
 
 
-def _observations(record: CalibrationRecord) -> list[str]:
+def _on_bounds_observed(record: CalibrationRecord) -> list[str]:
     """Of a calibration with observations besides sockets."""
-    observed = record.observed
-    assert observed is not None
-    found = [
-        f"{name} ({chi:.2g} times)"
-        for name, chi in zip(observed.names, observed.reduced_chi, strict=True)
-        if chi > _EXCESS and record.robust is None
-    ]
     sentences = []
-    if found:
-        sentences.append(
-            "Residuals are larger than the uncertainties and the scatter of the tips predict: "
-            f"{shorten(found)}; check these observations, or their u."
-        )
     sides = _sides(record)
     if _many_on_bounds(record) and not record.implausible_residual:
         sentences.append(_on_bounds(record, sides))
@@ -171,22 +179,6 @@ def _on_bounds(record: CalibrationRecord, sides: list[str]) -> str:
 def _cause(record: CalibrationRecord) -> str:
     cause = likely_cause(record.recording.nominal.arm, record.recording.capture)
     return f" {cause or _TRY_ALL}"
-
-
-def _validation(record: CalibrationRecord) -> list[str]:
-    """Results of cross-validation that contradict the uncertainty, and residuals that contradict the given noise."""
-    found = []
-    if record.validation is not None:
-        found += contradicted_prediction(record.validation)
-    if record.reduced_chi is not None and not 1 / _EXCESS < record.reduced_chi < _EXCESS:
-        word = "small" if record.reduced_chi > 1 else "large"
-        factor = max(record.reduced_chi, 1 / record.reduced_chi)
-        found.append(
-            f"Residuals are {record.reduced_chi:.2g} times what the given noise predicts, and every uncertainty "
-            f"follows from that noise: it is about {factor:.2g} times too {word}. Check the noise, or leave it out to "
-            "have it estimated."
-        )
-    return found
 
 
 def _scale(record: CalibrationRecord) -> list[str]:
@@ -261,28 +253,11 @@ def _data(record: CalibrationRecord) -> list[str]:
         found.append(
             f"Poses far from their socket, where {typical:.2g} mm is typical: {shorten(names)}; was the tip seated?"
         )
-    error = np.asarray(evaluation.error)
-    normalised = np.abs(error) / np.hypot(np.asarray(evaluation.u), 1e-9)
-    wrong = [
-        f"{length.start} - {length.end} ({error[i]:+.3g} mm, {normalised[i]:.0f} times its uncertainty)"
-        for i, length in enumerate(capture.lengths)
-        if len(error) > 1 and normalised[i] > _LENGTH_OUTLIER and abs(error[i]) > 1e-6
-    ]
-    if wrong:
-        found.append(f"Reference lengths that disagree with the arm: {shorten(wrong)}; check their values and sockets.")
     surplus = 3 * sum(size - 1 for size in capture.sizes) - (len(record.names) - 1)
     if surplus < (len(record.names) - 1) / 2:
         found.append(
             f"Only {surplus} more equations than unknowns, which makes the residuals small whatever the errors are; "
             "record more poses."
-        )
-    error, u = np.asarray(evaluation.error), np.asarray(evaluation.u)
-    birge = float(np.sqrt(np.sum((error / u) ** 2) / (len(error) - 1))) if len(error) > 1 and np.all(u > 0) else 0.0
-    if birge > _EXCESS:
-        found.append(
-            f"The {len(error)} reference lengths disagree {birge:.2g} times as much as their u and the scatter of the "
-            "poses predict (Birge ratio), and u(k) has been multiplied by it. Look for a wrong length, or for errors "
-            "outside the D-H model."
         )
     if len(capture.lengths) == 1 and record.method != REPEATABILITY:
         found.append("One reference length fixes the scale, so its own error is no check; keep another for checking.")

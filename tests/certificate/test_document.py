@@ -441,9 +441,10 @@ def test_what_was_left_out_is_stated(record):
 
 def test_warnings_and_simulations_are_stated(record):
     recording = record.recording
-    simulated = record._replace(recording=recording._replace(true=recording.nominal), reduced_chi=3.0)
+    given = aj.Noise(encoder_arcsec=2.0 / 3, seating=0.005 / 3)
+    simulated = record._replace(recording=recording._replace(true=recording.nominal), reduced_chi=3.0, noise=given)
     warnings = of_calibration(simulated)
-    assert any("3 times what the given noise predicts" in sentence for sentence in warnings)
+    assert any("times what the given noise predicts" in sentence for sentence in warnings)
     said = contents(dcc_xml(simulated, AdministrativeData(), created=CREATED), "*/dcc:statements")
     assert set(warnings) <= set(said)
     assert "The readings are simulated, so this is no certificate of a real arm." in said

@@ -1,0 +1,128 @@
+"""Whether the reference lengths of a calibration agree: with each other, and with the arm that the poses determine."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.distributions import chi_square_tail, f_tail
+from ..core.numpy_or_jax import to_numpy
+from ..kinematics.parameters import Parameters
+from ..model.measurement import Measurement, length_covariance
+from ..model.observed import Observed
+from ..model.residuals import measured_lengths
+from ..uncertainty.group_test import Block
+from ..uncertainty.residual_tests import consistency
+from .group_equations import LEAST_U, Rows, scale_anchor_of
+from .record import CalibrationRecord
+
+_EXACT = 1e-6  # mm: smaller errors are rounding errors of a simulation without noise
+# A length is named where chi-square falls below a ninth without it, to what chance exceeds in over 5 % of cases.
+_CLEAR, _AGREE = 9.0, 0.05
+
+
+class Lengths(NamedTuple):
+    """Reference lengths and certified values against each other, by the arm that the poses determine."""
+
+    birge_ratio: float
+    degrees_of_freedom: int
+    probability: float
+    number: int
+    odd: str = ""  # the one without which the others agree
+    difference: float = 0.0  # of that one from what the others say, mm
+
+
+def length_test(
+    record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block], spare: int
+) -> Lengths | None:
+    """Lengths and certified values against the arm as the poses alone determine it, but for its scale.
+
+    Args:
+        record: The calibration.
+        rows: Its equations of poses.
+        relations: Its equations of lengths and certified values, where it has any.
+        spare: Degrees of freedom of the noise, where it was estimated.
+
+    Returns:
+        None where there are too few to contradict each other.
+    """
+    related = _of_sockets(record, rows) if record.observed is None else _of_observations(record, rows, relations)
+    if related is None:
+        return None
+    names, units = related.names, related.units
+    found = consistency(related.poses, related.relations, related.covariance, related.scale)
+    if found.degrees_of_freedom < 1:
+        return None
+
+    def probability(square: float, number: int) -> float:
+        if record.given_noise is not None:
+            return chi_square_tail(square, number)
+        return f_tail(square / number, number, spare)
+
+    worst, number = int(np.argmax(found.gains)), found.degrees_of_freedom
+    square = max(found.square, 0.0)
+    rest = max(square - found.gains[worst], 0.0)
+    clear = number > 1 and probability(rest, number - 1) > _AGREE and _CLEAR * rest < square
+    return Lengths(
+        birge_ratio=float(np.sqrt(square / number)),
+        degrees_of_freedom=number,
+        probability=probability(square, number),
+        number=len(names),
+        odd=names[worst] if clear else "",
+        difference=float(found.shifts[worst] * units[worst]) if clear else 0.0,
+    )
+
+
+class _Related(NamedTuple):
+    """Lengths and certified values, and the equations of the poses that say what they should be."""
+
+    names: list[str]
+    units: Float[np.ndarray, " l"]  # of their residuals, mm
+    poses: list[Block]
+    relations: Block
+    covariance: Float[np.ndarray, "l l"]
+    scale: tuple[Float[np.ndarray, " R"], Float[np.ndarray, " l"]] | None  # derivatives by the scale anchor
+
+
+def _of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> _Related | None:
+    """The positions of sockets are eliminated: a length has the scatter of its ends besides its own u."""
+    names, anchor = _names_of_lengths(record), scale_anchor_of(record)
+    if not names:
+        return None
+    arm, measurement, noise = to_numpy((record.calibrated.arm, Measurement.of(record.recording.capture), record.noise))
+    measurement, space = measurement.weighted(arm.geometry, noise), Parameters(arm, record.names)
+    distance, slopes = measured_lengths(np.asarray(space.vector()), space, measurement)
+    error, slopes = np.asarray(distance - measurement.nominal), np.asarray(slopes) * np.asarray(space.scale)
+    if np.max(np.abs(error)) < _EXACT:
+        return None
+    centroids = measurement.centroids(np.asarray(arm.position(measurement.q)))
+    covariance = np.asarray(length_covariance(centroids, measurement, np.ones(())))
+    kept, scale = np.array([name != anchor for name in record.names]), None
+    if anchor is not None:
+        by_anchor = np.asarray(arm.jacobian(measurement.q, (anchor,)))
+        scale = np.concatenate([(each.by_tip @ by_anchor[each.poses]).ravel() for each in rows]), slopes[:, ~kept][:, 0]
+    further = rows[0].shared.shape[2] - int(kept.sum())  # unknowns of sockets with very many poses
+    relations = Block("", None, error, np.pad(slopes[:, kept], ((0, 0), (0, further))), np.zeros((len(error), 0)))
+    return _Related(names, np.ones(len(names)), [each.block("") for each in rows], relations, covariance, scale)
+
+
+def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block]) -> _Related | None:
+    if not relations:
+        return None
+    capture, anchor = record.recording.capture, scale_anchor_of(record)
+    certified = Observed.of(capture).certified()
+    names = [*_names_of_lengths(record), *(part for part, (value, _) in certified.items() for _ in np.asarray(value))]
+    own = [*(length.u for length in capture.lengths), *(u for _, of in certified.values() for u in np.asarray(of))]
+    units = np.maximum(np.array(own, dtype=float), LEAST_U)
+    poses, (related,), scale = [each.block("") for each in rows], relations, None
+    measured = any(one.fixes_scale and not one.certified for one in capture.observations)
+    if anchor is not None and record.hold is None and not measured:
+        column = record.names.index(anchor)
+        scale = np.concatenate([block.shared[:, column] for block in poses]), related.shared[:, column]
+        *poses, related = (b._replace(shared=np.delete(b.shared, column, axis=1)) for b in (*poses, related))
+    return _Related(names, units, poses, related, np.eye(len(units)), scale)
+
+
+def _names_of_lengths(record: CalibrationRecord) -> list[str]:
+    return [f"{length.start} - {length.end}" for length in record.recording.capture.lengths]

@@ -1,0 +1,150 @@
+"""Tests of a calibration's model and noise in sentences, and as JSON has them."""
+
+import math
+from typing import Any
+
+from ..calibration.missing_terms import Kind
+from ..calibration.model_errors import LEVEL, FoundTerm, Lengths, Misfit, ModelTests
+from ..calibration.record import REPEATABILITY
+from ..core.text import shorten
+from ..core.units import ARCSEC
+
+# What residuals follow, of joint {i}; what causes that; and the model that has such a term.
+_TERMS: dict[Kind, tuple[str, str, str]] = {
+    "zero": ("the zero of joint {i}, which is fixed", "a wrong zero", ""),
+    "first harmonic": ("cos q_{i}", "an eccentric encoder or a bending link", "harmonics"),
+    "second harmonic": ("cos 2 q_{i}", "a tilted or oval encoder", "harmonics"),
+    "gear ratio": ("q_{i} (gear ratio)", "a wrong gear ratio", "gear"),
+    "gravity": ("gravity about joint {i}", "a joint or link that bends under its load", "gravity"),
+    "drifting zero": ("the order of the poses in joint {i}", "a zero that drifts", ""),
+    "drifting base": ("the order of the poses in the tip", "a base or socket that moves", ""),
+    "growing arm": ("the order of the poses in the arm's size", "an arm that warms or cools", ""),
+}
+# Option of the command line that takes further terms into the model; None: there is none yet.
+MODEL_OPTION: str | None = None
+
+
+def sentences_of_tests(tests: ModelTests, method: str = "") -> list[str]:
+    """What the tests of a calibration found, the most serious first; ``method`` is that of the calibration."""
+    found = []
+    if tests.terms:
+        found.append(_terms(tests.terms))
+    if tests.misfit is not None and tests.misfit.probability < LEVEL:
+        found.append(_misfit(tests.misfit))
+    if tests.noisy_joint is not None and tests.noisy_joint.probability < LEVEL:
+        found.append(
+            f"Residuals are larger the more the reading of joint {tests.noisy_joint.joint} moves the tip "
+            f"({_chance(tests.noisy_joint.probability)}): is its encoder noisier than the others? State the noise "
+            "joint by joint, or look for play in this joint."
+        )
+    if tests.successive is not None and tests.successive.probability < LEVEL:
+        found.append(
+            f"Residuals of successive poses are alike (correlation {tests.successive.correlation:.2f}, "
+            f"{_chance(tests.successive.probability)}): a seat that shifts at each visit, or errors that the model "
+            "lacks. Such poses count as independent, so every u is too small."
+        )
+    if tests.noisy_observations:
+        named = [f"{one.name} ({math.sqrt(max(one.test.ratio, 0)):.2g} times)" for one in tests.noisy_observations]
+        found.append(
+            "Residuals are larger than the uncertainties and the scatter of the tips predict: "
+            f"{shorten(named)}; check these observations, or their u."
+        )
+    if tests.lengths is not None and tests.lengths.probability < LEVEL:
+        found.append(_lengths(tests.lengths, method))
+    return found
+
+
+def _terms(terms: tuple[FoundTerm, ...]) -> str:
+    named = [f"{_TERMS[term.kind][0].format(i=term.joint)} ({_amplitude(term)})" for term in terms]
+    kinds = dict.fromkeys(term.kind for term in terms)
+    options = list(dict.fromkeys(_TERMS[kind][2] for kind in kinds if _TERMS[kind][2]))
+    hint = f"; try {MODEL_OPTION} {','.join(options)}" if MODEL_OPTION and options else ""
+    found = {(term.kind, term.joint) for term in terms}
+    others = dict.fromkeys(other for term in terms for other in term.alternatives if other not in found)
+    as_well = [_TERMS[kind][0].format(i=joint) for kind, joint in others]
+    return (
+        f"Residuals follow {shorten(named, 3)} ({_chance(max(term.probability for term in terms))}), which the model "
+        f"lacks: {', '.join(_TERMS[kind][1] for kind in kinds)}{hint}. "
+        + (f"As good an explanation: {shorten(as_well, 3)}. " if as_well else "")
+        + "Every u is too small."
+    )
+
+
+def _amplitude(term: FoundTerm) -> str:
+    if term.kind == "gear ratio":
+        return f"{_rounded(100 * term.amplitude)} %"
+    return f"{_rounded(term.amplitude)} mm" if term.joint is None else f"{_rounded(term.amplitude / ARCSEC)} arcsec"
+
+
+def _rounded(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def _misfit(misfit: Misfit) -> str:
+    chance = _chance(misfit.probability)
+    if misfit.of_class:
+        return (
+            f"Residuals are {misfit.ratio:.2g} times what encoders and seat of this class of arms predict ({chance}): "
+            "errors that the model lacks, or worse encoders."
+        )
+    word = "small" if misfit.ratio > 1 else "large"
+    return (
+        f"Residuals are {misfit.ratio:.3g} times what the given noise predicts ({chance}), and every uncertainty "
+        f"follows from that noise: it is about {max(misfit.ratio, 1 / misfit.ratio):.3g} times too {word}, or the "
+        "model lacks something. Check the noise, or leave it out to have it estimated."
+    )
+
+
+def _lengths(lengths: Lengths, method: str) -> str:
+    odd = f"; without {lengths.odd} ({lengths.difference:+.3g} mm) the others agree" if lengths.odd else ""
+    enlarged = "" if method in ("joint", REPEATABILITY) else " u(k) allows for it."
+    return (
+        f"Reference lengths that disagree with the arm: the {lengths.number} err {lengths.birge_ratio:.2g} times as "
+        f"much as their u and the poses predict (Birge ratio, {_chance(lengths.probability)}){odd}.{enlarged} "
+        "Look for a wrong length, or for errors outside the D-H model."
+    )
+
+
+def _chance(probability: float) -> str:
+    return "p < 0.0001" if probability < 1e-4 else f"p = {probability:.1g}"
+
+
+def summary_of_tests(tests: ModelTests) -> dict[str, Any]:
+    """The tests as JSON has them: probabilities where nothing is wrong, and what was found; mm, rad."""
+    misfit, lengths, noisy, successive = tests.misfit, tests.lengths, tests.noisy_joint, tests.successive
+    return {
+        "level": LEVEL,
+        "misfit": None
+        if misfit is None
+        else {
+            "ratio": misfit.ratio,
+            "degrees_of_freedom": misfit.degrees_of_freedom,
+            "probability": misfit.probability,
+            "against": "class" if misfit.of_class else "given noise",
+        },
+        "lengths": None
+        if lengths is None
+        else {
+            "birge_ratio": lengths.birge_ratio,
+            "degrees_of_freedom": lengths.degrees_of_freedom,
+            "probability": lengths.probability,
+            "odd": lengths.odd or None,
+        },
+        "noisy_joint": None if noisy is None else {"joint": noisy.joint, "probability": noisy.probability},
+        "successive_poses": None
+        if successive is None
+        else {"correlation": successive.correlation, "probability": successive.probability},
+        "noisy_observations": [{"name": one.name, "probability": one.probability} for one in tests.noisy_observations],
+        "missing_terms": [
+            {
+                "term": term.kind,
+                "joint": term.joint,
+                "amplitude": term.amplitude,
+                "f": term.test.ratio,
+                "degrees_of_freedom": list(term.test.degrees_of_freedom),
+                "probability": term.probability,
+                "alternatives": [{"term": kind, "joint": joint} for kind, joint in term.alternatives],
+            }
+            for term in tests.terms
+        ],
+    }

@@ -1,0 +1,244 @@
+"""Tests of the residuals that a least squares leaves: whether further columns explain them, and quadratic forms.
+
+Rows are whitened: where model and noise are right, errors are independent with one variance. The residual is r = M e,
+with M the projector onto what the unknowns of the model cannot explain. Whether they have a further unknown with
+columns C is a score test, which needs no new fit: with D = M C, the gain is the drop of r.r that a step along D gives,
+r'D (D'D)^+ D'r, and its F ratio has the F distribution exactly (Rao 1948; Breusch and Pagan 1980, Review of Economic
+Studies 47). Whether the errors of some rows are larger than those of others, or alike, is seen in a quadratic form
+r'A r. Its distribution follows from the traces of MA, (MA)^2 and (MA)^3 by Pearson's three-moment chi-square (Imhof
+1961, Biometrika 48, eq. 4.1).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.distributions import chi_square_tail, f_tail
+from .group_test import Block
+
+_NULL = 1e-5  # singular values of scaled columns below this, of the largest, are zero
+_EXPLAINED = 1e-8  # squared part of a column that the model leaves, below which it counts as the model's own
+
+
+class Residuals(NamedTuple):
+    """What a linear least squares leaves of all rows, part after part."""
+
+    slices: tuple[slice, ...]  # rows of each part
+    own: tuple[Float[np.ndarray, "r k"], ...]  # orthonormal columns of each part's own unknowns
+    basis: Float[np.ndarray, "R q"]  # orthonormal columns of the shared unknowns, less the own
+    values: Float[np.ndarray, " R"]
+
+    @classmethod
+    def of(cls, parts: Sequence[Block]) -> "Residuals":
+        """The least squares of some equations."""
+        ends = np.cumsum([len(part.residual) for part in parts])
+        slices = tuple(slice(end - len(part.residual), end) for part, end in zip(parts, ends, strict=True))
+        values = np.concatenate([part.residual for part in parts])
+        empty = cls(slices, tuple(_orthonormal(part.own) for part in parts), np.zeros((len(values), 0)), values)
+        empty = empty._replace(values=empty.unexplained(values[:, None])[:, 0])
+        return empty.extended(np.concatenate([part.shared for part in parts]))
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Rows less unknowns that the rows determine."""
+        return len(self.values) - self.basis.shape[1] - sum(own.shape[1] for own in self.own)
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares."""
+        return float(self.values @ self.values)
+
+    def unexplained(self, columns: Float[np.ndarray, "R c"]) -> Float[np.ndarray, "R c"]:
+        """M times some columns."""
+        found = np.array(columns)
+        for rows, own in zip(self.slices, self.own, strict=True):
+            found[rows] -= own @ (own.T @ found[rows])
+        return found - self.basis @ (self.basis.T @ found)
+
+    def extended(self, columns: Float[np.ndarray, "R c"]) -> "Residuals":
+        """The least squares with further unknowns, whose columns are given."""
+        added = _orthonormal(self.unexplained(columns), columns)
+        basis = np.concatenate([self.basis, added], axis=1)
+        return self._replace(basis=basis, values=self.values - added @ (added.T @ self.values))
+
+
+def _orthonormal(columns: Float[np.ndarray, "R c"], before: Float[np.ndarray, "R c"] | None = None) -> np.ndarray:
+    """A basis of some columns, which were those ``before`` something was taken from them."""
+    lengths = np.linalg.norm(columns if before is None else before, axis=0)
+    scaled = columns / np.where(lengths > 0, lengths, 1.0)
+    vectors, values, _ = np.linalg.svd(scaled, full_matrices=False)
+    return vectors[:, values > _NULL * values.max(initial=0.0)]
+
+
+class Consistency(NamedTuple):
+    """Relations between unknowns (reference lengths) against what the other equations and each other say of them."""
+
+    square: float  # chi-square
+    degrees_of_freedom: int
+    shifts: Float[np.ndarray, " l"]  # of each from what all others say
+    gains: Float[np.ndarray, " l"]  # drop of the square without it; 0 where nothing else says anything of it
+
+
+def consistency(
+    parts: Sequence[Block],
+    relations: Block,
+    covariance: Float[np.ndarray, "l l"],
+    open_direction: tuple[Float[np.ndarray, " R"], Float[np.ndarray, " l"]] | None = None,
+) -> Consistency:
+    """Relations predicted by a least squares of the other equations, with the uncertainty of that prediction.
+
+    Args:
+        parts: The other equations.
+        relations: Residuals of the relations, and their derivatives by the shared unknowns.
+        covariance: Of the relations' own errors.
+        open_direction: Derivatives of the equations and of the relations by an unknown that only the relations
+            determine, such as the scale. Whatever else the equations leave open, the relations determine too.
+    """
+    plain = Residuals.of([part._replace(shared=part.shared[:, :0]) for part in parts])
+    slopes = plain.unexplained(np.concatenate([part.shared for part in parts]))
+    lengths = np.linalg.norm(slopes, axis=0)
+    scale = np.where(lengths > 0, lengths, 1.0)
+    vectors, values, turned = np.linalg.svd(slopes / scale, full_matrices=False)
+    known = values > _NULL * values.max(initial=0.0)
+    by_rows = relations.shared @ ((turned[known].T / values[known]) / scale[:, None])
+    vectors = vectors[:, known]
+    residual = relations.residual - by_rows @ (vectors.T @ plain.values)
+    free = [relations.shared @ (turned[~known].T / scale[:, None])]
+    if open_direction is not None:
+        rows, of_relations = open_direction
+        free.append((of_relations - by_rows @ (vectors.T @ plain.unexplained(rows[:, None])[:, 0]))[:, None])
+    root = np.linalg.inv(np.linalg.cholesky(covariance + by_rows @ by_rows.T))
+    white = root @ np.concatenate(free, axis=1)
+    sizes = np.linalg.norm(root @ relations.shared, axis=0).max(initial=0.0)
+    opened = white[:, np.linalg.norm(white, axis=0) > _NULL * sizes]
+    basis = _orthonormal(opened) if opened.shape[1] else opened
+    weight = root.T @ (np.eye(len(root)) - basis @ basis.T) @ root
+    pulled, diagonal = weight @ residual, np.diag(weight)
+    tested = diagonal > _EXPLAINED * np.diag(root.T @ root)
+    shifts = np.where(tested, pulled / np.where(tested, diagonal, 1.0), 0.0)
+    return Consistency(
+        float(residual @ pulled), len(root) - basis.shape[1], shifts, shifts * np.where(tested, pulled, 0)
+    )
+
+
+class ScoreTest(NamedTuple):
+    """Whether further unknowns explain residuals."""
+
+    gain: float  # drop of the sum of squares
+    ratio: float  # F
+    degrees_of_freedom: tuple[int, int]
+    probability: float  # of this ratio or a larger one, where the model is right
+    coefficients: Float[np.ndarray, " c"]
+
+
+def score_tests(left: Residuals, candidates: Sequence[Float[np.ndarray, "R _"]]) -> list[ScoreTest]:
+    """Each candidate against the model, whatever the level of the noise is.
+
+    Args:
+        left: The residuals.
+        candidates: The columns of each candidate.
+
+    Returns:
+        One for each candidate; probability 1 for those that the model explains itself.
+    """
+    if not candidates:
+        return []
+    columns = np.concatenate(candidates, axis=1)
+    lengths = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(lengths > 0, lengths, 1.0)
+    projected = left.unexplained(columns)
+    gram, score = projected.T @ projected, projected.T @ left.values
+    ends, found = np.cumsum([each.shape[1] for each in candidates]), []
+    for end, each in zip(ends, candidates, strict=True):
+        of = slice(end - each.shape[1], end)
+        values, vectors = np.linalg.eigh(gram[of, of])
+        known = values > _EXPLAINED
+        along = vectors[:, known].T @ score[of]
+        gain, added = float(np.sum(along**2 / values[known])), int(known.sum())
+        spare = left.degrees_of_freedom - added
+        step = vectors[:, known] @ (along / values[known]) / np.where(lengths[of] > 0, lengths[of], 1.0)
+        if not added or spare < 1:
+            found.append(ScoreTest(0.0, 0.0, (added, spare), 1.0, step))
+            continue
+        ratio = gain / added / max((left.cost - gain) / spare, 1e-300)
+        found.append(ScoreTest(gain, ratio, (added, spare), f_tail(ratio, added, spare), step))
+    return found
+
+
+class Form(NamedTuple):
+    """A quadratic form r'A r with A = Z K Z', part by part: symmetric K (c, c), and Z (r, c) of the part's rows."""
+
+    columns: tuple[Float[np.ndarray, "r c"] | None, ...]  # None: the part has none
+    kernel: tuple[Float[np.ndarray, "c c"] | None, ...]  # None: the identity
+
+
+class FormTest(NamedTuple):
+    """A quadratic form of residuals over its expectation."""
+
+    ratio: float
+    probability: float  # of this value or a larger one, where the noise is as stated
+    degrees_of_freedom: float  # of a chi-square variable with the same relative variance
+
+
+def form_test(left: Residuals, form: Form, relative: bool) -> FormTest:
+    """Whether a quadratic form of the residuals is larger than independent errors make it.
+
+    Args:
+        left: The residuals.
+        form: The form.
+        relative: Compare with the variance of all residuals instead of 1.
+    """
+    value, traces = _value_and_traces(left, form)
+    spare = left.degrees_of_freedom
+    if relative:
+        # r'A r > x r'r, which is r'(A - x I) r > 0.
+        x = value / max(left.cost, 1e-300)
+        one, two, three = traces
+        shifted = (one - x * spare, two - 2 * x * one + x**2 * spare)
+        shifted = (*shifted, three - 3 * x * two + 3 * x**2 * one - x**3 * spare)
+        probability, expected = _tail(0.0, shifted), traces[0] * left.cost / max(spare, 1)
+    else:
+        probability, expected = _tail(value, traces), traces[0]
+    ratio = value / expected if expected > 0 else float("nan")
+    return FormTest(ratio, probability, traces[0] ** 2 / max(traces[1], 1e-300))
+
+
+def _value_and_traces(left: Residuals, form: Form) -> tuple[float, tuple[float, float, float]]:
+    """r'A r, and the traces of the first powers of MA.
+
+    With W = Z' M Z = V - B B', V of the parts less their own unknowns and B = Z' times the basis, tr (MA)^k is
+    tr (KW)^k. V is block by block, so that only V's blocks and the small products with B are formed.
+    """
+    size = left.basis.shape[1]
+    g, h, h2 = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size))
+    value = one = two = three = 0.0
+    for rows, own, columns, kernel in zip(left.slices, left.own, form.columns, form.kernel, strict=True):
+        if columns is None:
+            continue
+        seen, z = own.T @ columns, columns.T @ left.values[rows]
+        v, b = columns.T @ columns - seen.T @ seen, columns.T @ left.basis[rows]
+        kv, kb, kz = (v, b, z) if kernel is None else (kernel @ v, kernel @ b, kernel @ z)
+        kv2 = kv @ kv
+        value += float(z @ kz)
+        one, two, three = one + float(np.trace(kv)), two + float(np.trace(kv2)), three + float(np.sum(kv2 * kv.T))
+        g, h, h2 = g + b.T @ kb, h + b.T @ (kv @ kb), h2 + b.T @ (kv2 @ kb)
+    return value, (
+        one - float(np.trace(g)),
+        two - 2 * float(np.trace(h)) + float(np.sum(g * g.T)),
+        three - 3 * float(np.trace(h2)) + 3 * float(np.sum(h * g.T)) - float(np.trace(g @ g @ g)),
+    )
+
+
+def _tail(value: float, traces: tuple[float, float, float]) -> float:
+    """Probability that a quadratic form of normal errors exceeds a value, from its first three cumulants."""
+    one, two, three = traces
+    if two <= 0:
+        return 1.0
+    if abs(three) < 1e-3 * two**1.5:
+        three = 1e-3 * two**1.5  # as good as normal
+    freedom = two**3 / three**2
+    argument = freedom + np.sign(three) * (value - one) * np.sqrt(freedom / two)
+    upper = chi_square_tail(max(float(argument), 0.0), freedom)
+    return upper if three > 0 else 1 - upper

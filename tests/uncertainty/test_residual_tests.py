@@ -1,0 +1,121 @@
+"""Score tests, quadratic forms and relations against the whole least squares, with every unknown in one matrix."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from aacmm_jax.uncertainty.group_test import Block
+from aacmm_jax.uncertainty.residual_tests import Form, Residuals, consistency, form_test, score_tests
+
+SIZES, PARAMETERS = (12, 9, 15), 4
+
+
+@pytest.fixture
+def problem(rng):
+    """Blocks with two unknowns of their own, and all columns in one matrix."""
+    blocks = [
+        Block(i, "", rng.normal(size=size), rng.normal(size=(size, PARAMETERS)), rng.normal(size=(size, 2)))
+        for i, size in enumerate(SIZES)
+    ]
+    rows, own = np.concatenate([block.shared for block in blocks]), np.zeros((sum(SIZES), 2 * len(SIZES)))
+    for i, (block, end) in enumerate(zip(blocks, np.cumsum(SIZES), strict=True)):
+        own[end - SIZES[i] : end, 2 * i : 2 * i + 2] = block.own
+    return blocks, np.concatenate([rows, own], axis=1)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(4)
+
+
+def annihilator(columns):
+    return np.eye(len(columns)) - columns @ np.linalg.pinv(columns)
+
+
+def test_score_tests_are_f_tests_of_the_larger_model(problem, rng):
+    blocks, columns = problem
+    left = Residuals.of(blocks)
+    everything = np.concatenate([block.residual for block in blocks])
+    spare = sum(SIZES) - columns.shape[1]
+    assert left.degrees_of_freedom == spare
+    np.testing.assert_allclose(left.values, annihilator(columns) @ everything, atol=1e-12)
+    candidates = [1e-3 * rng.normal(size=(sum(SIZES), 2)), columns[:, :1] * 5, 1e4 * rng.normal(size=(sum(SIZES), 1))]
+    candidates.append(np.concatenate([candidates[2], candidates[2]], axis=1))  # one column, twice
+    tests = score_tests(left, candidates)
+    for test, candidate in zip(tests, candidates, strict=True):
+        larger = np.concatenate([columns, candidate / np.linalg.norm(candidate, axis=0)], axis=1)
+        cost = float(everything @ annihilator(larger) @ everything)
+        added = np.linalg.matrix_rank(larger) - columns.shape[1]
+        assert test.degrees_of_freedom == (added, spare - added)
+        if added:
+            ratio = (left.cost - cost) / added / (cost / (spare - added))
+            assert test.ratio == pytest.approx(ratio)
+            assert test.probability == pytest.approx(stats.f.sf(ratio, added, spare - added))
+            wider = left.extended(candidate)
+            assert (wider.cost, wider.degrees_of_freedom) == (pytest.approx(cost), spare - added)
+            unexplained = left.values - left.unexplained(candidate) @ test.coefficients
+            np.testing.assert_allclose(unexplained, wider.values, atol=1e-9)
+        else:
+            assert test.probability == 1.0
+    assert score_tests(left, []) == []
+
+
+@pytest.mark.parametrize("relative", [True, False])
+@pytest.mark.parametrize("kernel", [None, "neighbours"])
+def test_quadratic_forms_have_the_distribution_of_their_draws(problem, rng, relative, kernel):
+    blocks, columns = problem
+    size = 3
+    parts = [rng.normal(size=(rows, size)) for rows in SIZES]
+    parts[1] = None
+    inner = None if kernel is None else np.eye(size, k=1) / 2 + np.eye(size, k=-1) / 2
+    form = Form(tuple(parts), tuple(None if part is None else inner for part in parts))
+    matrix = np.zeros((sum(SIZES), sum(SIZES)))
+    for part, end, rows in zip(parts, np.cumsum(SIZES), SIZES, strict=True):
+        if part is not None:
+            of = slice(end - rows, end)
+            matrix[of, of] = part @ (np.eye(size) if inner is None else inner) @ part.T
+    projector = annihilator(columns)
+    errors = projector @ rng.normal(size=(sum(SIZES), 20_000))
+    draws = np.einsum("rn,rs,sn->n", errors, matrix, errors)
+    residual = projector @ np.concatenate([block.residual for block in blocks])
+    value = residual @ matrix @ residual
+    if relative:
+        draws, value = draws / np.sum(errors**2, axis=0), value / (residual @ residual)
+    found = form_test(Residuals.of(blocks), form, relative)
+    assert found.probability == pytest.approx(np.mean(draws > value), abs=0.02)
+    if kernel is None:
+        assert found.ratio == pytest.approx(value / draws.mean(), rel=0.03)
+        product = projector @ matrix
+        assert found.degrees_of_freedom == pytest.approx(np.trace(product) ** 2 / np.trace(product @ product))
+
+
+@pytest.mark.parametrize("opened", [False, True])
+def test_relations_are_a_generalised_least_squares(problem, rng, opened):
+    """The drop of the cost without them, or without one of them; an unknown that only they determine costs one."""
+    blocks, columns = problem
+    number = 3
+    root = np.diag([0.5, 2.0, 1.0]) + np.tri(number, k=-1)
+    relations = Block("", None, rng.normal(size=number), rng.normal(size=(number, PARAMETERS)), np.zeros((number, 0)))
+    direction = (np.zeros(sum(SIZES)), rng.normal(size=number)) if opened else None
+    found = consistency(blocks, relations, root @ root.T, direction)
+    poses = np.concatenate([block.residual for block in blocks])
+
+    def cost(kept):
+        rows = np.zeros((number, columns.shape[1]))
+        rows[:, :PARAMETERS] = relations.shared
+        every = np.concatenate([columns, rows])
+        if opened:
+            every = np.concatenate([every, np.concatenate(direction)[:, None]], axis=1)
+        # What is left out has an unknown of its own.
+        free = np.eye(len(every))[:, [sum(SIZES) + i for i in range(number) if i not in kept]]
+        every = np.concatenate([every, free], axis=1)
+        inverse = np.eye(len(every))
+        inverse[sum(SIZES) :, sum(SIZES) :] = np.linalg.inv(root)
+        white = inverse @ np.concatenate([poses, relations.residual])
+        return float(white @ annihilator(inverse @ every) @ white)
+
+    assert found.degrees_of_freedom == number - opened
+    assert found.square == pytest.approx(cost(range(number)) - cost(()))
+    for i in range(number):
+        others = [j for j in range(number) if j != i]
+        assert found.gains[i] == pytest.approx(cost(range(number)) - cost(others))
