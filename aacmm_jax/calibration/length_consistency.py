@@ -90,7 +90,7 @@ def _of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> _Related | N
     names, anchor = _names_of_lengths(record), scale_anchor_of(record)
     if not names:
         return None
-    arm, measurement, noise = to_numpy((record.calibrated.arm, Measurement.of(record.recording.capture), record.noise))
+    arm, measurement, noise = to_numpy((record.calibrated.arm, Measurement.of(record.recording.capture, record.calibrated.arm), record.noise))
     measurement, space = measurement.weighted(arm.geometry, noise), Parameters(arm, record.names)
     distance, slopes = measured_lengths(np.asarray(space.vector()), space, measurement)
     error, slopes = np.asarray(distance - measurement.nominal), np.asarray(slopes) * np.asarray(space.scale)
@@ -111,7 +111,7 @@ def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations:
     if not relations:
         return None
     capture, anchor = record.recording.capture, scale_anchor_of(record)
-    certified = Observed.of(capture).certified()
+    certified = Observed.of(capture, None).certified()
     names = [*_names_of_lengths(record), *(part for part, (value, _) in certified.items() for _ in np.asarray(value))]
     own = [*(length.u for length in capture.lengths), *(u for _, of in certified.values() for u in np.asarray(of))]
     units = np.maximum(np.array(own, dtype=float), LEAST_U)

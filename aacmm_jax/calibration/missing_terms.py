@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..kinematics.arm import Arm
-from ..kinematics.chain import ForwardPass, forward_pass, sines_cosines
+from ..kinematics.chain import ForwardPass, forward_pass, joint_motion
 from .group_equations import Rows
 
 Kind = Literal[
@@ -58,18 +58,22 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
         arm: The calibrated arm.
         q: All readings in their order, rad.
     """
-    forward = forward_pass(arm.geometry, sines_cosines(q))
+    forward = forward_pass(arm.geometry, joint_motion(arm.geometry, q))
     order = np.linspace(-1.0, 1.0, len(q))[:, None]
     tip = np.moveaxis(np.asarray(forward.tip), -1, 0)
     return [
-        *(term for joint in range(arm.joints) for term in _of_joint(forward, q[:, joint, None], order, joint)),
+        *(
+            term
+            for joint in range(arm.joints)
+            for term in _of_joint(forward, q[:, joint, None], order, joint, joint + 1 in arm.prismatic)
+        ),
         MissingTerm("drifting base", None, order[:, :, None] * np.eye(3)),
         MissingTerm("growing arm", None, order[:, :, None] * tip[:, :, None] / 1e3),  # by 1 mm a m
     ]
 
 
 def _of_joint(
-    forward: ForwardPass, q: Float[np.ndarray, "N 1"], order: Float[np.ndarray, "N 1"], joint: int
+    forward: ForwardPass, q: Float[np.ndarray, "N 1"], order: Float[np.ndarray, "N 1"], joint: int, slides: bool
 ) -> Iterator[MissingTerm]:
     terms: dict[Kind, np.ndarray] = {
         "zero": np.ones_like(q),
@@ -79,6 +83,8 @@ def _of_joint(
         "gravity": _moments(forward, joint),
         "drifting zero": order,
     }
+    if slides:  # a scale has no revolution to repeat, and carries what it moves
+        terms = {kind: values for kind, values in terms.items() if kind in ("zero", "gear ratio", "drifting zero")}
     yield from (MissingTerm(kind, joint + 1, values) for kind, values in terms.items())
 
 

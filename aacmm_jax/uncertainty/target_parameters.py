@@ -28,7 +28,7 @@ def independent_of_targets(arm: Arm, capture: Capture) -> Parameters:
         arm: The nominal arm.
         capture: At least one observation, each of a target.
     """
-    observed, space = Observed.of(capture), Parameters(arm, ("probe_x",))
+    observed, space = Observed.of(capture, arm), Parameters(arm, ("probe_x",))
     found = observed.split(np.asarray(observed.start(space, np.asarray(space.vector()))))
     places = [np.asarray(found[offset_of(observation.target)]) for observation in observed.observations]
     tip = max(places, key=lambda place: float(np.hypot(place[0], place[1])))
