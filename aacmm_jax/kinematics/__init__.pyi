@@ -9,4 +9,5 @@ from .parameters import ArmSpecification as ArmSpecification
 from .parameters import Bounds as Bounds
 from .parameters import Parameters as Parameters
 from .parameters import perturbed_arm as perturbed_arm
+from .priors import Prior as Prior
 from .workspace import arm_reach as arm_reach
