@@ -150,7 +150,7 @@ def calibrate_many(
     return _batch_task("calibrate", arm, capture, lower, upper, start, given).calibrate(method)
 
 
-_SHARED = ("parameters", "de", "deltam", "steps", "result", "active", "covariance", "reduced_chi")
+_SHARED = ("parameters", "de", "deltam", "steps", "result", "active", "covariance", "reduced_chi", "prior")
 
 
 def _batch_task(

@@ -49,7 +49,7 @@ def identify_observed(task: ObservedTask) -> Identification:
     # Once more with the weights of a nearly right arm. Far from the solution a robust loss would see nothing but bad
     # poses, so it begins where least squares ends, and one with several minima where Huber's, which has one, ends.
     losses = [None, None] if task.loss is None else [None, Loss("huber"), task.loss, task.loss]
-    prior = None if task.prior is None else task.prior.of(Parameters(task.bounds.space.base, space.names))
+    prior = None if task.prior is None else task.prior.of(space.names, task.bounds.space.vector()[free])
     rows, of_prior, effective = None, None, None
     for number, loss in enumerate(losses, 1):
         if prior is not None:

@@ -87,17 +87,17 @@ def solve_observed(
     devices = devices_of(options.devices)
     slots = options.slots or _default_slots(devices[0].platform, len(form.pose))
 
-    def run(chunk: range, device: Any) -> dict[str, np.ndarray]:
+    def run(chunk: range, device: Any) -> dict[str, Any]:
         rows = np.full(slots, chunk.start)
         rows[: len(chunk)] = chunk
         with jax.default_device(device):
             part, *shared = jax.device_put((_selected(given, axes, rows), noise, prior), device)
             found = _solve(form, part, *shared)
-        return {name: np.asarray(values)[: len(chunk)] for name, values in found.items()}
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(chunk)], found)
 
     chunks = [range(i, min(i + slots, size)) for i in range(0, size, slots)]
     found = run_chunks(run, chunks, devices, options.workers or default_workers(devices))
-    fields = {name: np.concatenate([one[name] for one in found]) for name in found[0]}
+    fields = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
     return ManyIdentifications(
         k=None,
         result=reasons(jax.numpy.asarray(fields.pop("reason"))),
@@ -125,7 +125,7 @@ def _selected(given: tuple[Any, ...], axes: tuple[Any, ...], rows: Any) -> tuple
 
 
 @partial(eqx.filter_jit)
-def _solve(form: _Form, part: tuple[Any, ...], noise: Noise | None, prior: Prior | None) -> dict[str, AnyArray]:
+def _solve(form: _Form, part: tuple[Any, ...], noise: Noise | None, prior: Prior | None) -> dict[str, Any]:
     return jax.vmap(partial(_solve_one, form, noise, prior), in_axes=form.batched)(*part)
 
 
@@ -138,7 +138,7 @@ def _solve_one(
     start: Float[AnyArray, " p"],
     lower: Float[AnyArray, " p"],
     upper: Float[AnyArray, " p"],
-) -> dict[str, AnyArray]:
+) -> dict[str, Any]:
     """One problem, traced: the fields of `ManyIdentifications`."""
     bounds = Bounds(Parameters(arm, form.names), lower, upper)
     task = ObservedTask(
@@ -166,5 +166,6 @@ def _solve_one(
         "reason": numbers_of(found.result),
         "active": found.active,
         "reduced_chi": metrics.reduced_chi_of_all,
+        "prior": found.prior,
     }
     return fields | ({"covariance": found.covariance} if form.covariance else {})

@@ -81,6 +81,8 @@ def observed_task(
     if is_concrete(*jax.tree.leaves((arm, capture, vector))):
         known, at = to_numpy((space, vector))
         check_observed(observed, known, at, unknown_parameters(space, anchor, prior))
+    if prior is not None and is_concrete(*jax.tree.leaves((prior, bounds))):
+        check_means(prior, bounds)
     return ObservedTask(
         observed=observed,
         bounds=bounds,
@@ -95,13 +97,26 @@ def observed_task(
     )
 
 
+def check_means(prior: Prior, bounds: Bounds) -> None:
+    """Raise `InputError` where the mean of a prior is outside the bounds: one of both is wrong."""
+    names = bounds.space.names
+    known = prior.of(names, np.asarray(bounds.space.vector()))
+    for i in () if known is None else known.index:
+        mean, low, high = (float(values[i]) for values in (known.mean, bounds.lower, bounds.upper))
+        if not low <= mean <= high:
+            raise InputError(
+                f"the prior's mean of {names[i]} is {mean:g}, outside its bounds {low:g} to {high:g} (mm or rad); "
+                "correct the mean or widen the bounds."
+            )
+
+
 def unknown_parameters(space: Parameters, anchor: ScaleAnchor, prior: Prior | None) -> int:
     """How many parameters the observations must determine: not those that have a prior."""
     if prior is not None:
         prior.check(space.base)
-    free = Parameters(space.base, tuple(name for name in space.names if name != anchor.hold))
-    known = None if prior is None else prior.of(free)
-    return len(free.names) - (0 if known is None else len(known.index))
+    free = tuple(name for name in space.names if name != anchor.hold)
+    known = None if prior is None else prior.of(free, np.zeros(len(free)))
+    return len(free) - (0 if known is None else len(known.index))
 
 
 def configurations(q: Any) -> tuple[int, ...]:

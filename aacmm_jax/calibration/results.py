@@ -76,6 +76,11 @@ class PriorMetrics(eqx.Module):
     mean: Float[AnyArray, " q"]  # mm and rad
     weight: Float[AnyArray, " q"]  # one over the standard deviation, 1/mm and 1/rad; 0 without a prior
 
+    @property
+    def known(self) -> tuple[str, ...]:
+        """Names of the parameters that have a prior."""
+        return tuple(name for name, weight in zip(self.names, np.asarray(self.weight), strict=True) if weight > 0)
+
 
 class AbstractSingleResult(AbstractResult):
     """What an `Identification` and a `Calibration` have in common."""
@@ -285,6 +290,7 @@ class ManyIdentifications(AbstractManyResults):
     anchor: ScaleAnchor = eqx.field(static=True)  # what sets the scale
     covariance: Float[np.ndarray, "b p p"] | None = None  # where it was asked for
     reduced_chi: Float[np.ndarray, " b"] | None = None  # of all observations, where there are any but sockets
+    prior: PriorMetrics | None = None  # with a batch axis
 
     @property
     def _stage1(self) -> "ManyIdentifications":
@@ -308,6 +314,7 @@ class ManyCalibrations(AbstractManyResults):
     method: str = eqx.field(static=True)
     covariance: Float[np.ndarray, "b p p"] | None = None  # where it was asked for
     reduced_chi: Float[np.ndarray, " b"] | None = None  # of all observations, where there are any but sockets
+    prior: PriorMetrics | None = None  # with a batch axis
 
     @property
     def _stage1(self) -> ManyIdentifications:

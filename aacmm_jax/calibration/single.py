@@ -219,9 +219,13 @@ def _check_identifiable(capture: Capture, task: Task | ObservedTask, strict: boo
     if inside_trace() or not is_concrete(*jax.tree.leaves((capture, task.bounds))):
         return
     space = task.bounds.space
-    sentences = observability(space.base, capture, space).sentences()
-    if sentences and strict:
-        raise InputError(" ".join(sentences))
+    prior = task.prior if isinstance(task, ObservedTask) else None
+    known = None if prior is None else prior.of(space.names, space.vector())
+    named = () if known is None else tuple(space.names[i] for i in known.index)
+    seen = observability(space.base, capture, space, known=named)
+    sentences, lost = seen.sentences(), seen._replace(by_prior=()).sentences()
+    if lost and strict:
+        raise InputError(" ".join(lost))
     for sentence in sentences:
         warnings.warn(sentence, IdentifiabilityWarning, stacklevel=3)
 

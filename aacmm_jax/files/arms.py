@@ -19,6 +19,7 @@ from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, Parameters, single
 from .atomic_write import storable, write_text
 from .outputs import as_path
+from .priors import PriorTable, prior_toml
 from .toml import Strict, read_toml
 from .ur_kinematics import read_ur_kinematics
 from .urdf import read_urdf
@@ -69,6 +70,7 @@ class _ArmModel(Strict):
     base: str | None = None  # its links
     tip: str | None = None
     identification: _Identification | None = None
+    priors: PriorTable | None = None
 
     @model_validator(mode="after")
     def _one_description(self) -> "_ArmModel":
@@ -209,6 +211,8 @@ def _specification(path: Path, choose: bool) -> ArmSpecification:
             found = found._replace(name=model.name or path.stem)
         else:
             found = ArmSpecification(_arm_of_rows(model, length, angle), model.name or path.stem)
+        if model.priors is not None:
+            found = found._replace(prior=model.priors.prior(found.arm, length, angle))
         wanted = model.identification
         if wanted is None:
             return _chosen(found) if choose else found
@@ -289,6 +293,8 @@ def specification_toml(specification: ArmSpecification, *, source: str = "") -> 
     if specification.override:
         proposed["override"] = {name: float(width) for name, width in specification.override.items()}
     document["identification"] = proposed
+    if specification.prior is not None:
+        document["priors"] = prior_toml(specification.prior)
     return document.as_string()
 
 

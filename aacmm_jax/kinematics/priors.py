@@ -12,7 +12,6 @@ from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from .arm import Arm, is_length, natural_steps, parameter_names
-from .parameters import Parameters
 
 _BROAD = 10.0  # standard deviation at which the search for a learned one begins, in natural steps
 LEAST_STEPS = 1e-4  # smallest learned standard deviation, in natural steps: 0.1 um, 0.02 arcsec
@@ -22,9 +21,10 @@ class Prior(eqx.Module):
     """Gaussian priors of parameters: a mean and a standard deviation, as a maker states a nominal value and tolerance.
 
     A group is "all", "lengths", "angles", a kind ("alpha", "probe"), the name of a parameter ("d_3"), or a shell
-    pattern of names ("theta_*"). A parameter that several groups name belongs to the last of them; fixed ones need no
-    prior, and are left out. Standard deviations are in mm or rad; of a group that holds lengths and angles they count
-    in 1 mm and 1 mrad.
+    pattern of names ("theta_*"). Of several groups that hold a parameter its name comes before a kind or pattern, these
+    before "lengths" and "angles", and "all" is last; of equals, the last given counts. Fixed parameters need no prior,
+    and are left out. Standard deviations are in mm or rad; of a group that holds lengths and angles they count in 1 mm
+    and 1 mrad.
 
     A *learned* standard deviation is the one for which the measurement itself is most probable (the evidence, MacKay
     1992; Bishop 2006, section 3.5), one for each group. A group in which the data support no deviation from its mean
@@ -82,19 +82,17 @@ class Prior(eqx.Module):
 
     def check(self, arm: Arm) -> None:
         """Raise `InputError` for a group that holds no parameter of an arm."""
-        names = parameter_names(arm)
-        names = [*names, *(f"beta_{i + 1}" for i in range(arm.joints) if f"beta_{i + 1}" not in names)]
+        names = possible_names(arm)
         for group in (*self.groups, *self.mean):
             if not any(_matches(group, name) for name in names):
                 kinds = ("all", "lengths", "angles", *dict.fromkeys(name.rsplit("_", 1)[0] for name in names), *names)
                 raise InputError(f"the prior is of '{group}', and the arm has no such parameter{nearest(group, kinds)}")
 
-    def of(self, space: Parameters) -> "ParameterPrior | None":
-        """The prior of free parameters, whose base is the nominal arm; None where it says nothing of any of them."""
-        names, steps = space.names, natural_steps(space.names)
-        xp = namespace(self, space)
-        owners = [_last(self.groups, name) for name in names]
-        mean, sd = space.vector(), xp.asarray(_BROAD * steps)
+    def of(self, names: tuple[str, ...], nominal: Float[AnyArray, " p"]) -> "ParameterPrior | None":
+        """The prior of the named parameters, mm and rad; None where it says nothing of any of them."""
+        xp, steps = namespace(self, nominal), natural_steps(names)
+        owners = [_owner(self.groups, name) for name in names]
+        mean, sd = xp.asarray(nominal), xp.asarray(_BROAD * steps)
         members, used = [], []
         for number, group in enumerate(self.groups):
             own = [i for i, owner in enumerate(owners) if owner == number]
@@ -105,18 +103,18 @@ class Prior(eqx.Module):
             return None
         means = tuple(self.mean)
         for i, name in enumerate(names):
-            given = _last(means, name)
+            given = _owner(means, name)
             if given is not None:
                 mean = set_at(mean, i, self.mean[means[given]])
         for number, own in zip(used, members, strict=True):
             group = self.groups[number]
             if not self.learned[number]:
                 index = np.array(own)
-                mixed = _unit([names[i] for i in own]) == MIXED
+                mixed = _unit(names[i] for i in own) == MIXED
                 sd = set_at(sd, index, self.sd[group] * xp.asarray(steps[index] if mixed else np.ones(len(own))))
         groups = tuple(self.groups[number] for number in used)
         learned = tuple(self.learned[number] for number in used)
-        units = tuple(_unit([names[i] for i in own]) for own in members)
+        units = tuple(_unit(names[i] for i in own) for own in members)
         return ParameterPrior(mean, sd, groups, learned, tuple(members), units)
 
 
@@ -160,11 +158,26 @@ def _matches(group: str, name: str) -> bool:
     return group in ("all", name, name.rsplit("_", 1)[0]) or fnmatchcase(name, group)
 
 
-def _last(groups: tuple[str, ...], name: str) -> int | None:
-    """Number of the last group that names a parameter."""
-    return max((i for i, group in enumerate(groups) if _matches(group, name)), default=None)
+def _owner(groups: tuple[str, ...], name: str) -> int | None:
+    """Number of the group that a parameter belongs to."""
+    found = [(_closeness(group, name), i) for i, group in enumerate(groups) if _matches(group, name)]
+    return max(found)[1] if found else None
 
 
-def _unit(names: list[str]) -> str:
+def _closeness(group: str, name: str) -> int:
+    return {name: 3, "lengths": 1, "angles": 1, "all": 0}.get(group, 2)
+
+
+def possible_names(arm: Arm) -> tuple[str, ...]:
+    """Names that a prior may have: every parameter of an arm, Hayati's beta too."""
+    return tuple(dict.fromkeys([*parameter_names(arm), *(f"beta_{i + 1}" for i in range(arm.joints))]))
+
+
+def unit_of_group(group: str, names: Iterable[str]) -> str:
+    """The unit of a group's standard deviation: "mm", "rad", or `MIXED`."""
+    return _unit(name for name in names if _matches(group, name))
+
+
+def _unit(names: Iterable[str]) -> str:
     lengths = {is_length(name) for name in names}
     return MIXED if len(lengths) == 2 else "mm" if True in lengths else "rad"
