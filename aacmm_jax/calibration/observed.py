@@ -15,7 +15,7 @@ from ..uncertainty import observed_covariance as propagation
 from ..uncertainty.covariance import ParameterCovariance, inverse_information
 from .bounded_fit import RULES, fit
 from .observed_state import ObservedTask, State, scatter_at_start, state_at, whitening_at
-from .prior_fit import PriorProblem, fit_with_prior
+from .prior_fit import ByScales, PriorProblem, fit_with_prior
 from .results import Calibration, Identification, ObservedMetrics
 
 # Of the solves whose result only gives the weights of the next, or its start: a few standard uncertainties' millionths.
@@ -50,7 +50,7 @@ def identify_observed(task: ObservedTask) -> Identification:
     # poses, so it begins where least squares ends, and one with several minima where Huber's, which has one, ends.
     losses = [None, None] if task.loss is None else [None, Loss("huber"), task.loss, task.loss]
     prior = None if task.prior is None else task.prior.of(space.names, task.bounds.space.vector()[free])
-    rows, of_prior, effective = None, None, None
+    rows, of_prior, effective, by_scales = None, None, None, None
     for number, loss in enumerate(losses, 1):
         if prior is not None:
             problem = PriorProblem(task, space, prior, sides, steps, loss, state)
@@ -59,7 +59,7 @@ def identify_observed(task: ObservedTask) -> Identification:
             if number == len(losses):
                 scales, found = fit_with_prior(problem, z)
                 z, evaluations, rows = found.parameters, evaluations + found.steps, problem.rows(scales)
-                of_prior, effective = problem.metrics(scales, z)
+                of_prior, effective, by_scales = problem.metrics(scales, z)
                 state = state_at(task, space, z, effective=effective)
                 break
         args = (space, task.observed, whitening_at(task, state, rows), loss)
@@ -74,7 +74,7 @@ def identify_observed(task: ObservedTask) -> Identification:
     whitening = whitening_at(task, state, rows)
     reduced = Bounds(space, *(side[:p] for side in sides))
     active = reduced.active(z[:p])
-    covariance, of_geometry = _covariance(task, space, z, state, whitening, active, steps)
+    covariance, of_geometry = _covariance(task, space, z, state, whitening, active, steps, by_scales)
     parameters = set_at(task.start, free, z[:p])
     arm = task.bounds.space.arm(parameters)
     spent = len(names) + count if effective is None else effective
@@ -142,6 +142,7 @@ def _covariance(
     whitening: Whitening,
     active: Any,
     steps: Float[AnyArray, " z"],
+    by_scales: ByScales | None,
 ) -> tuple[ParameterCovariance, Float[AnyArray, "g g"]]:
     """Of the parameters, and of the geometry."""
     xp, p = namespace(z, task), len(space.names)
@@ -182,6 +183,7 @@ def _covariance(
         matrix = propagation.propagated(
             state.linear, state.errors, rows, whitening, inverse, relations, noise, np.array(task.pose)
         )
+    matrix = matrix if by_scales is None else matrix + by_scales.added(inverse)
     matrix = matrix * steps[:, None] * steps[None, :]
     # What the data leave open of the geometry (the turn of a ball bar about itself) has no uncertainty.
     known = determined[p:]

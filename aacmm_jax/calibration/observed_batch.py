@@ -73,7 +73,7 @@ def solve_observed(
     hold = None if fixed and options.hold == "longest" else options.hold
     anchor = scale_anchor(space, arm, hold, noise) if not fixed or hold else NO_ANCHOR
     observed = Observed.of(first[1])
-    check_observed(observed, first_space, first[2], unknown_parameters(first_space, anchor, options.prior))
+    check_observed(observed, first_space, first[2], unknown_parameters(first_space, anchor, prior, noise))
     form = _Form(
         names=space.names,
         anchor=anchor,

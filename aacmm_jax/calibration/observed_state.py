@@ -80,7 +80,7 @@ def observed_task(
     observed = Observed.of(capture)
     if is_concrete(*jax.tree.leaves((arm, capture, vector))):
         known, at = to_numpy((space, vector))
-        check_observed(observed, known, at, unknown_parameters(space, anchor, prior))
+        check_observed(observed, known, at, unknown_parameters(space, anchor, prior, noise))
     if prior is not None and is_concrete(*jax.tree.leaves((prior, bounds))):
         check_means(prior, bounds)
     return ObservedTask(
@@ -110,12 +110,13 @@ def check_means(prior: Prior, bounds: Bounds) -> None:
             )
 
 
-def unknown_parameters(space: Parameters, anchor: ScaleAnchor, prior: Prior | None) -> int:
-    """How many parameters the observations must determine: not those that have a prior."""
+def unknown_parameters(space: Parameters, anchor: ScaleAnchor, prior: Prior | None, noise: Noise | None) -> int:
+    """How many parameters the observations must determine: not those that have a prior, unless the noise has to be
+    estimated, to which fewer equations than unknowns would leave nothing."""
     if prior is not None:
         prior.check(space.base)
     free = tuple(name for name in space.names if name != anchor.hold)
-    known = None if prior is None else prior.of(free, np.zeros(len(free)))
+    known = None if prior is None or noise is None else prior.of(free, np.zeros(len(free)))
     return len(free) - (0 if known is None else len(known.index))
 
 
@@ -138,7 +139,8 @@ def check_observed(observed: Observed, space: Parameters, vector: Float[AnyArray
     if equations < unknowns:
         raise InputError(
             f"the observations give {equations} equations, but {unknowns} numbers are unknown ({count} parameters and "
-            f"{unknowns - count} of the unknown geometry); record more poses, or fix more parameters."
+            f"{unknowns - count} of the unknown geometry); record more poses, fix more parameters, or give a "
+            "prior of them together with the noise."
         )
 
 

@@ -20,7 +20,13 @@ from ..kinematics.priors import LEAST_STEPS, ParameterPrior
 from ..model.observed import PriorRows, Whitening, observed_model, observed_rows
 from ..model.robust import Loss
 from ..solver.reason import MAX_STEPS, reasons
-from ..uncertainty.evidence import PriorModel, effective_parameters, eliminated, learned_log_variances
+from ..uncertainty.evidence import (
+    PriorModel,
+    covariance_of_log_variances,
+    effective_parameters,
+    eliminated,
+    learned_log_variances,
+)
 from .bounded_fit import Fit, fit
 from .observed_state import ObservedTask, State, state_at, whitening_at
 from .results import PriorMetrics
@@ -28,6 +34,7 @@ from .results import PriorMetrics
 _ROUNDS = 60  # least squares with new standard deviations; usually 4 to 8
 # Largest change of the log of a variance that no further round is worth, where derivatives pass through, and elsewhere.
 _TOLERANCE, _BATCH_TOLERANCE = 1e-10, 1e-6
+_UNDAMPED = 15  # rounds
 _LEAST_GIVEN = 1e-7  # natural steps: a smaller standard deviation would be a row of infinite weight
 _LEAST_LOG = 2 * np.log(LEAST_STEPS)
 # Of the steps of the solve: so small that a tight prior does not dominate the damping, but not so small that the value
@@ -125,10 +132,21 @@ class PriorProblem(NamedTuple):
         of_sigma = scales[0] - xp.log(xp.maximum(self.sigma(scales, z, effective), 1e-9))
         return xp.concatenate([of_sigma[None], of_groups])
 
-    def metrics(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> tuple[PriorMetrics, AnyArray]:
-        """What the result says of the prior; and how many unknowns the data determine."""
+    def by_scales(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"], model: PriorModel) -> "ByScales":
+        """How the unknowns follow learned scales."""
+        xp, index = namespace(scales, z), self.prior.index
+        moving = xp.asarray(self.learned) & (scales[1:] > _LEAST_LOG + 1e-9)
+        covariance = covariance_of_log_variances(model, self.prior.membership, scales[1:], moving)
+        pull = (model.deviation / self.sd(scales) ** 2)[:, None] * xp.asarray(self.prior.membership.T)
+        return ByScales(set_at(xp.zeros((z.shape[0], pull.shape[1])), index, pull), covariance)
+
+    def metrics(
+        self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]
+    ) -> tuple[PriorMetrics, AnyArray, "ByScales | None"]:
+        """What the result says of the prior; how many unknowns the data determine; and how they follow the scales."""
         xp, prior, sd = namespace(scales, z), self.prior, self.sd(scales)
-        effective = effective_parameters(self.model(scales, z), sd)
+        model = self.model(scales, z)
+        effective = effective_parameters(model, sd)
         first = np.array([own[0] for own in prior.members])
         in_units = np.array([unit == "rad" for unit in prior.units])
         of_groups = xp.exp(0.5 * scales[1:])
@@ -144,7 +162,20 @@ class PriorProblem(NamedTuple):
             mean=prior.mean,
             weight=self.rows(scales).weight,
         )
-        return metrics, z.shape[0] - len(prior.index) + xp.sum(effective)
+        follow = self.by_scales(scales, z, model) if any(prior.learned) else None
+        return metrics, z.shape[0] - len(prior.index) + xp.sum(effective), follow
+
+
+class ByScales(NamedTuple):
+    """What the uncertainty of learned scales adds to that of the unknowns (Kass and Steffey 1989, JASA 84, 717-726)."""
+
+    pull: Float[AnyArray, "z g"]  # of the prior on the unknowns, by log variances, in natural steps
+    covariance: Float[AnyArray, "g g"]  # of the log variances
+
+    def added(self, inverse: Float[AnyArray, "z z"]) -> Float[AnyArray, "z z"]:
+        """To the covariance, given the inverse of the information."""
+        moved = inverse @ self.pull
+        return moved @ self.covariance @ moved.T
 
 
 def fit_with_prior(problem: PriorProblem, z: Float[AnyArray, " z"]) -> tuple[Float[AnyArray, " s"], Fit]:
@@ -160,6 +191,8 @@ def fit_with_prior(problem: PriorProblem, z: Float[AnyArray, " z"]) -> tuple[Flo
             count, scales, z, evaluations, _ = state
             found = known.fit(scales, z, differentiable=False)
             new = known.updated(scales, found.parameters)
+            # Few data can lead to and fro between two sets of scales.
+            new = xp.where(count < _UNDAMPED, new, 0.5 * (new + scales))
             return count + 1, new, found.parameters, evaluations + found.steps, xp.max(xp.abs(new - scales))
 
         return again

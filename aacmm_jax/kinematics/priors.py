@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ..core.arguments import items_of, shown
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError, nearest
-from ..core.numpy_or_jax import AnyArray, namespace, set_at
+from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from .arm import Arm, is_length, natural_steps, parameter_names
 
 _BROAD = 10.0  # standard deviation at which the search for a learned one begins, in natural steps
@@ -90,7 +90,8 @@ class Prior(eqx.Module):
 
     def of(self, names: tuple[str, ...], nominal: Float[AnyArray, " p"]) -> "ParameterPrior | None":
         """The prior of the named parameters, mm and rad; None where it says nothing of any of them."""
-        xp, steps = namespace(self, nominal), natural_steps(names)
+        given, nominal = to_numpy((self, nominal))
+        xp, steps = namespace(given, nominal), natural_steps(names)
         owners = [_owner(self.groups, name) for name in names]
         mean, sd = xp.asarray(nominal), xp.asarray(_BROAD * steps)
         members, used = [], []
@@ -103,15 +104,15 @@ class Prior(eqx.Module):
             return None
         means = tuple(self.mean)
         for i, name in enumerate(names):
-            given = _owner(means, name)
-            if given is not None:
-                mean = set_at(mean, i, self.mean[means[given]])
+            owner = _owner(means, name)
+            if owner is not None:
+                mean = set_at(mean, i, given.mean[means[owner]])
         for number, own in zip(used, members, strict=True):
             group = self.groups[number]
             if not self.learned[number]:
                 index = np.array(own)
                 mixed = _unit(names[i] for i in own) == MIXED
-                sd = set_at(sd, index, self.sd[group] * xp.asarray(steps[index] if mixed else np.ones(len(own))))
+                sd = set_at(sd, index, given.sd[group] * xp.asarray(steps[index] if mixed else np.ones(len(own))))
         groups = tuple(self.groups[number] for number in used)
         learned = tuple(self.learned[number] for number in used)
         units = tuple(_unit(names[i] for i in own) for own in members)

@@ -211,7 +211,7 @@ def prior_sentence(row: Mapping[str, Any]) -> str:
     """One group of a prior in words."""
     spent = f"{row['effective_parameters']:.1f} of {pluralise(row['parameters'], 'parameter')} determined by the data"
     if not row["supported"]:
-        return f"{row['group']}: learned, no deviation from the mean is supported; {spent}"
+        return f"{row['group']}: learned, no deviation from the mean is supported, so it counts as exact; {spent}"
     scale, unit = (1 / DEG, "deg") if row["unit"] == "rad" else (1.0, row["unit"])
     return f"{row['group']}: {'learned' if row['learned'] else 'given'}, {row['sd'] * scale:.3g} {unit}; {spent}"
 

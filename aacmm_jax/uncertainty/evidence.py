@@ -72,6 +72,41 @@ def effective_parameters(model: PriorModel, sd: Float[AnyArray, " k"]) -> Float[
     return _posterior(model, sd).effective
 
 
+class _Evidence(NamedTuple):
+    """What the log evidence is made of, group by group; its derivatives by log variances are half of these."""
+
+    squares: Float[AnyArray, " g"]  # sum of m^2
+    spent: Float[AnyArray, " g"]  # sum of gamma
+    second: Float[AnyArray, "g g"]  # derivatives of squares - spent
+
+
+def _evidence(model: PriorModel, members: Float[np.ndarray, "g k"], now: Float[AnyArray, " g"]) -> _Evidence:
+    xp = namespace(model, now)
+    groups = xp.asarray(members)
+    sd = xp.exp(0.5 * (now @ groups))
+    covariance, effective = _posterior(model, sd)
+    mean = xp.where(model.pinned, model.deviation / sd, covariance @ (sd * model.right))
+    by_group = mean[:, None] * groups.T
+    follow = xp.where(model.pinned[:, None], -by_group, 2 * covariance @ by_group - by_group)
+    second = groups @ (mean[:, None] * follow) + groups @ covariance**2 @ groups.T
+    second = second - xp.asarray(np.eye(len(members))) * (groups @ xp.diagonal(covariance))[:, None]
+    return _Evidence(groups @ mean**2, groups @ effective, second)
+
+
+def covariance_of_log_variances(
+    model: PriorModel, members: Float[np.ndarray, "g k"], at: Float[AnyArray, " g"], moving: Bool[AnyArray, " g"]
+) -> Float[AnyArray, "g g"]:
+    """Covariance of learned log variances, by the curvature of the log evidence at its maximum; 0 for the others.
+
+    A log variance that the evidence hardly determines counts as one of variance 4, that of a standard deviation known
+    to a factor of e.
+    """
+    xp = namespace(model, at)
+    unit, both = xp.asarray(np.eye(len(members))), moving[:, None] & moving[None, :]
+    curvature = xp.where(both, 0.25 * unit - 0.5 * _evidence(model, members, at).second, unit)
+    return xp.where(both, inverse_positive_definite(curvature), 0.0)
+
+
 def learned_log_variances(
     model: PriorModel,
     members: Float[np.ndarray, "g k"],
@@ -92,22 +127,14 @@ def learned_log_variances(
         least: smallest log variance of a learned group.
     """
     xp = namespace(model, start)
-    groups, learn = xp.asarray(members), xp.asarray(learned)
-    unit = xp.asarray(np.eye(len(learned)))
+    learn, unit = xp.asarray(learned), xp.asarray(np.eye(len(learned)))
 
     def again(state: tuple) -> tuple:
         count, now, _ = state
-        sd = xp.exp(0.5 * (now @ groups))
-        covariance, effective = _posterior(model, sd)
-        mean = xp.where(model.pinned, model.deviation / sd, covariance @ (sd * model.right))
-        squares, spent = groups @ mean**2, groups @ effective
+        squares, spent, second = _evidence(model, members, now)
         slope = squares - spent
         # Where the least is reached and the evidence still falls, it stays.
         moving = learn & ~((now <= least) & (slope <= 0))
-        by_group = mean[:, None] * groups.T
-        follow = xp.where(model.pinned[:, None], -by_group, 2 * covariance @ by_group - by_group)
-        second = groups @ (mean[:, None] * follow) + groups @ covariance**2 @ groups.T
-        second = second - unit * (groups @ xp.diagonal(covariance))[:, None]
         both = moving[:, None] & moving[None, :]
         newton = solve_positive_definite(xp.where(both, -second, unit), xp.where(moving, slope, 0.0))
         ratio = xp.log(xp.maximum(squares, 1e-300) / xp.maximum(spent, 1e-300))
