@@ -38,6 +38,7 @@ from .kinematics.arm import Arm as Arm
 from .kinematics.parameters import Bounds as Bounds
 from .kinematics.parameters import Parameters as Parameters
 from .kinematics.parameters import perturbed_arm as perturbed_arm
+from .kinematics.priors import Prior as Prior
 from .model.scale import fix_scale as fix_scale
 from .model.scale import scale_from_lengths as scale_from_lengths
 from .solver.bounded import least_squares as least_squares

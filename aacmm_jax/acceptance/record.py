@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from ..calibration.evaluation import evaluate
-from ..calibration.observed import check_observed
+from ..calibration.observed_state import check_observed
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.second_stage import LARGEST_LOG_K
 from ..core.errors import InputError

@@ -19,6 +19,7 @@ from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters, based_on
+from ..kinematics.priors import Prior
 from ..model.measurement import check_joints
 from ..model.robust import LossName
 from ..solver.reason import reasons
@@ -48,6 +49,7 @@ class BatchOptions(NamedTuple):
     devices: Sequence[Any] | None = None
     workers: int | None = None
     robust: LossName | None = None
+    prior: Prior | None = None
     covariance: bool = False
 
 
@@ -81,8 +83,9 @@ def identify_many(
         devices: The devices to use; by default all.
         workers: Threads; by default one for each device or, on a CPU, for each core.
         robust: A robust loss, as in `identify`.
+        prior: What is known of the parameters, as in `identify`; where no mean is given, that of each problem's arm.
         covariance: Whether the covariances of the parameters are computed too: of captures with observations besides
-            sockets, and of robust or joint solves.
+            sockets, and of robust or joint solves or those with a prior.
 
     Returns:
         Parameters, metrics and reasons, problem by problem.
@@ -91,7 +94,7 @@ def identify_many(
         InputError: For shapes that do not fit, a lower bound above its upper one, and too few poses.
     """
     given = BatchOptions(**options)
-    if capture.observations or given.robust is not None:
+    if capture.observations or given.robust is not None or given.prior is not None:
         return _solve_observed("identify", arm, capture, lower, upper, start, given)
     if given.covariance:
         raise InputError(
@@ -130,14 +133,14 @@ def calibrate_many(
     given = BatchOptions(**options)
     _, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)
     by_slides = scale_from_slides(arm, capture, space, given.noise)
-    general = bool(capture.observations) or given.robust is not None or given.covariance or by_slides
+    general = bool(capture.observations) or any((given.robust, given.prior, given.covariance, by_slides))
     method = default_method(arm, general) if method is None else method
     if not isinstance(method, str) or method not in ("two-stage", "joint"):
         raise InputError(f"method is {shown(method)}; it must be 'two-stage' or 'joint'.")
     if method == "two-stage" and general:
         raise InputError(
-            "method='two-stage' is for sockets and reference lengths, without a robust loss and covariances; use "
-            "method='joint'."
+            "method='two-stage' is for sockets and reference lengths, without a robust loss, a prior and covariances; "
+            "use method='joint'."
         )
     if not capture.lengths and not by_slides and not any(one.fixes_scale for one in capture.observations):
         raise InputError(
@@ -150,7 +153,7 @@ def calibrate_many(
     return _batch_task("calibrate", arm, capture, lower, upper, start, given).calibrate(method)
 
 
-_SHARED = ("parameters", "de", "deltam", "steps", "result", "active", "covariance", "reduced_chi")
+_SHARED = ("parameters", "de", "deltam", "steps", "result", "active", "covariance", "reduced_chi", "prior")
 
 
 def _batch_task(

@@ -12,6 +12,7 @@ from ..data.capture import Capture, names_in, part_of
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
+from ..kinematics.priors import Prior
 from ..model.observed import Observed
 from ..model.robust import LossName
 from .left_out import CrossValidation, LeftOut
@@ -107,6 +108,7 @@ def cross_validate(
     hold: str | None = "longest",
     noise: Noise | None = None,
     robust: LossName | None = None,
+    prior: Prior | None = None,
     groups: Iterable[str] | None = None,
 ) -> CrossValidation:
     """Calibrate once without each group of sockets and observations, and evaluate the result on that group.
@@ -126,6 +128,7 @@ def cross_validate(
         hold: the scale anchor of stage 1, as for `calibrate`.
         noise: standard deviations of readings and seat, as for `calibrate`.
         robust: robust loss of the calibrations, as for `calibrate`; bad poses of what is left out count in full.
+        prior: what is known of the parameters, as for `calibrate`.
         groups: what to leave out instead, each as a name or a shell pattern: ``["monday/*", "tuesday/*"]``.
 
     Returns:
@@ -145,7 +148,8 @@ def cross_validate(
             "the parameters; place the reference length somewhere else too, or leave cross-validation out "
             "(--no-cross-validate)."
         )
-    solving = {"method": method, "hold": hold, "noise": noise, "robust": robust, "check_identifiability": False}
+    solving = {"method": method, "hold": hold, "noise": noise, "robust": robust, "prior": prior}
+    solving |= {"check_identifiability": False}
     return CrossValidation(
         tuple(_left_out(calibrate(arm, rest, bounds, **solving), left, group) for rest, left, group in parts)
     )

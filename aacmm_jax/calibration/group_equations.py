@@ -138,7 +138,19 @@ def _of_observations(record: CalibrationRecord, extra: tuple[str, ...]) -> tuple
     every_row = Block(
         "", None, np.concatenate(residual) / u, (derivatives * steps)[:, common] / u[:, None], np.zeros((len(u), 0))
     )
-    return rows, [every_row] if len(u) else []
+    return rows, [*([every_row] if len(u) else []), *_of_prior(record, z, steps[:free], len(common))]
+
+
+def _of_prior(record: CalibrationRecord, z: np.ndarray, steps: np.ndarray, shared: int) -> list[Block]:
+    """The rows of the prior, which belong to no group."""
+    prior = record.prior
+    if prior is None:
+        return []
+    mean, weight = np.asarray(prior.mean), np.asarray(prior.weight)
+    known = np.flatnonzero(weight)
+    residual = weight[known] * (z[: len(steps)] - mean)[known]
+    derivatives = np.eye(shared)[known] * (weight * steps)[known][:, None]
+    return [Block("prior", None, residual, derivatives, np.zeros((len(known), 0)))]
 
 
 def _in_columns(part: Linear, root: np.ndarray, steps: np.ndarray):

@@ -90,7 +90,8 @@ def _of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> _Related | N
     names, anchor = _names_of_lengths(record), scale_anchor_of(record)
     if not names:
         return None
-    arm, measurement, noise = to_numpy((record.calibrated.arm, Measurement.of(record.recording.capture, record.calibrated.arm), record.noise))
+    arm = record.calibrated.arm
+    arm, measurement, noise = to_numpy((arm, Measurement.of(record.recording.capture, arm), record.noise))
     measurement, space = measurement.weighted(arm.geometry, noise), Parameters(arm, record.names)
     distance, slopes = measured_lengths(np.asarray(space.vector()), space, measurement)
     error, slopes = np.asarray(distance - measurement.nominal), np.asarray(slopes) * np.asarray(space.scale)

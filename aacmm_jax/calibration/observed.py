@@ -1,164 +1,25 @@
 """Identification from observations of all kinds: one least squares of the parameters and every unknown geometry."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arrays import Numbers, as_array, is_concrete
-from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray, compiled, namespace, set_at, to_numpy
-from ..data.capture import Capture
-from ..data.noise import Noise
-from ..kinematics.arm import Arm
-from ..kinematics.chain import forward_pass
-from ..kinematics.parameters import Bounds, Parameters, based_on
-from ..model.measurement import check_joints
+from ..core.numpy_or_jax import AnyArray, add_at, compiled, namespace, set_at
+from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import Repeatability, no_repeatability, repeatability
-from ..model.observed import Linear, Observed, Whitening, linear_rows, observed_model, observed_rows, whitening_of
-from ..model.robust import Loss, LossName, check_loss
+from ..model.observed import PriorRows, Whitening, observed_model, observed_rows
+from ..model.robust import Loss
 from ..uncertainty import observed_covariance as propagation
-from ..uncertainty.covariance import NoiseModel, ParameterCovariance, inverse_information
+from ..uncertainty.covariance import ParameterCovariance, inverse_information
 from .bounded_fit import RULES, fit
-from .checks import check_noise_model, check_start
+from .observed_state import ObservedTask, State, scatter_at_start, state_at, whitening_at
+from .prior_fit import ByScales, PriorProblem, fit_with_prior
 from .results import Calibration, Identification, ObservedMetrics
-from .scale_anchor import ScaleAnchor, scale_anchor
 
-NO_ANCHOR = ScaleAnchor(hold=None, adjusted=None, set_by=(), partners=None)
 # Of the solves whose result only gives the weights of the next, or its start: a few standard uncertainties' millionths.
 _ROUGH = RULES._replace(rtol=1e-5)
-_LEAST = 1e-4  # smallest standard uncertainty of what is certified, of a tip coordinate's standard deviation
-
-
-class ObservedTask(NamedTuple):
-    """An identification from observations, checked."""
-
-    observed: Observed
-    bounds: Bounds
-    start: Float[AnyArray, " p"]
-    noise: Noise | None
-    anchor: ScaleAnchor
-    noise_model: NoiseModel
-    max_steps: int
-    loss: Loss | None
-    pose: tuple[int, ...]  # number of the configuration of each row; equal ones were read at once
-    differentiable: bool = True  # whether derivatives pass through the solve
-
-
-class State(NamedTuple):
-    """Everything at one point of the solve."""
-
-    linear: list[Linear]
-    errors: list[propagation.ArmErrors]
-    sigma: Float[AnyArray, ""]  # standard deviation of a tip coordinate, mm
-
-
-def observed_task(
-    arm: Arm,
-    capture: Capture,
-    bounds: Bounds,
-    start: Numbers | None,
-    noise: Noise | None,
-    hold: str | None,
-    noise_model: NoiseModel | None,
-    max_steps: int,
-    robust: LossName | None,
-) -> ObservedTask:
-    """A checked task. Everything that the capture holds takes part, reference lengths too."""
-    space = based_on(bounds.space, arm)
-    bounds = Bounds(space, bounds.lower, bounds.upper)
-    vector = space.vector() if start is None else as_array(start, "the start")
-    if max_steps < 1:
-        raise InputError(f"max_steps is {max_steps}; give at least 1.")
-    check_loss(robust)
-    check_joints(capture, space)
-    check_start(bounds, vector, "the start" if start is not None else "the arm")
-    fixed = bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
-    if fixed and hold == "longest":
-        hold = None
-    anchor = scale_anchor(space, space.base, hold, noise, capture) if not fixed or hold else NO_ANCHOR
-    noise_model = check_noise_model(noise_model, noise, arm.joints)
-    observed = Observed.of(capture, space.base)
-    if is_concrete(*jax.tree.leaves((arm, capture, vector))):
-        known, at = to_numpy((space, vector))
-        check_observed(observed, known, at, len(space.names) - (anchor.hold is not None))
-    return ObservedTask(
-        observed=observed,
-        bounds=bounds,
-        start=vector,
-        noise=noise,
-        anchor=anchor,
-        noise_model=noise_model,
-        max_steps=max_steps,
-        loss=None if robust is None else Loss(robust),
-        pose=configurations(observed.q),
-    )
-
-
-def configurations(q: Any) -> tuple[int, ...]:
-    """A number for each different configuration; different ones where the readings are traced."""
-    if not is_concrete(q):
-        return tuple(range(q.shape[0]))
-    return tuple(int(i) for i in np.unique(np.asarray(q), axis=0, return_inverse=True)[1].ravel())
-
-
-def check_observed(observed: Observed, space: Parameters, vector: Float[AnyArray, " p"], count: int) -> None:
-    """Raise `InputError` where the observations cannot determine their own unknowns, or these parameters."""
-    geometry = space.geometry(vector)
-    forward = forward_pass(geometry, observed.motion)
-    for observation, rows in zip(observed.observations, observed.slices, strict=True):
-        observation.check_determined(np.asarray(forward.tip[:, rows]))
-    _check_targets(observed, forward)
-    equations = observed.equations
-    unknowns = count + len(observed.steps)
-    if equations < unknowns:
-        raise InputError(
-            f"the observations give {equations} equations, but {unknowns} numbers are unknown ({count} parameters and "
-            f"{unknowns - count} of the unknown geometry); record more poses, or fix more parameters."
-        )
-
-
-def _check_targets(observed: Observed, forward: Any) -> None:
-    """Refuse a target whose place cannot be told from that of the station, because the last frame never turns."""
-    targets = {observation.target for observation in observed.observations if observation.target}
-    for target in targets:
-        rows = np.concatenate(
-            [
-                np.arange(part.start, part.stop)
-                for observation, part in zip(observed.observations, observed.slices, strict=True)
-                if observation.target == target
-            ]
-        )
-        x = np.asarray(forward.frame[0])[:, rows]
-        z = np.asarray(forward.frame[2])[:, rows]
-        if max(np.ptp(x, axis=1).max(), np.ptp(z, axis=1).max()) < 0.05:
-            raise InputError(
-                f"target '{target}' was seen from one orientation of the last frame, in which its place cannot be told "
-                "from that of the instrument; take poses with the wrist turned."
-            )
-
-
-def _state(task: ObservedTask, space: Parameters, z: Float[AnyArray, " z"], sigma: Any) -> State:
-    linear = linear_rows(space, task.observed, z)
-    p = len(space.names)
-    forward = task.observed.forward(space, z[:p], z[p:])
-    errors = propagation.arm_errors(forward, linear, task.observed)
-    if sigma is None:
-        degrees_of_freedom = max(task.observed.equations - z.shape[0], 1)
-        scatter = propagation.scatter_of if task.loss is None else propagation.robust_scatter_of
-        sigma = scatter(linear, errors, degrees_of_freedom)
-    return State(linear, errors, sigma)
-
-
-def _whitening(task: ObservedTask, state: State) -> Whitening:
-    if task.noise is None:
-        of_arm = [propagation.covariance_of_sigma(errors, state.sigma) for errors in state.errors]
-    else:
-        of_arm = [propagation.covariance_of_noise(errors, task.noise) for errors in state.errors]
-    least = namespace(state.sigma).maximum(_LEAST * state.sigma, 1e-12)
-    return whitening_of(state.linear, task.observed, of_arm, least)
 
 
 @compiled(jit=eqx.filter_jit)
@@ -166,7 +27,8 @@ def identify_observed(task: ObservedTask) -> Identification:
     """The parameters and the unknown geometry that agree best with everything observed.
 
     Solved at least twice: with the weights of the start, and with those of that solution. Where the noise is not given,
-    tips are taken to scatter as much as the residuals then do (`observed_covariance.scatter_of`).
+    tips are taken to scatter as much as the residuals then do (`observed_covariance.scatter_of`). With a prior the last
+    solve is repeated until the weights agree with what it leads to (`prior_fit`).
     """
     xp = namespace(task)
     names = task.bounds.space.names
@@ -181,30 +43,42 @@ def identify_observed(task: ObservedTask) -> Identification:
     )
     steps = xp.concatenate([space.scale, xp.asarray(task.observed.steps)])
     first = xp.concatenate([task.start[free], geometry])
-    before = _state(task, space, first, _scatter(task, space, first))
+    before = state_at(task, space, first, scatter_at_start(task, space, first))
     z, evaluations = first, xp.zeros((), dtype=int)
     state, found = before, None
     # Once more with the weights of a nearly right arm. Far from the solution a robust loss would see nothing but bad
     # poses, so it begins where least squares ends, and one with several minima where Huber's, which has one, ends.
     losses = [None, None] if task.loss is None else [None, Loss("huber"), task.loss, task.loss]
+    prior = None if task.prior is None else task.prior.of(space.names, task.bounds.space.vector()[free])
+    rows, of_prior, effective, by_scales = None, None, None, None
     for number, loss in enumerate(losses, 1):
-        whitening = _whitening(task, state)
-        args = (space, task.observed, whitening, loss)
+        if prior is not None:
+            problem = PriorProblem(task, space, prior, sides, steps, loss, state)
+            scales = problem.first_scales()
+            rows = problem.rows(scales)
+            if number == len(losses):
+                scales, found = fit_with_prior(problem, z)
+                z, evaluations, rows = found.parameters, evaluations + found.steps, problem.rows(scales)
+                of_prior, effective, by_scales = problem.metrics(scales, z)
+                state = state_at(task, space, z, effective=effective)
+                break
+        args = (space, task.observed, whitening_at(task, state, rows), loss)
         functions = observed_rows, observed_model
         rules = RULES if number == len(losses) else _ROUGH
         found = fit(*functions, z, args, sides, steps, task.max_steps, rules=rules, differentiable=task.differentiable)
         z, evaluations = found.parameters, evaluations + found.steps
         # Where the noise is given, only the last scatter matters, and its iteration costs as much as a few steps.
         known = task.noise is not None and number < len(losses)
-        state = _state(task, space, z, _scatter(task, space, z) if known else None)
+        state = state_at(task, space, z, scatter_at_start(task, space, z) if known else None)
     assert found is not None
-    whitening = _whitening(task, state)
+    whitening = whitening_at(task, state, rows)
     reduced = Bounds(space, *(side[:p] for side in sides))
     active = reduced.active(z[:p])
-    covariance, of_geometry = _covariance(task, space, z, state, whitening, active, steps)
+    covariance, of_geometry = _covariance(task, space, z, state, whitening, active, steps, by_scales)
     parameters = set_at(task.start, free, z[:p])
     arm = task.bounds.space.arm(parameters)
-    metrics = _metrics(task, before, state, whitening, z[p:], of_geometry)
+    spent = len(names) + count if effective is None else effective
+    metrics = _metrics(task, before, state, whitening, z[p:], of_geometry, spent)
     return Identification(
         arm=arm,
         parameters=parameters,
@@ -222,10 +96,11 @@ def identify_observed(task: ObservedTask) -> Identification:
         bounds=task.bounds,
         anchor=task.anchor,
         noise_model=task.noise_model,
-        degrees_of_freedom=float("inf")
+        fitted_degrees_of_freedom=float("inf")
         if task.noise_model == "given"
-        else max(float(task.observed.equations - p - count), 1.0),
+        else float(task.observed.equations - p - count),
         observed=metrics[2],
+        prior_metrics=of_prior,
     )
 
 
@@ -259,14 +134,6 @@ def calibrate_observed(task: ObservedTask) -> Calibration:
     )
 
 
-def _scatter(task: ObservedTask, space: Parameters, z: Float[AnyArray, " z"]) -> Any:
-    """Root mean square of the start's residuals in mm, for the first weights."""
-    xp = namespace(z, task)
-    values = [part.rows.values[:3] for part in linear_rows(space, task.observed, z)]
-    flat = xp.concatenate([xp.reshape(value, (-1,)) for value in values])
-    return xp.sqrt(xp.mean(flat**2)) + 1e-9
-
-
 def _covariance(
     task: ObservedTask,
     space: Parameters,
@@ -275,6 +142,7 @@ def _covariance(
     whitening: Whitening,
     active: Any,
     steps: Float[AnyArray, " z"],
+    by_scales: ByScales | None,
 ) -> tuple[ParameterCovariance, Float[AnyArray, "g g"]]:
     """Of the parameters, and of the geometry."""
     xp, p = namespace(z, task), len(space.names)
@@ -300,6 +168,7 @@ def _covariance(
         found = propagation.moments(
             *(state.linear, state.errors, unweighted, rows, whitening, inverse, state.sigma),
             robust=task.loss is not None,
+            prior=None if whitening.prior is None else _information_of(whitening.prior, scaled),
         )
         noise = propagation.noise_from(found)
     else:
@@ -314,6 +183,7 @@ def _covariance(
         matrix = propagation.propagated(
             state.linear, state.errors, rows, whitening, inverse, relations, noise, np.array(task.pose)
         )
+    matrix = matrix if by_scales is None else matrix + by_scales.added(inverse)
     matrix = matrix * steps[:, None] * steps[None, :]
     # What the data leave open of the geometry (the turn of a ball bar about itself) has no uncertainty.
     known = determined[p:]
@@ -329,6 +199,11 @@ def _weighted_rows(loss: Loss, state: State, whitening: Whitening, rows: list[An
         white = xp.einsum("mab,bm->am", root, part.rows.values)
         found.append(row * loss.cost_and_weight(white)[1][None, None])
     return found
+
+
+def _information_of(prior: PriorRows, scaled: Float[AnyArray, " z"]) -> Float[AnyArray, "z z"]:
+    xp, own = namespace(scaled), np.arange(prior.mean.shape[0])
+    return add_at(xp.zeros((scaled.shape[0],) * 2), (own, own), (prior.weight * scaled[own]) ** 2)
 
 
 def _flat(rows: Float[AnyArray, "z r m"]) -> Float[AnyArray, "z k"]:
@@ -354,8 +229,10 @@ def _metrics(
     whitening: Whitening,
     geometry: Float[AnyArray, " g"],
     covariance: Float[AnyArray, "g g"],
+    spent: Any,
 ) -> tuple[Repeatability, Repeatability, ObservedMetrics]:
-    """Repeatability of the sockets, and how far each observation is from its geometry."""
+    """Repeatability of the sockets, and how far each observation is from its geometry; ``spent`` is how many unknowns
+    the data determine."""
     xp, observed = namespace(geometry, after.sigma), task.observed
     rms, chi, total, weights = [], [], 0.0, []
     for part, root in zip(after.linear, whitening.roots, strict=True):
@@ -365,7 +242,7 @@ def _metrics(
         weights.append(xp.ones(white.shape[1]) if task.loss is None else task.loss.cost_and_weight(white)[1])
     for state in (before, after):
         rms.append(xp.stack([xp.sqrt(xp.mean(xp.sum(part.rows.values[:3] ** 2, axis=0))) for part in state.linear]))
-    degrees_of_freedom = max(observed.equations - len(observed.steps) - len(task.bounds.space.names), 1)
+    degrees_of_freedom = xp.maximum(xp.asarray(observed.equations - spent, dtype=float), 1.0)
     metrics = ObservedMetrics(
         names=tuple(observation.name for observation in observed.observations),
         kinds=tuple(observation.kind for observation in observed.observations),

@@ -18,13 +18,15 @@ from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters, based_on
+from ..kinematics.priors import Prior
 from ..model.measurement import check_joints
 from ..model.observed import Observed
 from ..model.robust import Loss, check_loss
 from ..solver.reason import numbers_of, reasons
 from .checks import check_noise_model
 from .chunks import default_workers, devices_of, run_chunks
-from .observed import NO_ANCHOR, ObservedTask, check_observed, configurations, identify_observed
+from .observed import identify_observed
+from .observed_state import NO_ANCHOR, ObservedTask, check_observed, configurations, unknown_parameters
 from .results import ManyIdentifications
 from .scale_anchor import ScaleAnchor, scale_anchor
 
@@ -54,7 +56,7 @@ def solve_observed(
     options: Any,
 ) -> ManyIdentifications:
     """All problems of a batch, problem by problem what `identify` does; ``box`` is start, lower and upper bounds."""
-    robust, noise = options.robust, options.noise
+    robust, noise, prior = options.robust, options.noise, options.prior
     check_loss(robust)
     check_joints(capture, space)
     space = based_on(space, arm)
@@ -71,7 +73,7 @@ def solve_observed(
     hold = None if fixed and options.hold == "longest" else options.hold
     anchor = scale_anchor(space, arm, hold, noise, first[1]) if not fixed or hold else NO_ANCHOR
     observed = Observed.of(first[1], first[0])
-    check_observed(observed, first_space, first[2], len(space.names) - (anchor.hold is not None))
+    check_observed(observed, first_space, first[2], unknown_parameters(first_space, anchor, prior, noise))
     form = _Form(
         names=space.names,
         anchor=anchor,
@@ -85,17 +87,17 @@ def solve_observed(
     devices = devices_of(options.devices)
     slots = options.slots or _default_slots(devices[0].platform, len(form.pose))
 
-    def run(chunk: range, device: Any) -> dict[str, np.ndarray]:
+    def run(chunk: range, device: Any) -> dict[str, Any]:
         rows = np.full(slots, chunk.start)
         rows[: len(chunk)] = chunk
         with jax.default_device(device):
-            part, errors = jax.device_put((_selected(given, axes, rows), noise), device)
-            found = _solve(form, part, errors)
-        return {name: np.asarray(values)[: len(chunk)] for name, values in found.items()}
+            part, *shared = jax.device_put((_selected(given, axes, rows), noise, prior), device)
+            found = _solve(form, part, *shared)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(chunk)], found)
 
     chunks = [range(i, min(i + slots, size)) for i in range(0, size, slots)]
     found = run_chunks(run, chunks, devices, options.workers or default_workers(devices))
-    fields = {name: np.concatenate([one[name] for one in found]) for name in found[0]}
+    fields = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
     return ManyIdentifications(
         k=None,
         result=reasons(jax.numpy.asarray(fields.pop("reason"))),
@@ -123,19 +125,20 @@ def _selected(given: tuple[Any, ...], axes: tuple[Any, ...], rows: Any) -> tuple
 
 
 @partial(eqx.filter_jit)
-def _solve(form: _Form, part: tuple[Any, ...], noise: Noise | None) -> dict[str, AnyArray]:
-    return jax.vmap(partial(_solve_one, form, noise), in_axes=form.batched)(*part)
+def _solve(form: _Form, part: tuple[Any, ...], noise: Noise | None, prior: Prior | None) -> dict[str, Any]:
+    return jax.vmap(partial(_solve_one, form, noise, prior), in_axes=form.batched)(*part)
 
 
 def _solve_one(
     form: _Form,
     noise: Noise | None,
+    prior: Prior | None,
     arm: Arm,
     capture: Capture,
     start: Float[AnyArray, " p"],
     lower: Float[AnyArray, " p"],
     upper: Float[AnyArray, " p"],
-) -> dict[str, AnyArray]:
+) -> dict[str, Any]:
     """One problem, traced: the fields of `ManyIdentifications`."""
     bounds = Bounds(Parameters(arm, form.names), lower, upper)
     task = ObservedTask(
@@ -149,6 +152,7 @@ def _solve_one(
         loss=form.loss,
         pose=form.pose,
         differentiable=False,
+        prior=prior,
     )
     found = identify_observed(task)
     metrics = found.observed
@@ -162,5 +166,6 @@ def _solve_one(
         "reason": numbers_of(found.result),
         "active": found.active,
         "reduced_chi": metrics.reduced_chi_of_all,
+        "prior": found.prior,
     }
     return fields | ({"covariance": found.covariance} if form.covariance else {})

@@ -19,7 +19,7 @@ from ..uncertainty.arm_uncertainty import Uncertainty
 from .checks import largest_plausible_residual, plausible
 from .evaluation import Evaluation, evaluate
 from .left_out import CrossValidation
-from .results import Calibration, Identification, ObservedMetrics
+from .results import Calibration, Identification, ObservedMetrics, PriorMetrics
 from .second_stage import LARGEST_LOG_K
 
 REPEATABILITY = "repeatability"  # method of stage 1 alone
@@ -90,6 +90,7 @@ class CalibrationRecord(NamedTuple):
     robust: str | None = None  # the robust loss
     others: OtherPoses | None = None
     removed: tuple[Removed, ...] = ()
+    prior: PriorMetrics | None = None  # with arrays of NumPy
 
     @property
     def given_noise(self) -> Noise | None:
@@ -188,6 +189,7 @@ def record_of(
         reason=_reason(calibration, stage1),
         observed=None if stage1.observed is None else jax.tree.map(np.asarray, stage1.observed),
         robust=robust,
+        prior=None if calibration.prior is None else jax.tree.map(np.asarray, calibration.prior),
         others=None if others is None else _other_poses(calibration.arm, others, stage1.observed),
     )
 

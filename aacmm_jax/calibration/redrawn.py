@@ -26,7 +26,7 @@ from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..model.observed import Linear, Observed, linear_rows
 from ..uncertainty.observed_covariance import ArmErrors, arm_errors
-from .observed import configurations
+from .observed_state import configurations
 from .results import Calibration
 
 

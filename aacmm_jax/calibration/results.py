@@ -62,6 +62,26 @@ class AbstractResult(eqx.Module):
         return np.asarray(good) if is_concrete(good) else good
 
 
+class PriorMetrics(eqx.Module):
+    """What a prior was, and what the data made of it: group by group, and parameter by parameter."""
+
+    groups: tuple[str, ...] = eqx.field(static=True)
+    learned: tuple[bool, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)  # of each group's standard deviation
+    parameters: tuple[int, ...] = eqx.field(static=True)  # how many have the prior of the group
+    sd: Float[AnyArray, " g"]  # standard deviation, given or learned
+    effective: Float[AnyArray, " g"]  # how many of its parameters the data determine (the rest the prior does)
+    supported: Bool[AnyArray, " g"]  # False where the data support no deviation from the mean
+    names: tuple[str, ...] = eqx.field(static=True)  # of the parameters, without the scale anchor
+    mean: Float[AnyArray, " q"]  # mm and rad
+    weight: Float[AnyArray, " q"]  # one over the standard deviation, 1/mm and 1/rad; 0 without a prior
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """Names of the parameters that have a prior."""
+        return tuple(name for name, weight in zip(self.names, np.asarray(self.weight), strict=True) if weight > 0)
+
+
 class AbstractSingleResult(AbstractResult):
     """What an `Identification` and a `Calibration` have in common."""
 
@@ -89,6 +109,23 @@ class AbstractSingleResult(AbstractResult):
     def noise(self) -> Noise:
         """Noise of readings and seat: as given, or as estimated from the residuals."""
         return self.parameter_covariance.noise
+
+    @property
+    def prior(self) -> PriorMetrics | None:
+        """The prior, where one was given, with its learned standard deviations and effective parameters."""
+        return self._stage1.prior_metrics
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Degrees of freedom behind the covariance, equations less effective parameters; infinite where the noise was
+        given."""
+        fitted, prior = self._stage1.fitted_degrees_of_freedom, self.prior
+        if prior is None:
+            return max(fitted, 1.0)
+        spared = sum(prior.parameters) - namespace(prior.effective).sum(prior.effective)
+        if is_concrete(spared) and np.ndim(spared) == 0:
+            return max(fitted + float(spared), 1.0)
+        return namespace(spared).maximum(fitted + spared, 1.0)
 
     @property
     def given_noise(self) -> Noise | None:
@@ -153,8 +190,11 @@ class Identification(AbstractSingleResult):
     bounds: Bounds
     anchor: ScaleAnchor = eqx.field(static=True)  # what sets the scale
     noise_model: NoiseModel = eqx.field(static=True)  # model of the tips' errors
-    degrees_of_freedom: float = eqx.field(static=True)  # of the covariance; infinite where the noise was given
-    observed: ObservedMetrics | None = None  # where the capture has observations besides sockets, or a robust loss
+    # Of the covariance, with every parameter as fitted in full; infinite where the noise was given.
+    fitted_degrees_of_freedom: float = eqx.field(static=True)
+    # Where the capture has observations besides sockets, a robust loss or a prior.
+    observed: ObservedMetrics | None = None
+    prior_metrics: PriorMetrics | None = None
 
     @property
     def _stage1(self) -> "Identification":
@@ -205,11 +245,6 @@ class Calibration(AbstractSingleResult):
         return self.stage1.noise_model
 
     @property
-    def degrees_of_freedom(self) -> float:
-        """Degrees of freedom behind the covariance; infinite where the noise was given."""
-        return self.stage1.degrees_of_freedom
-
-    @property
     def bounds(self) -> Bounds:
         """The box of the identification."""
         return self.stage1.bounds
@@ -255,6 +290,7 @@ class ManyIdentifications(AbstractManyResults):
     anchor: ScaleAnchor = eqx.field(static=True)  # what sets the scale
     covariance: Float[np.ndarray, "b p p"] | None = None  # where it was asked for
     reduced_chi: Float[np.ndarray, " b"] | None = None  # of all observations, where there are any but sockets
+    prior: PriorMetrics | None = None  # with a batch axis
 
     @property
     def _stage1(self) -> "ManyIdentifications":
@@ -278,6 +314,7 @@ class ManyCalibrations(AbstractManyResults):
     method: str = eqx.field(static=True)
     covariance: Float[np.ndarray, "b p p"] | None = None  # where it was asked for
     reduced_chi: Float[np.ndarray, " b"] | None = None  # of all observations, where there are any but sockets
+    prior: PriorMetrics | None = None  # with a batch axis
 
     @property
     def _stage1(self) -> ManyIdentifications:

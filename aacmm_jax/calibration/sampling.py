@@ -222,6 +222,10 @@ def _check_level(level: float) -> None:
 
 
 def _check_loss(result: Calibration, capture: Capture, robust: LossName | None) -> None:
+    if result.prior is not None:
+        raise InputError(
+            "the calibration had a prior, which trials do not draw anew; calibrate without one, or use its covariance."
+        )
     """Refuse trials that would be solved with another loss than the calibration, or of another capture."""
     if result.observed is None:
         if capture.observations or robust is not None:

@@ -17,6 +17,7 @@ from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, based_on
+from ..kinematics.priors import Prior
 from ..model.measurement import Measurement, check_joints
 from ..model.metrics import repeatability
 from ..model.residuals import JointWeights, joint_normal_equations, joint_residual
@@ -27,7 +28,8 @@ from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_d
 from ..uncertainty.identifiability import observability
 from .bounded_fit import Fit, fit
 from .checks import check_enough, check_noise_model, check_single, check_start
-from .observed import ObservedTask, calibrate_observed, identify_observed, observed_task
+from .observed import calibrate_observed, identify_observed
+from .observed_state import ObservedTask, observed_task
 from .results import Calibration, Identification
 from .scale_anchor import default_method, scale_anchor, scale_from_slides, scale_set_by_clause
 from .second_stage import adjust_anchor, clip_to_bounds, divide_by_k, must_adjust_anchor
@@ -47,6 +49,7 @@ def identify(
     noise: Noise | None = None,
     noise_model: NoiseModel | None = None,
     robust: LossName | None = None,
+    prior: Prior | None = None,
     max_steps: int = _MAX_STEPS,
 ) -> Identification:
     """Stage 1: the parameters that make the poses of every socket agree, within bounds.
@@ -71,6 +74,8 @@ def identify(
             of its tip, and the covariance of the result follows from it; else both are estimated from the residuals.
         noise_model: another model of the tips' errors, one of `uncertainty.covariance.NOISE_MODELS`.
         robust: a robust loss, "huber", "cauchy" or "tukey", of each pose's whitened residual; None, least squares.
+        prior: what is known of the parameters, as a mean (by default ``arm``'s values) and a standard deviation. It
+            weighs against the data, whose noise is given or estimated; bounds hold as well. The scale anchor has none.
         max_steps: most evaluations of the residual.
 
     Returns:
@@ -79,11 +84,11 @@ def identify(
     Raises:
         InputError: too few poses, a start outside the box, names that do not fit, or a batch (see `identify_many`).
     """
-    if capture.observations or robust is not None:
+    if capture.observations or robust is not None or prior is not None:
         check_single(arm, capture, bounds, "identify_many")
         check_finite(arm=arm, capture=capture, noise=noise)
         alone = eqx.tree_at(lambda c: c.lengths, capture, (), is_leaf=lambda leaf: isinstance(leaf, tuple))
-        task = observed_task(arm, alone, bounds, start, noise, hold, noise_model, max_steps, robust)
+        task = observed_task(arm, alone, bounds, start, noise, hold, noise_model, max_steps, robust, prior)
         return to_jax(identify_observed(to_numpy(task)))
     task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many")
     return to_jax(_identify(to_numpy(task)))
@@ -130,6 +135,7 @@ def calibrate(
     noise: Noise | None = None,
     noise_model: NoiseModel | None = None,
     robust: LossName | None = None,
+    prior: Prior | None = None,
     check_identifiability: bool = True,
     strict: bool = False,
     max_steps: int = _MAX_STEPS,
@@ -151,13 +157,14 @@ def calibrate(
             determine the scale.
         bounds: box of the free parameters ``(p,)``, mm and rad.
         method: "two-stage" or "joint"; by default two-stage, but joint where the capture has observations besides
-            sockets and lengths, the arm has prismatic joints (whose readings say something about the scale too), or the
-            loss is robust.
+            sockets and lengths, the arm has prismatic joints (whose readings say something about the scale too), the
+            loss is robust, or there is a prior, which a division by k would ignore.
         hold: the scale anchor of stage 1.
         start: free parameters ``(p,)`` to start from, mm and rad.
         noise: standard deviations of readings and seat.
         noise_model: another model of the tips' errors.
         robust: a robust loss, as for `identify`.
+        prior: what is known of the parameters, as for `identify`.
         check_identifiability: warn where free parameters are not determined by these data; the check takes about as
             long as the calibration.
         strict: raise instead of warn where free parameters are not determined by these data.
@@ -170,13 +177,14 @@ def calibrate(
         InputError: as `identify` does, and without a reference length.
     """
     by_slides = scale_from_slides(arm, capture, bounds.space, noise)
-    general = bool(capture.observations) or robust is not None or by_slides
+    general = bool(capture.observations) or robust is not None or prior is not None or by_slides
     method = default_method(arm, general) if method is None else method
     if not isinstance(method, str) or method not in ("two-stage", "joint"):
         raise InputError(f"method is {shown(method)}; it must be 'two-stage' or 'joint'.")
     if method == "two-stage" and general:
         raise InputError(
-            "method='two-stage' is for sockets with reference lengths, without a robust loss; use method='joint'."
+            "method='two-stage' is for sockets with reference lengths, without a robust loss or a prior; use "
+            "method='joint'."
         )
     if not capture.lengths and not by_slides and not any(one.fixes_scale for one in capture.observations):
         raise InputError(
@@ -186,7 +194,7 @@ def calibrate(
     if general:
         check_single(arm, capture, bounds, "calibrate_many")
         check_finite(arm=arm, capture=capture, noise=noise)
-        task = observed_task(arm, capture, bounds, start, noise, None, noise_model, max_steps, robust)
+        task = observed_task(arm, capture, bounds, start, noise, None, noise_model, max_steps, robust, prior)
         if check_identifiability or strict:
             _check_identifiable(capture, task, strict)
         return to_jax(calibrate_observed(to_numpy(task)))
@@ -215,9 +223,13 @@ def _check_identifiable(capture: Capture, task: Task | ObservedTask, strict: boo
     if inside_trace() or not is_concrete(*jax.tree.leaves((capture, task.bounds))):
         return
     space = task.bounds.space
-    sentences = observability(space.base, capture, space).sentences()
-    if sentences and strict:
-        raise InputError(" ".join(sentences))
+    prior = task.prior if isinstance(task, ObservedTask) else None
+    known = None if prior is None else prior.of(space.names, space.vector())
+    named = () if known is None else tuple(space.names[i] for i in known.index)
+    seen = observability(space.base, capture, space, known=named)
+    sentences, lost = seen.sentences(), seen._replace(by_prior=()).sentences()
+    if lost and strict:
+        raise InputError(" ".join(lost))
     for sentence in sentences:
         warnings.warn(sentence, IdentifiabilityWarning, stacklevel=3)
 
@@ -273,7 +285,7 @@ def _solve_stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
         bounds=task.bounds,
         anchor=task.anchor,
         noise_model=task.noise_model,
-        degrees_of_freedom=residual_degrees_of_freedom(task.noise_model, measurement.sizes, fitted),
+        fitted_degrees_of_freedom=residual_degrees_of_freedom(task.noise_model, measurement.sizes, fitted),
     )
     return identification, propagated
 

@@ -20,6 +20,7 @@ from .app import Json, Only, Without, app, examples, show_summary, with_spinner
         "aacmm calibrate capture.h5 -o calibration.h5",
         "aacmm calibrate capture.h5 -o calibration.h5 --without 'test*' --method joint",
         "aacmm calibrate monday.h5 tuesday.h5 -o calibration.h5 --robust tukey",
+        "aacmm calibrate capture.h5 -o calibration.h5 --prior length=0.5mm,angle=0.05deg",
     )
 )
 def calibrate(
@@ -32,7 +33,7 @@ def calibrate(
         Literal["two-stage", "joint"] | None,
         typer.Option(
             help="two-stage: repeatability, then the scale by the reference lengths; joint: one least squares of all. "
-            "Default: two-stage, but joint with observations besides sockets or a robust loss."
+            "Default: two-stage, but joint with observations besides sockets, a robust loss or a prior."
         ),
     ] = None,
     robust: Annotated[
@@ -45,6 +46,14 @@ def calibrate(
             metavar="KINDS",
             help="What joints do besides their readings: dh,gravity,harmonics=1+2,gear,coupled=2-3. Default: the arm "
             "file's; dh alone for nothing.",
+        ),
+    ] = None,
+    prior: Annotated[
+        str | None,
+        typer.Option(
+            metavar="GROUP=SD,...",
+            help="Standard deviations of parameters about their nominal values: 'length=0.5mm,angle=0.05deg', "
+            "'d_3=750.2+-0.1mm', 'alpha=learn' from the data; 'learn' for all, 'none'. Default: the arm file's.",
         ),
     ] = None,
     scale: Annotated[
@@ -187,6 +196,7 @@ def calibrate(
         solving = {
             "hold": None if hold == "none" else hold,
             "noise": _noise(encoder_arcsec, seating_mm),
+            "prior": _prior(recording.nominal, prior),
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", IdentifiabilityWarning)  # the summary says it
@@ -203,7 +213,8 @@ def calibrate(
                 record = with_spinner("Comparing groups", lambda: removed(record, solved))
                 result = solved(record.recording.capture) if record.removed and monte_carlo else result
             recording, capture_used = record.recording, record.recording.capture
-            alike = scale == "measured" and robust is None and not capture_used.observations
+            plain = robust is None and solving["prior"] is None
+            alike = scale == "measured" and plain and not capture_used.observations
             if cross_validate or (
                 cross_validate is None
                 and alike
@@ -222,8 +233,8 @@ def calibrate(
             from ..calibration.results import Calibration
             from ..calibration.sampling import monte_carlo as sample
 
-            if not isinstance(result, Calibration) or robust is not None:
-                raise InputError("--monte-carlo is for calibrations without --robust and --scale nominal.")
+            if not isinstance(result, Calibration) or not plain:
+                raise InputError("--monte-carlo is for calibrations without --robust, priors and --scale nominal.")
             sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))
             record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
         summary = calibration_summary(record)
@@ -328,6 +339,15 @@ def _bounds(
         angle=nominal.angle if angle_deg is None else angle_deg * DEG,
         override=override,
     )
+
+
+def _prior(nominal: Any, text: str | None) -> Any:
+    """The prior of the arm's file, or that which the command line states instead."""
+    if text is None:
+        return nominal.prior
+    from ..files.priors import prior_of_text
+
+    return prior_of_text(text, nominal.arm)
 
 
 def _noise(encoder_arcsec: float | None, seating_mm: float | None) -> Any:

@@ -118,6 +118,10 @@ def calibration(summary: dict[str, Any]) -> None:
     _parameters(console, summary["parameters"])
     if summary["held"]:
         console.print(f"Fixed at their nominal values: {', '.join(summary['held'])}.")
+    if summary.get("prior"):
+        from ..summaries.calibration import prior_sentence
+
+        console.print("Prior (standard deviation of each group): " + ". ".join(map(prior_sentence, summary["prior"])))
     if summary["lengths"]:
         print_lengths(console, summary["lengths"], fitted=summary["fixed_by_one_length"])
     _uncertainty(console, summary)

@@ -23,6 +23,7 @@ from .arm_noise import ArmNoise, NoiseTable, stated_noise
 from .atomic_write import storable, write_text
 from .corrections import CorrectionsTable, corrections_toml
 from .outputs import as_path
+from .priors import PriorTable, prior_toml
 from .toml import Strict, each_once, read_toml
 from .ur_kinematics import read_ur_kinematics
 from .urdf import read_urdf
@@ -82,6 +83,7 @@ class _ArmModel(Strict):
     identification: _Identification | None = None
     corrections: CorrectionsTable | None = None
     noise: NoiseTable | None = None
+    priors: PriorTable | None = None
 
     @model_validator(mode="after")
     def _one_description(self) -> "_ArmModel":
@@ -284,6 +286,8 @@ def _specification(path: Path, probe: Numbers | None, choose: bool) -> ArmSpecif
                 found = found._replace(arm=with_tool(found.arm, probe))
         if model.corrections is not None:
             found = found._replace(arm=model.corrections.corrected(found.arm, length, angle))
+        if model.priors is not None:
+            found = found._replace(prior=model.priors.prior(found.arm, length, angle))
         wanted = model.identification
         if choose and (wanted is None or not wanted.names_parameters):
             found = _chosen(found)
@@ -400,6 +404,8 @@ def specification_toml(specification: ArmSpecification, *, source: str = "") -> 
     if specification.override:
         proposed["override"] = {name: float(width) for name, width in specification.override.items()}
     document["identification"] = proposed
+    if specification.prior is not None:
+        document["priors"] = prior_toml(specification.prior)
     return document.as_string()
 
 

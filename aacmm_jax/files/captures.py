@@ -29,6 +29,7 @@ from .hdf5 import (
     write_tables,
 )
 from .observations import observation_tables, observations_of
+from .prior_attributes import attributes_of_prior, prior_of_attributes
 from .sense import check_recording
 
 _KINDS = {
@@ -274,6 +275,7 @@ def arm_table(specification: ArmSpecification) -> Table:
         "override_half_widths": [float(width) for width in specification.override.values()] or None,
         "held": None if specification.held is None else list(specification.held) or "",
         "free": list(specification.free) or None,
+        **attributes_of_prior(specification.prior),
     }
     return Table(variables, attributes)
 
@@ -313,4 +315,5 @@ def specification_of(path: str | os.PathLike, stored: Stored, table: str) -> Arm
         angle=attributes.get("half_width_angle_rad", 0.0175),
         override=dict(override),
         free=names_in(attributes.get("free")),
+        prior=prior_of_attributes(attributes),
     )

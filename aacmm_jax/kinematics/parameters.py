@@ -31,6 +31,7 @@ from .arm import (
 from .chain import Geometry
 from .independence import generic_poses, independent_names
 from .inverse_kinematics import SocketPoses
+from .priors import Prior
 
 
 class Parameters(eqx.Module):
@@ -353,6 +354,7 @@ class ArmSpecification(NamedTuple):
         override: Half-widths of single parameters by name, mm or rad.
         free: Names that are free in addition, such as Hayati's ``beta_2``.
         urdf: The URDF that the arm was read from; None for others.
+        prior: Prior of the parameters; None where the file states none.
     """
 
     arm: Arm
@@ -363,6 +365,7 @@ class ArmSpecification(NamedTuple):
     override: Mapping[str, float] = MappingProxyType({})
     free: tuple[str, ...] = ()
     urdf: UrdfSource | None = None
+    prior: Prior | None = None
 
     def space(self) -> Parameters:
         """The free parameters that the file proposes."""

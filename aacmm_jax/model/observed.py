@@ -161,12 +161,20 @@ class Linear(NamedTuple):
     indices: np.ndarray  # of those numbers in z
 
 
+class PriorRows(NamedTuple):
+    """What is known of the parameters besides the observations: rows weight (x - mean), of standard deviation 1."""
+
+    mean: Float[AnyArray, " p"]
+    weight: Float[AnyArray, " p"]  # one over a standard deviation; 0 where nothing is known
+
+
 class Whitening(NamedTuple):
     """What makes rows of standard deviation 1 of the residuals."""
 
     roots: tuple[Float[AnyArray, "_ _ _"], ...]  # of each observation, inverse Cholesky factors
     lengths: Float[AnyArray, " l"]  # one over a standard deviation
     certified: dict[str, Float[AnyArray, " k"]]
+    prior: PriorRows | None = None
 
 
 def linear_rows(
@@ -216,8 +224,8 @@ def residual_rows(space: Parameters, observed: Observed, z: Float[AnyArray, " z"
 def observed_rows(
     z: Float[AnyArray, " z"], args: tuple[Parameters, Observed, Whitening, Loss | None]
 ) -> tuple[AnyArray, ...]:
-    """Whitened residuals of observations, lengths and certified values; half their sum of squares is what is
-    minimised."""
+    """Whitened residuals of observations, lengths, certified values and the prior; half their sum of squares is what
+    is minimised."""
     space, observed, whitening, loss = args
     parts = observed.split(z[len(space.names) :])
     found = []
@@ -226,7 +234,12 @@ def observed_rows(
         white = namespace(values, root).einsum("mab,bm->am", root, values)
         found.append(white if loss is None else loss.transformed(white))
     length, certified = _relations(observed, whitening, parts)
-    return (*found, length, *certified.values())
+    prior = () if whitening.prior is None else (_of_prior(whitening.prior, z),)
+    return (*found, length, *certified.values(), *prior)
+
+
+def _of_prior(prior: PriorRows, z: Float[AnyArray, " z"]) -> Float[AnyArray, " p"]:
+    return prior.weight * (z[: prior.mean.shape[0]] - prior.mean)
 
 
 def _relations(
@@ -299,6 +312,11 @@ def observed_model(
         cost = cost + 0.5 * xp.sum(residual**2)
         gradient = add_at(gradient, indices, whitening.certified[name] * residual)
         gram = add_at(gram, (indices, indices), whitening.certified[name] ** 2)
+    if whitening.prior is not None:
+        weight, residual, own = whitening.prior.weight, _of_prior(whitening.prior, z), np.arange(p)
+        cost = cost + 0.5 * xp.sum(residual**2)
+        gradient = add_at(gradient, own, weight * residual)
+        gram = add_at(gram, (own, own), weight**2)
     return QuadraticModel(cost, gradient, gram)
 
 

@@ -10,7 +10,7 @@ from ..calibration.pose_residuals import distances_of, observation_residuals
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise
 from ..core.units import ARCSEC, people_read
-from ..summaries.calibration import calibration_summary
+from ..summaries.calibration import calibration_summary, prior_sentence
 from ..summaries.observations import capture_words
 from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
@@ -195,6 +195,8 @@ def _nominal_and_calibrated(
     capture, fixed = record.recording.capture, record.fixed_by_one_length
     if record.observed is not None or record.method == REPEATABILITY:
         del stages["stage1"]  # which is the calibrated arm
+    if summary.get("prior"):
+        blocks.append("Prior (standard deviation of each group): " + ". ".join(map(prior_sentence, summary["prior"])))
     if record.observed is not None:
         blocks += [*agreement_tables(summary), *other_poses_table(summary)]
     if summary["nominal"]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..calibration.checks import check_enough
-from ..calibration.observed import check_observed
+from ..calibration.observed_state import check_observed
 from ..calibration.scale_anchor import scale_anchor
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG

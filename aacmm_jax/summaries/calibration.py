@@ -1,6 +1,6 @@
 """Arms, captures and calibrations as plain dictionaries with the unit in every key; ``--json`` prints them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,9 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..calibration.model_errors import model_tests
 from ..calibration.record import CalibrationRecord, uncertainty_of
-from ..calibration.results import active_names
+from ..calibration.results import PriorMetrics, active_names
+from ..core.text import pluralise
+from ..core.units import DEG
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
@@ -186,6 +188,7 @@ def calibration_summary(
         "cross_validation": None if record.validation is None else cross_validation_summary(record.validation),
         "monte_carlo": record.sampled_says,
         "model_tests": None if tests is None else summary_of_tests(tests),
+        "prior": None if record.prior is None else prior_rows(record.prior),
         "warnings": of_calibration(record, observability, tests),
         **observed_summary(record, evaluations["nominal"]),
     }
@@ -194,6 +197,31 @@ def calibration_summary(
             stage: truth_errors(record, vectors, stage) for stage in ("nominal", "stage1", "calibrated")
         }
     return summary
+
+
+def prior_rows(prior: PriorMetrics) -> list[dict[str, Any]]:
+    """A prior, group by group; the standard deviation in mm or rad, or in steps of 1 mm and 1 mrad."""
+    return [
+        {
+            "group": group,
+            "learned": prior.learned[i],
+            "parameters": prior.parameters[i],
+            "sd": float(prior.sd[i]),
+            "unit": prior.units[i],
+            "effective_parameters": float(prior.effective[i]),
+            "supported": bool(prior.supported[i]),
+        }
+        for i, group in enumerate(prior.groups)
+    ]
+
+
+def prior_sentence(row: Mapping[str, Any]) -> str:
+    """One group of a prior in words."""
+    spent = f"{row['effective_parameters']:.1f} of {pluralise(row['parameters'], 'parameter')} determined by the data"
+    if not row["supported"]:
+        return f"{row['group']}: learned, no deviation from the mean is supported, so it counts as exact; {spent}"
+    scale, unit = (1 / DEG, "deg") if row["unit"] == "rad" else (1.0, row["unit"])
+    return f"{row['group']}: {'learned' if row['learned'] else 'given'}, {row['sd'] * scale:.3g} {unit}; {spent}"
 
 
 def uncertainty_summary(

@@ -134,7 +134,10 @@ def observed(record: CalibrationRecord) -> Observability:
     covariances = tip_covariances(*to_numpy((arm.geometry, motion, record.noise)))
     sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
     space = Parameters(arm, record.names)
-    return observability(arm, capture, space, sigma=sigma, bounds=Bounds(space, record.lower, record.upper))
+    known = () if record.prior is None else record.prior.known
+    return observability(
+        arm, capture, space, sigma=sigma, bounds=Bounds(space, record.lower, record.upper), known=known
+    )
 
 
 def _implausible(record: CalibrationRecord) -> list[str]:

@@ -1,12 +1,13 @@
 """What a capture determines: rank, undetermined and near-degenerate directions, observability indices."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arguments import check_finite, checked_arguments
+from ..core.arguments import check_finite, checked_arguments, items_of
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from ..data.capture import Capture, ReferenceLength, check_one_capture
 from ..data.noise import Noise, tip_covariances
@@ -44,11 +45,12 @@ class Observability(NamedTuple):
     remedy: str  # what else to record; empty if that would not help
     parallel: tuple[int, ...]  # joints, from 1, whose axis is nearly parallel to the next, with beta not free
     trade_offs: tuple[TradeOff, ...] = ()  # near-degenerate directions, the weakest first
+    by_prior: tuple[str, ...] = ()  # what a prior determines, and these data do not or hardly
 
     @property
     def rank(self) -> int:
-        """Number of independent directions that are determined."""
-        return len(self.names) - self.null.shape[1]
+        """Number of independent directions that the data determine."""
+        return _rank(self.singular)
 
     @property
     def indices(self) -> dict[str, float]:
@@ -80,6 +82,11 @@ class Observability(NamedTuple):
             remedy = f" {self.remedy}" if self.remedy else " Fix one of each (--held)."
             count = f"{len(now)} combinations of {len(self.names)} parameters"
             found.append(f"Not determined by these data: {'; '.join(now) if len(now) <= _NAMED else count}.{remedy}")
+        if self.by_prior:
+            texts = list(self.by_prior[:_NAMED])
+            if len(self.by_prior) > _NAMED:
+                texts.append(f"{len(self.by_prior) - _NAMED} more combinations")
+            found.append(f"Determined by the prior and not, or hardly, by these data: {'; '.join(texts)}.")
         if self.trade_offs:
             texts = [trade_off.text for trade_off in self.trade_offs[:_NAMED]]
             if len(self.trade_offs) > _NAMED:
@@ -106,6 +113,7 @@ def observability(
     noise: Noise | None = None,
     sigma: float | None = None,
     bounds: Bounds | None = None,
+    known: Iterable[str] = (),
 ) -> Observability:
     """What the poses, reference lengths and other observations of a capture determine of the free parameters.
 
@@ -122,6 +130,7 @@ def observability(
             that. With it near-degenerate is also what the data determine hardly better than the bounds.
         bounds: Bounds that ``sigma`` is compared with; by default of +-10 mm and +-17.5 mrad, the default of
             `Bounds.around`.
+        known: Names of parameters that a prior determines: what the data leave open of them is told apart.
 
     Raises:
         InputError: Capture and arm do not fit.
@@ -148,10 +157,14 @@ def observability(
         if other.rank > spectrum.rank:
             base, spectrum = neighbour, other
     rank, p = spectrum.rank, len(space.names)
-    null, undetermined = named_directions(complement(spectrum.vectors[:rank], p), base, space)
+    known = items_of(known, "known")
+    open_directions, of_prior = _without_known(complement(spectrum.vectors[:rank], p), space, known)
+    null, undetermined = named_directions(open_directions, base, space)
     always = tuple(bool(x) for x in structural(null, base, space))
     if spectrum.agreeing is not None:
         undetermined = spectrum.agreeing.named(undetermined, null)
+    weak = _trade_offs(spectrum, capture, space, sigma, bounds)
+    by_prior = named_directions(of_prior, base, space)[1]
     return Observability(
         names=space.names,
         poses=sum(capture.sizes) + sum(observation.q.shape[0] for observation in capture.observations),
@@ -160,10 +173,23 @@ def observability(
         null=null,
         undetermined=undetermined,
         structural=always,
-        remedy="" if all(always) else _remedy(base, capture, space, p - sum(always)),
+        remedy="" if all(always) or not null.shape[1] else _remedy(base, capture, space, p - sum(always)),
         parallel=tuple(i for i in nearly_parallel(arm) if _lacks_beta(space, i)),
-        trade_offs=_trade_offs(spectrum, capture, space, sigma, bounds),
+        trade_offs=tuple(one for one in weak if not set(one.names) & set(known)),
+        by_prior=(*by_prior, *(one.text for one in weak if set(one.names) & set(known))),
     )
+
+
+def _without_known(
+    null: Float[np.ndarray, "p nullity"], space: Parameters, known: Iterable[str]
+) -> tuple[Float[np.ndarray, "p open"], Float[np.ndarray, "p by_prior"]]:
+    """Undetermined directions that concern no known parameter, and the others."""
+    rows = null[[name in known for name in space.names]]
+    if not rows.size:
+        return null, null[:, :0]
+    _, sizes, directions = np.linalg.svd(rows)
+    rank = int(np.sum(sizes > 1e-6))
+    return null @ directions[rank:].T, null @ directions[:rank].T
 
 
 class _Spectrum(NamedTuple):
@@ -205,10 +231,14 @@ def _decomposed(
     p = rows.shape[1]
     _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
     singular = np.concatenate([singular, np.zeros(p - len(singular))])
-    rank = int(np.sum(singular > _RANK * max(singular[0], 1e-300)))
+    rank = _rank(singular)
     norms = np.linalg.norm(rows, axis=0)
     equal = np.linalg.svd(rows / np.where(norms > 0, norms, 1), compute_uv=False)[:rank]
     return _Spectrum(poses, lengths, singular, vectors, rank, float(equal[0] / equal[-1]) if rank else np.inf)
+
+
+def _rank(singular: Float[np.ndarray, " p"]) -> int:
+    return int(np.sum(singular > _RANK * max(singular[0], 1e-300)))
 
 
 def _trade_offs(

@@ -79,17 +79,19 @@ def _each(matrices: Float[AnyArray, "m r s"], vectors: Float[AnyArray, "s m"]) -
     return _product(namespace(matrices).moveaxis(matrices, 0, -1), vectors[None])[:, 0]
 
 
-def scatter_of(linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom: int) -> Float[AnyArray, ""]:
+def scatter_of(
+    linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom: Float[AnyArray, ""] | float
+) -> Float[AnyArray, ""]:
     """Standard deviation of a tip coordinate, mm, with which the residuals are as large as they should be.
 
     The sum of w.w over all rows equals its degrees of freedom (Paule and Mandel 1982); 0 where what was measured
     explains more than all. Its derivative is that of the implicit equation.
     """
-    xp = namespace([part.jacobian for part in linear], errors)
+    xp = namespace([part.jacobian for part in linear], errors, degrees_of_freedom)
 
-    def excess(log_sigma: Any, linear: list[Linear], errors: list[ArmErrors]) -> tuple[Any, Any]:
+    def excess(log_sigma: Any, linear: list[Linear], errors: list[ArmErrors], expected: Any) -> tuple[Any, Any]:
         """Of the weighted sum over its expectation, and its derivative by the logarithm of sigma."""
-        total, slope = -float(degrees_of_freedom), 0.0
+        total, slope = -1.0 * expected, 0.0
         for part, error in zip(linear, errors, strict=True):
             of_arm = covariance_of_sigma(error, xp.exp(log_sigma))
             inverse = inverse_positive_definite(part.rows.measured + of_arm)
@@ -98,13 +100,13 @@ def scatter_of(linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom
             slope = slope - 2 * xp.sum(solved * _each(of_arm, solved))
         return total, xp.where(slope < 0, slope, -1.0)
 
-    known = stop_gradient((linear, errors))
+    known = stop_gradient((linear, errors, degrees_of_freedom))
 
     def refine(state: tuple[Any, Any]) -> tuple[Any, Any]:
         count, log_sigma = state
         total, slope = excess(log_sigma, *known)
         # Newton's step in the logarithm; far above the root, where the sum falls as a power of sigma, a longer one.
-        longer = xp.where(total > 0, (total + degrees_of_freedom) / degrees_of_freedom, 1.0)
+        longer = xp.where(total > 0, (total + known[2]) / known[2], 1.0)
         step = xp.clip(-total / slope * longer, -2.0, 2.0)
         done = xp.abs(step) < 1e-12
         return xp.where(done, _ROUNDS, count + 1), xp.maximum(log_sigma + step, np.log(_LEAST_SIGMA))
@@ -113,16 +115,18 @@ def scatter_of(linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom
     first = xp.log(xp.sqrt(xp.mean(values**2)) + _LEAST_SIGMA)
     _, root = while_loop(lambda state: state[0] < _ROUNDS, refine, (xp.asarray(0), first))
     # One more step, which is nothing, but carries the derivatives of the implicit equation.
-    total, slope = excess(root, linear, errors)
+    total, slope = excess(root, linear, errors, degrees_of_freedom)
     step = xp.where(root > np.log(_LEAST_SIGMA), -total / stop_gradient(slope), 0.0)
     return xp.exp(root + xp.clip(step, -0.1, 0.1))
 
 
-def robust_scatter_of(linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom: int) -> Float[AnyArray, ""]:
+def robust_scatter_of(
+    linear: list[Linear], errors: list[ArmErrors], degrees_of_freedom: Float[AnyArray, ""] | float
+) -> Float[AnyArray, ""]:
     """The same from the median of the poses' squared residuals, each over its median for normal errors: a few bad poses
     do not change it much."""
     xp = namespace([part.jacobian for part in linear], errors)
-    known = stop_gradient((linear, errors))
+    known, expected = stop_gradient((linear, errors)), stop_gradient(degrees_of_freedom)
     count = sum(part.rows.values.size for part in linear)
 
     def rescale(log_sigma: Any, _: Any) -> tuple[Any, Any]:
@@ -131,7 +135,7 @@ def robust_scatter_of(linear: list[Linear], errors: list[ArmErrors], degrees_of_
             inverse = inverse_positive_definite(part.rows.measured + covariance_of_sigma(error, xp.exp(log_sigma)))
             square = xp.einsum("rm,mrs,sm->m", part.rows.values, inverse, part.rows.values)
             squares.append(square / MEDIANS[part.rows.values.shape[0]])
-        ratio = xp.median(xp.concatenate(squares)) * count / degrees_of_freedom
+        ratio = xp.median(xp.concatenate(squares)) * count / expected
         return xp.maximum(log_sigma + 0.5 * xp.log(ratio + 1e-300), np.log(_LEAST_SIGMA)), xp.zeros(())
 
     return xp.exp(scan(rescale, xp.log(scatter_of(linear, errors, degrees_of_freedom)), length=_MEDIAN_ROUNDS)[0])
@@ -177,18 +181,21 @@ def moments(
     inverse: Float[AnyArray, "z z"],
     sigma: Float[AnyArray, ""],
     robust: bool = False,
+    prior: Float[AnyArray, "z z"] | None = None,
 ) -> Moments:
     """Both variances from two moments of the whitened residuals w = M e, M = I - A^T G A W.
 
     With D and T the parts of a row's covariance for 1 arcsec and 1 mm, and S that of what was measured,
     E[w.Dw] = v tr(DMDM^T) + s tr(DMTM^T) + tr(DMSM^T), and likewise with T (Henderson 1953). A negative variance is set
-    to 0 and the other taken from the total scatter ``sigma``.
+    to 0 and the other taken from the total scatter ``sigma``. With the information P of a prior, whose errors have
+    these variances too, A^T G P G A is added to the residuals' covariance.
 
     ``robust``: so that outliers have little influence, the forms are C^-1 D C^-1 and C^-1 T C^-1, with C = v D + s T +
     S by the variances so far, and a pose with w.C^-1 w above the 95 % point of chi-square counts as one at that point,
     over the expectation of this for normal errors (Huber's proposal 2 of 1964, here for two variances).
     """
     xp = namespace(inverse, sigma, rows)
+    known = None if prior is None else inverse @ prior @ inverse
     parts = []
     for part, error, root, j, weighted in zip(linear, errors, whitening.roots, rows, influence, strict=True):
         of_unit = xp.asarray(np.reshape(one_arcsec(error.kinds), (1, -1, 1)))
@@ -206,7 +213,8 @@ def moments(
         )
     if not robust:
         counts = [xp.ones(part.white.shape[1]) for part in parts]
-        return _solved(parts, [part.readings for part in parts], [part.seat for part in parts], counts, inverse, sigma)
+        plain = [part.readings for part in parts], [part.seat for part in parts]
+        return _solved(parts, *plain, counts, inverse, sigma, known)
 
     def again(found: Moments, _: Any) -> tuple[Moments, Any]:
         forms_d, forms_t, counts = [], [], []
@@ -215,7 +223,7 @@ def moments(
             forms_d.append(xp.einsum("abm,bcm,cdm->adm", by_covariance, part.readings, by_covariance))
             forms_t.append(xp.einsum("abm,bcm,cdm->adm", by_covariance, part.seat, by_covariance))
             counts.append(count)
-        return _solved(parts, forms_d, forms_t, counts, inverse, sigma), xp.zeros(())
+        return _solved(parts, forms_d, forms_t, counts, inverse, sigma, known), xp.zeros(())
 
     return scan(again, Moments(xp.zeros(()), sigma**2), length=_MOMENT_ROUNDS)[0]
 
@@ -239,8 +247,10 @@ def _solved(
     counts: list[Float[AnyArray, " _"]],
     inverse: Float[AnyArray, "z z"],
     sigma: Float[AnyArray, ""],
+    known: Float[AnyArray, "z z"] | None,
 ) -> Moments:
-    """The variances that explain both sums of quadratic forms of the residuals."""
+    """The variances that explain both sums of quadratic forms of the residuals, of which ``known`` is the part of the
+    unknowns' covariance that follows from a prior."""
     xp = namespace(inverse, sigma)
     d, t, s = ([getattr(part, name) for part in parts] for name in ("readings", "seat", "measured"))
 
@@ -251,6 +261,14 @@ def _solved(
     dd, dt, td, tt = (_expected(parts, form, by, inverse) for form in (forms_d, forms_t) for by in (d, t))
     right_d = seen(forms_d) - _expected(parts, forms_d, s, inverse)
     right_t = seen(forms_t) - _expected(parts, forms_t, s, inverse)
+    if known is not None:
+        right_d, right_t = (
+            right
+            - xp.sum(
+                known * sum(_outer(_product(part.rows, f), part.rows) for part, f in zip(parts, forms, strict=True))
+            )
+            for right, forms in ((right_d, forms_d), (right_t, forms_t))
+        )
     determinant = dd * tt - dt * td
     apart = determinant > 1e-9 * dd * tt
     safe = xp.where(apart, determinant, 1.0)

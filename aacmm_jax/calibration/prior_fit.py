@@ -1,0 +1,228 @@
+"""The last least squares of an identification with a prior; its scales and that of the tips settle with it.
+
+A prior weighs against the data by the ratio of their standard deviations. What of these is not given (that of a tip
+coordinate without `Noise`, those of learned groups) follows from the residuals and deviations that it leads to: the
+fixed point of MacKay's updates (`uncertainty.evidence`), with the model linearised anew at each least squares.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ..core._compat import member_numbers
+from ..core.linear_algebra import singular_values
+from ..core.numpy_or_jax import AnyArray, namespace, set_at, stop_gradient, while_loop
+from ..kinematics.parameters import Parameters
+from ..kinematics.priors import LEAST_STEPS, ParameterPrior
+from ..model.observed import PriorRows, Whitening, observed_model, observed_rows
+from ..model.robust import Loss
+from ..solver.reason import MAX_STEPS, reasons
+from ..uncertainty.evidence import (
+    PriorModel,
+    covariance_of_log_variances,
+    effective_parameters,
+    eliminated,
+    learned_log_variances,
+)
+from .bounded_fit import Fit, fit
+from .observed_state import ObservedTask, State, state_at, whitening_at
+from .results import PriorMetrics
+
+_ROUNDS = 60  # least squares with new standard deviations; usually 4 to 8
+# Largest change of the log of a variance that no further round is worth, where derivatives pass through, and elsewhere.
+_TOLERANCE, _BATCH_TOLERANCE = 1e-10, 1e-6
+_UNDAMPED = 15  # rounds
+_LEAST_GIVEN = 1e-7  # natural steps: a smaller standard deviation would be a row of infinite weight
+_LEAST_LOG = 2 * np.log(LEAST_STEPS)
+# Of the steps of the solve: so small that a tight prior does not dominate the damping, but not so small that the value
+# of a parameter drowns the test for convergence.
+_LEAST_SCALE = 1e-3
+
+
+class PriorProblem(NamedTuple):
+    """One least squares with a prior, whose weights are those at a nearly right arm (``reference``).
+
+    The *scales* are the log of a tip coordinate's standard deviation, then the log variance of each group in natural
+    steps.
+    """
+
+    task: ObservedTask
+    space: Parameters
+    prior: ParameterPrior
+    sides: tuple[Float[AnyArray, " z"], Float[AnyArray, " z"]]
+    steps: Float[AnyArray, " z"]
+    loss: Loss | None
+    reference: State
+
+    @property
+    def learned(self) -> np.ndarray:
+        """Which groups are learned."""
+        return np.array(self.prior.learned)
+
+    def first_scales(self) -> Float[AnyArray, " s"]:
+        """The scales before anything is learned; those that are given keep these values."""
+        xp, prior = namespace(self.reference.sigma, self.prior), self.prior
+        first = np.array([own[0] for own in prior.members])
+        variances = 2 * xp.log(xp.maximum((prior.sd / self.steps[: prior.sd.shape[0]])[first], _LEAST_GIVEN))
+        return xp.concatenate([xp.log(xp.maximum(self.reference.sigma, 1e-9))[None], variances])
+
+    def sd(self, scales: Float[AnyArray, " s"]) -> Float[AnyArray, " k"]:
+        """Standard deviation of every parameter that has a prior, in natural steps."""
+        return namespace(scales).exp(0.5 * (scales[1:] @ namespace(scales).asarray(self.prior.membership)))
+
+    def rows(self, scales: Float[AnyArray, " s"]) -> PriorRows:
+        """The rows of the prior with these scales."""
+        xp, index = namespace(scales, self.prior), self.prior.index
+        weight = 1 / (self.sd(scales) * self.steps[index])
+        return PriorRows(self.prior.mean, set_at(xp.zeros_like(self.prior.mean), index, weight))
+
+    def whitening(self, scales: Float[AnyArray, " s"], prior: PriorRows | None) -> Whitening:
+        """The weights with these scales."""
+        sigma = namespace(scales).exp(scales[0])
+        return whitening_at(self.task, self.reference._replace(sigma=sigma), prior)
+
+    def fit(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"], *, differentiable: bool) -> Fit:
+        """The least squares with these scales."""
+        xp, index = namespace(scales, z), self.prior.index
+        args = (self.space, self.task.observed, self.whitening(scales, self.rows(scales)), self.loss)
+        tight = xp.clip(stop_gradient(self.sd(scales)), _LEAST_SCALE, 1.0)
+        step = set_at(self.steps, index, self.steps[index] * tight)
+        functions, limit = (observed_rows, observed_model), self.task.max_steps
+        return fit(*functions, z, args, self.sides, step, limit, differentiable=differentiable)
+
+    def model(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> PriorModel:
+        """The model of the parameters that have a prior, linear at a point."""
+        xp, index = namespace(scales, z), self.prior.index
+        data = observed_model(z, (self.space, self.task.observed, self.whitening(scales, None), self.loss))
+        pinned = (z <= self.sides[0]) | (z >= self.sides[1])
+        deviation = (z[: self.prior.mean.shape[0]] - self.prior.mean)[index] / self.steps[index]
+        gram = data.gram * self.steps[:, None] * self.steps[None, :]
+        return eliminated(gram, data.gradient * self.steps, deviation, index, xp.asarray(pinned))
+
+    def sigma(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"], effective: Any) -> Float[AnyArray, ""]:
+        """The tips' standard deviation by the residuals; as in the reference where the noise is given."""
+        if self.task.noise is not None:
+            return self.reference.sigma
+        spent = z.shape[0] - effective.shape[0] + namespace(effective).sum(effective)
+        return state_at(self.task, self.space, z, effective=spent).sigma
+
+    def updated(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> Float[AnyArray, " s"]:
+        """The scales that the result of the least squares with these scales leads to."""
+        xp, model = namespace(scales, z), self.model(scales, z)
+        # Every search begins at a broad prior, so that what it finds depends on the data alone.
+        variances = learned_log_variances(
+            model, self.prior.membership, self.first_scales()[1:], self.learned, _LEAST_LOG
+        )
+        new = xp.concatenate([scales[:1], variances])
+        sigma = self.sigma(scales, z, effective_parameters(model, self.sd(new)))
+        return xp.concatenate([xp.log(xp.maximum(sigma, 1e-9))[None], variances])
+
+    def mismatch(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> Float[AnyArray, " s"]:
+        """Zero at the fixed point: the equations that `updated` solves."""
+        xp, model, sd = namespace(scales, z), self.model(scales, z), self.sd(scales)
+        effective = effective_parameters(model, sd)
+        groups, first = xp.asarray(self.prior.membership), self.first_scales()
+        slope = groups @ ((model.deviation / sd) ** 2 - effective)
+        smallest = stop_gradient(scales[1:]) <= _LEAST_LOG + 1e-9
+        of_groups = xp.where(smallest, scales[1:] - _LEAST_LOG, slope)
+        of_groups = xp.where(xp.asarray(self.learned), of_groups, scales[1:] - first[1:])
+        of_sigma = scales[0] - xp.log(xp.maximum(self.sigma(scales, z, effective), 1e-9))
+        return xp.concatenate([of_sigma[None], of_groups])
+
+    def by_scales(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"], model: PriorModel) -> "ByScales":
+        """How the unknowns follow learned scales."""
+        xp, index = namespace(scales, z), self.prior.index
+        moving = xp.asarray(self.learned) & (scales[1:] > _LEAST_LOG + 1e-9)
+        covariance = covariance_of_log_variances(model, self.prior.membership, scales[1:], moving)
+        pull = (model.deviation / self.sd(scales) ** 2)[:, None] * xp.asarray(self.prior.membership.T)
+        return ByScales(set_at(xp.zeros((z.shape[0], pull.shape[1])), index, pull), covariance)
+
+    def metrics(
+        self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]
+    ) -> tuple[PriorMetrics, AnyArray, "ByScales | None"]:
+        """What the result says of the prior; how many unknowns the data determine; and how they follow the scales."""
+        xp, prior, sd = namespace(scales, z), self.prior, self.sd(scales)
+        model = self.model(scales, z)
+        effective = effective_parameters(model, sd)
+        first = np.array([own[0] for own in prior.members])
+        in_units = np.array([unit == "rad" for unit in prior.units])
+        of_groups = xp.exp(0.5 * scales[1:])
+        metrics = PriorMetrics(
+            groups=prior.groups,
+            learned=prior.learned,
+            units=prior.units,
+            parameters=tuple(len(own) for own in prior.members),
+            sd=xp.where(in_units, of_groups * self.steps[first], of_groups),
+            effective=xp.asarray(prior.membership) @ effective,
+            supported=~xp.asarray(self.learned) | (scales[1:] > _LEAST_LOG + 1e-9),
+            names=self.space.names,
+            mean=prior.mean,
+            weight=self.rows(scales).weight,
+        )
+        follow = self.by_scales(scales, z, model) if any(prior.learned) else None
+        return metrics, z.shape[0] - len(prior.index) + xp.sum(effective), follow
+
+
+class ByScales(NamedTuple):
+    """What the uncertainty of learned scales adds to that of the unknowns (Kass and Steffey 1989, JASA 84, 717-726)."""
+
+    pull: Float[AnyArray, "z g"]  # of the prior on the unknowns, by log variances, in natural steps
+    covariance: Float[AnyArray, "g g"]  # of the log variances
+
+    def added(self, inverse: Float[AnyArray, "z z"]) -> Float[AnyArray, "z z"]:
+        """To the covariance, given the inverse of the information."""
+        moved = inverse @ self.pull
+        return moved @ self.covariance @ moved.T
+
+
+def fit_with_prior(problem: PriorProblem, z: Float[AnyArray, " z"]) -> tuple[Float[AnyArray, " s"], Fit]:
+    """The scales at their fixed point, and the least squares with them.
+
+    The derivative of the scales is that of an implicit function, exact where the fixed point is reached.
+    """
+    xp, differentiable = namespace(z, problem.task), problem.task.differentiable
+    tolerance = _TOLERANCE if xp is np or differentiable else _BATCH_TOLERANCE
+
+    def one_round(known: PriorProblem) -> Callable:
+        def again(state: tuple) -> tuple:
+            count, scales, z, evaluations, _ = state
+            found = known.fit(scales, z, differentiable=False)
+            new = known.updated(scales, found.parameters)
+            # Few data can lead to and fro between two sets of scales.
+            new = xp.where(count < _UNDAMPED, new, 0.5 * (new + scales))
+            return count + 1, new, found.parameters, evaluations + found.steps, xp.max(xp.abs(new - scales))
+
+        return again
+
+    def settle(known: PriorProblem, first: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> tuple:
+        none = xp.zeros((), dtype=np.int64)
+        return while_loop(
+            lambda state: (state[0] < _ROUNDS) & (state[4] > tolerance),
+            one_round(known),
+            (none, first, z, none, xp.asarray(np.inf)),
+        )
+
+    def solve(_: Any, first: Float[AnyArray, " s"]) -> tuple[Any, tuple[Any, Any, Any]]:
+        _, scales, last, evaluations, change = settle(*stop_gradient((problem, first, z)))
+        # As a float: custom_root gives this a tangent of its own type, which an integer must not have.
+        return scales, (last, xp.asarray(evaluations, dtype=float), change)
+
+    def mismatch(scales: Float[AnyArray, " s"]) -> Float[AnyArray, " s"]:
+        return problem.mismatch(scales, problem.fit(scales, stop_gradient(z), differentiable=True).parameters)
+
+    def solve_linear(derivative: Callable, right: Float[AnyArray, " s"]) -> Float[AnyArray, " s"]:
+        left, values, transposed = singular_values(jax.jacfwd(derivative)(right))
+        known = values > 1e-14 * values[0]
+        return transposed @ (xp.where(known, 1 / xp.where(known, values, 1.0), 0.0) * (left.T @ right))
+
+    first = stop_gradient(problem.first_scales())
+    if xp is np or not differentiable:
+        scales, (last, evaluations, change) = solve(None, first)
+    else:
+        scales, (last, evaluations, change) = jax.lax.custom_root(mismatch, first, solve, solve_linear, has_aux=True)
+    found = problem.fit(scales, stop_gradient(last), differentiable=differentiable)
+    reason = xp.where(change > 1e-4, MAX_STEPS, member_numbers(found.result))
+    return scales, found._replace(steps=xp.asarray(evaluations, dtype=np.int64) + found.steps, result=reasons(reason))
