@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from ..core.numpy_or_jax import to_numpy
 from .arm import Arm
-from .chain import Geometry, tip_pose
+from .chain import Geometry, JointKinds, tip_pose
 
 _MOST = 6_000_000  # hypotheses of one family: about a second
 _BLOCK = 50_000  # hypotheses of one array, so that it stays in the processor's cache
@@ -174,8 +174,12 @@ class _Links:
 
     def variants(self, joint: int, step: int) -> tuple[Int[np.ndarray, " v"], Int[np.ndarray, " v"]]:
         """Signs and zeros (in eighths of a revolution) that are tried."""
-        zeros = np.arange(0, 8, step) if joint in self.joints else np.zeros(1, dtype=int)
+        turns = joint in self.joints and not self._slides(joint)
+        zeros = np.arange(0, 8, step) if turns else np.zeros(1, dtype=int)
         return np.repeat([1, -1], len(zeros)), np.tile(zeros, 2)
+
+    def _slides(self, joint: int) -> bool:
+        return self._geometry.kinds is not None and self._geometry.kinds.prismatic[joint]
 
     def of(
         self, joint: int, column: int, signs: Int[np.ndarray, " v"], zeros: Int[np.ndarray, " v"]
@@ -184,8 +188,10 @@ class _Links:
         if (joint, column) not in self._known:
             readings = np.array([[[s * self.q[:, column] + k * _EIGHTH] for k in range(8)] for s in (1, -1)])
             part = slice(joint, joint + 1)
-            alpha, a, d, theta, beta, probe = self._geometry
-            link = Geometry(alpha[part], a[part], d[part], theta[part], None if beta is None else beta[part], 0 * probe)
+            whole, slides = self._geometry, self._slides(joint)
+            alpha, a, d, theta = whole.alpha[part], whole.a[part], whole.d[part], whole.theta[part]
+            beta = None if whole.beta is None else whole.beta[part]
+            link = Geometry(alpha, a, d, theta, beta, 0 * whole.probe, JointKinds((True,)) if slides else None)
             poses = np.asarray(tip_pose(link, readings.reshape(-1, 1))).reshape(2, 8, -1, 4, 4)
             self._known[joint, column] = poses[..., :3, :3], poses[..., :3, 3]
         turns, shifts = self._known[joint, column]

@@ -37,10 +37,8 @@ class _Recorded(NamedTuple):
 @lru_cache(maxsize=4)
 def _recorded(study: Study) -> _Recorded:
     assert study.capture is not None
-    arm, space, observed = to_numpy(
-        (study.nominal.arm, study.space, Observed.of(study.capture, study.nominal.arm))
-    )
-    geometry = fit_geometry(arm, observed, {}, None).geometry
+    arm, space, observed = to_numpy((study.nominal.arm, study.space, Observed.of(study.capture, study.nominal.arm)))
+    geometry = np.asarray(fit_geometry(arm, observed, {}, None).geometry)
     truth = ObservedTruth.at(study.capture, space, space.vector(), observed.split(geometry))
     units = reading_units(space.base.geometry)
     by_units = [np.moveaxis(np.asarray(error.by_readings) * units[:, None], -1, 0) for error in truth.errors]
