@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
 from aacmm_jax.files.urdf import urdf_chain, urdf_of
 from aacmm_jax.files.urdf_text import parse_urdf
 from aacmm_jax.kinematics.parameters import ArmSpecification, UrdfSource
-
-from ..kinematics.test_axes_to_dh import about
 
 CONFIGURATIONS = 1000
 # Files that the independent reader cannot read (a robot without a name).
@@ -60,7 +59,9 @@ def by_yourdfpy(model, base: str, tip: str, names: list[str], q: np.ndarray) -> 
         if joint.name in names:
             axis = np.array(joint.axis, dtype=float)
             axis /= np.linalg.norm(axis)
-            poses = poses @ np.array([about(axis, angle) for angle in q[:, names.index(joint.name)]])
+            turns = np.tile(np.eye(4), (len(q), 1, 1))
+            turns[:, :3, :3] = Rotation.from_rotvec(np.outer(q[:, names.index(joint.name)], axis)).as_matrix()
+            poses = poses @ turns
     return poses
 
 
