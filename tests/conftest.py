@@ -161,6 +161,7 @@ def _few_memory_maps():
 
 # Modules in decreasing order of their run time: a long one started last would keep a single worker busy at the end.
 LONGEST = (
+    *("test_notebooks", "files/test_example_robots", "test_readme"),  # of the slow tests
     "study/test_results",
     "cli/test_cli",
     "cli/test_observations_cli",
@@ -215,6 +216,20 @@ def pytest_collection_finish():
     gc.collect()
     gc.freeze()
     gc.set_threshold(100_000, 20, 50)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """A module's tests share its fixtures, so one worker runs them all; notebooks share nothing, and take long."""
+    if config.getvalue("dist") != "loadscope":
+        return None
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByModule(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            return nodeid if nodeid.startswith("tests/test_notebooks.py") else super()._split_scope(nodeid)
+
+    return ByModule(config, log)
 
 
 def pytest_collection_modifyitems(items):
