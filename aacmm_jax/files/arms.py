@@ -62,11 +62,6 @@ class _Identification(Strict):
     angle: PositiveFloat | None = None
     override: dict[str, PositiveFloat] = Field(default_factory=dict)
 
-    @property
-    def names_parameters(self) -> bool:
-        """Whether it says which parameters are free or fixed, and not only their bounds."""
-        return self.held is not None or bool(self.free)
-
 
 class _ArmModel(Strict):
     name: str = ""
@@ -166,34 +161,28 @@ def load_arm(
     Raises:
         InputError: There is neither, or the file is not an arm's.
     """
-    return _read(source, base, tip, probe, choose=False).arm
+    return read_arm(source, base=base, tip=tip, probe=probe)[0].arm
 
 
 def load_specification(
-    source: str | os.PathLike,
-    *,
-    base: str | None = None,
-    tip: str | None = None,
-    probe: Numbers | None = None,
-    choose: bool = True,
+    source: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
 ) -> ArmSpecification:
     """The arm of a file with its name, its proposed identification and, of a URDF, what an export needs.
 
-    A file that names no parameters in ``[identification]`` gets those that thorough data would determine well, of
-    `Parameters.independent`, and the default bounds where it states none.
+    A file without an ``[identification]`` table gets the parameters that thorough data would determine well, of
+    `Parameters.independent`, and the default bounds.
 
     Args:
         source: As of `load_arm`.
         base: As of `load_arm`.
         tip: As of `load_arm`.
         probe: As of `load_arm`.
-        choose: Whether to choose parameters where the file names none; otherwise ``held`` is None then, and ``free``
-            empty.
 
     Raises:
         InputError: There is neither, or the file is not an arm's.
     """
-    return _read(source, base, tip, probe, choose=choose)
+    found, proposed = read_arm(source, base=base, tip=tip, probe=probe)
+    return found if proposed else with_parameters(found)
 
 
 def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str | None = None) -> ArmNoise:
@@ -240,10 +229,10 @@ def arm_beside(folder: Path, arm: str) -> str | Path:
     return file if arm.endswith((".toml", *_OTHER_FORMATS)) or os.path.isfile(file) else arm
 
 
-def _read(
-    source: str | os.PathLike, base: str | None, tip: str | None, probe: Numbers | None, *, choose: bool
-) -> ArmSpecification:
-    """``choose``: whether parameters are chosen for a file that proposes none."""
+def read_arm(
+    source: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
+) -> tuple[ArmSpecification, bool]:
+    """The arm of a file as `load_specification` takes it, and whether the file proposes an identification."""
     shipped = isinstance(source, str) and source in shipped_arms()
     path = as_path(source)
     suffix = "" if shipped else path.suffix.lower()
@@ -255,20 +244,20 @@ def _read(
             if suffix in _ROBOTS
             else read_ur_kinematics(path, probe=probe)
         )
-        return _chosen(found) if choose else found
+        return found, False
     if shipped:
         with resources.as_file(resources.files("aacmm_jax.files") / "shipped_arms" / f"{source}.toml") as path:
-            return _specification(path, probe, choose)
+            return _specification(path, probe)
     if not os.path.exists(path) and path.suffix != ".toml":
         known = shipped_arms()
         raise InputError(
             f"'{source}' is neither a file nor an arm that ships with the package"
             f"{nearest(str(source), known, most=len(known))}"
         )
-    return _specification(path, probe, choose)
+    return _specification(path, probe)
 
 
-def _specification(path: Path, probe: Numbers | None, choose: bool) -> ArmSpecification:
+def _specification(path: Path, probe: Numbers | None) -> tuple[ArmSpecification, bool]:
     model = read_toml(path, _ArmModel)
     if probe is not None and any(model.probe):
         raise InputError(f"{path} states the probe itself; change it there, or with arm.replace(probe=...).")
@@ -289,13 +278,11 @@ def _specification(path: Path, probe: Numbers | None, choose: bool) -> ArmSpecif
         if model.priors is not None:
             found = found._replace(prior=model.priors.prior(found.arm, length, angle))
         wanted = model.identification
-        if choose and (wanted is None or not wanted.names_parameters):
-            found = _chosen(found)
         if wanted is None:
-            return found
+            return found, False
         specification = found._replace(
-            held=found.held if wanted.held is None else tuple(wanted.held),
-            free=(*found.free, *wanted.free),
+            held=None if wanted.held is None else tuple(wanted.held),
+            free=tuple(wanted.free),
             length=wanted.length * length,
             angle=0.0175 if wanted.angle is None else wanted.angle * angle,
             override={
@@ -303,11 +290,10 @@ def _specification(path: Path, probe: Numbers | None, choose: bool) -> ArmSpecif
                 for name, width in wanted.override.items()
             },
         )
-        if choose or wanted.names_parameters:
-            specification.bounds()
+        specification.bounds()
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    return specification
+    return specification, True
 
 
 def _arm_of_rows(model: _ArmModel, length: float, angle: float) -> Arm:
@@ -338,8 +324,7 @@ def _arm_of_rows(model: _ArmModel, length: float, angle: float) -> Arm:
     )
     far = any(abs(float(arm.d[i - 1])) > _FAR for i in nearly_parallel(arm))
     # A proposed identification names parameters as the table has them.
-    proposed = model.identification is not None and model.identification.names_parameters
-    return without_far_frames(arm) if far and not proposed else arm
+    return without_far_frames(arm) if far and model.identification is None else arm
 
 
 def _check_size(arm: Arm, unit: str) -> None:
@@ -354,20 +339,13 @@ def _check_size(arm: Arm, unit: str) -> None:
         )
 
 
-def with_parameters(specification: ArmSpecification, capture: Capture) -> ArmSpecification:
-    """The same with parameters that observations of such kinds determine, where the file names none."""
-    if specification.held is not None or specification.free:
-        return specification
-    found = _chosen(specification, capture)
-    try:
-        found.bounds()
-    except InputError as error:
-        raise InputError(f"{specification.name}: {error}") from error
-    return found
+def with_parameters(specification: ArmSpecification, capture: Capture | None = None) -> ArmSpecification:
+    """The same with the parameters for an arm whose file proposes none.
 
-
-def _chosen(specification: ArmSpecification, capture: Capture | None = None) -> ArmSpecification:
-    """The same with the identification for an arm whose file proposes none."""
+    Args:
+        specification: As of `read_arm`.
+        capture: What was observed; by default tips in sockets.
+    """
     try:
         if capture is not None and only_targets(capture):
             space = independent_of_targets(specification.arm, capture)

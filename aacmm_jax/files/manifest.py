@@ -29,7 +29,7 @@ from ..data.observations.socket import Socket
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
 from ..kinematics.arm import Arm, by_joint
-from .arms import arm_beside, load_specification, with_parameters
+from .arms import arm_beside, read_arm, with_parameters
 from .inputs import InputFile, fingerprint
 from .manifest_observations import FIELDS, LENGTHS, TABLES, Source, observations
 from .manifest_sessions import in_sessions, session_name
@@ -217,7 +217,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     model = read_toml(manifest := InputFile(path), _Manifest)
     try:
         arm = arm_beside(path.parent, model.arm)
-        nominal = load_specification(arm, base=model.base, tip=model.tip, probe=model.probe, choose=False)
+        nominal, proposed = read_arm(arm, base=model.base, tip=model.tip, probe=model.probe)
         joints, columns = nominal.arm.joints, model.angles.columns if model.angles else None
         if columns is not None and len(columns) != joints:
             raise InputError(
@@ -266,7 +266,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         check_readings(capture, nominal.arm)
         return Recording(
             capture,
-            with_parameters(nominal, capture),
+            nominal if proposed else with_parameters(nominal, capture),
             spheres=spheres,
             sources=sources,
             measured=str(model.date or ""),

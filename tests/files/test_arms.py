@@ -108,7 +108,7 @@ def test_every_shipped_arm_loads_and_is_reachable_by_name():
     assert set(aj.files.shipped_arms()) == measuring | robots
     for name in measuring | robots:
         assert aj.load_arm(name).limits is not None or name in measuring
-    for name in (*measuring, "panda", "so100"):  # each with an [identification] of its own
+    for name in (*measuring, "panda", "iiwa14"):  # each with an [identification] of its own
         specification = aj.files.load_specification(name)
         assert specification.name
         assert specification.bounds().space.names

@@ -125,11 +125,3 @@ def test_parallel_axes_have_beta_and_a_tool_is_stated_where_the_arm_is_named():
     assert {"d_2", "d_3"} <= set(robot.held or ())
     np.testing.assert_array_equal(robot.arm.probe, (30, 0, 100))
     assert_refused(lambda: aj.load_arm("ur10e", probe=(1, 2)), "probe")
-
-
-def test_bounds_alone_leave_the_choice_of_parameters(tmp_path):
-    """As of a file without any [identification]: independent parameters, where the bounds are the file's."""
-    hobby = aj.files.load_specification("so100")
-    assert hobby.free == ("beta_2", "beta_3")
-    assert (hobby.length, hobby.angle) == (5.0, pytest.approx(np.deg2rad(10)))
-    assert hobby.space().names == aj.Parameters.independent(hobby.arm).names

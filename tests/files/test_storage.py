@@ -322,6 +322,7 @@ while True:
 
 
 numbers = st.floats(-1e20, 1e20)  # larger ones are refused in TOML
+lengths = st.floats(-2e4, 2e4)  # arms of more than 50 m are refused there
 twists = st.floats(-2 * np.pi, 2 * np.pi)  # others are refused as meant in degrees
 positive = st.floats(1e-9, 1e9)
 angles = st.floats(-8 * np.pi, 8 * np.pi)
@@ -333,12 +334,12 @@ texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"
 @st.composite
 def arms(draw) -> dict:
     joints = draw(st.integers(1, 3))
-    row = st.lists(numbers, min_size=joints, max_size=joints)
+    row, long = (st.lists(values, min_size=joints, max_size=joints) for values in (numbers, lengths))
     limits = st.lists(numbers, min_size=2, max_size=2, unique=True).map(sorted)
-    arm = {kind: draw(row) for kind in ("a", "d", "theta")}
+    arm = {kind: draw(values) for kind, values in (("a", long), ("d", long), ("theta", row))}
     arm["alpha"] = draw(st.lists(twists, min_size=joints, max_size=joints))
     arm["beta"] = draw(st.none() | row)
-    arm["probe"] = draw(st.lists(numbers, min_size=3, max_size=3))
+    arm["probe"] = draw(st.lists(lengths, min_size=3, max_size=3))
     arm["limits"] = draw(st.none() | st.lists(limits, min_size=joints, max_size=joints))
     names = [f"{kind}_{i + 1}" for kind in ("alpha", "a", "d", "theta") for i in range(joints)]
     held = draw(st.none() | st.lists(st.sampled_from(names), unique=True))
@@ -406,7 +407,13 @@ def test_round_trip_of_an_arm(tmp_path_factory, drawn):
     specification = specification_of(drawn)
     path = tmp_path_factory.mktemp("round") / "arm.toml"
     path.write_text(specification_toml(specification), encoding="utf-8", newline="")
-    assert plain(aj.files.load_specification(path)) == plain(specification)
+    try:
+        read = aj.files.load_specification(path)
+    except aj.InputError as error:
+        if "are they in m" in str(error):  # mm that can only be m, and the reverse
+            return
+        raise
+    assert plain(read) == plain(specification)
     aj.files.save_arm(specification.arm, path, name=specification.name)
     arm = specification.arm
     if not any(abs(float(arm.d[i - 1])) > 10_000 for i in nearly_parallel(arm)):  # other frames are read, the same arm
