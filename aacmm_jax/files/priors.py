@@ -68,6 +68,8 @@ def prior_of_text(text: str, arm: Arm) -> Prior | None:
         group = {"length": "lengths", "angle": "angles"}.get(group, group)
         if group in sd or group in learn:
             raise InputError(f"--prior names '{group}' twice; name it once.")
+        if group:
+            Prior(learn=[group]).check(arm)
         if value == _LEARN:
             learn.append(group)
             continue

@@ -47,7 +47,7 @@ COLLINEAR = (
 REFUSED = {
     "fewer equations than unknowns": (
         lambda arm: kinds.Sphere("s", reaching(arm, on_cap(90)), diameter=50),
-        f"{SAME_PLACE}; record more poses, or fix more parameters.",
+        f"{SAME_PLACE}; record more poses, fix more parameters, or give a prior of them together with the noise.",
     ),
     "fewer touches than unknowns": (
         lambda arm: kinds.Sphere("s", Q[:3]),
