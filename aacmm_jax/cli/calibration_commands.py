@@ -188,7 +188,7 @@ def calibrate(
             part, others = draw_poses(recording.capture, only_poses, seed)
             recording = recording._replace(capture=part)
         if model is not None:
-            from ..files.corrections import with_model
+            from ..files.joint_models import with_model
 
             recording = recording._replace(nominal=with_model(recording.nominal, model))
         bounds = _bounds(recording.nominal, held, free, length_bound_mm, angle_bound_deg, bound or [])

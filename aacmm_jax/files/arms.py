@@ -199,7 +199,7 @@ def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str |
     Raises:
         InputError: There is no such arm, or the numbers are none of this arm.
     """
-    arm = _read(source, base, tip, None, choose=False).arm
+    arm = load_arm(source, base=base, tip=tip)
     shipped = isinstance(source, str) and source in shipped_arms()
     if not shipped and as_path(source).suffix.lower() in _OTHER_FORMATS:
         return stated_noise(arm, None, "robot")

@@ -8,12 +8,10 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, FiniteFloat, NonNegativeFloat, model_validator
 
-from ..core.errors import InputError
 from ..kinematics.arm import Arm, correction_names
 from ..kinematics.chain import Geometry
 from ..kinematics.corrected_arm import corrected_like, with_corrections
 from ..kinematics.corrections.kind import Loads
-from ..kinematics.parameters import ArmSpecification
 from .hdf5 import Variable, columns, need
 from .toml import Strict
 
@@ -123,21 +121,3 @@ def _arrays(geometry: Geometry) -> dict[str, Float[np.ndarray, "..."]]:
 def _loads(arm: Arm) -> Loads | None:
     assert arm.corrections is not None
     return next((term.loads for term in arm.corrections.functions.each if getattr(term, "loads", None)), None)
-
-
-def with_model(specification: ArmSpecification, model: str) -> ArmSpecification:
-    """The specification with another model of its joints; masses are those of its URDF, where it has one.
-
-    Raises:
-        InputError: The model names an unknown kind.
-    """
-    from .urdf import link_masses, urdf_chain
-
-    loads: dict[str, Any] = {}
-    if specification.urdf is not None:
-        masses = link_masses(urdf_chain(specification.urdf))
-        if np.any(masses.mass > 0):
-            loads = {"mass": masses.mass, "centre": masses.centre}
-    if not model.strip():
-        raise InputError("the model is empty; name dh alone for an arm without corrections.")
-    return specification._replace(arm=with_corrections(specification.arm, model, **loads))

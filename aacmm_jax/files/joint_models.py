@@ -1,0 +1,26 @@
+"""What joints do besides their readings, as people name it: the option ``--model``."""
+
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import InputError
+from ..kinematics.corrected_arm import with_corrections
+from ..kinematics.parameters import ArmSpecification
+from .urdf import link_masses, urdf_chain
+
+
+def with_model(specification: ArmSpecification, model: str) -> ArmSpecification:
+    """The specification with another model of its joints; masses are those of its URDF, where it has one.
+
+    Raises:
+        InputError: The model names an unknown kind.
+    """
+    loads: dict[str, Any] = {}
+    if specification.urdf is not None:
+        masses = link_masses(urdf_chain(specification.urdf))
+        if np.any(masses.mass > 0):
+            loads = {"mass": masses.mass, "centre": masses.centre}
+    if not model.strip():
+        raise InputError("the model is empty; name dh alone for an arm without corrections.")
+    return specification._replace(arm=with_corrections(specification.arm, model, **loads))
