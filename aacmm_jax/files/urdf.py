@@ -185,8 +185,9 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
     """The user's URDF with the origins of a calibrated arm; comments, meshes, order and other numbers stay.
 
     The base link stays, and a joint's frame moves along its axis, and turns about it, no more than the calibration
-    says: no data on the tip determine that. The zero offset of a prismatic joint shifts its frame along its axis. Where the arm has a tool beyond the tip link, or no fixed joint ends at the
-    tip link, the calibrated tip is the origin of a link that is added.
+    says: no data on the tip determine that. The zero offset of a prismatic joint shifts its frame along its axis. Where
+    the arm has a tool beyond the tip link, or no fixed joint ends at the tip link, the calibrated tip is the origin of
+    a link that is added.
 
     Args:
         arm: The calibrated arm.

@@ -137,7 +137,8 @@ def calibrated_frames(
 
     A frame on axis i turns about its axis with theta_i, so that a link keeps its shape where only zero offsets changed,
     and is where the axis passes nearest to the nominal origin, as the calibrated joint before it carries that; that of
-    a prismatic joint moves on along its axis with d_i, for the same reason (anywhere else would do as well). An origin that does not change comes back as it was, to the bit.
+    a prismatic joint moves on along its axis with d_i, for the same reason (anywhere else would do as well). An origin
+    that does not change comes back as it was, to the bit.
 
     Args:
         origins: Nominal origins, joint by joint, mm; the first in the frame of the base.

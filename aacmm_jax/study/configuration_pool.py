@@ -201,7 +201,8 @@ def _rows(arm: Arm, q: np.ndarray, points: np.ndarray) -> np.ndarray:
         np.asarray(_inverse(arm.geometry, jnp.asarray(np.resize(q[i : i + _ROWS], (_ROWS, q.shape[1])))))
         for i in range(0, len(q), _ROWS)
     ]
-    total = q + np.asarray(arm.theta)
+    prismatic = np.isin(np.arange(1, arm.joints + 1), arm.prismatic)
+    total = np.where(prismatic, 0.0, q) + np.asarray(arm.theta)
     return np.hstack([q, np.cos(total), np.sin(total), np.concatenate(inverses)[: len(q)], points])
 
 

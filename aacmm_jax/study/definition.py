@@ -12,13 +12,13 @@ from jaxtyping import Bool, Float
 
 from ..calibration.checks import check_enough
 from ..calibration.observed_state import check_observed
-from ..calibration.scale_anchor import scale_anchor
+from ..calibration.scale_anchor import default_method, scale_anchor
 from ..core.errors import InputError
-from ..core.units import ARCSEC, DEG
+from ..core.units import ARCSEC, DEG, M
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..files.arms import specification_toml
-from ..kinematics.arm import Arm, checked_limits, is_length
+from ..kinematics.arm import Arm, is_length, joint_limits
 from ..kinematics.parameters import ArmSpecification, Parameters, single
 from ..model.observed import Observed
 from .specification import Point, Region, Specification, label
@@ -58,7 +58,7 @@ class Setting(NamedTuple):
     """What determines the compiled program of a cell, and its pose pool."""
 
     fixtures: tuple[Fixture, ...]
-    limits: tuple[tuple[float, float], ...]  # rad
+    limits: tuple[tuple[float, float], ...]  # rad, or mm of prismatic joints
     hold: str | None
     method: str
     random_start: bool
@@ -81,6 +81,8 @@ class CellValues(NamedTuple):
     resolution: Float[np.ndarray, " c"]
     seating: Float[np.ndarray, " c"]
     eccentricity: Float[np.ndarray, " c"]
+    linear_encoder: Float[np.ndarray, " c"]  # of prismatic joints
+    linear_resolution: Float[np.ndarray, " c"]
     u: Float[np.ndarray, " c"]  # of reference lengths; NaN: as recorded
 
 
@@ -239,8 +241,12 @@ class Study:
                 f"capture.joint_limits_deg has {len(degrees)} rows, but the arm has {arm.joints} joints; give "
                 "[lowest, highest] for each."
             )
-        rows = arm.limits if degrees is None else [[math.radians(x) for x in pair] for pair in degrees]
-        limits = checked_limits([(-math.pi, math.pi)] * arm.joints if rows is None else rows, arm.joints)
+        if degrees is not None and arm.prismatic:
+            raise InputError(
+                f"capture.joint_limits_deg is in degrees, but joint {arm.prismatic[0]} is prismatic; state the limits "
+                "in the arm's file."
+            )
+        limits = joint_limits(arm, None if degrees is None else [[math.radians(x) for x in pair] for pair in degrees])
         return Setting(
             tuple(fixtures), tuple((float(a), float(b)) for a, b in limits), hold, method, random_start, False
         )
@@ -250,9 +256,9 @@ class Study:
             return self._observed_method(cell.get("identification.method"))
         if "identification.method" in cell:
             return cell["identification.method"]
-        if self.capture is not None:
-            return "two-stage" if self.capture.lengths else "stage1"
-        return "stage1" if self.specification.reference is None else "two-stage"
+        reference = self.specification.reference is not None
+        scaled = reference if self.capture is None else bool(self.capture.lengths)
+        return default_method(self.nominal.arm, general=False) if scaled else "stage1"
 
     def _observed_method(self, asked: str | None) -> str:
         """All observations are solved at once: jointly, or as stage 1 where nothing fixes the scale."""
@@ -298,6 +304,8 @@ class Study:
             cell["noise.resolution_arcsec"] * ARCSEC,
             cell["noise.seating_mm"],
             cell["noise.eccentricity_arcsec"] * ARCSEC,
+            cell.get("noise.linear_encoder_mm", M * cell["noise.encoder_arcsec"] * ARCSEC),
+            cell.get("noise.linear_resolution_mm", 0.0),
             cell.get("reference.u_mm", math.nan),
         )
 

@@ -15,6 +15,7 @@ from ..calibration.observed_evaluation import fit_geometry
 from ..calibration.redrawn import DrawnLengths, ObservedTruth, batch_of_observations, shifted
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
+from ..kinematics.arm import Arm, by_joint
 from ..kinematics.chain import reading_units
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed, residual_rows
@@ -82,7 +83,7 @@ def _trial(
         fixed = np.array([name == setting.hold for name in study.space.names])
         start = np.where(fixed, nominal, values.lower + fraction * (values.upper - values.lower))
     q, left = _taken(recorded, true)
-    read = _read(q, truth.reading, values, random)
+    read = _read(recorded.space.base, q, truth.reading, values, random)
     errors = truth.errors_of_rows(1, float(values.seating), random)
     shifts = [error[0] - rows for error, rows in zip(errors, left, strict=True)]
     certified = {name: one[0] for name, one in truth.values(1, random).items()}
@@ -117,11 +118,22 @@ def _agreeing(q: Float[np.ndarray, "M n"], reading: Int[np.ndarray, " M"]) -> Fl
 
 
 def _read(
-    q: Float[np.ndarray, "M n"], reading: Int[np.ndarray, " M"], values: CellValues, random: np.random.Generator
+    arm: Arm,
+    q: Float[np.ndarray, "M n"],
+    reading: Int[np.ndarray, " M"],
+    values: CellValues,
+    random: np.random.Generator,
 ) -> Float[np.ndarray, "M n"]:
     """What the encoders show: eccentricity (a first harmonic of the angle), noise and rounding."""
-    harmonics = float(values.eccentricity) * random.normal(size=(2, q.shape[1]))
+    eccentricity, encoder, step = (
+        np.array(by_joint(arm, *map(float, pair)))
+        for pair in (
+            (values.eccentricity, 0.0),
+            (values.encoder, values.linear_encoder),
+            (values.resolution, values.linear_resolution),
+        )
+    )
+    harmonics = eccentricity * random.normal(size=(2, q.shape[1]))
     q = q + harmonics[0] * np.sin(q) + harmonics[1] * np.cos(q)
-    q = q + float(values.encoder) * random.normal(size=(reading.max() + 1, q.shape[1]))[reading]
-    step = float(values.resolution)
-    return np.round(q / step) * step if step > 0 else q
+    q = q + encoder * random.normal(size=(reading.max() + 1, q.shape[1]))[reading]
+    return np.where(step > 0, np.round(q / np.where(step > 0, step, 1.0)) * step, q)

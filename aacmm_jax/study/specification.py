@@ -161,10 +161,16 @@ class CaptureTable(_Table):
 
 class NoiseTable(_Table):
     """Standard deviations of a reading, of a coordinate of the seated tip, and of both coefficients of every encoder's
-    first harmonic; and the resolution of a reading."""
+    first harmonic; and the resolution of a reading.
+
+    The readings of prismatic joints err by ``linear_encoder_mm``, by default what ``encoder_arcsec`` is at 1 m, and
+    have the resolution ``linear_resolution_mm``.
+    """
 
     encoder_arcsec: Levels[Amount] = [0.0]
     resolution_arcsec: Levels[Amount] = [0.0]
+    linear_encoder_mm: Levels[Amount] | None = None
+    linear_resolution_mm: Levels[Amount] | None = None
     seating_mm: Levels[Amount] = [0.0]
     eccentricity_arcsec: Levels[Amount] = [0.0]
 

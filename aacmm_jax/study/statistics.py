@@ -39,6 +39,7 @@ _FACTORS = {
     "identification.hold": "scale anchor",
     "identification.method": "method",
     "noise.encoder_arcsec": "encoder noise [arcsec]",
+    "noise.linear_encoder_mm": "noise of linear encoders [mm]",
     "noise.seating_mm": "seating noise [mm]",
     "capture.poses": "poses in a socket",
     "capture.sockets": "sockets",

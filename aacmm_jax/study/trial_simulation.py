@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..kinematics.arm import with_values
-from ..kinematics.chain import Geometry, forward_pass
+from ..kinematics.chain import Geometry, JointKinds, JointMotion, forward_pass, reading_units
 from ..kinematics.inverse_kinematics import damped_inverse
-from ..kinematics.jacobian import jacobian_columns
+from ..kinematics.jacobian import reading_columns
 from .configuration_pool import Pool, forget_pools, pool_of
 from .definition import POOL_PARTS, CellValues, Setting, Study
 from .drawn_trials import DrawnTrials
@@ -79,7 +79,7 @@ def _prepared(study: Study, setting: Setting, device: Any) -> tuple[_Static, _Sh
     pool = pool_of(study, setting)
     static = _static(study, setting, pool)
     u = [float(length.u) for length in study.capture.lengths] if study.capture else [0.0] * len(static.lengths)
-    shared = _Shared(pool.table, study.nominal.arm.geometry, np.asarray(study.space.vector()), np.array(u))
+    shared = _Shared(pool.table, study.space.base.geometry, np.asarray(study.space.vector()), np.array(u))
     return static, jax.device_put(shared, device)
 
 
@@ -141,9 +141,15 @@ def _chunk(static: _Static, shared: _Shared, keys: Array, trials: Int[Array, " w
     target = point + values.seating[:, None, None] * _noise(parts[:, 2], (3, poses))
     geometry = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_WIDTH, *leaf.shape)), shared.geometry)
     geometry = geometry._replace(**with_values(geometry, true, static.indices))
-    q = q + _joint_changes(geometry, cosine, sine, inverse, target)
-    q = q - jnp.swapaxes(geometry.theta - shared.geometry.theta[None], 0, 1)[:, :, None]
-    reading = _readings(static, q, parts[:, 3:5], values)
+    offsets = jnp.swapaxes(geometry.theta - shared.geometry.theta[None], 0, 1)[:, :, None]
+    joints = _Joints(cosine, sine, None)
+    if geometry.kinds is not None:  # the angle of a prismatic joint is that of the true arm
+        prismatic, angle = geometry.kinds.mask(3), jnp.swapaxes(geometry.theta, 0, 1)[:, :, None]
+        cosine, sine = jnp.where(prismatic, jnp.cos(angle), cosine), jnp.where(prismatic, jnp.sin(angle), sine)
+        joints = _Joints(cosine, sine, jnp.where(prismatic, q, 0.0))
+        offsets = jnp.where(prismatic, 0.0, offsets)
+    q = q + _joint_changes(geometry, joints, inverse, target) - offsets
+    reading = _readings(static, q, geometry.kinds, parts[:, 3:5], values)
     u = jnp.where(jnp.isnan(values.u)[:, None], shared.recorded_u[None], values.u[:, None])
     value, u = _certified(static, point, parts[:, 5], u)
     start = jnp.broadcast_to(shared.nominal, true.shape)
@@ -195,8 +201,7 @@ def _chosen(static: _Static, keys: Array, trials: Int[Array, " w"]) -> Int[Array
 
 def _joint_changes(
     geometry: Geometry,
-    cosine: Float[Array, "n w N"],
-    sine: Float[Array, "n w N"],
+    joints: "_Joints",
     inverse: Float[Array, "n 3 w N"],
     target: Float[Array, "w 3 N"],
 ) -> Float[Array, "n w N"]:
@@ -210,26 +215,26 @@ def _joint_changes(
     # Barriers keep XLA from computing them again for every pose, and the tip for every joint.
     links, *twist = jax.lax.optimization_barrier((rows, jnp.cos(rows.alpha), jnp.sin(rows.alpha)))
 
-    def gap_of(cosine: Array, sine: Array) -> tuple[Array, Array]:
-        gap = jax.lax.optimization_barrier(target - jnp.stack(_tip(links, (twist[0], twist[1]), cosine, sine), axis=1))
+    def gap_of(joints: _Joints) -> tuple[Array, Array]:
+        gap = jax.lax.optimization_barrier(target - jnp.stack(_tip(links, (twist[0], twist[1]), joints), axis=1))
         return gap, jnp.max(jnp.abs(gap), axis=(1, 2))
 
     def unfinished(state: tuple) -> Array:
         return (state[0] < _MOST_STEPS) & jnp.any(state[-1] > _TOLERANCE)
 
     def step(state: tuple) -> tuple:
-        number, change, cosine, sine, gap, distance = state
+        number, change, joints, gap, distance = state
         move = sum(inverse[:, i] * gap[None, :, i] for i in range(3))
         move = jnp.where((distance > _TOLERANCE)[None, :, None], move, 0.0)
-        cosine, sine = _rotated(cosine, sine, move)
-        return number + 1, change + move, cosine, sine, *gap_of(cosine, sine)
+        joints = joints.moved(geometry.kinds, move)
+        return number + 1, change + move, joints, *gap_of(joints)
 
-    begin = (jnp.asarray(0), jnp.zeros_like(cosine), cosine, sine, *gap_of(cosine, sine))
-    _, change, _, _, _, distance = jax.lax.while_loop(unfinished, step, begin)
+    begin = (jnp.asarray(0), jnp.zeros_like(joints.cosine), joints, *gap_of(joints))
+    _, change, _, _, distance = jax.lax.while_loop(unfinished, step, begin)
     arrived = distance <= _TOLERANCE
 
     def again() -> Array:
-        damped, distance = _damped_changes(geometry, cosine, sine, target)
+        damped, distance = _damped_changes(geometry, joints, target)
         return jnp.where(
             arrived[None, :, None], change, jnp.where((distance <= _TOLERANCE)[None, :, None], damped, jnp.nan)
         )
@@ -237,23 +242,40 @@ def _joint_changes(
     return jax.lax.cond(jnp.all(arrived), lambda: change, again)
 
 
-def _damped_changes(geometry: Geometry, cosine: Array, sine: Array, target: Array) -> tuple[Array, Array]:
+def _damped_changes(geometry: Geometry, joints: "_Joints", target: Array) -> tuple[Array, Array]:
     """The same by damped least-norm steps with the true arm's own derivatives; and the final distances, mm."""
+    units = reading_units(geometry)[:, None, None]
     zeroed = jax.tree.map(lambda leaf: leaf[:, None, :], geometry._replace(theta=jnp.zeros_like(geometry.theta)))
 
     def step(_: Array, state: tuple) -> tuple:
-        change, cosine, sine, _ = state
-        forward = forward_pass(zeroed, (cosine[:, :, None], sine[:, :, None]))
+        change, joints, _ = state
+        forward = forward_pass(zeroed, JointMotion(*jax.tree.map(lambda leaf: leaf[:, :, None], joints)))
         gap = target - forward.tip
         inverse = jax.vmap(damped_inverse, in_axes=(1, 0), out_axes=1)(
-            jacobian_columns(forward)["theta"], 1e-2 * jnp.sum(gap**2, axis=1) + 1e-12
+            reading_columns(forward) * units[..., None], 1e-2 * jnp.sum(gap**2, axis=1) + 1e-12
         )
-        move = jnp.clip(jnp.sum(inverse * gap[None], axis=2), -0.2, 0.2)
-        return change + move, *_rotated(cosine, sine, move), jnp.max(jnp.abs(gap), axis=(1, 2))
+        move = units * jnp.clip(jnp.sum(inverse * gap[None], axis=2), -0.2, 0.2)
+        return change + move, joints.moved(geometry.kinds, move), jnp.max(jnp.abs(gap), axis=(1, 2))
 
-    begin = (jnp.zeros_like(cosine), cosine, sine, jnp.zeros(_WIDTH))
-    change, *_, distance = jax.lax.fori_loop(0, _MOST_STEPS, step, begin)
+    begin = (jnp.zeros_like(joints.cosine), joints, jnp.zeros(_WIDTH))
+    change, _, distance = jax.lax.fori_loop(0, _MOST_STEPS, step, begin)
     return change, distance
+
+
+class _Joints(NamedTuple):
+    """Where the joints are: `JointMotion` with the zero offsets in it."""
+
+    cosine: Float[Array, "n w N"]
+    sine: Float[Array, "n w N"]
+    slide: Float[Array, "n w N"] | None  # mm
+
+    def moved(self, kinds: JointKinds | None, move: Float[Array, "n w N"]) -> "_Joints":
+        """After small changes of the readings."""
+        if self.slide is None or kinds is None:
+            return _Joints(*_rotated(self.cosine, self.sine, move), None)
+        prismatic = kinds.mask(3)
+        turned = _rotated(self.cosine, self.sine, jnp.where(prismatic, 0.0, move))
+        return _Joints(*turned, self.slide + jnp.where(prismatic, move, 0.0))
 
 
 def _rotated(cosine: Array, sine: Array, angle: Array) -> tuple[Array, Array]:
@@ -267,25 +289,33 @@ def _rotated(cosine: Array, sine: Array, angle: Array) -> tuple[Array, Array]:
     return cosine * cos_angle - sine * sin_angle, sine * cos_angle + cosine * sin_angle
 
 
-def _tip(links: Geometry, twist: tuple[Array, Array], cosine: Array, sine: Array) -> tuple[Array, ...]:
-    """The tip alone, from the probe back to the base: one vector instead of a frame. ``cosine`` is of q + theta."""
-    (cos_twist, sin_twist), (x, y, z) = twist, links.probe
+def _tip(links: Geometry, twist: tuple[Array, Array], joints: _Joints) -> tuple[Array, ...]:
+    """The tip alone, from the probe back to the base: one vector instead of a frame."""
+    (cos_twist, sin_twist), (x, y, z), (cosine, sine, slide) = twist, links.probe, joints
     for i in reversed(range(cosine.shape[0])):
         if links.beta is not None:
             cos_tilt, sin_tilt = jnp.cos(links.beta[i]), jnp.sin(links.beta[i])
             x, z = cos_tilt * x + sin_tilt * z, cos_tilt * z - sin_tilt * x
-        x, y, z = x + links.a[i], cos_twist[i] * y - sin_twist[i] * z, sin_twist[i] * y + cos_twist[i] * z + links.d[i]
+        d = links.d[i] if slide is None else links.d[i] + slide[i]
+        x, y, z = x + links.a[i], cos_twist[i] * y - sin_twist[i] * z, sin_twist[i] * y + cos_twist[i] * z + d
         x, y = cosine[i] * x - sine[i] * y, sine[i] * x + cosine[i] * y
     return tuple(jnp.broadcast_to(part, cosine.shape[1:]) for part in (x, y, z))
 
 
-def _readings(static: _Static, q: Float[Array, "n w N"], keys: Array, values: CellValues) -> Float[Array, "n w N"]:
+def _readings(
+    static: _Static, q: Float[Array, "n w N"], kinds: JointKinds | None, keys: Array, values: CellValues
+) -> Float[Array, "n w N"]:
     """Readings: eccentricity (a first harmonic of the angle, its coefficients drawn by joint), noise and rounding."""
     n, _, poses = q.shape
+    encoder, step = values.encoder[None, :, None], values.resolution[None, :, None]
+    if kinds is not None:
+        encoder = jnp.where(kinds.mask(3), values.linear_encoder[None, :, None], encoder)
+        step = jnp.where(kinds.mask(3), values.linear_resolution[None, :, None], step)
     if static.eccentric:
         harmonics = jax.vmap(lambda k: jax.random.normal(k, (2, n)))(keys[:, 1]) * values.eccentricity[:, None, None]
         harmonics = jnp.moveaxis(harmonics, 0, -1)[..., None]
+        if kinds is not None:
+            harmonics = jnp.where(kinds.mask(3)[None], 0.0, harmonics)
         q = q + harmonics[0] * jnp.sin(q) + harmonics[1] * jnp.cos(q)
-    q = q + values.encoder[None, :, None] * jnp.moveaxis(_noise(keys[:, 0], (n, poses)), 0, 1)
-    step = values.resolution[None, :, None]
+    q = q + encoder * jnp.moveaxis(_noise(keys[:, 0], (n, poses)), 0, 1)
     return jnp.where(step > 0, jnp.round(q / jnp.where(step > 0, step, 1.0)) * step, q)

@@ -112,7 +112,7 @@ def test_a_zero_offset_of_a_slide_moves_its_origin_alone():
     origins = [transform((0, 0, 0, 0, 0, 100)), transform((np.pi / 2, 0, 0, 50, 0, 0)), transform((1, 0, 0, 9, 80, 7))]
     base, geometry = dh_of_axes(lines_of(origins, np.tile([0.0, 0.0, 1.0], (3, 1)), np.eye(4)))
     geometry = geometry._replace(kinds=JointKinds((False, True, False)))
-    moved = calibrated_frames(origins, geometry, geometry._replace(d=geometry.d + [0.0, 2.0, 0.0]), base)
+    moved = calibrated_frames(origins, geometry, geometry._replace(d=geometry.d + np.array([0.0, 2.0, 0.0])), base)
     assert [one is other for one, other in zip(moved, origins, strict=True)] == [True, False, True]
     np.testing.assert_allclose(inverse(origins[1]) @ moved[1], along(np.array([0.0, 0.0, 1.0]), 2.0), atol=1e-12)
 
