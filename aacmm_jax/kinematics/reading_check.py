@@ -167,7 +167,8 @@ def _units(arm: Arm, evidence: Evidence, size: float) -> Iterator[tuple[float, f
         distances = np.linalg.norm(points - (points.mean(axis=0) if evidence.own_frame else 0.0), axis=1)
         farthest, span = float(distances.max()), size + abs(float(np.asarray(arm.d)[0]))
         if not _NEAREST * span <= farthest <= _FARTHEST * span:
-            lengths = [x for x in _LENGTHS if _NEAREST * span <= x * farthest <= _FARTHEST * span] or lengths
+            possible = [x for x in _LENGTHS if _NEAREST * span <= x * farthest <= _FARTHEST * span]
+            lengths = [1.0] * (farthest < _FARTHEST * span or not possible) + possible  # small ones are possible, too
     yield from itertools.product(angles, lengths)
 
 

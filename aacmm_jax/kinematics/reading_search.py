@@ -145,7 +145,9 @@ def search(arm: Arm, evidence: Evidence, lever: float) -> Found:
                     best.take(_costs(part, other, evidence, lever), part, other)
     rms = np.sqrt(np.maximum(best.costs, 0) / len(evidence.q))
     order = np.argsort(rms, kind="stable")
-    return Found(rms[order].tolist(), [best.hypotheses[i] for i in order], tried)
+    # The families overlap.
+    found = {best.hypotheses[i]: float(rms[i]) for i in reversed(order)}
+    return Found(list(found.values())[::-1], list(found)[::-1], tried)
 
 
 def _variants(n: int, joints: int, most: int, zeros: int) -> int:
