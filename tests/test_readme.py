@@ -15,6 +15,12 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
 
 
+def table_with(text: str) -> str:
+    """The one TOML block in which a text stands."""
+    (found,) = (block for block in blocks("toml") if text in block)
+    return found
+
+
 @pytest.mark.slow
 @pytest.mark.optimised  # it computes more than it compiles
 def test_python_runs(capsys, tmp_path, monkeypatch):
@@ -34,13 +40,13 @@ def test_no_command_overwrites_an_earlier_result():
 
 
 def test_study_is_read(tmp_path):
-    (tmp_path / "study.toml").write_text(blocks("toml")[5])
+    (tmp_path / "study.toml").write_text(table_with("trials = 1000"))
     assert len(aj.study.read_study(tmp_path / "study.toml").cells) == 6
 
 
 def test_administrative_data_is_read(tmp_path):
     # The table of conformity is commented out, because few certificates have one.
-    uncommented = re.sub(r"^# (\[conformity\]|\w+ = )", r"\1", blocks("toml")[4], flags=re.MULTILINE)
+    uncommented = re.sub(r"^# (\[conformity\]|\w+ = )", r"\1", table_with("[conformity]"), flags=re.MULTILINE)
     (tmp_path / "laboratory.toml").write_text(uncommented)
     data = aj.files.read_administrative_data(tmp_path / "laboratory.toml")
     # The example has every key.
@@ -82,8 +88,17 @@ def test_the_manifest_of_a_robot_is_read(tmp_path):
 
 
 def test_the_kit_can_be_read(tmp_path):
-    (tmp_path / "kit.toml").write_text(blocks("toml")[3])
+    (tmp_path / "kit.toml").write_text(table_with("ball bar"))
     assert [(item.simulated.name, item.places) for item in aj.files.read_kit(tmp_path / "kit.toml")] == [
         ("ball bar", 3),
         ("tracker", 0),
     ]
+
+
+def test_the_cell_and_the_noise_can_be_read(tmp_path):
+    (tmp_path / "cell.toml").write_text(table_with("cabinet"))
+    assert [one.name for one in aj.files.load_cell("panda", tmp_path / "cell.toml").cell.obstacles] == [
+        "wall", "cabinet"
+    ]  # fmt: skip
+    (tmp_path / "arm.toml").write_text(table_with("joint = [") + table_with("repeatability_mm"))
+    assert aj.files.load_noise(tmp_path / "arm.toml").source == "data sheet"

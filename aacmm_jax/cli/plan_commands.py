@@ -188,6 +188,13 @@ def plan(
             raise InputError(
                 "--acceptance has its own sockets and bars; leave out --socket, --sockets, --length and --region."
             )
+        own = (cone_deg, normal, cell, collisions, link_radius_mm, unconstrained)
+        if any(own) or retract_mm is not None or tool_axis != "z":
+            raise InputError(
+                "cones of approach, obstacles and approach points are of calibrations; with --acceptance, leave out "
+                "--cone-deg, --normal, --tool-axis, --retract-mm, --cell, --collisions, --link-radius-mm and "
+                "--unconstrained."
+            )
         options = {
             "above": above_mm,
             "margin": margin_deg * DEG,
@@ -197,7 +204,9 @@ def plan(
             "bars": bar_mm or None,
         }
         show_summary(
-            _procedure(specification, arm, acceptance, output, manifest, options), as_json, acceptance_display.procedure
+            _procedure(specification, arm, acceptance, output, manifest, options, angles),
+            as_json,
+            acceptance_display.procedure,
         )
         return
     axes = [_axis(text) for text in region or ()]
@@ -258,7 +267,13 @@ def plan(
 
 
 def _procedure(
-    specification: Any, arm: str, standard: Any, output: Path, manifest: Path | None, options: dict[str, Any]
+    specification: Any,
+    arm: str,
+    standard: Any,
+    output: Path,
+    manifest: Path | None,
+    options: dict[str, Any],
+    angles: Any,
 ) -> dict[str, Any]:
     """Plan an acceptance test and write it."""
     from ..acceptance.procedure import plan_procedure
@@ -267,7 +282,8 @@ def _procedure(
 
     found = with_spinner("Planning", lambda: plan_procedure(specification.arm, standard, **options))
     urdf = specification.urdf if _is_urdf(arm) else None
-    written = _written(output, procedure_csv(found), manifest, lambda name: procedure_manifest(found, name, urdf), arm)
+    text = procedure_csv(found, angles)
+    written = _written(output, text, manifest, lambda name: procedure_manifest(found, name, urdf, angles), arm)
     return procedure_summary(found, specification.name) | {"written": written}
 
 

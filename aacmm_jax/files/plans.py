@@ -189,12 +189,12 @@ def _manifest_start(
     return [*comments, f"arm = {_quoted(arm)}", *links, *made_for, date, "", "[angles]", f'unit = "{angles}"']
 
 
-def procedure_csv(procedure: Procedure) -> str:
+def procedure_csv(procedure: Procedure, angles: Angles = "deg") -> str:
     """A row for each pose of an acceptance test: test, name, file for its reading, position, readings."""
     items = (*procedure.sockets, *procedure.touches)
     labels = ([item.test, item.name, file_of(procedure, item)] for item in items for _ in item.q)
     points, q = (np.concatenate([getattr(item, kind) for item in items]) for kind in ("points", "q"))
-    return _poses_csv(procedure.arm, ["test", "name", "file"], labels, points, q)
+    return _poses_csv(procedure.arm, ["test", "name", "file"], labels, points, q, angles)
 
 
 def _poses_csv(
@@ -248,7 +248,7 @@ def file_of(procedure: Procedure, item: ProcedureItem) -> str:
     return f"{item.name}/{item.test.replace(' ', '-')}" + (f"-{item.group}" if several else "") + ".csv"
 
 
-def procedure_manifest(procedure: Procedure, arm: str, urdf: UrdfSource | None = None) -> str:
+def procedure_manifest(procedure: Procedure, arm: str, urdf: UrdfSource | None = None, angles: Angles = "deg") -> str:
     """A manifest for the readings of an acceptance test, in which the calibrated values are to be filled in.
 
     ``urdf``: where the arm is a URDF, its links.
@@ -260,6 +260,7 @@ def procedure_manifest(procedure: Procedure, arm: str, urdf: UrdfSource | None =
         "# artefacts, record a file for each socket and each group of touches (one row a pose, in the order of the",
         "# plan), then: aacmm import THIS.toml -o acceptance.h5",
         acceptance=procedure.standard,
+        angles=angles,
     )
     kinds = dict.fromkeys(item.name.split("/")[0] for item in procedure.sockets)
     for kind in kinds:

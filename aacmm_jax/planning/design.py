@@ -188,7 +188,7 @@ def plan(
     visited = np.array(list(dict.fromkeys(owner[order].tolist())))
     q, owner = q[order], np.argsort(visited)[owner[order]]
     placement, cones = in_order(placement, visited), cones.at(visited)
-    if isinstance(sockets, Mapping):  # names of sockets that were placed are given out in their order
+    if isinstance(sockets, Mapping) or isinstance(cone, Mapping):  # otherwise names are given out in their order
         names = [names[i] for i in visited]
     problem = problem._replace(region=problem.region._replace(cones=cones))
     possible = candidates_of(problem, placement, pool._replace(owner=np.argsort(visited)[pool.owner]))
@@ -240,11 +240,12 @@ def _chosen(
             return np.ones(len(q), dtype=bool)
         return approaches(region, q, region.cones.normals[owner], retract).possible
 
-    pool = pool_at(problem, placement.points, max(count // len(placement.points), 50))
+    each = max(count // len(names), 50)
+    pool = pool_at(problem, placement.points, each)
     pool = pool.at(approachable(pool.q, pool.owner))
     few = np.flatnonzero(np.bincount(pool.owner, minlength=len(names)) < _LEAST_CANDIDATES)
     if len(few):
-        raise InputError(explained(region, names, placement.points, int(few[0]), _LEAST_CANDIDATES, retract))
+        raise InputError(explained(region, names, placement.points, int(few[0]), _LEAST_CANDIDATES / each, retract))
     possible = candidates_of(problem, placement, pool)
     rows = exchange(
         possible, poses, problem.objective, least=LEAST_POSES, progress=lambda done: report("Choosing poses", done)

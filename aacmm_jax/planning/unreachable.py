@@ -18,10 +18,14 @@ def explained(
     names: Sequence[str],
     points: Float[np.ndarray, "s 3"],
     socket: int,
-    enough: int,
+    share: float,
     retract: float,
 ) -> str:
-    """Which constraint leaves too few of the poses in a socket: obstacles, cone, approach point, or the reach."""
+    """Which constraint leaves too few of the poses in a socket: obstacles, cone, approach point, or the reach.
+
+    ``share`` is the part of the random starts that would be enough.
+    """
+    enough = math.ceil(share * _STARTS)
     where = ", ".join(f"{round(float(x)):.6g}" for x in points[socket])
     what = f"socket '{names[socket]}' at ({where}) mm cannot be reached in enough poses"
     cones = None if region.cones is None else region.cones.at(np.array([socket]))
@@ -52,4 +56,4 @@ def explained(
             f"{what} within its cone of {angle:.3g} deg about ({normal}); widen the cone, turn its normal, or move the "
             "socket."
         )
-    return f"{what} within the joint limits and their margin; move it."
+    return f"{what} within the joint limits and their margin; move it, or give more candidates."

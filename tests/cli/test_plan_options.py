@@ -68,8 +68,14 @@ def test_a_robot_by_default(aacmm):
         (("--tool-axis", "w"), "--tool-axis 'w' is not of the form"),
         (("--link-radius-mm", "0"), "radius of the arm's links must be above 0"),
         (("--cell", "none.toml"), "none.toml"),
+        (("--acceptance", "iso", "--cone-deg", "50"), "leave out --socket"),
         (("--cone-deg", "A=20", "--normal", "A=0,0,-1"), "socket 'A' at (450, 100, 200) mm cannot be reached"),
     ],
 )
 def test_refused(aacmm, arguments, text):
     assert text in aacmm(*PLAN, *arguments, expect=2).stderr
+
+
+def test_an_acceptance_test_has_no_cones(aacmm):
+    refused = aacmm("plan", "panda", "-o", "plan.csv", "--acceptance", "iso", "--collisions", expect=2)
+    assert "obstacles and approach points are of calibrations" in refused.stderr

@@ -1,5 +1,7 @@
 """Kits as TOML: every kind that can be simulated, and refusals that say what to do."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,8 @@ points = { a = [0.0, 0.0, 0.0], b = [300.0, 0.0, 0.0] }
 u = 0.001
 places = 3
 turned = "vertical"
+half_angle_deg = 45
+normal = [0, 1, 1]
 
 [[touched_sphere]]
 name = "ball"
@@ -46,6 +50,8 @@ def test_what_a_kit_says(tmp_path):
     bar, tracker = found["bar"], found["tracker"].simulated
     assert (bar.places, bar.turned, bar.simulated.u) == (3, "vertical", 0.001)
     assert bar.simulated.points == {"a": (0, 0, 0), "b": (300, 0, 0)}
+    assert (bar.half_angle, bar.normal) == (math.radians(45), (0, 1, 1))
+    assert not found["ball"].has_cone
     assert (found["ball"].places, tracker.poses, tracker.target) == (0, 7, "reflector")
     np.testing.assert_array_equal(tracker.offset, [0, 10, 40])
     np.testing.assert_array_equal(found["gauge block"].simulated.sides, [[100, 0, 0], [0, 50, 0]])
@@ -69,6 +75,8 @@ def test_every_kind_that_can_be_simulated_has_a_table():
         (KIT.replace("centre = [300, 0, 300]\n", ""), ["touched_sphere", "centre", "missing"]),
         (KIT.replace('turned = "vertical"', 'turned = "up"'), ["turned"]),
         (KIT.replace("places = 3", "places = -1"), ["places"]),
+        (KIT.replace("normal = [0, 1, 1]", "normal = [0, 0, 0]"), ["'bar'", "normal (0, 0, 0)"]),
+        (KIT.replace("half_angle_deg = 45", "half_angle_deg = 0"), ["half_angle_deg"]),
         (KIT.replace("b = [300.0, 0.0, 0.0]", "b = [300.0, 0.0]"), ["artefact", "points"]),
         (KIT.replace("frame = [0.1,", "frame = [nan,"), ["frame"]),
     ],

@@ -131,18 +131,35 @@ def test_files_and_summary(constrained):
         assert row["largest_tilt_deg"] <= row["cone_deg"]
 
 
-def test_sockets_are_placed_within_their_cones(panda, monkeypatch):
-    for name, value in {"_PLACEMENTS": 12, "_NEIGHBOURS": 3, "_DESIGNED": 2, "_STARTS": 200}.items():
+def test_sockets_are_placed_within_their_own_cones(panda, monkeypatch):
+    """Through all stages: random placements, their neighbours, chosen and moved poses; the names keep their cones."""
+    for name, value in {"_PLACEMENTS": 12, "_NEIGHBOURS": 20, "_DESIGNED": 1, "_STARTS": 200}.items():
         monkeypatch.setattr(design, name, value)
-    monkeypatch.setattr(pose_refinement, "_ITERATIONS", 3)
+    monkeypatch.setattr(pose_refinement, "_ITERATIONS", 10)
+    normals = {"A": (0.0, 0.0, 1.0), "B": (0.8, 0.0, 0.6)}
     found = aj.planning.plan(
-        panda.arm, sockets=2, poses=14, space=panda.space(), cone=Cone(math.radians(25)), candidates=200
-    )
-    assert list(found.sockets) == ["A", "B"]
+        panda.arm, sockets=2, poses=14, space=panda.space(), candidates=200, length=300.0, seed=1,
+        cone={name: Cone(math.radians(25), normal) for name, normal in normals.items()},
+    )  # fmt: skip
+    assert sorted(found.sockets) == ["A", "B"]
     tool = np.asarray(panda.arm.pose(found.q))[:, :3, 2]
-    assert np.degrees(np.arccos(-tool[:, 2])).max() <= 25 + 1e-4
+    for i, name in enumerate(found.sockets):
+        tilt = np.arccos(np.clip(-tool[found.owner == i] @ np.array(normals[name]), -1, 1))
+        assert np.degrees(tilt).max() <= 25 + 1e-4
     assert found.motion.approach is None
     assert found.motion.clearance is None
+
+
+def test_a_low_ceiling(panda, monkeypatch):
+    """Most poses would break through it, and nothing but the choice of poses keeps them below."""
+    monkeypatch.setattr(pose_refinement, "_ITERATIONS", 3)
+    ceiling = HalfSpace("ceiling", (0.0, 0.0, -1.0), (0.0, 0.0, 480.0))
+    options = dict(sockets=PAIR, lengths=[("A", "B")], poses=16, space=panda.space(), candidates=300)
+    low = aj.planning.plan(panda.arm, cell=Cell(body_along_links(panda.arm, RADIUS), (ceiling,)), **options)
+    points, radii = body_points(panda.arm, low.q)
+    assert (points[..., 2] + radii).max() <= 480 + 1e-9
+    points, radii = body_points(panda.arm, aj.planning.plan(panda.arm, **options).q)
+    assert np.mean((points[..., 2] + radii).max(axis=1) > 480) > 0.3
 
 
 def test_a_plate_carries_its_normal(panda, monkeypatch):
