@@ -101,7 +101,9 @@ def check_means(prior: Prior, bounds: Bounds) -> None:
     """Raise `InputError` where the mean of a prior is outside the bounds: one of both is wrong."""
     names = bounds.space.names
     known = prior.of(names, np.asarray(bounds.space.vector()))
-    for i in () if known is None else known.index:
+    if known is None:
+        return
+    for i in known.index:
         mean, low, high = (float(values[i]) for values in (known.mean, bounds.lower, bounds.upper))
         if not low <= mean <= high:
             raise InputError(

@@ -179,7 +179,7 @@ def record_of(
         open=np.asarray(calibration.parameter_covariance.open),
         noise=calibration.noise,
         noise_model=calibration.noise_model,
-        degrees_of_freedom=calibration.degrees_of_freedom,
+        degrees_of_freedom=float(calibration.degrees_of_freedom),
         reduced_chi=None if stage1.reduced_chi is None else float(stage1.reduced_chi),
         k=np.nan if calibration.scale is None else float(calibration.scale.value),
         u_k=np.nan if calibration.scale is None else float(calibration.scale.u),
@@ -242,5 +242,5 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         noise=result.noise,
         u_k=None if scale is None else scale.u,
         names=result.space.names,
-        degrees_of_freedom=result.degrees_of_freedom,
+        degrees_of_freedom=float(result.degrees_of_freedom),
     )

@@ -116,7 +116,7 @@ class AbstractSingleResult(AbstractResult):
         return self._stage1.prior_metrics
 
     @property
-    def degrees_of_freedom(self) -> float:
+    def degrees_of_freedom(self) -> Float[AnyArray, "*batch"] | float:
         """Degrees of freedom behind the covariance, equations less effective parameters; infinite where the noise was
         given."""
         fitted, prior = self._stage1.fitted_degrees_of_freedom, self.prior
