@@ -71,15 +71,12 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
 def _of_joint(
     forward: ForwardPass, q: Float[np.ndarray, "N 1"], order: Float[np.ndarray, "N 1"], joint: int
 ) -> Iterator[MissingTerm]:
-    terms: dict[Kind, np.ndarray] = {
-        "zero": np.ones_like(q),
-        "first harmonic": np.concatenate([np.cos(q), np.sin(q)], axis=1),
-        "second harmonic": np.concatenate([np.cos(2 * q), np.sin(2 * q)], axis=1),
-        "gear ratio": q,
-        "gravity": _moments(forward, joint),
-        "drifting zero": order,
-    }
-    yield from (MissingTerm(kind, joint + 1, values) for kind, values in terms.items())
+    yield MissingTerm("zero", joint + 1, np.ones_like(q))
+    yield MissingTerm("first harmonic", joint + 1, np.concatenate([np.cos(q), np.sin(q)], axis=1))
+    yield MissingTerm("second harmonic", joint + 1, np.concatenate([np.cos(2 * q), np.sin(2 * q)], axis=1))
+    yield MissingTerm("gear ratio", joint + 1, q)
+    yield MissingTerm("gravity", joint + 1, _moments(forward, joint))
+    yield MissingTerm("drifting zero", joint + 1, order)
 
 
 def _moments(forward: ForwardPass, joint: int) -> Float[np.ndarray, "N k"]:
