@@ -75,17 +75,14 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
 def _of_joint(
     forward: ForwardPass, q: Float[np.ndarray, "N 1"], order: Float[np.ndarray, "N 1"], joint: int, slides: bool
 ) -> Iterator[MissingTerm]:
-    terms: dict[Kind, np.ndarray] = {
-        "zero": np.ones_like(q),
-        "first harmonic": np.concatenate([np.cos(q), np.sin(q)], axis=1),
-        "second harmonic": np.concatenate([np.cos(2 * q), np.sin(2 * q)], axis=1),
-        "gear ratio": q,
-        "gravity": _moments(forward, joint),
-        "drifting zero": order,
-    }
+    yield MissingTerm("zero", joint + 1, np.ones_like(q))
+    yield MissingTerm("gear ratio", joint + 1, q)
+    yield MissingTerm("drifting zero", joint + 1, order)
     if slides:  # a scale has no revolution to repeat, and carries what it moves
-        terms = {kind: values for kind, values in terms.items() if kind in ("zero", "gear ratio", "drifting zero")}
-    yield from (MissingTerm(kind, joint + 1, values) for kind, values in terms.items())
+        return
+    yield MissingTerm("first harmonic", joint + 1, np.concatenate([np.cos(q), np.sin(q)], axis=1))
+    yield MissingTerm("second harmonic", joint + 1, np.concatenate([np.cos(2 * q), np.sin(2 * q)], axis=1))
+    yield MissingTerm("gravity", joint + 1, _moments(forward, joint))
 
 
 def _moments(forward: ForwardPass, joint: int) -> Float[np.ndarray, "N k"]:

@@ -46,7 +46,6 @@ class Misfit(NamedTuple):
     degrees_of_freedom: float
     probability: float  # of a ratio as far from 1, where the noise is right; of the class: as large
     of_class: bool
-    noise: Noise
 
 
 class NoisyObservation(NamedTuple):
@@ -118,7 +117,7 @@ def model_tests(
         result: What `calibrate` or `identify` returned, or the record of a calibration.
         capture: What it was calibrated from; not with a record, which holds it.
         class_noise: Noise of encoders and seat that is usual for this class of arms, for a calibration whose noise was
-            estimated; by default what the arm's file states.
+            estimated.
 
     Returns:
         The tests; those that found something have a probability below `LEVEL`.
@@ -129,8 +128,6 @@ def model_tests(
         raise InputError("the result does not hold its capture; give the capture that it was calibrated from.")
     else:
         record = record_of(result, Recording(capture, ArmSpecification(result.space.base)))
-    if class_noise is None:
-        class_noise = getattr(record.recording.nominal, "noise", None)
     with np.errstate(all="ignore"):
         return _tests(record, class_noise)
 
@@ -146,7 +143,7 @@ def _tests(record: CalibrationRecord, class_noise: Noise | None) -> ModelTests:
     if _rms(rows) < _EXACT:
         return ModelTests(lengths=lengths)
     terms, explained = _terms(record, rows, left)
-    if record.robust is not None:  # its weights make residuals smaller, and less scattered, than any noise
+    if _weighted(record):  # a robust loss makes residuals smaller, and less scattered, than the noise
         return ModelTests(lengths=lengths, terms=terms)
     return ModelTests(
         misfit=_misfit(record, left, class_noise),
@@ -157,6 +154,11 @@ def _tests(record: CalibrationRecord, class_noise: Noise | None) -> ModelTests:
         noisy_joint=None if len(terms) == _MOST_TERMS else _noisy_joint(record.calibrated.arm.joints, rows, explained),
         successive=_successive(rows, explained),
     )
+
+
+def _weighted(record: CalibrationRecord) -> bool:
+    observed = record.observed
+    return observed is not None and any(bool(np.any(np.asarray(weights) < 1)) for weights in observed.weights)
 
 
 def _equations(record: CalibrationRecord) -> tuple[list[Rows], list[Block]]:
@@ -196,13 +198,13 @@ def _misfit(record: CalibrationRecord, left: Residuals, class_noise: Noise | Non
     if given is not None:
         spare = left.degrees_of_freedom
         upper = chi_square_tail(left.cost, spare)
-        return Misfit(float(np.sqrt(left.cost / spare)), spare, min(2 * min(upper, 1 - upper), 1.0), False, given)
+        return Misfit(float(np.sqrt(left.cost / spare)), spare, min(2 * min(upper, 1 - upper), 1.0), False)
     if class_noise is None:
         return None
     rows, relations = _equations(record._replace(noise=class_noise))
     left = Residuals.of([*(each.block("") for each in rows), *relations])
     spare, ratio = left.degrees_of_freedom, left.cost / left.degrees_of_freedom
-    return Misfit(float(np.sqrt(ratio)), spare, f_tail(ratio, spare, CLASS_DEGREES_OF_FREEDOM), True, class_noise)
+    return Misfit(float(np.sqrt(ratio)), spare, f_tail(ratio, spare, CLASS_DEGREES_OF_FREEDOM), True)
 
 
 def _noisy_observations(
@@ -275,11 +277,9 @@ def _criterion(left: Residuals, test: ScoreTest) -> float:
 
 
 def _amplitude(term: MissingTerm, coefficients: Float[np.ndarray, " k"]) -> float:
-    if term.kind == "gear ratio":
+    if term.kind in ("gear ratio", "zero"):
         return float(abs(coefficients[0])) * 1e-3
     added = term.values @ coefficients
-    if term.kind == "zero":
-        return float(abs(coefficients[0])) * 1e-3
     half = float(np.linalg.norm(np.ptp(added.reshape(len(added), -1), axis=0))) / 2
     return half if term.joint is None else half * 1e-3
 

@@ -3,14 +3,13 @@
 import math
 from typing import Any
 
-from ..calibration.missing_terms import Kind
 from ..calibration.model_errors import LEVEL, FoundTerm, Lengths, Misfit, ModelTests
 from ..calibration.record import REPEATABILITY
 from ..core.text import shorten
 from ..core.units import ARCSEC
 
 # What residuals follow, of joint {i}; what causes that; and the model that has such a term.
-_TERMS: dict[Kind, tuple[str, str, str]] = {
+_TERMS: dict[str, tuple[str, str, str]] = {
     "zero": ("the zero of joint {i}, which is fixed", "a wrong zero", ""),
     "first harmonic": ("cos q_{i}", "an eccentric encoder or a bending link", "harmonics"),
     "second harmonic": ("cos 2 q_{i}", "a tilted or oval encoder", "harmonics"),

@@ -14,7 +14,7 @@ from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
 from ..core.units import INCH, M
 from ..data.capture import Capture
-from ..data.noise import tip_covariances
+from ..data.noise import Noise, tip_covariances
 from ..data.recording import Recording
 from ..kinematics.chain import joint_motion, reading_units
 from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
@@ -72,7 +72,9 @@ def of_import(recording: Recording) -> list[str]:
     return [*([cause] if cause else []), *of_capture(recording)]
 
 
-def warnings_of(result: Calibration | Identification, capture: Capture) -> list[str]:
+def warnings_of(
+    result: Calibration | Identification, capture: Capture, *, class_noise: Noise | None = None
+) -> list[str]:
     """What should be read about a calibration before its numbers: one sentence each, the most serious first.
 
     The command line prints the same. The numbers behind the tests of model and noise: `calibration.model_tests`.
@@ -80,11 +82,13 @@ def warnings_of(result: Calibration | Identification, capture: Capture) -> list[
     Args:
         result: What `calibrate` or `identify` returned.
         capture: What it was calibrated from.
+        class_noise: Noise that is usual for this class of arms, for a calibration whose noise was estimated.
 
     Returns:
         The sentences; none where nothing is to be said.
     """
-    return of_calibration(record_of(result, Recording(capture, ArmSpecification(result.space.base))))
+    record = record_of(result, Recording(capture, ArmSpecification(result.space.base)))
+    return of_calibration(record, tests=model_tests(record, class_noise=class_noise))
 
 
 def of_calibration(
