@@ -19,8 +19,7 @@ _TERMS: dict[str, tuple[str, str, str]] = {
     "drifting base": ("the order of the poses in the tip", "a base or socket that moves", ""),
     "growing arm": ("the order of the poses in the arm's size", "an arm that warms or cools", ""),
 }
-# Option of the command line that takes further terms into the model; None: there is none yet.
-MODEL_OPTION: str | None = None
+_MODEL_OPTION = "--model dh,"  # of the command line, which takes further terms into the model
 
 
 def sentences_of_tests(tests: ModelTests, method: str = "") -> list[str]:
@@ -57,7 +56,7 @@ def _terms(terms: tuple[FoundTerm, ...]) -> str:
     named = [f"{_TERMS[term.kind][0].format(i=term.joint)} ({_amplitude(term)})" for term in terms]
     kinds = dict.fromkeys(term.kind for term in terms)
     options = list(dict.fromkeys(_TERMS[kind][2] for kind in kinds if _TERMS[kind][2]))
-    hint = f"; try {MODEL_OPTION} {','.join(options)}" if MODEL_OPTION and options else ""
+    hint = f"; try {_MODEL_OPTION}{','.join(options)}" if options else ""
     found = {(term.kind, term.joint) for term in terms}
     others = dict.fromkeys(other for term in terms for other in term.alternatives if other not in found)
     as_well = [_TERMS[kind][0].format(i=joint) for kind, joint in others]
