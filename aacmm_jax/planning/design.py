@@ -54,7 +54,7 @@ _OBJECTIVE_LENGTHS, _PREDICTION_LENGTHS = 300, 400  # predictions use other leng
 # Random placements, those of them for which poses are chosen, tried neighbours of the best, and starts for each.
 _PLACEMENTS, _DESIGNED, _NEIGHBOURS, _STARTS = 600, 10, 200, 1000
 _BLOCK = 25  # placements scored together
-_LEAST_CANDIDATES = 20  # in a socket
+_LEAST_CANDIDATES, _ROUNDS = 20, 5  # in a socket, from so many rounds of random starts at most
 
 Progress = Callable[[str, float], None]
 
@@ -240,12 +240,17 @@ def _chosen(
             return np.ones(len(q), dtype=bool)
         return approaches(region, q, region.cones.normals[owner], retract).possible
 
-    each = max(count // len(names), 50)
-    pool = pool_at(problem, placement.points, each)
-    pool = pool.at(approachable(pool.q, pool.owner))
-    few = np.flatnonzero(np.bincount(pool.owner, minlength=len(names)) < _LEAST_CANDIDATES)
-    if len(few):
-        raise InputError(explained(region, names, placement.points, int(few[0]), _LEAST_CANDIDATES / each, retract))
+    each, pools = max(count // len(names), 50), []
+    for _ in range(_ROUNDS):
+        drawn = pool_at(problem, placement.points, each)
+        pools.append(drawn.at(approachable(drawn.q, drawn.owner)))
+        pool = Pool(*(np.concatenate(parts) for parts in zip(*pools, strict=True)))
+        few = np.flatnonzero(np.bincount(pool.owner, minlength=len(names)) < _LEAST_CANDIDATES)
+        if not len(few):
+            break
+    else:
+        share = _LEAST_CANDIDATES / (_ROUNDS * each)
+        raise InputError(explained(region, names, placement.points, int(few[0]), share, retract))
     possible = candidates_of(problem, placement, pool)
     rows = exchange(
         possible, poses, problem.objective, least=LEAST_POSES, progress=lambda done: report("Choosing poses", done)
