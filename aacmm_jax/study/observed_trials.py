@@ -39,7 +39,7 @@ class _Recorded(NamedTuple):
 def _recorded(study: Study) -> _Recorded:
     assert study.capture is not None
     arm, space, observed = to_numpy((study.nominal.arm, study.space, Observed.of(study.capture)))
-    geometry = fit_geometry(arm, observed, {}, None).geometry
+    geometry = np.asarray(fit_geometry(arm, observed, {}, None).geometry)
     truth = ObservedTruth.at(study.capture, space, space.vector(), observed.split(geometry))
     by_readings = [np.moveaxis(np.asarray(error.by_readings), -1, 0) for error in truth.errors]
     return _Recorded(truth, space, [np.linalg.pinv(matrix, rcond=1e-6) for matrix in by_readings], geometry)
