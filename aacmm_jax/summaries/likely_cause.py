@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.numpy_or_jax import to_numpy
+from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.text import shorten
 from ..core.units import DEG, INCH, UM, M
 from ..data.capture import Capture
@@ -215,7 +215,7 @@ def _measured(observation: AbstractObservation) -> Iterator[tuple[str, AbstractO
         return
     values = np.asarray(getattr(observation, name))
 
-    def changed(new: np.ndarray, field: str = name) -> Any:
+    def changed(new: AnyArray, field: str = name) -> Any:
         return eqx.tree_at(lambda o: getattr(o, field), observation, new)
 
     for cause, factor in _UNITS.items():

@@ -23,6 +23,7 @@ from aacmm_jax.files.hdf5 import write_tables
 from aacmm_jax.kinematics.independence import nearly_parallel
 from tests.refusals import assert_refused
 
+FULL = OSError(28, "No space left on device")
 LOAD = {"capture": aj.files.load_capture, "calibration": aj.files.load_calibration}
 
 
@@ -183,9 +184,14 @@ def test_unwritable_place(tmp_path, good, what, place, reason):
     assert Path("/dev/null").is_char_device()
 
 
-@pytest.mark.parametrize("existing", [True, False], ids=["over a file", "new file"])
 @pytest.mark.parametrize(
-    "error", [OSError(28, "No space left on device"), RuntimeError("HDF5"), KeyboardInterrupt()], ids=repr
+    ("error", "existing"),
+    [
+        *((error, True) for error in (FULL, RuntimeError("HDF5"), KeyboardInterrupt())),
+        (FULL, False),
+        *(pytest.param(error, False, marks=pytest.mark.slow) for error in (RuntimeError("HDF5"), KeyboardInterrupt())),
+    ],
+    ids=lambda value: {True: "over a file", False: "new file"}[value] if isinstance(value, bool) else repr(value),
 )
 @pytest.mark.parametrize(
     ("what", "step"),

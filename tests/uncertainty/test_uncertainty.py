@@ -10,6 +10,7 @@ import pytest
 from scipy import stats
 
 import aacmm_jax as aj
+from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.data.noise import tip_covariances
 from aacmm_jax.kinematics.inverse_kinematics import project_to_centroids
@@ -116,16 +117,18 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
         ]
     ) / (2 * step)
     found = aj.calibrate(paper_arm, capture, bounds, method=method, noise=noise)
+    # With arrays of NumPy, which compiles nothing; tests/core/test_numpy_or_jax.py has both libraries.
+    found, arm, space, capture, noise = to_numpy((found, paper_arm, space, capture, noise))
     stage1, noise_model = found.stage1, "common" if noise is None else "given"
     if method == "joint":
         scaled, sigma = divided_arm(stage1.arm, stage1.scale.value), stage1.after.sigma / stage1.scale.value
         measurement = Measurement.of(capture, paper_arm).weighted(scaled.geometry, noise)
         weights = JointWeights.of(scaled.position(measurement.q), measurement, sigma)
-        none = jnp.zeros(21, dtype=bool)
+        none = np.zeros(21, dtype=bool)
         whole = propagation.propagate_solve(found.arm, space, measurement, none, sigma, noise_model, noise, weights)
     else:
-        measurement = Measurement.of(capture, paper_arm).weighted(paper_arm.geometry, noise)
-        held, sigma = jnp.asarray([name == "d_3" for name in space.names]), stage1.after.sigma
+        measurement = Measurement.of(capture, paper_arm).weighted(arm.geometry, noise)
+        held, sigma = np.asarray([name == "d_3" for name in space.names]), stage1.after.sigma
         whole = propagation.propagate_solve(stage1.arm, space, measurement, held, sigma, noise_model, noise)
         whole = scale_uncertainty.propagate_division(
             whole, stage1.arm, space, measurement, sigma, found.parameters, None
