@@ -122,12 +122,12 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
     stage1, noise_model = found.stage1, "common" if noise is None else "given"
     if method == "joint":
         scaled, sigma = divided_arm(stage1.arm, stage1.scale.value), stage1.after.sigma / stage1.scale.value
-        measurement = Measurement.of(capture, paper_arm).weighted(scaled.geometry, noise)
+        measurement = Measurement.of(capture, arm).weighted(scaled.geometry, noise)
         weights = JointWeights.of(scaled.position(measurement.q), measurement, sigma)
         none = np.zeros(21, dtype=bool)
         whole = propagation.propagate_solve(found.arm, space, measurement, none, sigma, noise_model, noise, weights)
     else:
-        measurement = Measurement.of(capture, paper_arm).weighted(arm.geometry, noise)
+        measurement = Measurement.of(capture, arm).weighted(arm.geometry, noise)
         held, sigma = np.asarray([name == "d_3" for name in space.names]), stage1.after.sigma
         whole = propagation.propagate_solve(stage1.arm, space, measurement, held, sigma, noise_model, noise)
         whole = scale_uncertainty.propagate_division(
