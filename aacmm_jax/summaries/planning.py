@@ -107,7 +107,7 @@ def _motion_summary(
     clearances = [motion.clearance.min() for motion in motions if motion.clearance is not None]
     return {
         "largest_tilt_deg": float(np.degrees(tilts.max())) if len(tilts) else None,
-        "retract_mm": retract,
+        "retract_mm": retract if any(motion.approach is not None for motion in motions) else 0.0,
         "travel_deg": math.degrees(sum(motion.travel for motion in motions)),
         "unordered_travel_deg": math.degrees(sum(motion.unordered for motion in motions)),
         "collisions": None
