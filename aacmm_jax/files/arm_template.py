@@ -62,6 +62,9 @@ joint = [
 {rows}
 ]
 
+# Joints that slide along their axis instead of turning about it, by number; their limits are in length_unit.
+# prismatic = [1]
+
 # Instead of the rows, a robot's own file, beside this one:
 # urdf = "robot.urdf"
 # base = "base_link"              # its link that does not move; left out: its root
@@ -74,4 +77,24 @@ joint = [
 # length = 10.0                   # half-width of the bounds of lengths
 # angle = 1.0                     # half-width of the bounds of angles
 # override = {{ probe_z = 60.0 }}   # half-widths of single parameters
+
+# How precise the readings are, for plans; a calibration estimates it from the data.
+# [noise]
+# class = "measuring arm"         # or "robot", "hobby arm"
+# repeatability_mm = 0.05         # pose repeatability of ISO 9283; or:
+# encoder_arcsec = 2.0            # standard deviation of a reading, one number or one a joint
+# seating_mm = 0.005              # standard deviation of the tip in its seat
+# source = "data sheet"
+
+# What the maker states of the parameters: standard deviations about the nominal values, by name or group.
+# [priors]
+# sd = {{ lengths = 0.5, angles = 0.05 }}
+# mean = {{ d_3 = 750.2 }}          # instead of the nominal value
+# learn = ["theta"]               # groups whose standard deviation the data tell
+
+# What joints do besides their readings.
+# [corrections]
+# model = "gravity,harmonics=1"   # also gear, coupled=2-3; or coefficients and nominal, as a calibrated arm has them
+# gravity = [0.0, 0.0, -1.0]      # its direction in the base frame
+# mass = [...]                    # of each link, kg; with centre, [x, y, z] of each mass in its link's frame
 """

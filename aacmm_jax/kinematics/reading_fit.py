@@ -63,7 +63,7 @@ class ReadingFit:
         self._few = evidence.thinned(*_FITTED)
         names = parameter_names(arm)
         self._nominal = np.array([value_of(arm, name) for name in names], dtype=float)
-        self._indices = tuple(locate(arm.joints, name) for name in names)
+        self._indices = tuple(locate(arm, name) for name in names)
         lengths = [is_length(name) for name in names]
         self._deviations = np.where(lengths, _LENGTH * size, _TWIST)
         self._zeros = np.array([name.startswith("theta") for name in names])
