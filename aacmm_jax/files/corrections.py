@@ -108,8 +108,9 @@ def corrected_of(path: str | os.PathLike, arm: Arm, arrays: Mapping[str, np.ndar
         **{kind: arrays[f"nominal_{kind}"] for kind in (*_KINDS, "probe") if f"nominal_{kind}" in arrays}
     )
     names = [str(name) for name in arrays["coefficient"]]
-    masses = {"mass": arrays.get("mass"), "centre": arrays.get("centre")}
-    corrected = corrected_like(with_corrections(nominal, names, **masses), arm)
+    corrected = corrected_like(
+        with_corrections(nominal, names, mass=arrays.get("mass"), centre=arrays.get("centre")), arm
+    )
     return corrected.replace(coefficients=arrays["coefficients"], gravity=arrays["gravity"])
 
 
@@ -120,4 +121,5 @@ def _arrays(geometry: Geometry) -> dict[str, Float[np.ndarray, "..."]]:
 
 def _loads(arm: Arm) -> Loads | None:
     assert arm.corrections is not None
-    return next((term.loads for term in arm.corrections.functions.each if getattr(term, "loads", None)), None)
+    loads = (getattr(term, "loads", None) for term in arm.corrections.functions.each)
+    return next((found for found in loads if found is not None), None)
