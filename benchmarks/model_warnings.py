@@ -36,7 +36,15 @@ WARNINGS = {
     "scale": "k = ",
 }
 # Those that only state how a capture is made.
-STATEMENTS = ("One reference length", "Only ", "Determined only", "Hardly determined", "No measurement", "These data")
+STATEMENTS = (
+    "One reference length",
+    "Only ",
+    "Determined",
+    "Hardly determined",
+    "No measurement",
+    "These data",
+    "Joint ",
+)
 POSE_SETS = 8
 
 
@@ -95,8 +103,11 @@ class Trials:
             if visit:
                 at = at + np.repeat(rng.normal(0.0, shift, (len(readings) // visit, 3)), visit, axis=0)
             moved.append(at)
-        slopes = np.asarray(true.jacobian(q, tuple(f"q_{i + 1}" for i in range(true.joints))))
-        q = q + np.einsum("nab,nb->na", np.linalg.pinv(slopes), np.concatenate(moved))
+        target = np.asarray(true.position(q)) + np.concatenate(moved)
+        for _ in range(4):  # one step is not exact where the arm is nearly stretched
+            slopes = np.asarray(true.jacobian(q, tuple(f"q_{i + 1}" for i in range(true.joints))))
+            missed = target - np.asarray(true.position(q))
+            q = q + np.einsum("nab,nb->na", np.linalg.pinv(slopes), missed)
         if errors is not None:
             function = errors(rng, true, q)
             read = q
@@ -222,11 +233,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trials", type=int, default=200)
     parser.add_argument("--only", choices=("right", "wrong"))
+    parser.add_argument("--arm", choices=(PAPER.arm, PANDA.arm))
     parser.add_argument("--results", type=Path, default=Path(__file__).parent / "results")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     found: dict[str, Any] = {}
-    for setup in (PAPER, PANDA):
+    for setup in (setup for setup in (PAPER, PANDA) if given.arm in (None, setup.arm)):
         for lengths in (1, 2, 3, 4) if given.only != "wrong" else ():
             name = f"{setup.arm}, {lengths} lengths"
             found[name] = rates(Trials(setup, lengths), given.trials)
@@ -236,7 +248,8 @@ def main() -> None:
             found[f"{setup.arm}, {fault}"] = rates(trials, given.trials, **made)
             print(setup.arm, fault, json.dumps(found[f"{setup.arm}, {fault}"]), flush=True)
     given.results.mkdir(parents=True, exist_ok=True)
-    path = given.results / f"model-warnings-{datetime.date.today()}{'-' + given.only if given.only else ''}.json"
+    parts = "-".join(part for part in ("", given.only, given.arm) if part is not None)
+    path = given.results / f"model-warnings-{datetime.date.today()}{parts}.json"
     path.write_text(json.dumps(found, indent=1) + "\n")
 
 

@@ -109,14 +109,17 @@ def _of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> _Related | N
 
 
 def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block]) -> _Related | None:
-    if not relations:
+    lengths = [block for block in relations if not block.fixture]
+    if not lengths:
         return None
     capture, anchor = record.recording.capture, scale_anchor_of(record)
     certified = Observed.of(capture, None).certified()
     names = [*_names_of_lengths(record), *(part for part, (value, _) in certified.items() for _ in np.asarray(value))]
     own = [*(length.u for length in capture.lengths), *(u for _, of in certified.values() for u in np.asarray(of))]
     units = np.maximum(np.array(own, dtype=float), LEAST_U)
-    poses, (related,), scale = [each.block("") for each in rows], relations, None
+    # What a prior says counts as the poses do: lengths are compared with all else.
+    poses, (related,), scale = [each.block("") for each in rows], lengths, None
+    poses += [block for block in relations if block.fixture]
     measured = any(one.fixes_scale and not one.certified for one in capture.observations)
     if anchor is not None and record.hold is None and not measured:
         column = record.names.index(anchor)

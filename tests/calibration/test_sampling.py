@@ -148,7 +148,7 @@ def test_cross_validation_shows_what_the_uncertainty_misses(arm, bounds, capture
     assert f"{checked.rms / checked.rms_predicted:.1f} times the predicted {checked.rms_predicted:.3g} mm;" in found[0]
     assert f"{checked.length_rms / checked.length_u:.1f} times the predicted {checked.length_u:.3g} mm" in found[0]
     assert "Use the cross-validated values" in found[0]
-    assert any("The 3 reference lengths disagree" in sentence for sentence in found)
+    assert any("Reference lengths that disagree with the arm: the 3 err" in sentence for sentence in found)
 
 
 def left_out(rms, errors, u, poses=24, predicted=0.01) -> LeftOut:
