@@ -16,6 +16,7 @@ from .app import (
     BaseLink,
     EncoderNoise,
     Json,
+    LinearEncoderNoise,
     NominalArm,
     ReferenceLengths,
     SeatingNoise,
@@ -70,6 +71,7 @@ def plan(
         float, typer.Option(metavar="MM", help="Standard uncertainty of the reference length to position.")
     ] = 0.002,
     encoder_arcsec: EncoderNoise = 2.0,
+    linear_encoder_mm: LinearEncoderNoise = None,
     seating_mm: SeatingNoise = 0.005,
     criterion: Annotated[
         Literal["length", "A", "D", "E"],
@@ -184,7 +186,7 @@ def plan(
         "poses": poses,
         "region": dict(axes) if axes else None,
         "space": specification.space(),
-        "noise": Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm),
+        "noise": Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm),
         "criterion": criterion,
         "margin": margin_deg * DEG,
         "above": above_mm,

@@ -106,10 +106,14 @@ def _print_predictions(
         )
         table.add_row(text, *values)
     print_table(console, table)
+    slide = summary["linear_encoder_mm"]
+    linear, option = (
+        ("", "") if slide is None else (f", linear ones of {1e3 * slide:.3g} um", f"--linear-encoder-mm {slide:.3g} ")
+    )
     console.print(
-        f"For a joint calibration with encoders of {summary['encoder_arcsec']:g} arcsec and a seat of "
+        f"For a joint calibration with encoders of {summary['encoder_arcsec']:g} arcsec{linear} and a seat of "
         f"{1e3 * summary['seating_mm']:g} um (--method joint --encoder-arcsec {summary['encoder_arcsec']:g} "
-        f"--seating-mm {summary['seating_mm']:g})."
+        f"{option}--seating-mm {summary['seating_mm']:g})."
     )
     console.print(
         "Checked: joint limits, reach, and that nothing comes below the table. Not checked: obstacles, collisions of "

@@ -190,7 +190,7 @@ def _validation(record: CalibrationRecord) -> list[str]:
 
 def _scale(record: CalibrationRecord) -> list[str]:
     k = record.k
-    if record.method == REPEATABILITY:
+    if record.method == REPEATABILITY and not record.scale_set_by:
         return [
             "The scale is that of the nominal arm, and every uncertainty takes it as exact: lengths are wrong by as "
             "much as it is." + (f" By the reference lengths, k = {k:.6f}." if math.isfinite(k) else "")
@@ -283,7 +283,7 @@ def _data(record: CalibrationRecord) -> list[str]:
             "poses predict (Birge ratio), and u(k) has been multiplied by it. Look for a wrong length, or for errors "
             "outside the D-H model."
         )
-    if len(capture.lengths) == 1 and record.method != REPEATABILITY:
+    if len(capture.lengths) == 1 and record.method != REPEATABILITY and not record.scale_set_by:
         found.append("One reference length fixes the scale, so its own error is no check; keep another for checking.")
     return found
 

@@ -198,7 +198,7 @@ REFUSED = {
     "exchanged": (None, {"base": "tool0", "tip": "world"}, ["comes after", "exchange base and tip"]),
     "same": (None, {"base": "tool0"}, ["same link"]),
     "nothing moves": (None, {"tip": "base_link"}, ["no joint moves between 'world' and 'base_link'"]),
-    "endless slide": (joint("finger_1", limit=""), {"tip": "left_finger"}, ["'finger_1' is prismatic and has no limits"]),
+    "endless": (joint("finger_1", limit=""), {"tip": "left_finger"}, ["'finger_1' is prismatic and has no limits"]),
     "reversed slide": (
         joint("finger_1", limit='<limit lower="0.04" upper="0"/>'), {"tip": "left_finger"}, ["limits 0.04 and 0 m;"]
     ),
