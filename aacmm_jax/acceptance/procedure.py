@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import InputError
-from ..core.units import ARCSEC
 from ..data.capture import Capture, ReferenceLength
+from ..data.noise import Noise
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest
 from ..kinematics.arm import Arm, is_single
@@ -113,6 +113,7 @@ def simulate_procedure(
     *,
     encoder_arcsec: float = 0.0,
     seating: float = 0.0,
+    linear_encoder: float | None = None,
     u_length: float = 0.0,
     u_diameter: float = 0.0,
     seed: int = 0,
@@ -125,6 +126,7 @@ def simulate_procedure(
         true: The arm that takes the poses; they are projected to the artefacts by this arm.
         encoder_arcsec: Standard deviation of a joint reading, arcsec.
         seating: Standard deviation of each coordinate of the tip in its socket, mm.
+        linear_encoder: Standard deviation of the reading of a prismatic joint, mm; by default as of `Noise`.
         u_length: Standard uncertainty stated for the bars, and standard deviation of their true error, mm.
         u_diameter: The same of the sphere's diameter, mm.
         seed: Seed of the noise.
@@ -139,6 +141,8 @@ def simulate_procedure(
     for what, value in noise.items():
         if not (math.isfinite(value) and value >= 0):
             raise InputError(f"{what} is {value:g}; noise must be zero or positive.")
+    encoders = Noise(encoder_arcsec=encoder_arcsec, linear_encoder=linear_encoder)
+    read = np.asarray(encoders.of_readings(true.arm.geometry.kinds))
     random = np.random.default_rng(seed)
 
     def readings(item: ProcedureItem, seating: float) -> Float[np.ndarray, "m n"]:
@@ -148,7 +152,7 @@ def simulate_procedure(
             raise InputError(
                 f"{item.test} '{item.name}': the true arm does not reach it; let it differ less from the nominal one."
             )
-        return q + encoder_arcsec * ARCSEC * random.normal(size=q.shape)
+        return q + read * random.normal(size=q.shape)
 
     sockets = {item.name: readings(item, seating) for item in procedure.sockets}
     bars: dict[float, float] = {}  # every position of a bar has the same error

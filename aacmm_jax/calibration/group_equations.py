@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.numpy_or_jax import to_numpy
-from ..kinematics.arm import is_length, value_of
+from ..kinematics.arm import by_joint, is_length, value_of
 from ..kinematics.parameters import Parameters
 from ..model.measurement import Measurement
 from ..model.observed import Linear, Observed, certified_and_lengths, linear_rows, whitened, whitening_of
@@ -67,7 +67,8 @@ class Equations(NamedTuple):
 
 def equations_of(record: CalibrationRecord) -> Equations:
     """The equations of a calibration, linear at its solution; as weighted by its robust loss."""
-    extra = (*(f"theta_{i + 1}" for i in range(record.calibrated.arm.joints)), *PROBE)
+    kinds = by_joint(record.calibrated.arm, "theta", "d")  # where a reading is added
+    extra = (*(f"{kind}_{i}" for i, kind in enumerate(kinds, start=1)), *PROBE)
     steps = np.array([1.0 if is_length(name) else 1e-3 for name in extra])
     if record.observed is None:
         return Equations(_of_sockets(record, extra), [], extra, steps)

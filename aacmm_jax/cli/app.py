@@ -63,6 +63,16 @@ EncoderNoise = Annotated[
     float, typer.Option("--encoder-arcsec", min=0, metavar="ARCSEC", help="Standard deviation of a joint reading.")
 ]
 
+LinearEncoderNoise = Annotated[
+    float | None,
+    typer.Option(
+        "--linear-encoder-mm",
+        min=0,
+        metavar="MM",
+        help="The same of prismatic joints. Default: what the other encoders are at a distance of 1 m.",
+    ),
+]
+
 SeatingNoise = Annotated[
     float,
     typer.Option(

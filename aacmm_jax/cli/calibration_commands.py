@@ -12,7 +12,7 @@ from ..core.text import number
 from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import reading, together
-from .app import Json, Only, Without, app, examples, show_summary, with_spinner
+from .app import Json, LinearEncoderNoise, Only, Without, app, examples, show_summary, with_spinner
 
 
 @app.command(
@@ -112,6 +112,7 @@ def calibrate(
             help="Known standard deviation of a joint reading, for the weights. Default: estimated.",
         ),
     ] = None,
+    linear_encoder_mm: LinearEncoderNoise = None,
     seating_mm: Annotated[
         float | None,
         typer.Option(
@@ -195,7 +196,7 @@ def calibrate(
         recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
         solving = {
             "hold": None if hold == "none" else hold,
-            "noise": _noise(encoder_arcsec, seating_mm),
+            "noise": _noise(encoder_arcsec, seating_mm, linear_encoder_mm),
             "prior": _prior(recording.nominal, prior),
         }
         with warnings.catch_warnings():
@@ -350,16 +351,16 @@ def _prior(nominal: Any, text: str | None) -> Any:
     return prior_of_text(text, nominal.arm)
 
 
-def _noise(encoder_arcsec: float | None, seating_mm: float | None) -> Any:
-    """The noise that is known: both of its parts, or None."""
+def _noise(encoder_arcsec: float | None, seating_mm: float | None, linear_encoder_mm: float | None) -> Any:
+    """The noise that is known: encoders and seat, or None."""
     from ..data.noise import Noise
 
-    if encoder_arcsec is None and seating_mm is None:
+    if encoder_arcsec is None and seating_mm is None and linear_encoder_mm is None:
         return None
     if encoder_arcsec is None or seating_mm is None:
         missing = "--seating-mm" if seating_mm is None else "--encoder-arcsec"
         raise InputError(f"{missing} is missing: give both standard deviations, or neither to have both estimated.")
-    return Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm)
+    return Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm)
 
 
 def _names(text: str) -> tuple[str, ...]:

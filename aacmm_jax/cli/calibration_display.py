@@ -8,7 +8,7 @@ from rich.markup import escape
 
 from ..core.text import pluralise, shorten
 from ..core.units import ARCSEC, DEG, people_read
-from ..summaries.tables import METRICS, expanded_words, observed_words, quantity_words, volume_rows
+from ..summaries.tables import METRICS, encoders_in_words, expanded_words, observed_words, quantity_words, volume_rows
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
 _MOST_PARTS = 12  # rows of a table
@@ -269,10 +269,8 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
     console.print(
         "Propagated from u of the parameters to 400 positions that random poses within the joint limits reach."
     )
-    encoder = found["encoder_arcsec"]
-    readings = ", ".join(f"{x:.3g}" for x in encoder) if isinstance(encoder, list) else f"{encoder:.3g}"
     seat = "seat" if summary["sockets_used"] else "tip, each coordinate,"
-    noise = f"encoders {readings} arcsec, {seat} {1e3 * found['seating_mm']:.3g} um"
+    noise = f"{encoders_in_words(found)}, {seat} {1e3 * found['seating_mm']:.3g} um"
     source = {
         "given": f"Noise as given: {noise}; residuals are {found['misfit'] or 0:.2f} times what it predicts.",
         "estimated": f"Noise estimated from the residuals: {noise} (their sum is better known than each).",

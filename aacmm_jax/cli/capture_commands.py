@@ -16,6 +16,7 @@ from .app import (
     CaptureOutput,
     EncoderNoise,
     Json,
+    LinearEncoderNoise,
     NominalArm,
     ReferenceLengths,
     SeatingNoise,
@@ -74,6 +75,10 @@ def simulate(
     resolution_arcsec: Annotated[
         float, typer.Option(min=0, metavar="ARCSEC", help="Resolution of a joint reading.")
     ] = 0.0,
+    linear_encoder_mm: LinearEncoderNoise = None,
+    linear_resolution_mm: Annotated[
+        float, typer.Option(min=0, metavar="MM", help="Resolution of the readings of prismatic joints.")
+    ] = 0.0,
     seating_mm: SeatingNoise = 0.0,
     true_arm: Annotated[
         str | None,
@@ -98,6 +103,7 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Make a capture with a simulated arm."""
+    from ..data.noise import Noise
     from ..data.recording import Recording
     from ..data.simulation import simulate as run
     from ..files.arms import load_specification
@@ -120,12 +126,12 @@ def simulate(
             drawn = perturbed_arm(space, length=deviate_length_mm, angle=deviate_angle_deg * DEG, seed=seed)
             true = true._replace(arm=drawn, name=f"{true.name}, deviated")
         if acceptance is not None:
-            if socket or poses or length or resolution_arcsec:
+            if socket or poses or length or resolution_arcsec or linear_resolution_mm:
                 raise InputError(
-                    "--acceptance brings its own sockets, poses and lengths; leave out --socket, --poses, --length and "
-                    "--resolution-arcsec."
+                    "--acceptance brings its own sockets, poses and lengths; leave out --socket, --poses, --length, "
+                    "--resolution-arcsec and --linear-resolution-mm."
                 )
-            noise = {"encoder_arcsec": encoder_arcsec, "seating": seating_mm}
+            noise = {"encoder_arcsec": encoder_arcsec, "seating": seating_mm, "linear_encoder": linear_encoder_mm}
             noise |= {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
 
             def taken() -> Recording:
@@ -145,9 +151,9 @@ def simulate(
                     points,
                     poses=_poses_option(poses or ["70"], points),
                     lengths=[length_option(text) for text in length or ()],
-                    encoder_arcsec=encoder_arcsec,
+                    noise=Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm),
                     resolution_arcsec=resolution_arcsec,
-                    seating=seating_mm,
+                    linear_resolution=linear_resolution_mm,
                     seed=seed,
                 ),
             )

@@ -15,6 +15,7 @@ from ..files.outputs import together
 from .app import (
     BaseLink,
     Json,
+    LinearEncoderNoise,
     NominalArm,
     ReferenceLengths,
     TipLink,
@@ -82,6 +83,7 @@ def plan(
         float, typer.Option(metavar="MM", help="Standard uncertainty of the reference length to position.")
     ] = 0.002,
     encoder_arcsec: PlanEncoderNoise = None,
+    linear_encoder_mm: LinearEncoderNoise = None,
     seating_mm: PlanSeatingNoise = None,
     cone_deg: ConeAngles = None,
     normal: Normals = None,
@@ -230,8 +232,8 @@ def plan(
     names = list(points) or [chr(ord("A") + i) for i in range(4 if sockets is None else min(sockets, 26))]
     with together(output, manifest):
         assumed = planned_arm(
-            arm, {"base": base, "tip": tip}, (encoder_arcsec, seating_mm), (cone_deg, normal), tool_axis, retract_mm,
-            (cell, collisions, link_radius_mm), names,
+            arm, {"base": base, "tip": tip}, (encoder_arcsec, seating_mm, linear_encoder_mm), (cone_deg, normal),
+            tool_axis, retract_mm, (cell, collisions, link_radius_mm), names,
         )  # fmt: skip
     shared |= assumed.options
     stated = {"noise_source": assumed.noise_source, "notes": list(assumed.notes), "angles": angles}

@@ -125,9 +125,13 @@ def _print_noise(console: Console, summary: dict[str, Any]) -> None:
     encoders, seat = summary["encoder_arcsec"], summary["seating_mm"]
     each = isinstance(encoders, list)
     text = ", ".join(f"{value:.3g}" for value in encoders) if each else f"{encoders:.3g}"
-    options = "" if each else f" (--method joint --encoder-arcsec {encoders:.3g} --seating-mm {seat:g})"
+    slide = summary["linear_encoder_mm"]
+    linear, option = ("", "")
+    if slide is not None:
+        linear, option = f", linear ones of {1e3 * slide:.3g} um", f"--linear-encoder-mm {slide:.3g} "
+    options = "" if each else f" (--method joint --encoder-arcsec {encoders:.3g} {option}--seating-mm {seat:g})"
     console.print(
-        f"For a joint calibration with encoders of {text} arcsec and a seat of {1e3 * seat:g} um{options}; "
+        f"For a joint calibration with encoders of {text} arcsec{linear} and a seat of {1e3 * seat:g} um{options}; "
         f"{escape(summary['noise_source'])}."
     )
 

@@ -104,7 +104,7 @@ class PlannedArm(NamedTuple):
 def planned_arm(
     arm: str,
     links: Mapping[str, str | None],
-    noise: tuple[float | None, float | None],
+    noise: tuple[float | None, float | None, float | None],
     cones: tuple[Sequence[str] | None, Sequence[str] | None],
     tool_axis: str,
     retract: float | None,
@@ -113,8 +113,9 @@ def planned_arm(
 ) -> PlannedArm:
     """The options as `planning.plan` takes them; what is not given follows from the class of the arm.
 
-    ``links``: base and tip of a URDF. ``noise``: arcsec and mm. ``cones``: texts of --cone-deg and --normal. ``cell``:
-    its file, whether collisions are checked, and the radius of the links. ``sockets``: names that may be named.
+    ``links``: base and tip of a URDF. ``noise``: arcsec, mm and, of prismatic joints, mm. ``cones``: texts of
+    --cone-deg and --normal. ``cell``: its file, whether collisions are checked, and the radius of the links.
+    ``sockets``: names that may be named.
     """
     from ..data.arm_classes import CLASSES
     from ..data.noise import Noise
@@ -123,10 +124,11 @@ def planned_arm(
 
     assumed = load_noise(arm, **links)
     default = CLASSES[assumed.arm_class]
-    encoder, seating = noise
+    encoder, seating, linear = noise
     found = Noise(
         encoder_arcsec=assumed.noise.encoder_arcsec if encoder is None else encoder,
         seating=assumed.noise.seating if seating is None else seating,
+        linear_encoder=assumed.noise.linear_encoder if linear is None else linear,
     )
     file, wanted, radius = cell
     loaded = load_cell(arm, file, **links, radius=radius) if wanted or file is not None or radius is not None else None

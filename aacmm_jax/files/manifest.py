@@ -1,7 +1,6 @@
 """The manifest of a capture (TOML): which text files hold which socket or observation, in which unit; the lengths."""
 
 import datetime
-import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -22,16 +21,15 @@ from pydantic import (
 
 from ..acceptance.standards import Standard
 from ..core.errors import InputError
-from ..core.units import ARCSEC, DEG
 from ..data.capture import Capture, ReferenceLength, check_readings
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.socket import Socket
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
-from ..kinematics.arm import Arm, by_joint
 from .arms import arm_beside, read_arm, with_parameters
 from .inputs import InputFile, fingerprint
-from .manifest_observations import FIELDS, LENGTHS, TABLES, Source, observations
+from .manifest_angles import Angles, angles_of, in_rad
+from .manifest_observations import FIELDS, TABLES, Source, observations
 from .manifest_sessions import in_sessions, session_name
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
@@ -39,25 +37,6 @@ from .text_table import read_numbers
 from .toml import Strict, each_once, read_toml
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-_UNITS = {"rad": 1.0, "deg": DEG, "arcsec": ARCSEC}
-
-
-class _Angles(Strict):
-    unit: Literal["rad", "deg", "arcsec", "counts"]
-    counts_per_turn: _Positive | Annotated[list[_Positive], Field(min_length=1)] | None = None
-    sign: Literal[1, -1] | list[Literal[1, -1]] = 1
-    offset: FiniteFloat | list[FiniteFloat] = 0.0
-    columns: Annotated[list[PositiveInt], AfterValidator(each_once)] | None = None
-    linear_unit: Literal["mm", "m", "um", "inch", "counts"] = "mm"  # of prismatic joints
-    counts_per_mm: _Positive | Annotated[list[_Positive], Field(min_length=1)] | None = None
-
-    @model_validator(mode="after")
-    def _counts(self) -> "_Angles":
-        if (self.unit == "counts") != (self.counts_per_turn is not None):
-            raise ValueError("give counts_per_turn with unit = 'counts', and only with it.")
-        if (self.linear_unit == "counts") != (self.counts_per_mm is not None):
-            raise ValueError("give counts_per_mm with linear_unit = 'counts', and only with it.")
-        return self
 
 
 class _Files(Strict):
@@ -148,7 +127,7 @@ class _Poses(_Recorded):
     tip: str | None = None
     probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None  # mm, from the tip link
     acceptance: Standard | Annotated[list[Standard], AfterValidator(each_once)] = Field(default_factory=list)
-    angles: _Angles | None = None
+    angles: Angles | None = None
     sessions: _Sessions | None = None
 
 
@@ -236,17 +215,17 @@ def read_manifest(path: str | os.PathLike) -> Recording:
                     f"{file} has {table.shape[1]} columns, but the arm has {joints} joints; give one column a joint, "
                     "or pick them with columns = [...] in [angles]."
                 )
-            return _readings(table, _angles_of(model.angles), nominal.arm)
+            return in_rad(table, angles_of(model.angles), nominal.arm)
 
         sockets, lengths, spheres = recorded(path.parent, model, angles)
 
         def radians(readings: np.ndarray, unit: str | None, preset: str | None, header: str | None) -> np.ndarray:
-            stated = _angles_of(model.angles, unit, header or preset)
+            stated = angles_of(model.angles, unit, header or preset)
             if header is not None and stated.unit != header:
                 raise InputError(
                     f"the header of the readings says {header}, but the manifest {stated.unit}; correct one of them."
                 )
-            return _readings(readings, stated, nominal.arm)
+            return in_rad(readings, stated, nominal.arm)
 
         source = Source(path.parent, opened, nominal.arm, columns, radians)
         sessions = _sessions_of(path.parent, model)
@@ -274,24 +253,6 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-
-
-def _angles_of(angles: _Angles | None, unit: str | None = None, preset: str | None = None) -> _Angles:
-    """How readings are written: what a table states comes first, then [angles], then the table's preset."""
-    unit = unit if unit is not None or angles is not None else preset
-    if unit is None and angles is None:
-        raise InputError(
-            "'angles' is missing, so that the unit of the readings is not known; add [angles] with unit = \"deg\" or "
-            '"rad", or state it in the header of the table, as J1 [deg].'
-        )
-    if unit is None:
-        assert angles is not None
-        return angles
-    if unit not in _UNITS:
-        raise InputError(f"units.q is '{unit}'; it must be one of {', '.join(_UNITS)}.")
-    same = ("sign", "offset", "linear_unit", "counts_per_mm")
-    stated = {} if angles is None else {what: getattr(angles, what) for what in same}
-    return _Angles(unit=unit, **stated)  # pyright: ignore[reportArgumentType]
 
 
 def _sockets_of_targets(folder: Path, model: _Poses, sockets: dict[str, np.ndarray]) -> Iterator[Socket]:
@@ -338,28 +299,6 @@ def recorded(
         sphere = ProbedSphere(entry.name, entry.test, groups, entry.diameter, entry.u, entry.stylus, entry.form)
         spheres.append(checked_sphere(sphere))
     return sockets, _lengths(model.length, fields, sockets), tuple(spheres)
-
-
-def _readings(readings: np.ndarray, angles: _Angles, arm: Arm) -> np.ndarray:
-    """Readings in rad, and in mm of prismatic joints."""
-    joints = readings.shape[1]
-
-    def a_joint(value: float | list, what: str) -> np.ndarray:
-        array = np.asarray(value, dtype=float)
-        if array.ndim and array.shape != (joints,):
-            raise InputError(
-                f"angles.{what} has {array.size} values, but there are {joints} joints; give one, or one a joint."
-            )
-        return array
-
-    unit = (
-        2 * math.pi / a_joint(angles.counts_per_turn, "counts_per_turn")
-        if angles.counts_per_turn
-        else _UNITS[angles.unit]
-    )
-    linear = 1 / a_joint(angles.counts_per_mm, "counts_per_mm") if angles.counts_per_mm else LENGTHS[angles.linear_unit]
-    units = np.where(by_joint(arm, False, True), linear, unit)
-    return a_joint(angles.sign, "sign") * (readings - a_joint(angles.offset, "offset")) * units
 
 
 def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:

@@ -81,7 +81,8 @@ def check_calibration(path: str | os.PathLike, stored: Stored) -> None:
     # Observations, or a single stage, need no reference length.
     scaled = "observed" not in stored.tables and attributes["method"] != "repeatability"
     finite = all(np.all(np.isfinite(x)) for x in ((k, u_k, covariance) if scaled else (covariance,)))
-    noise = np.append(attributes.get("encoder_arcsec", 0.0), attributes.get("seating_mm", 0.0))
+    stated = ("encoder_arcsec", "linear_encoder_mm", "seating_mm")
+    noise = np.concatenate([np.atleast_1d(attributes.get(what, 0.0)) for what in stated])
     sampled = stored.tables.get("monte_carlo")
     check_sense(
         path,

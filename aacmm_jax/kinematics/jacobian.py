@@ -4,7 +4,7 @@ Rotating the chain by a small angle about a unit axis ``u`` through a point ``o`
 sliding it along ``u`` moves the tip by ``u``. So each Jacobian column follows from one axis of the forward pass.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -105,7 +105,9 @@ def _correction_column(forward: ForwardPass, kind: str, i: int) -> Float[AnyArra
     return column
 
 
-def readings_gradient(forward: ForwardPass, cotangents: dict[str, Float[AnyArray, "k 3 N"]]) -> Float[AnyArray, "n N"]:
+def readings_gradient(
+    forward: ForwardPass, cotangents: Mapping[str, Float[AnyArray, "k 3 N"]]
+) -> Float[AnyArray, "n N"]:
     """Derivative by the joint readings of a function of the Jacobian columns; ``cotangents`` are its derivatives by
     them, by kind.
 

@@ -43,8 +43,8 @@ class Measurement(eqx.Module):
         """
         check_one_capture(capture)
         check_sockets_only(capture, "this function")
-        check_readings(capture, arm)
         capture = to_numpy(capture)
+        check_readings(capture, arm)
         xp = namespace(capture)
         return cls(
             q=capture.q,

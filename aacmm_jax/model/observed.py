@@ -44,9 +44,9 @@ class Observed(eqx.Module):
         Raises `InputError` for a batch of captures.
         """
         check_one_capture(capture)
+        capture = to_numpy(capture)
         if arm is not None:
             check_readings(capture, arm)
-        capture = to_numpy(capture)
         xp = namespace(capture)
         sockets = tuple(Socket(name, readings) for name, readings in capture.sockets.items())
         observations = to_numpy((*sockets, *capture.observations))

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.numpy_or_jax import to_numpy
-from ..kinematics.arm import locate
+from ..kinematics.arm import by_joint, locate
 from ..kinematics.chain import ForwardPass, forward_pass, joint_motion, reading_units
 from ..kinematics.jacobian import reading_columns, readings_gradient
 from ..kinematics.workspace import reached
@@ -141,7 +141,9 @@ def value_and_gradient(
     forward = _forward(problem, q)
     readings = np.asarray(reading_columns(forward))
     encoder = np.broadcast_to(np.asarray(problem.noise.of_readings(forward.kinds)), readings.shape[:1])
-    cotangents = {"theta": 2 * np.einsum("ncd,kdn->kcn", by_covariance, readings) * encoder[:, None, None] ** 2}
+    of_readings = 2 * np.einsum("ncd,kdn->kcn", by_covariance, readings) * encoder[:, None, None] ** 2
+    slides = np.array(by_joint(problem.arm, False, True))[:, None, None]
+    cotangents = {"theta": np.where(slides, 0.0, of_readings), "d": np.where(slides, of_readings, 0.0)}
     for index, (name, scale) in enumerate(zip(problem.space.names, np.asarray(problem.space.scale), strict=True)):
         kind, i = locate(problem.arm, name)
         cotangents.setdefault(kind, np.zeros((3 if kind == "probe" else len(readings), *readings.shape[1:])))

@@ -8,7 +8,7 @@ import numpy as np
 from ..calibration.record import CalibrationRecord
 from ..core.units import people_read
 from ..kinematics.arm import parameter_unit
-from ..summaries.tables import volume_rows
+from ..summaries.tables import encoders_in_words, volume_rows
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
@@ -81,9 +81,8 @@ def _volume_chart(volume: VolumetricUncertainty, factor: float, length: str) -> 
 
 
 def _noise_sentence(found: dict[str, Any]) -> str:
-    arcsec, seating = found["encoder_arcsec"], 1e3 * found["seating_mm"]
-    encoders = ", ".join(f"{x:.3g}" for x in arcsec) if isinstance(arcsec, list) else f"{arcsec:.3g}"
-    noise = f"encoders {encoders} arcsec, seat {seating:.3g} µm"
+    seating = 1e3 * found["seating_mm"]
+    noise = f"{encoders_in_words(found)}, seat {seating:.3g} µm"
     basis = "All uncertainties are based on"
     return {
         "given": f"{basis} the given noise: {noise}. Residuals are {found['misfit'] or 0:.2f} times its prediction.",

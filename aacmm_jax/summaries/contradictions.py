@@ -73,7 +73,9 @@ def _as_if(cause: Cause | None, group: str = "it") -> str:
         return ""
     if cause.names == PROBE:
         return f"In {group}, the probe seems to be elsewhere by {_offset(cause)}. "
-    joint = cause.names[0].removeprefix("theta_")
+    kind, joint = cause.names[0].split("_")
+    if kind == "d":
+        return f"In {group}, joint {joint} seems to read {-cause.values[0]:+.3g} mm more. "
     return f"In {group}, joint {joint} seems to read {-cause.values[0] / DEG:+.3g} deg more. "
 
 

@@ -18,7 +18,7 @@ from ..core.units import DEG, INCH, UM, M
 from ..data.capture import Capture
 from ..data.observations.measured_transforms import MeasuredTransforms
 from ..data.observations.observation import AbstractObservation
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, by_joint
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import total_link_length
 from ..model.observed import Observed, linear_rows
@@ -85,7 +85,7 @@ class _OfSockets(NamedTuple):
         return _Tried("", np.asarray(self.capture.q))
 
     def corrections(self) -> Iterator[_Tried]:
-        return _readings(np.asarray(self.capture.q))
+        return _readings(np.asarray(self.capture.q), self.arm)
 
     def rms(self, tried: _Tried) -> float:
         """RMS distance of the tips from the centroid of their socket, mm."""
@@ -113,7 +113,7 @@ class _OfObservations(NamedTuple):
 
     def corrections(self) -> Iterator[_Tried]:
         q, observations = np.asarray(self.observed.q), self.observed.observations
-        yield from _readings(q)
+        yield from _readings(q, self.arm)
         concerned = [i for i, one in enumerate(observations) if _measured_field(one) is not None]
         alike: dict[tuple[str, str], list[int]] = {}
         for i in concerned:
@@ -176,7 +176,7 @@ def _roots(shape: tuple[int, ...], lever: float) -> Float[np.ndarray, "m r r"]:
     return np.broadcast_to(np.diag([1.0] * min(rows, 3) + [lever] * (rows - 3)), (poses, rows, rows))
 
 
-def _readings(q: Float[np.ndarray, "M n"]) -> Iterator[_Tried]:
+def _readings(q: Float[np.ndarray, "M n"], arm: Arm) -> Iterator[_Tried]:
     joints = range(q.shape[1])
     for several in (1, 2):
         for chosen in itertools.combinations(joints, several):
@@ -191,12 +191,15 @@ def _readings(q: Float[np.ndarray, "M n"]) -> Iterator[_Tried]:
     yield _Tried("the columns are in reverse order", q[:, ::-1])
     yield _Tried("the columns begin with that of the last joint", np.roll(q, -1, axis=1))
     yield _Tried("the columns end with that of the first joint", np.roll(q, 1, axis=1))
-    yield _Tried("readings in gon are taken for degrees", 0.9 * q)
-    largest = float(np.abs(q).max())
-    if largest < _TURN * DEG:
-        yield _Tried("readings in radians are taken for degrees", q / DEG)
+    slides = np.array(by_joint(arm, False, True))
+    yield _Tried("readings in gon are taken for degrees", np.where(slides, q, 0.9 * q))
+    largest = float(np.abs(q[:, ~slides]).max(initial=0.0))
+    if 0 < largest < _TURN * DEG:
+        yield _Tried("readings in radians are taken for degrees", np.where(slides, q, q / DEG))
     if largest > _TURN:  # otherwise every tip would come near every other
-        yield _Tried("readings in degrees are taken for radians", q * DEG)
+        yield _Tried("readings in degrees are taken for radians", np.where(slides, q, q * DEG))
+    if slides.any():
+        yield _Tried("readings of prismatic joints in m are taken for mm", np.where(slides, 1000.0 * q, q))
 
 
 def _measured_field(observation: AbstractObservation) -> str | None:

@@ -72,10 +72,13 @@ def scale_sources(record: CalibrationRecord) -> list[str]:
     """What the scale of the calibrated arm comes from: reference lengths and observations, by their names; none where
     it is that of the nominal arm."""
     capture = record.recording.capture
-    if record.method == REPEATABILITY or record.scale_set_by:
-        return []
+    slides = [name.removeprefix("q_") for name in record.scale_set_by if name.startswith("q_")]
+    by_slides = [f"the readings of joint {', '.join(slides)}"] if slides else []
+    # Where something else sets the scale in two stages, lengths change nothing.
+    if record.method == REPEATABILITY or (record.scale_set_by and record.method == "two-stage"):
+        return by_slides
     lengths = ["the reference lengths"] if capture.lengths else []
-    return lengths + [f"{one.name} ({one.kind})" for one in capture.observations if one.fixes_scale]
+    return lengths + by_slides + [f"{one.name} ({one.kind})" for one in capture.observations if one.fixes_scale]
 
 
 def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str, Any]:

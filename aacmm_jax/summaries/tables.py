@@ -61,3 +61,13 @@ def volume_rows(volume: Mapping[str, Any], factor: float) -> list[tuple[str, lis
     }
     u = {key: [volume[f"{key}_{which}_mm"] for which in ("median", "95", "largest")] for key in titles}
     return [(title, [None if x is None else factor * x for x in u[key]]) for key, title in titles.items()]
+
+
+def encoders_in_words(found: Mapping[str, Any]) -> str:
+    """The noise of the encoders of a summary: "encoders 2 arcsec, linear encoders 5 um"."""
+
+    def listed(values: float | list[float], factor: float) -> str:
+        return ", ".join(f"{factor * x:.3g}" for x in (values if isinstance(values, list) else [values]))
+
+    words, linear = f"encoders {listed(found['encoder_arcsec'], 1.0)} arcsec", found["linear_encoder_mm"]
+    return words if linear is None else f"{words}, linear encoders {listed(linear, 1e3)} um"

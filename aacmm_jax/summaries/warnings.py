@@ -190,7 +190,7 @@ def _cause(record: CalibrationRecord) -> str:
 
 def _scale(record: CalibrationRecord) -> list[str]:
     k = record.k
-    if record.method == REPEATABILITY:
+    if record.method == REPEATABILITY and not record.scale_set_by:
         return [
             "The scale is that of the nominal arm, and every uncertainty takes it as exact: lengths are wrong by as "
             "much as it is." + (f" By the reference lengths, k = {k:.6f}." if math.isfinite(k) else "")
@@ -266,7 +266,7 @@ def _data(record: CalibrationRecord) -> list[str]:
             f"Only {surplus} more equations than unknowns, which makes the residuals small whatever the errors are; "
             "record more poses."
         )
-    if len(capture.lengths) == 1 and record.method != REPEATABILITY:
+    if len(capture.lengths) == 1 and record.method != REPEATABILITY and not record.scale_set_by:
         found.append("One reference length fixes the scale, so its own error is no check; keep another for checking.")
     return found
 

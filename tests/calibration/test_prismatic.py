@@ -128,3 +128,15 @@ def test_noise_of_linear_encoders():
     np.testing.assert_allclose(each, [aj.units.ARCSEC, 2 * aj.units.ARCSEC, 0.01, 4 * aj.units.ARCSEC])
     with pytest.raises(aj.InputError, match="linear_encoder has 2 values, but the arm has 6 joints"):
         aj.Noise(linear_encoder=[1, 2]).check(GANTRY.joints)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["SCARA", "six axes on a linear axis"])
+def test_intervals_hold_the_truth(name):
+    """As `benchmarks/prismatic.py` shows for 2,000 trials."""
+    from benchmarks.prismatic import coverage
+
+    found = coverage(name, 200, NOISE)
+    assert found["converged"] == 1
+    assert 93 < found["coverage of parameters"][1] < 97
+    assert 93 < found["coverage of lengths"][1] < 97

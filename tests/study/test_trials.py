@@ -11,6 +11,7 @@ from aacmm_jax.study import configuration_pool, trial_simulation
 from aacmm_jax.study.blocks import Block
 from aacmm_jax.study.trials import run_block
 
+from ..prismatic_arms import LINEAR_AXIS
 from .small_study import CAPTURE, DEVIATION, NOISE, REFERENCE, made
 
 AT_A_TIME = 64  # trials of one call: more are drawn by several, since another number would be compiled anew
@@ -54,6 +55,36 @@ def test_without_noise_every_true_tip_is_at_its_point(arm, deviation):
     np.testing.assert_allclose(length, 300, atol=1e-8)
     np.testing.assert_allclose(trials.value, 300, atol=1e-8)
     assert np.ptp(trials.true, axis=0).min() > 0.5 * 2 * study.cell_values.width[0].min()
+
+
+@pytest.mark.slow
+def test_true_tips_of_an_arm_on_a_linear_axis_are_at_their_points():
+    """The true arm's slide, twists and angles of the slide are others; readings stay near the limits of the arm."""
+    points = [[500, 200, 300], [-300, 500, 800]]
+    study = made(
+        arm=LINEAR_AXIS,
+        deviation=DEVIATION,
+        reference=None,
+        capture={"positions_mm": [points], "poses": 6, "pool": 4096},
+    )
+    trials = drawn(study)
+    found = tips(study, trials).reshape(64, 2, 6, 3)
+    assert np.abs(found - np.array(points)[None, :, None]).max() < 1e-8
+    low, high = np.array(LINEAR_AXIS.limits).T
+    assert np.all((trials.q > low - 10) & (trials.q < high + 10))
+    assert np.ptp(trials.q[..., 0]) > 500
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("noise", "spread"), [({"linear_encoder_mm": 0.05}, 0.05), ({"encoder_arcsec": 10.0}, 1e4 * np.pi / 648_000)]
+)
+def test_slides_have_noise_of_their_own(noise, spread):
+    """In mm, or what the other encoders have at 1 m."""
+    given = {"arm": LINEAR_AXIS, "reference": None, "deviation": None}
+    given["capture"] = {"positions_mm": [[[500, 200, 300]]], "poses": 40, "pool": 4096}
+    exact, noisy = (drawn(made(**given, noise=of)).q[..., 0] for of in (None, noise))
+    assert np.std(noisy - exact) == pytest.approx(spread, rel=0.05)
 
 
 def test_no_pose_twice_and_all_within_the_limits():
