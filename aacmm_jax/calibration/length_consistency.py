@@ -14,7 +14,7 @@ from ..model.observed import Observed
 from ..model.residuals import measured_lengths
 from ..uncertainty.group_test import Block
 from ..uncertainty.residual_tests import consistency
-from .group_equations import LEAST_U, Rows, scale_anchor_of
+from .group_equations import LEAST_U, PRIOR, Rows, scale_anchor_of
 from .record import CalibrationRecord
 
 _EXACT = 1e-6  # mm: smaller errors are rounding errors of a simulation without noise
@@ -109,6 +109,7 @@ def _of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> _Related | N
 
 
 def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block]) -> _Related | None:
+    relations = [block for block in relations if block.fixture != PRIOR]
     if not relations:
         return None
     capture, anchor = record.recording.capture, scale_anchor_of(record)

@@ -14,7 +14,7 @@ from ...core.numpy_or_jax import AnyArray, namespace
 from ..chain import ForwardPass
 from .kind import AbstractCorrection, Loads, Term
 
-_HIGHEST = 99
+HIGHEST = 99
 
 
 def orders_of(option: str) -> tuple[int, ...] | None:
@@ -40,7 +40,7 @@ class Harmonics(AbstractCorrection):
         orders = orders_of(option or "1+2")
         if orders is None:
             raise InputError(
-                f"harmonics={option} has no orders from 1 to {_HIGHEST}; write harmonics=1, harmonics=1+2 or "
+                f"harmonics={option} has no orders from 1 to {HIGHEST}; write harmonics=1, harmonics=1+2 or "
                 "harmonics=1-31."
             )
         return tuple(
@@ -51,7 +51,7 @@ class Harmonics(AbstractCorrection):
         )
 
     def wrong(self, term: Term, joints: int) -> str:
-        return "" if 1 <= term.number <= _HIGHEST else f"has no order from 1 to {_HIGHEST}"
+        return "" if 1 <= term.number <= HIGHEST else f"has no order from 1 to {HIGHEST}"
 
     def unit_of(self, term: Term) -> str:
         return "rad"

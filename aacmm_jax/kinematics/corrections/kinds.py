@@ -13,7 +13,7 @@ KINDS: tuple[AbstractCorrection, ...] = (Harmonics(), GearRatio(), Gravity(), Co
 # Short forms. An error function of each joint, whatever its cause: with a prior, 62 coefficients a joint are few enough
 # to be found in seconds from 500 poses, and orders to 63 were hardly better (`benchmarks/NOTES.md`).
 _SHORT_FORMS = {"functions": "harmonics=1-31"}
-_NAME = re.compile(r"([a-z]+)([1-9][0-9]*)?_([1-9][0-9]*)")
+COEFFICIENT = re.compile(r"([a-z]+)([1-9][0-9]*)?_([1-9][0-9]*)")
 
 
 def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
@@ -22,7 +22,7 @@ def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
     Raises:
         InputError: It is one, but not of an arm with so many joints.
     """
-    found = _NAME.fullmatch(name)
+    found = COEFFICIENT.fullmatch(name)
     kind = None if found is None else next((kind for kind in KINDS if found[1] in kind.words), None)
     if found is None or kind is None:
         return None
