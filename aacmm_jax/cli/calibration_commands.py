@@ -196,7 +196,7 @@ def calibrate(
         solving = {
             "hold": None if hold == "none" else hold,
             "noise": _noise(encoder_arcsec, seating_mm),
-            "prior": _prior(recording.nominal, prior),
+            "prior": _prior(recording.nominal, prior, model),
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", IdentifiabilityWarning)  # the summary says it
@@ -234,7 +234,8 @@ def calibrate(
             from ..calibration.sampling import monte_carlo as sample
 
             if not isinstance(result, Calibration) or not plain:
-                raise InputError("--monte-carlo is for calibrations without --robust, priors and --scale nominal.")
+                raise InputError("--monte-carlo is for calibrations without --robust, --scale nominal and priors (--model has one unless "
+                    "--prior is none).")
             sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))
             record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
         summary = calibration_summary(record)
@@ -341,8 +342,12 @@ def _bounds(
     )
 
 
-def _prior(nominal: Any, text: str | None) -> Any:
-    """The prior of the arm's file, or that which the command line states instead."""
+def _prior(nominal: Any, text: str | None, model: str | None) -> Any:
+    """The prior that the command line states; else that of the arm's file, or the default one of a model of joints."""
+    if text is None and nominal.prior is None and model is not None and nominal.arm.corrections is not None:
+        from ..kinematics.prior_scales import default_prior
+
+        return default_prior(nominal.arm)
     if text is None:
         return nominal.prior
     from ..files.priors import prior_of_text
