@@ -114,7 +114,8 @@ def compare_models(
         bounds: Box of the free Denavit-Hartenberg parameters, mm and rad; by default around those of
             `Parameters.free_of`. Coefficients of corrections are free in each model that has them.
         models: Models from simple to rich, as for `kinematics.with_corrections`; "dh" is the arm alone. The default
-            takes some ten seconds for 500 poses, most of them for "functions" (harmonics=1-31, 62 coefficients a joint).
+            takes some ten seconds for 500 poses, most of them for "functions" (harmonics=1-31, 62 coefficients a
+            joint).
         regions: What to leave out instead, each as a name or a shell pattern: ``["monday/*", "tuesday/*"]``.
         noise: Standard deviations of readings and seat, as for `calibrate`.
         mass: Mass of each link ``(n,)``, kg, as for `kinematics.with_corrections`.
@@ -157,7 +158,8 @@ def _compared(
         arm, capture, widened, method="joint", noise=noise, prior=default_prior(arm), check_identifiability=False
     )
     record = record_of(result, Recording(capture, ArmSpecification(arm)))
-    assert record.observed is not None and record.prior is not None
+    assert record.observed is not None
+    assert record.prior is not None
     poses = [len(weights) for weights in record.observed.weights]
     return ComparedModel(
         model=model,
@@ -179,6 +181,4 @@ def _with_coefficients(bounds: Bounds, arm: Arm) -> Bounds:
     base = based_on(bounds.space, arm).base
     endless = np.full(len(added), np.inf)
     sides = np.asarray(bounds.lower)[kept], np.asarray(bounds.upper)[kept]
-    return Bounds(
-        Parameters(base, names), np.concatenate([sides[0], -endless]), np.concatenate([sides[1], endless])
-    )
+    return Bounds(Parameters(base, names), np.concatenate([sides[0], -endless]), np.concatenate([sides[1], endless]))

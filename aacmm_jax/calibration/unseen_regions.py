@@ -1,7 +1,7 @@
 """How a calibration without a region of joint space predicts that region, for many regions at little cost.
 
-The calibration without it is one Gauss-Newton step away from the calibration of everything, by the normal equations less
-the region's part of them (case deletion: Cook and Weisberg 1982, section 3.6). Weights and the learned standard
+The calibration without it is one Gauss-Newton step away from the calibration of everything, by the normal equations
+less the region's part of them (case deletion: Cook and Weisberg 1982, section 3.6). Weights and the learned standard
 deviations of the prior stay: a few numbers, which one region hardly changes.
 """
 
@@ -58,7 +58,8 @@ def regions_of(capture: Capture, patterns: Iterable[str] | None = None) -> tuple
     elif len(groups := groups_of(capture)) >= _GROUPS:
         found = [Region(", ".join(group), np.isin(owner, [names.index(name) for name in group])) for group in groups]
     else:
-        found = _halves(np.concatenate([np.asarray(part) for part in _readings(capture)]))
+        sockets = [capture.q] if capture.sizes else []
+        found = _halves(np.concatenate([*sockets, *(observation.q for observation in capture.observations)]))
     whole = [region.label for region in found if region.poses.all()]
     if whole:
         raise InputError(f"nothing is left without '{whole[0]}', so nothing can be calibrated; leave out less.")
@@ -70,15 +71,13 @@ def regions_of(capture: Capture, patterns: Iterable[str] | None = None) -> tuple
     return tuple(found)
 
 
-def _readings(capture: Capture) -> list[Float[np.ndarray, "m n"]]:
-    return [*([capture.q] if capture.sizes else []), *(observation.q for observation in capture.observations)]
-
-
 def _halves(q: Float[np.ndarray, "M n"]) -> list[Region]:
     found = []
     for joint in np.flatnonzero(np.ptp(q, axis=0) > _MOVES):
         upper = q[:, joint] >= np.median(q[:, joint])
-        found += [Region(f"joint {joint + 1}, {side} half", half) for side, half in (("lower", ~upper), ("upper", upper))]
+        found += [
+            Region(f"joint {joint + 1}, {side} half", half) for side, half in (("lower", ~upper), ("upper", upper))
+        ]
     return found
 
 
@@ -108,8 +107,11 @@ def _dense(equations: Equations, parameters: int) -> _Dense:
         first += k
     relations = [np.pad(block.shared, ((0, 0), (0, size - shared))) for block in equations.relations]
     of_prior = [np.full(len(block.residual), block.fixture == PRIOR) for block in equations.relations]
+    white, residual, in_mm = (np.concatenate(part) for part in zip(*parts, strict=True))
     return _Dense(
-        *(np.concatenate(part) for part in zip(*parts, strict=True)),
+        white,
+        residual,
+        in_mm,
         np.concatenate([np.zeros((0, size)), *relations]),
         np.concatenate([np.zeros(0), *(block.residual for block in equations.relations)]),
         np.concatenate([np.zeros(0, dtype=bool), *of_prior]),

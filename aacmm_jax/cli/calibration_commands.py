@@ -195,7 +195,7 @@ def calibrate(
         recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
         solving = {
             "hold": None if hold == "none" else hold,
-            "noise": _noise(encoder_arcsec, seating_mm),
+            "noise": known_noise(encoder_arcsec, seating_mm),
             "prior": _prior(recording.nominal, prior, model),
         }
         with warnings.catch_warnings():
@@ -234,8 +234,10 @@ def calibrate(
             from ..calibration.sampling import monte_carlo as sample
 
             if not isinstance(result, Calibration) or not plain:
-                raise InputError("--monte-carlo is for calibrations without --robust, --scale nominal and priors (--model has one unless "
-                    "--prior is none).")
+                raise InputError(
+                    "--monte-carlo is for calibrations without --robust, --scale nominal and priors (--model has one "
+                    "unless --prior is none)."
+                )
             sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))
             record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
         summary = calibration_summary(record)
@@ -355,7 +357,7 @@ def _prior(nominal: Any, text: str | None, model: str | None) -> Any:
     return prior_of_text(text, nominal.arm)
 
 
-def _noise(encoder_arcsec: float | None, seating_mm: float | None) -> Any:
+def known_noise(encoder_arcsec: float | None, seating_mm: float | None) -> Any:
     """The noise that is known: both of its parts, or None."""
     from ..data.noise import Noise
 

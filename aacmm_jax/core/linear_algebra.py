@@ -72,9 +72,10 @@ def inverse_cholesky(matrix: Float[AnyArray, "*batch p p"]) -> Float[AnyArray, "
             return np.full_like(matrix, np.nan)
         return np.stack([inverse_cholesky(one) for one in matrix])
     if matrix.ndim == 2 and len(matrix) > _LARGE:
-        from scipy.linalg import lapack
+        from scipy.linalg import get_lapack_funcs
 
-        return np.tril(lapack.dtrtri(factor, lower=True)[0])
+        (inverse_of_triangle,) = get_lapack_funcs(("trtri",), (factor,))
+        return np.tril(inverse_of_triangle(factor, lower=True)[0])
     return np.tril(np.linalg.inv(factor))
 
 

@@ -11,9 +11,9 @@ from ..core.arguments import items_of, shown
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
+from .arm import Arm, is_length, natural_steps, parameter_names
 from .corrections.harmonics import Harmonics, orders_of
 from .corrections.kinds import COEFFICIENT, KINDS
-from .arm import Arm, is_length, natural_steps, parameter_names
 
 _KIND_OF_WORD = {word: kind.model for kind in KINDS for word in kind.words}
 _CORRECTIONS = frozenset(_KIND_OF_WORD.values())

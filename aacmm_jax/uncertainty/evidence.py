@@ -199,7 +199,5 @@ def learned_log_variances(
     def unfinished(state: _Search) -> AnyArray:
         return (state.count < _ROUNDS) & (state.change > _TOLERANCE)
 
-    first = _Search(
-        xp.asarray(0), start, _evidence(model, groups, start), xp.asarray(0.0), xp.asarray(np.inf)
-    )
+    first = _Search(xp.asarray(0), start, _evidence(model, groups, start), xp.asarray(0.0), xp.asarray(np.inf))
     return while_loop(unfinished, again, first).now

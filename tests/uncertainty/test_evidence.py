@@ -29,7 +29,9 @@ def learned(model, members, first=BROAD, which=True, expected=False):
     """Log variances of groups, of which all are learned unless others are named."""
     shape = (len(members),)
     flags = [np.broadcast_to(np.asarray(flag), shape) for flag in (which, expected)]
-    return learned_log_variances(model, Groups(members, np.broadcast_to(np.asarray(first, float), shape), *flags, LEAST))
+    return learned_log_variances(
+        model, Groups(members, np.broadcast_to(np.asarray(first, float), shape), *flags, LEAST)
+    )
 
 
 def random_model(seed, k=6):

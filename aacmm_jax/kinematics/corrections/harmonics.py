@@ -29,7 +29,7 @@ def orders_of(option: str) -> tuple[int, ...] | None:
 
 
 class Harmonics(AbstractCorrection):
-    """cos hq and sin hq of every joint; of orders 1 and 2 by default, or of those in the option: ``harmonics=1-3+8``."""
+    """cos hq and sin hq of every joint; of orders 1 and 2 by default, or of an option's: ``harmonics=1-3+8``."""
 
     model: ClassVar[str] = "harmonics"
     words: ClassVar[tuple[str, ...]] = ("cos", "sin")
@@ -44,10 +44,7 @@ class Harmonics(AbstractCorrection):
                 "harmonics=1-31."
             )
         return tuple(
-            Term(self, word, order, joint)
-            for joint in range(1, joints + 1)
-            for order in orders
-            for word in self.words
+            Term(self, word, order, joint) for joint in range(1, joints + 1) for order in orders for word in self.words
         )
 
     def wrong(self, term: Term, joints: int) -> str:
