@@ -16,6 +16,7 @@ from .calibration.batch import calibrate_many as calibrate_many
 from .calibration.batch import identify_many as identify_many
 from .calibration.cross_validation import cross_validate as cross_validate
 from .calibration.evaluation import evaluate as evaluate
+from .calibration.model_ladder import compare_models as compare_models
 from .calibration.record import uncertainty_of as uncertainty_of
 from .calibration.results import Calibration as Calibration
 from .calibration.results import Identification as Identification

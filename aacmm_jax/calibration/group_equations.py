@@ -15,6 +15,7 @@ from ..uncertainty.group_test import Block
 from ..uncertainty.observed_covariance import arm_errors, covariance_of_noise
 from .record import CalibrationRecord
 
+PRIOR = "prior"  # name of its rows
 PROBE = ("probe_x", "probe_y", "probe_z")
 LEAST_U = 1e-6  # mm: smallest standard deviation of a length or certified value
 
@@ -151,7 +152,7 @@ def _of_prior(record: CalibrationRecord, z: np.ndarray, steps: np.ndarray, share
     known = np.flatnonzero(weight)
     residual = weight[known] * (z[: len(steps)] - mean)[known]
     derivatives = np.eye(shared)[known] * (weight * steps)[known][:, None]
-    return [Block("prior", None, residual, derivatives, np.zeros((len(known), 0)))]
+    return [Block(PRIOR, None, residual, derivatives, np.zeros((len(known), 0)))]
 
 
 def _in_columns(part: Linear, root: np.ndarray, steps: np.ndarray):

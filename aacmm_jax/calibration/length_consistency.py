@@ -14,7 +14,7 @@ from ..model.observed import Observed
 from ..model.residuals import measured_lengths
 from ..uncertainty.group_test import Block
 from ..uncertainty.residual_tests import consistency
-from .group_equations import LEAST_U, Rows, scale_anchor_of
+from .group_equations import LEAST_U, PRIOR, Rows, scale_anchor_of
 from .record import CalibrationRecord
 
 _EXACT = 1e-6  # mm: smaller errors are rounding errors of a simulation without noise
@@ -109,7 +109,7 @@ def _of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> _Related | N
 
 
 def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block]) -> _Related | None:
-    lengths = [block for block in relations if not block.fixture]
+    lengths = [block for block in relations if block.fixture != PRIOR]
     if not lengths:
         return None
     capture, anchor = record.recording.capture, scale_anchor_of(record)
@@ -119,7 +119,7 @@ def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations:
     units = np.maximum(np.array(own, dtype=float), LEAST_U)
     # What a prior says counts as the poses do: lengths are compared with all else.
     poses, (related,), scale = [each.block("") for each in rows], lengths, None
-    poses += [block for block in relations if block.fixture]
+    poses += [block for block in relations if block.fixture == PRIOR]
     measured = any(one.fixes_scale and not one.certified for one in capture.observations)
     if anchor is not None and record.hold is None and not measured:
         column = record.names.index(anchor)

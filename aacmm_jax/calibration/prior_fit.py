@@ -21,11 +21,13 @@ from ..model.observed import PriorRows, Whitening, observed_model, observed_rows
 from ..model.robust import Loss
 from ..solver.reason import MAX_STEPS, reasons
 from ..uncertainty.evidence import (
+    Groups,
     PriorModel,
     covariance_of_log_variances,
     effective_parameters,
     eliminated,
     learned_log_variances,
+    slope_of_expectation,
 )
 from .bounded_fit import Fit, fit
 from .observed_state import ObservedTask, State, state_at, whitening_at
@@ -61,6 +63,12 @@ class PriorProblem(NamedTuple):
     def learned(self) -> np.ndarray:
         """Which groups are learned."""
         return np.array(self.prior.learned)
+
+    @property
+    def groups(self) -> Groups:
+        """The groups, with what is known of them."""
+        prior = self.prior
+        return Groups(prior.membership, self.first_scales()[1:], self.learned, np.array(prior.expected), _LEAST_LOG)
 
     def first_scales(self) -> Float[AnyArray, " s"]:
         """The scales before anything is learned; those that are given keep these values."""
@@ -112,10 +120,9 @@ class PriorProblem(NamedTuple):
     def updated(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> Float[AnyArray, " s"]:
         """The scales that the result of the least squares with these scales leads to."""
         xp, model = namespace(scales, z), self.model(scales, z)
-        # Every search begins at a broad prior, so that what it finds depends on the data alone.
-        variances = learned_log_variances(
-            model, self.prior.membership, self.first_scales()[1:], self.learned, _LEAST_LOG
-        )
+        groups = self.groups
+        # Where nothing is expected, every search begins at a broad prior, so that it depends on the data alone.
+        variances = learned_log_variances(model, groups, xp.where(groups.expected, scales[1:], groups.first))
         new = xp.concatenate([scales[:1], variances])
         sigma = self.sigma(scales, z, effective_parameters(model, self.sd(new)))
         return xp.concatenate([xp.log(xp.maximum(sigma, 1e-9))[None], variances])
@@ -123,9 +130,9 @@ class PriorProblem(NamedTuple):
     def mismatch(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> Float[AnyArray, " s"]:
         """Zero at the fixed point: the equations that `updated` solves."""
         xp, model, sd = namespace(scales, z), self.model(scales, z), self.sd(scales)
-        effective = effective_parameters(model, sd)
-        groups, first = xp.asarray(self.prior.membership), self.first_scales()
-        slope = groups @ ((model.deviation / sd) ** 2 - effective)
+        effective, groups, first = effective_parameters(model, sd), self.groups, self.first_scales()
+        slope = xp.asarray(groups.members) @ ((model.deviation / sd) ** 2 - effective)
+        slope = slope + slope_of_expectation(groups, scales[1:])
         smallest = stop_gradient(scales[1:]) <= _LEAST_LOG + 1e-9
         of_groups = xp.where(smallest, scales[1:] - _LEAST_LOG, slope)
         of_groups = xp.where(xp.asarray(self.learned), of_groups, scales[1:] - first[1:])
@@ -136,7 +143,7 @@ class PriorProblem(NamedTuple):
         """How the unknowns follow learned scales."""
         xp, index = namespace(scales, z), self.prior.index
         moving = xp.asarray(self.learned) & (scales[1:] > _LEAST_LOG + 1e-9)
-        covariance = covariance_of_log_variances(model, self.prior.membership, scales[1:], moving)
+        covariance = covariance_of_log_variances(model, self.groups, scales[1:], moving)
         pull = (model.deviation / self.sd(scales) ** 2)[:, None] * xp.asarray(self.prior.membership.T)
         return ByScales(set_at(xp.zeros((z.shape[0], pull.shape[1])), index, pull), covariance)
 

@@ -16,6 +16,7 @@ _FAMILIES = (
     "arm_command",
     "capture_commands",
     "calibration_commands",
+    "models_command",
     "result_commands",
     "correct_command",
     "study_commands",

@@ -85,7 +85,7 @@ def arm(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Look at an arm before its first calibration, or write a template for one.
+    """Look at an arm before its first calibration.
 
     Prints its axes at zero readings, its reach, which parameters are redundant and with what, what sockets, reference
     lengths and a tracker determine of it, and how many poses a first capture needs.

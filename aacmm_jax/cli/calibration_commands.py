@@ -196,8 +196,8 @@ def calibrate(
         recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
         solving = {
             "hold": None if hold == "none" else hold,
-            "noise": _noise(encoder_arcsec, seating_mm, linear_encoder_mm),
-            "prior": _prior(recording.nominal, prior),
+            "noise": known_noise(encoder_arcsec, seating_mm, linear_encoder_mm),
+            "prior": _prior(recording.nominal, prior, model),
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", IdentifiabilityWarning)  # the summary says it
@@ -235,7 +235,10 @@ def calibrate(
             from ..calibration.sampling import monte_carlo as sample
 
             if not isinstance(result, Calibration) or not plain:
-                raise InputError("--monte-carlo is for calibrations without --robust, priors and --scale nominal.")
+                raise InputError(
+                    "--monte-carlo is for calibrations without --robust, --scale nominal and priors (--model has one "
+                    "unless --prior is none)."
+                )
             sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))
             record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
         summary = calibration_summary(record)
@@ -342,8 +345,12 @@ def _bounds(
     )
 
 
-def _prior(nominal: Any, text: str | None) -> Any:
-    """The prior of the arm's file, or that which the command line states instead."""
+def _prior(nominal: Any, text: str | None, model: str | None) -> Any:
+    """The prior that the command line states; else that of the arm's file, or the default one of a model of joints."""
+    if text is None and nominal.prior is None and model is not None and nominal.arm.corrections is not None:
+        from ..kinematics.prior_scales import default_prior
+
+        return default_prior(nominal.arm)
     if text is None:
         return nominal.prior
     from ..files.priors import prior_of_text
@@ -351,7 +358,7 @@ def _prior(nominal: Any, text: str | None) -> Any:
     return prior_of_text(text, nominal.arm)
 
 
-def _noise(encoder_arcsec: float | None, seating_mm: float | None, linear_encoder_mm: float | None) -> Any:
+def known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_encoder_mm: float | None = None) -> Any:
     """The noise that is known: encoders and seat, or None."""
     from ..data.noise import Noise
 

@@ -16,11 +16,14 @@ def with_model(specification: ArmSpecification, model: str) -> ArmSpecification:
     Raises:
         InputError: The model names an unknown kind.
     """
-    loads: dict[str, Any] = {}
-    if specification.urdf is not None:
-        masses = link_masses(urdf_chain(specification.urdf))
-        if np.any(masses.mass > 0):
-            loads = {"mass": masses.mass, "centre": masses.centre}
     if not model.strip():
         raise InputError("the model is empty; name dh alone for an arm without corrections.")
-    return specification._replace(arm=with_corrections(specification.arm, model, **loads))
+    return specification._replace(arm=with_corrections(specification.arm, model, **masses_of(specification)))
+
+
+def masses_of(specification: ArmSpecification) -> dict[str, Any]:
+    """Mass and centre of mass of each link, as arguments of `with_corrections`; none where they are unknown."""
+    if specification.urdf is None:
+        return {}
+    masses = link_masses(urdf_chain(specification.urdf))
+    return {"mass": masses.mass, "centre": masses.centre} if np.any(masses.mass > 0) else {}

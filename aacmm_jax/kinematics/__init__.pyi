@@ -18,6 +18,7 @@ from .parameters import ArmSpecification as ArmSpecification
 from .parameters import Bounds as Bounds
 from .parameters import Parameters as Parameters
 from .parameters import perturbed_arm as perturbed_arm
+from .prior_scales import default_prior as default_prior
 from .priors import Prior as Prior
 from .reading_check import ReadingCheck as ReadingCheck
 from .reading_check import check_readings as check_readings

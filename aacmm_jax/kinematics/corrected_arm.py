@@ -114,4 +114,5 @@ def function_values(
     """The function of each term at N configurations, in units of its coefficient's effect (rad, or mm)."""
     rows, forward = joints_first(q, 1), forward_pass(nominal, joint_motion(nominal, q))
     values = (term.values(rows, forward)[:, 0] for term in terms)
-    return np.array([gravity @ value if len(value) == 3 else value[0] for value in values])
+    found = [gravity @ value if len(value) == 3 else value[0] for value in values]
+    return np.array(found).reshape(len(terms), len(q))

@@ -40,8 +40,10 @@ def jacobian_columns(forward: ForwardPass) -> dict[str, Float[AnyArray, "k ... 3
     xp, columns = namespace(forward.tip), {kind: _columns_of(forward, kind, slice(None)) for kind in kinds}
     columns["probe"] = xp.stack(forward.frame)
     if forward.errors is not None:
-        for kind, count in (("coefficients", len(forward.errors.functions.each)), ("gravity", 3)):
-            columns[kind] = xp.stack([_correction_column(forward, kind, i) for i in range(count)])
+        # All at once: there may be hundreds of coefficients.
+        moved = np.array([function.joint - 1 for function in forward.errors.functions.each])
+        columns["coefficients"] = forward.errors.by_coefficient * reading_columns(forward)[moved]
+        columns["gravity"] = xp.stack([_correction_column(forward, "gravity", i) for i in range(3)])
     return columns
 
 

@@ -12,7 +12,11 @@ from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from .arm import Arm, is_length, natural_steps, parameter_names
+from .corrections.harmonics import Harmonics, orders_of
+from .corrections.kinds import COEFFICIENT, KINDS
 
+_KIND_OF_WORD = {word: kind.model for kind in KINDS for word in kind.words}
+_CORRECTIONS = frozenset(_KIND_OF_WORD.values())
 _BROAD = 10.0  # standard deviation at which the search for a learned one begins, in natural steps
 LEAST_STEPS = 1e-4  # smallest learned standard deviation, in natural steps: 0.1 um, 0.02 arcsec
 
@@ -20,18 +24,23 @@ LEAST_STEPS = 1e-4  # smallest learned standard deviation, in natural steps: 0.1
 class Prior(eqx.Module):
     """Gaussian priors of parameters: a mean and a standard deviation, as a maker states a nominal value and tolerance.
 
-    A group is "all", "lengths", "angles", a kind ("alpha", "probe"), the name of a parameter ("d_3"), or a shell
-    pattern of names ("theta_*"). Of several groups that hold a parameter its name comes before a kind or pattern, these
-    before "lengths" and "angles", and "all" is last; of equals, the last given counts. Fixed parameters need no prior,
-    and are left out. Standard deviations are in mm or rad; of a group that holds lengths and angles they count in 1 mm
-    and 1 mrad.
+    A group is "all", "lengths", "angles", a kind of joint correction as a model names it ("gravity", "gear", "coupled",
+    "harmonics", or orders of these: "harmonics=2-3"), a kind ("alpha", "probe"), the name of a parameter ("d_3"), or a
+    shell pattern of names ("theta_*"). Of several groups that hold a parameter its name comes before a kind or pattern,
+    these before "harmonics" and its like, these before "lengths" and "angles", and "all" is last; of equals, the last
+    given counts. Fixed parameters need no prior, and are left out. Standard deviations are in mm or rad (of joint
+    corrections, in the unit of their coefficients); of a group that holds lengths and angles they count in 1 mm and
+    1 mrad.
 
     A *learned* standard deviation is the one for which the measurement itself is most probable (the evidence, MacKay
     1992; Bishop 2006, section 3.5), one for each group. A group in which the data support no deviation from its mean
-    gets the least, 0.1 um or 0.1 urad, with which it stays there.
+    gets the least, 0.1 um or 0.1 urad, with which it stays there. Where ``sd`` names a learned group, its standard
+    deviation is *expected* to be about that, to a factor of 4.5 (the log of the variance has the standard deviation 3):
+    this keeps groups apart of which the data hardly tell which one acts.
 
     Args:
-        sd: standard deviation by group, mm or rad, positive; infinite where nothing is known.
+        sd: standard deviation by group, mm or rad, positive; infinite where nothing is known; of a learned group, what
+            is expected.
         mean: mean by parameter or group, mm or rad; by default the nominal arm's value.
         learn: groups whose standard deviation is learned, whether or not ``sd`` names them; True for all that ``sd``
             names, or, without ``sd``, for lengths and angles.
@@ -42,7 +51,7 @@ class Prior(eqx.Module):
 
     groups: tuple[str, ...] = eqx.field(static=True)
     learned: tuple[bool, ...] = eqx.field(static=True)
-    sd: dict[str, Float[AnyArray, ""]]  # of the groups that are neither learned nor without any knowledge
+    sd: dict[str, Float[AnyArray, ""]]  # of the groups of which something is known
     mean: dict[str, Float[AnyArray, ""]]
 
     def __init__(
@@ -67,7 +76,7 @@ class Prior(eqx.Module):
         self.sd = {
             group: value
             for group, value in given.items()
-            if group not in chosen and not (is_concrete(value) and np.isposinf(np.asarray(value)))
+            if not (is_concrete(value) and np.isposinf(np.asarray(value)))
         }
         self.mean = {group: _number(value, f"the mean of {group}") for group, value in (mean or {}).items()}
         for group, value in given.items():
@@ -83,9 +92,11 @@ class Prior(eqx.Module):
     def check(self, arm: Arm) -> None:
         """Raise `InputError` for a group that holds no parameter of an arm."""
         names = possible_names(arm)
+        corrections = tuple(kind.model for kind in KINDS)
         for group in (*self.groups, *self.mean):
-            if not any(_matches(group, name) for name in names):
-                kinds = ("all", "lengths", "angles", *dict.fromkeys(name.rsplit("_", 1)[0] for name in names), *names)
+            if not any(is_of_group(group, name) for name in names):
+                stems = dict.fromkeys(name.rsplit("_", 1)[0] for name in names)
+                kinds = ("all", "lengths", "angles", *corrections, *stems, *names)
                 raise InputError(f"the prior is of '{group}', and the arm has no such parameter{nearest(group, kinds)}")
 
     def of(self, names: tuple[str, ...], nominal: Float[AnyArray, " p"]) -> "ParameterPrior | None":
@@ -109,14 +120,15 @@ class Prior(eqx.Module):
                 mean = set_at(mean, i, given.mean[means[owner]])
         for number, own in zip(used, members, strict=True):
             group = self.groups[number]
-            if not self.learned[number]:
+            if group in self.sd:
                 index = np.array(own)
                 mixed = _unit(names[i] for i in own) == MIXED
                 sd = set_at(sd, index, given.sd[group] * xp.asarray(steps[index] if mixed else np.ones(len(own))))
         groups = tuple(self.groups[number] for number in used)
         learned = tuple(self.learned[number] for number in used)
+        expected = tuple(self.learned[number] and self.groups[number] in self.sd for number in used)
         units = tuple(_unit(names[i] for i in own) for own in members)
-        return ParameterPrior(mean, sd, groups, learned, tuple(members), units)
+        return ParameterPrior(mean, sd, groups, learned, expected, tuple(members), units)
 
 
 MIXED = "mm and mrad"
@@ -129,6 +141,7 @@ class ParameterPrior(eqx.Module):
     sd: Float[AnyArray, " p"]  # that of learned groups before anything is learned; of no meaning without a prior
     groups: tuple[str, ...] = eqx.field(static=True)  # that hold free parameters
     learned: tuple[bool, ...] = eqx.field(static=True)
+    expected: tuple[bool, ...] = eqx.field(static=True)  # learned, with ``sd`` as what is expected
     members: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # of each group, indices of its parameters
     units: tuple[str, ...] = eqx.field(static=True)  # of each group's standard deviation
 
@@ -153,20 +166,41 @@ def _number(value: Numbers, what: str) -> Float[AnyArray, ""]:
     return number
 
 
-def _matches(group: str, name: str) -> bool:
+def is_of_group(group: str, name: str) -> bool:
+    """Whether a group holds a parameter."""
     if group in ("lengths", "angles"):
         return is_length(name) == (group == "lengths")
+    if group.partition("=")[0] in _CORRECTIONS:
+        return _is_correction(group, name)
     return group in ("all", name, name.rsplit("_", 1)[0]) or fnmatchcase(name, group)
+
+
+def _is_correction(group: str, name: str) -> bool:
+    """Whether a coefficient is of the kind of a group, and of its orders where it names some."""
+    kind, _, option = group.partition("=")
+    found = _correction(name)
+    if found is None or found[0] != kind:
+        return False
+    return not option or (kind == Harmonics.model and found[1] in (orders_of(option) or ()))
+
+
+def _correction(name: str) -> tuple[str, int] | None:
+    """Kind of a coefficient, as a model names it, and its number; None for every other parameter."""
+    found = COEFFICIENT.fullmatch(name)
+    kind = None if found is None else _KIND_OF_WORD.get(found[1])
+    return None if found is None or kind is None else (kind, int(found[2] or 0))
 
 
 def _owner(groups: tuple[str, ...], name: str) -> int | None:
     """Number of the group that a parameter belongs to."""
-    found = [(_closeness(group, name), i) for i, group in enumerate(groups) if _matches(group, name)]
+    found = [(_closeness(group, name), i) for i, group in enumerate(groups) if is_of_group(group, name)]
     return max(found)[1] if found else None
 
 
 def _closeness(group: str, name: str) -> int:
-    return {name: 3, "lengths": 1, "angles": 1, "all": 0}.get(group, 2)
+    if group.partition("=")[0] in _CORRECTIONS:
+        return 3 if "=" in group else 2
+    return {name: 4, "lengths": 1, "angles": 1, "all": 0}.get(group, 3)
 
 
 def possible_names(arm: Arm) -> tuple[str, ...]:
@@ -176,7 +210,7 @@ def possible_names(arm: Arm) -> tuple[str, ...]:
 
 def unit_of_group(group: str, names: Iterable[str]) -> str:
     """The unit of a group's standard deviation: "mm", "rad", or `MIXED`."""
-    return _unit(name for name in names if _matches(group, name))
+    return _unit(name for name in names if is_of_group(group, name))
 
 
 def _unit(names: Iterable[str]) -> str:

@@ -13,14 +13,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..core.linear_algebra import inverse_positive_definite, solve_positive_definite
+from ..core.linear_algebra import inverse_cholesky, inverse_positive_definite, solve_positive_definite
 from ..core.numpy_or_jax import AnyArray, namespace, while_loop
 from .covariance import inverse_information
 
 _ROUNDS = 300
 _TOLERANCE = 1e-12  # of a log variance
 _NOTHING = 1e-9  # effective parameters of a group, below which the data say nothing of it
-_FACTOR = 10.0  # largest change of a log variance in one step
+_FACTOR = 3.0  # largest change of a log variance in one step
+_EXPECTED_VARIANCE = 9.0  # of a log variance that is expected
+_LEAST_CURVATURE = 1e-9
+_DAMPING = 0.01  # of Fisher scoring, after the first step that fails
+_ROUNDING = 1e-10  # of the log evidence, relative
 
 
 class PriorModel(NamedTuple):
@@ -54,14 +58,17 @@ def eliminated(
 class _Posterior(NamedTuple):
     covariance: Float[AnyArray, "k k"]  # V
     effective: Float[AnyArray, " k"]  # gamma
+    log_determinant: Float[AnyArray, ""]  # of I + K
 
 
 def _posterior(model: PriorModel, sd: Float[AnyArray, " k"]) -> _Posterior:
     xp = namespace(model, sd)
     relative = sd[:, None] * model.information * sd[None, :]
-    covariance = inverse_positive_definite(xp.asarray(np.eye(sd.shape[0])) + relative)
+    whitening = inverse_cholesky(xp.asarray(np.eye(sd.shape[0])) + relative)
+    covariance = whitening.T @ whitening
     # Not 1 - V_ii, which loses what little the data say of a parameter with a small standard deviation.
-    return _Posterior(covariance, xp.where(model.pinned, 1.0, xp.sum(covariance * relative, axis=1)))
+    effective = xp.where(model.pinned, 1.0, xp.sum(covariance * relative, axis=1))
+    return _Posterior(covariance, effective, -2 * xp.sum(xp.log(xp.diagonal(whitening))))
 
 
 def effective_parameters(model: PriorModel, sd: Float[AnyArray, " k"]) -> Float[AnyArray, " k"]:
@@ -72,79 +79,125 @@ def effective_parameters(model: PriorModel, sd: Float[AnyArray, " k"]) -> Float[
     return _posterior(model, sd).effective
 
 
+class Groups(NamedTuple):
+    """Groups of parameters with one standard deviation each, and what is known of these."""
+
+    members: Float[np.ndarray, "g k"]  # 1 where a parameter belongs to a group
+    first: Float[AnyArray, " g"]  # log variances that are given, expected, or begun with
+    learned: np.ndarray  # whether a log variance is learned
+    expected: np.ndarray  # and expected to be about that
+    least: float  # smallest log variance of a learned group
+
+
 class _Evidence(NamedTuple):
-    """What the log evidence is made of, group by group; its derivatives by log variances are half of these."""
+    """Twice the log evidence but for a constant, and its derivatives by log variances."""
 
-    squares: Float[AnyArray, " g"]  # sum of m^2
+    value: Float[AnyArray, ""]
+    slope: Float[AnyArray, " g"]
+    second: Float[AnyArray, "g g"]
+    fisher: Float[AnyArray, "g g"]  # expectation of -second over data
     spent: Float[AnyArray, " g"]  # sum of gamma
-    second: Float[AnyArray, "g g"]  # derivatives of squares - spent
 
 
-def _evidence(model: PriorModel, members: Float[np.ndarray, "g k"], now: Float[AnyArray, " g"]) -> _Evidence:
+def _evidence(model: PriorModel, groups: Groups, now: Float[AnyArray, " g"]) -> _Evidence:
     xp = namespace(model, now)
-    groups = xp.asarray(members)
-    sd = xp.exp(0.5 * (now @ groups))
-    covariance, effective = _posterior(model, sd)
-    mean = xp.where(model.pinned, model.deviation / sd, covariance @ (sd * model.right))
-    by_group = mean[:, None] * groups.T
+    members, unit = xp.asarray(groups.members), np.eye(groups.members.shape[1])
+    logs = now @ members
+    sd = xp.exp(0.5 * logs)
+    covariance, effective, log_determinant = _posterior(model, sd)
+    scaled = xp.where(model.pinned, 0.0, sd * model.right)
+    mean = xp.where(model.pinned, model.deviation / sd, covariance @ scaled)
+    by_group = mean[:, None] * members.T
     follow = xp.where(model.pinned[:, None], -by_group, 2 * covariance @ by_group - by_group)
-    second = groups @ (mean[:, None] * follow) + groups @ covariance**2 @ groups.T
-    second = second - xp.asarray(np.eye(len(members))) * (groups @ xp.diagonal(covariance))[:, None]
-    return _Evidence(groups @ mean**2, groups @ effective, second)
+    second = members @ (mean[:, None] * follow) + members @ covariance**2 @ members.T
+    second = second - xp.asarray(np.eye(len(members))) * (members @ xp.diagonal(covariance))[:, None]
+    informed = (xp.asarray(unit) - covariance) ** 2 + xp.asarray(unit) * xp.where(model.pinned, 1.0, 0.0)[:, None]
+    spent, away = members @ effective, (now - groups.first) * groups.expected.astype(float)
+    certain = xp.asarray(np.diag(groups.expected * 2 / _EXPECTED_VARIANCE))
+    return _Evidence(
+        value=scaled @ mean
+        - log_determinant
+        - xp.sum(xp.where(model.pinned, mean**2 + logs, 0.0))
+        - xp.sum(away**2) / _EXPECTED_VARIANCE,
+        slope=members @ mean**2 - spent + slope_of_expectation(groups, now),
+        second=second - certain,
+        fisher=members @ informed @ members.T + certain,
+        spent=spent,
+    )
+
+
+def slope_of_expectation(groups: Groups, at: Float[AnyArray, " g"]) -> Float[AnyArray, " g"]:
+    """What expectations add to the derivative of twice the log evidence by log variances."""
+    return (at - groups.first) * (groups.expected * -2 / _EXPECTED_VARIANCE)
 
 
 def covariance_of_log_variances(
-    model: PriorModel, members: Float[np.ndarray, "g k"], at: Float[AnyArray, " g"], moving: Bool[AnyArray, " g"]
+    model: PriorModel, groups: Groups, at: Float[AnyArray, " g"], moving: Bool[AnyArray, " g"]
 ) -> Float[AnyArray, "g g"]:
     """Covariance of learned log variances, by the curvature of the log evidence at its maximum; 0 for the others.
 
     A log variance that the evidence hardly determines counts as one of variance 4, that of a standard deviation known
-    to a factor of e.
+    to a factor of e; an expected one as it is expected.
     """
     xp = namespace(model, at)
-    unit, both = xp.asarray(np.eye(len(members))), moving[:, None] & moving[None, :]
-    curvature = xp.where(both, 0.25 * unit - 0.5 * _evidence(model, members, at).second, unit)
+    known = xp.asarray(np.diag(np.where(groups.expected, 0.0, 0.25)))
+    unit, both = xp.asarray(np.eye(len(groups.members))), moving[:, None] & moving[None, :]
+    curvature = xp.where(both, known - 0.5 * _evidence(model, groups, at).second, unit)
     return xp.where(both, inverse_positive_definite(curvature), 0.0)
 
 
-def learned_log_variances(
-    model: PriorModel,
-    members: Float[np.ndarray, "g k"],
-    start: Float[AnyArray, " g"],
-    learned: np.ndarray,
-    least: float,
-) -> Float[AnyArray, " g"]:
-    """Log variances of groups at which the evidence is largest; those that are not learned stay as they start.
+class _Search(NamedTuple):
+    count: AnyArray
+    now: Float[AnyArray, " g"]
+    evidence: _Evidence
+    damping: AnyArray
+    change: AnyArray  # of a log variance in the last step; of Newton's its square, which is about what is left after it
 
-    MacKay's fixed point, s^2 = sum of deviation^2 / effective parameters, until Newton's steps on the log evidence are
-    short. Its second derivatives follow from dV = -V dK V.
+
+def learned_log_variances(
+    model: PriorModel, groups: Groups, start: Float[AnyArray, " g"] | None = None
+) -> Float[AnyArray, " g"]:
+    """Log variances of groups at which the evidence is largest; those that are not learned stay as they are given.
+
+    Fisher scoring, damped where the evidence would fall, until Newton's steps are short (the second derivatives follow
+    from dV = -V dK V).
 
     Args:
         model: of the parameters, in natural steps.
-        members: 1 where a parameter belongs to a group ``(g, k)``.
-        start: log variance of each group ``(g,)``.
-        learned: which groups are learned ``(g,)``.
-        least: smallest log variance of a learned group.
+        groups: of the parameters.
+        start: log variance of each group ``(g,)`` to begin with; by default ``groups.first``.
     """
+    start = groups.first if start is None else start
     xp = namespace(model, start)
-    learn, unit = xp.asarray(learned), xp.asarray(np.eye(len(learned)))
+    learn, unit = xp.asarray(groups.learned), xp.asarray(np.eye(len(groups.learned)))
+    alone = xp.asarray(~groups.expected)
 
-    def again(state: tuple) -> tuple:
-        count, now, _ = state
-        squares, spent, second = _evidence(model, members, now)
-        slope = squares - spent
+    def again(state: _Search) -> _Search:
+        count, now, evidence, damping, _ = state
         # Where the least is reached and the evidence still falls, it stays.
-        moving = learn & ~((now <= least) & (slope <= 0))
-        both = moving[:, None] & moving[None, :]
-        newton = solve_positive_definite(xp.where(both, -second, unit), xp.where(moving, slope, 0.0))
-        ratio = xp.log(xp.maximum(squares, 1e-300) / xp.maximum(spent, 1e-300))
-        fixed_point = xp.where(spent > _NOTHING, xp.clip(ratio, -_FACTOR, _FACTOR), -_FACTOR)
-        near = xp.all(xp.isfinite(newton)) & (xp.max(xp.abs(newton)) <= 1.0)
-        step = xp.where(moving, xp.where(near, newton, fixed_point), 0.0)
-        after = xp.where(learn, xp.maximum(now + step, least), now)
-        return count + 1, after, xp.max(xp.abs(after - now))
+        moving = learn & ~((now <= groups.least) & (evidence.slope <= 0))
+        both, slope = moving[:, None] & moving[None, :], xp.where(moving, evidence.slope, 0.0)
+        newton = solve_positive_definite(xp.where(both, -evidence.second, unit), slope)
+        damped = evidence.fisher + unit * (damping * xp.diagonal(evidence.fisher) + _LEAST_CURVATURE)[:, None]
+        scoring = solve_positive_definite(xp.where(both, damped, unit), slope)
+        scoring = xp.where(alone & (evidence.spent <= _NOTHING), -_FACTOR, xp.clip(scoring, -_FACTOR, _FACTOR))
+        near = xp.all(xp.isfinite(newton)) & (xp.max(xp.abs(newton)) <= 1.0) & (damping <= 0)
+        step = xp.where(moving, xp.where(near, newton, scoring), 0.0)
+        after = xp.where(learn, xp.maximum(now + step, groups.least), now)
+        new = _evidence(model, groups, after)
+        better = new.value >= evidence.value - _ROUNDING * (1 + xp.abs(evidence.value))
+        size = xp.max(xp.abs(after - now))
+        size = xp.where(near, size**2, size)
+        # A short step after which the evidence seems to fall is at its rounding.
+        change = xp.where(better | (size <= _TOLERANCE), size, np.inf)
+        eased = xp.where(damping <= _DAMPING, 0.0, 0.1 * damping)
+        damping = xp.where(better, eased, xp.maximum(10 * damping, _DAMPING))
+        now = xp.where(better, after, now)
+        evidence = _Evidence(*(xp.where(better, *pair) for pair in zip(new, evidence, strict=True)))
+        return _Search(count + 1, now, evidence, damping, change)
 
-    def unfinished(state: tuple) -> AnyArray:
-        return (state[0] < _ROUNDS) & (state[2] > _TOLERANCE)
+    def unfinished(state: _Search) -> AnyArray:
+        return (state.count < _ROUNDS) & (state.change > _TOLERANCE)
 
-    return while_loop(unfinished, again, (xp.asarray(0), start, xp.asarray(np.inf)))[1]
+    first = _Search(xp.asarray(0), start, _evidence(model, groups, start), xp.asarray(0.0), xp.asarray(np.inf))
+    return while_loop(unfinished, again, first).now

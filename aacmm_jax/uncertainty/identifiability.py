@@ -11,7 +11,7 @@ from ..core.arguments import check_finite, checked_arguments, items_of
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from ..data.capture import Capture, ReferenceLength, check_one_capture
 from ..data.noise import Noise, tip_covariances
-from ..kinematics.arm import Arm, joint_limits, neighbouring_arm, with_arrays
+from ..kinematics.arm import Arm, correction_names, joint_limits, neighbouring_arm, with_arrays
 from ..kinematics.chain import joint_motion
 from ..kinematics.independence import equations, nearly_parallel, tip_movements
 from ..kinematics.inverse_kinematics import project_to_centroids, project_to_targets
@@ -26,6 +26,7 @@ from .observed_identifiability import Agreeing
 
 _RANK = 1e-8  # singular values below this, of the largest, are zero
 _NAMED = 4
+_FOLLOWS = 1e-3  # part of a direction, above which a parameter belongs to it
 
 
 class Observability(NamedTuple):
@@ -45,7 +46,9 @@ class Observability(NamedTuple):
     remedy: str  # what else to record; empty if that would not help
     parallel: tuple[int, ...]  # joints, from 1, whose axis is nearly parallel to the next, with beta not free
     trade_offs: tuple[TradeOff, ...] = ()  # near-degenerate directions, the weakest first
-    by_prior: tuple[str, ...] = ()  # what a prior determines, and these data do not or hardly
+    # What a prior determines, and these data do not or hardly; without coefficients of joint corrections, many of which
+    # no data tell apart: that is what their prior is for.
+    by_prior: tuple[str, ...] = ()
 
     @property
     def rank(self) -> int:
@@ -164,7 +167,9 @@ def observability(
     if spectrum.agreeing is not None:
         undetermined = spectrum.agreeing.named(undetermined, null)
     weak = _trade_offs(spectrum, capture, space, sigma, bounds)
-    by_prior = named_directions(of_prior, base, space)[1]
+    functions = set(correction_names(base)) & set(known)
+    rows = [name in functions for name in space.names]
+    by_prior = named_directions(of_prior[:, ~np.any(np.abs(of_prior[rows]) > _FOLLOWS, axis=0)], base, space)[1]
     return Observability(
         names=space.names,
         poses=sum(capture.sizes) + sum(observation.q.shape[0] for observation in capture.observations),
@@ -176,7 +181,10 @@ def observability(
         remedy="" if all(always) or not null.shape[1] else _remedy(base, capture, space, p - sum(always)),
         parallel=tuple(i for i in nearly_parallel(arm) if _lacks_beta(space, i)),
         trade_offs=tuple(one for one in weak if not set(one.names) & set(known)),
-        by_prior=(*by_prior, *(one.text for one in weak if set(one.names) & set(known))),
+        by_prior=(
+            *by_prior,
+            *(one.text for one in weak if set(one.names) & set(known) and not set(one.names) & functions),
+        ),
     )
 
 

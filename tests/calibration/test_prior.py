@@ -227,7 +227,7 @@ def test_derivatives_are_exact(paper_arm, space, active):
         lengths = [aj.ReferenceLength("A", "B", value=length + longer, u=0.002)]
         bounds = aj.Bounds(space, around.lower + 0.01 * bound * step, around.upper + 0.02 * bound * step)
         means = {"d_2": float(paper_arm.d[1]) + 0.1 + mean}
-        prior = aj.Prior({"d": 0.4 + sd, "alpha": 1e-3}, mean=means, learn=["a", "theta", "probe"])
+        prior = aj.Prior({"d": 0.4 + sd, "alpha": 1e-3, "a": 0.2 + sd}, mean=means, learn=["a", "theta", "probe"])
         result = calibrate(paper_arm, aj.Capture(moved, lengths), bounds, prior=prior)
         return jnp.concatenate([result.parameters / step, result.prior.sd, result.prior.effective])
 

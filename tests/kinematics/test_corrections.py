@@ -10,6 +10,7 @@ from aacmm_jax.kinematics import parameter_names, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
 from aacmm_jax.kinematics.chain import forward_pass, joint_motion
 from aacmm_jax.kinematics.corrected_arm import function_values
+from aacmm_jax.kinematics.corrections.kinds import terms_of
 from aacmm_jax.kinematics.jacobian import rotation_columns
 
 MODEL = "gravity,harmonics,gear,coupled"
@@ -98,6 +99,12 @@ def test_functions_of_the_readings():
         np.testing.assert_allclose(corrected.position(q), arm.position(moved), atol=1e-10)
 
 
+def test_ranges_of_orders():
+    found = [term.name for term in terms_of("harmonics=2-3+1+3", 1)]
+    assert found == ["cos1_1", "sin1_1", "cos2_1", "sin2_1", "cos3_1", "sin3_1"]
+    assert terms_of("gear,functions", 2) == terms_of("gear,harmonics=1-31", 2)
+
+
 def test_the_nominal_arm_decides_the_functions(elbow):
     """A calibrated length changes no moment: what was calibrated is what is evaluated."""
     q, longer = readings(elbow), elbow.replace(d_3=400.0)
@@ -111,6 +118,9 @@ def test_the_nominal_arm_decides_the_functions(elbow):
         ("harmonic", "unknown model 'harmonic'; did you mean 'harmonics'"),
         ("gear,gear", "the model names 'gear' twice"),
         ("harmonics=0", "has no orders from 1 to 99"),
+        ("harmonics=3-1", "has no orders from 1 to 99"),
+        ("harmonics=1-100", "has no orders from 1 to 99"),
+        ("functions,harmonics=1", "the model names 'harmonics' twice"),
         ("gear=2", "gear takes no option"),
         ("coupled=2", "names no joints"),
         ("coupled=2-9", "names joint 9 of 7"),

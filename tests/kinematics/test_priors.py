@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.kinematics import default_prior, with_corrections
 
 NAMES = ("alpha_1", "alpha_2", "a_2", "d_2", "d_3", "theta_2", "probe_z")
 NOMINAL = np.array([1.0, 2.0, 20.0, 22.0, 23.0, 0.1, 30.0])
@@ -45,6 +46,38 @@ def test_learned_groups():
     prior = aj.Prior({"lengths": 0.5, "alpha": 1e-3}, learn=["alpha", "theta_*"])
     assert dict(zip(prior.groups, prior.learned, strict=True)) == {"lengths": False, "alpha": True, "theta_*": True}
     assert aj.Prior({"lengths": 0.5}, learn=True).learned == (True,)
+    found = prior.of(NAMES, NOMINAL)
+    assert dict(zip(found.groups, found.expected, strict=True)) == {"lengths": False, "alpha": True, "theta_*": False}
+
+
+CORRECTIONS = ("theta_2", "cos1_2", "sin2_2", "cos3_1", "compliance3_2", "gear_2", "coupled1_2")
+
+
+@pytest.mark.parametrize(
+    ("groups", "expected"),
+    [
+        (["gravity"], [["compliance3_2"]]),
+        (["harmonics=2-3", "harmonics"], [["sin2_2", "cos3_1"], ["cos1_2"]]),
+        (["harmonics=1+3", "gear", "angles"],
+         [["cos1_2", "cos3_1"], ["gear_2"], ["theta_2", "sin2_2", "compliance3_2", "coupled1_2"]]),
+        (["gear", "coupled", "harmonics", "sin2_2"], [["gear_2"], ["coupled1_2"], ["cos1_2", "cos3_1"], ["sin2_2"]]),
+    ],
+)  # fmt: skip
+def test_kinds_of_joint_corrections_are_groups(groups, expected):
+    found = aj.Prior(learn=groups).of(CORRECTIONS, np.zeros(len(CORRECTIONS)))
+    assert [[CORRECTIONS[i] for i in own] for own in found.members] == expected
+
+
+def test_the_default_has_the_groups_that_the_arm_has(paper_arm):
+    assert default_prior(paper_arm).groups == ("lengths", "angles")
+    prior = default_prior(with_corrections(paper_arm, "gravity,gear,harmonics=1-5"))
+    assert prior.groups == (
+        "lengths", "angles", "gravity", "gear", "harmonics=1", "harmonics=2-3", "harmonics=4-7"
+    )  # fmt: skip
+    found = prior.of(("a_2", "theta_2", "cos1_2", "cos3_2"), np.zeros(4))
+    assert all(found.learned)
+    assert all(found.expected)
+    np.testing.assert_allclose(found.sd, [1.0, 1e-3, 5e-5, 5e-5])
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 from aacmm_jax.uncertainty.evidence import (
+    Groups,
     PriorModel,
     effective_parameters,
     eliminated,
@@ -22,6 +23,15 @@ def model_of(information, right, deviation=None, pinned=None):
     deviation = np.zeros(k) if deviation is None else np.asarray(deviation, dtype=float)
     pinned = np.zeros(k, dtype=bool) if pinned is None else np.asarray(pinned)
     return PriorModel(np.asarray(information, dtype=float), np.asarray(right, dtype=float), deviation, pinned)
+
+
+def learned(model, members, first=BROAD, which=True, expected=False):
+    """Log variances of groups, of which all are learned unless others are named."""
+    shape = (len(members),)
+    flags = [np.broadcast_to(np.asarray(flag), shape) for flag in (which, expected)]
+    return learned_log_variances(
+        model, Groups(members, np.broadcast_to(np.asarray(first, float), shape), *flags, LEAST)
+    )
 
 
 def random_model(seed, k=6):
@@ -42,7 +52,7 @@ def log_evidence(model, sd):
 def test_one_parameter():
     """With information 4 and sd 0.5 the data determine half. An estimate of 2 with u = 1 has variance 2^2 - 1 left."""
     assert effective_parameters(model_of([[4.0]], [1.0]), np.array([0.5])) == pytest.approx([0.5])
-    found = learned_log_variances(model_of([[1.0]], [2.0]), np.ones((1, 1)), np.array([BROAD]), np.array([True]), LEAST)
+    found = learned(model_of([[1.0]], [2.0]), np.ones((1, 1)))
     assert np.exp(found) == pytest.approx([3.0], rel=1e-12)
 
 
@@ -50,7 +60,7 @@ def test_one_parameter():
 def test_what_the_data_do_not_support_shrinks_to_the_least(information, right):
     """An estimate of 0.9 with u = 1 is what a deviation of nothing gives."""
     model = model_of(information, right)
-    found = learned_log_variances(model, np.ones((1, 1)), np.array([BROAD]), np.array([True]), LEAST)
+    found = learned(model, np.ones((1, 1)))
     assert found == pytest.approx([LEAST])
 
 
@@ -61,13 +71,27 @@ def test_learned_scales_maximise_the_evidence(seed):
         lambda t: -log_evidence(model, np.exp(0.5 * t @ members)), np.zeros(2), method="Nelder-Mead",
         options={"xatol": 1e-9, "fatol": 1e-13},
     )  # fmt: skip
-    found = learned_log_variances(model, members, np.full(2, BROAD), np.array([True, True]), LEAST)
+    found = learned(model, members)
     np.testing.assert_allclose(found, best.x, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_expected_scales_maximise_the_evidence_with_their_prior(seed):
+    model, members, first = random_model(seed), np.repeat(np.eye(2), 3, axis=1), np.array([-4.0, 1.0])
+    best = minimize(
+        lambda t: -log_evidence(model, np.exp(0.5 * t @ members)) + np.sum((t - first) ** 2) / 18, first,
+        method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-13},
+    )  # fmt: skip
+    np.testing.assert_allclose(learned(model, members, first, expected=True), best.x, atol=1e-6)
+
+
+def test_what_nothing_is_seen_of_stays_as_expected():
+    assert learned(model_of([[0.0]], [0.0]), np.ones((1, 1)), -3.0, expected=True) == pytest.approx([-3.0])
 
 
 def test_a_given_scale_stays():
     model, members = random_model(0), np.repeat(np.eye(2), 3, axis=1)
-    found = learned_log_variances(model, members, np.array([0.3, BROAD]), np.array([False, True]), LEAST)
+    found = learned(model, members, [0.3, BROAD], [False, True])
     best = minimize(lambda t: -log_evidence(model, np.exp(0.5 * np.array([0.3, t[0]]) @ members)), [0.0], tol=1e-10)
     assert found[0] == 0.3
     assert found[1] == pytest.approx(best.x[0], abs=1e-4)
@@ -77,7 +101,7 @@ def test_a_parameter_on_a_bound_counts_in_full():
     """Its deviation is known: with the other at sqrt(3), the variance is the mean of 9 and of what that one has."""
     pinned = model_of(np.diag([0.0, 1e12]), [0.0, np.sqrt(3) * 1e12], [3.0, 0.0], [True, False])
     assert effective_parameters(pinned, np.ones(2))[0] == 1.0
-    found = learned_log_variances(pinned, np.ones((1, 2)), np.array([BROAD]), np.array([True]), LEAST)
+    found = learned(pinned, np.ones((1, 2)))
     assert np.exp(found) == pytest.approx([(9 + 3) / 2])
 
 
@@ -93,10 +117,9 @@ def test_elimination_is_the_marginal():
 
 def test_the_same_under_jit_and_vmap():
     models, members = [random_model(seed) for seed in range(3)], np.repeat(np.eye(2), 3, axis=1)
-    start, learned = np.full(2, BROAD), np.array([True, True])
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
-    many = jax.jit(jax.vmap(lambda m: learned_log_variances(m, members, jnp.asarray(start), learned, LEAST)))(stacked)
-    one = [learned_log_variances(model, members, start, learned, LEAST) for model in models]
+    many = jax.jit(jax.vmap(lambda m: learned(m, members)))(stacked)
+    one = [learned(model, members) for model in models]
     np.testing.assert_allclose(many, one, atol=1e-9)
 
 

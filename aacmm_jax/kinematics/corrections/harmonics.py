@@ -4,6 +4,7 @@ An encoder that is eccentric by e at the radius R errs by e / R times a sine of 
 one that is oval or tilted errs by the second harmonic, and N evenly spaced read heads leave multiples of N only.
 """
 
+import re
 from typing import ClassVar
 
 from jaxtyping import Float
@@ -13,11 +14,22 @@ from ...core.numpy_or_jax import AnyArray, namespace
 from ..chain import ForwardPass
 from .kind import AbstractCorrection, Loads, Term
 
-_HIGHEST = 99
+HIGHEST = 99
+
+
+def orders_of(option: str) -> tuple[int, ...] | None:
+    """The orders that an option such as ``1-3+8`` names, each once; None where it names none from 1 to the highest."""
+    found: set[int] = set()
+    for part in option.split("+"):
+        ends = re.fullmatch(r"([1-9]\d?)(?:-([1-9]\d?))?", part)
+        if ends is None or int(ends[2] or ends[1]) < int(ends[1]):
+            return None
+        found |= set(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
+    return tuple(sorted(found))
 
 
 class Harmonics(AbstractCorrection):
-    """cos hq and sin hq of every joint; of orders 1 and 2 by default, or of those in the option: ``harmonics=1+3``."""
+    """cos hq and sin hq of every joint; of orders 1 and 2 by default, or of an option's: ``harmonics=1-3+8``."""
 
     model: ClassVar[str] = "harmonics"
     words: ClassVar[tuple[str, ...]] = ("cos", "sin")
@@ -25,18 +37,18 @@ class Harmonics(AbstractCorrection):
     rows: ClassVar[int] = 1
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
-        orders = option.split("+") if option else ["1", "2"]
-        if not all(order.isdecimal() and 1 <= int(order) <= _HIGHEST for order in orders):
-            raise InputError(f"harmonics={option} has no orders from 1 to {_HIGHEST}; write harmonics=1 or 1+2.")
+        orders = orders_of(option or "1+2")
+        if orders is None:
+            raise InputError(
+                f"harmonics={option} has no orders from 1 to {HIGHEST}; write harmonics=1, harmonics=1+2 or "
+                "harmonics=1-31."
+            )
         return tuple(
-            Term(self, word, order, joint)
-            for joint in range(1, joints + 1)
-            for order in sorted({int(order) for order in orders})
-            for word in self.words
+            Term(self, word, order, joint) for joint in range(1, joints + 1) for order in orders for word in self.words
         )
 
     def wrong(self, term: Term, joints: int) -> str:
-        return "" if 1 <= term.number <= _HIGHEST else f"has no order from 1 to {_HIGHEST}"
+        return "" if 1 <= term.number <= HIGHEST else f"has no order from 1 to {HIGHEST}"
 
     def unit_of(self, term: Term) -> str:
         return "rad"

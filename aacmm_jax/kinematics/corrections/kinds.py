@@ -10,7 +10,10 @@ from .harmonics import Harmonics
 from .kind import AbstractCorrection, Loads, Term
 
 KINDS: tuple[AbstractCorrection, ...] = (Harmonics(), GearRatio(), Gravity(), Coupling())
-_NAME = re.compile(r"([a-z]+)([1-9][0-9]*)?_([1-9][0-9]*)")
+# Short forms. An error function of each joint, whatever its cause: with a prior, 62 coefficients a joint are few enough
+# to be found in seconds from 500 poses, and orders to 63 were hardly better (`benchmarks/NOTES.md`).
+_SHORT_FORMS = {"functions": "harmonics=1-31"}
+COEFFICIENT = re.compile(r"([a-z]+)([1-9][0-9]*)?_([1-9][0-9]*)")
 
 
 def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
@@ -19,7 +22,7 @@ def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
     Raises:
         InputError: It is one, but not of an arm with so many joints.
     """
-    found = _NAME.fullmatch(name)
+    found = COEFFICIENT.fullmatch(name)
     kind = None if found is None else next((kind for kind in KINDS if found[1] in kind.words), None)
     if found is None or kind is None:
         return None
@@ -35,7 +38,8 @@ def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term,
     """The terms of a model: kinds with their options, separated by commas, such as "dh,gravity,harmonics=1".
 
     Args:
-        model: Names of kinds, each with an option after "=" if need be; "dh" stands for the arm itself.
+        model: Names of kinds, each with an option after "=" if need be; "dh" stands for the arm itself, "functions"
+            for harmonics=1-31.
         joints: Number of joints of the arm.
         loads: Masses of the arm, where known.
 
@@ -44,8 +48,9 @@ def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term,
     """
     found: list[Term] = []
     seen: set[str] = set()
-    for part in model.split(","):
-        name, _, option = part.strip().partition("=")
+    for given in model.split(","):
+        part = _SHORT_FORMS.get(given.strip(), given.strip())
+        name, _, option = part.partition("=")
         if name in seen:
             raise InputError(f"the model names '{name}' twice; name it once, as in dh,gravity,harmonics=1+2.")
         seen.add(name)
@@ -53,11 +58,12 @@ def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term,
             continue
         kinds = [kind for kind in KINDS if kind.model == name]
         if not kinds:
-            raise InputError(f"unknown model '{name}'{nearest(name, ['dh', *(kind.model for kind in KINDS)])}")
+            known = ["dh", *(kind.model for kind in KINDS), *_SHORT_FORMS]
+            raise InputError(f"unknown model '{name}'{nearest(name, known)}")
         terms = kinds[0].terms(joints, option, loads)
         for term in terms:
             wrong = kinds[0].wrong(term, joints)
             if wrong or not 1 <= term.joint <= joints:
-                raise InputError(f"{part.strip()} {wrong or f'names joint {term.joint} of {joints}'}; correct it.")
+                raise InputError(f"{part} {wrong or f'names joint {term.joint} of {joints}'}; correct it.")
         found += terms
     return tuple(dict.fromkeys(found))

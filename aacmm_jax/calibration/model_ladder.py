@@ -1,0 +1,184 @@
+"""Which model of its joints an arm needs: models from simple to rich, judged by regions that they have not seen.
+
+Errors of poses like those that a model was fitted to hardly tell models apart, and a random part of the poses is such.
+Chosen is the simplest model whose mean square error over the regions exceeds that of the best one by no more than a
+standard error of the difference, region by region: what two models have in common (a region that is hard for both)
+cancels in it (Breiman et al. 1984, section 3.4.3, with paired differences).
+"""
+
+import time
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.arguments import checked_arguments, items_of
+from ..core.arrays import Numbers
+from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
+from ..data.capture import Capture
+from ..data.noise import Noise
+from ..data.recording import Recording
+from ..kinematics.arm import DOWN, Arm, correction_names
+from ..kinematics.corrected_arm import with_corrections
+from ..kinematics.parameters import ArmSpecification, Bounds, Parameters, based_on
+from ..kinematics.prior_scales import default_prior
+from .record import record_of
+from .results import Calibration
+from .single import calibrate
+from .unseen_regions import Region, UnseenRegion, regions_of, unseen_regions
+
+DEFAULT_MODELS = ("dh", "gravity", "harmonics=1", "gravity,harmonics=1", "functions", "gravity,functions")
+
+
+class ComparedModel(NamedTuple):
+    """One model: errors inside and outside what it was fitted to, mm."""
+
+    model: str
+    parameters: int  # free ones of the arm
+    effective_parameters: float  # how many of them the data determine
+    rms_inside: float  # root mean square distance from the geometry, of all poses, calibrated with all
+    regions: tuple[UnseenRegion, ...]
+    cpu_seconds: float
+    result: Calibration  # with all poses
+
+    @property
+    def mean_squares(self) -> Float[np.ndarray, " f"]:
+        """Mean square error of each region, of a calibration without it, mm^2."""
+        return np.array([region.mean_square for region in self.regions])
+
+    @property
+    def rms_outside(self) -> float:
+        """Root of their mean, mm."""
+        return float(np.sqrt(np.mean(self.mean_squares)))
+
+    @property
+    def u_outside(self) -> float:
+        """Standard error of `rms_outside` by the scatter of the regions, mm."""
+        squares = self.mean_squares
+        return float(np.std(squares, ddof=1) / np.sqrt(len(squares)) / max(2 * self.rms_outside, 1e-300))
+
+    @property
+    def ratio(self) -> float:
+        """Mean of (error / predicted standard deviation)^2 outside; about 1 where the uncertainty is right."""
+        return float(np.mean([region.ratio for region in self.regions]))
+
+
+class ComparedModels(NamedTuple):
+    """Models from simple to rich, and which of them to use."""
+
+    models: tuple[ComparedModel, ...]
+
+    @property
+    def best(self) -> int:
+        """Number of the model with the smallest error outside."""
+        return int(np.argmin([np.mean(model.mean_squares) for model in self.models]))
+
+    @property
+    def differences(self) -> list[tuple[float, float]]:
+        """Of each model from the best: mean difference of the mean square errors, and its standard error, mm^2."""
+        best = self.models[self.best].mean_squares
+        paired = [model.mean_squares - best for model in self.models]
+        return [(float(np.mean(each)), float(np.std(each, ddof=1) / np.sqrt(len(each)))) for each in paired]
+
+    @property
+    def recommended(self) -> ComparedModel:
+        """The simplest model whose difference from the best is within one standard error of that difference."""
+        within = (mean <= u for mean, u in self.differences)
+        return next(model for model, is_within in zip(self.models, within, strict=True) if is_within)
+
+
+@checked_arguments
+def compare_models(
+    arm: Arm,
+    capture: Capture,
+    bounds: Bounds | None = None,
+    *,
+    models: Iterable[str] = DEFAULT_MODELS,
+    regions: Iterable[str] | None = None,
+    noise: Noise | None = None,
+    mass: Numbers | None = None,
+    centre: Numbers | None = None,
+    gravity: Numbers = DOWN,
+) -> ComparedModels:
+    """Fit models of the joints, each with its prior's scales learned, and predict regions that they have not seen.
+
+    A region is a placement, a station or another group that shares an unknown geometry, where there are at least three;
+    otherwise either half of each joint's travel. Errors are distances of the poses from their geometry; reference
+    lengths take part in the fits only.
+
+    Args:
+        arm: The nominal arm; corrections that it has are replaced by those of each model.
+        capture: Sockets, reference lengths and other observations.
+        bounds: Box of the free Denavit-Hartenberg parameters, mm and rad; by default around those of
+            `Parameters.free_of`. Coefficients of corrections are free in each model that has them.
+        models: Models from simple to rich, as for `kinematics.with_corrections`; "dh" is the arm alone. The default
+            takes some ten seconds for 500 poses, most of them for "functions" (harmonics=1-31, 62 coefficients a
+            joint).
+        regions: What to leave out instead, each as a name or a shell pattern: ``["monday/*", "tuesday/*"]``.
+        noise: Standard deviations of readings and seat, as for `calibrate`.
+        mass: Mass of each link ``(n,)``, kg, as for `kinematics.with_corrections`.
+        centre: Centre of mass of each link ``(n, 3)``, mm.
+        gravity: Direction of gravity in the base frame ``(3,)``.
+
+    Returns:
+        The errors of each model, and the recommended one with its calibration.
+
+    Raises:
+        InputError: A model is unknown, fewer than two regions can be left out, or as `calibrate` does.
+    """
+    named = items_of(models, "models")
+    if not named or not all(isinstance(model, str) and model.strip() for model in named):
+        raise InputError("models names no model; give some, from simple to rich, such as 'dh' and 'dh,gravity'.")
+    plain = arm.replace(coefficients=None, gravity=None, corrections=None)
+    bounds = Bounds.around(plain, Parameters.free_of(plain)) if bounds is None else bounds
+    left_out = regions_of(to_numpy(capture), regions)
+
+    def compared(model: str) -> ComparedModel:
+        begun = time.process_time()
+        corrected = with_corrections(plain, model, mass=mass, centre=centre, gravity=gravity)
+        return _compared(corrected, model, capture, bounds, left_out, noise, begun)
+
+    return ComparedModels(tuple(compared(model) for model in named))
+
+
+def _compared(
+    arm: Arm,
+    model: str,
+    capture: Capture,
+    bounds: Bounds,
+    regions: tuple[Region, ...],
+    noise: Noise | None,
+    begun: float,
+) -> ComparedModel:
+    widened = _with_coefficients(bounds, arm)
+    arm = widened.space.base
+    result = calibrate(
+        arm, capture, widened, method="joint", noise=noise, prior=default_prior(arm), check_identifiability=False
+    )
+    record = record_of(result, Recording(capture, ArmSpecification(arm)))
+    assert record.observed is not None
+    assert record.prior is not None
+    poses = [len(weights) for weights in record.observed.weights]
+    return ComparedModel(
+        model=model,
+        parameters=len(record.names),
+        effective_parameters=float(np.sum(record.prior.effective)),
+        rms_inside=float(np.sqrt(np.average(np.asarray(record.observed.rms_after) ** 2, weights=poses))),
+        regions=unseen_regions(record, regions),
+        cpu_seconds=time.process_time() - begun,
+        result=result,
+    )
+
+
+def _with_coefficients(bounds: Bounds, arm: Arm) -> Bounds:
+    """The box of the Denavit-Hartenberg parameters, with the coefficients of a corrected arm free and without bounds:
+    their prior is enough."""
+    kept = [i for i, name in enumerate(bounds.space.names) if name not in correction_names(bounds.space.base)]
+    added = tuple(name for name in correction_names(arm) if not name.startswith("gravity_"))
+    names = (*(bounds.space.names[i] for i in kept), *added)
+    base = based_on(bounds.space, arm).base
+    endless = np.full(len(added), np.inf)
+    sides = np.asarray(bounds.lower)[kept], np.asarray(bounds.upper)[kept]
+    return Bounds(Parameters(base, names), np.concatenate([sides[0], -endless]), np.concatenate([sides[1], endless]))

@@ -1,0 +1,46 @@
+"""The prior of an arm of which nothing else is known: what errors of arms are usually about, learned from the data.
+
+One scale for each kind of parameter, and for harmonics one an octave of the order, which all joints share: the error of
+an encoder or a gear is a function whose harmonics fade with their order at a rate that nobody knows beforehand. A scale
+for each joint fails where a joint moves little, since high orders imitate anything there (`benchmarks/NOTES.md`).
+"""
+
+from ..core.arguments import checked_arguments
+from .arm import Arm, correction_names
+from .corrections.coupling import Coupling
+from .corrections.gear_ratio import GearRatio
+from .corrections.gravity import Gravity
+from .corrections.harmonics import HIGHEST, Harmonics
+from .priors import Prior, is_of_group
+
+_LENGTH, _ANGLE = 1.0, 1e-3  # mm, rad
+_HARMONIC = 5e-5  # rad: 10 arcsec
+_RATIO = 2e-4  # of a gear, or part of another joint's reading
+_BY_LINK = 1e-3  # rad/m: 1 mrad for links with levers of 1 m
+_COMPLIANCE = 1e-2  # rad/(kN m): 1 mrad for 100 N m
+_SLIDE = 0.05  # mm, of the harmonics of a prismatic joint
+
+
+@checked_arguments
+def default_prior(arm: Arm) -> Prior:
+    """The prior with which an arm with joint corrections is calibrated where no other is given.
+
+    Learned from the data, each expected to a factor of 4.5: lengths (1 mm), angles (1 mrad), gravity (1 mrad for links
+    with levers of 1 m, or for 100 N m), gear and coupled (0.02 %), and one group for each octave of harmonics
+    (0.05 mrad).
+
+    Args:
+        arm: The nominal arm, with the corrections that are calibrated.
+
+    Returns:
+        The prior of the groups that the arm has.
+    """
+    with_masses = any(name.startswith("compliance_") for name in correction_names(arm))
+    octaves = [(2**k, min(2 ** (k + 1) - 1, HIGHEST)) for k in range(HIGHEST.bit_length())]
+    kinds = {Gravity.model: _COMPLIANCE if with_masses else _BY_LINK, GearRatio.model: _RATIO, Coupling.model: _RATIO}
+    kinds |= {f"{Harmonics.model}={low}" + (f"-{high}" if high > low else ""): _HARMONIC for low, high in octaves}
+    # Coefficients of a slide are in mm, so that they cannot share a scale with those of joints that turn.
+    slides = {f"{word}*_{joint}": _SLIDE for joint in arm.prismatic for word in ("cos", "sin", "compliance", "coupled")}
+    names = correction_names(arm)
+    known = {group: sd for group, sd in (kinds | slides).items() if any(is_of_group(group, name) for name in names)}
+    return Prior({"lengths": _LENGTH, "angles": _ANGLE} | known, learn=True)

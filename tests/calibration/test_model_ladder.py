@@ -1,0 +1,139 @@
+"""Models of joints compared: predictions of regions against calibrations without them, and which model is found."""
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.calibration.model_ladder import ComparedModel, ComparedModels, compare_models
+from aacmm_jax.calibration.prediction import unseen_errors
+from aacmm_jax.calibration.record import record_of
+from aacmm_jax.calibration.unseen_regions import Region, UnseenRegion, regions_of, unseen_regions
+from aacmm_jax.data import observations as kinds
+from aacmm_jax.data.recording import Recording
+from aacmm_jax.kinematics import with_corrections
+from aacmm_jax.kinematics.parameters import ArmSpecification
+
+NOISE = aj.Noise(encoder_arcsec=10, seating=0.02)
+FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
+BOX = [[200, -300, 100], [600, 300, 500]]
+MODELS = ("dh", "gravity", "harmonics=1")
+
+
+@pytest.fixture(scope="module")
+def space(paper_arm):
+    return aj.Parameters.independent(paper_arm)
+
+
+@pytest.fixture(scope="module")
+def bounds(paper_arm, space):
+    return aj.Bounds.around(paper_arm, space)
+
+
+def seen_by_a_tracker(paper_arm, space, model="dh", poses=50, seed=1, **coefficients):
+    true = with_corrections(aj.perturbed_arm(space, length=0.3, angle=5e-4, seed=seed), model).replace(**coefficients)
+    points = [kinds.SimulatedPoints("T", BOX, poses, FRAME, u=0.01)]
+    return aj.simulate(true, {}, observations=points, noise=NOISE, seed=seed)
+
+
+def sockets(paper_arm, space):
+    true = aj.perturbed_arm(space, length=0.3, angle=5e-4, seed=1)
+    points = {"A": (400, 200, 300), "B": (500, 300, 100), "C": (300, -300, 300), "D": (450, 0, 400)}
+    return aj.simulate(true, points, poses=14, lengths=[("A", "B", 0.002)], noise=NOISE, seed=2)
+
+
+def test_a_region_is_predicted_as_by_a_calibration_without_it(paper_arm, space, bounds):
+    """Of sockets, whose positions only the region shows, and a reference length between two of them."""
+    capture, prior = sockets(paper_arm, space), aj.Prior({"lengths": 0.3, "angles": 5e-4})
+    solving = {"noise": NOISE, "prior": prior, "check_identifiability": False}
+    record = record_of(
+        aj.calibrate(paper_arm, capture, bounds, **solving), Recording(capture, ArmSpecification(paper_arm))
+    )
+    for names in (("A", "B"), ("C",)):
+        left = np.isin(np.array(capture.names)[capture.owner], names)
+        (found,) = unseen_regions(record, [Region("", left)])
+        rest = aj.Capture(
+            {name: q for name, q in capture.sockets.items() if name not in names},
+            [] if "A" in names else capture.lengths,
+        )
+        alone = aj.identify(paper_arm, rest, bounds, noise=NOISE, prior=prior, hold=None)
+        part = aj.Capture({name: capture.sockets[name] for name in names})
+        expected = unseen_errors(aj.uncertainty_of(alone), part).of(names)
+        assert found.poses == len(names) * 14
+        assert np.sqrt(found.mean_square) == pytest.approx(expected.rms, rel=1e-3)
+        assert np.sqrt(found.ratio) == pytest.approx(expected.rms / expected.predicted, rel=0.1)
+
+
+def test_half_of_a_travel_is_predicted_as_by_a_calibration_without_it(paper_arm, space, bounds):
+    """The frame of the tracker is known from the other half."""
+    capture, prior = seen_by_a_tracker(paper_arm, space), aj.Prior({"lengths": 0.3, "angles": 5e-4})
+    solving = {"noise": NOISE, "prior": prior, "check_identifiability": False}
+    result = aj.calibrate(paper_arm, capture, bounds, **solving)
+    region = regions_of(capture)[3]
+    assert region.label == "joint 2, upper half"
+    (found,) = unseen_regions(record_of(result, Recording(capture, ArmSpecification(paper_arm))), [region])
+    (points,) = capture.observations
+    parts = [aj.Capture({}, [], [points.select(np.flatnonzero(which))]) for which in (~region.poses, region.poses)]
+    alone = aj.calibrate(paper_arm, parts[0], bounds, **solving)
+    errors = aj.evaluate(alone.arm, parts[1], geometry=alone.stage1.observed.geometry).observed
+    assert found.poses == 25
+    assert np.sqrt(found.mean_square) == pytest.approx(float(errors.rms[0]), rel=1e-3)
+
+
+def test_nothing_wrong_needs_no_correction(paper_arm, space, bounds):
+    found = compare_models(paper_arm, seen_by_a_tracker(paper_arm, space), bounds, models=MODELS)
+    assert found.recommended.model == "dh"
+    assert [len(model.regions) for model in found.models] == [12, 12, 12]
+    assert 0.6 < found.recommended.ratio < 1.5
+
+
+def test_an_eccentric_encoder_is_recognised(paper_arm, space, bounds):
+    """Also in an arm that comes with other corrections, which do not count."""
+    capture = seen_by_a_tracker(paper_arm, space, "harmonics=1", cos1_2=4e-4, sin1_2=-3e-4)
+    found = compare_models(with_corrections(paper_arm, "gear"), capture, bounds, models=MODELS)
+    chosen = found.recommended
+    assert chosen.model == "harmonics=1"
+    assert found.models[0].rms_outside > 1.2 * chosen.rms_outside
+    assert "gear_2" not in chosen.result.space.names
+    # Mean and cosine of the second joint are hardly apart, as its travel is short; its sine is found.
+    names = chosen.result.space.names
+    u = np.sqrt(np.diag(chosen.result.covariance))
+    for name, true in (("cos1_2", 4e-4), ("sin1_2", -3e-4)):
+        i = names.index(name)
+        assert abs(float(chosen.result.parameters[i]) - true) < 3 * u[i]
+
+
+def test_placements_are_the_regions_where_there_are_several(paper_arm, space):
+    capture = sockets(paper_arm, space)
+    assert [region.label for region in regions_of(capture)] == ["A, B", "C", "D"]
+    assert [region.label for region in regions_of(capture, ["A", "[BC]"])] == ["A", "[BC]"]
+    assert regions_of(capture, ["A", "[BC]"])[1].poses.sum() == 28
+    with pytest.raises(aj.InputError, match="nothing is left without"):
+        regions_of(capture, ["*"])
+    with pytest.raises(aj.InputError, match="fewer than two"):
+        regions_of(capture, ["A"])
+
+
+@pytest.mark.parametrize(
+    ("squares", "expected"),
+    [
+        ([[4.0, 4.0, 4.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]], "b"),
+        # 0.1 on average with a standard error of 0.11, although both are as uncertain as 4: one region is hard.
+        ([[1.0, 1.1, 13.2], [1.0, 1.0, 13.0], [1.1, 1.1, 12.9]], "b"),
+        ([[1.0, 1.0, 13.1], [1.0, 1.0, 13.0], [2.0, 2.0, 14.0]], "a"),
+        ([[1.2, 1.2, 13.1], [1.0, 1.0, 13.0], [1.0, 1.0, 12.9]], "b"),
+    ],
+)
+def test_the_simplest_model_within_a_paired_standard_error(squares, expected):
+    def model(name, values):
+        regions = tuple(UnseenRegion(str(i), 10, value, 1.0) for i, value in enumerate(values))
+        return ComparedModel(name, 1, 1.0, 0.1, regions, 0.0, None)
+
+    models = tuple(model(name, values) for name, values in zip("abc", squares, strict=True))
+    assert ComparedModels(models).recommended.model == expected
+
+
+def test_refused(paper_arm, space, bounds):
+    with pytest.raises(aj.InputError, match="names no model"):
+        compare_models(paper_arm, sockets(paper_arm, space), bounds, models=[])
+    with pytest.raises(aj.InputError, match="unknown model 'grvity'"):
+        compare_models(paper_arm, sockets(paper_arm, space), bounds, models=["dh,grvity"])
