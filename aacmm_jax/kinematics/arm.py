@@ -272,6 +272,11 @@ def parameter_names(arm: Arm) -> tuple[str, ...]:
     return (*by_joint, *(f"probe_{axis}" for axis in _AXES), *correction_names(arm))
 
 
+def without_corrections(arm: Arm) -> Arm:
+    """The arm whose joints do what they read."""
+    return arm.replace(coefficients=None, gravity=None, corrections=None)
+
+
 def correction_names(arm: Arm) -> tuple[str, ...]:
     """Names of the coefficients of an arm's corrections, and of the components of gravity where some depend on it."""
     if arm.corrections is None:

@@ -9,7 +9,7 @@ from ..core.arguments import items_of
 from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
-from .arm import DOWN, Arm, is_single, joint_limits
+from .arm import DOWN, Arm, is_single, joint_limits, without_corrections
 from .chain import Corrections, Geometry, KnownFunctions, forward_pass, joint_motion, joints_first
 from .corrections.kind import Loads, Term
 from .corrections.kinds import term_of, terms_of
@@ -45,7 +45,7 @@ def with_corrections(
     """
     if not is_single(arm):
         raise InputError("corrections are for one arm, but this is a batch; take one of it first.")
-    plain: Arm = to_numpy(arm.replace(coefficients=None, gravity=None, corrections=None))
+    plain: Arm = to_numpy(without_corrections(arm))
     loads, down = _loads(plain, mass, centre), _direction(gravity)
     if isinstance(model, str):
         terms = _determined(plain, terms_of(model, plain.joints, loads), down)

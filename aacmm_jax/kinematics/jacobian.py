@@ -89,7 +89,7 @@ def _columns_of(forward: ForwardPass, kind: str, at: int | slice) -> Float[AnyAr
     return {"a": forward.x, "d": forward.z_before, "probe": forward.frame}[kind][at]
 
 
-def _by_corrections(forward: ForwardPass, kind: str, i: int) -> list[tuple[int, Float[AnyArray, "... 1 N"]]]:
+def moved_by_correction(forward: ForwardPass, kind: str, i: int) -> list[tuple[int, Float[AnyArray, "... 1 N"]]]:
     """The joints that a coefficient, or a component of gravity, moves, and by how much."""
     assert forward.errors is not None
     each = forward.errors.functions.each
@@ -102,7 +102,7 @@ def _by_corrections(forward: ForwardPass, kind: str, i: int) -> list[tuple[int, 
 def _correction_column(forward: ForwardPass, kind: str, i: int) -> Float[AnyArray, "... 3 N"]:
     """Derivative of the tip by a coefficient, or by a component of the direction of gravity."""
     column = namespace(forward.tip).zeros_like(forward.tip)
-    for joint, by in _by_corrections(forward, kind, i):
+    for joint, by in moved_by_correction(forward, kind, i):
         column = column + by * _columns_of(forward, _parameter_of(forward.kinds, "q", joint), joint)
     return column
 
@@ -159,7 +159,7 @@ def rotation_columns(forward: ForwardPass, indices: tuple[tuple[str, int], ...])
         if kind in ("coefficients", "gravity"):
             moved = [
                 by * forward.z_before[joint]
-                for joint, by in _by_corrections(forward, kind, i)
+                for joint, by in moved_by_correction(forward, kind, i)
                 if _parameter_of(forward.kinds, "q", joint) == "theta"
             ]
             return sum(moved, still)

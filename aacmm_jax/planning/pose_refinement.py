@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.numpy_or_jax import to_numpy
-from ..kinematics.arm import by_joint, locate
+from ..kinematics.arm import Arm, by_joint, locate
 from ..kinematics.chain import ForwardPass, forward_pass, joint_motion, reading_units
-from ..kinematics.jacobian import reading_columns, readings_gradient
+from ..kinematics.jacobian import moved_by_correction, reading_columns, readings_gradient
 from ..kinematics.workspace import reached
 from .fedorov_exchange import covariance_of
 from .placement import DesignProblem, FixturePlacement, candidates_of, pool_of
@@ -143,10 +143,53 @@ def value_and_gradient(
     encoder = np.broadcast_to(np.asarray(problem.noise.of_readings(forward.kinds)), readings.shape[:1])
     of_readings = 2 * np.einsum("ncd,kdn->kcn", by_covariance, readings) * encoder[:, None, None] ** 2
     slides = np.array(by_joint(problem.arm, False, True))[:, None, None]
+    by_functions = np.zeros((0 if forward.errors is None else len(forward.errors.functions.term_of_row), len(q)))
     cotangents = {"theta": np.where(slides, 0.0, of_readings), "d": np.where(slides, of_readings, 0.0)}
     for index, (name, scale) in enumerate(zip(problem.space.names, np.asarray(problem.space.scale), strict=True)):
         kind, i = locate(problem.arm, name)
+        cotangent = -2 * scale * by_rows[:, :, index].T
+        if kind in ("coefficients", "gravity"):
+            for joint, by in moved_by_correction(forward, kind, i):
+                cotangents["d" if slides[joint] else "theta"][joint] += by * cotangent
+            by_functions += _by_functions(problem, forward, kind, i, cotangent)
+            continue
         cotangents.setdefault(kind, np.zeros((3 if kind == "probe" else len(readings), *readings.shape[1:])))
-        cotangents[kind][i] -= 2 * scale * by_rows[:, :, index].T
-    gradient = readings_gradient(forward, cotangents)
-    return problem.objective.value(of_parameters), np.asarray(gradient).T
+        cotangents[kind][i] += cotangent
+    gradient = np.asarray(readings_gradient(forward, cotangents)).T
+    if np.any(by_functions):
+        gradient = gradient + _gradient_of_functions(problem.arm, q, by_functions)
+    return problem.objective.value(of_parameters), gradient
+
+
+def _by_functions(
+    problem: DesignProblem, forward: ForwardPass, kind: str, i: int, cotangent: Float[np.ndarray, "3 N"]
+) -> Float[np.ndarray, "rows N"]:
+    """Derivative by the known functions of joint corrections of the product of a column with ``cotangent``."""
+    assert forward.errors is not None
+    functions, columns = forward.errors.functions, np.asarray(reading_columns(forward))
+    of_joints = np.einsum("ncN,cN->nN", columns, cotangent)
+    found = np.zeros((len(functions.term_of_row), cotangent.shape[1]))
+    coefficients, gravity = np.asarray(problem.arm.coefficients), [*np.asarray(problem.arm.gravity), 1.0]
+    for row, (term, component) in enumerate(zip(functions.term_of_row, functions.component_of_row, strict=True)):
+        joint = functions.each[term].joint - 1
+        if kind == "coefficients" and term == i:
+            found[row] = gravity[component] * of_joints[joint]
+        if kind == "gravity" and component == i:
+            found[row] = coefficients[term] * of_joints[joint]
+    return found
+
+
+def _gradient_of_functions(
+    arm: Arm, q: Float[np.ndarray, "N n"], by_functions: Float[np.ndarray, "rows N"]
+) -> Float[np.ndarray, "N n"]:
+    """Derivative by the readings through the known functions, by central differences: they are smooth and cheap."""
+    geometry, gradient = to_numpy(arm.geometry), np.empty(q.shape)
+
+    def weighted(readings: np.ndarray) -> np.ndarray:
+        return np.sum(by_functions * np.asarray(joint_motion(geometry, readings).functions)[:, 0], axis=0)
+
+    for joint, unit in enumerate(reading_units(geometry)):
+        step = np.zeros(arm.joints)
+        step[joint] = 1e-5 * unit
+        gradient[:, joint] = (weighted(q + step) - weighted(q - step)) / (2 * step[joint])
+    return gradient

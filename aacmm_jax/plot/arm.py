@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers
 from ..core.errors import InputError
-from ..kinematics.arm import Arm, joint_limits
+from ..kinematics.arm import Arm, joint_limits, without_corrections
 from ..kinematics.axes_to_dh import dh_frames, geometry_of
 from ..kinematics.workspace import arm_reach, skeleton
 from .style import ACCENT, DARK, LIGHT, label_axes, save_figure
@@ -63,7 +63,7 @@ def arm_at_zero(arm: Arm, axes: Any = None, *, base: Float[np.ndarray, "4 4"] | 
     axes.plot(*line.T, color=DARK, linewidth=3, marker="o", markersize=3)
     axes.plot(*line[-1:].T, linestyle="none", marker="+", color=ACCENT, markersize=10)
     size = 0.12 * max(np.ptp(line, axis=0).max(), 1e-9)
-    for number, frame in enumerate(dh_frames(geometry_of(arm), base)[:-1], start=1):
+    for number, frame in enumerate(dh_frames(geometry_of(without_corrections(arm)), base)[:-1], start=1):
         origin, end = frame[:3, 3], frame[:3, 3] + size * frame[:3, 2]
         axes.quiver(*origin, *(end - origin), color=ACCENT, linewidth=1.2, arrow_length_ratio=0.25)
         axes.text(*(end + 0.25 * size * frame[:3, 2]), str(number), color=ACCENT, fontsize=9)

@@ -11,7 +11,7 @@ from ..core.numpy_or_jax import to_numpy
 from ..core.text import pluralise, shorten
 from ..core.units import ARCSEC
 from ..data.noise import Noise
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, without_corrections
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, tip_frame
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..kinematics.workspace import arm_reach, closest_approach, total_link_length
@@ -33,14 +33,15 @@ def arm_survey(
         base: The first frame in a robot's base link, mm; frames are in the base link then.
     """
     arm: Arm = to_numpy(specification.arm)
-    reach = arm_reach(arm)
+    plain = without_corrections(arm)
+    reach = arm_reach(plain)
     base = np.eye(4) if base is None else base
     summary = arm_summary(specification) | {
-        "frames": _frames(arm, base),
+        "frames": _frames(plain, base),
         "reach_mm": {
             "shoulder": (base[:3, :3] @ reach.shoulder + base[:3, 3]).tolist(),
             "farthest": reach.radius,
-            "nearest": closest_approach(arm),
+            "nearest": closest_approach(plain),
             "links": total_link_length(arm),
         },
     }

@@ -99,10 +99,14 @@ def test_criteria_are_what_they_say(name):
         assert expected == pytest.approx(np.log(eigenvalues[-1]), abs=0.1)
 
 
-@pytest.mark.parametrize("kind", ["functions", "trace", "determinant"])
-def test_the_gradient_of_the_refinement_is_exact(paper_arm, kind):
-    """By differences, also through the projection to the sockets, with an arm that has Hayati's angle."""
+@pytest.mark.parametrize(
+    ("kind", "model"), [("functions", ""), ("trace", ""), ("determinant", ""), ("functions", "gravity,gear")]
+)
+def test_the_gradient_of_the_refinement_is_exact(paper_arm, kind, model):
+    """By differences, also through the projection to the sockets, with an arm that has Hayati's angle, and one with
+    joint corrections."""
     arm = paper_arm.replace(beta=np.linspace(0.1, 0.3, 6))
+    arm = aj.kinematics.with_corrections(arm, model) if model else arm
     space = aj.Parameters.free_of(arm, held=HELD, free=("beta_2",))
     random = np.random.default_rng(0)
     problem = DesignProblem(
