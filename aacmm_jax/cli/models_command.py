@@ -61,7 +61,7 @@ def compare_models(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Compare models of the joints by regions that they have not seen, and recommend one.
+    """Compare models of the joints by unseen regions.
 
     Each model is calibrated with all poses, its prior learned from them, and predicts every region from the others.
     """
