@@ -16,7 +16,7 @@ from ..core._compat import member_numbers
 from ..core.linear_algebra import singular_values
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, stop_gradient, while_loop
 from ..kinematics.parameters import Parameters
-from ..kinematics.priors import LEAST_STEPS, ParameterPrior
+from ..kinematics.priors import LEAST_STEPS, MIXED, ParameterPrior
 from ..model.observed import PriorRows, Whitening, observed_model, observed_rows
 from ..model.robust import Loss
 from ..solver.reason import MAX_STEPS, reasons
@@ -155,7 +155,7 @@ class PriorProblem(NamedTuple):
         model = self.model(scales, z)
         effective = effective_parameters(model, sd)
         first = np.array([own[0] for own in prior.members])
-        in_units = np.array([unit == "rad" for unit in prior.units])
+        in_units = np.array([unit != MIXED for unit in prior.units])
         of_groups = xp.exp(0.5 * scales[1:])
         metrics = PriorMetrics(
             groups=prior.groups,

@@ -10,15 +10,18 @@ from ..core.errors import InputError
 from ..core.text import number
 from ..core.units import ARCSEC, DEG, UM, M
 from ..kinematics.arm import Arm
-from ..kinematics.priors import MIXED, Prior, possible_names, unit_of_group
+from ..kinematics.priors import Prior, possible_names, unit_of_group
 from .toml import Strict
 
 _UNITS = {
     "mm": {"mm": 1.0, "um": UM, "m": M},
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": DEG, "arcsec": ARCSEC},
+    # Of joint corrections.
+    "rad/m": {"rad/m": 1.0, "mrad/m": 1e-3},
+    "1": {"": 1.0},
 }
 _LEARN = "learn"
-_VALUE = re.compile(r"(?:(?P<mean>[^\s]+?)\s*\+-\s*)?(?P<sd>[^\s]+?)\s*(?P<unit>[a-z]+)")
+_VALUE = re.compile(r"(?:(?P<mean>[^\s]+?)\s*\+-\s*)?(?P<sd>[^\s]+?)\s*(?P<unit>[a-z/]*)")
 
 
 class PriorTable(Strict):
@@ -30,12 +33,11 @@ class PriorTable(Strict):
 
     def prior(self, arm: Arm, length: float, angle: float) -> Prior:
         """The prior; ``length`` and ``angle`` are the file's units in mm and rad."""
-        factors = {"mm": length, "rad": angle, MIXED: 1.0}
+        factors = {"mm": length, "rad": angle}  # others, such as rad/m, are the same in every file
 
         def converted(values: Mapping[str, float]) -> dict[str, float]:
-            return {
-                group: value * factors[unit_of_group(group, possible_names(arm))] for group, value in values.items()
-            }
+            names = possible_names(arm)
+            return {group: value * factors.get(unit_of_group(group, names), 1.0) for group, value in values.items()}
 
         found = Prior(converted(self.sd), mean=converted(self.mean), learn=self.learn)
         found.check(arm)
@@ -64,7 +66,7 @@ def prior_of_text(text: str, arm: Arm) -> Prior | None:
         return Prior(learn=True)
     sd, mean, learn = {}, {}, []
     for part in filter(None, (part.strip() for part in text.split(","))):
-        group, _, value = (word.strip() for word in part.partition("="))
+        group, _, value = (word.strip() for word in part.rpartition("="))  # harmonics=2-3=learn
         group = {"length": "lengths", "angle": "angles"}.get(group, group)
         if group in sd or group in learn:
             raise InputError(f"--prior names '{group}' twice; name it once.")

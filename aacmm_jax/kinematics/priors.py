@@ -13,6 +13,7 @@ from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from .arm import Arm, is_length, natural_steps, parameter_names
 from .corrections.harmonics import Harmonics, orders_of
+from .corrections.kind import Term
 from .corrections.kinds import COEFFICIENT, KINDS
 
 _KIND_OF_WORD = {word: kind.model for kind in KINDS for word in kind.words}
@@ -92,7 +93,7 @@ class Prior(eqx.Module):
     def check(self, arm: Arm) -> None:
         """Raise `InputError` for a group that holds no parameter of an arm."""
         names = possible_names(arm)
-        corrections = tuple(kind.model for kind in KINDS)
+        corrections = [kind.model for kind in KINDS if any(_is_correction(kind.model, name) for name in names)]
         for group in (*self.groups, *self.mean):
             if not any(is_of_group(group, name) for name in names):
                 stems = dict.fromkeys(name.rsplit("_", 1)[0] for name in names)
@@ -209,10 +210,21 @@ def possible_names(arm: Arm) -> tuple[str, ...]:
 
 
 def unit_of_group(group: str, names: Iterable[str]) -> str:
-    """The unit of a group's standard deviation: "mm", "rad", or `MIXED`."""
+    """The unit of a group's standard deviation: "mm", "rad", `MIXED`, or that of coefficients of one kind."""
     return _unit(name for name in names if is_of_group(group, name))
 
 
 def _unit(names: Iterable[str]) -> str:
+    names = list(names)
+    own = {_unit_of_coefficient(name) for name in names}
+    if len(own) == 1 and "" not in own:
+        return own.pop()
     lengths = {is_length(name) for name in names}
     return MIXED if len(lengths) == 2 else "mm" if True in lengths else "rad"
+
+
+def _unit_of_coefficient(name: str) -> str:
+    """Of a joint correction; empty for other parameters."""
+    found = _correction(name)
+    kind = next((kind for kind in KINDS if found is not None and kind.model == found[0]), None)
+    return "" if found is None or kind is None else kind.unit_of(Term(kind, "", found[1], 1))

@@ -232,7 +232,7 @@ def test_derivatives_are_exact(paper_arm, space, active):
         return jnp.concatenate([result.parameters / step, result.prior.sd, result.prior.effective])
 
     jacobian = np.asarray(jax.jacfwd(found)(jnp.zeros(5)))
-    h = np.array([1e-3, 1e-2, 1e-3, 1e-3, 1e-3])
+    h = np.array([1e-3, 1e-2, 1e-3, 1e-2, 1e-3])
     moved = {k: [np.asarray(found(k * h[i] * e)) for i, e in enumerate(np.eye(5))] for k in (-1, -0.5, 0.5, 1)}
     differences = [(8 * (moved[0.5][i] - moved[-0.5][i]) - (moved[1][i] - moved[-1][i])) / (6 * h[i]) for i in range(5)]
     size = np.maximum(np.abs(jacobian).max(axis=0), 0.01)

@@ -9,6 +9,7 @@ import aacmm_jax as aj
 from aacmm_jax.core.units import DEG
 from aacmm_jax.files.arms import specification_toml
 from aacmm_jax.files.priors import prior_of_text
+from aacmm_jax.kinematics import with_corrections
 
 ARM = """
 length_unit = "m"
@@ -63,10 +64,12 @@ def test_refused_in_an_arm_file(tmp_path, table, message):
         ("d_3=750.2+-0.1mm, theta_*=20arcsec", aj.Prior({"d_3": 0.1, "theta_*": 20 * DEG / 3600}, mean={"d_3": 750.2})),
         ("a=100um,alpha=learn", aj.Prior({"a": 0.1}, learn=["alpha"])),
         ("learn", aj.Prior(learn=True)),
+        ("harmonics=2-3=learn,gravity=learn", aj.Prior(learn=["harmonics=2-3", "gravity"])),
+        ("gravity=2mrad/m,gear=2e-4", aj.Prior({"gravity": 2e-3, "gear": 2e-4})),
     ],
 )
 def test_text(paper_arm, text, expected):
-    assert_same(prior_of_text(text, paper_arm), expected)
+    assert_same(prior_of_text(text, with_corrections(paper_arm, "gravity,gear,harmonics=1-3")), expected)
 
 
 def test_no_prior(paper_arm):

@@ -1,0 +1,64 @@
+"""``compare-models``, and ``calibrate --model`` with its default prior."""
+
+import json
+
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.data import observations as kinds
+from aacmm_jax.files import save_capture
+from aacmm_jax.kinematics import with_corrections
+from aacmm_jax.kinematics.parameters import ArmSpecification
+
+BOX = [[200, -300, 100], [600, 300, 500]]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, paper_arm):
+    """60 poses seen by a tracker, of an arm with two eccentric encoders."""
+    path = tmp_path_factory.mktemp("models")
+    true = with_corrections(paper_arm, "harmonics=1").replace(cos1_2=5e-4, sin1_3=-4e-4)
+    points = [kinds.SimulatedPoints("T", BOX, 60, (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0), u=0.01)]
+    capture = aj.simulate(true, {}, observations=points, noise=aj.Noise(encoder_arcsec=10, seating=0.02), seed=1)
+    space = aj.Parameters.independent(paper_arm)
+    nominal = ArmSpecification(paper_arm, "arm", held=space.held)
+    save_capture(path / "c.h5", aj.Recording(capture, nominal))
+    return path
+
+
+def test_models_are_compared(aacmm, folder):
+    command = ("compare-models", folder / "c.h5", "--models")
+    found = json.loads(aacmm(*command, "dh; gravity; harmonics=1", "--json").stdout)
+    assert found["recommended"] == "harmonics=1"
+    assert found["poses"] == 60
+    assert [row["model"] for row in found["models"]] == ["dh", "gravity", "harmonics=1"]
+    assert len(found["regions"]) == 12
+    assert found["models"][0]["rms_outside"] > found["models"][2]["rms_outside"]
+    shown = aacmm(*command, "gear;dh", "--only-poses", 50).stdout
+    assert "2 models on 50 poses, 12 regions left out one by one" in shown
+    assert "Recommended: gear" in shown
+    assert "joint 3, upper half" in shown
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--models", "dh;;gravity"), "names an empty model"),
+        (("--models", "dh;grvity"), "did you mean 'gravity'"),
+        (("--leave-out", "T"), "nothing is left without 'T'"),
+        (("--leave-out", "U"), "U"),
+    ],
+)
+def test_refused(aacmm, folder, options, message):
+    assert message in aacmm("compare-models", folder / "c.h5", *options, expect=2).stderr
+
+
+def test_a_model_has_a_default_prior(aacmm, folder, tmp_path):
+    """All coefficients are free, and no trade-off of theirs is warned of."""
+    command = ("calibrate", folder / "c.h5", "-o", tmp_path / "r.h5", "--model", "harmonics=1-3", "--json")
+    found = json.loads(aacmm(*command).stdout)
+    groups = {row["group"]: row for row in found["prior"]}
+    assert list(groups) == ["lengths", "angles", "harmonics=1", "harmonics=2-3"]
+    assert groups["harmonics=1"]["learned"]
+    assert groups["harmonics=1"]["parameters"] == 12
+    assert not [sentence for sentence in found["warnings"] if "cos" in sentence or "sin" in sentence]
