@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from ..core.arguments import items_of
 from ..core.errors import InputError
 from ..core.linear_algebra import inverse_cholesky
+from ..core.text import common_labels
 from ..data.capture import Capture, names_in
 from .cross_validation import groups_of
 from .group_equations import PRIOR, Equations, equations_of
@@ -56,7 +57,8 @@ def regions_of(capture: Capture, patterns: Iterable[str] | None = None) -> tuple
         chosen = {pattern: names_in(capture.select(pattern)) for pattern in items_of(patterns, "regions")}
         found = [Region(pattern, np.isin(owner, [names.index(name) for name in of])) for pattern, of in chosen.items()]
     elif len(groups := groups_of(capture)) >= _GROUPS:
-        found = [Region(", ".join(group), np.isin(owner, [names.index(name) for name in group])) for group in groups]
+        members = [np.isin(owner, [names.index(name) for name in group]) for group in groups]
+        found = [Region(label, poses) for label, poses in zip(common_labels(groups), members, strict=True)]
     else:
         sockets = [capture.q] if capture.sizes else []
         found = _halves(np.concatenate([*sockets, *(observation.q for observation in capture.observations)]))

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from ..core.arrays import LARGEST_INTEGER
 from ..core.errors import IdentifiabilityWarning, InputError
+from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import reading, together
 from .app import Json, Only, Without, app, examples, show_summary, with_spinner
 from .calibration_commands import known_noise
