@@ -15,7 +15,6 @@ from ..kinematics.chain import joint_motion
 from .noise import Noise, encoder_covariances, noise_of
 
 SEATING = 0.005  # mm: a ball in a kinematic seat
-SMALL_ARM = Noise(encoder_arcsec=2.0, seating=SEATING)  # a small commercial arm
 _SAMPLES = 2000
 # ISO 9283: repeatability is the mean distance from the barycentre plus three of its standard deviations. Distances of
 # three normal components of standard deviation s have the mean 2 s sqrt(2 / pi) and the variance (3 - 8 / pi) s^2.
@@ -51,10 +50,15 @@ def class_named(name: str) -> ArmClass:
     return CLASSES[name]
 
 
+def small_arm_noise() -> Noise:
+    """The noise of a small commercial measuring arm."""
+    return Noise(encoder_arcsec=2.0, seating=SEATING)
+
+
 def class_noise(arm: Arm, name: str) -> Noise:
     """The noise that plans assume of an arm of a class."""
     repeatability = class_named(name).repeatability
-    return SMALL_ARM if repeatability is None else noise_of_repeatability(arm, repeatability)
+    return small_arm_noise() if repeatability is None else noise_of_repeatability(arm, repeatability)
 
 
 def noise_of_repeatability(arm: Arm, repeatability: float, seating: float = SEATING) -> Noise:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
-from ..data.arm_classes import SMALL_ARM
+from ..data.arm_classes import small_arm_noise
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
 from ..kinematics.arm import Arm, is_single, jacobian_at, joint_limits
@@ -96,7 +96,7 @@ def plan(
     lengths: Sequence[tuple] = (),
     region: Ranges | None = None,
     space: Parameters | None = None,
-    noise: Noise = SMALL_ARM,
+    noise: Noise | None = None,
     criterion: Criterion = "length",
     margin: float = math.radians(5),
     above: float = 0.0,
@@ -129,7 +129,7 @@ def plan(
         region: Ranges of ``x``, ``y``, ``z`` and of the ``distance`` from the origin for placed sockets, mm (default:
             z at least 0).
         space: Free parameters (default: those of `Parameters.free_of`).
-        noise: Noise of the readings, which weights them.
+        noise: Noise of the readings, which weights them; by default that of a small measuring arm.
         criterion: "length" (largest uncertainty of a length over the volume); or "A", "D", "E" of the parameters'
             covariance in natural steps (1 mm, 1 mrad).
         margin: Distance of the joints from their limits, rad.
@@ -161,6 +161,7 @@ def plan(
     if arm.beta is None and space.base.beta is not None:  # free, and 0 so far
         arm = arm.replace(beta=np.zeros(arm.joints))
     check_length = default_length(arm) if check_length is None else check_length
+    noise = small_arm_noise() if noise is None else noise
     check_plannable(arm, criterion, noise)
     check_counts(sockets, poses, len(space.names), u, lengths)
     check_retract(retract)

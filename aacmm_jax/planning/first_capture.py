@@ -21,13 +21,9 @@ from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import search_region
 from ..uncertainty.identifiability import Observability, observability
 from ..uncertainty.volume import default_length, sample_lengths
-from .design import SMALL_ARM
 from .fedorov_exchange import Candidates, Objective, covariance_of
 from .placement import PRIOR, DesignProblem, FixturePlacement, candidates_of, pool_at, pool_of
 
-# Repeatability of 0.05 to 0.1 mm by ISO 9283 is about 10 arcsec a joint on an arm of 1 m.
-ROBOT = Noise(encoder_arcsec=10.0, seating=0.02)
-CLASSES = {"measuring arm": SMALL_ARM, "robot": ROBOT}
 COUNTS = (10, 15, 20, 30, 40, 60, 80, 120, 160, 240)  # of poses
 _LENGTHS = 200  # that predictions are of
 _DETERMINED = 10.0  # mm: a length known no better follows from the weak prior alone

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from ..calibration.observed_evaluation import fit_geometry
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
-from ..data.arm_classes import SMALL_ARM
+from ..data.arm_classes import small_arm_noise
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation, AbstractSimulated
@@ -81,7 +81,7 @@ def plan_kit(
     poses: int = 60,
     region: Ranges | None = None,
     space: Parameters | None = None,
-    noise: Noise = SMALL_ARM,
+    noise: Noise | None = None,
     criterion: Criterion = "length",
     margin: float = math.radians(5),
     above: float = 0.0,
@@ -108,7 +108,7 @@ def plan_kit(
         region: Ranges of ``x``, ``y``, ``z`` and of the ``distance`` from the origin for the tip in what is placed, mm
             (default: z at least 0).
         space: Free parameters (default: those of `Parameters.free_of`).
-        noise: Noise of readings and seat.
+        noise: Noise of readings and seat; by default that of a small measuring arm.
         criterion: As in `plan`.
         margin: Distance of the joints from their limits, rad.
         above: Height in the base frame below which no joint and no tip comes, mm.
@@ -132,6 +132,7 @@ def plan_kit(
     report = progress or (lambda stage, fraction: None)
     if not is_single(arm):
         raise InputError("plan_kit takes one arm, not a batch; give one of its arms.")
+    noise = small_arm_noise() if noise is None else noise
     check_plannable(arm, criterion, noise)
     items = _checked(kit)
     ranges = {"z": (0.0, np.inf)} if region is None else region

@@ -10,12 +10,13 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import pluralise, shorten
 from ..core.units import ARCSEC
+from ..data.arm_classes import class_noise
 from ..data.noise import Noise
 from ..kinematics.arm import Arm, without_corrections
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, tip_frame
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..kinematics.workspace import arm_reach, closest_approach, total_link_length
-from ..planning.first_capture import CLASSES, Determined, FirstCapture, determined_by, first_capture, still_joints
+from ..planning.first_capture import Determined, FirstCapture, determined_by, first_capture, still_joints
 from .calibration import arm_summary
 
 _SHORTEST, _LONGEST = 20.0, 20_000.0  # mm: of an arm's links together
@@ -60,7 +61,8 @@ def arm_survey(
             "determined": [_row(one) for one in found],
             "still": [{"joint": one.joint, "lost": None if one.lost is None else list(one.lost)} for one in still],
         }
-        noises = CLASSES if noise is None else {"given": noise}
+        classes = ("measuring arm", "robot")
+        noises = {name: class_noise(arm, name) for name in classes} if noise is None else {"given": noise}
         needed = [first_capture(arm, one, name) for name, one in noises.items()]
         moving = [one.joint for one in still if one.lost is None or one.lost]
         summary |= {"needed": [_needed(one) for one in needed], "advice": _advice(needed, moving, arm.joints)}
