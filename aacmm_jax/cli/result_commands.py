@@ -249,7 +249,7 @@ def export(
     ] = None,
     about: About = None,
 ) -> None:
-    """Write a calibration for other programs, controllers or as URDF."""
+    """Write a calibration for other programs or controllers."""
     written_as: str = form or _FORMATS.get("" if output is None else output.suffix.lower(), "toml")
     if about is not None and written_as != "dcc":
         raise InputError("--about is for certificates; give it with --format dcc.")
