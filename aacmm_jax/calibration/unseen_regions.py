@@ -155,16 +155,17 @@ def _without(
     errors = np.einsum("mcr,mr->mc", in_mm, dense.residual[left])
     moved = np.einsum("mcr,mrp->mcp", in_mm, dense.white[left])
     by_kept, by_lost = (moved[:, :, which].reshape(errors.size, -1) for which in (kept, lost))
-    errors, spread = errors.ravel() + by_kept @ step, by_kept @ root.T
+    errors, of_parameters = errors.ravel() + by_kept @ step, by_kept @ root.T
     noise = in_mm @ np.swapaxes(in_mm, 1, 2)
     variance = np.diagonal(noise, axis1=1, axis2=2).ravel()
     if lost.any():
         basis, sizes, _ = np.linalg.svd(by_lost, full_matrices=False)
         basis = basis[:, sizes > 1e-9 * sizes.max(initial=1e-300)]
-        errors, spread = errors - basis @ (basis.T @ errors), spread - basis @ (basis.T @ spread)
+        errors = errors - basis @ (basis.T @ errors)
+        of_parameters = of_parameters - basis @ (basis.T @ of_parameters)
         crossed = (noise @ basis.reshape(*in_mm.shape[:2], -1)).reshape(basis.shape)
         variance = variance + np.sum(basis * (basis @ (basis.T @ crossed) - 2 * crossed), axis=1)
-    variance = variance + np.sum(spread**2, axis=1)
+    variance = variance + np.sum(of_parameters**2, axis=1)
     seen = variance > _NOTHING
     poses = int(seen.reshape(-1, 3).any(axis=1).sum())
     ratio = float(np.mean(errors[seen] ** 2 / variance[seen])) if poses else np.nan

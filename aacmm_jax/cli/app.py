@@ -63,6 +63,26 @@ EncoderNoise = Annotated[
     float, typer.Option("--encoder-arcsec", min=0, metavar="ARCSEC", help="Standard deviation of a joint reading.")
 ]
 
+KnownEncoderNoise = Annotated[
+    float | None,
+    typer.Option(
+        "--encoder-arcsec",
+        min=0,
+        metavar="ARCSEC",
+        help="Known standard deviation of a joint reading, for the weights. Default: estimated.",
+    ),
+]
+
+KnownSeatingNoise = Annotated[
+    float | None,
+    typer.Option(
+        "--seating-mm",
+        min=0,
+        metavar="MM",
+        help="Known standard deviation of the tip in its socket, for each coordinate. Default: estimated.",
+    ),
+]
+
 LinearEncoderNoise = Annotated[
     float | None,
     typer.Option(

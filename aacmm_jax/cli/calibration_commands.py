@@ -12,7 +12,18 @@ from ..core.text import number
 from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import reading, together
-from .app import Json, LinearEncoderNoise, Only, Without, app, examples, show_summary, with_spinner
+from .app import (
+    Json,
+    KnownEncoderNoise,
+    KnownSeatingNoise,
+    LinearEncoderNoise,
+    Only,
+    Without,
+    app,
+    examples,
+    show_summary,
+    with_spinner,
+)
 
 
 @app.command(
@@ -104,23 +115,9 @@ def calibrate(
         list[str] | None,
         typer.Option(metavar="NAME=WIDTH", help="Half-width of the bounds of one parameter, in mm or deg; repeatable."),
     ] = None,
-    encoder_arcsec: Annotated[
-        float | None,
-        typer.Option(
-            min=0,
-            metavar="ARCSEC",
-            help="Known standard deviation of a joint reading, for the weights. Default: estimated.",
-        ),
-    ] = None,
+    encoder_arcsec: KnownEncoderNoise = None,
     linear_encoder_mm: LinearEncoderNoise = None,
-    seating_mm: Annotated[
-        float | None,
-        typer.Option(
-            min=0,
-            metavar="MM",
-            help="Known standard deviation of the tip in its socket, for each coordinate. Default: estimated.",
-        ),
-    ] = None,
+    seating_mm: KnownSeatingNoise = None,
     cross_validate: Annotated[
         bool | None,
         typer.Option(
@@ -358,7 +355,7 @@ def _prior(nominal: Any, text: str | None, model: str | None) -> Any:
     return prior_of_text(text, nominal.arm)
 
 
-def known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_encoder_mm: float | None = None) -> Any:
+def known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_encoder_mm: float | None) -> Any:
     """The noise that is known: encoders and seat, or None."""
     from ..data.noise import Noise
 

@@ -10,7 +10,18 @@ from rich.markup import escape
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import reading, together
-from .app import Json, Only, Without, app, examples, show_summary, with_spinner
+from .app import (
+    Json,
+    KnownEncoderNoise,
+    KnownSeatingNoise,
+    LinearEncoderNoise,
+    Only,
+    Without,
+    app,
+    examples,
+    show_summary,
+    with_spinner,
+)
 from .calibration_commands import known_noise
 from .display import formatted, new_console, new_table, print_table, print_warnings
 
@@ -47,18 +58,9 @@ def compare_models(
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_INTEGER, metavar="N", help="Seed of --only-poses.")] = 0,
     only: Only = None,
     without: Without = None,
-    encoder_arcsec: Annotated[
-        float | None,
-        typer.Option(min=0, metavar="ARCSEC", help="Known standard deviation of a joint reading. Default: estimated."),
-    ] = None,
-    seating_mm: Annotated[
-        float | None,
-        typer.Option(
-            min=0,
-            metavar="MM",
-            help="Known standard deviation of the tip in its socket, for each coordinate. Default: estimated.",
-        ),
-    ] = None,
+    encoder_arcsec: KnownEncoderNoise = None,
+    linear_encoder_mm: LinearEncoderNoise = None,
+    seating_mm: KnownSeatingNoise = None,
     as_json: Json = False,
 ) -> None:
     """Compare models of the joints by unseen regions.
@@ -82,7 +84,7 @@ def compare_models(
     part, nominal = recording.capture.select(only or None, without or ()), recording.nominal
     if only_poses is not None:
         part = draw_poses(part, only_poses, seed)[0]
-    noise = known_noise(encoder_arcsec, seating_mm)
+    noise = known_noise(encoder_arcsec, seating_mm, linear_encoder_mm)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IdentifiabilityWarning)
         found = with_spinner("Comparing models", lambda: compared(

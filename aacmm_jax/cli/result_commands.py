@@ -98,7 +98,7 @@ def evaluate(
 ) -> None:
     """Test a calibration on a capture that it has not seen.
 
-    Errors on data that the calibration has not used are printed beside those that its uncertainty predicts. A manifest
+    Errors on data that the calibration has not used are printed next to those that its uncertainty predicts. A manifest
     of points is tested without a calibration.
     """
     from ..acceptance.decision import read_limits

@@ -316,6 +316,9 @@ class Study:
     def _check(self) -> None:
         """Refuse everything that can be known to be wrong before work starts, but for what cannot be reached."""
         capture, pool = self.capture, self.specification.capture.pool
+        for what, there in (("corrections", self.nominal.arm.corrections), ("priors", self.nominal.prior)):
+            if there is not None:
+                raise InputError(f"studies do not know {what} of an arm; leave [{what}] out of its file.")
         if capture is not None and self.specification.reference is not None:
             raise InputError("the capture file brings its reference lengths; leave [reference] out.")
         if capture is not None and capture.joints != self.nominal.arm.joints:

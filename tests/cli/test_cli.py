@@ -146,6 +146,8 @@ def test_float32_is_refused_at_import(aacmm_process, monkeypatch):
 def test_a_process_of_its_own(aacmm_process, cache, tmp_path, monkeypatch):
     """Exit codes of real processes, and the folder in which compiled programs are kept for the next one."""
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    # Every program is kept, however fast this machine compiles it.
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     aacmm_process("simulate", "panda", "-o", "capture.h5", "--socket", "A=400,0,300", "--poses", 2)
     assert (tmp_path / "capture.h5").exists()
     assert list((cache / "aacmm_jax").iterdir())

@@ -286,7 +286,7 @@ def _worth_refining(
     radii: Float[AnyArray, " k"],
 ) -> Int[AnyArray, " t"]:
     """The directions whose circle fits better than those around them, the best of them, and the principal axes: a few
-    touches may lie nearly on several cylinders, and the best direction tried need not be beside the best of all."""
+    touches may lie nearly on several cylinders, and the best direction tried need not be next to the best of all."""
     xp = namespace(centred)
     y = xp.einsum("kca,cm->kam", frames[:, :, :2], centred)
     distance = xp.sqrt(xp.sum((y - centres[:, :, None]) ** 2, axis=1))
