@@ -296,7 +296,8 @@ def _solved(bounds: Any, capture: Any, scale: str, method: Any, solving: dict[st
     from ..calibration.single import identify
 
     if scale == "measured":
-        return run(bounds.space.base, capture, bounds, method=method, **solving, strict=strict)
+        options = solving | {"strict": strict, "check_identifiability": False}  # the summary has its own
+        return run(bounds.space.base, capture, bounds, method=method, **options)
     if method is not None or strict:
         raise InputError("--scale nominal is stage 1 alone; leave out --method and --strict.")
     if any(observation.fixes_scale for observation in capture.observations):

@@ -281,9 +281,8 @@ def correction_names(arm: Arm) -> tuple[str, ...]:
     """Names of the coefficients of an arm's corrections, and of the components of gravity where some depend on it."""
     if arm.corrections is None:
         return ()
-    each = arm.corrections.functions.each
-    by_gravity = any(function.rows == 3 for function in each)
-    return (*(function.name for function in each), *(f"gravity_{axis}" for axis in _AXES if by_gravity))
+    functions = arm.corrections.functions
+    return (*functions.names, *(f"gravity_{axis}" for axis in _AXES if functions.by_gravity.any()))
 
 
 def locate(arm: Arm, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:

@@ -6,8 +6,10 @@ on a GPU. (Measured, 70 configurations x 21 columns on one core: 30 us; unrolled
 XLA then computes the chain again for every column. `forward_pass_by_joints` prevents that, for batches on a CPU.)
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -64,8 +66,20 @@ class KnownFunction(Protocol):
         """1, or 3 where the function is the product of the direction of gravity with three rows."""
         ...
 
-    def values(self, q: Float[AnyArray, "n ... 1 N"], forward: "ForwardPass") -> Float[AnyArray, "rows ... 1 N"]:
-        """Its rows at N configurations, with the nominal arm's frames there."""
+    @property
+    def kind(self) -> "KindOfFunctions":
+        """What evaluates it."""
+        ...
+
+
+@runtime_checkable
+class KindOfFunctions(Protocol):
+    """What evaluates functions of a kind all at once, of which an arm may have hundreds."""
+
+    def values(
+        self, terms: Sequence[Any], q: Float[AnyArray, "n ... 1 N"], forward: "ForwardPass"
+    ) -> Float[AnyArray, "rows ... 1 N"]:
+        """Their rows at N configurations, with the nominal arm's frames there."""
         ...
 
 
@@ -76,20 +90,47 @@ class KnownFunctions:
 
     each: tuple[KnownFunction, ...]
 
-    @property
+    def values(self, q: Float[AnyArray, "n ... 1 N"], forward: "ForwardPass") -> Float[AnyArray, "rows ... 1 N"]:
+        """All rows at N configurations, with the nominal arm's frames there."""
+        kinds = [tuple(own) for _, own in groupby(self.each, key=lambda function: type(function.kind))]
+        return namespace(q, forward).concatenate([own[0].kind.values(own, q, forward) for own in kinds])
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coefficients."""
+        return tuple(function.name for function in self.each)
+
+    @cached_property
+    def moved(self) -> Int[np.ndarray, " k"]:
+        """The joint, from 0, that each function moves."""
+        return np.array([function.joint - 1 for function in self.each])
+
+    @cached_property
+    def by_gravity(self) -> Bool[np.ndarray, " k"]:
+        """Whether a function is the product of the direction of gravity with three rows."""
+        return np.array([function.rows == 3 for function in self.each])
+
+    @cached_property
+    def first_row(self) -> Int[np.ndarray, " k"]:
+        """The first row of each function."""
+        rows = np.where(self.by_gravity, 3, 1)
+        return np.cumsum(rows) - rows
+
+    @cached_property
     def term_of_row(self) -> Int[np.ndarray, " rows"]:
         """The function, from 0, that each row belongs to."""
-        return np.repeat(np.arange(len(self.each)), [function.rows for function in self.each])
+        return np.repeat(np.arange(len(self.each)), np.where(self.by_gravity, 3, 1))
 
     @property
     def component_of_row(self) -> Int[np.ndarray, " rows"]:
         """The component of gravity that each row is multiplied by; 3 for those of other functions."""
-        return np.concatenate([np.arange(3) if function.rows == 3 else [3] for function in self.each])
+        return np.where(
+            self.by_gravity[self.term_of_row], np.arange(len(self.term_of_row)) - self.first_row[self.term_of_row], 3
+        )
 
-    def joint_of_row(self, joints: int) -> Float[np.ndarray, "n rows"]:
-        """1 where a row moves a joint, else 0."""
-        moved = np.array([self.each[term].joint - 1 for term in self.term_of_row])
-        return (np.arange(joints)[:, None] == moved).astype(float)
+    def of_joints(self, joints: int) -> Float[np.ndarray, "n k"]:
+        """1 where a function moves a joint, else 0."""
+        return (np.arange(joints)[:, None] == self.moved).astype(float)
 
 
 class Corrections(NamedTuple):
@@ -196,9 +237,7 @@ def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"])
     if corrections is None:
         return motion
     forward = forward_pass(corrections.nominal, motion)
-    return motion._replace(
-        functions=xp.concatenate([function.values(rows, forward) for function in corrections.functions.each])
-    )
+    return motion._replace(functions=corrections.functions.values(rows, forward))
 
 
 @compiled
@@ -298,15 +337,20 @@ def _joint_errors(
     assert motion.functions is not None
     assert parameters.coefficients is not None
     assert parameters.gravity is not None
-    by_component = xp.concatenate([parameters.gravity, xp.ones_like(parameters.gravity[:1])])
-    component, term = functions.component_of_row, functions.term_of_row
-    joints = functions.joint_of_row(len(parameters.theta))
-    weighted = by_component[component] * motion.functions
-    terms = (np.arange(len(functions.each))[:, None] == term).astype(float)
-    by_coefficient = xp.tensordot(terms, weighted, axes=1)
-    added = xp.tensordot(joints, parameters.coefficients[term] * weighted, axes=1)
-    moments = parameters.coefficients[term] * motion.functions
-    by_gravity = xp.stack([xp.tensordot(joints * (component == i), moments, axes=1) for i in range(3)], axis=1)
+    rows, gravity, joints = motion.functions, parameters.gravity, functions.of_joints(len(parameters.theta))
+    by_coefficient, by_gravity = rows, xp.zeros((len(joints), 3, *rows.shape[1:]))
+    heavy = np.flatnonzero(functions.by_gravity)
+    if len(heavy):
+        moments = [rows[functions.first_row[heavy] + i] for i in range(3)]
+        moment = gravity[:1] * moments[0] + gravity[1:2] * moments[1] + gravity[2:] * moments[2]
+        others = functions.first_row[~functions.by_gravity]
+        order = np.argsort(np.concatenate([heavy, np.flatnonzero(~functions.by_gravity)]))
+        by_coefficient = xp.concatenate([moment, xp.broadcast_to(rows[others], (len(others), *moment.shape[1:]))])[
+            order
+        ]
+        weighted = xp.stack([parameters.coefficients[heavy] * each for each in moments], axis=1)
+        by_gravity = xp.tensordot(joints[:, heavy], weighted, axes=1)
+    added = xp.tensordot(joints, parameters.coefficients * by_coefficient, axes=1)
     return added, JointErrors(by_coefficient, by_gravity, functions)
 
 

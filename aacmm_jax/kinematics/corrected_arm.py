@@ -112,7 +112,7 @@ def function_values(
     nominal: Geometry, terms: Sequence[Term], q: Float[np.ndarray, "N n"], gravity: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "k N"]:
     """The function of each term at N configurations, in units of its coefficient's effect (rad, or mm)."""
-    rows, forward = joints_first(q, 1), forward_pass(nominal, joint_motion(nominal, q))
-    values = (term.values(rows, forward)[:, 0] for term in terms)
-    found = [gravity @ value if len(value) == 3 else value[0] for value in values]
-    return np.array(found).reshape(len(terms), len(q))
+    functions = KnownFunctions(tuple(terms))
+    rows = functions.values(joints_first(q, 1), forward_pass(nominal, joint_motion(nominal, q)))[:, 0]
+    weight = np.array([*gravity, 1.0])[functions.component_of_row]
+    return np.add.reduceat(weight[:, None] * rows, functions.first_row)

@@ -41,7 +41,7 @@ def jacobian_columns(forward: ForwardPass) -> dict[str, Float[AnyArray, "k ... 3
     columns["probe"] = xp.stack(forward.frame)
     if forward.errors is not None:
         # All at once: there may be hundreds of coefficients.
-        moved = np.array([function.joint - 1 for function in forward.errors.functions.each])
+        moved = forward.errors.functions.moved
         columns["coefficients"] = forward.errors.by_coefficient * reading_columns(forward)[moved]
         columns["gravity"] = xp.stack([_correction_column(forward, "gravity", i) for i in range(3)])
     return columns
@@ -92,11 +92,13 @@ def _columns_of(forward: ForwardPass, kind: str, at: int | slice) -> Float[AnyAr
 def moved_by_correction(forward: ForwardPass, kind: str, i: int) -> list[tuple[int, Float[AnyArray, "... 1 N"]]]:
     """The joints that a coefficient, or a component of gravity, moves, and by how much."""
     assert forward.errors is not None
-    each = forward.errors.functions.each
+    functions = forward.errors.functions
     if kind == "coefficients":
-        return [(each[i].joint - 1, forward.errors.by_coefficient[i])]
-    moved = sorted({function.joint - 1 for function in each if function.rows == 3})
-    return [(joint, forward.errors.by_gravity[joint, i]) for joint in moved]
+        return [(int(functions.moved[i]), forward.errors.by_coefficient[i])]
+    return [
+        (joint, forward.errors.by_gravity[joint, i])
+        for joint in sorted(set(functions.moved[functions.by_gravity].tolist()))
+    ]
 
 
 def _correction_column(forward: ForwardPass, kind: str, i: int) -> Float[AnyArray, "... 3 N"]:

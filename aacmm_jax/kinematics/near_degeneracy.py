@@ -89,21 +89,25 @@ def trade_offs(
         return ()
     leading = reduced_echelon(vectors[weak].T)[1]
     fixed = np.isin(np.arange(len(names)), leading)
-    found = [_trade_off(int(i), fixed, movements, names, whitened, half_widths) for i in leading]
+    # The best imitation of one step of each by all that do not lead a trade-off themselves.
+    imitations = np.linalg.lstsq(rows[:, ~fixed], rows[:, leading], rcond=_ZERO)[0].T
+    found = [
+        _trade_off(i, amounts, fixed, movements, names, whitened, half_widths)
+        for i, amounts in zip(leading, imitations, strict=True)
+    ]
     return tuple(sorted(found, key=lambda item: item.movement))
 
 
 def _trade_off(
     i: int,
+    amounts: Float[np.ndarray, " free"],
     fixed: Bool[np.ndarray, " p"],
     movements: Float[np.ndarray, "r p"],
     names: Sequence[str],
     whitened: Float[np.ndarray, "w p"] | None,
     half_widths: Float[np.ndarray, " p"] | None,
 ) -> TradeOff:
-    """The best imitation of one step of parameter i by all that do not lead a trade-off themselves."""
-    rows = movements if whitened is None else whitened
-    amounts = np.linalg.lstsq(rows[:, ~fixed], rows[:, i], rcond=_ZERO)[0]
+    """The trade-off of parameter i with those that imitate it by these amounts."""
     direction = np.zeros(len(names))
     direction[~fixed], direction[i] = -amounts, 1.0
     largest = np.abs(amounts).max(initial=0.0)

@@ -55,7 +55,7 @@ class Observed(eqx.Module):
         return cls(
             observations=observations,
             q=q,
-            motion=None if arm is None else joint_motion(arm.geometry, q),
+            motion=None if arm is None else joint_motion(to_numpy(arm.geometry), q),
             nominal=xp.stack([length.value for length in lengths]) if lengths else np.zeros(0),
             u=xp.stack([length.u for length in lengths]) if lengths else np.zeros(0),
             ends=tuple((position_of(length.start), position_of(length.end)) for length in lengths),

@@ -134,8 +134,8 @@ def _on_bounds_observed(record: CalibrationRecord) -> list[str]:
 def observed(record: CalibrationRecord) -> Observability:
     """What the data of a calibration determine about the calibrated arm, given its noise and bounds."""
     arm, capture = record.calibrated.arm, record.recording.capture
-    motion = joint_motion(arm.geometry, np.asarray(capture.readings))
-    covariances = tip_covariances(*to_numpy((arm.geometry, motion, record.noise)))
+    geometry, noise = to_numpy((arm.geometry, record.noise))
+    covariances = tip_covariances(geometry, joint_motion(geometry, np.asarray(capture.readings)), noise)
     sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
     space = Parameters(arm, record.names)
     known = () if record.prior is None else record.prior.known

@@ -1,8 +1,10 @@
 """Coupled joints: a motor or a belt that turns one joint moves another a little, too."""
 
 import re
+from collections.abc import Sequence
 from typing import ClassVar
 
+import numpy as np
 from jaxtyping import Float
 
 from ...core.errors import InputError
@@ -36,6 +38,6 @@ class Coupling(AbstractCorrection):
         return "1"
 
     def values(
-        self, term: Term, q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
+        self, terms: Sequence[Term], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
     ) -> Float[AnyArray, "rows ... 1 N"]:
-        return q[term.number - 1][None]
+        return q[np.array([term.number - 1 for term in terms])]

@@ -1,7 +1,9 @@
 """Gear ratio: a joint that turns, or a carriage that moves, by a little more or less than it reads."""
 
+from collections.abc import Sequence
 from typing import ClassVar
 
+import numpy as np
 from jaxtyping import Float
 
 from ...core.errors import InputError
@@ -30,6 +32,6 @@ class GearRatio(AbstractCorrection):
         return "1"
 
     def values(
-        self, term: Term, q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
+        self, terms: Sequence[Term], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
     ) -> Float[AnyArray, "rows ... 1 N"]:
-        return q[term.joint - 1][None]
+        return q[np.array([term.joint - 1 for term in terms])]

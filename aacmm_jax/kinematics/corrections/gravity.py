@@ -4,8 +4,10 @@ The moment of a mass m at c about the axis z through o is m g . (z x (c - o)): l
 that its three components are functions of the readings alone.
 """
 
+from collections.abc import Sequence
 from typing import ClassVar
 
+import numpy as np
 from jaxtyping import Float
 
 from ...core.errors import InputError
@@ -50,21 +52,24 @@ class Gravity(AbstractCorrection):
         return "rad/m" if term.number else "rad/(kN m)"
 
     def values(
-        self, term: Term, q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
+        self, terms: Sequence[Term], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
     ) -> Float[AnyArray, "rows ... 1 N"]:
-        i = term.joint - 1
-        axis, origin = forward.z_before[i], forward.origin_before[i]
-        if term.number:
-            last = term.number == len(forward.origin)
-            moment = _METRE * cross(axis, (forward.tip if last else forward.origin[term.number - 1]) - origin)
-        else:
-            assert term.loads is not None
-            loads, centres = term.loads, _centres(forward, term.loads)
-            moment = sum(
-                _METRE * _KILONEWTON * _STANDARD_GRAVITY * loads.mass[j] * cross(axis, centres[j] - origin)
-                for j in range(i, len(centres))
-            )
-        return namespace(moment).moveaxis(moment, -2, 0)[..., None, :]
+        xp, joints = namespace(forward), np.array([term.joint - 1 for term in terms])
+        weights, points = zip(*[_pull(term, forward) for term in terms], strict=True)
+        weight = np.array(weights).reshape(-1, *(1,) * forward.tip.ndim)
+        lever = xp.stack(points) - weight * forward.origin_before[joints]
+        moments = xp.moveaxis(_METRE * cross(forward.z_before[joints], lever), -2, 1)
+        return moments.reshape(-1, *moments.shape[2:])[..., None, :]
+
+
+def _pull(term: Term, forward: ForwardPass) -> tuple[float, Float[AnyArray, "... 3 N"]]:
+    """The weight that pulls at a joint, and the sum of weights times where they are, mm: 1 of a single link, kN."""
+    if term.number:
+        return 1.0, forward.tip if term.number == len(forward.origin) else forward.origin[term.number - 1]
+    assert term.loads is not None
+    centres, each = _centres(forward, term.loads), _KILONEWTON * _STANDARD_GRAVITY * np.array(term.loads.mass)
+    after = range(term.joint - 1, len(centres))
+    return float(each[after].sum()), sum(each[j] * centres[j] for j in after)
 
 
 def _centres(forward: ForwardPass, loads: Loads) -> list[Float[AnyArray, "... 3 N"]]:

@@ -5,8 +5,10 @@ one that is oval or tilted errs by the second harmonic, and N evenly spaced read
 """
 
 import re
+from collections.abc import Sequence
 from typing import ClassVar
 
+import numpy as np
 from jaxtyping import Float
 
 from ...core.errors import InputError
@@ -54,7 +56,11 @@ class Harmonics(AbstractCorrection):
         return "rad"
 
     def values(
-        self, term: Term, q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
+        self, terms: Sequence[Term], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
     ) -> Float[AnyArray, "rows ... 1 N"]:
-        xp, angle = namespace(q), term.number * q[term.joint - 1]
-        return (xp.cos(angle) if term.word == "cos" else xp.sin(angle))[None]
+        xp, angles = namespace(q), list(dict.fromkeys((term.number, term.joint) for term in terms))
+        order, joint = np.array(angles).T
+        angle = order.astype(float).reshape(-1, *(1,) * (q.ndim - 1)) * q[joint - 1]
+        place = {which: i for i, which in enumerate(angles)}
+        rows = [place[term.number, term.joint] + len(angles) * (term.word == "sin") for term in terms]
+        return xp.concatenate([xp.cos(angle), xp.sin(angle)])[np.array(rows)]

@@ -9,6 +9,7 @@ d) times phi. A new kind is one file with one class, and its entry in `kinds.KIN
 """
 
 import abc
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -61,12 +62,12 @@ class AbstractCorrection(eqx.Module):
 
     @abc.abstractmethod
     def values(
-        self, term: "Term", q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
+        self, terms: Sequence["Term"], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
     ) -> Float[AnyArray, "rows ... 1 N"]:
-        """The function of a term at N configurations.
+        """The functions of terms at N configurations, one after the other: `rows` of each.
 
         Args:
-            term: One of this kind's.
+            terms: Of this kind.
             q: Joint readings, rad (mm of prismatic joints), joints first.
             forward: The frames of the nominal arm at these readings, mm.
         """
@@ -103,7 +104,3 @@ class Term(NamedTuple):
     def rows(self) -> int:
         """How many rows `values` has."""
         return self.kind.rows
-
-    def values(self, q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass) -> Float[AnyArray, "rows ... 1 N"]:
-        """The function at N configurations, of the nominal arm's frames; see `AbstractCorrection.values`."""
-        return self.kind.values(self, q, forward)
