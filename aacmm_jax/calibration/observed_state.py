@@ -103,13 +103,13 @@ def check_means(prior: Prior, bounds: Bounds) -> None:
     known = prior.of(names, np.asarray(bounds.space.vector()))
     if known is None:
         return
-    for i in known.index:
-        mean, low, high = (float(values[i]) for values in (known.mean, bounds.lower, bounds.upper))
-        if not low <= mean <= high:
-            raise InputError(
-                f"the prior's mean of {names[i]} is {mean:g}, outside its bounds {low:g} to {high:g} (mm or rad); "
-                "correct the mean or widen the bounds."
-            )
+    mean, low, high = (np.asarray(values)[known.index] for values in (known.mean, bounds.lower, bounds.upper))
+    outside = np.flatnonzero(~((low <= mean) & (mean <= high)))
+    for i in outside[:1]:
+        raise InputError(
+            f"the prior's mean of {names[known.index[i]]} is {mean[i]:g}, outside its bounds {low[i]:g} to "
+            f"{high[i]:g} (mm or rad); correct the mean or widen the bounds."
+        )
 
 
 def unknown_parameters(space: Parameters, anchor: ScaleAnchor, prior: Prior | None, noise: Noise | None) -> int:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.evaluation import Evaluation
 from ..calibration.left_out import CrossValidation, LeftOut
 from ..calibration.record import CalibrationRecord
 from ..calibration.scale_anchor import scale_anchor
@@ -57,9 +58,10 @@ def save_calibration(
     tables["stage1_arm"] = arm_table(record.stage1)
     tables["calibrated_arm"] = arm_table(record.calibrated)
     tables["parameters"] = _parameter_table(record)
-    tables["sockets"] = _socket_table(record)
+    evaluations = record.evaluations()
+    tables["sockets"] = _socket_table(record, evaluations)
     reference = tables["reference"].variables
-    for stage, evaluation in record.evaluations().items():
+    for stage, evaluation in evaluations.items():
         reference[f"measured_{stage}"] = Variable(
             ("length",), np.asarray(evaluation.measured), "mm", f"length as the {stage} arm measures it"
         )
@@ -302,11 +304,11 @@ def _sampled_table(record: CalibrationRecord) -> Table:
     )
 
 
-def _socket_table(record: CalibrationRecord) -> Table:
+def _socket_table(record: CalibrationRecord, evaluations: Mapping[str, Evaluation]) -> Table:
     capture = record.recording.capture
     variables = columns("socket", socket=(list(capture.names), "", "socket")) | axes("axis of the base frame")
     variables |= columns("socket", poses=(list(capture.sizes), "1", "number of poses"))
-    for stage, evaluation in record.evaluations().items():
+    for stage, evaluation in evaluations.items():
         metrics = evaluation.repeatability
         for name, values, text in (
             ("de", metrics.socket_de, "mean distance from the centroid"),

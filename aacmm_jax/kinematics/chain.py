@@ -90,10 +90,17 @@ class KnownFunctions:
 
     each: tuple[KnownFunction, ...]
 
+    def __hash__(self) -> int:
+        return hash(self.names)  # kept: every call of a compiled program asks for it
+
     def values(self, q: Float[AnyArray, "n ... 1 N"], forward: "ForwardPass") -> Float[AnyArray, "rows ... 1 N"]:
         """All rows at N configurations, with the nominal arm's frames there."""
-        kinds = [tuple(own) for _, own in groupby(self.each, key=lambda function: type(function.kind))]
-        return namespace(q, forward).concatenate([own[0].kind.values(own, q, forward) for own in kinds])
+        return namespace(q, forward).concatenate([own[0].kind.values(own, q, forward) for own in self._of_one_kind])
+
+    @cached_property
+    def _of_one_kind(self) -> list[tuple[KnownFunction, ...]]:
+        """Neighbours of the same kind."""
+        return [tuple(own) for _, own in groupby(self.each, key=lambda function: type(function.kind))]
 
     @cached_property
     def names(self) -> tuple[str, ...]:

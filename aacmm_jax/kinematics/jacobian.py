@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..core._compat import SymbolicZero
 from ..core.numpy_or_jax import AnyArray, compiled, namespace
@@ -37,14 +37,20 @@ def _cross(u: Float[AnyArray, "... 3 N"], v: Float[AnyArray, "... 3 N"]) -> Floa
 def jacobian_columns(forward: ForwardPass) -> dict[str, Float[AnyArray, "k ... 3 N"]]:
     """Derivative of the tip by every parameter: kind -> one vector per joint (or probe axis)."""
     kinds = ("alpha", "a", "d", "theta") if forward.y is None else ("alpha", "a", "d", "theta", "beta")
-    xp, columns = namespace(forward.tip), {kind: _columns_of(forward, kind, slice(None)) for kind in kinds}
-    columns["probe"] = xp.stack(forward.frame)
-    if forward.errors is not None:
-        # All at once: there may be hundreds of coefficients.
-        moved = forward.errors.functions.moved
-        columns["coefficients"] = forward.errors.by_coefficient * reading_columns(forward)[moved]
-        columns["gravity"] = xp.stack([_correction_column(forward, "gravity", i) for i in range(3)])
-    return columns
+    kinds = (*kinds, "probe") if forward.errors is None else (*kinds, "probe", "coefficients", "gravity")
+    return {kind: _columns_of_kind(forward, kind) for kind in kinds}
+
+
+def _columns_of_kind(forward: ForwardPass, kind: str) -> Float[AnyArray, "k ... 3 N"]:
+    xp = namespace(forward.tip)
+    if kind == "probe":
+        return xp.stack(forward.frame)
+    if kind == "gravity":
+        return xp.stack([_correction_column(forward, kind, i) for i in range(3)])
+    if kind == "coefficients":  # all at once: there may be hundreds
+        assert forward.errors is not None
+        return forward.errors.by_coefficient * reading_columns(forward)[forward.errors.functions.moved]
+    return _columns_of(forward, kind, slice(None))
 
 
 def reading_columns(forward: ForwardPass) -> Float[AnyArray, "n ... 3 N"]:
@@ -147,9 +153,44 @@ def stacked_jacobian_columns(
     if isinstance(forward.x, tuple):
         chosen = [_columns_of(forward, kind, i) for kind, i in wanted]
     else:
-        columns = jacobian_columns(forward)
+        columns = {kind: _columns_of_kind(forward, kind) for kind in dict.fromkeys(kind for kind, _ in wanted)}
         chosen = [columns[kind][i] for kind, i in wanted]
     return xp.stack(chosen, axis=-3) if chosen else xp.zeros((*forward.tip.shape[:-2], 0, *forward.tip.shape[-2:]))
+
+
+def shared_indices(
+    forward: ForwardPass, indices: tuple[tuple[str, int], ...]
+) -> tuple[tuple[tuple[str, int], ...], Int[np.ndarray, " p"]]:
+    """Fewer parameters, and of which of them the column of each parameter is a multiple.
+
+    The columns of a joint's coefficients are multiples of that of its reading (`multiplied`), so that what is done to
+    all columns (weights, products) need be done to few of them.
+    """
+    if forward.errors is None:
+        return indices, np.arange(len(indices))
+    moved = forward.errors.functions.moved
+    wanted = [("q", int(moved[i])) if kind == "coefficients" else (kind, i) for kind, i in indices]
+    few = {one: place for place, one in enumerate(dict.fromkeys(wanted))}
+    return tuple(few), np.array([few[one] for one in wanted])
+
+
+def multiplied(
+    columns: Float[AnyArray, "b r m"],
+    source: Int[np.ndarray, " p"],
+    forward: ForwardPass,
+    indices: tuple[tuple[str, int], ...],
+    rows: slice,
+) -> Float[AnyArray, "p r m"]:
+    """Columns of all parameters, at some of the configurations, from those of `shared_indices`."""
+    of_functions = np.array([kind == "coefficients" for kind, _ in indices])
+    if not of_functions.any():
+        return columns
+    assert forward.errors is not None
+    which = np.array([i for kind, i in indices if kind == "coefficients"])
+    products = columns[source[of_functions]] * forward.errors.by_coefficient[which][..., rows]
+    both = namespace(columns, forward).concatenate([columns[source[~of_functions]], products])
+    order = np.argsort(np.concatenate([np.flatnonzero(~of_functions), np.flatnonzero(of_functions)]))
+    return both if np.array_equal(order, np.arange(len(order))) else both[order]
 
 
 def rotation_columns(forward: ForwardPass, indices: tuple[tuple[str, int], ...]) -> Float[AnyArray, "... p 3 N"]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
+from functools import cache
 
 import equinox as eqx
 import numpy as np
@@ -185,6 +186,7 @@ def _is_correction(group: str, name: str) -> bool:
     return not option or (kind == Harmonics.model and found[1] in (orders_of(option) or ()))
 
 
+@cache
 def _correction(name: str) -> tuple[str, int] | None:
     """Kind of a coefficient, as a model names it, and its number; None for every other parameter."""
     found = COEFFICIENT.fullmatch(name)
@@ -223,6 +225,7 @@ def _unit(names: Iterable[str]) -> str:
     return MIXED if len(lengths) == 2 else "mm" if True in lengths else "rad"
 
 
+@cache
 def _unit_of_coefficient(name: str) -> str:
     """Of a joint correction; empty for other parameters."""
     found = _correction(name)

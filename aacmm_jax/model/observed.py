@@ -19,7 +19,7 @@ from ..data.observations.platform import platform_frames
 from ..data.observations.socket import Socket, position_of
 from ..kinematics.arm import Arm
 from ..kinematics.chain import ForwardPass, JointMotion, forward_pass, joint_motion
-from ..kinematics.jacobian import rotation_columns, stacked_jacobian_columns
+from ..kinematics.jacobian import multiplied, rotation_columns, shared_indices, stacked_jacobian_columns
 from ..kinematics.parameters import Parameters
 from ..solver.active_set import QuadraticModel
 from .robust import Loss
@@ -184,8 +184,8 @@ def linear_rows(
     p = len(space.names)
     forward = observed.forward(space, z[:p], z[p:])
     xp, parts, positions = namespace(forward, z), observed.split(z[p:]), observed.positions
-    columns = stacked_jacobian_columns(forward, space.indices())
-    own_probe = np.array([kind == "probe" for kind, _ in space.indices()])
+    few, source = shared_indices(forward, space.indices())
+    columns, own_probe = stacked_jacobian_columns(forward, few), np.array([kind == "probe" for kind, _ in few])
     turned = None
     found = []
     for number, (observation, rows) in enumerate(zip(observed.observations, observed.slices, strict=True)):
@@ -198,8 +198,9 @@ def linear_rows(
             mine = xp.where(own_probe[:, None, None], 0.0, mine)
         by_parameters = _times(residual.by_tip, mine)
         if residual.by_rotation is not None:
-            turned = rotation_columns(forward, space.indices()) if turned is None else turned
+            turned = rotation_columns(forward, few) if turned is None else turned
             by_parameters = by_parameters + _times(residual.by_rotation, turned[..., rows])
+        by_parameters = multiplied(by_parameters, source, forward, space.indices(), rows)
         if observation.target:
             axes = xp.stack([axis[:, rows] for axis in forward.frame])
             blocks.append(_times(residual.by_tip, axes))
