@@ -90,6 +90,8 @@ def _direction(gravity: Numbers) -> Float[np.ndarray, " 3"]:
 
 def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"]) -> tuple[Term, ...]:
     """The terms whose functions are no combination of a constant and of those before them, joint by joint."""
+    if not terms:
+        return ()
     limits = joint_limits(arm, None)
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_CONFIGURATIONS, arm.joints))
     values, taken = function_values(arm.geometry, terms, q, gravity), []
