@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.numpy_or_jax import AnyArray, add_at, compiled, namespace, set_at
+from ..core.numpy_or_jax import AnyArray, added_to, compiled, namespace, set_at
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import PriorRows, Whitening, observed_model, observed_rows
@@ -203,7 +203,7 @@ def _weighted_rows(loss: Loss, state: State, whitening: Whitening, rows: list[An
 
 def _information_of(prior: PriorRows, scaled: Float[AnyArray, " z"]) -> Float[AnyArray, "z z"]:
     xp, own = namespace(scaled), np.arange(prior.mean.shape[0])
-    return add_at(xp.zeros((scaled.shape[0],) * 2), (own, own), (prior.weight * scaled[own]) ** 2)
+    return added_to(xp.zeros((scaled.shape[0],) * 2), (own, own), (prior.weight * scaled[own]) ** 2)
 
 
 def _flat(rows: Float[AnyArray, "z r m"]) -> Float[AnyArray, "z k"]:

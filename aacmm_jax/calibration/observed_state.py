@@ -16,7 +16,7 @@ from ..kinematics.chain import forward_pass
 from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..kinematics.priors import Prior
 from ..model.measurement import check_joints
-from ..model.observed import Linear, Observed, PriorRows, Whitening, linear_rows, whitening_of
+from ..model.observed import Linear, Observed, PriorRows, Whitening, linear_rows, residual_rows, whitening_of
 from ..model.robust import Loss, LossName, check_loss
 from ..uncertainty import observed_covariance as propagation
 from ..uncertainty.covariance import NoiseModel
@@ -175,7 +175,22 @@ def state_at(
 ) -> State:
     """The state at a point; ``sigma`` is estimated unless it is given, and ``effective`` is how many unknowns the data
     determine, by default all."""
-    linear = linear_rows(space, task.observed, z)
+    return _state_of(task, space, z, linear_rows(space, task.observed, z), sigma, effective)
+
+
+def sigma_at(
+    task: ObservedTask, space: Parameters, z: Float[AnyArray, " z"], effective: Float[AnyArray, ""]
+) -> Float[AnyArray, ""]:
+    """The standard deviation of a tip coordinate that `state_at` estimates, without derivatives by the unknowns."""
+    rows = residual_rows(space, task.observed, z)
+    none = np.arange(0)
+    linear = [Linear(part, namespace(z).zeros((0, *part.values.shape)), none) for part in rows]
+    return _state_of(task, space, z, linear, None, effective).sigma
+
+
+def _state_of(
+    task: ObservedTask, space: Parameters, z: Float[AnyArray, " z"], linear: list[Linear], sigma: Any, effective: Any
+) -> State:
     p = len(space.names)
     forward = task.observed.forward(space, z[:p], z[p:])
     errors = propagation.arm_errors(forward, linear, task.observed)

@@ -30,7 +30,7 @@ from ..uncertainty.evidence import (
     slope_of_expectation,
 )
 from .bounded_fit import Fit, fit
-from .observed_state import ObservedTask, State, state_at, whitening_at
+from .observed_state import ObservedTask, State, sigma_at, whitening_at
 from .results import PriorMetrics
 
 _ROUNDS = 60  # least squares with new standard deviations; usually 4 to 8
@@ -115,7 +115,7 @@ class PriorProblem(NamedTuple):
         if self.task.noise is not None:
             return self.reference.sigma
         spent = z.shape[0] - effective.shape[0] + namespace(effective).sum(effective)
-        return state_at(self.task, self.space, z, effective=spent).sigma
+        return sigma_at(self.task, self.space, z, spent)
 
     def updated(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> Float[AnyArray, " s"]:
         """The scales that the result of the least squares with these scales leads to."""

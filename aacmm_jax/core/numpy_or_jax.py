@@ -136,13 +136,15 @@ def set_at(array: AnyArray, index: Any, value: Any) -> Any:
     return changed
 
 
-def add_at(array: AnyArray, index: Any, value: Any) -> Any:
-    """A copy of the array with values added at an index, which names no element twice."""
+def added_to(array: AnyArray, index: Any, value: Any) -> Any:
+    """An array that nothing else holds, with values added at an index, which names no element twice.
+
+    NumPy's is changed itself, which saves the copy.
+    """
     if namespace(array, value) is jnp:
         return jnp.asarray(array).at[index].add(value)
-    changed = np.array(array)
-    changed[index] += value
-    return changed
+    array[index] += value
+    return array
 
 
 def stop_gradient(tree: Tree) -> Tree:

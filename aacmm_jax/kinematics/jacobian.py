@@ -5,8 +5,8 @@ sliding it along ``u`` moves the tip by ``u``. So each Jacobian column follows f
 """
 
 from collections.abc import Callable, Mapping
-from functools import partial
-from typing import Any
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from .chain import (
     Geometry,
     JointKinds,
     JointMotion,
+    KnownFunctions,
     components_last,
     forward_pass,
     forward_pass_by_joints,
@@ -158,39 +159,48 @@ def stacked_jacobian_columns(
     return xp.stack(chosen, axis=-3) if chosen else xp.zeros((*forward.tip.shape[:-2], 0, *forward.tip.shape[-2:]))
 
 
-def shared_indices(
-    forward: ForwardPass, indices: tuple[tuple[str, int], ...]
-) -> tuple[tuple[tuple[str, int], ...], Int[np.ndarray, " p"]]:
-    """Fewer parameters, and of which of them the column of each parameter is a multiple.
+class SharedColumns(NamedTuple):
+    """Parameters whose columns are multiples of fewer columns, as those of a joint's coefficients are of its reading's.
 
-    The columns of a joint's coefficients are multiples of that of its reading (`multiplied`), so that what is done to
-    all columns (weights, products) need be done to few of them.
+    What is done to all columns (weights, products) then need be done to few of them.
     """
-    if forward.errors is None:
-        return indices, np.arange(len(indices))
-    moved = forward.errors.functions.moved
-    wanted = [("q", int(moved[i])) if kind == "coefficients" else (kind, i) for kind, i in indices]
+
+    few: tuple[tuple[str, int], ...]  # parameters whose columns are needed
+    source: Int[np.ndarray, " p"]  # of which of them each parameter's column is a multiple
+    functions: Int[np.ndarray, " k"]  # of the parameters that are coefficients
+    own: Int[np.ndarray, " c"]  # the parameters that are none
+    order: Int[np.ndarray, " p"] | None  # of these and the coefficients among all; None where they are in order
+
+    def multiplied(
+        self, columns: Float[AnyArray, "b r m"], forward: ForwardPass, rows: slice
+    ) -> Float[AnyArray, "p r m"]:
+        """Columns of all parameters at some of the configurations, from the few."""
+        if not len(self.functions):
+            return columns
+        assert forward.errors is not None
+        of_functions = np.delete(self.source, self.own)
+        products = columns[of_functions] * forward.errors.by_coefficient[self.functions][..., rows]
+        both = namespace(columns, forward).concatenate([columns[self.source[self.own]], products])
+        return both if self.order is None else both[self.order]
+
+
+@lru_cache(maxsize=32)
+def shared_columns(functions: KnownFunctions | None, indices: tuple[tuple[str, int], ...]) -> SharedColumns:
+    """How the columns of some parameters follow from fewer, for an arm with these corrections."""
+    of_functions = np.array([kind == "coefficients" for kind, _ in indices], dtype=bool)
+    wanted = indices
+    if functions is not None:
+        wanted = [("q", int(functions.moved[i])) if kind == "coefficients" else (kind, i) for kind, i in indices]
     few = {one: place for place, one in enumerate(dict.fromkeys(wanted))}
-    return tuple(few), np.array([few[one] for one in wanted])
-
-
-def multiplied(
-    columns: Float[AnyArray, "b r m"],
-    source: Int[np.ndarray, " p"],
-    forward: ForwardPass,
-    indices: tuple[tuple[str, int], ...],
-    rows: slice,
-) -> Float[AnyArray, "p r m"]:
-    """Columns of all parameters, at some of the configurations, from those of `shared_indices`."""
-    of_functions = np.array([kind == "coefficients" for kind, _ in indices])
-    if not of_functions.any():
-        return columns
-    assert forward.errors is not None
-    which = np.array([i for kind, i in indices if kind == "coefficients"])
-    products = columns[source[of_functions]] * forward.errors.by_coefficient[which][..., rows]
-    both = namespace(columns, forward).concatenate([columns[source[~of_functions]], products])
-    order = np.argsort(np.concatenate([np.flatnonzero(~of_functions), np.flatnonzero(of_functions)]))
-    return both if np.array_equal(order, np.arange(len(order))) else both[order]
+    own, coefficients = np.flatnonzero(~of_functions), np.flatnonzero(of_functions)
+    order = np.argsort(np.concatenate([own, coefficients]))
+    return SharedColumns(
+        few=tuple(few),
+        source=np.array([few[one] for one in wanted], dtype=int),
+        functions=np.array([indices[i][1] for i in coefficients], dtype=int),
+        own=own,
+        order=None if np.array_equal(order, np.arange(len(order))) else order,
+    )
 
 
 def rotation_columns(forward: ForwardPass, indices: tuple[tuple[str, int], ...]) -> Float[AnyArray, "... p 3 N"]:

@@ -12,14 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
-from ..core.numpy_or_jax import AnyArray, add_at, namespace, to_numpy
+from ..core.numpy_or_jax import AnyArray, added_to, namespace, to_numpy
 from ..data.capture import Capture, check_one_capture, check_readings
 from ..data.observations.observation import POINT, AbstractObservation, Rows, Tips, offset_of
 from ..data.observations.platform import platform_frames
 from ..data.observations.socket import Socket, position_of
 from ..kinematics.arm import Arm
 from ..kinematics.chain import ForwardPass, JointMotion, forward_pass, joint_motion
-from ..kinematics.jacobian import multiplied, rotation_columns, shared_indices, stacked_jacobian_columns
+from ..kinematics.jacobian import rotation_columns, shared_columns, stacked_jacobian_columns
 from ..kinematics.parameters import Parameters
 from ..solver.active_set import QuadraticModel
 from .robust import Loss
@@ -36,6 +36,7 @@ class Observed(eqx.Module):
     nominal: Float[AnyArray, " l"]  # reference lengths, mm
     u: Float[AnyArray, " l"]
     ends: tuple[tuple[str, str], ...] = eqx.field(static=True)  # names of the positions at their ends
+    parts: tuple[tuple[str, tuple[str, ...]], ...] = eqx.field(static=True)  # of the unknown geometry; see `blocks`
 
     @classmethod
     def of(cls, capture: Capture, arm: Arm | None) -> "Observed":
@@ -59,6 +60,7 @@ class Observed(eqx.Module):
             nominal=xp.stack([length.value for length in lengths]) if lengths else np.zeros(0),
             u=xp.stack([length.u for length in lengths]) if lengths else np.zeros(0),
             ends=tuple((position_of(length.start), position_of(length.end)) for length in lengths),
+            parts=_parts(observations),
         )
 
     def moved(
@@ -72,12 +74,7 @@ class Observed(eqx.Module):
     @property
     def blocks(self) -> dict[str, tuple[str, ...]]:
         """The parts of the unknown geometry, and the unit of each of their numbers."""
-        found: dict[str, tuple[str, ...]] = {}
-        for observation in self.observations:
-            found.update(observation.unknowns)
-            if observation.target:
-                found[offset_of(observation.target)] = POINT
-        return found
+        return dict(self.parts)
 
     @property
     def positions(self) -> dict[str, np.ndarray]:
@@ -148,6 +145,15 @@ class Observed(eqx.Module):
         return namespace(arm, forward).concatenate([found[name] for name in self.blocks])
 
 
+def _parts(observations: tuple[AbstractObservation, ...]) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    found: dict[str, tuple[str, ...]] = {}
+    for observation in observations:
+        found.update(observation.unknowns)
+        if observation.target:
+            found[offset_of(observation.target)] = POINT
+    return tuple(found.items())
+
+
 def _tips(forward: ForwardPass, rows: slice) -> Tips:
     x, y, z = (axis[:, rows] for axis in forward.frame)
     return Tips(forward.tip[:, rows], (x, y, z))
@@ -184,8 +190,10 @@ def linear_rows(
     p = len(space.names)
     forward = observed.forward(space, z[:p], z[p:])
     xp, parts, positions = namespace(forward, z), observed.split(z[p:]), observed.positions
-    few, source = shared_indices(forward, space.indices())
-    columns, own_probe = stacked_jacobian_columns(forward, few), np.array([kind == "probe" for kind, _ in few])
+    functions = None if forward.errors is None else forward.errors.functions
+    shared = shared_columns(functions, space.indices())
+    columns = stacked_jacobian_columns(forward, shared.few)
+    own_probe = np.array([kind == "probe" for kind, _ in shared.few])
     turned = None
     found = []
     for number, (observation, rows) in enumerate(zip(observed.observations, observed.slices, strict=True)):
@@ -198,9 +206,9 @@ def linear_rows(
             mine = xp.where(own_probe[:, None, None], 0.0, mine)
         by_parameters = _times(residual.by_tip, mine)
         if residual.by_rotation is not None:
-            turned = rotation_columns(forward, few) if turned is None else turned
+            turned = rotation_columns(forward, shared.few) if turned is None else turned
             by_parameters = by_parameters + _times(residual.by_rotation, turned[..., rows])
-        by_parameters = multiplied(by_parameters, source, forward, space.indices(), rows)
+        by_parameters = shared.multiplied(by_parameters, forward, rows)
         if observation.target:
             axes = xp.stack([axis[:, rows] for axis in forward.frame])
             blocks.append(_times(residual.by_tip, axes))
@@ -285,8 +293,9 @@ def observed_model(
 ) -> QuadraticModel:
     """Cost, gradient and Gram matrix of `observed_rows`, block by block of the unknowns."""
     space, observed, whitening, loss = args
-    xp = namespace(z, args)
+    xp, p = namespace(z, args), len(space.names)
     cost, gradient, gram = xp.zeros(()), xp.zeros_like(z), xp.zeros((z.shape[0], z.shape[0]))
+    of_parameters, values = [], []
     for linear in linear_rows(space, observed, z, whitening):
         white, jacobian = linear.rows.values, linear.jacobian
         if loss is not None:
@@ -295,10 +304,17 @@ def observed_model(
             white, jacobian = xp.sqrt(weight)[None] * white, xp.sqrt(weight)[None, None] * jacobian
         else:
             cost = cost + 0.5 * xp.sum(white**2)
-        flat, indices = jacobian.reshape(jacobian.shape[0], -1), linear.indices
-        gradient = add_at(gradient, indices, flat @ white.reshape(-1))
-        gram = add_at(gram, np.ix_(indices, indices), flat @ flat.T)
-    p = len(space.names)
+        flat, own = jacobian.reshape(jacobian.shape[0], -1), linear.indices[p:]
+        of_parameters.append(flat[:p])
+        values.append(white.reshape(-1))
+        gradient = added_to(gradient, own, flat[p:] @ values[-1])
+        gram = added_to(gram, np.ix_(own, own), flat[p:] @ flat[p:].T)
+        crossed = flat[p:] @ flat[:p].T
+        gram = added_to(added_to(gram, (own, slice(p)), crossed), (slice(p), own), crossed.T)
+    # The parameters are in all rows: one large product instead of one for each observation.
+    whole, own = xp.concatenate(of_parameters, axis=1), slice(p)
+    gradient = added_to(gradient, own, whole @ xp.concatenate(values))
+    gram = added_to(gram, (own, own), whole @ whole.T)
     parts, positions = observed.split(z[p:]), observed.positions
     lengths, certified = _relations(observed, whitening, parts)
     vectors = _vectors(observed, parts)
@@ -306,18 +322,18 @@ def observed_model(
         direction = vectors[i] / xp.sqrt(xp.sum(vectors[i] ** 2)) * whitening.lengths[i]
         row, indices = xp.concatenate([-direction, direction]), p + np.concatenate([positions[start], positions[end]])
         cost = cost + 0.5 * lengths[i] ** 2
-        gradient = add_at(gradient, indices, row * lengths[i])
-        gram = add_at(gram, np.ix_(indices, indices), row[:, None] * row[None, :])
+        gradient = added_to(gradient, indices, row * lengths[i])
+        gram = added_to(gram, np.ix_(indices, indices), row[:, None] * row[None, :])
     for name, residual in certified.items():
         indices = p + positions[name]
         cost = cost + 0.5 * xp.sum(residual**2)
-        gradient = add_at(gradient, indices, whitening.certified[name] * residual)
-        gram = add_at(gram, (indices, indices), whitening.certified[name] ** 2)
+        gradient = added_to(gradient, indices, whitening.certified[name] * residual)
+        gram = added_to(gram, (indices, indices), whitening.certified[name] ** 2)
     if whitening.prior is not None:
         weight, residual, own = whitening.prior.weight, _of_prior(whitening.prior, z), np.arange(p)
         cost = cost + 0.5 * xp.sum(residual**2)
-        gradient = add_at(gradient, own, weight * residual)
-        gram = add_at(gram, (own, own), weight**2)
+        gradient = added_to(gradient, own, weight * residual)
+        gram = added_to(gram, (own, own), weight**2)
     return QuadraticModel(cost, gradient, gram)
 
 
