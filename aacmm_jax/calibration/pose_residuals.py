@@ -16,6 +16,7 @@ from .evaluation import Evaluation
 from .record import CalibrationRecord
 
 _POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
+_LEAST_LEVER = 1e-6  # mm per rad: a joint whose axis the tip is on explains nothing
 
 
 class ObservationResiduals(NamedTuple):
@@ -29,6 +30,8 @@ class ObservationResiduals(NamedTuple):
     weight: Float[np.ndarray, " m"]  # below 1 where a robust loss took weight from the pose
     u: float  # standard uncertainty of a coordinate or distance that was measured, RMS over the poses, mm
     u_angle: float | None  # of an orientation about each axis, rad
+    by_joint: Float[np.ndarray, "n m"]  # change of each reading that alone would explain most of the residual, rad
+    lever: Float[np.ndarray, "n m"]  # what the tip moves with that reading, mm per rad; a slide: mm, mm per mm
 
 
 def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResiduals, ...]:
@@ -62,15 +65,23 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
     ]
     roots = whitening_of(linear, observed, of_arm, np.maximum(1e-4 * sigma, 1e-12)).roots
     return tuple(
-        _residuals(observation, part, np.asarray(root), np.asarray(weight))
-        for observation, part, root, weight in zip(observed.observations, linear, roots, metrics.weights, strict=True)
+        _residuals(observation, part, error, np.asarray(root), np.asarray(weight))
+        for observation, part, error, root, weight in zip(
+            observed.observations, linear, errors, roots, metrics.weights, strict=True
+        )
     )
 
 
 def _residuals(
-    observation: AbstractObservation, linear: Linear, root: Float[np.ndarray, "m r r"], weight: Float[np.ndarray, " m"]
+    observation: AbstractObservation,
+    linear: Linear,
+    errors: propagation.ArmErrors,
+    root: Float[np.ndarray, "m r r"],
+    weight: Float[np.ndarray, " m"],
 ) -> ObservationResiduals:
     values = np.asarray(linear.rows.values)
+    moved = np.asarray(errors.by_readings)[:_POSITION_ROWS]
+    lever = np.linalg.norm(moved, axis=0)
     white = np.einsum("mab,bm->am", root, values)
     variances = np.diagonal(np.asarray(linear.rows.measured), axis1=1, axis2=2)
     turned = values.shape[0] > _POSITION_ROWS
@@ -82,6 +93,8 @@ def _residuals(
         weight=weight,
         u=float(np.sqrt(np.mean(variances[:, :_POSITION_ROWS]))),
         u_angle=float(np.sqrt(np.mean(variances[:, _POSITION_ROWS:]))) if turned else None,
+        by_joint=-np.einsum("rm,rnm->nm", values[:_POSITION_ROWS], moved) / np.maximum(lever, _LEAST_LEVER) ** 2,
+        lever=lever,
     )
 
 

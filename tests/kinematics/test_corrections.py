@@ -8,7 +8,7 @@ import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.kinematics import parameter_names, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
-from aacmm_jax.kinematics.chain import forward_pass, joint_motion
+from aacmm_jax.kinematics.chain import KnownFunctions, forward_pass, joint_motion, joints_first
 from aacmm_jax.kinematics.corrected_arm import function_values
 from aacmm_jax.kinematics.corrections.kinds import terms_of
 from aacmm_jax.kinematics.jacobian import rotation_columns
@@ -156,3 +156,23 @@ def test_found_by_a_batch():
     capture, bounds, true = eccentric()
     many = aj.calibrate_many(bounds.space.base, aj.stack_captures([capture] * 2), bounds, method="joint")
     np.testing.assert_allclose(many.parameters, np.stack([true] * 2), atol=1e-5)
+
+
+def test_functions_together_are_those_one_by_one():
+    """Kinds are evaluated together, also where the names of a file mix them; harmonics by addition of angles."""
+    arm = to_numpy(aj.load_arm("ur10"))
+    names = ["cos1_1", "compliance3_2", "sin3_2", "gear_3", "sin99_5", "compliance2_2", "cos31_5", "coupled2_3"]
+    q = np.random.default_rng(0).uniform(-6, 6, (50, 6))
+    each = with_corrections(arm, names).corrections.functions.each
+    rows, forward = joints_first(q, 1), forward_pass(arm.geometry, joint_motion(arm.geometry, q))
+    together, alone = KnownFunctions(each), [KnownFunctions((one,)) for one in each]
+    assert together.names == tuple(names)
+    values = together.values(rows, forward)
+    np.testing.assert_array_equal(values, np.concatenate([one.values(rows, forward) for one in alone]))
+    for term, row in (
+        (0, np.cos(q[:, 0])),
+        (2, np.sin(3 * q[:, 1])),
+        (4, np.sin(99 * q[:, 4])),
+        (6, np.cos(31 * q[:, 4])),
+    ):
+        np.testing.assert_allclose(values[together.first_row[term], 0], row, atol=1e-12)
