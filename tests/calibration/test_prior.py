@@ -262,7 +262,7 @@ def test_coverage_where_the_truth_is_drawn_from_the_prior(paper_arm, space):
 
 
 def test_rounds_that_follow_each_other_are_extrapolated():
-    """A fixed point that is reached by turns, eleven times closer each second round, takes a dozen rounds, not thirty."""
+    """A fixed point that is reached by turns, eleven times closer each second round, takes a dozen rounds."""
     turn = 0.3 * np.array([[0.0, 1.0, 0.1], [-1.0, 0.0, 0.0], [0.0, 0.2, 0.5]])
     point, scales, rounds = np.array([1.0, -2.0, 0.5]), np.zeros(3), 0
     history, change = _History.empty(scales), np.inf
