@@ -186,7 +186,8 @@ def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion
 
 def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"]) -> JointMotion:
     """`joint_motion` of readings that have the joints first and the configurations last."""
-    xp, corrections = namespace(rows), geometry.corrections
+    corrections = geometry.corrections
+    xp = namespace(rows, corrections)
     if geometry.kinds is None:
         motion = JointMotion(xp.cos(rows), xp.sin(rows), None)
     else:
@@ -196,8 +197,18 @@ def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"])
     if corrections is None:
         return motion
     forward = forward_pass(corrections.nominal, motion)
-    return motion._replace(
-        functions=xp.concatenate([function.values(rows, forward) for function in corrections.functions.each])
+    values = [function.values(rows, forward) for function in corrections.functions.each]
+    # Those of frames have the batch of the nominal arms, others that of the readings alone.
+    batch = np.broadcast_shapes(*(each.shape[1:] for each in values))
+    return motion._replace(functions=xp.concatenate([_broadcast_after_rows(each, batch) for each in values]))
+
+
+def _broadcast_after_rows(values: Float[AnyArray, "rows ..."], batch: tuple[int, ...]) -> Float[AnyArray, "rows ..."]:
+    if values.shape[1:] == batch:
+        return values
+    missing = (1,) * (len(batch) + 1 - values.ndim)
+    return namespace(values).broadcast_to(
+        values.reshape(values.shape[:1] + missing + values.shape[1:]), (len(values), *batch)
     )
 
 
