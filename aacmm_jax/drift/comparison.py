@@ -137,7 +137,7 @@ def _compared(
 
 def _values(arm: Arm, names: tuple[str, ...]) -> Float[np.ndarray, " p"]:
     """Values of parameters; coefficients of corrections that the arm lacks are 0."""
-    down = dict(zip(("gravity_x", "gravity_y", "gravity_z"), DOWN, strict=True))
+    down: dict[str, float] = dict(zip(("gravity_x", "gravity_y", "gravity_z"), DOWN, strict=True))
     known = {*parameter_names(arm), *(f"beta_{i}" for i in range(1, arm.joints + 1) if arm.beta is not None)}
     return np.array([float(value_of(arm, name)) if name in known else down.get(name, 0.0) for name in names])
 
