@@ -28,6 +28,7 @@ from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_d
 from ..uncertainty.identifiability import observability
 from .bounded_fit import Fit, fit
 from .checks import check_enough, check_noise_model, check_single, check_start
+from .joint_model import with_joint_model
 from .observed import calibrate_observed, identify_observed
 from .observed_state import ObservedTask, observed_task
 from .results import Calibration, Identification
@@ -127,8 +128,9 @@ def _prepare_task(
 def calibrate(
     arm: Arm,
     capture: Capture,
-    bounds: Bounds,
+    bounds: Bounds | None = None,
     *,
+    model: str | None = None,
     method: Literal["two-stage", "joint"] | None = None,
     hold: str | None = "longest",
     start: Numbers | None = None,
@@ -155,7 +157,9 @@ def calibrate(
         arm: as for `identify`, like all arguments that are not named here.
         capture: sockets, and at least one reference length, mm; none is needed where the slides of prismatic joints
             determine the scale.
-        bounds: box of the free parameters ``(p,)``, mm and rad.
+        bounds: box of the free parameters ``(p,)``, mm and rad; by default around those of `Parameters.free_of`.
+        model: what the joints do besides their readings, as on the command line: "gravity,harmonics=1" (see
+            `kinematics.with_corrections`). Corrections that the arm has are replaced; all coefficients are free.
         method: "two-stage" or "joint"; by default two-stage, but joint where the capture has observations besides
             sockets and lengths, the arm has prismatic joints (whose readings say something about the scale too), the
             loss is robust, or there is a prior, which a division by k would ignore.
@@ -164,7 +168,7 @@ def calibrate(
         noise: standard deviations of readings and seat.
         noise_model: another model of the tips' errors.
         robust: a robust loss, as for `identify`.
-        prior: what is known of the parameters, as for `identify`.
+        prior: what is known of the parameters, as for `identify`; of a model, by default `kinematics.default_prior`.
         check_identifiability: warn where free parameters are not determined by these data; the check takes about as
             long as the calibration.
         strict: raise instead of warn where free parameters are not determined by these data.
@@ -176,6 +180,7 @@ def calibrate(
     Raises:
         InputError: as `identify` does, and without a reference length.
     """
+    arm, bounds, prior = with_joint_model(arm, bounds, model, prior)
     by_slides = scale_from_slides(arm, capture, bounds.space, noise)
     general = bool(capture.observations) or robust is not None or prior is not None or by_slides
     method = default_method(arm, general) if method is None else method

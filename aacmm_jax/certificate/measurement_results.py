@@ -14,6 +14,7 @@ from ..data.capture import ReferenceLength
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
 from ..kinematics.arm import Arm, parameter_names, parameter_unit
 from ..kinematics.parameters import Parameters
+from ..summaries.calibration import prior_rows, prior_sentence
 from ..summaries.observations import less_weight
 from .observation_results import add_observation_equipment, add_observations
 from .xml_elements import (
@@ -75,12 +76,21 @@ def uncertainty_statement(record: CalibrationRecord) -> str:
     sources = "uncertainty of the reference lengths"
     if record.recording.capture.observations:
         sources = "uncertainties of what was measured and certified"
+    if record.prior is not None:
+        groups = ". ".join(map(prior_sentence, prior_rows(record.prior)))
+        sources += (
+            ", and from what was known of the parameters beforehand, as normal distributions (standard deviation of "
+            f"each group: {groups})"
+        )
+    model = "Denavit-Hartenberg model"
+    if record.calibrated.arm.corrections is not None:
+        model += " with the joint corrections below"
     return (
         f"Expanded uncertainties are standard uncertainties times {uncertainty_of(record).factor(LEVEL):.4g}, the "
         f"coverage factor of Student's t for {count} degrees of freedom and a coverage probability of {LEVEL:.0%}. "
         f"They follow, by the law of propagation of uncertainty, from the noise of the readings, {noise}, and from the "
         f"{sources}. They apply to each parameter alone; the parameters are correlated. "
-        "Errors that the Denavit-Hartenberg model does not describe are not included."
+        f"Errors that the {model} does not describe are not included."
     )
 
 
@@ -255,7 +265,13 @@ def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, 
         results,
         "Denavit-Hartenberg parameters",
         "Standard convention; of one joint: Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta). The probe is the tip in the "
-        "last frame.",
+        "last frame."
+        + (
+            ""
+            if stage.arm.corrections is None
+            else " To theta (d of a prismatic joint) each joint correction adds its "
+            "coefficient times a known function of the readings; gravity is its direction in the base frame."
+        ),
     )
     for name, value in _values(stage.arm).items():
         note, u = "", None

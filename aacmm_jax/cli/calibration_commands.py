@@ -231,11 +231,8 @@ def calibrate(
             from ..calibration.results import Calibration
             from ..calibration.sampling import monte_carlo as sample
 
-            if not isinstance(result, Calibration) or not plain:
-                raise InputError(
-                    "--monte-carlo is for calibrations without --robust, --scale nominal and priors (--model has one "
-                    "unless --prior is none)."
-                )
+            if not isinstance(result, Calibration) or robust is not None:
+                raise InputError("--monte-carlo is for calibrations without --robust and --scale nominal.")
             sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))
             record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
         summary = calibration_summary(record)

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..core.text import pluralise, shorten
-from ..core.units import ARCSEC, DEG, people_read
+from ..core.units import ARCSEC, DEG, people_read, people_read_change
 from ..summaries.tables import METRICS, encoders_in_words, expanded_words, observed_words, quantity_words, volume_rows
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
@@ -40,6 +40,14 @@ def arm(summary: dict[str, Any]) -> None:
     console.print(
         f"Probe {', '.join(formatted(x) for x in summary['probe_mm'])} mm. Fixed: {', '.join(summary['held'])}."
     )
+    if summary["corrections"]:
+        others = [row for row in summary["corrections"] if row["value"] == 0]
+        title = f"\nJoint corrections ({len(others)} more coefficients are 0)" if others else "\nJoint corrections"
+        table = new_table(title, "coefficient", "value", "unit")
+        for row in (row for row in summary["corrections"] if row["value"] != 0):
+            scale, unit = people_read_change(row["unit"]) if row["unit"] == "rad" else people_read(row["unit"])
+            table.add_row(row["coefficient"], f"{scale * row['value']:.4g}", unit)
+        print_table(console, table)
     if summary["urdf"] is not None:
         base, frame = summary["urdf"]["base"], summary["urdf"]["first_frame_in_base_mm"]
         where = f"in the frame of {base}"

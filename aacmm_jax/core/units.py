@@ -13,3 +13,14 @@ ARCSEC = math.pi / (180 * 3600)  # rad
 def people_read(unit: str) -> tuple[float, str]:
     """The unit in which people read a value, and the factor to it: degrees for radians, others as they are."""
     return (1 / DEG, "deg") if unit == "rad" else (1.0, "" if unit == "1" else unit)
+
+
+def people_read_change(unit: str) -> tuple[float, str]:
+    """The unit in which people read a small change of a value, and the factor to it: um, arcsec, urad/m, ppm."""
+    if unit == "rad":
+        return 1 / ARCSEC, "arcsec"
+    if unit == "1":
+        return 1e6, "ppm"
+    if unit.startswith("mm"):
+        return 1 / UM, unit.replace("mm", "um", 1)
+    return (1e6, f"u{unit}") if unit.startswith("rad") else (1.0, unit)

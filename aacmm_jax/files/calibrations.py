@@ -12,7 +12,7 @@ from ..calibration.record import CalibrationRecord
 from ..calibration.scale_anchor import scale_anchor
 from ..core.errors import InputError
 from ..data.noise import Noise
-from ..kinematics.arm import Arm, is_length, parameter_names, value_of
+from ..kinematics.arm import Arm, is_length, parameter_names, parameter_unit, value_of
 from ..kinematics.parameters import Parameters
 from ..uncertainty.covariance import NOISE_MODELS
 from .calibration_observations import observed_of, observed_tables, other_poses_of, removed_of
@@ -193,8 +193,8 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
 
 def _parameter_table(record: CalibrationRecord) -> Table:
     names = list(record.names)
-    units = ["mm" if is_length(name) else "rad" for name in names]
-    both, square = "mm or rad, see unit", ("parameter", "parameter_2")
+    units = [parameter_unit(record.calibrated.arm, name) for name in names]
+    both, square = "see unit", ("parameter", "parameter_2")
     variables = columns("parameter", parameter=(names, "", "free parameter"))
     variables |= columns("parameter_2", parameter_2=(names, "", "free parameter, second axis of the covariance"))
     variables |= columns(

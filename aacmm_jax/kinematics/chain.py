@@ -95,7 +95,10 @@ class KnownFunctions:
 
     def values(self, q: Float[AnyArray, "n ... 1 N"], forward: "ForwardPass") -> Float[AnyArray, "rows ... 1 N"]:
         """All rows at N configurations, with the nominal arm's frames there."""
-        return namespace(q, forward).concatenate([own[0].kind.values(own, q, forward) for own in self._of_one_kind])
+        values = [own[0].kind.values(own, q, forward) for own in self._of_one_kind]
+        # Those of frames have the batch of the nominal arms, others that of the readings alone.
+        batch = np.broadcast_shapes(*(each.shape[1:] for each in values))
+        return namespace(q, forward).concatenate([_broadcast_after_rows(each, batch) for each in values])
 
     @cached_property
     def _of_one_kind(self) -> list[tuple[KnownFunction, ...]]:
@@ -234,7 +237,8 @@ def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion
 
 def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"]) -> JointMotion:
     """`joint_motion` of readings that have the joints first and the configurations last."""
-    xp, corrections = namespace(rows), geometry.corrections
+    corrections = geometry.corrections
+    xp = namespace(rows, corrections)
     if geometry.kinds is None:
         motion = JointMotion(xp.cos(rows), xp.sin(rows), None)
     else:
@@ -245,6 +249,15 @@ def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"])
         return motion
     forward = forward_pass(corrections.nominal, motion)
     return motion._replace(functions=corrections.functions.values(rows, forward))
+
+
+def _broadcast_after_rows(values: Float[AnyArray, "rows ..."], batch: tuple[int, ...]) -> Float[AnyArray, "rows ..."]:
+    if values.shape[1:] == batch:
+        return values
+    missing = (1,) * (len(batch) + 1 - values.ndim)
+    return namespace(values).broadcast_to(
+        values.reshape(values.shape[:1] + missing + values.shape[1:]), (len(values), *batch)
+    )
 
 
 @compiled

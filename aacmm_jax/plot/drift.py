@@ -86,7 +86,7 @@ def parameter_trend(trend: Trend, axes: Any, positions: np.ndarray | None = None
     for i, color, line, marker in zip(named, _COLORS, _LINES, _MARKERS, strict=False):
         style = {"color": color, "linestyle": line, "marker": marker, "markersize": 5, "linewidth": 1.5, "zorder": 3}
         axes.plot(positions, ratio[:, i], **style)
-        labels.append((ratio[-1, i], f"{trend.names[i]} {in_words(trend.names[i], float(drift.change[i]))}", color))
+        labels.append((ratio[-1, i], f"{trend.names[i]} {in_words(drift.units[i], float(drift.change[i]))}", color))
     _label_ends(axes, labels, positions)
     _title_changes(
         axes,
@@ -132,7 +132,7 @@ def parameter_drift(drift: Drift, axes: Any) -> Any:
     for i in positions[moved]:
         up = ratio[i] > 0
         style = {"va": "bottom" if up else "top", "ha": "center", "rotation": 90 if crowded else 0, "fontsize": 8}
-        text = in_words(drift.names[chosen[i]], float(drift.change[chosen[i]]))
+        text = in_words(drift.units[chosen[i]], float(drift.change[chosen[i]]))
         offset = {"xytext": (0, 7 if up else -7), "textcoords": "offset points"}
         axes.annotate(text, (i, ratio[i]), color=DARK, **offset, **style)
     style = {"rotation": 60, "ha": "right", "rotation_mode": "anchor", "fontsize": 8}

@@ -14,7 +14,7 @@ from ..core.units import DEG
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
-from ..kinematics.arm import by_joint, is_length, parameter_unit
+from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
@@ -48,6 +48,10 @@ def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
         "name": specification.name,
         "joints": joints,
         "probe_mm": np.asarray(arm.probe).tolist(),
+        "corrections": [
+            {"coefficient": name, "unit": parameter_unit(arm, name), "value": float(value_of(arm, name))}
+            for name in correction_names(arm)
+        ],
         "held": list(specification.space().held),
         "urdf": None
         if specification.urdf is None
@@ -257,8 +261,8 @@ def active_names_of(record: CalibrationRecord, active: np.ndarray) -> dict[str, 
 def truth_errors(record: CalibrationRecord, vectors: dict[str, np.ndarray], stage: str) -> dict[str, float]:
     """Largest parameter errors against the true arm of a simulation."""
     difference = np.abs(vectors[stage] - vectors["true"])
-    length = np.array([is_length(name) for name in record.names])
+    units = np.array([parameter_unit(record.calibrated.arm, name) for name in record.names])
     return {
-        "length_error_largest_mm": float(difference[length].max(initial=0.0)),
-        "angle_error_largest_rad": float(difference[~length].max(initial=0.0)),
+        "length_error_largest_mm": float(difference[units == "mm"].max(initial=0.0)),
+        "angle_error_largest_rad": float(difference[units == "rad"].max(initial=0.0)),
     }

@@ -347,6 +347,23 @@ def test_parameters_without_an_uncertainty_of_their_own_say_why(record, certific
     assert all(left[name] is None and values["As left", PARAMETERS, name].expanded for name in others)
 
 
+def test_priors_and_joint_corrections_are_stated(record):
+    """What was assumed is part of the statement on uncertainty, coefficients have their own units."""
+    capture = record.recording.capture
+    nominal = aj.kinematics.with_corrections(record.recording.nominal.arm, "gear,harmonics=1")
+    bounds = aj.Bounds.around(nominal, aj.Parameters(nominal, ("d_3", "theta_3", "gear_2", "cos1_3", "sin1_3")))
+    prior = aj.Prior({"lengths": 0.5, "harmonics": 5e-5}, learn=["harmonics"])
+    found = aj.calibrate(nominal, capture, bounds, prior=prior, check_identifiability=False)
+    named = record.recording.nominal._replace(arm=nominal)
+    text = dcc_xml(aj.calibration.record_of(found, aj.Recording(capture, named)), AdministrativeData(), created=CREATED)
+    stated = " ".join(contents(text, ".//dcc:usedMethod/dcc:description"))
+    assert "what was known of the parameters beforehand" in stated
+    assert "lengths: given, 0.5 mm; " in stated
+    assert "harmonics: learned" in stated
+    assert "Denavit-Hartenberg model with the joint corrections below does not describe" in stated
+    assert "each joint correction adds its coefficient" in text
+
+
 def test_a_fixed_length_says_so(record):
     i = record.names.index("probe_z")
     parts = ("lower", "upper", "active_stage1", "active", "determined")

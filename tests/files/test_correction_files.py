@@ -6,7 +6,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.files.arms import arm_toml, load_specification, save_arm
-from aacmm_jax.files.controllers import dh_table
+from aacmm_jax.files.controllers import python_program
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.kinematics.arm import correction_names
 
@@ -55,6 +55,6 @@ def test_a_model_in_an_arm_file(tmp_path):
             aj.load_arm(file)
 
 
-def test_formats_of_dh_tables_refuse_corrections():
+def test_formats_without_a_place_for_corrections_refuse_them():
     with pytest.raises(aj.InputError, match="joint corrections, which this format cannot hold"):
-        dh_table(corrected())
+        python_program(corrected(), title="")

@@ -151,6 +151,19 @@ def test_found_by_a_calibration():
     np.testing.assert_allclose(result.parameters, true, atol=1e-7)
 
 
+def test_batches_of_corrected_arms(paper_arm):
+    """As results of many have them, the nominal arms of their functions batched too; under vmap as well."""
+    names = ["cos1_2", "gear_3", "compliance4_3", "compliance3_2"]
+    single = with_corrections(paper_arm, names)
+    arms = [single.replace(cos1_2=1e-3 * i, compliance4_3=2e-3 * i, d_3=400.0 + i) for i in range(3)]
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *arms)
+    q = np.random.default_rng(0).uniform(-1, 1, (5, 6))
+    expected = np.stack([arm.position(q) for arm in arms])
+    np.testing.assert_allclose(np.moveaxis(batch.position(q[:, None, :]), 1, 0), expected, atol=1e-9)
+    np.testing.assert_allclose(batch.position(q[:3]), expected[np.arange(3), np.arange(3)], atol=1e-9)
+    np.testing.assert_allclose(jax.vmap(lambda arm: arm.position(q))(batch), expected, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_found_by_a_batch():
     capture, bounds, true = eccentric()
