@@ -19,6 +19,7 @@ from ..summaries.observations import capture_words
 from . import charts
 from .arm_view import view_of_arm
 from .elements import ArmView, Cell, Chart, Report, ReportTable, Section, format_number, number_cell, text_cell
+from .lengths import by_placement
 from .residuals import length_rows, metrics_table, pose_distances, residual_chart, socket_table
 
 _MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}
@@ -258,7 +259,7 @@ def _metrics_chart(tests: list[AcceptanceTest]) -> Chart:
     metrics = [metric for test in tests for metric in test.metrics]
     limited = [metric for metric in metrics if metric.worst.limit is not None]
     if limited:
-        metrics, y, shapes = limited, "|value| / MPE", charts.horizontal([1.0], "solid")
+        metrics, y, lines = limited, "|value| / MPE", [1.0]
         least = 1e-6  # mm: drawn for a limit of zero
         divisors = [max(metric.worst.limit or 0.0, least) for metric in metrics]
         title = "Metrics against their limits"
@@ -266,17 +267,20 @@ def _metrics_chart(tests: list[AcceptanceTest]) -> Chart:
             "The value of each metric, divided by its limit, with U: it conforms if the whole bar lies below 1."
         )
     else:
-        y, shapes, divisors = "|value| [mm]", [], [1.0] * len(metrics)
+        y, lines, divisors = "|value| [mm]", [], [1.0] * len(metrics)
         title, description = "Metrics", "The value of each metric, with U. No limit was given."
-    values = [abs(metric.value) / divisor for metric, divisor in zip(metrics, divisors, strict=True)]
-    bars = [metric.worst.expanded / divisor for metric, divisor in zip(metrics, divisors, strict=True)]
+    values = np.array([abs(metric.value) / divisor for metric, divisor in zip(metrics, divisors, strict=True)])
+    bars = np.array([metric.worst.expanded / divisor for metric, divisor in zip(metrics, divisors, strict=True)])
     hover = [f"{metric.name}: {format_number(metric.value)} mm at {metric.worst.where}" for metric in metrics]
-    names = [metric.name for metric in metrics]
-    trace = charts.markers("as left", names, values, charts.DARK, "square", hover=hover, bars=bars)
     # An absolute value is not negative, so a bar that is longer than its value ends at 0.
-    top = 1.05 * max([value + bar for value, bar in zip(values, bars, strict=True)] + [1.0 if limited else 0.0])
-    layout = charts.layout("", y, shapes=shapes, showlegend=False, yaxis={"range": [0.0, top]})
-    return Chart("margins", title, description, {"data": [trace], "layout": layout}, height=320)
+    low = np.maximum(values - bars, 0.0)
+    x = np.arange(len(metrics))
+    marks = charts.Marks("as left", x, values, "square", "main", hover, low, values + bars, size=8)
+    axes = (
+        charts.names("", [metric.name for metric in metrics]),
+        charts.linear(y, values + bars, lines, [0.0], zero=True),
+    )
+    return Chart("margins", title, description, (charts.Plot(*axes, (marks,), horizontal=lines, height=240),))
 
 
 def _nominal_and_calibrated(
@@ -330,29 +334,27 @@ def _lengths(
 
 
 def _length_chart(tests: list[AcceptanceTest]) -> Chart | None:
-    """Errors of single readings of lengths (E_Uni), and their limits."""
+    """Errors of single readings of lengths (E_Uni), placement by placement, and their limits."""
     metric: Metric | None = next((m for test in tests for m in test.metrics if m.name == "E_Uni"), None)
     if metric is None:
         return None
-    lengths = [part.length or 0.0 for part in metric.values]
-    x_title = "length [mm]"
-    if max(lengths) - min(lengths) < 0.01 * max(lengths):  # of one nominal length, which would be one vertical line
-        x_title = f"reading of a length of {np.mean(lengths):g} mm"
-        lengths = [float(i + 1) for i in range(len(lengths))]
-    hover = [f"{part.where}: {format_number(part.value, signed=True)} mm" for part in metric.values]
-    style = {"hover": hover, "bars": [part.expanded for part in metric.values], "size": 5}
-    values = [part.value for part in metric.values]
-    traces = [charts.markers("single readings, with U", lengths, values, charts.DARK, "circle", **style)]
-    pairs = zip(lengths, metric.values, strict=True)
-    limits = sorted((length, part.limit) for length, part in pairs if part.limit is not None)
-    if limits:
-        x, y = [length for length, _ in limits], np.array([limit for _, limit in limits])
-        line = {"mode": "lines", "line": {"color": "#444", "dash": "dash", "width": 1.5}}
-        traces += [
-            charts.markers("MPE", x, y, "#444", "circle", **line),
-            charts.markers("MPE", x, -y, "#444", "circle", showlegend=False, **line),
-        ]
-    layout = charts.layout(x_title, "measured − value [mm]", shapes=charts.horizontal([0.0], "dot"))
+    ends = [part.where.partition(", reading ")[0].split(" - ", 1) for part in metric.values]
+    x, axis, borders = by_placement([(one[0], one[-1]) for one in ends])
+    values, bars = (np.array([getattr(part, name) for part in metric.values]) for name in ("value", "expanded"))
+    hover = [
+        f"{part.where}: {format_number(part.value, signed=True)} mm; length {part.length:g} mm"
+        + (f", MPE {format_number(part.limit)} mm" if part.limit is not None else "")
+        for part in metric.values
+    ]
+    says = "single readings" + (", with U" if np.any(bars > 0) else "")
+    marks = [charts.Marks(says, x, values, "dot", "main", hover, values - bars, values + bars, size=5)]
+    limits = np.array([np.nan if part.limit is None else part.limit for part in metric.values])
+    if np.any(np.isfinite(limits)):
+        order = np.argsort(x)
+        for side, name in ((1, "MPE"), (-1, "MPE")):
+            marks.append(charts.Marks(name, x[order], side * limits[order], "dashed", "ink"))
+    axis_of_errors = charts.linear("measured − value [mm]", values - bars, values + bars, limits, -limits, [0.0])
     description = "Errors of the reference lengths, reading by reading, by the calibrated arm"
-    description += ", and their limits." if limits else "."
-    return Chart("length-errors", "Errors of lengths", description, {"data": traces, "layout": layout})
+    description += ", and their limits." if len(marks) > 1 else "."
+    plot = charts.Plot(axis, axis_of_errors, tuple(marks), borders, [0.0])
+    return Chart("length-errors", "Errors of lengths", description, (plot,))
