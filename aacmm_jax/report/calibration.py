@@ -9,9 +9,10 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.pose_residuals import distances_of, observation_residuals
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise
-from ..core.units import ARCSEC, people_read
+from ..core.units import DEG, people_read
 from ..summaries.calibration import calibration_summary, prior_sentence
 from ..summaries.observations import capture_words
+from ..summaries.tables import decimals_for, two_digits
 from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
 from . import charts
@@ -22,7 +23,6 @@ from .elements import (
     Report,
     ReportTable,
     Section,
-    decimals_for,
     format_number,
     number_cell,
     scientific,
@@ -79,16 +79,12 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
     ]
     method = _OBSERVED if record.method == "joint" and capture.observations else _METHODS[record.method]
     robust = f", robust loss {record.robust}" if record.robust else ""
-    verdict, good = record.reason, record.converged and not record.implausible_residual
-    if not good:
-        verdict = "Not to be used" + (": data and arm do not belong together." if record.converged else f". {verdict}")
-    if not record.plausible_scale:
-        verdict = "Not to be used: the reference lengths give the arm a scale that it cannot have."
+    verdict = summary["verdict"]
     report = Report(
         title="Calibration of " + (record.recording.nominal.name or "an arm"),
         subtitle=f"{method}{robust}; {pluralise(summary['poses'], 'pose')} in {capture_words(capture)}",
-        verdict=verdict,
-        verdict_mark="good" if good else "bad",
+        verdict=verdict["says"],
+        verdict_mark=verdict["mark"],
         warnings=summary["warnings"],
         facts=_facts(summary, factor),
         sections=sections,
@@ -122,9 +118,8 @@ def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
     length = f"U of a {volume['length_mm']:g} mm length"
     largest, median = volume["u_length_largest_mm"], volume["u_length_median_mm"]
     if median is not None and largest is not None:
-        facts.append(
-            (f"{length} (95 %)", f"median {_two_digits(factor * median)}, largest {_two_digits(factor * largest)}")
-        )
+        typical, worst = (f"{two_digits(factor * u)}\u00a0mm" for u in (median, largest))
+        facts.append((f"{length} (95 %)", f"median {typical}, largest {worst}"))
     else:
         facts.append((length, "not determined everywhere"))
     if summary["scale_k"] is not None:
@@ -135,16 +130,15 @@ def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
     return facts
 
 
-def _two_digits(expanded: float) -> str:
-    """An uncertainty in mm to two digits, which no line break divides."""
-    return f"{format_number(expanded, decimals_for(expanded))}\u00a0mm"
-
-
 def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     capture = record.recording.capture
     sockets = [[text_cell(name), number_cell(size, 0)] for name, size in zip(capture.names, capture.sizes, strict=True)]
     lengths = [
-        [text_cell(f"{row['from']} – {row['to']}"), number_cell(row["value_mm"]), number_cell(float(length.u))]
+        [
+            text_cell(f"{row['from']} – {row['to']}"),
+            number_cell(row["value_mm"], decimals_for(float(length.u))),
+            number_cell(float(length.u), decimals_for(float(length.u))),
+        ]
         for row, length in zip(summary["lengths"], capture.lengths, strict=True)
     ]
     introduction = (
@@ -217,7 +211,7 @@ def _nominal_and_calibrated(
             [text_cell(title), *(number_cell(scale * summary["truth"][stage][key]) for stage in stages)]
             for key, title, scale in (
                 ("length_error_largest_mm", "largest error of a length parameter [mm]", 1.0),
-                ("angle_error_largest_rad", "largest error of an angle parameter [arcsec]", 1 / ARCSEC),
+                ("angle_error_largest_rad", "largest error of an angle parameter [deg]", 1 / DEG),
             )
         ]
         blocks.append(ReportTable("Against the true arm of the simulation", ("", *stages.values()), rows))

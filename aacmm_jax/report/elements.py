@@ -96,10 +96,3 @@ def format_number(value: float, decimals: int = 4, *, signed: bool = False) -> s
 def scientific(value: float) -> str:
     """A number with two digits in powers of ten, which no line break divides."""
     return f"{value:.1e}".replace("-", "−")
-
-
-def decimals_for(u: float | None, default: int = 4) -> int:
-    """Decimals that show two digits of an uncertainty."""
-    if u is None or not math.isfinite(u) or u <= 0:
-        return default
-    return min(max(1 - math.floor(math.log10(u)), 0), 9)

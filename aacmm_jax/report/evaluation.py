@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.decision import worst
 from ..acceptance.record import EvaluationRecord, PointsRecord
 from ..acceptance.results import METRICS, AcceptanceTest, Metric
 from ..acceptance.standards import EDITIONS
@@ -16,6 +15,7 @@ from ..data.sphere import ProbedSphere
 from ..kinematics.arm import Arm
 from ..summaries.evaluation import evaluation_summary, points_summary
 from ..summaries.observations import capture_words
+from ..summaries.tables import decimals_for
 from . import charts
 from .arm_view import view_of_arm
 from .elements import ArmView, Cell, Chart, Report, ReportTable, Section, format_number, number_cell, text_cell
@@ -34,7 +34,7 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
     summary = evaluation_summary(record, tests)
     evaluations = {stage: evaluate(arm.arm, capture) for stage, arm in record.arms().items()}
     calibrated = evaluations["calibrated"]
-    verdict, mark = _verdict(summary)
+    verdict = summary["verdict"]
     residuals = residual_chart(
         "residuals", "Residuals of the calibrated arm", capture, {"calibrated": calibrated}, mark=True
     )
@@ -43,9 +43,13 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
         title="Evaluation of " + (record.recording.nominal.name or "an arm"),
         subtitle=f"{pluralise(len(capture.readings), 'pose')} in {capture_words(capture)}"
         + (f", {pluralise(tested, 'touched sphere')}" if (tested := len(record.recording.spheres)) else ""),
-        verdict=verdict,
-        verdict_mark=mark,
-        warnings=summary["warnings"] + [f"Over the limit: {sentence}" for sentence in summary["failed"]],
+        verdict=verdict["says"],
+        verdict_mark=verdict["mark"],
+        warnings=[
+            *summary["warnings"],
+            *(f"Over the limit: {sentence}" for sentence in summary["failed"]),
+            *(f"Of the calibration: {sentence}" for sentence in record.calibration_warnings),
+        ],
         facts=_facts(summary),
         sections=[
             _acceptance_section(tests["calibrated"], summary, capture.lengths, record.recording.spheres),
@@ -94,7 +98,7 @@ def points_report(record: PointsRecord) -> tuple[Report, dict[str, Any]]:
     """The report of an evaluation of points, and the summary that it was made from."""
     tests, measured = record.acceptance(), record.measured
     summary = points_summary(record, tests)
-    verdict, mark = _verdict(summary)
+    verdict = summary["verdict"]
     chart = _length_chart(tests)
     sections = [
         _acceptance_section(tests, summary, measured.lengths, measured.spheres),
@@ -104,29 +108,8 @@ def points_report(record: PointsRecord) -> tuple[Report, dict[str, Any]]:
         f"{pluralise(summary['points'], 'point')} as recorded: {pluralise(summary['sockets'], 'socket')}, "
         f"{pluralise(summary['lengths'], 'length')}, {pluralise(summary['spheres'], 'sphere')}"
     )
-    report = Report("Acceptance test of points", subtitle, verdict, mark, summary["warnings"], [], sections)
-    return report, summary
-
-
-def overall_decision(summary: dict[str, Any]) -> str | None:
-    """The decision on all limits together: "fails", "undecided" or "conforms"; None without limits."""
-    decisions = [
-        metric["decision"] for test in summary["acceptance"] for metric in test["figures"] if metric["decision"]
-    ]
-    return "fails" if summary["failed"] else worst(decisions) or ("conforms" if summary["kept"] else None)
-
-
-def _verdict(summary: dict[str, Any]) -> tuple[str, str]:
-    decision = overall_decision(summary)
-    if decision == "fails":
-        return "A limit is not kept", "bad"
-    if decision == "undecided":
-        return "Undecided: the measurement is too uncertain for a limit", "unsure"
-    if decision == "conforms":
-        incomplete = any(test["missing"] for test in summary["acceptance"] if test["decision"])
-        verdict = "Every limit is kept" + ("; a procedure was not complete" if incomplete else "")
-        return verdict, "unsure" if incomplete or summary["warnings"] else "good"
-    return "Measured; no limit was given", "neutral"
+    title = "Acceptance test of points"
+    return Report(title, subtitle, verdict["says"], verdict["mark"], summary["warnings"], [], sections), summary
 
 
 def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
@@ -189,7 +172,9 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
     parts = [
         [
             *(text_cell(word) for word in (test.standard, metric.name, part.where)),
-            *(number_cell(part.value), _expanded(part.expanded), number_cell(part.limit)),
+            number_cell(part.value, decimals_for(part.expanded)),
+            _expanded(part.expanded),
+            number_cell(part.limit),
             text_cell(part.decision or "–", _MARKS[part.decision]),
         ]
         for test in tests
@@ -204,27 +189,26 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
 
 def _test_table(test: dict[str, Any], before: bool, limited: bool) -> ReportTable:
     """One acceptance test; ``before``: with columns of the arm as found; ``limited``: with limits and decisions."""
-    columns = ["metric", "what it is"]
-    if before:
-        columns += ["as found", *(["decision as found"] if limited else [])]
-    columns += ["as left" if before else "value", "U"]
-    columns += ["MPE", "decision as left" if before else "decision"] if limited else []
+    columns = ["metric", *(["decision as left" if before else "decision"] if limited else [])]
+    columns += ["as left" if before else "value", "U", *(["MPE"] if limited else [])]
+    columns += ["as found", *(["decision as found"] if limited else [])] if before else []
     rows = []
     for metric in test["figures"]:
-        row = [text_cell(metric["name"]), text_cell(METRICS[metric["name"]])]
+        row, decimals = [text_cell(metric["name"])], decimals_for(metric["expanded_mm"])
+        row += [_decision(metric["decision"], metric["failing"], len(metric["parts"]))] if limited else []
+        row += [number_cell(metric["value_mm"], decimals), _expanded(metric["expanded_mm"])]
+        row += [number_cell(metric["limit_mm"])] if limited else []
         if before:
-            row += [number_cell(metric["as_found_mm"]), *([_decision(metric["as_found_decision"])] if limited else [])]
-        row += [number_cell(metric["value_mm"]), _expanded(metric["expanded_mm"])]
-        if limited:
-            decision = _decision(metric["decision"], metric["failing"], len(metric["parts"]))
-            row += [number_cell(metric["limit_mm"]), decision]
-        rows.append([*row, text_cell(metric["where"])])
-    return ReportTable(f"{EDITIONS[test['standard']]}: {test['title']} [mm]", (*columns, "worst at"), rows)
+            row.append(number_cell(metric["as_found_mm"], decimals))
+            row += [_decision(metric["as_found_decision"])] if limited else []
+        rows.append([*row, text_cell(metric["where"]), text_cell(METRICS[metric["name"]])])
+    caption = f"{EDITIONS[test['standard']]}: {test['title']} [mm]"
+    return ReportTable(caption, (*columns, "worst at", "what it is"), rows)
 
 
 def _expanded(value: float) -> Cell:
     """U, or that nothing was stated to compute it from."""
-    return number_cell(value) if value > 0 else text_cell("not stated")
+    return number_cell(value, decimals_for(value)) if value > 0 else text_cell("not stated")
 
 
 def _decision(decision: Any, failing: int = 0, of: int = 1) -> Cell:
@@ -240,8 +224,8 @@ def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSpher
     rows = [
         [
             text_cell("length"),
-            number_cell(value),
-            number_cell(u),
+            number_cell(value, decimals_for(u)),
+            number_cell(u, decimals_for(u)),
             text_cell(f"in {count} position{'' if count == 1 else 's'}"),
         ]
         for (value, u), count in sorted(bars.items())
@@ -250,7 +234,8 @@ def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSpher
         name = f"sphere '{sphere.name}' for {sphere.test.replace('-', ' ')}"
         touches = "+".join(str(len(group)) for group in sphere.groups)
         use = f"touched {touches} times by a ball of {sphere.stylus:g} mm; form error {format_number(sphere.form)} mm"
-        rows.append([text_cell(name), number_cell(sphere.diameter), number_cell(sphere.u), text_cell(use)])
+        numbers = (number_cell(value, decimals_for(sphere.u)) for value in (sphere.diameter, sphere.u))
+        rows.append([text_cell(name), *numbers, text_cell(use)])
     return [ReportTable("Artefacts", ("artefact", "calibrated value [mm]", "u [mm]", "used"), rows)] if rows else []
 
 

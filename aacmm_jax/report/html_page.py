@@ -78,7 +78,8 @@ def _calibration(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple
 
 
 def _evaluation(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
-    from .evaluation import evaluation_report, overall_decision, points_report
+    from ..summaries.verdicts import overall_decision
+    from .evaluation import evaluation_report, points_report
 
     if attributes.get("of") == "points":
         from ..files.evaluations import load_points

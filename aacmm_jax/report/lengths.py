@@ -33,7 +33,8 @@ def by_placement(between: Sequence[tuple[str, str]]) -> tuple[np.ndarray, charts
     order = sorted(range(len(keys)), key=lambda i: keys[i])
     x = np.empty(len(keys))
     x[order] = np.arange(len(keys))
-    for words, plural in ((lengths, "length"), (placements, "placement")):
+    one_each = len(length_number) == len(place_number)
+    for words, plural in ((placements if one_each else lengths, "length"), (placements, "placement")):
         sorted_words = [words[i] for i in order]
         last = [i for i, word in enumerate(sorted_words) if i + 1 == len(order) or sorted_words[i + 1] != word]
         if len(last) <= _NAMED:

@@ -9,7 +9,7 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.pose_residuals import distances_of
 from ..data.capture import Capture
 from ..model.metrics import pose_outliers
-from ..summaries.tables import METRICS
+from ..summaries.tables import METRICS, decimals_for
 from . import charts
 from .elements import Cell, Chart, ReportTable, format_number, number_cell, text_cell
 
@@ -243,13 +243,16 @@ def length_rows(
 
     ``fixed_scale``: index of the length that fixed the scale, so that its error is zero by construction.
     """
-    return [
-        [
+    found = []
+    for i, row in enumerate(rows):
+        expanded = None if row["error_u_mm"] is None else factor * row["error_u_mm"]
+        decimals = decimals_for(expanded)
+        error = number_cell(row["error_mm"], decimals, signed=True)
+        found.append([
             text_cell(f"{row['from']} – {row['to']}"),
             number_cell(row["value_mm"]),
-            *(number_cell(float(errors[i]), signed=True) for errors in before),
-            text_cell("fixed the scale") if i == fixed_scale else number_cell(row["error_mm"], signed=True),
-            number_cell(None if row["error_u_mm"] is None else factor * row["error_u_mm"]),
-        ]
-        for i, row in enumerate(rows)
-    ]
+            *(number_cell(float(errors[i]), decimals, signed=True) for errors in before),
+            text_cell("fixed the scale") if i == fixed_scale else error,
+            number_cell(expanded, decimals),
+        ])  # fmt: skip
+    return found

@@ -8,12 +8,12 @@ import numpy as np
 from ..calibration.record import CalibrationRecord
 from ..core.units import people_read
 from ..kinematics.arm import parameter_unit
-from ..summaries.tables import encoders_in_words, volume_rows
+from ..summaries.tables import decimals_for, encoders_in_words, volume_rows
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
 from . import charts
-from .elements import Chart, ReportTable, Section, decimals_for, format_number, number_cell, text_cell
+from .elements import Cell, Chart, ReportTable, Section, format_number, number_cell, text_cell
 
 _MOST_CORRELATED = 45  # parameters in a chart
 _INDICES = {
@@ -29,7 +29,7 @@ def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], facto
     """Expanded uncertainty of tips and lengths over the working volume."""
     found = summary["uncertainty"]["volume"]
     length = f"{volume.length:g} mm length"
-    rows = [[text_cell(title), *map(number_cell, values)] for title, values in volume_rows(found, factor)]
+    rows = [[text_cell(title), *map(_expanded, values)] for title, values in volume_rows(found, factor)]
     low, high = volume.start.min(axis=0), volume.start.max(axis=0)
     box = ", ".join(f"{axis} from {a:.0f} to {b:.0f}" for axis, a, b in zip("xyz", low, high, strict=True))
     introduction = (
@@ -45,6 +45,11 @@ def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], facto
         "Uncertainty over the working volume",
         [introduction, table, chart, _noise_sentence(summary["uncertainty"])],
     )
+
+
+def _expanded(u: float | None) -> Cell:
+    """An expanded uncertainty, to two digits."""
+    return number_cell(u, decimals_for(u))
 
 
 def _volume_chart(volume: VolumetricUncertainty, factor: float, length: str) -> Chart:
@@ -67,7 +72,7 @@ def _volume_chart(volume: VolumetricUncertainty, factor: float, length: str) -> 
     plot = charts.Plot(*axes, (marks,), height=380)
     columns = ("x [mm]", "y [mm]", "z [mm]", "U of the tip [mm]", f"U of a {length} [mm]", "with readings [mm]")
     data = [
-        [*(number_cell(float(x), 0) for x in point), *(number_cell(factor * float(value)) for value in u)]
+        [*(number_cell(float(x), 0) for x in point), *(_expanded(factor * float(value)) for value in u)]
         for point, *u in zip(volume.start, volume.u_tip, volume.u_length, volume.u_length_reading, strict=True)
     ]
     return Chart(
