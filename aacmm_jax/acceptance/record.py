@@ -40,6 +40,7 @@ class EvaluationRecord(NamedTuple):
     maxima: Mapping[str, float] = MappingProxyType({})  # limits of the quantities in `MAXIMA`, mm
     standards: tuple[str, ...] = tuple(STANDARDS)  # whose acceptance tests are run, in addition to those with a limit
     uncertainty: Uncertainty | None = None  # of the calibrated arm; files of earlier versions have none
+    calibration_warnings: tuple[str, ...] = ()  # what should be read about the calibration itself
 
     def arms(self) -> dict[str, ArmSpecification]:
         """The arm as found (nominal) and as left (calibrated)."""
@@ -113,6 +114,7 @@ def evaluation_of(
     u_test: float = 0.0,
     maxima: Mapping[str, float] | None = None,
     standards: Iterable[str] | None = None,
+    calibration_warnings: Iterable[str] = (),
 ) -> EvaluationRecord:
     """Evaluate a calibration on a capture.
 
@@ -127,6 +129,8 @@ def evaluation_of(
         maxima: Limits of the quantities in `MAXIMA`, mm.
         standards: Standards whose acceptance tests are run: "jjf", "asme", "iso". Default: those whose procedure the
             recording was made for. Tests with a limit are run in any case.
+        calibration_warnings: What should be read about the calibration before its numbers (`warnings_of`); the
+            evaluation keeps it.
 
     Returns:
         The record, with warnings on what makes it doubtful.
@@ -168,6 +172,7 @@ def evaluation_of(
         maxima=dict(maxima or {}),
         standards=made_for(recording) if standards is None else checked_standards(standards),
         uncertainty=to_numpy(uncertainty_of(record)),
+        calibration_warnings=tuple(calibration_warnings),
     )
     if not found.independent:
         warnings.append(

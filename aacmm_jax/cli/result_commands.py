@@ -179,12 +179,23 @@ def _evaluated(
             capture=recording.capture.select(choice[0] or None, choice[1] or ()),
             sources=(*map(fingerprint, read), *recording.sources),
         )
-        found = evaluation_of(record, recording, limits=limits, u_test=u_test, maxima=maxima, standards=standards)
+        limited = {"limits": limits, "u_test": u_test, "maxima": maxima, "standards": standards}
+        found = evaluation_of(record, recording, **limited, calibration_warnings=_warnings_of(read[0], record))
         summary = with_spinner("Evaluating", lambda: evaluation_summary(found))
         if output is not None:
             save_evaluation(output, found, summary)
             summary["written"] = str(output)
     return summary
+
+
+def _warnings_of(file: InputFile, record: Any) -> list[str]:
+    """What the calibration warned of, from the summary in its file."""
+    summary = read_summary(file, ("calibration",))[1]
+    if summary is None:
+        from ..summaries.warnings import of_calibration
+
+        return of_calibration(record)
+    return summary["warnings"]
 
 
 def _evaluated_points(

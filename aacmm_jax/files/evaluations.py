@@ -67,6 +67,7 @@ def save_evaluation(
         tables["uncertainty"] = _uncertainty_table(record.uncertainty)
     attributes = recording_attributes(record.recording) | {
         "warnings": list(record.warnings) or None,
+        "calibration_warnings": list(record.calibration_warnings) or None,
         "standards": list(record.standards) or "",
         "u_test_mm": record.u_test,
         **{f"most_{name}": value for name, value in record.maxima.items()},
@@ -195,6 +196,7 @@ def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
             maxima,
             _standards_of(stored),
             _uncertainty_of(path, stored, calibrated.arm),
+            tuple(map(str, np.atleast_1d(attributes.get("calibration_warnings") or []))),
         )
 
 

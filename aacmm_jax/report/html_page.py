@@ -14,6 +14,7 @@ from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
 from .administrative_data import administrative_section
+from .chart_svg import drawn, key, points, shade_key
 from .elements import ArmView, Chart, Report, ReportTable
 
 KINDS = ("calibration", "evaluation", "study")
@@ -77,7 +78,8 @@ def _calibration(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple
 
 
 def _evaluation(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
-    from .evaluation import evaluation_report, overall_decision, points_report
+    from ..summaries.verdicts import overall_decision
+    from .evaluation import evaluation_report, points_report
 
     if attributes.get("of") == "points":
         from ..files.evaluations import load_points
@@ -123,7 +125,6 @@ def _origin(source: str | os.PathLike, attributes: dict[str, Any]) -> list[tuple
 def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
     """The HTML of a report. Jinja escapes texts given by people, and only the page's own scripts run."""
     import jinja2
-    from plotly.offline import get_plotlyjs
 
     def read(name: str) -> str:
         return (_FOLDER / name).read_text(encoding="utf-8")
@@ -131,7 +132,7 @@ def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
     template = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     ).from_string(read("page_template.html"))
-    scripts = [get_plotlyjs(), read("page_script.js")]
+    script = read("page_script.js")
     blocks = [block for section in report.sections for block in section.blocks]
     return template.render(
         report=report,
@@ -139,13 +140,19 @@ def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
         is_chart=lambda block: isinstance(block, Chart),
         is_table=lambda block: isinstance(block, ReportTable),
         is_arm_view=lambda block: isinstance(block, ArmView),
-        charts={block.id: block.figure for block in blocks if isinstance(block, Chart)},
+        plots=lambda chart: [drawn(plot, f"chart-{chart.id}") for plot in chart.plots],
+        keys=_key,
+        points={block.id: [points(plot) for plot in block.plots] for block in blocks if isinstance(block, Chart)},
         scenes={block.id: block.data for block in blocks if isinstance(block, ArmView)},
         style=read("page_style.css"),
-        scripts=scripts,
+        script=script,
         mark=hashlib.sha256(repr(origin).encode()).hexdigest()[:12],
-        hashes=[_script_hash(script) for script in scripts],
+        allowed=_script_hash(script),
     )
+
+
+def _key(chart: Chart) -> list[tuple[str, str]]:
+    return [*key(chart.plots), *(shade_key(chart.shade_limits, chart.shade_unit) if chart.shade_limits else ())]
 
 
 def _script_hash(script: str) -> str:

@@ -21,6 +21,7 @@ from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .model_errors import summary_of_tests
 from .observations import capture_observations, observed_summary
 from .validation import cross_validation_summary
+from .verdicts import calibration_verdict
 from .warnings import observed, of_calibration, of_import
 
 _CORRELATED = 0.95
@@ -174,6 +175,7 @@ def calibration_summary(
         "method": record.method,
         "converged": record.converged,
         "residual_plausible": not record.implausible_residual,
+        "scale_plausible": record.plausible_scale,
         "reason": record.reason,
         "steps": record.steps,
         "poses": len(record.recording.capture.readings),
@@ -200,7 +202,7 @@ def calibration_summary(
         summary["truth"] = {
             stage: truth_errors(record, vectors, stage) for stage in ("nominal", "stage1", "calibrated")
         }
-    return summary
+    return summary | {"verdict": calibration_verdict(summary)._asdict()}
 
 
 def prior_rows(prior: PriorMetrics) -> list[dict[str, Any]]:

@@ -18,6 +18,7 @@ from ..kinematics.arm import Arm
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .calibration import length_metrics, metrics, metrics_by_socket_and_length
 from .validation import agreement_row, finite, no_better, surprise
+from .verdicts import evaluation_verdict
 
 _LIMITED = {"rms_mm": "RMS distance", "deltam_mm": "Deltam", "length_error_largest_mm": "largest length error"}
 _GROUPS = ("held_out", "identified_from")
@@ -72,6 +73,8 @@ def evaluation_summary(
     summary["acceptance"] = acceptance_summary(found["calibrated"], found["nominal"])
     summary["standards"] = list(record.standards)
     summary["u_test_mm"] = record.u_test
+    summary["verdict"] = evaluation_verdict(summary, len(summary["warnings"]))._asdict()
+    summary["calibration_warnings"] = list(record.calibration_warnings)
     return summary
 
 
@@ -163,7 +166,7 @@ def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = No
     """Acceptance tests of points; ``tests`` (`PointsRecord.acceptance`) are run if not given."""
     tests = record.acceptance() if tests is None else tests
     sockets = record.measured.sockets
-    return {
+    summary = {
         "kind": "acceptance",
         "points": sum(map(len, sockets.values()))
         + sum(len(group) for sphere in record.measured.spheres for group in sphere.groups),
@@ -177,6 +180,7 @@ def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = No
         "standards": list(record.standards),
         "u_test_mm": record.u_test,
     }
+    return summary | {"verdict": evaluation_verdict(summary, len(summary["warnings"]))._asdict()}
 
 
 def acceptance_summary(tests: list[AcceptanceTest], before: list[AcceptanceTest] | None = None) -> list[dict[str, Any]]:

@@ -304,7 +304,7 @@ try:
 finally:
     print(*sys.modules, file=sys.stderr)
 """
-_PLOTS = "matplotlib plotly jinja2"
+_PLOTS = "matplotlib jinja2"
 _NEVER_NEEDED = "optimistix lineax jax.experimental.pallas xarray matplotlib"
 
 
@@ -315,9 +315,9 @@ _NEVER_NEEDED = "optimistix lineax jax.experimental.pallas xarray matplotlib"
         ("--version", f"jax scipy h5py {_PLOTS}"),
         ("calibrate --help", f"jax scipy h5py {_PLOTS}"),
         ("show p.h5", f"jax scipy {_PLOTS}"),
-        ("calibrate p.h5 -o again.h5", f"{_NEVER_NEEDED} plotly jinja2"),
-        ("evaluate c.h5 p.h5 -o e.h5", f"{_NEVER_NEEDED} plotly jinja2 scipy"),
-        ("compare c.h5 c.h5", f"{_NEVER_NEEDED} plotly jinja2"),
+        ("calibrate p.h5 -o again.h5", f"{_NEVER_NEEDED} jinja2"),
+        ("evaluate c.h5 p.h5 -o e.h5", f"{_NEVER_NEEDED} jinja2 scipy"),
+        ("compare c.h5 c.h5", f"{_NEVER_NEEDED} jinja2"),
         ("report c.h5 -o r.html", _NEVER_NEEDED),
     ],
 )
