@@ -108,7 +108,7 @@ def test_what_is_tolerated_is_tolerated(checks):
         assert checks.compared([known], [row])[0].passed
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_papers_method_ends_as_its_stored_runs(checks):
     """One search of the thousand; its k depends on the processor, the rest does not."""
     import paper_method

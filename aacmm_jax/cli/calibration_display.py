@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..core.text import pluralise, shorten
-from ..core.units import ARCSEC, DEG, people_read, people_read_change
+from ..core.units import DEG, people_read, people_read_change
 from ..summaries.tables import (
     METRICS,
     decimals_for,

@@ -199,7 +199,7 @@ def test_without_noise_nothing_is_checked(paper_arm):
     assert not found.warns
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_rates_of_false_alarms_and_of_warnings(monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
     import model_warnings

@@ -31,8 +31,11 @@ def captures(space):
     return [aj.simulate(true, {}, observations=SIMULATED, noise=NOISE, seed=seed) for seed in range(3)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "options", [{}, pytest.param({"noise": NOISE, "robust": "tukey"}, marks=pytest.mark.slow)], ids=["plain", "robust"]
+    "options",
+    [{}, pytest.param({"noise": NOISE, "robust": "tukey"}, marks=pytest.mark.exhaustive)],
+    ids=["plain", "robust"],
 )
 def test_as_one_by_one(paper_arm, bounds, captures, options):
     many = aj.calibrate_many(paper_arm, aj.stack_captures(captures), bounds, covariance=True, slots=2, **options)

@@ -241,7 +241,7 @@ def test_many_are_as_one(paper_arm, space, bounds, true):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("active", [False, True])
+@pytest.mark.parametrize("active", [pytest.param(False, marks=pytest.mark.exhaustive), True])
 def test_derivatives_are_exact(paper_arm, space, active):
     """By readings, bounds, the length, the prior's mean and scale: of parameters, learned scales and effective numbers;
     against differences of calibrations in NumPy. With two bounds active too."""
@@ -273,7 +273,7 @@ def test_derivatives_are_exact(paper_arm, space, active):
         np.testing.assert_allclose(reverse, jacobian, atol=1e-10 * np.abs(jacobian).max())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_coverage_where_the_truth_is_drawn_from_the_prior(paper_arm, space):
     """Six poses in each of two sockets, so that half of the angles are the prior's."""
     draw, nominal = np.random.default_rng(0), np.asarray(space.vector())

@@ -178,7 +178,7 @@ def differentiated(request, paper_arm, noisy_capture, space):
 
 
 # Reverse has forward within it, and takes all inputs at once; the suite compiles reverse alone.
-@pytest.mark.parametrize("mode", ["reverse", pytest.param("forward", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mode", ["reverse", pytest.param("forward", marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("case", ["inactive", "active", "repeated"])
 @pytest.mark.parametrize("by", ["angles", "bounds", "length"])
 def test_derivatives_of_a_calibration(paper_arm, noisy_capture, space, start, differentiated, by, case, mode):
@@ -240,7 +240,7 @@ def test_hayatis_angle_tells_parallel_axes_apart():
     assert float(result.arm.beta[1]) == pytest.approx(2e-3, abs=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_uncertainties_are_those_that_trials_show(paper_arm, space, bounds):
     """150 simulated calibrations with lengths that share sockets: normalised errors of every parameter, of k and of a
     length elsewhere have a root mean square near 1, for each method and whether a length is held or not."""

@@ -35,6 +35,7 @@ def test_help_has_an_example(aacmm, command):
     assert re.search(rf"Examples?: aacmm {command}", " ".join(text.split()))
 
 
+@pytest.mark.slow
 def test_demo_recovers_the_truth_and_leaves_its_files(aacmm, tmp_path):
     result = json.loads(aacmm("demo", "out", "--json", "--seed", 3).stdout)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(result["files"])
@@ -316,9 +317,14 @@ _NEVER_NEEDED = "optimistix lineax jax.experimental.pallas xarray matplotlib"
         ("calibrate --help", f"jax scipy h5py {_PLOTS}"),
         ("show p.h5", f"jax scipy {_PLOTS}"),
         ("calibrate p.h5 -o again.h5", f"{_NEVER_NEEDED} jinja2"),
-        ("evaluate c.h5 p.h5 -o e.h5", f"{_NEVER_NEEDED} jinja2 scipy"),
-        ("compare c.h5 c.h5", f"{_NEVER_NEEDED} jinja2"),
-        ("report c.h5 -o r.html", _NEVER_NEEDED),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                ("evaluate c.h5 p.h5 -o e.h5", f"{_NEVER_NEEDED} jinja2 scipy"),
+                ("compare c.h5 c.h5", f"{_NEVER_NEEDED} jinja2"),
+                ("report c.h5 -o r.html", _NEVER_NEEDED),
+            )
+        ),
     ],
 )
 def test_a_command_imports_and_compiles_no_more_than_it_needs(panda_files, tmp_path, monkeypatch, arguments, absent):

@@ -53,6 +53,7 @@ def test_refused(aacmm, folder, options, message):
     assert message in aacmm("compare-models", folder / "c.h5", *options, expect=2).stderr
 
 
+@pytest.mark.slow
 def test_a_model_has_a_default_prior(aacmm, folder, tmp_path):
     """All coefficients are free, and no trade-off of theirs is warned of."""
     command = ("calibrate", folder / "c.h5", "-o", tmp_path / "r.h5", "--model", "harmonics=1-3", "--json")

@@ -39,7 +39,7 @@ def readings(arm: aj.Arm) -> np.ndarray:
     return np.random.default_rng(0).uniform(-2, 2, (4, arm.joints))
 
 
-@pytest.mark.parametrize("name", ["elbow", "scara"])
+@pytest.mark.parametrize("name", [pytest.param("elbow", marks=pytest.mark.slow), "scara"])
 def test_derivatives_are_exact(name, request):
     arm = request.getfixturevalue(name)
     q, names = readings(arm), parameter_names(arm)

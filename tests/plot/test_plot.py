@@ -78,6 +78,7 @@ def test_residuals_of_observations(observed_record, unit, count):
     assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1
 
 
+@pytest.mark.slow
 def test_figures_of_a_calibration_from_observations(observed_record, tmp_path):
     """The file has the distances, the residuals in standard deviations and the orientations."""
     aj.plot.save_calibration_figure(observed_record, tmp_path / "figure.svg")

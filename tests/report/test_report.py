@@ -307,6 +307,7 @@ def test_groups_held_out_are_listed_one_by_one_the_worst_first(written):
     assert unknown[3].text == "–"
 
 
+@pytest.mark.slow
 def test_a_report_says_where_the_scale_comes_from(observed_record):
     from aacmm_jax.report.calibration import calibration_report
 
@@ -700,7 +701,9 @@ def test_tables_sort_by_click_and_by_keyboard(shown):
     assert names == sorted(names)
 
 
-@pytest.mark.parametrize("kind", ["calibration", pytest.param("evaluation", marks=pytest.mark.slow), "study"])
+@pytest.mark.parametrize(
+    "kind", ["calibration", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("evaluation", "study"))]
+)
 def test_it_prints_to_pdf(shown, tmp_path, kind):
     opened = shown(kind, 1600)
     content = opened.pdf(path=tmp_path / "report.pdf", format="A4", print_background=True)

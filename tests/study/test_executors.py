@@ -90,7 +90,7 @@ def test_the_cache_of_a_worker_is_that_of_its_environment(tmp_path, monkeypatch)
     assert worker_setup.CacheSettings.current() == before
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_dask_workers_find_what_others_have_compiled(home, study, tmp_path):
     """Two clusters, one after the other, whose workers have imported JAX before they hear of a study."""
     distributed = pytest.importorskip("distributed")
@@ -136,7 +136,9 @@ def test_an_interrupt_is_answered_while_programs_compile(home, tmp_path, prepare
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("where", [(), ("--dask", "local")], ids=["threads", "processes"])
+@pytest.mark.parametrize(
+    "where", [(), pytest.param(("--dask", "local"), marks=pytest.mark.exhaustive)], ids=["threads", "processes"]
+)
 def test_an_interrupt_lets_running_blocks_end(home, tmp_path, prepared, where):
     path = tmp_path / "s.h5"
     options = ("--chunk", CHUNK, "--workers", 1, *where)

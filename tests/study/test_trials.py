@@ -38,7 +38,7 @@ def hayati() -> "aj.Arm":
     [
         ("cheng2018-simulation", DEVIATION),
         ("cheng2018-simulation", {"length_mm": 10.0, "angle_deg": 1.0}),
-        pytest.param("panda", DEVIATION, marks=pytest.mark.slow),
+        pytest.param("panda", DEVIATION, marks=pytest.mark.exhaustive),
         pytest.param(hayati(), DEVIATION, marks=pytest.mark.slow),
     ],
     ids=["paper", "far off", "panda", "beta"],
@@ -87,6 +87,7 @@ def test_slides_have_noise_of_their_own(noise, spread):
     assert np.std(noisy - exact) == pytest.approx(spread, rel=0.05)
 
 
+@pytest.mark.slow
 def test_no_pose_twice_and_all_within_the_limits():
     limits = [[-170, 170], [-100, 100], [-150, 150], [-120, 120], [-170, 170], [-90, 90]]
     q = drawn(made(capture=CAPTURE | {"joint_limits_deg": limits}, deviation=None)).q
@@ -204,9 +205,9 @@ STUDIES = {
     scope="module",
     params=[
         ("two-stage", 8),
-        ("joint", 8),
-        pytest.param(("stage1", 8), marks=pytest.mark.slow),
-        pytest.param(("two-stage", 40), marks=pytest.mark.slow),  # another size of program
+        pytest.param(("joint", 8), marks=pytest.mark.slow),
+        pytest.param(("stage1", 8), marks=pytest.mark.exhaustive),
+        pytest.param(("two-stage", 40), marks=pytest.mark.exhaustive),  # another size of program
     ],
     ids=str,
 )
