@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core._compat import member_numbers
-from ..core.linear_algebra import singular_values
+from ..core.linear_algebra import singular_values, solve_positive_definite
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, stop_gradient, while_loop
 from ..kinematics.parameters import Parameters
 from ..kinematics.priors import LEAST_STEPS, MIXED, ParameterPrior
@@ -37,6 +37,8 @@ _ROUNDS = 60  # least squares with new standard deviations; usually 4 to 8
 # Largest change of the log of a variance that no further round is worth, where derivatives pass through, and elsewhere.
 _TOLERANCE, _BATCH_TOLERANCE = 1e-10, 1e-6
 _UNDAMPED = 15  # rounds
+_REMEMBERED = 3  # rounds that are extrapolated
+_NEAR = 0.5  # change of the log of a variance, below which they are
 _LEAST_GIVEN = 1e-7  # natural steps: a smaller standard deviation would be a row of infinite weight
 _LEAST_LOG = 2 * np.log(LEAST_STEPS)
 # Of the steps of the solve: so small that a tight prior does not dominate the damping, but not so small that the value
@@ -127,6 +129,11 @@ class PriorProblem(NamedTuple):
         sigma = self.sigma(scales, z, effective_parameters(model, self.sd(new)))
         return xp.concatenate([xp.log(xp.maximum(sigma, 1e-9))[None], variances])
 
+    def allowed(self, scales: Float[AnyArray, " s"]) -> Float[AnyArray, " s"]:
+        """Extrapolated scales, those of learned groups not below the least."""
+        least = np.concatenate([[-np.inf], np.where(self.learned, _LEAST_LOG, -np.inf)])
+        return namespace(scales).maximum(scales, least)
+
     def mismatch(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> Float[AnyArray, " s"]:
         """Zero at the fixed point: the equations that `updated` solves."""
         xp, model, sd = namespace(scales, z), self.model(scales, z), self.sd(scales)
@@ -185,6 +192,55 @@ class ByScales(NamedTuple):
         return moved @ self.covariance @ moved.T
 
 
+class _History(NamedTuple):
+    """The last rounds of a fixed-point iteration, to extrapolate from (Anderson 1965; Walker and Ni 2011).
+
+    Of each round: how much the scales that it began with led to changed since the round before, and their residuals,
+    which are what the round changed.
+    """
+
+    count: AnyArray  # rounds near the fixed point
+    new: Float[AnyArray, " s"]
+    residual: Float[AnyArray, " s"]
+    of_new: Float[AnyArray, "m s"]
+    of_residual: Float[AnyArray, "m s"]
+
+    @classmethod
+    def empty(cls, scales: Float[AnyArray, " s"]) -> "_History":
+        xp, none = namespace(scales), namespace(scales).zeros((_REMEMBERED, *scales.shape))
+        return cls(xp.zeros((), dtype=np.int64), scales, scales, none, none)
+
+    def continued(self, scales: Float[AnyArray, " s"], new: Float[AnyArray, " s"]) -> "_History":
+        """With one more round; rounds far from the fixed point say nothing of it, and are forgotten."""
+        xp, residual = namespace(scales, new), new - scales
+        near = xp.max(xp.abs(residual)) < _NEAR
+        known = near & (self.count > 0)
+        rows = [
+            xp.where(known, xp.concatenate([(now - before)[None], older[:-1]]), 0.0)
+            for now, before, older in ((new, self.new, self.of_new), (residual, self.residual, self.of_residual))
+        ]
+        return _History(xp.where(near, self.count + 1, 0), new, residual, rows[0], rows[1])
+
+    def extrapolated(self) -> Float[AnyArray, " s"]:
+        """Where the residual would vanish if it were linear along the rounds, as far as they tell."""
+        xp = namespace(self.new)
+        gram = self.of_residual @ self.of_residual.T
+        least = 1e-12 * xp.trace(gram) + 1e-300
+        weights = solve_positive_definite(
+            gram + least * xp.asarray(np.eye(_REMEMBERED)), self.of_residual @ self.residual
+        )
+        return self.new - xp.where(xp.all(xp.isfinite(weights)), weights, 0.0) @ self.of_new
+
+
+class _Rounds(NamedTuple):
+    count: AnyArray
+    scales: Float[AnyArray, " s"]
+    z: Float[AnyArray, " z"]
+    evaluations: AnyArray
+    change: AnyArray  # of the scales in the last round
+    history: _History
+
+
 def fit_with_prior(problem: PriorProblem, z: Float[AnyArray, " z"]) -> tuple[Float[AnyArray, " s"], Fit]:
     """The scales at their fixed point, and the least squares with them.
 
@@ -194,28 +250,31 @@ def fit_with_prior(problem: PriorProblem, z: Float[AnyArray, " z"]) -> tuple[Flo
     tolerance = _TOLERANCE if xp is np or differentiable else _BATCH_TOLERANCE
 
     def one_round(known: PriorProblem) -> Callable:
-        def again(state: tuple) -> tuple:
-            count, scales, z, evaluations, _ = state
-            found = known.fit(scales, z, differentiable=False)
-            new = known.updated(scales, found.parameters)
+        def again(state: _Rounds) -> _Rounds:
+            found = known.fit(state.scales, state.z, differentiable=False)
+            new = known.updated(state.scales, found.parameters)
+            count, evaluations = state.count + 1, state.evaluations + found.steps
+            history = state.history.continued(state.scales, new)
+            change = xp.max(xp.abs(new - state.scales))
             # Few data can lead to and fro between two sets of scales.
-            new = xp.where(count < _UNDAMPED, new, 0.5 * (new + scales))
-            return count + 1, new, found.parameters, evaluations + found.steps, xp.max(xp.abs(new - scales))
+            damped = xp.where(state.count < _UNDAMPED, new, 0.5 * (new + state.scales))
+            after = xp.where(change < _NEAR, known.allowed(history.extrapolated()), damped)
+            return _Rounds(count, after, found.parameters, evaluations, change, history)
 
         return again
 
-    def settle(known: PriorProblem, first: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> tuple:
+    def settle(known: PriorProblem, first: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> _Rounds:
         none = xp.zeros((), dtype=np.int64)
         return while_loop(
-            lambda state: (state[0] < _ROUNDS) & (state[4] > tolerance),
+            lambda state: (state.count < _ROUNDS) & (state.change > tolerance),
             one_round(known),
-            (none, first, z, none, xp.asarray(np.inf)),
+            _Rounds(none, first, z, none, xp.asarray(np.inf), _History.empty(first)),
         )
 
     def solve(_: Any, first: Float[AnyArray, " s"]) -> tuple[Any, tuple[Any, Any, Any]]:
-        _, scales, last, evaluations, change = settle(*stop_gradient((problem, first, z)))
+        ended = settle(*stop_gradient((problem, first, z)))
         # As a float: custom_root gives this a tangent of its own type, which an integer must not have.
-        return scales, (last, xp.asarray(evaluations, dtype=float), change)
+        return ended.scales, (ended.z, xp.asarray(ended.evaluations, dtype=float), ended.change)
 
     def mismatch(scales: Float[AnyArray, " s"]) -> Float[AnyArray, " s"]:
         return problem.mismatch(scales, problem.fit(scales, stop_gradient(z), differentiable=True).parameters)
