@@ -3,9 +3,9 @@ combination of types, in each worker process.
 
 A check costs about 0.1 ms, ten times as much as many of the functions that it checks, and almost all calls repeat the
 types of an earlier one: checked anew in each test, they were a fifth of the suite's CPU. Arrays of NumPy, arrays of JAX
-and what is traced have types of their own, so each of them is checked. Preparing a function to be checked costs 4 ms, so it
-is prepared when it is first called. A function in another one would be prepared each time the outer one runs, so it is
-checked in the first runs only.
+and what is traced have types of their own, so each of them is checked. Preparing a function to be checked costs 4 ms,
+so it is prepared when it is first called. A function in another one would be prepared each time the outer one runs, so
+it is checked in the first runs only.
 """
 
 import collections

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 import aacmm_jax as aj
 from tests.refusals import assert_refused
+from tests.written_study import write_study
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def made(record, tmp_path_factory):
         noise={"encoder_arcsec": [2, 4]}, identification={"method": "stage1"},
     )  # fmt: skip
     path = tmp_path_factory.mktemp("plot") / "study.h5"
-    aj.study.run_study(study, path)
+    write_study(path, study)
     arm, capture = record.calibrated.arm, record.recording.capture
     sockets = {name: np.asarray(arm.position(q)) for name, q in capture.sockets.items()}
 

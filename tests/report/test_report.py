@@ -16,6 +16,7 @@ import aacmm_jax as aj
 from aacmm_jax.report import chart_svg, charts, elements, write_report
 from aacmm_jax.summaries.tables import decimals_for
 from tests.refusals import assert_refused
+from tests.written_study import write_study
 
 HOSTILE = '<script>document.title="taken"</script><img src=x onerror=alert(1)> & "B" <b>bold</b>'
 STUDY = {
@@ -51,7 +52,7 @@ def written(tmp_path_factory, observed_record):
     )
     evaluation = evaluation._replace(warnings=(*evaluation.warnings, f"Beware of {HOSTILE}"))
     aj.files.save_evaluation(folder / "evaluation.h5", evaluation)
-    aj.study.run_study(aj.study.make_study(**{**STUDY, "arm": nominal.arm}), folder / "study.h5")
+    write_study(folder / "study.h5", aj.study.make_study(**{**STUDY, "arm": nominal.arm}))
     aj.files.save_calibration(folder / "observations.h5", with_hostile_names(observed_record))
     pages = {kind: folder / f"{kind}.html" for kind in ("calibration", "evaluation", "study", "observations")}
     for kind, page in pages.items():
