@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from ..core.text import shorten
 from ..core.units import ARCSEC
 from ..study.results import Results
 from ..study.statistics import METRICS, factor_title, level_text, level_title, shown_unit, study_summary
@@ -65,7 +64,8 @@ def _warnings(summary: dict[str, Any]) -> list[str]:
         shares = [(label, cell[key]["value"] or 0.0) for label, cell in ran]
         named = [f"{label} ({100 * share:.3g} %)" for label, share in shares if share < least]
         if named:
-            found.append(f"{says}: {shorten(named, _NAMED)}.")
+            more = f"; and {len(named) - _NAMED} more cells" if len(named) > _NAMED else ""
+            found.append(f"{says}: {'; '.join(named[:_NAMED])}{more}.")
     return found
 
 
