@@ -295,6 +295,10 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
     console.print(
         "Propagated from u of the parameters to 400 positions that random poses within the joint limits reach."
     )
+    if found.get("tried"):
+        from ..summaries.calibration import tried_sentence
+
+        console.print(tried_sentence(found["tried"]))
     seat = "seat" if summary["sockets_used"] else "tip, each coordinate,"
     noise = f"{encoders_in_words(found)}, {seat} {1e3 * found['seating_mm']:.3g} um"
     source = {

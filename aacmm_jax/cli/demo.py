@@ -24,14 +24,22 @@ from ..summaries.calibration import calibration_summary, capture_summary
 
 _DEVIATION_MM, _DEVIATION_DEG = 1.0, 0.1
 _ENCODER_ARCSEC, _SEATING_MM, _LENGTH_U_MM = 2.0, 0.005, 0.002
-_FILES = ("capture.h5", "calibration.h5", "nominal.toml", "true.toml", "calibrated.toml", "calibration.png")
+_FILES = (
+    "capture.h5",
+    "calibration.h5",
+    "nominal.toml",
+    "true.toml",
+    "calibrated.toml",
+    "calibration.png",
+    "report.html",
+)
 _TRUE = ", true"  # what the name of the true arm ends in
 _CHECKS, _CHECK_MM = 30, 300.0
 _START, _END = (400.0, 200.0, 300.0), (700.0, 500.0, 500.0)
 
 
 def run(folder: Path, seed: int) -> dict[str, Any]:
-    """Simulate, calibrate, compare, and leave capture, calibration, arms and a figure in ``folder``."""
+    """Simulate, calibrate, compare, and leave capture, calibration, arms, a figure and a report in ``folder``."""
     nominal = load_specification("cheng2018-simulation")
     _prepare(folder, nominal.name + _TRUE)
     with together(*(folder / name for name in _FILES)):
@@ -86,8 +94,10 @@ def _made(folder: Path, nominal: ArmSpecification, seed: int) -> dict[str, Any]:
     save_arm(record.calibrated.arm, folder / "calibrated.toml", name=record.calibrated.name)
     summary = _summary(record, whole, _checks(record, seed))
     from ..plot import save_calibration_figure
+    from ..report import write_report
 
     save_calibration_figure(record, folder / "calibration.png")
+    write_report(folder / "calibration.h5", folder / "report.html")
     return summary | {"folder": str(folder), "files": list(_FILES)}
 
 

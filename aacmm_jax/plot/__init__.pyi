@@ -12,6 +12,7 @@ from .calibration import save_calibration_figure as save_calibration_figure
 from .drift import drift_trend as drift_trend
 from .drift import parameter_trend as parameter_trend
 from .drift import save_drift_trend as save_drift_trend
+from .patterns import residual_patterns as residual_patterns
 from .study import save_study_figures as save_study_figures
 from .study import study_convergence as study_convergence
 from .study import study_correlation as study_correlation

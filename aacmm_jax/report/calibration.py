@@ -10,7 +10,7 @@ from ..calibration.pose_residuals import distances_of, observation_residuals
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise
 from ..core.units import DEG, people_read
-from ..summaries.calibration import calibration_summary, prior_sentence
+from ..summaries.calibration import calibration_summary
 from ..summaries.observations import capture_words
 from ..summaries.tables import decimals_for, two_digits
 from ..summaries.warnings import observed
@@ -38,7 +38,9 @@ from .observations import (
     residuals_section,
     stages_chart,
 )
+from .patterns import patterns_sections
 from .residuals import length_rows, metrics_table, pose_distances, residual_chart, socket_table, validation_tables
+from .tried import tried_sections
 from .uncertainty import (
     bounds_section,
     correlations_section,
@@ -70,8 +72,10 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
         _scale(record, summary, evaluations, factor),
         _parameters(summary, factor),
         *_residuals(record, summary, evaluations["calibrated"]),
+        *patterns_sections(record),
         Section("arm", "The arm in its poses", [_view(record, evaluations["calibrated"])]),
         volume_section(volume, summary, factor),
+        *tried_sections(record, volume, factor),
         *([] if record.sampled is None else [monte_carlo_section(record)]),
         correlations_section(record, uncertainty),
         observability_section(observability),
@@ -191,7 +195,7 @@ def _nominal_and_calibrated(
     if record.observed is not None or record.method == REPEATABILITY:
         del stages["stage1"]  # which is the calibrated arm
     if summary.get("prior"):
-        blocks.append("Prior (standard deviation of each group): " + ". ".join(map(prior_sentence, summary["prior"])))
+        blocks.append(_prior_table(summary["prior"]))
     if record.observed is not None:
         blocks += [*agreement_tables(summary), *other_poses_table(summary)]
     if summary["nominal"]:
@@ -216,6 +220,20 @@ def _nominal_and_calibrated(
         ]
         blocks.append(ReportTable("Against the true arm of the simulation", ("", *stages.values()), rows))
     return Section("stages", "Nominal and calibrated arm", blocks)
+
+
+def _prior_table(prior: list[dict[str, Any]]) -> ReportTable:
+    """Each group of parameters that has a prior: its standard deviation, and how many parameters the data determine."""
+    rows = []
+    for row in prior:
+        scale, unit = people_read(row["unit"])
+        sd = text_cell("0: not supported by the data, so exact")
+        if row["supported"]:
+            sd = text_cell(f"{row['sd'] * scale:.3g} {unit}".strip())
+        cells = (text_cell(row["group"]), text_cell("learned" if row["learned"] else "given"), sd)
+        rows.append([*cells, number_cell(row["parameters"], 0), number_cell(row["effective_parameters"], 1)])
+    columns = ("group", "prior", "standard deviation", "parameters", "of these determined by the data")
+    return ReportTable("Priors of the parameters, and effective parameters", columns, rows)
 
 
 def _scale(

@@ -13,7 +13,7 @@ import numpy as np
 from .charts import Axis, Marks, Plot
 
 _CHARACTER = 6.6  # pixels: mean width of one in a label
-_OVERLAP = 14  # pixels: least distance of labels of the vertical axis
+_OVERLAP = 16  # pixels: least distance of labels of the vertical axis
 
 
 def drawn(plot: Plot, label: str) -> str:
@@ -32,15 +32,15 @@ def drawn(plot: Plot, label: str) -> str:
     body = "".join((*_lines(plot), *map(_marks, [plot] * len(plot.marks), plot.marks), *_labels(plot)))
     return (
         f'<div class="plot">{title}{y_title}<div class="axes{ratio} style="{style}">'
-        f'<svg role="img" aria-labelledby="{label}" width="100%" height="{plot.height}">{body}</svg></div>'
+        f'<svg role="img" aria-labelledby="{label}" style="--height:{plot.height}px">{body}</svg></div>'
         f"{x_title}</div>"
     )
 
 
-def key(plots: Sequence[Plot]) -> list[tuple[str, str]]:
-    """The glyph and the name of every named series, if there are several or a band or bar needs words."""
+def key(plots: Sequence[Plot], least: int = 2) -> list[tuple[str, str]]:
+    """The glyph and the name of every named series, where there are at least so many."""
     named = {marks.name: marks for plot in plots for marks in plot.marks if marks.name}
-    return [(_glyph(marks), name) for name, marks in named.items()] if len(named) > 1 else []
+    return [(_glyph(marks), name) for name, marks in named.items()] if len(named) >= least else []
 
 
 def points(plot: Plot) -> list[list]:
@@ -61,8 +61,10 @@ def points(plot: Plot) -> list[list]:
 def shade_key(limits: Sequence[float], unit: str) -> list[tuple[str, str]]:
     """The key of a sequential scale: each shade with its range."""
     decimals = max(1 - int(np.floor(np.log10(max(limits[1] - limits[0], 1e-9)))), 0)
-    words = (f"{low:.{decimals}f} to {high:.{decimals}f} {unit}" for low, high in pairwise(limits))
-    return [(_box(f"s{i}"), word.strip()) for i, word in enumerate(words)]
+    words = [f"{low:.{decimals}f} to {high:.{decimals}f} {unit}".strip() for low, high in pairwise(limits)]
+    if np.isinf(limits[-1]):
+        words[-1] = f"over {limits[-2]:.{decimals}f} {unit}".strip()
+    return [(_box(f"s{i}"), word) for i, word in enumerate(words)]
 
 
 def _text(words: object) -> str:
@@ -110,6 +112,8 @@ def _marks(plot: Plot, marks: Marks) -> str:
     found = []
     if marks.symbol == "band" and marks.low is not None and marks.high is not None:
         return _band(plot, marks, tone)
+    if marks.symbol == "bars":
+        return _bars(plot, marks, tone, "bars", marks.size)
     if marks.low is not None and marks.high is not None:
         found.append(_bars(plot, marks, tone))
     if marks.symbol in ("line", "dashed"):
@@ -133,21 +137,22 @@ def _marks(plot: Plot, marks: Marks) -> str:
 
 
 def _dots(marks: Marks, x: np.ndarray, y: np.ndarray, known: np.ndarray, tone: str) -> Iterable[str]:
-    """Dots are lines without length, whose ends are round or square."""
+    """Dots are lines without length, whose ends are round or square; in PDF, square ends need a direction."""
+    length = "h0" if marks.symbol == "dot" else "h.1"
     shade = None if marks.shade is None else np.asarray(marks.shade)
     for i in (None,) if shade is None else np.unique(shade).tolist():
         mine = known if i is None else known & (shade == i)
-        d = [f"M{_number(a)} {_number(b)}h0" for a, b in zip(x[mine], y[mine], strict=True)]
+        d = [f"M{_number(a)} {_number(b)}{length}" for a, b in zip(x[mine], y[mine], strict=True)]
         kind = f"{marks.symbol}s {tone if i is None else f's{i}'}"
         yield _path(d, kind, marks.size if i is None else marks.size + 1.6 * i)
 
 
-def _bars(plot: Plot, marks: Marks, tone: str) -> str:
+def _bars(plot: Plot, marks: Marks, tone: str, kind: str = "bar", width: float | None = None) -> str:
     x, low = _positions(plot, marks.x, marks.low)
     high = _positions(plot, marks.x, marks.high)[1]
     known = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
     ends = zip(x[known], np.clip(low[known], 0, 1000), np.clip(high[known], 0, 1000), strict=True)
-    return _path([f"M{_number(a)} {_number(b)}V{_number(c)}" for a, b, c in ends], f"bar {tone}")
+    return _path([f"M{_number(a)} {_number(b)}V{_number(c)}" for a, b, c in ends], f"{kind} {tone}", width)
 
 
 def _band(plot: Plot, marks: Marks, tone: str) -> str:
@@ -196,7 +201,7 @@ def _apart(axis: Axis, height: int) -> list[tuple[float, str]]:
     found: list[tuple[float, str]] = []
     for tick, words in axis.ticks:
         position = 100 * (1 - float(axis.at(tick)))
-        if not found or abs(position - found[-1][0]) * height / 100 >= (_OVERLAP if not found else 11):
+        if not found or abs(position - found[-1][0]) * height / 100 >= _OVERLAP:
             found.append((position, words))
     return found
 
@@ -207,11 +212,11 @@ def _glyph(marks: Marks) -> str:
         inside = f'<use href="#{marks.symbol}" x="11" y="7" class="{tone}"/>'
     elif marks.symbol in ("line", "dashed"):
         inside = f'<path class="curve {tone}{" dashed" if marks.symbol == "dashed" else ""}" d="M1 7H21"/>'
-    elif marks.symbol in ("band", "boxes"):
-        return _box(f"{marks.symbol if marks.symbol == 'band' else 'boxes'} {tone}")
+    elif marks.symbol in ("band", "bars", "boxes"):
+        return _box(f"{'boxes' if marks.symbol == 'boxes' else 'band'} {tone}")
     else:
         bar = f'<path class="bar {tone}" d="M11 0V14"/>' if marks.low is not None else ""
-        inside = f'{bar}<path class="{marks.symbol}s {tone}" stroke-width="{max(marks.size, 6):g}" d="M11 7h0"/>'
+        inside = f'{bar}<path class="{marks.symbol}s {tone}" stroke-width="{max(marks.size, 6):g}" d="M11 7h.1"/>'
     return f'<svg width="22" height="14" aria-hidden="true">{inside}</svg>'
 
 

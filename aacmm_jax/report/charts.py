@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-Symbol = Literal["dot", "square", "diamond", "cross", "line", "dashed", "band", "boxes"]
+Symbol = Literal["dot", "square", "diamond", "cross", "line", "dashed", "band", "bars", "boxes"]
 Tone = Literal["main", "accent", "soft", "ink"]
 SHADES = 6  # of a sequential colour scale, from little to much
 _MOST_NAMES = 45  # along an axis; more would overlap

@@ -1,6 +1,7 @@
 """The elements of a report, independent of how they are shown: sections of text, tables, charts and views."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from .charts import Plot
@@ -22,6 +23,7 @@ class ReportTable(NamedTuple):
     caption: str
     columns: tuple[str, ...]
     rows: list[list[Cell]]
+    folded: bool = False  # shown on demand only, and not printed
 
     @property
     def numeric(self) -> list[bool]:
@@ -69,6 +71,7 @@ class Report(NamedTuple):
     warnings: list[str]
     facts: list[tuple[str, str]]
     sections: list[Section]
+    administrative: Sequence[tuple[str, list[tuple[str, str]]]] = ()  # groups of titles and values
 
 
 def text_cell(value: object, mark: str = "") -> Cell:

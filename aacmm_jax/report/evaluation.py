@@ -123,7 +123,8 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
         by_construction = group and key.startswith("length") and summary[group]["fixed_by_one_length"]
         if group and key in summary[group]["calibrated"] and not by_construction:
             values = " → ".join(format_number(summary[group][stage][key]) for stage in _STAGES)
-            facts.append((f"{name}, {title[0].lower()}{title[1:]}, nominal → calibrated", f"{values}\u00a0mm"))
+            what = f"{title}: {name}, nominal → calibrated"
+            facts.append((what, f"{values}\u00a0mm"))
     return facts
 
 

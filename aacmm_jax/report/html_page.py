@@ -13,7 +13,7 @@ from ..files.atomic_write import write_text
 from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
-from .administrative_data import administrative_section
+from .administrative_data import administrative_groups
 from .chart_svg import drawn, key, points, shade_key
 from .elements import ArmView, Chart, Report, ReportTable
 
@@ -54,8 +54,7 @@ def _written(source: Path, target: Path, administrative_data: AdministrativeData
     if administrative_data is not None:
         tested = kind == "evaluation"
         check_conformity(administrative_data, simulated=simulated, decision=decision, tested=tested)
-        section = administrative_section(administrative_data, tested)
-        report = report._replace(sections=[section, *report.sections])
+        report = report._replace(administrative=administrative_groups(administrative_data, tested))
     page = _render(report, _origin(read, stored.attributes))
     write_text(target, page)
     return {
@@ -152,7 +151,9 @@ def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
 
 
 def _key(chart: Chart) -> list[tuple[str, str]]:
-    return [*key(chart.plots), *(shade_key(chart.shade_limits, chart.shade_unit) if chart.shade_limits else ())]
+    if not chart.shade_limits:
+        return key(chart.plots)
+    return [*shade_key(chart.shade_limits, chart.shade_unit), *key(chart.plots, least=1)]
 
 
 def _script_hash(script: str) -> str:

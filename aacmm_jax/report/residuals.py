@@ -109,12 +109,13 @@ def residual_chart(
     id: str, title: str, capture: Capture, evaluations: Mapping[str, Evaluation], *, mark: bool = False
 ) -> Chart:
     """Distance of every pose from its socket's centroid, or the geometry of its observation, by arm; ``mark``: poses of
-    the last arm that are far off are marked."""
+    the last arm that are far off are marked, and a table lists the distances."""
     groups = Groups.of(capture)
     last = np.concatenate(distances_of(capture, list(evaluations.values())[-1]))
     far = pose_outliers(last, groups.sizes)[0] if mark else None
     distances = {name: pose_distances(capture, evaluation) for name, evaluation in evaluations.items()}
-    return pose_chart(id, title, groups, distances, far=far)
+    chart = pose_chart(id, title, groups, distances, far=far)
+    return chart if mark else chart._replace(table=None)
 
 
 def pose_chart(

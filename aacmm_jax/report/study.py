@@ -14,7 +14,7 @@ _SHOWN = (
     *("length_error", "angle_error", "de", "deltam", "scale_error"),
     *("length_error_stage1", "angle_error_stage1", "de_stage1", "deltam_stage1", "k"),
 )
-_MOST_CELLS, _MOST_ROWS, _MOST_WARNINGS, _MOST_PLOTS = 400, 2000, 12, 12
+_MOST_CELLS, _MOST_ROWS, _NAMED, _MOST_PLOTS = 400, 2000, 6, 12
 
 
 def study_report(results: Results) -> tuple[Report, dict[str, Any]]:
@@ -55,19 +55,18 @@ def _warnings(summary: dict[str, Any]) -> list[str]:
         found.append(
             "The study is not finished; the same command continues it. Metrics are of the trials that were run."
         )
-    for cell in summary["results"]:
-        if cell["trials_run"] and (cell["converged"]["value"] or 0.0) < 0.99:
-            found.append(
-                f"Cell {cell['cell']}: only {100 * cell['converged']['value']:.3g} % of {cell['trials_run']} trials "
-                "converged; its metrics are of those, if any."
-            )
-        if (cell["truth_inside"]["value"] or 0.0) < 1.0 and cell["trials_run"]:
-            found.append(
-                f"Cell {cell['cell']}: the true arm lies within the bounds in "
-                f"{100 * cell['truth_inside']['value']:.3g} % of the trials."
-            )
-    more = len(found) - _MOST_WARNINGS
-    return found[:_MOST_WARNINGS] + ([f"And {more} more of this kind; see the table of cells."] if more > 0 else [])
+    cells = zip(_labels(summary), summary["results"], strict=True)
+    ran = [(label, cell) for label, cell in cells if cell["trials_run"]]
+    for key, least, says in (
+        ("converged", 0.99, "Not all trials converged, and metrics are of those that did"),
+        ("truth_inside", 1.0, "The true arm lies within the bounds in some of the trials only"),
+    ):
+        shares = [(label, cell[key]["value"] or 0.0) for label, cell in ran]
+        named = [f"{label} ({100 * share:.3g} %)" for label, share in shares if share < least]
+        if named:
+            more = f"; and {len(named) - _NAMED} more cells" if len(named) > _NAMED else ""
+            found.append(f"{says}: {'; '.join(named[:_NAMED])}{more}.")
+    return found
 
 
 def _varied(summary: dict[str, Any]) -> list[str]:
@@ -173,13 +172,13 @@ def _plots(summary: dict[str, Any], name: str, unit: str, factor: float) -> tupl
 def _parameter_sections(summary: dict[str, Any]) -> list[Section]:
     """Bias and standard deviation of every parameter, cell by cell."""
     rows = []
-    for label, cell in zip(_labels(summary), summary["results"], strict=True):
+    for cell in summary["results"]:
         for row in cell.get("parameters", [])[: _MOST_ROWS // max(summary["cells"], 1)]:
             factor, unit = (1 / ARCSEC, "arcsec") if row.get("unit") == "rad" else (1.0, "mm")
             statistics = (_statistic_cell(row.get(key), factor) for key in ("bias", "spread"))
-            rows.append([text_cell(label), text_cell(row["parameter"]), text_cell(unit), *statistics])
+            rows.append([number_cell(cell["cell"], 0), text_cell(row["parameter"]), text_cell(unit), *statistics])
     if not rows:
         return []
     columns = ("cell", "parameter", "unit", "bias", "standard deviation")
-    table = ReportTable("Errors of the parameters; ± one Monte Carlo standard error", columns, rows)
+    table = ReportTable("Errors of the parameters; ± one Monte Carlo standard error", columns, rows, folded=True)
     return [Section("parameters", "Parameters", [table])]

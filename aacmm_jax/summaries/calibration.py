@@ -17,6 +17,7 @@ from ..data.recording import Recording
 from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
+from ..uncertainty.tried_poses import tried_poses
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .model_errors import summary_of_tests
 from .observations import capture_observations, observed_summary
@@ -235,6 +236,7 @@ def uncertainty_summary(
 ) -> dict[str, Any]:
     """Noise behind the uncertainty, standard uncertainties (k = 1) over the working volume, and observability."""
     uncertainty = uncertainty_of(record)
+    volume = volumetric_uncertainty(uncertainty) if volume is None else volume
     found = {
         "form": record.noise_model,
         "encoder_arcsec": np.asarray(record.noise.encoder_arcsec).tolist(),
@@ -242,7 +244,7 @@ def uncertainty_summary(
         "seating_mm": float(record.noise.seating),
         "misfit": record.reduced_chi,
         "coverage_factor_95": uncertainty.factor(0.95),
-        "volume": (volumetric_uncertainty(uncertainty) if volume is None else volume).summary,
+        "volume": volume.summary,
         "correlated": [{"one": one, "other": other, "r": r} for one, other, r in uncertainty.correlated(_CORRELATED)],
         "rank": observability.rank,
         "parameters": len(observability.names),
@@ -251,8 +253,28 @@ def uncertainty_summary(
     }
     # JSON has no infinity: None for what is not determined.
     found["volume"] = {key: value if np.isfinite(value) else None for key, value in found["volume"].items()}
+    found["tried"] = _tried(record, volume)
     found["condition"] = found["condition"] if np.isfinite(found["condition"]) else None
     return found
+
+
+def _tried(record: CalibrationRecord, volume: VolumetricUncertainty) -> dict[str, Any] | None:
+    """How many of the volume's poses are near those of the calibration; None of a single pose."""
+    readings = np.asarray(record.recording.capture.readings)
+    if len(readings) < 2:
+        return None
+    found = tried_poses(record.calibrated.arm, readings, volume.q)
+    return {"poses": len(found.distance), "tried": int(found.tried.sum()), "spacing_rad": found.spacing}
+
+
+def tried_sentence(found: Mapping[str, Any]) -> str:
+    """How much of the volume a calibration has tried, in words."""
+    percentage = 100 * found["tried"] / found["poses"]
+    return (
+        f"Of {found['poses']} random poses within the joint limits, {percentage:.2g} % lie as near to a pose of the "
+        f"calibration as its poses lie to one another ({found['spacing_rad'] / DEG:.2g} deg RMS over the joints). "
+        "Elsewhere the calibration was never tried, and U rests on the model alone."
+    )
 
 
 def active_names_of(record: CalibrationRecord, active: np.ndarray) -> dict[str, str]:

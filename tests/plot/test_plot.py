@@ -108,10 +108,26 @@ def test_figures_hold_the_numbers(record, made):
     changes = aj.plot.parameter_changes(record, "angle").containers[0].lines[0].get_ydata()
     vectors = record.vectors()
     angles = [i for i, name in enumerate(record.names) if name.startswith(("alpha", "theta"))]
-    expected = (vectors["calibrated"] - vectors["nominal"])[angles] / aj.units.ARCSEC
+    expected = (vectors["calibrated"] - vectors["nominal"])[angles] / aj.units.DEG
     np.testing.assert_allclose(changes, expected)
     values = aj.plot.singular_values(*made["singular_values"]).lines[0].get_ydata()
     np.testing.assert_allclose(values, made["singular_values"][0].singular)
+
+
+def test_patterns_in_the_residuals(record):
+    """A panel for each joint, one for each axis, and the histogram; with the numbers of the calibration."""
+    from aacmm_jax.calibration.pose_residuals import signed_residuals
+
+    panels = aj.plot.residual_patterns(record).axes
+    assert len(panels) == 6 + 3 + 1
+    found = signed_residuals(record)
+    drawn = panels[2].lines[1].get_xydata()
+    np.testing.assert_allclose(drawn[:, 0], np.asarray(record.recording.capture.readings)[:, 2] / aj.units.DEG)
+    inside = np.abs(found.along_joint[:, 2]) < panels[2].get_ylim()[1]
+    np.testing.assert_allclose(drawn[inside, 1], found.along_joint[inside, 2])
+    single = aj.Capture({name: q[:1] for name, q in record.recording.capture.sockets.items()})
+    alone = record._replace(recording=record.recording._replace(capture=single))
+    assert_refused(lambda: aj.plot.residual_patterns(alone), "no pose has a residual with a direction")
 
 
 @pytest.mark.parametrize(
