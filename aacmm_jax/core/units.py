@@ -15,6 +15,11 @@ def people_read(unit: str) -> tuple[float, str]:
     return (1 / DEG, "deg") if unit == "rad" else (1.0, "" if unit == "1" else unit)
 
 
+def error_unit(unit: str) -> tuple[float, str]:
+    """The same of errors of parameters: mm, but arcsec, ppm and urad/m of others."""
+    return (1.0, "mm") if unit == "mm" else people_read_change(unit)
+
+
 def people_read_change(unit: str) -> tuple[float, str]:
     """The unit in which people read a small change of a value, and the factor to it: um, arcsec, urad/m, ppm."""
     if unit == "rad":

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.units import ARCSEC
+from ..core.units import error_unit
 from ..study.results import Results
 from ..study.statistics import METRICS, factor_title, level_text, level_title, shown_unit, study_summary
 from . import charts
@@ -174,7 +174,7 @@ def _parameter_sections(summary: dict[str, Any]) -> list[Section]:
     rows = []
     for cell in summary["results"]:
         for row in cell.get("parameters", [])[: _MOST_ROWS // max(summary["cells"], 1)]:
-            factor, unit = (1 / ARCSEC, "arcsec") if row.get("unit") == "rad" else (1.0, "mm")
+            factor, unit = error_unit(row.get("unit", "mm"))
             statistics = (_statistic_cell(row.get(key), factor) for key in ("bias", "spread"))
             rows.append([number_cell(cell["cell"], 0), text_cell(row["parameter"]), text_cell(unit), *statistics])
     if not rows:
