@@ -11,5 +11,6 @@ ARCSEC = math.pi / (180 * 3600)  # rad
 
 
 def people_read(unit: str) -> tuple[float, str]:
-    """The unit in which people read a value, and the factor to it: degrees for radians, others as they are."""
-    return (1 / DEG, "deg") if unit == "rad" else (1.0, "" if unit == "1" else unit)
+    """The unit in which people read a value, and the factor to it: degrees for radians, um/(m K) for 1/K, others as
+    they are."""
+    return {"rad": (1 / DEG, "deg"), "1": (1.0, ""), "1/K": (1e6, "um/(m K)")}.get(unit, (1.0, unit))

@@ -46,7 +46,7 @@ class KnownFunction(Protocol):
 
     @property
     def joint(self) -> int:
-        """The joint that it moves, from 1."""
+        """The joint that it moves, from 1; 0 where it scales all lengths."""
         ...
 
     @property
@@ -91,6 +91,11 @@ class KnownFunctions:
         moved = np.array([self.each[term].joint - 1 for term in self.term_of_row])
         return (np.arange(joints)[:, None] == moved).astype(float)
 
+    @property
+    def of_lengths(self) -> Float[np.ndarray, " k"]:
+        """1 for the functions that scale all lengths, else 0."""
+        return np.array([float(function.joint == 0) for function in self.each])
+
 
 class Corrections(NamedTuple):
     """What joints do besides their readings: known functions, and the arm on whose frames they are evaluated."""
@@ -134,9 +139,10 @@ class JointMotion(NamedTuple):
 class JointErrors(NamedTuple):
     """Derivatives of what the corrections add to each joint's theta, or d of a prismatic joint."""
 
-    by_coefficient: Float[AnyArray, "k ... 1 N"]  # of the one joint that it moves
+    by_coefficient: Float[AnyArray, "k ... 1 N"]  # of the one joint that it moves, or of the scale
     by_gravity: Float[AnyArray, "n 3 ... 1 N"]
     functions: KnownFunctions
+    scale: Float[AnyArray, "... 1 N"] | None  # of all lengths, by thermal expansion; None without a term of it
 
 
 class ForwardPass(NamedTuple):
@@ -179,7 +185,7 @@ def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion
 
     Args:
         geometry: The chain, whose parameters may be anything.
-        q: Readings ``(..., n)``, rad, or mm of prismatic joints.
+        q: Readings ``(..., n)``, rad, or mm of prismatic joints; ``(..., n + 1)`` with a thermometer, C.
     """
     return joint_motion_of_rows(geometry, joints_first(q, max(q.ndim - 1, 1)))
 
@@ -187,18 +193,25 @@ def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion
 def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"]) -> JointMotion:
     """`joint_motion` of readings that have the joints first and the configurations last."""
     xp, corrections = namespace(rows), geometry.corrections
+    readings = of_joints(geometry, rows)
     if geometry.kinds is None:
-        motion = JointMotion(xp.cos(rows), xp.sin(rows), None)
+        motion = JointMotion(xp.cos(readings), xp.sin(readings), None)
     else:
         prismatic = geometry.kinds.mask(rows.ndim)
-        angle = xp.where(prismatic, 0.0, rows)
-        motion = JointMotion(xp.cos(angle), xp.sin(angle), xp.where(prismatic, rows, 0.0))
+        angle = xp.where(prismatic, 0.0, readings)
+        motion = JointMotion(xp.cos(angle), xp.sin(angle), xp.where(prismatic, readings, 0.0))
     if corrections is None:
         return motion
     forward = forward_pass(corrections.nominal, motion)
     return motion._replace(
         functions=xp.concatenate([function.values(rows, forward) for function in corrections.functions.each])
     )
+
+
+def of_joints(geometry: Geometry, rows: Float[AnyArray, "columns ..."]) -> Float[AnyArray, "n ..."]:
+    """The readings of the joints alone, which come first, without that of a thermometer."""
+    joints = geometry.alpha.shape[-1]
+    return rows if rows.shape[0] == joints else rows[:joints]
 
 
 @compiled
@@ -249,7 +262,7 @@ def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> Fo
     rank = max(motion.cos.ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
     motion = _with_rank(motion, rank)
     parameters = jax.tree.map(lambda leaf: joints_first(leaf, rank), geometry)
-    theta, d, errors = parameters.theta, parameters.d, None
+    theta, d, a, probe, errors = parameters.theta, parameters.d, parameters.a, parameters.probe, None
     if motion.slide is not None:
         d = d + motion.slide
     if geometry.corrections is not None:
@@ -257,12 +270,14 @@ def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> Fo
         mask = np.zeros(()) if geometry.kinds is None else geometry.kinds.mask(added.ndim)
         theta = theta + (added if geometry.kinds is None else xp.where(mask, 0.0, added))
         d = d if geometry.kinds is None else d + xp.where(mask, added, 0.0)
+        if errors.scale is not None:
+            d, a, probe = d * errors.scale, a * errors.scale, probe * errors.scale
     cos_theta, sin_theta = xp.cos(theta), xp.sin(theta)
     inputs = (
         (motion.cos * cos_theta - motion.sin * sin_theta, motion.sin * cos_theta + motion.cos * sin_theta),
         (xp.cos(parameters.alpha), xp.sin(parameters.alpha)),
         None if parameters.beta is None else (xp.cos(parameters.beta), xp.sin(parameters.beta)),
-        parameters.a,
+        a,
         d,
     )
 
@@ -285,7 +300,6 @@ def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> Fo
     axes_of_base = [xp.broadcast_to(axis.reshape((1,) * len(batch[:-2]) + (3, 1)), shape) for axis in xp.eye(3)]
     start = ((axes_of_base[0], axes_of_base[1], axes_of_base[2]), xp.zeros(shape))
     (frame, origin), axes = loop(joint, start, inputs)
-    probe = parameters.probe
     tip = origin + probe[0] * frame[0] + probe[1] * frame[1] + probe[2] * frame[2]
     return ForwardPass(frame, tip, *axes, kinds=geometry.kinds, errors=errors)
 
@@ -307,15 +321,28 @@ def _joint_errors(
     added = xp.tensordot(joints, parameters.coefficients[term] * weighted, axes=1)
     moments = parameters.coefficients[term] * motion.functions
     by_gravity = xp.stack([xp.tensordot(joints * (component == i), moments, axes=1) for i in range(3)], axis=1)
-    return added, JointErrors(by_coefficient, by_gravity, functions)
+    of_lengths, scale = functions.of_lengths, None
+    if of_lengths.any():
+        scale = 1.0 + xp.tensordot(of_lengths, parameters.coefficients * by_coefficient, axes=1)
+    return added, JointErrors(by_coefficient, by_gravity, functions, scale)
 
 
-def joint_errors(geometry: Geometry, motion: JointMotion) -> Float[AnyArray, "n ... 1 N"]:
-    """What the corrections add to each joint's theta, rad, or to d of a prismatic joint, mm."""
+def joint_errors(
+    geometry: Geometry, motion: JointMotion
+) -> tuple[Float[AnyArray, "n ... 1 N"], Float[AnyArray, "... 1 N"]]:
+    """What the corrections add to each joint's theta, rad, or to d of a prismatic joint, mm; the scale of lengths."""
     assert geometry.corrections is not None
     rank = max(motion.cos.ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
     parameters = jax.tree.map(lambda leaf: joints_first(leaf, rank), geometry)
-    return _joint_errors(parameters, _with_rank(motion, rank), geometry.corrections.functions)[0]
+    added, errors = _joint_errors(parameters, _with_rank(motion, rank), geometry.corrections.functions)
+    return added, namespace(added).ones_like(added[0]) if errors.scale is None else errors.scale
+
+
+def length_scale(geometry: Geometry, q: Float[AnyArray, "N n"]) -> Float[AnyArray, " N"]:
+    """What all lengths of one arm are multiplied by at readings with a thermometer; 1 without thermal expansion."""
+    if geometry.corrections is None or not geometry.corrections.functions.of_lengths.any():
+        return namespace(q).ones_like(q[:, 0])
+    return joint_errors(geometry, joint_motion(geometry, q))[1][0]
 
 
 def components_last(

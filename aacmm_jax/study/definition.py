@@ -321,7 +321,7 @@ class Study:
                 raise InputError(f"studies do not know {what} of an arm; leave [{what}] out of its file.")
         if capture is not None and self.specification.reference is not None:
             raise InputError("the capture file brings its reference lengths; leave [reference] out.")
-        if capture is not None and capture.joints != self.nominal.arm.joints:
+        if capture is not None and capture.columns not in (self.nominal.arm.joints, self.nominal.arm.columns):
             raise InputError("the capture and the arm differ in their number of joints; name the arm that recorded it.")
         unknowns = len(self.space.names) - int(self.space.lengths.any())
         if capture is not None and self.observed:
