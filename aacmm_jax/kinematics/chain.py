@@ -271,7 +271,7 @@ def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> Fo
         theta = theta + (added if geometry.kinds is None else xp.where(mask, 0.0, added))
         d = d if geometry.kinds is None else d + xp.where(mask, added, 0.0)
         if errors.scale is not None:
-            d, a, probe = d * errors.scale, a * errors.scale, probe * errors.scale
+            d, a, probe = (lengths * errors.scale[None] for lengths in (d, a, probe))
     cos_theta, sin_theta = xp.cos(theta), xp.sin(theta)
     inputs = (
         (motion.cos * cos_theta - motion.sin * sin_theta, motion.sin * cos_theta + motion.cos * sin_theta),

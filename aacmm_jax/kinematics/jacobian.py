@@ -64,7 +64,9 @@ def reading_columns(forward: ForwardPass) -> Float[AnyArray, "n ... 3 N"]:
 
 def _of_length(forward: ForwardPass, columns: Float[AnyArray, "... 3 N"]) -> Float[AnyArray, "... 3 N"]:
     """Columns of lengths, which grow with the temperature."""
-    return columns if forward.errors is None or forward.errors.scale is None else columns * forward.errors.scale
+    if forward.errors is None or forward.errors.scale is None:
+        return columns
+    return columns * (forward.errors.scale if columns.ndim == forward.tip.ndim else forward.errors.scale[None])
 
 
 def _tip_by_scale(forward: ForwardPass) -> Float[AnyArray, "... 3 N"]:
@@ -211,7 +213,7 @@ _tip_position = jax.custom_jvp(_plain_tip_position)
 
 
 def _errors_by_readings(
-    geometry: Geometry, q: Float[AnyArray, "... n"], q_dot: Float[AnyArray, "... n"]
+    geometry: Geometry, q: Float[AnyArray, "... columns"], q_dot: Float[AnyArray, "... columns"]
 ) -> tuple[Float[AnyArray, "n ... 1 N"], Float[AnyArray, "... 1 N"]]:
     """How the corrections of each joint, and the scale of all lengths, change with the readings, by JAX."""
     errors = lambda readings: joint_errors(geometry, joint_motion(geometry, readings))  # noqa: E731
