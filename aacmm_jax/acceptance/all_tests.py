@@ -47,7 +47,7 @@ def measured_by(arm: Arm, recording: Recording) -> Measured:
     capture, touched = recording.capture, [group for sphere in recording.spheres for group in sphere.groups]
     readings = [np.asarray(q) for q in (*capture.sockets.values(), *touched)]
     ends = np.cumsum([len(q) for q in readings])
-    none = np.zeros((0, capture.joints))
+    none = np.zeros((0, capture.columns))
     points = iter(np.split(np.asarray(arm.position(np.concatenate([*readings, none]))), ends[:-1]))
     sockets = {name: next(points) for name in capture.sockets}
     # Sockets that held another target than the arm's own probe are not part of any procedure.

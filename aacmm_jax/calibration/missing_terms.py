@@ -3,7 +3,7 @@
 Of joint i, the model's angle is its reading and a zero. What it lacks is a further function phi of the readings, whose
 column is that of theta_i times phi: harmonics of an eccentric, tilted or oval encoder, a wrong gear ratio, the moment
 of gravity about the axis where the joint or the link behind it bends, a zero that drifts from pose to pose. A base that
-moves and an arm that grows meanwhile move the tip itself.
+moves and an arm that grows, meanwhile or with its temperature, move the tip itself.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,6 +25,7 @@ Kind = Literal[
     "drifting zero",
     "drifting base",
     "growing arm",
+    "thermal expansion",
 ]
 
 
@@ -56,7 +57,7 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
 
     Args:
         arm: The calibrated arm.
-        q: All readings in their order, rad.
+        q: All readings in their order, rad; with a thermometer, the temperature last, C.
     """
     forward = forward_pass(arm.geometry, joint_motion(arm.geometry, q))
     order = np.linspace(-1.0, 1.0, len(q))[:, None]
@@ -69,6 +70,11 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
         ),
         MissingTerm("drifting base", None, order[:, :, None] * np.eye(3)),
         MissingTerm("growing arm", None, order[:, :, None] * tip[:, :, None] / 1e3),  # by 1 mm a m
+        *(
+            MissingTerm("thermal expansion", None, (temperature - 20)[:, None, None] * tip[:, :, None] / 1e3)
+            for temperature in q[:, arm.joints :].T
+            if np.ptp(temperature) > 0
+        ),
     ]
 
 

@@ -134,7 +134,7 @@ def compare_models(
         raise InputError("models names no model; give some, from simple to rich, such as 'dh' and 'dh,gravity'.")
     plain = without_corrections(arm)
     bounds = Bounds.around(plain, Parameters.free_of(plain)) if bounds is None else bounds
-    left_out = regions_of(to_numpy(capture), regions)
+    left_out = regions_of(to_numpy(capture), regions, arm.joints)
 
     def compared(model: str) -> ComparedModel:
         begun = time.process_time()

@@ -50,6 +50,7 @@ class _Stage(NamedTuple):
 # Metres and newtons only of compliances.
 _UNITS = {"mm": MILLIMETRE, "rad": RADIAN, "1": ONE}
 _UNITS |= {"rad/m": r"\radian\metre\tothe{-1}", "rad/(kN m)": r"\radian\kilo\newton\tothe{-1}\metre\tothe{-1}"}
+_UNITS |= {"1/K": r"\kelvin\tothe{-1}"}
 _UNITS |= {"mm/m": r"\milli\metre\metre\tothe{-1}"}
 _UNITS |= {"mm/(kN m)": r"\milli\metre\kilo\newton\tothe{-1}\metre\tothe{-1}"}
 

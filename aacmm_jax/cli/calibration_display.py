@@ -101,6 +101,9 @@ def capture(summary: dict[str, Any]) -> None:
         unit = " deg" if slides else ""
         table.add_row(str(row["joint"]), *(f"{row[key] / DEG:.3f}{unit}" for key in ("lowest_rad", "highest_rad")))
     print_table(console, table)
+    if summary["temperature_C"] is not None:
+        low, high = summary["temperature_C"]
+        console.print(f"Temperature: {low:.2f} to {high:.2f} C.")
     if summary["lengths"]:
         table = new_table("\nReference lengths", "from", "to", "value [mm]", "u [mm]")
         for row in summary["lengths"]:

@@ -39,7 +39,7 @@ def exported(
 
         return ur_kinematics_yaml(specification.arm), ()
     if form == "offsets":
-        readings = np.asarray(record.recording.capture.readings)
+        readings = np.asarray(record.recording.capture.readings)[:, : nominal.arm.joints]
         found = controllers.zero_offsets(nominal.arm, record.calibrated.arm, readings)
         return controllers.zero_offsets_csv(found), ()
     base = None

@@ -75,6 +75,7 @@ class _ArmModel(Strict):
     urdf: str | None = None  # instead of rows of joints: a URDF beside this file
     base: str | None = None  # its links
     tip: str | None = None
+    thermometer: bool = False
     identification: _Identification | None = None
     corrections: CorrectionsTable | None = None
     noise: NoiseTable | None = None
@@ -273,6 +274,8 @@ def _specification(path: Path, probe: Numbers | None) -> tuple[ArmSpecification,
             found = ArmSpecification(arm, model.name or path.stem)
             if probe is not None:
                 found = found._replace(arm=with_tool(found.arm, probe))
+        if model.thermometer:
+            found = found._replace(arm=found.arm.replace(thermometer=True))
         if model.corrections is not None:
             found = found._replace(arm=model.corrections.corrected(found.arm, length, angle))
         if model.priors is not None:
@@ -399,8 +402,8 @@ def _document(specification: ArmSpecification, source: str) -> "TOMLDocument":
     document["length_unit"] = "mm"
     document["angle_unit"] = "rad"
     document["probe"] = [float(x) for x in np.asarray(arm.probe)]
-    if arm.prismatic:
-        document["prismatic"] = list(arm.prismatic)
+    facts = {"prismatic": list(arm.prismatic), "thermometer": arm.thermometer}
+    document.update({key: fact for key, fact in facts.items() if fact})
     rows = tomlkit.array().multiline(True)
     for i in range(arm.joints):
         row = tomlkit.inline_table()

@@ -31,6 +31,7 @@ from .hdf5 import (
 from .observations import observation_tables, observations_of
 from .prior_attributes import attributes_of_prior, prior_of_attributes
 from .sense import check_recording
+from .temperatures import reading_variables, readings_of
 
 _KINDS = {
     "alpha": "link twist",
@@ -84,15 +85,15 @@ def recording_attributes(recording: Recording) -> dict[str, Any]:
 
 def recording_tables(recording: Recording) -> dict[str, Table]:
     """The tables of a recording: ``capture``, ``reference``, ``nominal_arm``, and one for each observation."""
-    capture, unit = recording.capture, readings_unit(recording.nominal.arm)
+    capture, arm = recording.capture, recording.nominal.arm
+    unit = readings_unit(arm)
     check_one_capture(capture)
     owner = [capture.names[i] for i in capture.owner]
     poses, lengths = capture.repeated
     tables = {
         "capture": Table(
             numbering("pose", len(owner))
-            | numbering("joint", capture.joints)
-            | {"angle": Variable(("pose", "joint"), np.asarray(capture.q), unit, "joint reading")}
+            | reading_variables("angle", np.asarray(capture.q), arm.joints, unit)
             | columns("pose", socket=(owner, "", "socket that held the tip")),
             {
                 "repeated_sockets": [n for n, _ in poses] or None,
@@ -113,8 +114,8 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     if recording.true is not None:
         tables["true_arm"] = arm_table(recording.true)
     if recording.spheres:
-        tables["sphere"] = sphere_table(recording.spheres, unit=unit)
-    return tables | observation_tables(capture.observations, unit)
+        tables["sphere"] = sphere_table(recording.spheres, unit=unit, joints=arm.joints)
+    return tables | observation_tables(capture.observations, arm.joints, unit)
 
 
 def reference_table(lengths: Sequence[ReferenceLength]) -> Table:
@@ -137,10 +138,12 @@ def lengths_of(path: str | os.PathLike, stored: Stored) -> list[ReferenceLength]
     return [ReferenceLength(str(start), str(end), float(value), float(u)) for start, end, value, u in rows]
 
 
-def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False, unit: str = "rad") -> Table:
+def sphere_table(
+    spheres: Sequence[ProbedSphere], *, points: bool = False, unit: str = "rad", joints: int | None = None
+) -> Table:
     """Touched spheres, by poses or points, one row a touch; what belongs to a sphere is in every row of it.
 
-    ``unit`` is that of readings.
+    ``unit`` is that of readings, of so many joints.
     """
     rows = [
         (sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group
@@ -161,8 +164,7 @@ def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False, unit:
         return Table(
             variables | axes() | {"position": Variable(("touch", "axis"), values, "mm", "centre of the probe")}
         )
-    angle = Variable(("touch", "joint"), values, unit, "joint reading")
-    return Table(variables | numbering("joint", values.shape[1]) | {"angle": angle})
+    return Table(variables | reading_variables("angle", values, joints or values.shape[1], unit, "touch"))
 
 
 def spheres_of(path: str | os.PathLike, stored: Stored, entry: str = "angle") -> tuple[ProbedSphere, ...]:
@@ -171,12 +173,13 @@ def spheres_of(path: str | os.PathLike, stored: Stored, entry: str = "angle") ->
     if table is None:
         return ()
     need(path, table, "sphere", "test", "group", "diameter", "u", "stylus", "form", entry, of="entry")
+    touched = readings_of(table, entry)
     keys = list(zip(table["sphere"].tolist(), table["test"].tolist(), strict=True))
     found = []
     for name, test in dict.fromkeys(keys):
         rows = np.array([key == (name, test) for key in keys])
         first = int(rows.argmax())
-        groups = tuple(table[entry][rows & (table["group"] == number)] for number in np.unique(table["group"][rows]))
+        groups = tuple(touched[rows & (table["group"] == number)] for number in np.unique(table["group"][rows]))
         numbers = (float(table[what][first]) for what in ("diameter", "u", "stylus", "form"))
         found.append(ProbedSphere(str(name), test, groups, *numbers))
     return tuple(found)
@@ -187,10 +190,11 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     need(path, stored.tables, "capture", "reference", "nominal_arm")
     poses = stored.tables["capture"]
     need(path, poses, "angle", "socket", of="entry")
+    q = readings_of(poses, "angle")
     owner = np.asarray(poses["socket"]).astype(str)
     names = list(dict.fromkeys(owner.tolist()))
     try:
-        sockets = {name: poses["angle"][owner == name] for name in names}
+        sockets = {name: q[owner == name] for name in names}
         capture = Capture(
             sockets,
             lengths_of(path, stored),
@@ -202,7 +206,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         raise InputError(f"{path}: {error}") from error
     true = specification_of(path, stored, "true_arm") if "true_arm" in stored.tables else None
     try:
-        spheres = tuple(checked_sphere(sphere, capture.joints) for sphere in spheres_of(path, stored))
+        spheres = tuple(checked_sphere(sphere, capture.columns) for sphere in spheres_of(path, stored))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     sources = tuple(stored.attributes.get("sources") or ())
@@ -269,6 +273,7 @@ def arm_table(specification: ArmSpecification) -> Table:
     attributes: dict[str, Any] = {
         "name": specification.name,
         "prismatic": list(arm.prismatic) or None,
+        "thermometer": arm.thermometer or None,
         "half_width_length_mm": specification.length,
         "half_width_angle_rad": specification.angle,
         "override_names": list(specification.override) or None,
@@ -299,6 +304,7 @@ def specification_of(path: str | os.PathLike, stored: Stored, table: str) -> Arm
             probe=arrays["probe"],
             limits=limits,
             prismatic=[int(joint) for joint in np.atleast_1d(attributes.get("prismatic", ()))],
+            thermometer=bool(attributes.get("thermometer", False)),
         )
         arm = corrected_of(path, arm, arrays)
     except InputError as error:

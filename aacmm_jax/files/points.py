@@ -39,7 +39,7 @@ def read_points(path: str | os.PathLike) -> Measured:
     try:
         files = [manifest]
 
-        def points(file: Path) -> np.ndarray:
+        def points(file: Path, _: float | None) -> np.ndarray:
             files.append(read := InputFile(file))
             table = read_numbers(read, model.points.columns)
             if table.shape[1] != 3:

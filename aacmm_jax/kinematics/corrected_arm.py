@@ -15,6 +15,7 @@ from .corrections.kind import Loads, Term
 from .corrections.kinds import term_of, terms_of
 
 _CONFIGURATIONS = 300
+_TEMPERATURES = (10.0, 30.0)  # C
 _INDEPENDENT = 1e-6  # of a function's size: what must be left of it beside the constant and those before it
 
 
@@ -93,9 +94,10 @@ def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"
     if not terms:
         return ()
     limits = joint_limits(arm, None)
-    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_CONFIGURATIONS, arm.joints))
+    limits = np.concatenate([limits, [_TEMPERATURES]])
+    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_CONFIGURATIONS, arm.joints + 1))
     values, taken = function_values(arm.geometry, terms, q, gravity), []
-    for joint in range(1, arm.joints + 1):
+    for joint in range(arm.joints + 1):  # 0: functions that scale all lengths
         basis = np.full((_CONFIGURATIONS, 1), _CONFIGURATIONS**-0.5)
         for term, column in zip(terms, values, strict=True):
             if term.joint != joint:

@@ -220,9 +220,7 @@ def linear_rows(
     return found
 
 
-def _residual(
-    observation: AbstractObservation, forward: ForwardPass, rows: slice, parts: dict[str, AnyArray]
-) -> Rows:
+def _residual(observation: AbstractObservation, forward: ForwardPass, rows: slice, parts: dict[str, AnyArray]) -> Rows:
     # Through the class: a bound method of Equinox is a module made anew, which takes as long as a socket's residual.
     return type(observation).residual(observation, _tips(forward, rows), parts)
 

@@ -147,7 +147,7 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     ]
     introduction = (
         f"The poses {'are simulated' if record.recording.true is not None else 'were recorded'}. "
-        f"{len(record.names)} parameters of {capture.joints} joints were identified. "
+        f"{len(record.names)} parameters of {record.recording.nominal.arm.joints} joints were identified. "
         f"Fixed at their nominal values: {', '.join(record.held) or 'none'}."
     )
     if record.hold and record.method == REPEATABILITY:

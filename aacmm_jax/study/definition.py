@@ -326,7 +326,7 @@ class Study:
         capture, pool = self.capture, self.specification.capture.pool
         if capture is not None and self.specification.reference is not None:
             raise InputError("the capture file brings its reference lengths; leave [reference] out.")
-        if capture is not None and capture.joints != self.nominal.arm.joints:
+        if capture is not None and capture.columns not in (self.nominal.arm.joints, self.nominal.arm.columns):
             raise InputError("the capture and the arm differ in their number of joints; name the arm that recorded it.")
         deviations = self.specification.deviation
         given = [key for key in type(deviations).model_fields if getattr(deviations, key) is not None]

@@ -10,7 +10,7 @@ from ..calibration.model_errors import model_tests
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import PriorMetrics, active_names
 from ..core.text import pluralise
-from ..core.units import DEG
+from ..core.units import DEG, people_read
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
@@ -75,10 +75,12 @@ def parameters_csv(record: CalibrationRecord) -> str:
 def capture_summary(recording: Recording) -> dict[str, Any]:
     """A capture: sockets with their poses, lengths, the nominal arm."""
     capture, units = recording.capture, by_joint(recording.nominal.arm, "rad", "mm")
+    q = np.asarray(capture.readings)
+    warmth = q[:, len(units) :]
     return {
         "kind": "capture",
         "arm": recording.nominal.name,
-        "joints": capture.joints,
+        "joints": recording.nominal.arm.joints,
         "poses": len(capture.readings),
         "sockets": [{"socket": name, "poses": size} for name, size in zip(capture.names, capture.sizes, strict=True)],
         "observations": capture_observations(capture),
@@ -86,9 +88,10 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
         "ranges": [
             {"joint": i + 1, f"lowest_{unit}": float(low), f"highest_{unit}": float(high)}
             for i, (low, high, unit) in enumerate(
-                zip(np.min(capture.readings, axis=0), np.max(capture.readings, axis=0), units, strict=True)
+                zip(np.min(q[:, : len(units)], axis=0), np.max(q[:, : len(units)], axis=0), units, strict=True)
             )
         ],
+        "temperature_C": [float(end) for end in (warmth.min(), warmth.max())] if warmth.size else None,
         "simulated": recording.true is not None,
         "warnings": of_import(recording),
     }
@@ -227,8 +230,9 @@ def prior_sentence(row: Mapping[str, Any]) -> str:
     spent = f"{row['effective_parameters']:.1f} of {pluralise(row['parameters'], 'parameter')} determined by the data"
     if not row["supported"]:
         return f"{row['group']}: learned, no deviation from the mean is supported, so it counts as exact; {spent}"
-    scale, unit = (1 / DEG, "deg") if row["unit"] == "rad" else (1.0, row["unit"])
-    return f"{row['group']}: {'learned' if row['learned'] else 'given'}, {row['sd'] * scale:.3g} {unit}; {spent}"
+    scale, unit = people_read(row["unit"])
+    scale_in_words = f"{row['sd'] * scale:.3g} {unit}".strip()
+    return f"{row['group']}: {'learned' if row['learned'] else 'given'}, {scale_in_words}; {spent}"
 
 
 def uncertainty_summary(

@@ -18,6 +18,7 @@ _TERMS: dict[str, tuple[str, str, str]] = {
     "drifting zero": ("the order of the poses in joint {i}", "a zero that drifts", ""),
     "drifting base": ("the order of the poses in the tip", "a base or socket that moves", ""),
     "growing arm": ("the order of the poses in the arm's size", "an arm that warms or cools", ""),
+    "thermal expansion": ("temperature", "an arm that expands", "expansion"),
 }
 _MODEL_OPTION = "--model dh,"  # of the command line, which takes further terms into the model
 
