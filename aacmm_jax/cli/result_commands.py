@@ -68,7 +68,7 @@ def evaluate(
         typer.Option(
             metavar="NAME=A[+L/K]",
             help="Maximum permissible error of an acceptance test, mm (L: the length); repeatable. Exit code 1 where "
-            "one is not met by the decision rule of ISO 14253-1.",
+            "one is not met by the decision rule.",
         ),
     ] = None,
     acceptance: Annotated[
@@ -80,11 +80,32 @@ def evaluate(
         ),
     ] = None,
     test_u_mm: Annotated[
-        float,
+        str,
         typer.Option(
-            min=0, metavar="MM", help="Standard uncertainty that seat, fixture and temperature add to every test value."
+            metavar="A[+L/K]",
+            help="Standard uncertainty that seat and fixture add to every test value (L: the length).",
         ),
-    ] = 0.0,
+    ] = "0",
+    expansion: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="OF=C,U,T,U",
+            help="Thermal expansion of the artefact or the arm in an acceptance test: coefficient in 1e-6/K, "
+            "temperature in C, each with its standard uncertainty; 'artefact=11.5,1,20.8,0.2'. Lengths are corrected. "
+            "Of the arm only where it does not compensate its own.",
+        ),
+    ] = None,
+    rule: Annotated[
+        Literal["iso-2017", "iso-2013", "simple"] | None,
+        typer.Option(
+            help="Decision rule: ISO 14253-1:2017 (95 % probability), its guard band of 2013, or simple acceptance "
+            "(ASME B89.7.3.1, 4:1). Default: simple for ASME, else iso-2017."
+        ),
+    ] = None,
+    range_mm: Annotated[
+        float | None,
+        typer.Option(min=0, metavar="MM", help="Measuring range that the maker states, a diameter; else of the files."),
+    ] = None,
     max_rms_mm: Annotated[
         float | None, typer.Option(min=0, metavar="MM", help="Exit code 1 where the RMS distance is larger.")
     ] = None,
@@ -101,23 +122,31 @@ def evaluate(
     Errors on data that the calibration has not used are printed next to those that its uncertainty predicts. A manifest
     of points is tested without a calibration.
     """
-    from ..acceptance.decision import read_limits
+    from ..acceptance.decision import read_limits, read_uncertainty
+    from ..acceptance.influences import Influences, read_expansions
     from ..acceptance.results import METRICS
     from . import acceptance_display
 
-    limits = read_limits(mpe or [], METRICS)
+    u_test, bodies = read_uncertainty(test_u_mm), read_expansions(expansion or [])
+    of_test = {
+        "limits": read_limits(mpe or [], METRICS),
+        "u_test": u_test.fixed,
+        "influences": Influences(0.0, 1 / u_test.divisor, bodies.get("artefact"), bodies.get("arm")),
+        "rule": rule,
+    }
     maxima = {"rms_mm": max_rms_mm, "deltam_mm": max_deltam_mm, "length_error_largest_mm": max_length_error_mm}
     maxima = {name: value for name, value in maxima.items() if value is not None}
     if capture is None:
         if maxima or only or without:
             raise InputError(
-                "a manifest of points takes only --mpe, --acceptance, --test-u-mm, --output and --json; name a "
-                "calibration and a capture for the other options."
+                "a manifest of points takes no --max-..., --only and --without; name a calibration and a capture for "
+                "these options."
             )
-        summary = _evaluated_points(calibration, output, limits, test_u_mm, acceptance)
+        summary = _evaluated_points(calibration, output, acceptance, range_mm, of_test)
         show_summary(summary, as_json, acceptance_display.points)
     else:
-        summary = _evaluated(calibration, capture, output, (only, without), limits, test_u_mm, maxima, acceptance)
+        of_test |= {"maxima": maxima, "standards": acceptance}
+        summary = _evaluated(calibration, capture, output, (only, without), range_mm, of_test)
         show_summary(summary, as_json, acceptance_display.evaluation)
     undecided = [test for test in summary["acceptance"] if test["decision"] in ("fails", "undecided")]
     if summary["failed"] or undecided:
@@ -160,10 +189,8 @@ def _evaluated(
     capture: Path,
     output: Path | None,
     choice: tuple,
-    limits: Any,
-    u_test: float,
-    maxima: dict[str, float],
-    standards: list[str] | None,
+    measuring_range: float | None,
+    of_test: dict[str, Any],
 ) -> dict[str, Any]:
     from ..acceptance.record import evaluation_of
     from ..files.calibrations import load_calibration
@@ -178,8 +205,9 @@ def _evaluated(
         recording = recording._replace(
             capture=recording.capture.select(choice[0] or None, choice[1] or ()),
             sources=(*map(fingerprint, read), *recording.sources),
+            measuring_range=measuring_range or recording.measuring_range,
         )
-        found = evaluation_of(record, recording, limits=limits, u_test=u_test, maxima=maxima, standards=standards)
+        found = evaluation_of(record, recording, **of_test)
         summary = with_spinner("Evaluating", lambda: evaluation_summary(found))
         if output is not None:
             save_evaluation(output, found, summary)
@@ -188,7 +216,11 @@ def _evaluated(
 
 
 def _evaluated_points(
-    manifest: Path, output: Path | None, limits: Any, u_test: float, standards: list[str] | None
+    manifest: Path,
+    output: Path | None,
+    standards: list[str] | None,
+    measuring_range: float | None,
+    of_test: dict[str, Any],
 ) -> dict[str, Any]:
     from ..acceptance.record import PointsRecord
     from ..acceptance.standards import STANDARDS, checked_standards
@@ -202,7 +234,9 @@ def _evaluated_points(
         )
     with together(output):
         chosen = checked_standards(STANDARDS if standards is None else standards)
-        record = PointsRecord(read_points(manifest), limits, u_test, chosen)
+        measured = read_points(manifest)
+        measured = measured._replace(measuring_range=measuring_range or measured.measuring_range)
+        record = PointsRecord(measured, standards=chosen, **of_test)
         summary = points_summary(record)
         if output is not None:
             save_points(output, record, summary)

@@ -8,7 +8,6 @@ import numpy as np
 from ..acceptance.decision import worst
 from ..acceptance.record import EvaluationRecord, PointsRecord
 from ..acceptance.results import METRICS, AcceptanceTest, Metric
-from ..acceptance.standards import EDITIONS
 from ..calibration.evaluation import Evaluation, evaluate
 from ..core.text import pluralise
 from ..data.capture import Capture, ReferenceLength
@@ -169,22 +168,20 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
     blocks: list = [
         "Every metric is of single readings. U, with coverage factor 2, is what the tester contributes: the artefacts' "
         f"uncertainty; {stated}. The arm's own scatter is what is tested (ISO 14253-5). What standards allow about "
-        "repeating a reading is not applied, and the distribution of positions and directions is not checked. "
-        "Procedures and formulas follow secondary sources of the editions named.",
+        "repeating a reading is not applied. A test that lacks something its standard requires is called 'after' it. "
+        "Requirements and formulas follow secondary sources of the editions named.",
     ]
     limited = any(metric["limit_mm"] is not None for test in rows for metric in test["figures"])
     if limited:
-        blocks.append(
-            "A metric conforms if |value| ≤ MPE − U, fails if |value| ≥ MPE + U, and is undecided in between (ISO "
-            "14253-1, with U as guard band as in its editions up to 2013)."
-        )
+        used = dict.fromkeys(f"{test['standard']}: {test['rule']}" for test in rows if test["decision"])
+        blocks.append(f"Decision rules: {'; '.join(used)}. What no rule decides is undecided.")
     before = any(metric["as_found_mm"] is not None for test in rows for metric in test["figures"])
     if before:
         blocks.append("As found is the nominal arm, as left the calibrated one.")
     for test in rows:
         blocks.append(_test_table(test, before, limited))
         if test["missing"]:
-            blocks.append(f"This was not the full procedure; it also needs {'; '.join(test['missing'])}.")
+            blocks.append(f"This was not the full procedure. {' '.join(test['missing'])}")
     parts = [
         [
             *(text_cell(word) for word in (test.standard, metric.name, part.where)),
@@ -210,7 +207,7 @@ def _test_table(test: dict[str, Any], before: bool, limited: bool) -> ReportTabl
     columns += ["MPE", "decision as left" if before else "decision"] if limited else []
     rows = []
     for metric in test["figures"]:
-        row = [text_cell(metric["name"]), text_cell(METRICS[metric["name"]])]
+        row = [text_cell(metric["symbol"]), text_cell(METRICS[metric["name"]])]
         if before:
             row += [number_cell(metric["as_found_mm"]), *([_decision(metric["as_found_decision"])] if limited else [])]
         row += [number_cell(metric["value_mm"]), _expanded(metric["expanded_mm"])]
@@ -218,7 +215,7 @@ def _test_table(test: dict[str, Any], before: bool, limited: bool) -> ReportTabl
             decision = _decision(metric["decision"], metric["failing"], len(metric["parts"]))
             row += [number_cell(metric["limit_mm"]), decision]
         rows.append([*row, text_cell(metric["where"])])
-    return ReportTable(f"{EDITIONS[test['standard']]}: {test['title']} [mm]", (*columns, "worst at"), rows)
+    return ReportTable(f"{test['called']}: {test['title']} [mm]", (*columns, "worst at"), rows)
 
 
 def _expanded(value: float) -> Cell:
