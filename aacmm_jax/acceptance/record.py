@@ -175,7 +175,7 @@ def evaluation_of(
     if partly:
         names = ", ".join(partly)
         warnings.append(f"The arm was identified from some poses of {names}; these count as identified from.")
-    if not _same(recording.nominal.arm, record.recording.nominal.arm):
+    if not same_arm(recording.nominal.arm, record.recording.nominal.arm):
         warnings.append(
             f"The capture is of '{recording.nominal.name}', but the calibration is of "
             f"'{record.recording.nominal.name}'; check that it is the same arm."
@@ -240,7 +240,7 @@ def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:
     ]
 
 
-def _same(one: Arm, other: Arm) -> bool:
+def same_arm(one: Arm, other: Arm) -> bool:
     """Whether two arms have the same parameters; without beta it is 0. A model of its joints may come
     with a calibration."""
 

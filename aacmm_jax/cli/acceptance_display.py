@@ -168,13 +168,16 @@ def _acceptance(console: Console, summary: dict[str, Any]) -> None:
                 )
                 cells += [formatted(metric["limit_mm"]), f"[{_STYLES[decision]}]{decision or '-'}{count}[/]"]
             # Summaries that earlier versions stored name the standard only.
-            called, name = test.get("called", test["standard"]), metric.get("symbol", metric["name"])
-            table.add_row(called, name, *cells, escape(metric["where"]))
+            table.add_row(test.get("called", test["standard"]), metric["name"], *cells, escape(metric["where"]))
     rules = dict.fromkeys(test.get("rule", "ISO 14253-1") for test in tests if test.get("decision", limited))
     of_test = summary["u_test_mm"] or any(summary.get("influences", {}).values())
     for column in table.columns[1], table.columns[-1]:
         column.justify = "left"
     print_table(console, table, keys=2)
+    metrics = [metric for test in tests for metric in test["figures"]]
+    symbols = [metric["symbol"] for metric in metrics if metric.get("symbol", metric["name"]) != metric["name"]]
+    if symbols:
+        console.print(f"Symbols: {', '.join(symbols)}.")
     for test in tests:
         if test["missing"]:
             console.print(f"{test.get('called', test['standard'])}, {test['title']}: not the full procedure.")

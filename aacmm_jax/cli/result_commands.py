@@ -10,8 +10,8 @@ import typer
 from ..core.errors import InputError
 from ..core.text import printable
 from ..files.atomic_write import write_text
-from ..files.hdf5 import read_summary, read_tables
-from ..files.inputs import InputFile, fingerprint
+from ..files.hdf5 import read_summary
+from ..files.inputs import InputFile
 from ..files.outputs import together
 from ..files.sense import check_shown
 from .app import (
@@ -27,6 +27,7 @@ from .app import (
     warn_of_unusable,
     with_spinner,
 )
+from .evaluations import certificate, evaluated, evaluated_points
 from .export_formats import exported
 
 _ARM_SUFFIXES = ("", ".toml", ".urdf", ".xacro", ".yaml", ".yml")
@@ -142,11 +143,11 @@ def evaluate(
                 "a manifest of points takes no --max-..., --only and --without; name a calibration and a capture for "
                 "these options."
             )
-        summary = _evaluated_points(calibration, output, acceptance, range_mm, of_test)
+        summary = evaluated_points(calibration, output, acceptance, range_mm, of_test)
         show_summary(summary, as_json, acceptance_display.points)
     else:
         of_test |= {"maxima": maxima, "standards": acceptance}
-        summary = _evaluated(calibration, capture, output, (only, without), range_mm, of_test)
+        summary = evaluated(calibration, capture, output, (only, without), range_mm, of_test)
         show_summary(summary, as_json, acceptance_display.evaluation)
     undecided = [test for test in summary["acceptance"] if test["decision"] in ("fails", "undecided")]
     if summary["failed"] or undecided:
@@ -184,72 +185,12 @@ def report(
     show_summary(summary, as_json, acceptance_display.report)
 
 
-def _evaluated(
-    calibration: Path,
-    capture: Path,
-    output: Path | None,
-    choice: tuple,
-    measuring_range: float | None,
-    of_test: dict[str, Any],
-) -> dict[str, Any]:
-    from ..acceptance.record import evaluation_of
-    from ..files.calibrations import load_calibration
-    from ..files.captures import load_capture
-    from ..files.evaluations import save_evaluation
-    from ..files.inputs import InputFile, fingerprint
-    from ..summaries.evaluation import evaluation_summary
-
-    with together(output):
-        read = InputFile(calibration), InputFile(capture)
-        record, recording = load_calibration(read[0]), load_capture(read[1])
-        recording = recording._replace(
-            capture=recording.capture.select(choice[0] or None, choice[1] or ()),
-            sources=(*map(fingerprint, read), *recording.sources),
-            measuring_range=measuring_range or recording.measuring_range,
-        )
-        found = evaluation_of(record, recording, **of_test)
-        summary = with_spinner("Evaluating", lambda: evaluation_summary(found))
-        if output is not None:
-            save_evaluation(output, found, summary)
-            summary["written"] = str(output)
-    return summary
-
-
-def _evaluated_points(
-    manifest: Path,
-    output: Path | None,
-    standards: list[str] | None,
-    measuring_range: float | None,
-    of_test: dict[str, Any],
-) -> dict[str, Any]:
-    from ..acceptance.record import PointsRecord
-    from ..acceptance.standards import STANDARDS, checked_standards
-    from ..files.evaluations import save_points
-    from ..files.points import read_points
-    from ..summaries.evaluation import points_summary
-
-    if manifest.suffix != ".toml":
-        raise InputError(
-            f"{manifest} alone cannot be evaluated; name a capture as well, or a manifest of points (TOML)."
-        )
-    with together(output):
-        chosen = checked_standards(STANDARDS if standards is None else standards)
-        measured = read_points(manifest)
-        measured = measured._replace(measuring_range=measuring_range or measured.measuring_range)
-        record = PointsRecord(measured, standards=chosen, **of_test)
-        summary = points_summary(record)
-        if output is not None:
-            save_points(output, record, summary)
-            summary["written"] = str(output)
-    return summary
-
-
 @app.command(
     epilog=examples(
         "aacmm export calibration.h5 --format toml -o arm.toml",
         "aacmm export calibration.h5 -o robot.urdf",
         "aacmm export calibration.h5 --format table --convention craig --units m-rad",
-        "aacmm export calibration.h5 --format dcc --about laboratory.toml -o certificate.xml",
+        "aacmm export calibration.h5 --format dcc --evaluation tests.h5 --about laboratory.toml -o certificate.xml",
     )
 )
 def export(
@@ -282,11 +223,19 @@ def export(
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write. Default: standard output.")
     ] = None,
     about: About = None,
+    evaluation: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.h5",
+            help="Of --format dcc: an evaluation (aacmm evaluate -o) of this calibration, whose acceptance tests are "
+            "added.",
+        ),
+    ] = None,
 ) -> None:
     """Write a calibration for other programs or controllers."""
     written_as: str = form or _FORMATS.get("" if output is None else output.suffix.lower(), "toml")
-    if about is not None and written_as != "dcc":
-        raise InputError("--about is for certificates; give it with --format dcc.")
+    if (about is not None or evaluation is not None) and written_as != "dcc":
+        raise InputError("--about and --evaluation are for certificates; give them with --format dcc.")
     if which is not None and written_as not in _OF_ONE_ARM:
         raise InputError(
             f"--arm is for --format {', '.join(_OF_ONE_ARM)}; leave it out, as {written_as} holds what it needs."
@@ -307,7 +256,7 @@ def export(
             scale = "" if math.isnan(record.k) else f", k = {record.k:.8f}"
             source = f"calibrated from {len(record.recording.capture.readings)} poses, {record.method}{scale}"
         if written_as == "dcc":
-            text, notes = _certificate(read, record, about), ()
+            text, notes = certificate(read, record, about, evaluation), ()
         else:
             text, notes = exported(record, specification, written_as, source, convention, units)
         if output is not None:
@@ -315,22 +264,6 @@ def export(
     typer.echo(text, nl=False) if output is None else typer.echo(f"Written: {output}")
     for note in notes:
         typer.echo(printable(note), err=output is None)
-
-
-def _certificate(calibration: InputFile, record: Any, about: Path | None) -> str:
-    from ..certificate import dcc_xml
-    from ..files.administrative_data import AdministrativeData as Stated
-    from ..files.administrative_data import read_administrative_data
-
-    made = read_tables(calibration, ("calibration",)).attributes
-    sources = [fingerprint(calibration), *record.recording.sources]
-    return dcc_xml(
-        record,
-        Stated() if about is None else read_administrative_data(about),
-        created=made["created"],
-        sources=sources,
-        command=made["command"],
-    )
 
 
 @app.command(epilog=examples("aacmm show calibration.h5", "aacmm show panda"))
