@@ -27,8 +27,10 @@ from .xml_elements import (
     add_english,
     add_identifications,
     add_real,
+    add_row,
     add_software,
     add_text,
+    decimals_of,
 )
 
 _METHODS = {"two-stage": "from repeatability first, and then the scale from the lengths", "joint": "from both jointly"}
@@ -37,6 +39,10 @@ _METRICS = {
     "Deltam": "Largest half range of a coordinate of the tip in a socket",
     "RMS": "Root mean square distance of the tip from its mean position in the socket",
 }
+
+
+_DECIMALS = 5  # of mm without an uncertainty
+_SIMPLE, _SQUARED = (MILLIMETRE, RADIAN), r"\tothe{2}"  # units that are squared as one
 
 
 class _Stage(NamedTuple):
@@ -90,7 +96,8 @@ def uncertainty_statement(record: CalibrationRecord) -> str:
         f"Expanded uncertainties are standard uncertainties times {uncertainty_of(record).factor(LEVEL):.4g}, the "
         f"coverage factor of Student's t for {count} degrees of freedom and a coverage probability of {LEVEL:.0%}. "
         f"They follow, by the law of propagation of uncertainty, from the noise of the readings, {noise}, and from the "
-        f"{sources}. They apply to each parameter alone; the parameters are correlated. "
+        f"{sources}. They apply to each parameter alone; the parameters are correlated, as the covariance matrix says. "
+        "Expanded uncertainties have two digits, and values are rounded to them. "
         f"Errors that the {model} does not describe are not included."
     )
 
@@ -125,6 +132,8 @@ def _add_measurement(
         data = _add_result(results, "Observations", "Distances of the tip from the geometry of each observation.")
         add_observations(data, residuals, distances_of(capture, stage.evaluation), left)
     _add_parameters(results, record, stage, factor)
+    if left:
+        _add_covariance(results, record)
     if left and not math.isnan(record.k):
         _add_scale(results, record, factor)
 
@@ -219,7 +228,7 @@ def _add_repeatability(results: Element, stage: _Stage) -> None:
         quantity = add(data, "quantity")
         add_english(quantity, "name", name)
         add_english(quantity, "description", _METRICS[name])
-        add_real(quantity, value, MILLIMETRE)
+        add_real(quantity, value, MILLIMETRE, decimals=_DECIMALS)
 
 
 def _length_name(number: int, length: ReferenceLength) -> str:
@@ -240,10 +249,12 @@ def _add_lengths(
     for number, (length, measured, error, error_u) in enumerate(zip(lengths, *columns, strict=True), start=1):
         row = add(data, "list")
         add_text(row, "name", _length_name(number, length))
+        decimals = decimals_of(factor * float(error_u)) if _is_known(float(error_u)) else _DECIMALS
+        # The reference has the uncertainty of its own certificate, not that of this calibration's coverage factor.
         values = [
-            ("calibrated value", "basic_referenceValue", length.value, float(length.u)),
-            ("measured value", "basic_measuredValue", measured, math.nan),
-            ("error", "basic_measurementError", error, float(error_u)),
+            ("calibrated value", "basic_referenceValue", length.value, float(length.u), None),
+            ("measured value", "basic_measuredValue", measured, math.nan, decimals),
+            ("error", "basic_measurementError", error, float(error_u), decimals),
         ]
         if fixed_scale:
             add_english(
@@ -253,12 +264,13 @@ def _add_lengths(
                 "measured.",
             )
             values = values[:1]
-        for name, ref_type, value, u in values:
+        for name, ref_type, value, u, digits in values:
             quantity = add(row, "quantity", ref_type=ref_type)
             add_english(quantity, "name", name)
             if name == "calibrated value" and u == 0:
                 add_english(quantity, "description", "Taken as exact")
-            add_real(quantity, float(value), MILLIMETRE, u if _is_known(u) else None, factor)
+            scale = None if digits is None else factor
+            add_real(quantity, float(value), MILLIMETRE, u if _is_known(u) else None, scale, digits)
 
 
 def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, factor: float) -> None:
@@ -283,6 +295,26 @@ def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, 
         if note:
             add_english(quantity, "description", note)
         add_real(quantity, value, _UNITS[parameter_unit(stage.arm, name)], u, factor)
+
+
+def _add_covariance(results: Element, record: CalibrationRecord) -> None:
+    """The covariance matrix of the parameters that have an uncertainty of their own, a row each."""
+    own = [i for i, name in enumerate(record.names) if _note_and_uncertainty(record, name)[1] is not None]
+    if not own:
+        return
+    data = _add_result(
+        results,
+        "Covariance matrix",
+        "Of the parameters with an uncertainty of their own, a row each, columns in the same order. The diagonal has "
+        "the squares of the standard uncertainties. Expanded uncertainties elsewhere are rounded; what is computed of "
+        "several parameters needs this table.",
+    )
+    table = add(data, "list")
+    add_english(table, "name", "Covariance")
+    units = [_UNITS[parameter_unit(record.calibrated.arm, record.names[i])] for i in own]
+    for row, unit in zip(own, units, strict=True):
+        products = [f"{unit}{_SQUARED}" if unit == other and unit in _SIMPLE else unit + other for other in units]
+        add_row(table, record.names[row], np.asarray(record.covariance)[row, own].tolist(), products)
 
 
 def _values(arm: Arm) -> dict[str, float]:

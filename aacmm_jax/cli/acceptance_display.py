@@ -176,21 +176,27 @@ def _acceptance(console: Console, summary: dict[str, Any]) -> None:
                     else ""
                 )
                 cells += [formatted(metric["limit_mm"]), f"[{_STYLES[decision]}]{decision or '-'}{count}[/]"]
-            table.add_row(test["standard"], metric["name"], *cells, escape(metric["where"]))
+            # Summaries that earlier versions stored name the standard only.
+            table.add_row(test.get("called", test["standard"]), metric["name"], *cells, escape(metric["where"]))
+    rules = dict.fromkeys(test.get("rule", "ISO 14253-1") for test in tests if test.get("decision", limited))
+    of_test = summary["u_test_mm"] or any(summary.get("influences", {}).values())
     for column in table.columns[1], table.columns[-1]:
         column.justify = "left"
     print_table(console, table, keys=2)
+    metrics = [metric for test in tests for metric in test["figures"]]
+    symbols = [metric["symbol"] for metric in metrics if metric.get("symbol", metric["name"]) != metric["name"]]
+    if symbols:
+        console.print(f"Symbols: {', '.join(symbols)}.")
     for test in tests:
         if test["missing"]:
-            lacking = "; ".join(test["missing"])
-            console.print(
-                f"Not the full procedure of {test['standard']}, {test['title']}: it also needs {escape(lacking)}."
-            )
+            console.print(f"{test.get('called', test['standard'])}, {test['title']}: not the full procedure.")
+            for sentence in test["missing"]:
+                console.print(f"  - {escape(sentence)}")
     console.print(
         "U: the uncertainty of the artefacts"
-        + (" and --test-u-mm" if summary["u_test_mm"] else "")
+        + (" and of the test (--test-u-mm, --expansion)" if of_test else "")
         + "."
-        + (" Decisions by ISO 14253-1." if limited else "")
+        + (f" Decisions: {'; '.join(rules)}." if limited else "")
         + (" As found: the nominal arm; as left: the calibrated one." if before else "")
     )
 
@@ -199,8 +205,10 @@ def procedure(summary: dict[str, Any]) -> None:
     """A planned acceptance test: positions of the artefacts, and number of poses."""
     console = new_console()
     x, y, z = summary["shoulder_mm"]
+    stated = "" if summary["measuring_range_stated"] else " (twice the reach; state the maker's)"
     console.print(
         f"[bold]{escape(summary['arm'])}[/bold]: {summary['standard']}, {summary['poses']} poses. "
+        f"Measuring range {summary['measuring_range_mm']:.0f} mm{stated}. "
         f"Reach {summary['reach_mm']:.0f} mm from the shoulder at ({x:.0f}, {y:.0f}, {z:.0f}) mm"
     )
     print_warnings(console, summary)

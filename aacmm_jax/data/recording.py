@@ -19,6 +19,7 @@ class Recording(NamedTuple):
         sources: Files that it was read from, as name and SHA-256, the latest first.
         measured: Day of the recording, ISO 8601; empty where not stated.
         acceptance: Standards whose acceptance procedure the poses were taken for: "jjf", "asme", "iso".
+        measuring_range: Diameter of the measuring volume as the arm's maker states it, mm; None where not stated.
     """
 
     capture: Capture
@@ -29,3 +30,4 @@ class Recording(NamedTuple):
     sources: tuple[str, ...] = ()
     measured: str = ""
     acceptance: tuple[str, ...] = ()
+    measuring_range: float | None = None

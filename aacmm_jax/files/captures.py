@@ -80,6 +80,7 @@ def recording_attributes(recording: Recording) -> dict[str, Any]:
         "sources": list(recording.sources) or None,
         "measured": recording.measured or None,
         "acceptance": list(recording.acceptance) or None,
+        "measuring_range_mm": recording.measuring_range,
     }
 
 
@@ -157,6 +158,7 @@ def sphere_table(
         u=([sphere.u for sphere, *_ in rows], "mm", "standard uncertainty of the diameter"),
         stylus=([sphere.stylus for sphere, *_ in rows], "mm", "diameter of the probe's ball"),
         form=([sphere.form for sphere, *_ in rows], "mm", "calibrated form error"),
+        u_form=([sphere.u_form for sphere, *_ in rows], "mm", "standard uncertainty of the form error"),
     )
     variables |= numbering("touch", len(rows))
     values = np.array([touched for *_, touched in rows])
@@ -181,7 +183,8 @@ def spheres_of(path: str | os.PathLike, stored: Stored, entry: str = "angle") ->
         first = int(rows.argmax())
         groups = tuple(touched[rows & (table["group"] == number)] for number in np.unique(table["group"][rows]))
         numbers = (float(table[what][first]) for what in ("diameter", "u", "stylus", "form"))
-        found.append(ProbedSphere(str(name), test, groups, *numbers))
+        u_form = float(table["u_form"][first]) if "u_form" in table else 0.0  # files of earlier versions have none
+        found.append(ProbedSphere(str(name), test, groups, *numbers)._replace(u_form=u_form))
     return tuple(found)
 
 
@@ -226,6 +229,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         sources,
         attributes.get("measured", ""),
         names_in(attributes.get("acceptance")),
+        attributes.get("measuring_range_mm"),
     )
 
 

@@ -95,6 +95,7 @@ class _Sphere(_Files):
     u: NonNegativeFloat = 0.0
     stylus: NonNegativeFloat = 0.0
     form: NonNegativeFloat = 0.0
+    u_form: NonNegativeFloat = 0.0
 
     @model_validator(mode="after")
     def _one(self) -> "_Sphere":
@@ -107,6 +108,7 @@ class _Points(Strict):
     unit: Literal["mm", "m", "um", "inch"]
     columns: Annotated[list[PositiveInt], Field(min_length=3, max_length=3), AfterValidator(each_once)] | None = None
     reach: PositiveFloat | None = None  # mm
+    measuring_range: PositiveFloat | None = None  # diameter of the measuring volume as the maker states it, mm
     shoulder: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None  # mm
 
     @model_validator(mode="after")
@@ -143,6 +145,7 @@ class _Poses(_Recorded):
     tip: str | None = None
     probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None  # mm, from the tip link
     acceptance: Standard | Annotated[list[Standard], AfterValidator(each_once)] = Field(default_factory=list)
+    measuring_range: PositiveFloat | None = None  # diameter of the measuring volume as the maker states it, mm
     angles: Angles | None = None
     sessions: _Sessions | None = None
 
@@ -199,7 +202,8 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     ``session = "monday"`` in such tables, with fields in braces if needed, or ``columns = { session = "day" }`` for
     each row, makes sessions of one arm (`data.capture.join_sessions`); names are then ``monday/name``, in lengths too.
     ``[sessions] probe = "same"`` says that the probe was not remounted between them.
-    ``acceptance`` (jjf, asme, iso, or a list) says for which standards' acceptance procedure the poses were taken.
+    ``acceptance`` (jjf, asme, iso, or a list) says for which standards' acceptance procedure the poses were taken, and
+    ``measuring_range`` the diameter of the measuring volume that the arm's maker states, mm.
 
     ``arm`` is a shipped name, an arm file (TOML), a URDF, or a ``kinematics.yaml``. Of a URDF, ``base`` and ``tip``
     name the links at the ends of the chain; ``probe`` is a tool's tip in the last frame, mm, of an arm that states
@@ -275,6 +279,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
             sources=sources,
             measured=str(model.date or ""),
             acceptance=(model.acceptance,) if isinstance(model.acceptance, str) else tuple(model.acceptance),
+            measuring_range=model.measuring_range,
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
@@ -321,8 +326,8 @@ def recorded(
         if any((entry.name, entry.test) == (other.name, other.test) for other in spheres):
             raise InputError(f"sphere '{entry.name}' is defined twice for one test; give its files in one [[sphere]].")
         groups = tuple(read(folder / file, entry.temperature_C) for file in entry.paths)
-        sphere = ProbedSphere(entry.name, entry.test, groups, entry.diameter, entry.u, entry.stylus, entry.form)
-        spheres.append(checked_sphere(sphere))
+        numbers = (entry.diameter, entry.u, entry.stylus, entry.form, entry.u_form)
+        spheres.append(checked_sphere(ProbedSphere(entry.name, entry.test, groups, *numbers)))
     return sockets, _lengths(model.length, fields, sockets), tuple(spheres)
 
 

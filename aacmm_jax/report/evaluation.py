@@ -7,7 +7,6 @@ import numpy as np
 
 from ..acceptance.record import EvaluationRecord, PointsRecord
 from ..acceptance.results import METRICS, AcceptanceTest, Metric
-from ..acceptance.standards import EDITIONS
 from ..calibration.evaluation import Evaluation, evaluate
 from ..core.text import pluralise
 from ..data.capture import Capture, ReferenceLength
@@ -154,22 +153,20 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
     blocks: list = [
         "Every metric is of single readings. U, with coverage factor 2, is what the tester contributes: the artefacts' "
         f"uncertainty; {stated}. The arm's own scatter is what is tested (ISO 14253-5). What standards allow about "
-        "repeating a reading is not applied, and the distribution of positions and directions is not checked. "
-        "Procedures and formulas follow secondary sources of the editions named.",
+        "repeating a reading is not applied. A test that lacks something its standard requires is called 'after' it. "
+        "Requirements and formulas follow secondary sources of the editions named.",
     ]
     limited = any(metric["limit_mm"] is not None for test in rows for metric in test["figures"])
     if limited:
-        blocks.append(
-            "A metric conforms if |value| ≤ MPE − U, fails if |value| ≥ MPE + U, and is undecided in between (ISO "
-            "14253-1, with U as guard band as in its editions up to 2013)."
-        )
+        used = dict.fromkeys(f"{test['standard']}: {test['rule']}" for test in rows if test["decision"])
+        blocks.append(f"Decision rules: {'; '.join(used)}. What no rule decides is undecided.")
     before = any(metric["as_found_mm"] is not None for test in rows for metric in test["figures"])
     if before:
         blocks.append("As found is the nominal arm, as left the calibrated one.")
     for test in rows:
         blocks.append(_test_table(test, before, limited))
         if test["missing"]:
-            blocks.append(f"This was not the full procedure; it also needs {'; '.join(test['missing'])}.")
+            blocks.append(f"This was not the full procedure. {' '.join(test['missing'])}")
     parts = [
         [
             *(text_cell(word) for word in (test.standard, metric.name, part.where)),
@@ -195,7 +192,7 @@ def _test_table(test: dict[str, Any], before: bool, limited: bool) -> ReportTabl
     columns += ["as found", *(["decision as found"] if limited else [])] if before else []
     rows = []
     for metric in test["figures"]:
-        row, decimals = [text_cell(metric["name"])], decimals_for(metric["expanded_mm"])
+        row, decimals = [text_cell(metric["symbol"])], decimals_for(metric["expanded_mm"])
         row += [_decision(metric["decision"], metric["failing"], len(metric["parts"]))] if limited else []
         row += [number_cell(metric["value_mm"], decimals), _expanded(metric["expanded_mm"])]
         row += [number_cell(metric["limit_mm"])] if limited else []
@@ -203,7 +200,7 @@ def _test_table(test: dict[str, Any], before: bool, limited: bool) -> ReportTabl
             row.append(number_cell(metric["as_found_mm"], decimals))
             row += [_decision(metric["as_found_decision"])] if limited else []
         rows.append([*row, text_cell(metric["where"]), text_cell(METRICS[metric["name"]])])
-    caption = f"{EDITIONS[test['standard']]}: {test['title']} [mm]"
+    caption = f"{test['called']}: {test['title']} [mm]"
     return ReportTable(caption, (*columns, "worst at", "what it is"), rows)
 
 
