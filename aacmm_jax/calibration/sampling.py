@@ -299,9 +299,9 @@ class _RepeatedTask(NamedTuple):
         stage1, bounds = result.stage1, result.bounds
         # What sets the scale, and the noise that weights the poses, are the calibration's own.
         if result.observed is not None:
-            options = {"noise": result.given_noise, "hold": result.hold, "robust": self.robust}
+            options = {"noise": result.weighting_noise, "hold": result.hold, "robust": self.robust}
             return identify_many(result.arm, captures, bounds, start=result.parameters, **options)
-        box, options = (bounds.lower, bounds.upper), BatchOptions(noise=result.given_noise)
+        box, options = (bounds.lower, bounds.upper), BatchOptions(noise=result.weighting_noise)
         task = BatchTask.of(stage1.arm, captures, box, stage1.parameters, result.space, options, stage1.anchor)
         return task.calibrate(result.method)
 

@@ -3,7 +3,9 @@
 import math
 from typing import Any
 
-from ..calibration.model_errors import LEVEL, FoundTerm, Lengths, Misfit, ModelTests
+from ..calibration.length_consistency import Lengths
+from ..calibration.missing_terms import FoundTerm
+from ..calibration.model_errors import LEVEL, Misfit, ModelTests
 from ..calibration.record import REPEATABILITY
 from ..core.text import shorten
 from ..core.units import ARCSEC
