@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.errors import InputError
+from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
@@ -38,8 +39,8 @@ class Misfit(NamedTuple):
 
     ratio: float  # of the root mean square to that of the noise
     degrees_of_freedom: float
-    probability: float  # of a ratio as far from 1, where the noise is right; of the class: as large
-    of_class: bool
+    probability: float  # of a ratio as far from 1, where the noise is right; of what is usual: as large
+    usual: str = ""  # what is usual for such an arm, in words; empty where the noise was given
 
 
 class NoisyObservation(NamedTuple):
@@ -92,7 +93,7 @@ def model_tests(
         result: What `calibrate` or `identify` returned, or the record of a calibration.
         capture: What it was calibrated from; not with a record, which holds it.
         class_noise: Noise of encoders and seat that is usual for this class of arms, for a calibration whose noise was
-            estimated.
+            estimated; by default that which the arm's file states, where the record has it.
 
     Returns:
         The tests; those that found something have a probability below `LEVEL`.
@@ -103,11 +104,12 @@ def model_tests(
         raise InputError("the result does not hold its capture; give the capture that it was calibrated from.")
     else:
         record = record_of(result, Recording(capture, ArmSpecification(result.space.base)))
+    usual = record.recording.usual if class_noise is None else ArmNoise("as given", class_noise, "")
     with np.errstate(all="ignore"):
-        return _tests(record, class_noise)
+        return _tests(record, usual)
 
 
-def _tests(record: CalibrationRecord, class_noise: Noise | None) -> ModelTests:
+def _tests(record: CalibrationRecord, usual: ArmNoise | None) -> ModelTests:
     rows, relations = equations_in_chunks(record)
     if not rows:
         return ModelTests()
@@ -124,7 +126,7 @@ def _tests(record: CalibrationRecord, class_noise: Noise | None) -> ModelTests:
     of_all, others = with_terms(rows, relations, terms, arm.joints)
     explained = Residuals.of([*(each.block("") for each in of_all), *others]) if terms else left
     return ModelTests(
-        misfit=_misfit(record, left, class_noise),
+        misfit=_misfit(record, left, usual),
         lengths=lengths,
         noisy_observations=_noisy_observations(record, rows, left),
         terms=terms,
@@ -144,18 +146,20 @@ def _rms(rows: Sequence[Rows]) -> float:
     return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
-def _misfit(record: CalibrationRecord, left: Residuals, class_noise: Noise | None) -> Misfit | None:
+def _misfit(record: CalibrationRecord, left: Residuals, usual: ArmNoise | None) -> Misfit | None:
     given = record.given_noise
     if given is not None:
         spare = left.degrees_of_freedom
         upper = chi_square_tail(left.cost, spare)
-        return Misfit(float(np.sqrt(left.cost / spare)), spare, min(2 * min(upper, 1 - upper), 1.0), False)
-    if class_noise is None:
+        return Misfit(float(np.sqrt(left.cost / spare)), spare, min(2 * min(upper, 1 - upper), 1.0))
+    if usual is None:
         return None
-    rows, relations = equations_in_chunks(record._replace(noise=class_noise))
+    rows, relations = equations_in_chunks(record._replace(noise=usual.noise))
     left = Residuals.of([*(each.block("") for each in rows), *relations])
     spare, ratio = left.degrees_of_freedom, left.cost / left.degrees_of_freedom
-    return Misfit(float(np.sqrt(ratio)), spare, f_tail(ratio, spare, CLASS_DEGREES_OF_FREEDOM), True)
+    return Misfit(
+        float(np.sqrt(ratio)), spare, f_tail(ratio, spare, CLASS_DEGREES_OF_FREEDOM), usual.source or usual.arm_class
+    )
 
 
 def _noisy_observations(

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from ..kinematics.parameters import ArmSpecification
+from .arm_classes import ArmNoise
 from .capture import Capture
 from .sphere import ProbedSphere
 
@@ -19,6 +20,7 @@ class Recording(NamedTuple):
         sources: Files that it was read from, as name and SHA-256, the latest first.
         measured: Day of the recording, ISO 8601; empty where not stated.
         acceptance: Standards whose acceptance procedure the poses were taken for: "jjf", "asme", "iso".
+        usual: Noise that the arm's file states, with which an estimated one is compared; None where it states none.
     """
 
     capture: Capture
@@ -29,3 +31,4 @@ class Recording(NamedTuple):
     sources: tuple[str, ...] = ()
     measured: str = ""
     acceptance: tuple[str, ...] = ()
+    usual: ArmNoise | None = None

@@ -26,7 +26,7 @@ from ..data.observations.observation import AbstractObservation
 from ..data.observations.socket import Socket
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
-from .arms import arm_beside, read_arm, with_parameters
+from .arms import arm_beside, read_arm, usual_noise, with_parameters
 from .inputs import InputFile, fingerprint
 from .manifest_angles import Angles, angles_of, in_rad
 from .manifest_observations import FIELDS, TABLES, Source, observations
@@ -250,6 +250,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
             sources=sources,
             measured=str(model.date or ""),
             acceptance=(model.acceptance,) if isinstance(model.acceptance, str) else tuple(model.acceptance),
+            usual=usual_noise(arm, base=model.base, tip=model.tip),
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
