@@ -23,6 +23,7 @@ _TERMS: dict[str, tuple[str, str, str]] = {
     "drifting base": ("the order of the poses in the tip", "a base or socket that moves", ""),
     "growing arm": ("the order of the poses in the arm's size", "an arm that warms or cools", ""),
 }
+_FAR_MORE = 100.0  # ratio of noise beyond which the number says nothing
 _MODEL_OPTION = "--model dh,"  # of the command line, which takes further terms into the model
 
 
@@ -59,10 +60,8 @@ def sentences_of_tests(tests: ModelTests, method: str = "") -> list[str]:
 def sentence_of_noisy_encoders(encoders: Sequence[NoisyEncoder], slides: Collection[int], given: bool) -> str:
     """That the noise of some encoders was replaced; ``slides`` are the numbers of prismatic joints."""
     named = [
-        f"joint {one.joint} scatter by {_noise(one, slides)}, {one.found / one.expected:.2g} times as much as "
+        f"joint {one.joint} scatter by {_noise(one, slides)}, {_times(one)} "
         f"{'given' if given else 'those of the others'} ({_chance(one.probability)})"
-        if one.expected > 0
-        else f"joint {one.joint} scatter by {_noise(one, slides)}, but were given as exact ({_chance(one.probability)})"
         for one in encoders
     ]
     return (
@@ -70,6 +69,12 @@ def sentence_of_noisy_encoders(encoders: Sequence[NoisyEncoder], slides: Collect
         f"(--keep-noise: from {'the noise as given' if given else 'one noise of all encoders'}). Check the encoder, "
         "and the joint for play."
     )
+
+
+def _times(one: NoisyEncoder) -> str:
+    # Of the others nothing may be left beside the noise of the tip, and what is given may be 0.
+    known = one.found < _FAR_MORE * one.expected
+    return f"{one.found / one.expected:.2g} times as much as" if known else "far more than"
 
 
 def _noise(one: NoisyEncoder, slides: Collection[int]) -> str:
