@@ -156,7 +156,12 @@ def _compared(
     widened = with_coefficients(bounds, arm)
     arm = widened.space.base
     result = calibrate(
-        arm, capture, widened, method="joint", noise=noise, prior=default_prior(arm), check_identifiability=False
+        *(arm, capture, widened),
+        method="joint",
+        noise=noise,
+        prior=default_prior(arm),
+        replace_noise=False,  # so that all models are compared with the same
+        check_identifiability=False,
     )
     record = record_of(result, Recording(capture, ArmSpecification(arm)))
     assert record.observed is not None

@@ -19,7 +19,7 @@ from ..uncertainty.arm_uncertainty import Uncertainty
 from .checks import largest_plausible_residual, plausible
 from .evaluation import Evaluation, evaluate
 from .left_out import CrossValidation
-from .results import Calibration, Identification, ObservedMetrics, PriorMetrics
+from .results import Calibration, Identification, NoisyEncoder, ObservedMetrics, PriorMetrics
 from .second_stage import LARGEST_LOG_K
 
 REPEATABILITY = "repeatability"  # method of stage 1 alone
@@ -91,6 +91,7 @@ class CalibrationRecord(NamedTuple):
     others: OtherPoses | None = None
     removed: tuple[Removed, ...] = ()
     prior: PriorMetrics | None = None  # with arrays of NumPy
+    noisy_encoders: tuple[NoisyEncoder, ...] = ()  # whose noise was estimated, because it is larger than expected
 
     @property
     def given_noise(self) -> Noise | None:
@@ -193,6 +194,7 @@ def record_of(
         observed=None if stage1.observed is None else jax.tree.map(np.asarray, stage1.observed),
         robust=robust,
         prior=None if calibration.prior is None else jax.tree.map(np.asarray, calibration.prior),
+        noisy_encoders=calibration.noisy_encoders,
         others=None if others is None else _other_poses(calibration.arm, others, stage1.observed),
     )
 

@@ -323,7 +323,7 @@ class _RepeatedTask(NamedTuple):
         stage1, bounds = result.stage1, result.bounds
         # What sets the scale, and the noise that weights the poses, are the calibration's own.
         if result.observed is not None:
-            options = {"noise": result.given_noise, "hold": result.hold, "robust": self.robust}
+            options = {"noise": result.weighting_noise, "hold": result.hold, "robust": self.robust}
             if means is None:
                 return identify_many(result.arm, captures, bounds, start=result.parameters, **options)
             assert result.prior is not None
@@ -331,7 +331,7 @@ class _RepeatedTask(NamedTuple):
             weights = zip(result.prior.names, np.asarray(result.prior.weight).tolist(), strict=True)
             prior = Prior({name: 1 / weight for name, weight in weights if weight > 0})
             return identify_many(arms, captures, bounds, start=result.parameters, prior=prior, **options)
-        box, options = (bounds.lower, bounds.upper), BatchOptions(noise=result.given_noise)
+        box, options = (bounds.lower, bounds.upper), BatchOptions(noise=result.weighting_noise)
         task = BatchTask.of(stage1.arm, captures, box, stage1.parameters, result.space, options, stage1.anchor)
         return task.calibrate(result.method)
 

@@ -25,12 +25,12 @@ from ..model.robust import LossName
 from ..uncertainty import propagation, scale_uncertainty
 from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
-from ..uncertainty.identifiability import observability
 from .bounded_fit import Fit, fit
-from .checks import check_enough, check_noise_model, check_single, check_start
+from .checks import check_enough, check_identifiable, check_noise_model, check_single, check_start
+from .encoder_noise import with_noise_by_joint
 from .joint_model import with_joint_model
 from .observed import calibrate_observed, identify_observed
-from .observed_state import ObservedTask, observed_task
+from .observed_state import observed_task
 from .results import Calibration, Identification
 from .scale_anchor import default_method, scale_anchor, scale_from_slides, scale_set_by_clause
 from .second_stage import adjust_anchor, clip_to_bounds, divide_by_k, must_adjust_anchor
@@ -51,6 +51,7 @@ def identify(
     noise_model: NoiseModel | None = None,
     robust: LossName | None = None,
     prior: Prior | None = None,
+    replace_noise: bool = True,
     max_steps: int = _MAX_STEPS,
 ) -> Identification:
     """Stage 1: the parameters that make the poses of every socket agree, within bounds.
@@ -77,6 +78,9 @@ def identify(
         robust: a robust loss, "huber", "cauchy" or "tukey", of each pose's whitened residual; None, least squares.
         prior: what is known of the parameters, as a mean (by default ``arm``'s values) and a standard deviation. It
             weighs against the data, whose noise is given or estimated; bounds hold as well. The scale anchor has none.
+        replace_noise: where the residuals show that some encoders are noisier than given, or than the others, solve
+            once more with their noise as estimated (``noisy_encoders`` of the result). Not inside jit, vmap or a
+            derivative, in batches, with a robust loss, or where ``noise_model`` is named.
         max_steps: most evaluations of the residual.
 
     Returns:
@@ -90,9 +94,14 @@ def identify(
         check_finite(arm=arm, capture=capture, noise=noise)
         alone = eqx.tree_at(lambda c: c.lengths, capture, (), is_leaf=lambda leaf: isinstance(leaf, tuple))
         task = observed_task(arm, alone, bounds, start, noise, hold, noise_model, max_steps, robust, prior)
-        return to_jax(identify_observed(to_numpy(task)))
-    task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many")
-    return to_jax(_identify(to_numpy(task)))
+        result = to_jax(identify_observed(to_numpy(task)))
+    else:
+        task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many")
+        result = to_jax(_identify(to_numpy(task)))
+    if not replace_noise or noise_model in ("common", "robust") or robust is not None:
+        return result
+    options = {"hold": hold, "start": start, "prior": prior, "max_steps": max_steps, "replace_noise": False}
+    return with_noise_by_joint(result, capture, lambda found: identify(arm, capture, bounds, noise=found, **options))
 
 
 def _prepare_task(
@@ -138,6 +147,7 @@ def calibrate(
     noise_model: NoiseModel | None = None,
     robust: LossName | None = None,
     prior: Prior | None = None,
+    replace_noise: bool = True,
     check_identifiability: bool = True,
     strict: bool = False,
     max_steps: int = _MAX_STEPS,
@@ -169,6 +179,7 @@ def calibrate(
         noise_model: another model of the tips' errors.
         robust: a robust loss, as for `identify`.
         prior: what is known of the parameters, as for `identify`; of a model, by default `kinematics.default_prior`.
+        replace_noise: estimate the noise of encoders that prove noisier, as for `identify`.
         check_identifiability: warn where free parameters are not determined by these data; the check takes about as
             long as the calibration.
         strict: raise instead of warn where free parameters are not determined by these data.
@@ -201,16 +212,28 @@ def calibrate(
         check_finite(arm=arm, capture=capture, noise=noise)
         task = observed_task(arm, capture, bounds, start, noise, None, noise_model, max_steps, robust, prior)
         if check_identifiability or strict:
-            _check_identifiable(capture, task, strict)
-        return to_jax(calibrate_observed(to_numpy(task)))
-    task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
+            check_identifiable(capture, task.bounds, prior, strict)
+        result = to_jax(calibrate_observed(to_numpy(task)))
+    else:
+        task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
+        if check_identifiability or strict:
+            check_identifiable(capture, task.bounds, None, strict)
+        result = _calibrate_sockets(task, method, hold)
+    if not replace_noise or noise_model in ("common", "robust") or robust is not None:
+        return result
+    options = {"method": method, "hold": hold, "start": start, "prior": prior, "max_steps": max_steps}
+    options |= {"check_identifiability": False, "replace_noise": False}
+    return with_noise_by_joint(result, capture, lambda found: calibrate(arm, capture, bounds, noise=found, **options))
+
+
+def _calibrate_sockets(task: Task, method: str, hold: str | None) -> Calibration:
+    """From sockets and reference lengths alone."""
+    arm, bounds = task.space.base, task.bounds
     if hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
         raise InputError(
             "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
             "hold."
         )
-    if check_identifiability or strict:
-        _check_identifiable(capture, task, strict)
     _check_scale(task, method)
     task = to_numpy(task)
     if method == "joint":
@@ -221,22 +244,6 @@ def calibrate(
     if is_concrete(adjust):
         return to_jax(_calibrate_by_adjustment(task, result))
     return jax.lax.cond(adjust, lambda: _calibrate_by_adjustment(task, result), lambda: result)
-
-
-def _check_identifiable(capture: Capture, task: Task | ObservedTask, strict: bool) -> None:
-    """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; not of traced values."""
-    if inside_trace() or not is_concrete(*jax.tree.leaves((capture, task.bounds))):
-        return
-    space = task.bounds.space
-    prior = task.prior if isinstance(task, ObservedTask) else None
-    known = None if prior is None else prior.of(space.names, space.vector())
-    named = () if known is None else tuple(space.names[i] for i in known.index)
-    seen = observability(space.base, capture, space, known=named)
-    sentences, lost = seen.sentences(), seen._replace(by_prior=()).sentences()
-    if lost and strict:
-        raise InputError(" ".join(lost))
-    for sentence in sentences:
-        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=3)
 
 
 def _check_scale(task: Task, method: str) -> None:

@@ -118,6 +118,10 @@ def calibrate(
     encoder_arcsec: KnownEncoderNoise = None,
     linear_encoder_mm: LinearEncoderNoise = None,
     seating_mm: KnownSeatingNoise = None,
+    keep_noise: Annotated[
+        bool,
+        typer.Option("--keep-noise", help="Keep the noise as it is where an encoder proves noisier."),
+    ] = False,
     cross_validate: Annotated[
         bool | None,
         typer.Option(
@@ -195,6 +199,7 @@ def calibrate(
             "hold": None if hold == "none" else hold,
             "noise": known_noise(encoder_arcsec, seating_mm, linear_encoder_mm),
             "prior": _prior(recording.nominal, prior, model),
+            "replace_noise": not keep_noise,
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", IdentifiabilityWarning)  # the summary says it

@@ -304,8 +304,10 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
         console.print(tried_sentence(found["tried"]))
     seat = "seat" if summary["sockets_used"] else "tip, each coordinate,"
     noise = f"{encoders_in_words(found)}, {seat} {1e3 * found['seating_mm']:.3g} um"
+    joints = ", ".join(str(row["joint"]) for row in found.get("noisy_encoders", ()))
+    replaced = f", but for joint {joints}" if joints else ""
     source = {
-        "given": f"Noise as given: {noise}; residuals are {found['misfit'] or 0:.2f} times what it predicts.",
+        "given": f"Noise as given{replaced}: {noise}; residuals are {found['misfit'] or 0:.2f} times what it predicts.",
         "estimated": f"Noise estimated from the residuals: {noise} (their sum is better known than each).",
         "common": f"One variance for all poses: {1e3 * found['seating_mm']:.3g} um a coordinate.",
         "robust": "The variance of each pose is taken from its own residual (robust noise model).",

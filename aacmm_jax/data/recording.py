@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from ..kinematics.parameters import ArmSpecification
+from .arm_classes import ArmNoise
 from .capture import Capture
 from .sphere import ProbedSphere
 
@@ -20,6 +21,7 @@ class Recording(NamedTuple):
         measured: Day of the recording, ISO 8601; empty where not stated.
         acceptance: Standards whose acceptance procedure the poses were taken for: "jjf", "asme", "iso".
         measuring_range: Diameter of the measuring volume as the arm's maker states it, mm; None where not stated.
+        usual: Noise that the arm's file states, with which an estimated one is compared; None where it states none.
     """
 
     capture: Capture
@@ -31,3 +33,4 @@ class Recording(NamedTuple):
     measured: str = ""
     acceptance: tuple[str, ...] = ()
     measuring_range: float | None = None
+    usual: ArmNoise | None = None

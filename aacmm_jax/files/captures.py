@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
+from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture, ReferenceLength, check_one_capture, check_readings
 from ..data.copies import Repeated
+from ..data.noise import Noise
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm, readings_unit
@@ -81,7 +83,44 @@ def recording_attributes(recording: Recording) -> dict[str, Any]:
         "measured": recording.measured or None,
         "acceptance": list(recording.acceptance) or None,
         "measuring_range_mm": recording.measuring_range,
+        **_attributes_of_usual(recording.usual),
     }
+
+
+def _attributes_of_usual(usual: ArmNoise | None) -> dict[str, Any]:
+    """Of the noise that the nominal arm's file states."""
+    if usual is None:
+        return {}
+    return {
+        "usual_class": usual.arm_class,
+        "usual_source": usual.source,
+        "usual_encoder_arcsec": np.asarray(usual.noise.encoder_arcsec),
+        "usual_linear_encoder_mm": linear_encoder_attribute(usual.noise),
+        "usual_seating_mm": float(usual.noise.seating),
+    }
+
+
+def _usual_of(attributes: Mapping[str, Any]) -> ArmNoise | None:
+    """What `_attributes_of_usual` wrote; earlier files have none."""
+    if "usual_class" not in attributes:
+        return None
+    noise = noise_of_attributes({name.removeprefix("usual_"): value for name, value in attributes.items()})
+    return ArmNoise(attributes["usual_class"], noise, attributes.get("usual_source", ""))
+
+
+def linear_encoder_attribute(noise: Noise) -> Any:
+    """Standard deviation of the readings of prismatic joints, mm; None where it follows from the others."""
+    return None if noise.linear_encoder is None else np.asarray(noise.linear_encoder)
+
+
+def noise_of_attributes(attributes: Mapping[str, Any]) -> Noise:
+    """The noise of ``encoder_arcsec``, ``linear_encoder_mm`` and ``seating_mm``."""
+    linear = attributes.get("linear_encoder_mm")  # files of version 2 and before have none
+    return Noise(
+        encoder_arcsec=np.squeeze(np.atleast_1d(attributes.get("encoder_arcsec", 0.0))),
+        seating=attributes.get("seating_mm", 0.0),
+        linear_encoder=None if linear is None else np.squeeze(np.atleast_1d(linear)),
+    )
 
 
 def recording_tables(recording: Recording) -> dict[str, Table]:
@@ -230,6 +269,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         attributes.get("measured", ""),
         names_in(attributes.get("acceptance")),
         attributes.get("measuring_range_mm"),
+        _usual_of(attributes),
     )
 
 

@@ -13,14 +13,14 @@ from ..acceptance.influences import Expansion, Influences, checked_influences
 from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord
 from ..acceptance.results import METRICS, Measured
 from ..acceptance.standards import STANDARDS
-from ..data.noise import Noise
 from ..kinematics.arm import Arm, parameter_names
 from ..kinematics.workspace import Reach
 from ..uncertainty.arm_uncertainty import Uncertainty
-from .calibrations import linear_encoder_attribute, linear_encoder_of
 from .captures import (
     arm_table,
     lengths_of,
+    linear_encoder_attribute,
+    noise_of_attributes,
     recording_attributes,
     recording_of,
     recording_tables,
@@ -110,11 +110,7 @@ def _uncertainty_of(path: str | os.PathLike, stored: Stored, calibrated: Arm) ->
         arm=calibrated,
         covariance=table["covariance"],
         open=table["open"],
-        noise=Noise(
-            encoder_arcsec=np.squeeze(np.atleast_1d(attributes["encoder_arcsec"])),
-            seating=attributes["seating_mm"],
-            linear_encoder=linear_encoder_of(attributes),
-        ),
+        noise=noise_of_attributes(attributes),
         u_k=None,
         names=names,
         degrees_of_freedom=float(attributes["degrees_of_freedom"]),

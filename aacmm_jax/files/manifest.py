@@ -27,7 +27,7 @@ from ..data.observations.socket import Socket
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
 from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
-from .arms import arm_beside, read_arm, with_parameters
+from .arms import arm_beside, read_arm, usual_noise, with_parameters
 from .inputs import InputFile, fingerprint
 from .manifest_angles import Angles, angles_of, in_rad
 from .manifest_observations import FIELDS, TABLES, Source, observations
@@ -280,6 +280,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
             measured=str(model.date or ""),
             acceptance=(model.acceptance,) if isinstance(model.acceptance, str) else tuple(model.acceptance),
             measuring_range=model.measuring_range,
+            usual=usual_noise(arm, base=model.base, tip=model.tip),
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

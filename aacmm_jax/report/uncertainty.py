@@ -90,8 +90,11 @@ def _noise_sentence(found: dict[str, Any]) -> str:
     seating = 1e3 * found["seating_mm"]
     noise = f"{encoders_in_words(found)}, seat {seating:.3g} µm"
     basis = "All uncertainties are based on"
+    joints = ", ".join(str(row["joint"]) for row in found.get("noisy_encoders", ()))
+    replaced = f", but for joint {joints}, whose noise was estimated" if joints else ""
     return {
-        "given": f"{basis} the given noise: {noise}. Residuals are {found['misfit'] or 0:.2f} times its prediction.",
+        "given": f"{basis} the given noise{replaced}: {noise}. Residuals are {found['misfit'] or 0:.2f} times its "
+        "prediction.",
         "estimated": f"{basis} the noise estimated from the residuals: {noise}.",
         "common": f"{basis} one variance for all poses: {seating:.3g} µm in each coordinate.",
         "robust": "Each pose's own residual is taken as its error (robust covariance).",

@@ -19,7 +19,7 @@ from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.tried_poses import tried_poses
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
-from .model_errors import summary_of_tests
+from .model_errors import noisy_encoder_rows, summary_of_tests
 from .observations import capture_observations, observed_summary
 from .validation import cross_validation_summary
 from .verdicts import calibration_verdict
@@ -246,6 +246,7 @@ def uncertainty_summary(
         "encoder_arcsec": np.asarray(record.noise.encoder_arcsec).tolist(),
         "linear_encoder_mm": linear_encoder_mm(record.noise, record.calibrated.arm),
         "seating_mm": float(record.noise.seating),
+        "noisy_encoders": noisy_encoder_rows(record.noisy_encoders, record.calibrated.arm.prismatic),
         "misfit": record.reduced_chi,
         "coverage_factor_95": uncertainty.factor(0.95),
         "volume": volume.summary,
