@@ -1,7 +1,9 @@
 """The record of a calibration: everything that a file keeps of it, in plain arrays; and its uncertainty."""
 
+from collections import deque
 from collections.abc import Mapping
 from typing import NamedTuple
+from weakref import ref
 
 import jax
 import numpy as np
@@ -110,7 +112,7 @@ class CalibrationRecord(NamedTuple):
         """
         if self.method != "two-stage" or len(self.recording.capture.lengths) != 1 or self.scale_set_by:
             return False
-        left = np.asarray(evaluate(self.calibrated.arm, self.recording.capture).error)
+        left = np.asarray(_evaluated(self.calibrated.arm, self.recording.capture).error)
         return bool(np.abs(left[0]) <= LARGEST_LOG_K * float(self.recording.capture.lengths[0].value))
 
     @property
@@ -123,7 +125,7 @@ class CalibrationRecord(NamedTuple):
             poses = [len(weights) for weights in self.observed.weights]
             rms = float(np.sqrt(np.average(np.asarray(self.observed.rms_after) ** 2, weights=poses)))
         else:
-            rms = float(evaluate(arm, capture).repeatability.rms)
+            rms = float(_evaluated(arm, capture).repeatability.rms)
         return rms > largest_plausible_residual(arm, self.given_noise)
 
     def vectors(self) -> dict[str, np.ndarray]:
@@ -137,7 +139,21 @@ class CalibrationRecord(NamedTuple):
     def evaluations(self) -> dict[str, Evaluation]:
         """The three arms on the capture that was identified from."""
         arms = {"nominal": self.recording.nominal.arm, "stage1": self.stage1.arm, "calibrated": self.calibrated.arm}
-        return {stage: evaluate(arm, self.recording.capture) for stage, arm in arms.items()}
+        return {stage: _evaluated(arm, self.recording.capture) for stage, arm in arms.items()}
+
+
+# Summary, tables and warnings of one record ask for the same three.
+_last_evaluations: deque[tuple[ref[Arm], ref[Capture], Evaluation]] = deque(maxlen=3)
+
+
+def _evaluated(arm: Arm, capture: Capture) -> Evaluation:
+    """`evaluate`, or what it has just returned for this arm and this capture."""
+    for one, other, evaluation in tuple(_last_evaluations):
+        if one() is arm and other() is capture:
+            return evaluation
+    evaluation = evaluate(arm, capture)
+    _last_evaluations.append((ref(arm), ref(capture), evaluation))
+    return evaluation
 
 
 @checked_arguments
