@@ -55,6 +55,7 @@ def test_every_published_number_has_its_row(rows):
         assert any(row.startswith(name) for row in what), name
 
 
+@pytest.mark.slow
 def test_the_quick_part_passes_its_check(rows, checks):
     """What `make reproduce` does with all rows; and it fails where a stored value is another one."""
     import table2

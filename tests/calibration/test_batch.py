@@ -31,7 +31,7 @@ def starts(box):
     return lower + (upper - lower) * np.random.default_rng(3).uniform(size=(BATCH, 21))
 
 
-@pytest.mark.parametrize("hold", ["d_3", None])
+@pytest.mark.parametrize("hold", ["d_3", pytest.param(None, marks=pytest.mark.slow)])
 def test_equals_single_identifications(paper_arm, noisy_capture, box, starts, hold):
     many = aj.identify_many(paper_arm, noisy_capture, *box, starts, hold=hold)
     assert np.all(many.converged)

@@ -136,6 +136,16 @@ def test_metrics_by_hand():
     np.testing.assert_allclose(figures.centroids, [[1, 2, 0], [7, 7, 7]])
 
 
+def test_a_record_evaluates_each_of_its_arms_once(paper_arm, noisy_capture, bounds):
+    nominal = aj.kinematics.ArmSpecification(paper_arm, "test")
+    result = aj.calibrate(paper_arm, noisy_capture, bounds)
+    record = aj.calibration.record_of(result, aj.Recording(noisy_capture, nominal))
+    first, again = record.evaluations(), record.evaluations()
+    assert all(again[stage] is evaluation for stage, evaluation in first.items())
+    other = record._replace(calibrated=nominal._replace(arm=paper_arm.replace(a_2=70.0))).evaluations()
+    assert float(other["calibrated"].repeatability.rms) > 10 * float(first["calibrated"].repeatability.rms)
+
+
 @pytest.mark.slow  # tests/core/test_numpy_or_jax.py compares whole calibrations
 def test_identify_under_vmap_equals_single_runs(paper_arm, noisy_capture, bounds, space):
     starts = jnp.stack([space.vector() + shift * space.scale for shift in (-2.0, 0.5, 3.0)])
@@ -158,7 +168,7 @@ def central(function, point, direction, step=2e-3):
     return sum(w * (at(n) - at(-n)) for n, w in ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))) / step
 
 
-@pytest.fixture(scope="module", params=["identify", pytest.param("calibrate", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["identify", pytest.param("calibrate", marks=pytest.mark.exhaustive)])
 def differentiated(request, paper_arm, noisy_capture, space):
     """Both stages, or the first, as a function of angles, bounds, length and start; and its derivatives."""
     solve = {"identify": aj.identify, "calibrate": aj.calibrate}[request.param]

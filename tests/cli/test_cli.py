@@ -161,7 +161,7 @@ def test_a_process_of_its_own(aacmm_process, cache, tmp_path, monkeypatch):
         ("show panda", "| true", "utf-8", 141, ""),
         pytest.param("show panda --json", "| true", "utf-8", 141, "", marks=pytest.mark.slow),
         ("show panda", "> /dev/full", "utf-8", 1, "Error: standard output cannot be written: no space left"),
-        ("show named.toml", "> out.txt", "ascii", 0, ""),
+        pytest.param("show named.toml", "> out.txt", "ascii", 0, "", marks=pytest.mark.slow),
     ],
 )
 def test_standard_output(tmp_path, arguments, redirection, encoding, code, error):
@@ -342,7 +342,7 @@ def test_a_command_imports_and_compiles_no_more_than_it_needs(panda_files, tmp_p
     [
         (lambda q: q * [1, 1, -1, 1, 1, 1], "joint 3 read with the wrong sign."),
         (lambda q: q[:, [0, 2, 1, 3, 4, 5]], "the columns of joints 2 and 3 are exchanged."),
-        (lambda q: q / 0.9, "readings in gon are taken for degrees."),
+        pytest.param(lambda q: q / 0.9, "readings in gon are taken for degrees.", marks=pytest.mark.slow),
     ],
     ids=["sign", "order", "gon"],
 )

@@ -101,6 +101,7 @@ def test_a_tracker_and_a_sphere(aacmm, folder, tmp_path):
     assert parts["radius of ball"]["certified_u"] == [0.0005]
 
 
+@pytest.mark.slow
 def test_names_of_points_are_shown_as_they_are(aacmm, folder, observed_record):
     """Brackets are markup for the terminal's library."""
     from aacmm_jax.cli import calibration_display

@@ -73,6 +73,7 @@ def test_a_batch_of_calibrations_calls_no_lapack(method):
     assert "lapack" not in program.lower(starts).as_text()
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_solve_and_the_factorisations_call_no_lapack():
     def optimum(target):
         return aj.least_squares(

@@ -27,7 +27,7 @@ def same(one: aj.Arm, other: aj.Arm) -> bool:
     return jax.tree.structure(one) == jax.tree.structure(other) and all(map(np.array_equal, *leaves))
 
 
-@pytest.mark.parametrize("masses", [{}, MASSES])
+@pytest.mark.parametrize("masses", [pytest.param({}, marks=pytest.mark.slow), MASSES])
 def test_files_bring_the_same_arm_back(masses, tmp_path):
     arm = corrected(**masses)
     save_arm(arm, tmp_path / "arm.toml")

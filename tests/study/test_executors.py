@@ -112,7 +112,9 @@ def test_dask_workers_find_what_others_have_compiled(home, study, tmp_path):
     assert kept[0] == kept[1]
 
 
-@pytest.mark.parametrize("where", [(), ("--dask", "local")], ids=["threads", "processes"])
+@pytest.mark.parametrize(
+    "where", [(), pytest.param(("--dask", "local"), marks=pytest.mark.slow)], ids=["threads", "processes"]
+)
 def test_an_interrupt_is_answered_while_programs_compile(home, tmp_path, prepared, where):
     """First blocks that would take an hour, as a compilation that Python cannot interrupt; Ctrl-C reaches all."""
     path = tmp_path / "s.h5"
@@ -166,7 +168,7 @@ def test_an_interrupt_is_answered_in_the_middle_of_xla(home, tmp_path):
     assert "Stopped; 0 of 96 trials are kept" in errors
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_any_executor(home, study, tmp_path):
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         assert aj.study.run_study(study, tmp_path / "s.h5", executor=pool, chunk=CHUNK).finished

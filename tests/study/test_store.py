@@ -158,6 +158,7 @@ def test_results_without_their_parts_are_missed(home, study, tmp_path):
         aj.study.open_study(tmp_path / "none.h5")
 
 
+@pytest.mark.slow
 def test_blocks_of_a_study_whose_file_is_gone_are_not_taken_for_anothers(home, study, tmp_path):
     path = tmp_path / "s.h5"
     other = aj.study.Study(study.specification.model_copy(update={"seed": 6}), study.nominal)

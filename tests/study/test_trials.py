@@ -185,6 +185,7 @@ def test_starts_at_random_fill_the_box():
     assert np.delete(np.ptp(held.start, axis=0), d_3).min() > 0
 
 
+@pytest.mark.slow
 def test_a_recording_gives_its_poses(noisy_capture):
     study = made(arm=aj.load_arm("cheng2018-simulation"), capture=noisy_capture, reference=None)
     trials = drawn(study, 20)
@@ -274,6 +275,7 @@ def test_trials_are_drawn_one_by_one():
         aj.study.draw_trials(study, -1, [0])
 
 
+@pytest.mark.slow
 def test_pools_are_the_same_in_every_study_of_a_seed(pools_built_once, monkeypatch):
     monkeypatch.setattr(configuration_pool, "_fixture_table", pools_built_once)
     one_socket = {"capture": CAPTURE | {"positions_mm": [[400, 200, 300]]}, "reference": None}
