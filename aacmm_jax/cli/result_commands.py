@@ -157,7 +157,11 @@ def evaluate(
 @app.command(epilog=examples("aacmm report calibration.h5 -o report.html"))
 def report(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE.h5", help="Calibration, evaluation (aacmm evaluate -o) or study.")
+        Path,
+        typer.Argument(
+            metavar="FILE.h5",
+            help="Calibration, evaluation (evaluate -o), study or compared models (compare-models -o).",
+        ),
     ],
     output: Annotated[
         Path,
@@ -272,8 +276,8 @@ def show(
         str,
         typer.Argument(
             metavar="FILE",
-            help="Capture, calibration, evaluation or study (HDF5), or an arm: a TOML file, a URDF, a kinematics.yaml "
-            "or a shipped name.",
+            help="Capture, calibration, evaluation, study or compared models (HDF5), or an arm: a TOML file, a URDF, a "
+            "kinematics.yaml or a shipped name.",
         ),
     ],
     cell: Annotated[int | None, typer.Option(min=1, metavar="N", help="Of a study: show this cell in full.")] = None,
@@ -291,7 +295,7 @@ def show(
         return
     if base is not None or tip is not None:
         raise InputError(f"--base and --tip are links of a URDF, and {file} is none; leave them out.")
-    attributes, summary = read_summary(path, ("capture", "calibration", "evaluation", "study"))
+    attributes, summary = read_summary(path, ("capture", "calibration", "evaluation", "study", "model comparison"))
     kind = attributes["kind"]
     if kind == "study":
         from .study_commands import show_study
@@ -301,6 +305,7 @@ def show(
     if cell is not None or figures is not None:
         raise InputError(f"{file} holds a {kind}; --cell and --figures are for studies.")
     from . import acceptance_display, calibration_display
+    from .models_command import display as display_models
 
     if kind == "evaluation" and attributes.get("of") == "points":
         kind = "points"
@@ -309,6 +314,7 @@ def show(
         "calibration": calibration_display.calibration,
         "evaluation": acceptance_display.evaluation,
         "points": acceptance_display.points,
+        "model comparison": display_models,
     }[kind]
     if summary is None:
         summary = _summary_of(path, kind)
@@ -335,6 +341,7 @@ def _summary_of(file: Path, kind: str) -> dict[str, Any]:
     """The summary of a file that holds none: one written through Python, or by another version."""
     from ..files.calibrations import load_calibration
     from ..files.captures import load_capture
+    from ..files.compared_models import load_compared_models
     from ..files.evaluations import load_evaluation, load_points
     from ..summaries.calibration import calibration_summary, capture_summary
     from ..summaries.evaluation import evaluation_summary, points_summary
@@ -344,5 +351,6 @@ def _summary_of(file: Path, kind: str) -> dict[str, Any]:
         "calibration": (load_calibration, calibration_summary),
         "evaluation": (load_evaluation, evaluation_summary),
         "points": (load_points, points_summary),
+        "model comparison": (load_compared_models, dict),
     }[kind]
     return summarise(load(file))

@@ -17,17 +17,17 @@ from .administrative_data import administrative_groups
 from .chart_svg import drawn, key, points, shade_key
 from .elements import ArmView, Chart, Report, ReportTable
 
-KINDS = ("calibration", "evaluation", "study")
+KINDS = ("calibration", "evaluation", "study", "model comparison")
 _FOLDER = Path(__file__).parent
 
 
 def write_report(
     source: str | os.PathLike, target: str | os.PathLike, administrative_data: AdministrativeData | None = None
 ) -> dict[str, Any]:
-    """Write the report of a calibration, an evaluation or a study as one HTML file.
+    """Write the report of a calibration, an evaluation, a study or compared models as one HTML file.
 
     Args:
-        source: The HDF5 file of the calibration, the evaluation or the study.
+        source: The HDF5 file of the calibration, the evaluation, the study or the compared models.
         target: The HTML file to write, whole or not at all.
         administrative_data: Laboratory, customer, item, persons, dates and artefacts, shown in a section of their own.
 
@@ -92,6 +92,13 @@ def _evaluation(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[
     return report, record.recording.true is not None, overall_decision(summary)
 
 
+def _models(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+    from ..files.compared_models import load_compared_models
+    from .models import models_report
+
+    return models_report(load_compared_models(source)), False, None
+
+
 def _study(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
     from ..study.results import Results
     from .study import study_report
@@ -104,6 +111,7 @@ _REPORTS: dict[str, Callable[[str | os.PathLike, dict[str, Any]], tuple[Report, 
     "calibration": _calibration,
     "evaluation": _evaluation,
     "study": _study,
+    "model comparison": _models,
 }
 
 
