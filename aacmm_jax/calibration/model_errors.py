@@ -133,7 +133,7 @@ def model_tests(
 
 
 def _tests(record: CalibrationRecord, class_noise: Noise | None) -> ModelTests:
-    rows, relations = _equations(record)
+    rows, relations = limited_equations(record)
     if not rows:
         return ModelTests()
     left = Residuals.of([*(each.block("") for each in rows), *relations])
@@ -143,7 +143,7 @@ def _tests(record: CalibrationRecord, class_noise: Noise | None) -> ModelTests:
     if _rms(rows) < _EXACT:
         return ModelTests(lengths=lengths)
     terms, explained = _terms(record, rows, left)
-    if _weighted(record):  # a robust loss makes residuals smaller, and less scattered, than the noise
+    if weighted_by_loss(record):  # a robust loss makes residuals smaller, and less scattered, than the noise
         return ModelTests(lengths=lengths, terms=terms)
     return ModelTests(
         misfit=_misfit(record, left, class_noise),
@@ -156,12 +156,12 @@ def _tests(record: CalibrationRecord, class_noise: Noise | None) -> ModelTests:
     )
 
 
-def _weighted(record: CalibrationRecord) -> bool:
+def weighted_by_loss(record: CalibrationRecord) -> bool:
     observed = record.observed
     return observed is not None and any(bool(np.any(np.asarray(weights) < 1)) for weights in observed.weights)
 
 
-def _equations(record: CalibrationRecord) -> tuple[list[Rows], list[Block]]:
+def limited_equations(record: CalibrationRecord) -> tuple[list[Rows], list[Block]]:
     """The equations of poses in chunks, or of very many an even choice of these, and those of relations.
 
     Unknowns of an observation that is divided become shared ones.
@@ -201,7 +201,7 @@ def _misfit(record: CalibrationRecord, left: Residuals, class_noise: Noise | Non
         return Misfit(float(np.sqrt(left.cost / spare)), spare, min(2 * min(upper, 1 - upper), 1.0), False)
     if class_noise is None:
         return None
-    rows, relations = _equations(record._replace(noise=class_noise))
+    rows, relations = limited_equations(record._replace(noise=class_noise))
     left = Residuals.of([*(each.block("") for each in rows), *relations])
     spare, ratio = left.degrees_of_freedom, left.cost / left.degrees_of_freedom
     return Misfit(float(np.sqrt(ratio)), spare, f_tail(ratio, spare, CLASS_DEGREES_OF_FREEDOM), True)
@@ -217,7 +217,7 @@ def _noisy_observations(
     tests = []
     for name in names:
         columns = [np.eye(each.residual.size) if each.name == name else None for each in rows]
-        tests.append((form_test(left, _form(left, columns), record.given_noise is None), name))
+        tests.append((form_test(left, form_of_poses(left, columns), record.given_noise is None), name))
     found, tests = [], sorted(tests, key=lambda pair: pair[0].probability)
     for number, (test, name) in enumerate(tests):
         probability = min(test.probability * (len(tests) - number), 1.0)
@@ -227,7 +227,7 @@ def _noisy_observations(
     return tuple(found)
 
 
-def _form(
+def form_of_poses(
     left: Residuals, columns: Sequence[np.ndarray | None], kernel: Sequence[np.ndarray | None] | None = None
 ) -> Form:
     """A form of the rows of poses; relations, which come last, have no part in it."""
@@ -288,8 +288,8 @@ def _noisy_joint(joints: int, rows: Sequence[Rows], left: Residuals) -> NoisyJoi
     """The joint in whose direction residuals are larger than in those of the others (a score test of its variance)."""
     tests = []
     for joint in range(joints):
-        columns = [_block_diagonal(each.extra[..., joint, None]) for each in rows]
-        tests.append((form_test(left, _form(left, columns), relative=True), joint + 1))
+        columns = [block_diagonal(each.extra[..., joint, None]) for each in rows]
+        tests.append((form_test(left, form_of_poses(left, columns), relative=True), joint + 1))
     known = [(test, joint) for test, joint in tests if np.isfinite(test.ratio)]
     if not known:
         return None
@@ -297,7 +297,7 @@ def _noisy_joint(joints: int, rows: Sequence[Rows], left: Residuals) -> NoisyJoi
     return NoisyJoint(joint, test, min(test.probability * len(known), 1.0))
 
 
-def _block_diagonal(columns: Float[np.ndarray, "m r c"]) -> Float[np.ndarray, "R C"]:
+def block_diagonal(columns: Float[np.ndarray, "m r c"]) -> Float[np.ndarray, "R C"]:
     """Columns of single poses, 0 in the rows of all others."""
     poses, size, width = columns.shape
     found = np.zeros((poses, size, poses, width))
@@ -307,11 +307,11 @@ def _block_diagonal(columns: Float[np.ndarray, "m r c"]) -> Float[np.ndarray, "R
 
 def _successive(rows: Sequence[Rows], left: Residuals) -> Successive | None:
     """Errors of the tip that successive poses of one observation share (a score test of their covariance)."""
-    columns = [_block_diagonal(each.by_tip) for each in rows]
+    columns = [block_diagonal(each.by_tip) for each in rows]
     kernel = [np.kron(np.eye(len(each.poses), k=1) + np.eye(len(each.poses), k=-1), np.eye(3)) / 2 for each in rows]
     if not any(np.any(matrix) for matrix in kernel):
         return None
-    test = form_test(left, _form(left, columns, kernel), relative=True)
+    test = form_test(left, form_of_poses(left, columns, kernel), relative=True)
     product = total = 0.0
     for each, of in zip(rows, left.slices, strict=False):
         tips = np.einsum("mrc,mr->mc", each.by_tip, left.values[of].reshape(each.residual.shape))

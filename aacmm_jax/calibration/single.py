@@ -32,6 +32,8 @@ from .observed import calibrate_observed, identify_observed
 from .observed_state import ObservedTask, observed_task
 from .results import Calibration, Identification
 from .scale_anchor import default_method, scale_anchor, scale_from_slides, scale_set_by_clause
+from .sensitivities import sensitivities_of_observations, sensitivities_of_sockets
+from .shared_errors import with_shared_errors
 from .second_stage import adjust_anchor, clip_to_bounds, divide_by_k, must_adjust_anchor
 from .task import Task, fit_repeatability
 
@@ -136,6 +138,7 @@ def calibrate(
     noise_model: NoiseModel | None = None,
     robust: LossName | None = None,
     prior: Prior | None = None,
+    shared_errors: bool = True,
     check_identifiability: bool = True,
     strict: bool = False,
     max_steps: int = _MAX_STEPS,
@@ -165,6 +168,8 @@ def calibrate(
         noise_model: another model of the tips' errors.
         robust: a robust loss, as for `identify`.
         prior: what is known of the parameters, as for `identify`.
+        shared_errors: look for errors that poses share (of visits and places, and by functions of the readings that
+            the model lacks) and add what they do to the covariance, with known values (`SharedErrors`).
         check_identifiability: warn where free parameters are not determined by these data; the check takes about as
             long as the calibration.
         strict: raise instead of warn where free parameters are not determined by these data.
@@ -197,7 +202,11 @@ def calibrate(
         task = observed_task(arm, capture, bounds, start, noise, None, noise_model, max_steps, robust, prior)
         if check_identifiability or strict:
             _check_identifiable(capture, task, strict)
-        return to_jax(calibrate_observed(to_numpy(task)))
+        task = to_numpy(task)
+        result = calibrate_observed(task)
+        if shared_errors:
+            result = with_shared_errors(result, capture, lambda: sensitivities_of_observations(task, result))
+        return to_jax(result)
     task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
     if hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
         raise InputError(
@@ -207,15 +216,23 @@ def calibrate(
     if check_identifiability or strict:
         _check_identifiable(capture, task, strict)
     _check_scale(task, method)
-    task = to_numpy(task)
+    result, propagated = _solve(to_numpy(task), method)
+    if shared_errors and propagated is not None:
+        q = task.measurement.q
+        result = with_shared_errors(result, capture, lambda: sensitivities_of_sockets(result, q, propagated))
+    return to_jax(result)
+
+
+def _solve(task: Task, method: str) -> tuple[Calibration, propagation.Propagated | None]:
+    """The calibration, and how its covariance was propagated, as far as its values are known."""
     if method == "joint":
-        return to_jax(_calibrate_jointly(task))
-    result, adjust = _calibrate_by_division(task)
+        return _calibrate_jointly(task)
+    result, propagated, adjust = _calibrate_by_division(task)
     if not task.anchor.can_scale or (is_concrete(adjust) and not bool(adjust)):
-        return to_jax(result)
+        return result, propagated
     if is_concrete(adjust):
-        return to_jax(_calibrate_by_adjustment(task, result))
-    return jax.lax.cond(adjust, lambda: _calibrate_by_adjustment(task, result), lambda: result)
+        return _calibrate_by_adjustment(task, result)
+    return jax.lax.cond(adjust, lambda: _calibrate_by_adjustment(task, result)[0], lambda: result), None
 
 
 def _check_identifiable(capture: Capture, task: Task | ObservedTask, strict: bool) -> None:
@@ -340,7 +357,7 @@ def _make_calibration(
 
 
 @compiled(jit=eqx.filter_jit)
-def _calibrate_by_division(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]:
+def _calibrate_by_division(task: Task) -> tuple[Calibration, propagation.Propagated, Bool[AnyArray, ""]]:
     """Stage 1 and the division by k; and whether the anchor must be adjusted instead."""
     xp = namespace(task)
     stage1, propagated = _solve_stage1(task)
@@ -348,24 +365,23 @@ def _calibrate_by_division(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]
     space, bounds, anchor = task.space, task.bounds, task.anchor
     scaled = divide_by_k(anchor, space, stage1.parameters, stage1.scale.value)
     adjust = must_adjust_anchor(anchor, bounds, stage1.active, scaled)
-    parameter_covariance = propagated.parameter_covariance
     if anchor.can_scale:
         scaled = clip_to_bounds(space, bounds.lower, bounds.upper, scaled)
         measurement = task.measurement.weighted(space.arm(task.start).geometry, task.noise)
-        parameter_covariance = scale_uncertainty.propagate_division(
+        propagated = scale_uncertainty.propagate_division(
             propagated, stage1.arm, space, measurement, stage1.after.sigma, scaled, anchor.partners
-        ).parameter_covariance
+        )
     # Divided, a length may have left its bound, which stage 1's covariance takes as exact all the same.
     active = bounds.active(scaled)
     exact = xp.where(active != 0, active, stage1.active)
     divided = Fit(scaled, xp.zeros_like(stage1.steps), stage1.result, stage1.optimality)
-    return _make_calibration(
-        task, stage1, "two-stage", divided, parameter_covariance, stage1.after.sigma, exact
-    ), adjust
+    covariance = propagated.parameter_covariance
+    calibration = _make_calibration(task, stage1, "two-stage", divided, covariance, stage1.after.sigma, exact)
+    return calibration, propagated, adjust
 
 
 @compiled(jit=eqx.filter_jit)
-def _calibrate_by_adjustment(task: Task, by_division: Calibration) -> Calibration:
+def _calibrate_by_adjustment(task: Task, by_division: Calibration) -> tuple[Calibration, propagation.Propagated]:
     """Stage 2 where the division leaves the box, or would need a fixed length to move."""
     xp = namespace(task, by_division)
     stage1, space, name = by_division.stage1, task.space, task.anchor.adjusted
@@ -379,14 +395,13 @@ def _calibrate_by_adjustment(task: Task, by_division: Calibration) -> Calibratio
     solved = propagation.propagate_solve(
         arm, space, measurement, (active != 0) | is_anchor, sigma, task.noise_model, task.noise
     )
-    parameter_covariance = scale_uncertainty.propagate_adjustment(
-        solved, arm, space, measurement, sigma, name, xp.any((active != 0) & is_anchor)
-    ).parameter_covariance
-    return _make_calibration(task, stage1, "two-stage", adjusted, parameter_covariance, sigma)
+    fixed = xp.any((active != 0) & is_anchor)
+    found = scale_uncertainty.propagate_adjustment(solved, arm, space, measurement, sigma, name, fixed)
+    return _make_calibration(task, stage1, "two-stage", adjusted, found.parameter_covariance, sigma), found
 
 
 @compiled(jit=eqx.filter_jit)
-def _calibrate_jointly(task: Task) -> Calibration:
+def _calibrate_jointly(task: Task) -> tuple[Calibration, propagation.Propagated]:
     """One weighted least squares of poses and lengths, from the arm of stage 1 divided by k."""
     stage1, _ = _solve_stage1(task)
     assert stage1.scale is not None
@@ -400,7 +415,7 @@ def _calibrate_jointly(task: Task) -> Calibration:
     bounds = task.bounds.lower, task.bounds.upper
     found = fit(joint_residual, joint_normal_equations, parameters, args, bounds, space.scale, task.max_steps)
     active = task.bounds.active(found.parameters)
-    parameter_covariance = propagation.propagate_solve(
+    solved = propagation.propagate_solve(
         space.arm(found.parameters), space, measurement, active != 0, sigma, task.noise_model, task.noise, joint_weights
-    ).parameter_covariance
-    return _make_calibration(task, stage1, "joint", found, parameter_covariance, stage1.after.sigma)
+    )
+    return _make_calibration(task, stage1, "joint", found, solved.parameter_covariance, stage1.after.sigma), solved
