@@ -20,6 +20,8 @@ import numpy as np
 from model_warnings import PAPER, Errors, Trials, bending, eccentric, geared
 
 import aacmm_jax as aj
+from aacmm_jax.data.drawing import draw_poses
+from aacmm_jax.kinematics.arm import correction_names
 from aacmm_jax.kinematics.prior_scales import default_prior
 from aacmm_jax.uncertainty.volume import sample_lengths
 
@@ -100,6 +102,87 @@ def simulated(scenario: Mapping[str, Any], number: int) -> dict[str, Any]:
             }
         found[f"found, noise {'given' if given else 'estimated'}"] = {k: round(v, 2) for k, v in kinds.items()}
         found["cpu_s"] = round(found.get("cpu_s", 0) + time.process_time() - begun, 1)
+    return found
+
+
+def with_model(specification: Any, model: str) -> tuple[aj.Arm, aj.Bounds]:
+    """The arm with a model of its joints, and bounds of its Denavit-Hartenberg parameters only."""
+    bounds = specification.bounds()
+    arm = aj.kinematics.with_corrections(bounds.space.base, model)
+    added = tuple(name for name in correction_names(arm) if not name.startswith("gravity_"))
+    space, endless = aj.Parameters(arm, (*bounds.space.names, *added)), np.full(len(added), np.inf)
+    return arm, aj.Bounds(space, np.r_[bounds.lower, -endless], np.r_[bounds.upper, endless])
+
+
+def mukca() -> dict[str, Any]:
+    """Tips and lengths of placements that were left out, of three sets and of all five."""
+    found: dict[str, Any] = {}
+    sets = ("capture", "panda_3", "panda_3_bis", "panda_6", "kuka_14")
+    for model in ("dh", "gravity", "gravity,harmonics=1"):
+        for shared in (True, False):
+            normalised: dict[str, np.ndarray] = {}
+            for name in sets:
+                begun = time.process_time()
+                recording = aj.files.read_manifest(EXAMPLES / "mukca" / f"{name}.toml")
+                arm, bounds = with_model(recording.nominal, model)
+                crossed = aj.cross_validate(
+                    arm, recording.capture, bounds, method="joint", prior=default_prior(arm), shared_errors=shared
+                )
+                error = np.concatenate([group.length_error for group in crossed.groups])
+                u = np.concatenate([group.length_u for group in crossed.groups])
+                normalised[name] = np.array([error, u])
+                found[f"{model}, {name}, {'shared' if shared else 'plain'}"] = row = {
+                    "tips_mm": round(crossed.rms, 4),
+                    "tips_predicted_mm": round(crossed.rms_predicted, 4),
+                    "lengths_mm": round(crossed.length_rms, 4),
+                    "lengths_mean_mm": round(float(np.mean(np.abs(error))), 4),
+                    "lengths_predicted_mm": round(crossed.length_u, 4),
+                    "inside": f"{int(np.sum(np.abs(error) <= 1.96 * u))} of {len(u)}",
+                    "cpu_s": round(time.process_time() - begun, 1),
+                }
+                print(model, name, "shared" if shared else "plain", row, flush=True)
+            for part in (sets[:3], sets):
+                error, u = np.concatenate([normalised[name] for name in part], axis=1)
+                row = {
+                    "found_over_predicted": round(float(np.sqrt(np.mean(error**2) / np.mean(u**2))), 3),
+                    "normalised": round(float(np.sqrt(np.mean((error / u) ** 2))), 3),
+                    "inside": f"{int(np.sum(np.abs(error) <= 1.96 * u))} of {len(u)}",
+                }
+                found[f"{model}, {len(part)} sets, {'shared' if shared else 'plain'}"] = row
+                print(model, len(part), "sets", "shared" if shared else "plain", row, flush=True)
+    return found
+
+
+def ur10() -> dict[str, Any]:
+    """Series A predicted from 500 poses of C."""
+    found: dict[str, Any] = {}
+    series = [aj.files.read_manifest(EXAMPLES / "ipa_ur10" / f"{name}.toml") for name in ("positions", "series_a")]
+    for model in ("dh", "gravity", "gravity,functions"):
+        for seed in range(3):
+            begun = time.process_time()
+            part, _ = draw_poses(series[0].capture, 500, seed)
+            arm, bounds = with_model(series[0].nominal, model)
+            for shared in (True, False):
+                result = aj.calibrate(
+                    arm,
+                    part,
+                    bounds,
+                    method="joint",
+                    prior=default_prior(arm),
+                    shared_errors=shared,
+                    check_identifiability=False,
+                )
+                unseen = aj.calibration.unseen_errors(aj.uncertainty_of(result), series[1].capture)
+                every = unseen.of(unseen.parts)
+                row = {
+                    "found_mm": round(every.rms, 4),
+                    "predicted_mm": round(every.predicted, 4),
+                    "ratio": round((every.rms / every.predicted) ** 2, 3),
+                    "kinds": {} if result.shared is None else dict(zip(result.shared.kinds, np.round(result.shared.sd, 6).tolist(), strict=True)),
+                    "cpu_s": round(time.process_time() - begun, 1),
+                }
+                found[f"{model}, seed {seed}, {'shared' if shared else 'plain'}"] = row
+                print(model, seed, "shared" if shared else "plain", row, flush=True)
     return found
 
 

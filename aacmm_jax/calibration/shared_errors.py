@@ -32,6 +32,7 @@ from ..uncertainty.shared_errors import (
     SUCCESSIVE,
     VISITS,
     Effects,
+    LearnedGroups,
     SharedErrors,
     group_variances,
     one_variance,
@@ -166,12 +167,14 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
             visits = tips
         else:
             # Lengths that contradict each other would be explained by whatever moves them.
-            ratio = group_variances(without, functions.columns, functions.members)
-            effects = effects.joined(problem.turned(*functions.turned), ratio @ functions.members)
-            missing = functions._replace(ratio=ratio)
+            learned = group_variances(without, functions.columns, functions.members)
+            values, vectors = np.linalg.eigh(learned.moments)
+            columns = problem.turned(*functions.turned) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+            effects = effects.joined(columns, np.full(len(values), 1 / effects.variance))
+            missing = functions._replace(learned=learned)
     places = _places(problem, effects)
     variance = effects.variance
-    if not (visits.ratio or places.ratio or len(missing.ratio)):
+    if not (visits.ratio or places.ratio or missing.learned):
         return None
     length = np.nan
     for effect in (visits, places):
@@ -182,20 +185,20 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
             units.append("mm")
             sds.append(np.sqrt(effect.ratio * variance))
             length = effect.length if effect is visits else length
-    sd = np.zeros(0)
-    if len(missing.ratio):
-        sd = np.sqrt((missing.ratio * variance) @ missing.members) * missing.steps
-        added = added + (missing.follow * sd**2) @ missing.follow.T
+    moments = np.zeros((0, 0))
+    if missing.learned is not None:
+        moments = missing.learned.moments * missing.steps[:, None] * missing.steps
+        added = added + missing.follow @ moments @ missing.follow.T
         kinds += missing.kinds
         units += missing.units
         firsts = [int(np.flatnonzero(own)[0]) for own in missing.members]
-        sds += [sd[i] for i in firsts]
+        sds += list(missing.learned.sd * missing.steps[firsts])
     shared = SharedErrors(
         kinds=tuple(kinds),
         units=tuple(units),
         names=missing.names,
         sd=np.array(sds),
-        coefficient_sd=sd,
+        moments=moments,
         follow=missing.follow,
         correlation_length=np.asarray(length),
     )
@@ -306,14 +309,14 @@ class _Functions(NamedTuple):
     turned: tuple[Float[np.ndarray, "M k"], np.ndarray, Float[np.ndarray, " k"]]  # what `_Problem.turned` takes
     columns: Float[np.ndarray, "R k"]
     follow: Float[np.ndarray, "p k"]
-    ratio: Float[np.ndarray, " g"]
+    learned: LearnedGroups | None = None
 
     @classmethod
     def none(cls, parameters: int) -> "_Functions":
         """No function."""
         empty, none = np.zeros(0), np.zeros((0, 0))
         turned = none, np.zeros(0, dtype=int), empty
-        return cls(1.0, (), [], [], none, empty, turned, none, np.zeros((parameters, 0)), empty)
+        return cls(1.0, (), [], [], none, empty, turned, none, np.zeros((parameters, 0)))
 
 
 def _functions(problem: _Problem) -> _Functions:

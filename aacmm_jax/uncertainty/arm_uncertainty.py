@@ -46,10 +46,9 @@ class Uncertainty(eqx.Module):
         if shared is None or not shared.names:
             return self
         xp, k = namespace(self), len(shared.names)
-        variances = xp.asarray(shared.coefficient_sd) ** 2
-        crossed = shared.follow * variances[None, :]
+        crossed = shared.follow @ shared.moments
         above = xp.concatenate([self.covariance, crossed], axis=1)
-        below = xp.concatenate([crossed.T, xp.diag(variances)], axis=1)
+        below = xp.concatenate([crossed.T, shared.moments], axis=1)
         return Uncertainty(
             arm=with_further_corrections(self.arm, shared.names),
             covariance=xp.concatenate([above, below]),

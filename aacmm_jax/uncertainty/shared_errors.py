@@ -40,7 +40,7 @@ class SharedErrors(eqx.Module):
     units: tuple[str, ...] = eqx.field(static=True)  # of each standard deviation
     names: tuple[str, ...] = eqx.field(static=True)  # coefficients of the functions, as of `kinematics.corrections`
     sd: Float[AnyArray, " g"]  # of each kind
-    coefficient_sd: Float[AnyArray, " k"]  # of each coefficient, 0 on average; rad or its unit
+    moments: Float[AnyArray, "k k"]  # second moments of the coefficients about 0, which the calibrated arm has
     follow: Float[AnyArray, "p k"]  # derivatives of the parameters by the coefficients, mm and rad
     correlation_length: Float[AnyArray, ""]  # of successive poses, where visits are not marked; NaN otherwise
 
@@ -49,7 +49,7 @@ class SharedErrors(eqx.Module):
         own = [i for i, kind in enumerate(self.kinds) if kind in (PLACES, VISITS, SUCCESSIVE)]
         none = np.zeros(0)
         kinds, units = tuple(self.kinds[i] for i in own), tuple(self.units[i] for i in own)
-        return SharedErrors(kinds, units, (), self.sd[np.array(own, dtype=int)], none, self.follow[:, :0], self.correlation_length)
+        return SharedErrors(kinds, units, (), self.sd[np.array(own, dtype=int)], none[:, None], self.follow[:, :0], self.correlation_length)
 
     def sd_of(self, *kinds: str) -> Float[AnyArray, ""] | float:
         """Standard deviation of a tip coordinate by effects of some kinds, mm; 0 without."""
@@ -136,9 +136,16 @@ def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], low: float
     return OneVariance(mean / float(variance[at]), float(likelihood[at]))
 
 
+class LearnedGroups(NamedTuple):
+    """Groups of coefficients with one standard deviation each, natural steps."""
+
+    sd: Float[np.ndarray, " g"]
+    moments: Float[np.ndarray, "k k"]  # second moments of the coefficients about 0, given the residuals
+
+
 def group_variances(
     effects: Effects, columns: Float[np.ndarray, "R k"], members: Float[np.ndarray, "g k"]
-) -> Float[np.ndarray, " g"]:
+) -> "LearnedGroups":
     """Variances of groups of effects at which the residuals are most probable, over that of independent errors. Each group is expected, to a factor of 4.5, to explain an equal share of the residuals: else groups of
     which the data say little would be as large as anybody fears, or collapse (`benchmarks/NOTES.md`).
 
@@ -164,4 +171,7 @@ def group_variances(
         change, variance = abs(np.log(new / variance)), new
         if change < _TOLERANCE:
             break
-    return np.exp(logs) / variance
+    inner = information / variance + np.diag(np.exp(-logs @ members))
+    covariance = np.linalg.inv(inner)
+    mean = covariance @ right / variance
+    return LearnedGroups(np.exp(0.5 * logs), covariance + mean[:, None] * mean[None, :])
