@@ -118,7 +118,7 @@ def mukca() -> dict[str, Any]:
     """Tips and lengths of placements that were left out, of three sets and of all five."""
     found: dict[str, Any] = {}
     sets = ("capture", "panda_3", "panda_3_bis", "panda_6", "kuka_14")
-    for model in ("dh", "gravity", "gravity,harmonics=1"):
+    for model in ("dh", "gravity,harmonics=1"):
         for shared in (True, False):
             normalised: dict[str, np.ndarray] = {}
             for name in sets:

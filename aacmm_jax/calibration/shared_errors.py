@@ -32,10 +32,10 @@ from ..uncertainty.shared_errors import (
     SUCCESSIVE,
     VISITS,
     Effects,
-    LearnedGroups,
     SharedErrors,
-    group_variances,
+    group_deviations,
     one_variance,
+    second_moments,
 )
 from .group_equations import PRIOR, Rows
 from .length_consistency import lengths_of_sockets
@@ -45,7 +45,7 @@ from .results import Calibration
 from .sensitivities import Sensitivities
 
 _GATE = 0.1  # probability of a test below which an effect is looked at
-_MODEL = "gravity,gear,harmonics=1-7"  # functions that joints may follow
+_MODEL = "gravity,gear,harmonics=1-3"  # functions that joints may follow
 _LENGTHS = (2.0, 5.0, 15.0, 60.0)  # poses over which successive errors may be alike
 _MOST_PATTERNS = 8  # of successive poses of one socket: slower ones matter, faster ones are like noise
 _NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are alike
@@ -65,7 +65,8 @@ def with_shared_errors(
         return result
     before = result.parameter_covariance
     covariance = before._replace(
-        matrix=found.variance * before.matrix + found.added,
+        # What a prior determines does not follow the noise.
+        matrix=(found.variance if result.prior is None else 1.0) * before.matrix + found.added,
         noise=jax.tree.map(lambda leaf: np.sqrt(found.variance) * leaf, before.noise),
     )
     if not np.all(np.isfinite(covariance.matrix)):
@@ -167,14 +168,12 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
             visits = tips
         else:
             # Lengths that contradict each other would be explained by whatever moves them.
-            learned = group_variances(without, functions.columns, functions.members)
-            values, vectors = np.linalg.eigh(learned.moments)
-            columns = problem.turned(*functions.turned) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-            effects = effects.joined(columns, np.full(len(values), 1 / effects.variance))
-            missing = functions._replace(learned=learned)
+            missing = functions._replace(sd=group_deviations(without, functions.columns, functions.members))
+            every = problem.turned(*functions.turned)
+            effects = effects.joined(every, (missing.sd**2 / effects.variance) @ functions.members)
     places = _places(problem, effects)
     variance = effects.variance
-    if not (visits.ratio or places.ratio or missing.learned):
+    if not (visits.ratio or places.ratio or len(missing.sd)):
         return None
     length = np.nan
     for effect in (visits, places):
@@ -186,13 +185,19 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
             sds.append(np.sqrt(effect.ratio * variance))
             length = effect.length if effect is visits else length
     moments = np.zeros((0, 0))
-    if missing.learned is not None:
-        moments = missing.learned.moments * missing.steps[:, None] * missing.steps
+    if len(missing.sd):
+        known = Effects.none(problem.left, effects.given)
+        for effect in (visits, places):
+            if effect.ratio:
+                columns = problem.moved(effect.patterns[0])
+                known = known.joined(columns, np.full(columns.shape[1], effect.ratio * variance / known.variance))
+        moments = second_moments(known, problem.turned(*missing.turned), missing.sd @ missing.members)
+        moments = moments * missing.steps[:, None] * missing.steps
         added = added + missing.follow @ moments @ missing.follow.T
         kinds += missing.kinds
         units += missing.units
         firsts = [int(np.flatnonzero(own)[0]) for own in missing.members]
-        sds += list(missing.learned.sd * missing.steps[firsts])
+        sds += list(missing.sd * missing.steps[firsts])
     shared = SharedErrors(
         kinds=tuple(kinds),
         units=tuple(units),
@@ -202,7 +207,7 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
         follow=missing.follow,
         correlation_length=np.asarray(length),
     )
-    return _Found(shared, added, 1.0 if effects.given else variance)
+    return _Found(shared, added, variance)
 
 
 def _of_poses(
@@ -309,7 +314,7 @@ class _Functions(NamedTuple):
     turned: tuple[Float[np.ndarray, "M k"], np.ndarray, Float[np.ndarray, " k"]]  # what `_Problem.turned` takes
     columns: Float[np.ndarray, "R k"]
     follow: Float[np.ndarray, "p k"]
-    learned: LearnedGroups | None = None
+    sd: Float[np.ndarray, " g"] = np.zeros(0)  # of each group, natural steps
 
     @classmethod
     def none(cls, parameters: int) -> "_Functions":

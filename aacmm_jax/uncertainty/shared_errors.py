@@ -136,17 +136,10 @@ def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], low: float
     return OneVariance(mean / float(variance[at]), float(likelihood[at]))
 
 
-class LearnedGroups(NamedTuple):
-    """Groups of coefficients with one standard deviation each, natural steps."""
-
-    sd: Float[np.ndarray, " g"]
-    moments: Float[np.ndarray, "k k"]  # second moments of the coefficients about 0, given the residuals
-
-
-def group_variances(
+def group_deviations(
     effects: Effects, columns: Float[np.ndarray, "R k"], members: Float[np.ndarray, "g k"]
-) -> "LearnedGroups":
-    """Variances of groups of effects at which the residuals are most probable, over that of independent errors. Each group is expected, to a factor of 4.5, to explain an equal share of the residuals: else groups of
+) -> Float[np.ndarray, " g"]:
+    """Standard deviations of groups of effects at which the residuals are most probable, natural steps. Each group is expected, to a factor of 4.5, to explain an equal share of the residuals: else groups of
     which the data say little would be as large as anybody fears, or collapse (`benchmarks/NOTES.md`).
 
     Args:
@@ -171,7 +164,18 @@ def group_variances(
         change, variance = abs(np.log(new / variance)), new
         if change < _TOLERANCE:
             break
-    inner = information / variance + np.diag(np.exp(-logs @ members))
+    return np.exp(0.5 * logs)
+
+
+def second_moments(
+    effects: Effects, columns: Float[np.ndarray, "R k"], sd: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "k k"]:
+    """Second moments about 0 of the coefficients of an effect, given the residuals and their own standard deviations.
+
+    A calibration without the effect has the error that these coefficients make, whose mean square is this.
+    """
+    variance, r = effects.variance, effects.left.values[:, None]
+    inner = effects.product(columns, columns) / variance + np.diag(1 / sd**2)
     covariance = np.linalg.inv(inner)
-    mean = covariance @ right / variance
-    return LearnedGroups(np.exp(0.5 * logs), covariance + mean[:, None] * mean[None, :])
+    mean = covariance @ effects.product(columns, r) / variance
+    return covariance + mean @ mean.T
