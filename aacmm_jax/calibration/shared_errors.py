@@ -37,7 +37,7 @@ from ..uncertainty.shared_errors import (
     one_variance,
     second_moments,
 )
-from .group_equations import PRIOR, Rows
+from .group_equations import LEAST_U, PRIOR, Rows
 from .length_consistency import lengths_of_sockets
 from .model_errors import block_diagonal, form_of_poses, limited_equations, weighted_by_loss
 from .record import CalibrationRecord, record_of
@@ -46,7 +46,9 @@ from .sensitivities import Sensitivities
 
 _GATE = 0.1  # probability of a test below which an effect is looked at
 _MODEL = "gravity,gear,harmonics=1-3"  # functions that joints may follow
-_LENGTHS = (2.0, 5.0, 15.0, 60.0)  # poses over which successive errors may be alike
+# Poses over which successive errors may be alike. Over a third of the poses of a socket and more they are as good as
+# alike in all, which poses do not show.
+_LENGTHS, _PART = (2.0, 5.0, 15.0), 3
 _MOST_PATTERNS = 8  # of successive poses of one socket: slower ones matter, faster ones are like noise
 _NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are alike
 _FEWEST = 6  # degrees of freedom
@@ -146,68 +148,56 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
     if of_poses.left.degrees_of_freedom < _FEWEST:
         return None
     problem = _with_lengths(of_poses, relations)
-    given = record.given_noise is not None
-    effects, without = Effects.none(problem.left, given), Effects.none(of_poses.left, given)
-    kinds, units, sds, added = [], [], [], 0.0
-    visits = _visits(problem)
-    functions = _functions(of_poses)
-    missing = _Functions.none(len(record.names))
-    order = [(visits.probability, "tips"), (functions.probability, "functions")]
-    for probability, which in sorted(order):
+    tips, functions = _visits(of_poses), _functions(of_poses)
+    # All but places by the poses alone: lengths that contradict each other would be put down to whatever moves them.
+    effects = Effects.none(of_poses.left, record.given_noise is not None)
+    for probability, effect in sorted([(tips.probability, tips.kind), (functions.probability, "")]):
         if probability >= _GATE:
             continue
-        if which == "tips":
-            best = [(one_variance(effects, problem.moved(one), *_usual(problem)), one) for one in visits.patterns]
-            number = int(np.argmax([found.log_likelihood for found, _ in best]))
-            found, patterns = best[number]
-            columns = problem.moved(patterns)
-            effects = effects.joined(columns, np.full(columns.shape[1], found.ratio))
-            columns = of_poses.moved(patterns)
-            without = without.joined(columns, np.full(columns.shape[1], found.ratio))
-            tips = visits._replace(patterns=[patterns], ratio=found.ratio, length=visits.lengths[number])
-            visits = tips
+        if effect == tips.kind:
+            tips = tips.learned(of_poses, effects)
+            effects = tips.joined(of_poses, effects)
         else:
-            # Lengths that contradict each other would be explained by whatever moves them.
-            missing = functions._replace(sd=group_deviations(without, functions.columns, functions.members))
-            every = problem.turned(*functions.turned)
-            effects = effects.joined(every, (missing.sd**2 / effects.variance) @ functions.members)
-    places = _places(problem, effects)
-    variance = effects.variance
-    if not (visits.ratio or places.ratio or len(missing.sd)):
+            functions = functions._replace(sd=group_deviations(effects, functions.columns, functions.members))
+            effects = effects.joined(functions.columns, functions.sd**2 @ functions.members)
+    with_tips = tips.joined(problem, Effects.none(problem.left, effects.given))
+    every = functions.joined(problem, with_tips)
+    places = _places(problem, every)
+    if not (tips.variance or places.variance or len(functions.sd)):
         return None
-    length = np.nan
-    for effect in (visits, places):
-        if effect.ratio:
-            follow = problem.by_patterns(effect.patterns[0])
-            added = added + effect.ratio * variance * follow @ follow.T
-            kinds.append(effect.kind)
-            units.append("mm")
-            sds.append(np.sqrt(effect.ratio * variance))
-            length = effect.length if effect is visits else length
-    moments = np.zeros((0, 0))
-    if len(missing.sd):
-        known = Effects.none(problem.left, effects.given)
-        for effect in (visits, places):
-            if effect.ratio:
-                columns = problem.moved(effect.patterns[0])
-                known = known.joined(columns, np.full(columns.shape[1], effect.ratio * variance / known.variance))
-        moments = second_moments(known, problem.turned(*missing.turned), missing.sd @ missing.members)
-        moments = moments * missing.steps[:, None] * missing.steps
-        added = added + missing.follow @ moments @ missing.follow.T
-        kinds += missing.kinds
-        units += missing.units
-        firsts = [int(np.flatnonzero(own)[0]) for own in missing.members]
-        sds += list(missing.sd * missing.steps[firsts])
+    return _summed(problem, (tips, places), functions, places.joined(problem, with_tips), places.joined(problem, every))
+
+
+def _summed(
+    problem: "_Problem", tips: "tuple[_Tips, ...]", functions: "_Functions", without: Effects, every: Effects
+) -> _Found:
+    """What all effects add; ``without`` knows those of the tips, and ``every`` all."""
+    found = [effect for effect in tips if effect.variance]
+    kinds, units = [effect.kind for effect in found], ["mm" for _ in found]
+    sds = [np.sqrt(effect.variance) for effect in found]
+    p = len(problem.record.names)
+    added, follow, moments, names = np.zeros((p, p)), np.zeros((p, 0)), np.zeros((0, 0)), ()
+    for effect in found:
+        by_effect = problem.by_patterns(effect.patterns[0])
+        added = added + effect.variance * by_effect @ by_effect.T
+    if len(functions.sd):
+        names, follow, steps = functions.names, functions.follow, functions.steps
+        moments = second_moments(without, problem.turned(*functions.turned), functions.sd @ functions.members)
+        moments = moments * steps[:, None] * steps
+        added = added + follow @ moments @ follow.T
+        kinds, units = [*kinds, *functions.kinds], [*units, *functions.units]
+        sds += [sd * steps[np.argmax(own)] for sd, own in zip(functions.sd, functions.members, strict=True)]
+    lengths = [effect.length for effect in found if np.isfinite(effect.length)]
     shared = SharedErrors(
         kinds=tuple(kinds),
         units=tuple(units),
-        names=missing.names,
+        names=names,
         sd=np.array(sds),
         moments=moments,
-        follow=missing.follow,
-        correlation_length=np.asarray(length),
+        follow=follow,
+        correlation_length=np.asarray(lengths[0] if lengths else np.nan),
     )
-    return _Found(shared, added, variance)
+    return _Found(shared, added, every.variance)
 
 
 def _of_poses(
@@ -218,11 +208,16 @@ def _of_poses(
 
 
 def _with_lengths(problem: _Problem, relations: list[Block]) -> _Problem:
-    """The same with what lengths and certified values say."""
+    """The same with what lengths and certified values say, of all but the scale.
+
+    Fixed lengths or a prior may contradict the scale of all lengths, which errors of single places do not explain.
+    """
     record, rows = problem.record, problem.rows
     blocks = [*(each.block("") for each in rows), *relations]
+    values = np.array([float(length.value) for length in record.recording.capture.lengths])
     if record.observed is not None:
-        return problem._replace(left=Residuals.of(blocks))
+        u = np.maximum([float(length.u) for length in record.recording.capture.lengths], LEAST_U)
+        return problem._replace(left=_without_scale(Residuals.of(blocks), sum(map(_size, rows)), values / u))
     related = lengths_of_sockets(record, rows)
     if related is None:
         return problem
@@ -231,7 +226,19 @@ def _with_lengths(problem: _Problem, relations: list[Block]) -> _Problem:
     blocks.append(related.relations._replace(residual=residual, shared=shared))
     if related.scale is not None:
         blocks = _with_column(blocks, related.scale[0], whitening @ related.scale[1])
-    return problem._replace(left=Residuals.of(blocks), lengths=whitening)
+    left = _without_scale(Residuals.of(blocks), sum(map(_size, rows)), whitening @ values)
+    return problem._replace(left=left, lengths=whitening)
+
+
+def _size(rows: Rows) -> int:
+    return rows.residual.size
+
+
+def _without_scale(left: Residuals, first: int, by_scale: Float[np.ndarray, " l"]) -> Residuals:
+    """With the scale of the lengths, which begin at a row, as one more unknown."""
+    column = np.zeros((len(left.values), 1))
+    column[first : first + len(by_scale), 0] = by_scale
+    return left.extended(column) if len(by_scale) else left
 
 
 def _rms(rows: list[Rows]) -> float:
@@ -259,8 +266,23 @@ class _Tips(NamedTuple):
     probability: float
     patterns: list[Float[np.ndarray, "M c"]]
     lengths: tuple[float, ...] = (np.nan,)  # of correlation, for each of the patterns
-    ratio: float = 0.0
+    variance: float = 0.0  # mm^2
     length: float = np.nan
+
+    def learned(self, problem: _Problem, effects: Effects) -> "_Tips":
+        """With the variance of the most likely patterns."""
+        every = [one_variance(effects, problem.moved(patterns), *_usual(problem)) for patterns in self.patterns]
+        best = int(np.argmax([one.log_likelihood for one in every]))
+        return self._replace(
+            patterns=[self.patterns[best]], variance=every[best].variance, length=self.lengths[best]
+        )
+
+    def joined(self, problem: _Problem, effects: Effects) -> Effects:
+        """Effects with this one."""
+        if not self.variance:
+            return effects
+        columns = problem.moved(self.patterns[0])
+        return effects.joined(columns, np.full(columns.shape[1], self.variance))
 
 
 def _visits(problem: _Problem) -> _Tips:
@@ -289,7 +311,9 @@ def _visits(problem: _Problem) -> _Tips:
     if capture.visits is not None:
         numbers = [number for number in np.unique(marked) if number >= 0]
         return _Tips(VISITS, probability, [(marked[:, None] == numbers).astype(float)])
-    for length in _LENGTHS:
+    most = max(float(np.median([len(each.poses) for each in rows])) / _PART, _LENGTHS[0])
+    lengths = tuple(length for length in _LENGTHS if length <= most)
+    for length in lengths:
         found = []
         for each in rows:
             order = np.arange(len(each.poses))
@@ -299,7 +323,7 @@ def _visits(problem: _Problem) -> _Tips:
             own[each.poses] = vectors[:, chosen] * np.sqrt(values[chosen])
             found.append(own)
         patterns.append(np.concatenate(found, axis=1))
-    return _Tips(SUCCESSIVE, probability, patterns, _LENGTHS)
+    return _Tips(SUCCESSIVE, probability, patterns, lengths)
 
 
 class _Functions(NamedTuple):
@@ -315,6 +339,12 @@ class _Functions(NamedTuple):
     columns: Float[np.ndarray, "R k"]
     follow: Float[np.ndarray, "p k"]
     sd: Float[np.ndarray, " g"] = np.zeros(0)  # of each group, natural steps
+
+    def joined(self, problem: _Problem, effects: Effects) -> Effects:
+        """Effects with these."""
+        if not len(self.sd):
+            return effects
+        return effects.joined(problem.turned(*self.turned), self.sd**2 @ self.members)
 
     @classmethod
     def none(cls, parameters: int) -> "_Functions":
@@ -402,12 +432,11 @@ def _places(problem: _Problem, effects: Effects) -> _Tips:
     else:
         rest = max(float(effects.product(r, r)[0, 0]) - square, 1e-300)
         probability = f_tail(square / number / (rest / spare), number, spare)
-    if not len(effects.ratio):
+    if not len(effects.variances):
         probability = min(probability, _neighbours(problem))
     if not probability < _GATE:
         return nothing
-    found = one_variance(effects, columns, *_usual(problem))
-    return nothing._replace(probability=probability, patterns=[patterns], ratio=found.ratio)
+    return nothing._replace(probability=probability, patterns=[patterns]).learned(problem, effects)
 
 
 def _neighbours(problem: _Problem) -> float:

@@ -57,47 +57,56 @@ class SharedErrors(eqx.Module):
 
 
 class Effects(NamedTuple):
-    """Effects that are known so far, next to independent errors: columns, and variances over that of independent ones.
+    """Effects that are known so far next to independent errors: columns, and the variance of each coefficient.
 
-    Whatever a further effect is compared with has the covariance I + D diag(ratio) D^T, of variance ``s``.
+    Whatever a further effect is compared with has the covariance ``variance`` I + D diag(variances) D^T.
     """
 
     left: Residuals
     given: bool  # whether the variance of independent errors is 1, as given
     columns: Float[np.ndarray, "R k"]
-    ratio: Float[np.ndarray, " k"]
+    variances: Float[np.ndarray, " k"]
+    variance: float  # of independent errors
 
     @classmethod
     def none(cls, left: Residuals, given: bool) -> "Effects":
         """Nothing but independent errors."""
-        return cls(left, given, np.zeros((len(left.values), 0)), np.zeros(0))
+        variance = 1.0 if given else left.cost / left.degrees_of_freedom
+        return cls(left, given, np.zeros((len(left.values), 0)), np.zeros(0), variance)
 
     def product(self, one: Float[np.ndarray, "R a"], other: Float[np.ndarray, "R b"]) -> Float[np.ndarray, "a b"]:
-        """one^T (I + D diag(ratio) D^T)^-1 other."""
-        if not len(self.ratio):
+        """one^T (I + D diag(variances / variance) D^T)^-1 other."""
+        if not len(self.variances):
             return one.T @ other
-        root = np.sqrt(self.ratio)
-        d = self.columns * root
-        inner = np.eye(len(root)) + d.T @ d
-        return one.T @ other - (one.T @ d) @ np.linalg.solve(inner, d.T @ other)
+        d = self.columns * np.sqrt(self.variances / self.variance)
+        return one.T @ other - (one.T @ d) @ np.linalg.solve(np.eye(d.shape[1]) + d.T @ d, d.T @ other)
 
-    @property
-    def variance(self) -> float:
-        """s: 1 where it is given."""
-        r = self.left.values[:, None]
-        return 1.0 if self.given else float(self.product(r, r)[0, 0]) / self.left.degrees_of_freedom
-
-    def joined(self, columns: Float[np.ndarray, "R c"], ratio: Float[np.ndarray, " c"]) -> "Effects":
-        """With a further effect, whose columns the model has not explained."""
-        return self._replace(
-            columns=np.concatenate([self.columns, columns], axis=1), ratio=np.concatenate([self.ratio, ratio])
+    def joined(self, columns: Float[np.ndarray, "R c"], variances: Float[np.ndarray, " c"]) -> "Effects":
+        """With a further effect, whose columns the model has not explained; the variance of independent errors is the
+        one with which the residuals are as large as they should be."""
+        found = self._replace(
+            columns=np.concatenate([self.columns, columns], axis=1),
+            variances=np.concatenate([self.variances, variances]),
         )
+        if self.given:
+            return found
+        d, r = found.columns * np.sqrt(found.variances), self.left.values
+        values, vectors = np.linalg.eigh(d.T @ d)
+        seen, values = (vectors.T @ (d.T @ r)) ** 2, np.maximum(values, 0.0)
+        variance = self.variance
+        for _ in range(_ROUNDS):
+            explained = float(np.sum(seen / (variance + values)))
+            new = max(self.left.cost - explained, 1e-12 * self.left.cost) / self.left.degrees_of_freedom
+            change, variance = abs(np.log(new / variance)), new
+            if change < _TOLERANCE:
+                break
+        return found._replace(variance=variance)
 
 
 class OneVariance(NamedTuple):
     """An effect of one variance: every coefficient is a displacement of the tip, mm."""
 
-    ratio: float  # posterior mean of its variance over that of independent errors
+    variance: float  # posterior mean, mm^2
     log_likelihood: float  # its maximum over that without the effect
 
 
@@ -132,8 +141,7 @@ def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], low: float
     weight = likelihood - np.maximum(np.log(sd / usual), 0.0)
     weight = np.exp(weight - weight.max())
     mean = float(np.sum(weight * ratio * variance) / np.sum(weight))
-    at = int(np.argmax(likelihood))
-    return OneVariance(mean / float(variance[at]), float(likelihood[at]))
+    return OneVariance(mean, float(np.max(likelihood)))
 
 
 def group_deviations(
