@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.errors import InputError
@@ -19,7 +18,15 @@ from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..kinematics.parameters import ArmSpecification
-from ..uncertainty.residual_tests import LEVEL, Form, FormTest, Residuals, form_test, pose_form_test
+from ..uncertainty.residual_tests import (
+    LEVEL,
+    FormTest,
+    Residuals,
+    block_diagonal,
+    form_of_poses,
+    form_test,
+    pose_form_test,
+)
 from .encoder_noise import NoisyJoint, noisy_joint
 from .group_equations import Rows, equations_in_chunks
 from .length_consistency import Lengths, length_test
@@ -121,7 +128,7 @@ def _tests(record: CalibrationRecord, usual: ArmNoise | None) -> ModelTests:
         return ModelTests(lengths=lengths)
     arm, q = record.calibrated.arm, np.asarray(record.recording.capture.readings)
     terms = found_terms(arm, q, rows, relations)
-    if _weighted(record):  # a robust loss makes residuals smaller, and less scattered, than the noise
+    if weighted_by_loss(record):  # a robust loss makes residuals smaller, and less scattered, than the noise
         return ModelTests(lengths=lengths, terms=terms)
     of_all, others = with_terms(rows, relations, terms, arm.joints)
     explained = Residuals.of([*(each.block("") for each in of_all), *others]) if terms else left
@@ -136,7 +143,7 @@ def _tests(record: CalibrationRecord, usual: ArmNoise | None) -> ModelTests:
     )
 
 
-def _weighted(record: CalibrationRecord) -> bool:
+def weighted_by_loss(record: CalibrationRecord) -> bool:
     observed = record.observed
     return observed is not None and any(bool(np.any(np.asarray(weights) < 1)) for weights in observed.weights)
 
@@ -184,22 +191,13 @@ def _noisy_observations(
     return tuple(found)
 
 
-def _block_diagonal(columns: Float[np.ndarray, "m r c"]) -> Float[np.ndarray, "R C"]:
-    """Columns of single poses, 0 in the rows of all others."""
-    poses, size, width = columns.shape
-    found = np.zeros((poses, size, poses, width))
-    found[np.arange(poses), :, np.arange(poses)] = columns
-    return found.reshape(poses * size, poses * width)
-
-
 def _successive(rows: Sequence[Rows], left: Residuals) -> Successive | None:
     """Errors of the tip that successive poses of one observation share (a score test of their covariance)."""
-    columns = [_block_diagonal(each.by_tip) for each in rows]
+    columns = [block_diagonal(each.by_tip) for each in rows]
     kernel = [np.kron(np.eye(len(each.poses), k=1) + np.eye(len(each.poses), k=-1), np.eye(3)) / 2 for each in rows]
     if not any(np.any(matrix) for matrix in kernel):
         return None
-    none = [None] * (len(left.slices) - len(rows))  # relations, which come last, have no part in it
-    test = form_test(left, Form((*columns, *none), (*kernel, *none)), relative=True)
+    test = form_test(left, form_of_poses(left, columns, kernel), relative=True)
     product = total = 0.0
     for each, of in zip(rows, left.slices, strict=False):
         tips = np.einsum("mrc,mr->mc", each.by_tip, left.values[of].reshape(each.residual.shape))

@@ -20,6 +20,7 @@ from ..model.metrics import Repeatability
 from ..model.scale import Scale
 from ..solver.reason import Reason, numbers_of
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance
+from ..uncertainty.shared_errors import SharedErrors
 from .checks import PLAUSIBLE_SCALE, largest_plausible_residual
 from .scale_anchor import ScaleAnchor
 
@@ -246,6 +247,7 @@ class Calibration(AbstractSingleResult):
     length_after: Float[AnyArray, " l"]  # by the calibrated arm
     stage1: Identification
     method: str = eqx.field(static=True)
+    shared: SharedErrors | None = None  # errors that poses share, which the covariance contains; None: none were found
 
     @property
     def _stage1(self) -> Identification:

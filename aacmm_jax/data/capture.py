@@ -20,6 +20,7 @@ from .copies import NOTHING_REPEATED, Repeated, check_different, observation_wit
 from .observations.observation import AbstractObservation, checked_name, checked_readings
 from .observations.socket import Socket
 from .reference_length import ReferenceLength
+from .visits import checked_visits, visits_by_socket
 
 # Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
 _MOST_RADIANS = 8 * np.pi
@@ -46,6 +47,8 @@ class Capture(eqx.Module):
         observations: What else ties the tip down (`data.observations`): measured points, spheres, planes, artefacts.
         repeated: Copies that were left out of these data before.
         sessions: Names of the sessions of `join_sessions`; what belongs to one is named ``session/name``.
+        visits: Socket name -> number of the visit of each of its poses ``(m,)``: the tip was lifted between visits, and
+            may have come to rest elsewhere. Where a socket is not named, or nothing is given, visits are unknown.
 
     Raises:
         InputError: For names that are empty, longer than a line or given twice, readings that are not finite,
@@ -60,6 +63,7 @@ class Capture(eqx.Module):
     sizes: tuple[int, ...] = eqx.field(static=True)
     repeated: Repeated = eqx.field(static=True)
     sessions: tuple[str, ...] = eqx.field(static=True)
+    visits: tuple[int, ...] | None = eqx.field(static=True)  # of each pose of a socket, where they are known
 
     def __init__(
         self,
@@ -68,6 +72,7 @@ class Capture(eqx.Module):
         observations: Iterable[AbstractObservation] | AbstractObservation = (),
         repeated: Repeated = NOTHING_REPEATED,
         sessions: Iterable[str] = (),
+        visits: Mapping[str, Numbers] | None = None,
     ):
         if not isinstance(sockets, Mapping):
             raise InputError(
@@ -124,6 +129,7 @@ class Capture(eqx.Module):
         )
         for name in (*self.names, *(o.name for o in self.observations)) if self.sessions else ():
             self.session_of(name)
+        self.visits = checked_visits(visits, blocks)
 
     def session_of(self, name: str) -> str:
         """The session of a socket or observation, by its name; `InputError` where it belongs to none."""
@@ -146,6 +152,11 @@ class Capture(eqx.Module):
         q = np.asarray(self.q) if is_concrete(self.q) else self.q
         ends = np.cumsum(self.sizes)
         return {name: q[..., end - size : end, :] for name, size, end in zip(self.names, self.sizes, ends, strict=True)}
+
+    @property
+    def visits_of_sockets(self) -> dict[str, Int[np.ndarray, " m"]]:
+        """Number of the visit of each pose, ``(m,)``, of the sockets whose visits are known."""
+        return visits_by_socket(self.visits, self.names, self.sizes)
 
     @property
     def readings(self) -> Float[AnyArray, "M n"]:
@@ -194,7 +205,8 @@ class Capture(eqx.Module):
         )
         others = [observation for observation in self.observations if observation.name in kept]
         chosen = {name: sockets[name] for name in self.names if name in kept}
-        return Capture(chosen, lengths, others, repeated=repeated, sessions=self.sessions)
+        visits = {name: rows for name, rows in self.visits_of_sockets.items() if name in kept}
+        return Capture(chosen, lengths, others, repeated=repeated, sessions=self.sessions, visits=visits)
 
 
 def names_in(capture: Capture) -> tuple[str, ...]:
@@ -208,7 +220,8 @@ def part_of(capture: Capture, names: Collection[str]) -> Capture:
     lengths = [length for length in capture.lengths if length.start in names and length.end in names]
     others = [observation for observation in capture.observations if observation.name in names]
     sockets = {name: q for name, q in capture.sockets.items() if name in names}
-    return Capture(sockets, lengths, others, sessions=capture.sessions)
+    visits = {name: rows for name, rows in capture.visits_of_sockets.items() if name in names}
+    return Capture(sockets, lengths, others, sessions=capture.sessions, visits=visits)
 
 
 def check_one_capture(capture: Capture) -> None:
@@ -295,6 +308,7 @@ def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) ->
     if not isinstance(captures, Mapping) or not captures:
         raise InputError("the sessions are no dictionary; give the captures by name: {'Monday': capture, ...}.")
     sockets: dict[str, Numbers] = {}
+    visits: dict[str, Numbers] = {}
     lengths: list[ReferenceLength] = []
     observations: list[AbstractObservation] = []
     for number, (session, capture) in enumerate(captures.items()):
@@ -307,13 +321,15 @@ def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) ->
                 observations.append(Socket(f"{session}/{name}", readings, target=f"probe of {session}"))
             else:
                 sockets[f"{session}/{name}"] = readings
+        visits |= {f"{session}/{name}": rows for name, rows in capture.visits_of_sockets.items()}
         lengths += [
             ReferenceLength(f"{session}/{length.start}", f"{session}/{length.end}", length.value, length.u)
             for length in capture.lengths
         ]
         own = f"probe of {session}" if number and own_probe else ""
         observations += [observation.in_session(session, own) for observation in capture.observations]
-    return Capture(sockets, lengths, observations, sessions=tuple(captures))
+    visits = {name: rows for name, rows in visits.items() if name in sockets}
+    return Capture(sockets, lengths, observations, sessions=tuple(captures), visits=visits)
 
 
 def stack_captures(captures: Iterable[Capture]) -> Capture:

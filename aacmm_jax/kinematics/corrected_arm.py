@@ -8,7 +8,7 @@ from jaxtyping import Float
 from ..core.arguments import items_of
 from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError
-from ..core.numpy_or_jax import to_numpy
+from ..core.numpy_or_jax import namespace, to_numpy
 from .arm import DOWN, Arm, is_single, joint_limits, without_corrections
 from .chain import Corrections, Geometry, KnownFunctions, forward_pass, joint_motion, joints_first
 from .corrections.kind import Loads, Term
@@ -120,3 +120,18 @@ def function_values(
     rows = functions.values(joints_first(q, 1), forward_pass(nominal, joint_motion(nominal, q)))[:, 0]
     weight = np.array([*gravity, 1.0])[functions.component_of_row]
     return np.add.reduceat(weight[:, None] * rows, functions.first_row)
+
+
+def with_further_corrections(arm: Arm, names: Sequence[str]) -> Arm:
+    """The same arm with more corrections than it has, by the names of their coefficients, which are 0."""
+    added = tuple(term for term in (term_of(name, arm.joints) for name in names) if term is not None)
+    if arm.corrections is None:
+        return arm.replace(corrections=Corrections(KnownFunctions(added), arm.geometry), gravity=np.array(DOWN))
+    assert arm.coefficients is not None
+    each = (*arm.corrections.functions.each, *added)
+    coefficients = namespace(arm.coefficients).concatenate([arm.coefficients, np.zeros(len(added))])
+    return arm.replace(
+        corrections=Corrections(KnownFunctions(each), arm.corrections.nominal),
+        coefficients=coefficients,
+        gravity=arm.gravity,
+    )

@@ -194,6 +194,20 @@ def form_test(left: Residuals, form: Form, relative: bool) -> FormTest:
     return _tested(left, *_value_and_traces(left, form), relative)
 
 
+def form_of_poses(left: Residuals, columns: Sequence[np.ndarray | None], kernel: Sequence[np.ndarray | None]) -> Form:
+    """A form of the rows of poses; relations, which come last, have no part in it."""
+    none = (None,) * (len(left.slices) - len(columns))
+    return Form((*columns, *none), (*kernel, *none))
+
+
+def block_diagonal(columns: Float[np.ndarray, "m r c"]) -> Float[np.ndarray, "R C"]:
+    """Columns of single poses, 0 in the rows of all others."""
+    poses, size, width = columns.shape
+    found = np.zeros((poses, size, poses, width))
+    found[np.arange(poses), :, np.arange(poses)] = columns
+    return found.reshape(poses * size, poses * width)
+
+
 def pose_form_test(left: Residuals, kernels: Sequence[Float[np.ndarray, "m k k"] | None], relative: bool) -> FormTest:
     """The same of a form in which rows of different poses do not meet: r'A r is the sum of r_i' K_i r_i.
 
