@@ -27,7 +27,7 @@ from aacmm_jax.summaries.warnings import observed, of_calibration
 WARNINGS = {
     "missing term": "Residuals follow",
     "misfit": "Residuals are ",
-    "noisy joint": "Residuals are larger the more",
+    "noisy joint": ("Residuals are larger the more", "Readings of joint"),
     "successive poses": "Residuals of successive",
     "lengths": "Reference lengths that disagree",
     "contradictions": ("Socket", "Some sockets", "Placement"),

@@ -143,12 +143,6 @@ def observed_record(paper_arm) -> "aj.calibration.CalibrationRecord":
     return aj.calibration.record_of(result, aj.Recording(capture, nominal), robust="tukey")
 
 
-@pytest.fixture(autouse=True)
-def _types_checked_anew():
-    """Each test has the types of its own calls checked."""
-    run_time_types.check_anew()
-
-
 @pytest.fixture(scope="module", autouse=True)
 def _few_memory_maps():
     """Forget compiled programs before Linux refuses more memory maps (65,530 a process), which ends in a crash."""

@@ -35,6 +35,7 @@ def test_contenders_minimise_the_same_residual(contenders):
     np.testing.assert_allclose(jacobian(vector), (centred - centred.mean(axis=0)).reshape(-1, 21), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_part_runs_and_names_who_is_absent(tmp_path):
     options = ["--rounds", "1", "--only", "kinematics", "--results", tmp_path]
     command = [sys.executable, ROOT / "benchmarks/throughput.py", *options]

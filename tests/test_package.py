@@ -28,7 +28,7 @@ def test_an_unknown_name_is_an_attribute_error():
     "line",
     [
         "from aacmm_jax import *; print(load_arm('panda').joints)",
-        "import aacmm_jax; print(aacmm_jax.files.load_arm('panda').joints)",
+        pytest.param("import aacmm_jax; print(aacmm_jax.files.load_arm('panda').joints)", marks=pytest.mark.slow),
     ],
 )
 def test_late_names_in_a_fresh_process(line):

@@ -20,7 +20,8 @@ def test_default_parameters_are_the_papers(paper_arm):
 
 @pytest.mark.parametrize(
     ("number", "hold"),
-    [(1, None), (2, "d_3"), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((1, "d_3"), (2, None)))],
+    [(1, None), pytest.param(2, "d_3", marks=pytest.mark.slow)]
+    + [pytest.param(*case, marks=pytest.mark.exhaustive) for case in ((1, "d_3"), (2, None))],
 )
 def test_noise_free_simulation_from_random_starts(paper_arm, paper_capture, number, hold):
     """Table 1: DE is rounding error from every start (paper: 7e-5 and 8e-5 mm), then one length gives the others."""

@@ -21,7 +21,7 @@ def table_with(text: str) -> str:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.optimised  # it computes more than it compiles
 def test_python_runs(capsys, tmp_path, monkeypatch):
     """The blocks continue one another, so they run as one program."""

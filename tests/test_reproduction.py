@@ -55,6 +55,7 @@ def test_every_published_number_has_its_row(rows):
         assert any(row.startswith(name) for row in what), name
 
 
+@pytest.mark.slow
 def test_the_quick_part_passes_its_check(rows, checks):
     """What `make reproduce` does with all rows; and it fails where a stored value is another one."""
     import table2
@@ -108,7 +109,7 @@ def test_what_is_tolerated_is_tolerated(checks):
         assert checks.compared([known], [row])[0].passed
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_papers_method_ends_as_its_stored_runs(checks):
     """One search of the thousand; its k depends on the processor, the rest does not."""
     import paper_method

@@ -1,8 +1,12 @@
 from .all_tests import measured_by as measured_by
+from .all_tests import requirements_table as requirements_table
 from .all_tests import run as run
 from .asme_b89_4_22 import spat as spat
+from .decision import RULES as RULES
 from .decision import Limit as Limit
 from .decision import decide as decide
+from .influences import Expansion as Expansion
+from .influences import Influences as Influences
 from .iso_10360_12 import articulated_location as articulated_location
 from .iso_10360_12 import form_error as form_error
 from .jjf_1408 import half_range as half_range
@@ -20,3 +24,4 @@ from .results import Metric as Metric
 from .spheres import enclosing_sphere as enclosing_sphere
 from .spheres import fit_sphere as fit_sphere
 from .spheres import size_error as size_error
+from .standards import SYMBOLS as SYMBOLS

@@ -7,7 +7,7 @@ Uncertainties are the tester's (artefacts, seat, fixture, temperature): the arm'
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,19 +18,17 @@ from ..data.sphere import checked_sphere
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach
 from . import asme_b89_4_22, iso_10360_12, jjf_1408
-from .decision import LEAST_DIVISOR, MOST, Limit, decide
+from .decision import LEAST_DIVISOR, MOST, Limit, Rule, checked_rule, decide
+from .influences import Influences, checked_influences
+from .postures import postures_of
+from .requirements import StandardTest
+from .requirements import requirements_table as table_of
 from .results import METRICS, AcceptanceTest, Measured, Metric
 from .spheres import points_of
+from .standards import DEFAULT_RULES
 
-_TESTS: tuple[Callable[[Measured, float], AcceptanceTest | None], ...] = (
-    jjf_1408.single_point_and_length,
-    asme_b89_4_22.effective_diameter,
-    asme_b89_4_22.single_point_articulation,
-    asme_b89_4_22.volumetric,
-    iso_10360_12.probing,
-    iso_10360_12.location,
-    iso_10360_12.length_error,
-)
+TESTS: tuple[StandardTest, ...] = (*jjf_1408.TESTS, *asme_b89_4_22.TESTS, *iso_10360_12.TESTS)
+NO_INFLUENCES = Influences()
 _FARTHEST = 1e6  # mm: no arm reaches a kilometre
 
 
@@ -47,30 +45,46 @@ def measured_by(arm: Arm, recording: Recording) -> Measured:
     capture, touched = recording.capture, [group for sphere in recording.spheres for group in sphere.groups]
     readings = [np.asarray(q) for q in (*capture.sockets.values(), *touched)]
     ends = np.cumsum([len(q) for q in readings])
-    none = np.zeros((0, capture.joints))
+    none = np.zeros((0, capture.columns))
     points = iter(np.split(np.asarray(arm.position(np.concatenate([*readings, none]))), ends[:-1]))
     sockets = {name: next(points) for name in capture.sockets}
     # Sockets that held another target than the arm's own probe are not part of any procedure.
     lengths = tuple(length for length in capture.lengths if length.start in sockets and length.end in sockets)
     spheres = tuple(sphere._replace(groups=tuple(next(points) for _ in sphere.groups)) for sphere in recording.spheres)
-    return Measured(sockets, lengths, spheres, arm_reach(arm))
+    reach = arm_reach(arm)
+    return Measured(
+        sockets,
+        lengths,
+        spheres,
+        reach,
+        measuring_range=recording.measuring_range,
+        postures=postures_of(arm, recording, reach),
+    )
 
 
 def run(
-    measured: Measured, limits: Mapping[str, Limit | float] | None = None, u_test: float = 0.0
+    measured: Measured,
+    limits: Mapping[str, Limit | float] | None = None,
+    u_test: float = 0.0,
+    *,
+    influences: Influences = NO_INFLUENCES,
+    rule: Rule | None = None,
 ) -> list[AcceptanceTest]:
     """Run every test that the measured points allow.
 
     Source: JJF 1408-2013 as used by Cheng et al. 2018, ASME B89.4.22-2004, ISO 10360-12:2016; formulas stated from
-    secondary sources. Decisions follow ISO 14253-1 (see `decide`).
+    secondary sources (`requirements_table` says which, and how certain they are). Decisions: see `decide`.
 
     Args:
         measured: Points of sockets and spheres, and reference lengths, mm.
         limits: MPE by the name of a metric (a key of `METRICS`): a `Limit`, or a number of mm.
-        u_test: Standard uncertainty that seat, fixture and temperature add to every test value, mm.
+        u_test: Standard uncertainty that seat and fixture add to every test value, mm.
+        influences: What else adds to it: in proportion to a length, and thermal expansion of artefact and arm.
+        rule: Decision rule (a key of `RULES`); by default ISO 14253-1:2017, and simple acceptance for ASME.
 
     Returns:
         One `AcceptanceTest` for each test with at least one metric; each says what its full procedure would also need.
+        It bears the standard's name (`AcceptanceTest.called`) only where nothing that can be checked is missing.
 
     Raises:
         InputError: The points are not points in mm; a limit names no metric or one that these points do not give; or a
@@ -78,10 +92,14 @@ def run(
     """
     measured = _checked(measured)
     u_test = _number(u_test, "the standard uncertainty of the test")
+    influences = checked_influences(influences)
+    influences = influences._replace(u=math.hypot(influences.u, u_test))
     given = checked_limits(limits or {})
-    tests = [found for test in _TESTS if (found := test(measured, u_test)) is not None]
+    tests = [found for test in TESTS if (found := test.run(measured, influences)) is not None]
+    rules = DEFAULT_RULES if rule is None else dict.fromkeys(DEFAULT_RULES, checked_rule(rule))
+    tests = [test._replace(rule=rules[test.standard]) for test in tests]
     if measured.none_held_out:
-        held_out = "sockets and lengths that the arm was not identified from"
+        held_out = "Everything was used to identify the arm; measure sockets and lengths that were not."
         tests = [test._replace(missing=(held_out, *test.missing)) for test in tests]
     present = {metric.name for test in tests for metric in test.metrics}
     for name in given:
@@ -91,7 +109,14 @@ def run(
                 f"a limit is given for {name} ({METRICS[name]}), but the capture has nothing{held_out} to measure it on"
                 "; leave the limit out."
             )
-    return [test._replace(metrics=tuple(_decided(metric, given) for metric in test.metrics)) for test in tests]
+    return [
+        test._replace(metrics=tuple(_decided(metric, given, test.rule) for metric in test.metrics)) for test in tests
+    ]
+
+
+def requirements_table() -> str:
+    """The requirements of every test as Markdown: whether they are checked, their source, and how certain that is."""
+    return table_of(TESTS)
 
 
 def without_stated_uncertainty(tests: Sequence[AcceptanceTest]) -> list[str]:
@@ -127,6 +152,9 @@ def _checked(measured: Measured) -> Measured:
     for name, points in (*sockets.items(), *((sphere.name, group) for sphere in spheres for group in sphere.groups)):
         if np.abs(points).max() > _FARTHEST:
             raise InputError(f"'{name}' has a coordinate beyond {_FARTHEST:g} mm; give points in mm.")
+    size = measured.measuring_range
+    if size is not None and not 0 < size <= 2 * _FARTHEST:
+        raise InputError(f"measuring_range is {size:g} mm; give the diameter of the maker's measuring volume in mm.")
     return measured._replace(sockets=sockets, spheres=spheres)
 
 
@@ -140,7 +168,7 @@ def _number(value: Any, what: str) -> float:
     return number
 
 
-def _decided(metric: Metric, limits: Mapping[str, Limit]) -> Metric:
+def _decided(metric: Metric, limits: Mapping[str, Limit], rule: Rule) -> Metric:
     if metric.name not in limits:
         return metric
     values = []
@@ -150,5 +178,5 @@ def _decided(metric: Metric, limits: Mapping[str, Limit]) -> Metric:
                 f"the limit of {metric.name} grows with a length, but the metric is not of one; give only a number."
             )
         limit = limits[metric.name].at(found.length or 0.0)
-        values.append(found._replace(limit=limit, decision=decide(found.value, limit, found.expanded)))
+        values.append(found._replace(limit=limit, decision=decide(found.value, limit, found.expanded, rule)))
     return metric._replace(values=tuple(values))

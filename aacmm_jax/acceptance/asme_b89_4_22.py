@@ -4,13 +4,17 @@ The text of the standard was not available: formulas and procedures follow backg
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..kinematics.workspace import Reach
+from .geometry import LEAST_SPREAD, least_turn
+from .influences import Influences
 from .lengths import deviation_metrics, distinct_lengths, length_readings, values_by_artefact
+from .postures import LEFT_OR_RIGHT, elbow_sides
 from .procedure_items import (
     OutOfReach,
     PlannedItems,
@@ -22,13 +26,30 @@ from .procedure_items import (
     socket_in_zone,
     touch_item,
 )
-from .results import AcceptanceTest, Measured, Metric, acceptance_test, metric_value, percent
-from .spheres import errors_named, missing_touches, points_of, size_error
+from .requirements import (
+    CALIBRATED,
+    CONDITIONS,
+    RANGE_STATED,
+    Requirement,
+    StandardTest,
+    all_directions,
+    different_positions,
+    groups_of_touches,
+    sphere_size,
+    spheres_for,
+    spread_places,
+    spread_touches,
+    touches,
+)
+from .results import Measured, Metric, metric_value, percent
+from .spheres import errors_named, points_of, size_error
 from .standards import ASME_B89_4_22
 
 ZONES = {"near": (0.0, 0.2), "middle": (0.2, 0.8), "far": (0.8, 1.0)}  # fractions of the reach
 BARS = ((0.5, 0.75), (1.2, 1.5))  # fractions of the reach
 _SPAT_POSES, _POSITIONS, _DIAMETER_POINTS, _DIAMETER_REPEATS = 10, 20, 9, 3
+_LEAST_TURN, _LEAST_ELBOW = math.radians(15), 3  # of rings of touches; poses with the elbow on either side
+_BACKGROUND = "background knowledge of ASME B89.4.22"
 _DIAMETER, _SPAT, _VOLUMETRIC = "effective diameter", "single-point articulation", "volumetric"
 
 
@@ -53,80 +74,167 @@ def spat(points: Numbers) -> tuple[float, float]:
     return float(distances.max()), 2 * math.sqrt(float(distances @ distances) / (len(given) - 1))
 
 
-def effective_diameter(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None:
-    """Largest |D - Dcal| of a sphere of 10 to 50 mm: 9 points, 3 repeats."""
-    values, missing = [], []
-    for sphere in (sphere for sphere in measured.spheres if sphere.test == "effective-diameter"):
+def _diameter_metrics(measured: Measured, influences: Influences) -> list[Metric]:
+    """Largest |D - Dcal| of a sphere."""
+    values = []
+    for sphere in spheres_for(measured, "effective-diameter"):
         for number, group in enumerate(sphere.groups, start=1):
             with errors_named(sphere, number):
-                error = size_error(group, sphere.diameter, sphere.stylus)
-            values.append(metric_value(f"{sphere.name}, repeat {number}", error, sphere.u, u_test))
-        missing += missing_touches(sphere, groups=_DIAMETER_REPEATS, points=_DIAMETER_POINTS, of="repeats")
-    return acceptance_test(ASME_B89_4_22, _DIAMETER, [Metric("D_Eff", tuple(values))], missing)
+                error = size_error(group, sphere.diameter, sphere.stylus) + influences.correction(sphere.diameter)
+            u = influences.u_of(sphere.diameter)
+            values.append(metric_value(f"{sphere.name}, repeat {number}", error, sphere.u, u))
+    return [Metric("D_Eff", tuple(values))]
 
 
-def single_point_articulation(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None:
-    """A socket in each of three zones of the reach (0 to 20, 20 to 80, 80 to 100 %), 10 articulations in each.
-
-    Distances are from the shoulder (see `arm_reach`); sockets with fewer poses are left out.
-    """
-    largest, scatter, zones = [], [], set()
-    reach = measured.reach
-    for name, points in measured.tested.items():
-        if len(points) < _SPAT_POSES:
-            continue
-        zone = None if reach is None else _zone(reach, points)
-        zones.add(zone)
+def _articulation_metrics(measured: Measured, influences: Influences) -> list[Metric]:
+    """Scatter in sockets of 10 articulations or more; distances are from the shoulder (see `arm_reach`)."""
+    largest, scatter = [], []
+    for name, points in _articulated(measured).items():
+        zone = _zone(measured, points)
         where = name if zone is None else f"{name} ({percent(zone)} of the reach)"
         for values, value in zip((largest, scatter), spat(points), strict=True):
-            values.append(metric_value(where, value, u_test))
-    missing = ["the reach of the arm, to distinguish its zones"]
-    if reach is not None:
-        missing = [
-            f"a socket with {_SPAT_POSES} poses at {percent(zone)} of the reach ({zone[0] * reach.radius:.0f} to "
-            f"{zone[1] * reach.radius:.0f} mm from the shoulder)"
-            for zone in ZONES.values()
-            if zone not in zones
-        ]
-    metrics = [Metric("SPAT", tuple(largest)), Metric("SPAT_2s", tuple(scatter))]
-    return acceptance_test(ASME_B89_4_22, _SPAT, metrics, missing)
+            values.append(metric_value(where, value, influences.u))
+    return [Metric("SPAT", tuple(largest)), Metric("SPAT_2s", tuple(scatter))]
 
 
-def volumetric(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None:
-    """Largest |L - Lcal|, range and twice the RMS: two bars (50 to 75, 120 to 150 % of the reach), 20 positions."""
-    missing = []
-    lengths = distinct_lengths(measured.lengths)
-    if len(lengths) < _POSITIONS:
-        missing.append(f"{_POSITIONS} positions of the bars ({len(lengths)} given)")
-    bars = values_by_artefact(lengths)
-    if len(bars) != len(BARS):
-        missing.append(f"two bars, no fewer and no more ({len(bars)} given)")
-    elif min(map(len, bars)) < _POSITIONS // 4:
-        missing.append(f"each bar in {_POSITIONS // 4} positions or more")
-    if measured.reach is None:
-        missing.append("the reach of the arm, to judge the lengths of the bars")
-    else:
-        radius = measured.reach.radius
-        values = np.array([float(length.value) for length in measured.lengths]) / radius
-        missing += [
-            f"a bar of {_bar_range(bar, radius)}" for bar in BARS if not np.any((values >= bar[0]) & (values <= bar[1]))
-        ]
+def _volumetric_metrics(measured: Measured, influences: Influences) -> Sequence[Metric]:
+    """Largest |L - Lcal|, range and twice the RMS."""
     names = ("Volumetric", "Volumetric_Range", "Volumetric_2RMS")
-    metrics = deviation_metrics(length_readings(measured), u_test, names)
-    return acceptance_test(ASME_B89_4_22, _VOLUMETRIC, metrics, missing)
+    return deviation_metrics(length_readings(measured, influences), influences, names)
 
 
-def default_bars(reach: Reach) -> list[float]:
+def _articulated(measured: Measured) -> dict[str, np.ndarray]:
+    return {name: points for name, points in measured.tested.items() if len(points) >= _SPAT_POSES}
+
+
+def _rings_lacking(measured: Measured) -> str:
+    straight = [
+        f"'{sphere.name}', repeat {number}"
+        for sphere in spheres_for(measured, "effective-diameter")
+        for number, group in enumerate(sphere.groups, start=1)
+        if len(group) >= _DIAMETER_POINTS and least_turn(group) < _LEAST_TURN
+    ]
+    if not straight:
+        return ""
+    return f"The rings of touches must be turned by 22.5 deg or more against each other ({', '.join(straight)})."
+
+
+def _zones_lacking(measured: Measured) -> str:
+    if measured.reach is None:
+        return "The reach of the arm and its shoulder are unknown, so that its zones cannot be told apart."
+    radius = _radius(measured, measured.reach)
+    found = {_zone(measured, points) for points in _articulated(measured).values()}
+    absent = [
+        f"at {percent(zone)} of the reach ({zone[0] * radius:.0f} to {zone[1] * radius:.0f} mm from the shoulder)"
+        for zone in ZONES.values()
+        if zone not in found
+    ]
+    return f"A socket with {_SPAT_POSES} poses is required {' and '.join(absent)}." if absent else ""
+
+
+def _elbow_lacking(measured: Measured) -> str:
+    if measured.postures is None:
+        return "Points do not tell on which side the elbow was; record joint readings."
+    bad = []
+    for name in _articulated(measured):
+        sides = np.sin(measured.postures.elbows[name])
+        if min(np.sum(sides >= math.sin(LEFT_OR_RIGHT)), np.sum(sides <= -math.sin(LEFT_OR_RIGHT))) < _LEAST_ELBOW:
+            bad.append(name)
+    if not bad:
+        return ""
+    few = f"{_LEAST_ELBOW} poses"
+    return f"The elbow must be on the left in {few} and on the right in {few} of every socket ({', '.join(bad)})."
+
+
+def _two_bars_lacking(measured: Measured) -> str:
+    groups = values_by_artefact(distinct_lengths(measured.lengths))
+    if len(groups) != len(BARS):
+        return f"Two bars are required, no fewer and no more ({len(groups)} given)."
+    return "" if min(map(len, groups)) >= _POSITIONS // 4 else f"Each bar is required in {_POSITIONS // 4} positions."
+
+
+def _bar_lengths_lacking(measured: Measured) -> str:
+    if measured.reach is None and measured.measuring_range is None:
+        return "The reach of the arm is unknown, so that the lengths of the bars cannot be judged."
+    radius = _radius(measured, measured.reach)
+    values = np.array([float(length.value) for length in measured.lengths]) / radius
+    wanted = [_bar_range(bar, radius) for bar in BARS if not np.any((values >= bar[0]) & (values <= bar[1]))]
+    return f"A bar of {' and one of '.join(wanted)} is required." if wanted else ""
+
+
+TESTS = (
+    StandardTest(
+        ASME_B89_4_22,
+        _DIAMETER,
+        _diameter_metrics,
+        (
+            sphere_size("effective-diameter", 10, 50, _BACKGROUND, "background"),
+            touches("effective-diameter", _DIAMETER_POINTS, _BACKGROUND, "background"),
+            groups_of_touches("effective-diameter", _DIAMETER_REPEATS, "repeats", _BACKGROUND, "background"),
+            spread_touches("effective-diameter", _DIAMETER_POINTS, _BACKGROUND, "own reading"),
+            Requirement(
+                "rings of touches turned against each other, by 22.5 deg or more (15 as touched by hand)",
+                _BACKGROUND,
+                "background",
+                _rings_lacking,
+            ),
+            CALIBRATED,
+            CONDITIONS,
+        ),
+    ),
+    StandardTest(
+        ASME_B89_4_22,
+        _SPAT,
+        _articulation_metrics,
+        (
+            Requirement(
+                "a socket with 10 articulations in each of three zones: 0 to 20, 20 to 80, 80 to 100 % of the reach",
+                _BACKGROUND,
+                "background",
+                _zones_lacking,
+            ),
+            Requirement(
+                "the elbow on the left and on the right: in 3 poses each or more, 15 degrees off the vertical",
+                "FARO's public instructions swing the elbow from side to side",
+                "own reading",
+                _elbow_lacking,
+            ),
+            RANGE_STATED,
+            CONDITIONS,
+        ),
+    ),
+    StandardTest(
+        ASME_B89_4_22,
+        _VOLUMETRIC,
+        _volumetric_metrics,
+        (
+            Requirement("two bars, each in 5 positions or more", _BACKGROUND, "background", _two_bars_lacking),
+            Requirement(
+                "bars of 50 to 75 % and of 120 to 150 % of the reach", _BACKGROUND, "background", _bar_lengths_lacking
+            ),
+            different_positions(_POSITIONS, False, _BACKGROUND, "own reading"),
+            all_directions(False, _BACKGROUND, "own reading"),
+            spread_places(False, LEAST_SPREAD, _BACKGROUND, "own reading"),
+            RANGE_STATED,
+            CALIBRATED,
+            CONDITIONS,
+        ),
+    ),
+)
+
+
+def default_bars(measuring_range: float) -> list[float]:
     """Lengths of bars in the middle of the standard's ranges, mm."""
-    return [round(float(np.mean(bar)) * reach.radius) for bar in BARS]
+    return [round(float(np.mean(bar)) * measuring_range / 2) for bar in BARS]
 
 
-def unsuitable_bars(reach: Reach, lengths: list[float]) -> list[str]:
+def unsuitable_bars(measuring_range: float, lengths: list[float]) -> list[str]:
     """Sentences on bars outside the standard's ranges."""
+    radius = measuring_range / 2
     return [
-        f"A bar of {length:g} mm is not {_bar_range(bar, reach.radius)}."
+        f"A bar of {length:g} mm is not {_bar_range(bar, radius)}."
         for bar, length in zip(BARS, lengths, strict=True)
-        if not bar[0] <= length / reach.radius <= bar[1]
+        if not bar[0] <= length / radius <= bar[1]
     ]
 
 
@@ -139,7 +247,7 @@ def procedure_items(region: ProcedureRegion, diameter: float, stylus: float, bar
         except OutOfReach as error:
             left_out.append(f"{error} The test leaves out that zone.")
             continue
-        q = q[far_apart(q, _SPAT_POSES)]
+        q = q[_both_sides(elbow_sides(region.search.arm, q, region.reach), q)]
         sockets.append(ProcedureItem(_SPAT, f"spat/{name}", 1, np.tile(point, (len(q), 1)), q))
     middle = next((item.points[0] for item in sockets if item.name == "spat/middle"), None)
     if middle is None:
@@ -158,6 +266,27 @@ def _bar_range(bar: tuple[float, float], radius: float) -> str:
     return f"{percent(bar)} of the reach ({bar[0] * radius:.0f} to {bar[1] * radius:.0f} mm)"
 
 
-def _zone(reach: Reach, points: np.ndarray) -> tuple[float, float]:
-    fraction = float(np.linalg.norm(points.mean(axis=0) - reach.shoulder)) / reach.radius
+def _radius(measured: Measured, reach: Reach | None) -> float:
+    """The reach: half of the maker's measuring range, or that of the model where it is not stated, mm."""
+    if measured.measuring_range is not None or reach is None:
+        return (measured.measuring_range or 0.0) / 2
+    return reach.radius
+
+
+def _zone(measured: Measured, points: np.ndarray) -> tuple[float, float] | None:
+    if measured.reach is None:
+        return None
+    away = float(np.linalg.norm(points.mean(axis=0) - measured.reach.shoulder))
+    fraction = away / _radius(measured, measured.reach)
     return next((zone for zone in ZONES.values() if fraction <= zone[1]), ZONES["far"])
+
+
+def _both_sides(sides: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Indices of poses far apart, half of them with the elbow on each side as far as there are such."""
+    far = np.abs(sides) >= LEFT_OR_RIGHT
+    halves = [np.flatnonzero(far & (sides > 0)), np.flatnonzero(far & (sides < 0))]
+    chosen = [half[far_apart(q[half], _SPAT_POSES // 2)] for half in halves if len(half)]
+    found = np.concatenate([*chosen, np.zeros(0, dtype=int)]).astype(int)
+    others = np.setdiff1d(np.arange(len(q)), found)
+    missing = _SPAT_POSES - len(found)
+    return found if missing <= 0 else np.concatenate([found, others[far_apart(q[others], missing)]])

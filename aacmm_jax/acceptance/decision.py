@@ -1,4 +1,4 @@
-"""Limits (MPE) and the decision rule of ISO 14253-1: whether an error keeps a limit, given its uncertainty."""
+"""Limits (MPE) and decision rules by name: whether an error keeps a limit, given its uncertainty."""
 
 import math
 import re
@@ -10,6 +10,17 @@ from ..core.text import number
 
 Decision = Literal["fails", "undecided", "conforms"]
 DECISIONS: tuple[Decision, ...] = get_args(Decision)  # the worst first
+Rule = Literal["iso-2017", "iso-2013", "simple"]
+# Decision rules by name. Guard bands of ISO 14253-1 are stated from secondary sources; the ratio of 4 to 1 is one of
+# the "N:1 decision rules" that ASME B89.7.3.1-2001 defines in its section 2, which is public in extracts.
+RULES: dict[Rule, str] = {
+    "iso-2017": "ISO 14253-1:2017, conformity proven with a probability of 95 %",
+    "iso-2013": "ISO 14253-1:2013, guard band U",
+    "simple": "simple acceptance with a ratio of 4:1 (ASME B89.7.3.1)",
+}
+COVERAGE_FACTOR = 2.0  # of every U of a test value
+GUARD_FACTOR = 1.65  # one-sided, 95 %, of a normal distribution: the guard band of 2017 is this times u
+_PROBABILITY, _RATIO = 0.95, 4.0
 MOST, LEAST_DIVISOR = 1e6, 1e-3  # of a limit in mm, and of its divisor
 _ROUNDING = 1e-9  # relative to the limit: decimal numbers that equal a limit on paper must equal it in binary
 _LIMIT = re.compile(r"\s*(?P<fixed>[^+/LlKk]+?)\s*(?:\+\s*[Ll]\s*/\s*(?P<divisor>.+?))?\s*")
@@ -29,22 +40,25 @@ class Limit(NamedTuple):
         return f"{self.fixed:g}" + ("" if math.isinf(self.divisor) else f" + L/{self.divisor:g}")
 
 
-def decide(error: float, limit: float, expanded: float = 0.0) -> Decision:
+def decide(error: float, limit: float, expanded: float = 0.0, rule: Rule = "iso-2017") -> Decision:
     """Decide whether an error keeps a limit.
 
-    Source: ISO 14253-1, stated from secondary sources. The guard band is U itself, as in the editions up to 2013; that
-    of 2017 allows 0.83 U by default, so that whatever conforms here conforms there too.
+    With u = U / 2, "iso-2017" (ISO 14253-1:2017) asks for a probability of 95 % that the error is within the limit, or
+    beyond it: guard bands of 1.65 u, and more where u is so large that both limits count. "iso-2013" has guard bands
+    of U. "simple" (ASME B89.7.3.1) compares the error alone, if the limit is at least four times U; otherwise it
+    leaves it undecided. The texts of ISO 14253-1 were not available.
 
     Args:
         error: Test value, mm.
         limit: Maximum permissible error (MPE), mm.
         expanded: Expanded uncertainty U of the test value (coverage factor 2), mm.
+        rule: A key of `RULES`.
 
     Returns:
-        "conforms" if ``|error| <= limit - expanded``, "fails" if ``|error| >= limit + expanded``, else "undecided".
+        "conforms", "fails" or "undecided".
 
     Raises:
-        InputError: An argument is not a number, or the limit or U is negative or infinite.
+        InputError: An argument is not a number, the limit or U is negative or infinite, or the rule is unknown.
     """
     try:
         error, limit, expanded = float(error), float(limit), float(expanded)
@@ -57,10 +71,31 @@ def decide(error: float, limit: float, expanded: float = 0.0) -> Decision:
             raise InputError(f"the {what} is {value:g} mm; it must be zero or positive.")
     if math.isnan(error):
         raise InputError("the error is not a number, so nothing can be decided; give the measured error.")
-    slack = _ROUNDING * max(limit, expanded)
-    if abs(error) <= limit - expanded + slack:
+    error, slack = abs(error), _ROUNDING * max(limit, expanded)
+    if checked_rule(rule) == "simple":
+        if limit + slack < _RATIO * expanded:
+            return "undecided"
+        return "conforms" if error <= limit + slack else "fails"
+    guard = expanded if rule == "iso-2013" else GUARD_FACTOR * expanded / COVERAGE_FACTOR
+    if error > limit - guard + slack:
+        return "fails" if error >= limit + guard - slack else "undecided"
+    if rule == "iso-2013" or expanded <= slack:
         return "conforms"
-    return "fails" if abs(error) >= limit + expanded - slack else "undecided"
+    # Where u is large, the opposite limit counts as well.
+    return "conforms" if _within(error, limit, expanded / COVERAGE_FACTOR) >= _PROBABILITY else "undecided"
+
+
+def _within(error: float, limit: float, u: float) -> float:
+    """Probability that a normally distributed error lies between the limits."""
+    high, low = ((end - error) / (u * math.sqrt(2)) for end in (limit, -limit))
+    return 0.5 * (math.erf(high) - math.erf(low))
+
+
+def checked_rule(rule: str) -> Rule:
+    """A decision rule, or `InputError` for a name that is none."""
+    if rule not in RULES:
+        raise InputError(f"rule is {rule!r}; it must be one of {', '.join(RULES)}.")
+    return rule
 
 
 def worst(decisions: list[Decision]) -> Decision | None:
@@ -93,4 +128,20 @@ def read_limits(texts: list[str], known: Mapping[str, str]) -> dict[str, Limit]:
                 f"--mpe '{text}': a limit must be zero or positive and finite, and K at least {LEAST_DIVISOR:g}."
             )
         found[name] = limit
+    return found
+
+
+def read_uncertainty(text: str) -> Limit:
+    """A standard uncertainty of the test, from a text ``A`` or ``A+L/K`` in mm."""
+    match = _LIMIT.fullmatch(text)
+    try:
+        if match is None:
+            raise ValueError
+        found = Limit(number(match["fixed"]), number(match["divisor"]) if match["divisor"] else math.inf)
+    except ValueError as error:
+        raise InputError(f"--test-u-mm '{text}' is not A or A+L/K with numbers in mm; give 0.002+L/500000.") from error
+    if not (0 <= found.fixed <= MOST and found.divisor >= LEAST_DIVISOR):
+        raise InputError(
+            f"--test-u-mm '{text}' must be zero or positive and finite, with K at least {LEAST_DIVISOR:g}."
+        )
     return found

@@ -3,13 +3,16 @@
 import numpy as np
 
 from ..core.arrays import Numbers
-from .lengths import deviation_metrics, distinct_lengths, length_readings
-from .results import AcceptanceTest, Measured, Metric, acceptance_test, metric_value
+from .influences import Influences
+from .lengths import deviation_metrics, length_readings
+from .requirements import CALIBRATED, CONDITIONS, Requirement, StandardTest, different_positions
+from .results import Measured, Metric, metric_value
 from .spheres import points_of
 from .standards import JJF_1408
 
 _SOCKET_POSES = 10  # of one socket, for a complete test
 _LENGTH_POSITIONS = 30  # of a length: Cheng et al. 2018, section 4.4
+_PAPER = "Cheng et al. 2018, section 4"
 
 
 def half_range(points: Numbers) -> float:
@@ -29,19 +32,38 @@ def half_range(points: Numbers) -> float:
     return float(np.ptp(points_of(points, "points of a socket"), axis=0).max() / 2)
 
 
-def single_point_and_length(measured: Measured, u_test: float = 0.0) -> AcceptanceTest | None:
-    """Deltam in every socket, and the deviations of lengths (section 4 of Cheng et al. 2018, after their reference 17).
-
-    The paper's verification measures a length in 30 positions; its Table 3 gives Deltam of 70 poses.
-    """
+def _metrics(measured: Measured, influences: Influences) -> list[Metric]:
+    """Deltam in every socket, and the deviations of lengths (Cheng et al. 2018, section 4, after reference 17)."""
     sockets = {name: points for name, points in measured.tested.items() if len(points) > 1}
-    deltam = tuple(metric_value(name, half_range(points), u_test) for name, points in sockets.items())
-    lengths = deviation_metrics(length_readings(measured), u_test, ("Length", "Length_Range", "Length_2RMS"))
-    missing = []
-    if not any(len(points) >= _SOCKET_POSES for points in sockets.values()):
-        missing.append(f"a socket measured in {_SOCKET_POSES} poses or more")
-    positions = len(distinct_lengths(measured.lengths))
-    if positions < _LENGTH_POSITIONS:
-        missing.append(f"a length in {_LENGTH_POSITIONS} positions ({positions} given)")
-    title = "single point and length, as in Cheng et al. 2018"
-    return acceptance_test(JJF_1408, title, [Metric("Deltam", deltam), *lengths], missing)
+    deltam = tuple(metric_value(name, half_range(points), influences.u) for name, points in sockets.items())
+    readings = length_readings(measured, influences)
+    return [
+        Metric("Deltam", deltam),
+        *deviation_metrics(readings, influences, ("Length", "Length_Range", "Length_2RMS")),
+    ]
+
+
+def _socket_lacking(measured: Measured) -> str:
+    if any(len(points) >= _SOCKET_POSES for points in measured.tested.values()):
+        return ""
+    return f"A socket measured in {_SOCKET_POSES} poses or more is required."
+
+
+TESTS = (
+    StandardTest(
+        JJF_1408,
+        "single point and length, as in Cheng et al. 2018",
+        _metrics,
+        (
+            Requirement(
+                "a socket in 10 poses or more; the paper's Table 3 has 70",
+                _PAPER,
+                "own reading",
+                _socket_lacking,
+            ),
+            different_positions(_LENGTH_POSITIONS, False, f"{_PAPER}: a length measured 30 times", "own reading"),
+            CALIBRATED,
+            CONDITIONS,
+        ),
+    ),
+)

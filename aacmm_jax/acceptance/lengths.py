@@ -10,6 +10,7 @@ from jaxtyping import Float
 from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError
 from ..data.capture import ReferenceLength
+from .influences import Influences
 from .results import Measured, Metric, MetricValue, metric_value
 
 _SAME_ARTEFACT = 0.01  # lengths that differ by less (relative) belong to one artefact
@@ -23,26 +24,30 @@ class LengthReading(NamedTuple):
     u: float
     length: float
 
-    def as_value(self, u_test: float) -> MetricValue:
-        """The deviation, with the uncertainties of the artefact and of the test."""
-        return metric_value(self.where, self.deviation, self.u, u_test)._replace(length=self.length)
+    def as_value(self, influences: Influences) -> MetricValue:
+        """The deviation at 20 C, with the uncertainties of the artefact and of the test."""
+        return metric_value(self.where, self.deviation, self.u, influences.u_of(self.length))._replace(
+            length=self.length
+        )
 
 
-def length_readings(measured: Measured) -> list[LengthReading]:
-    """Every length as single readings: the i-th point at one end with the i-th at the other."""
+def length_readings(measured: Measured, influences: Influences) -> list[LengthReading]:
+    """Every length as single readings: the i-th point at one end with the i-th at the other; thermal expansion of
+    artefact and arm, where it is stated, is corrected."""
     found = []
     for length in measured.lengths:
         start, end = (measured.sockets[name] for name in (length.start, length.end))
         pairs = min(len(start), len(end))
-        deviations = np.linalg.norm(end[:pairs] - start[:pairs], axis=1) - float(length.value)
+        value = float(length.value)
+        deviations = np.linalg.norm(end[:pairs] - start[:pairs], axis=1) - value + influences.correction(value)
         for number, deviation in enumerate(deviations, start=1):
             where = f"{length.start} - {length.end}" + (f", reading {number}" if pairs > 1 else "")
-            found.append(LengthReading(where, float(deviation), float(length.u), float(length.value)))
+            found.append(LengthReading(where, float(deviation), float(length.u), value))
     return found
 
 
 def deviation_metrics(
-    readings: Sequence[LengthReading], u_test: float, names: tuple[str, str, str]
+    readings: Sequence[LengthReading], influences: Influences, names: tuple[str, str, str]
 ) -> tuple[Metric, ...]:
     """Largest deviation, range and twice the RMS; only the first of a single reading.
 
@@ -50,15 +55,17 @@ def deviation_metrics(
     which lengths share one. So U of the range takes the errors as independent, and U of the RMS as fully correlated (by
     the Cauchy-Schwarz inequality it cannot be larger).
     """
-    largest = Metric(names[0], tuple(reading.as_value(u_test) for reading in readings))
+    largest = Metric(names[0], tuple(reading.as_value(influences) for reading in readings))
     if len(readings) < 2:
         return (largest,)
     deviations = np.array([reading.deviation for reading in readings])
     u = np.array([reading.u for reading in readings])
     low, high = readings[int(deviations.argmin())], readings[int(deviations.argmax())]
-    span = metric_value(f"{low.where} to {high.where}", high.deviation - low.deviation, low.u, high.u, u_test, u_test)
-    rms_u = 2 * float(np.sqrt(np.mean(u**2)))
-    rms = metric_value(f"{len(readings)} readings", two_rms(deviations), rms_u, 2 * u_test)
+    test = np.array([influences.u_of(reading.length) for reading in readings])
+    ends = (low.u, high.u, test[int(deviations.argmin())], test[int(deviations.argmax())])
+    span = metric_value(f"{low.where} to {high.where}", high.deviation - low.deviation, *ends)
+    rms_u = (2 * float(np.sqrt(np.mean(part**2))) for part in (u, test))
+    rms = metric_value(f"{len(readings)} readings", two_rms(deviations), *rms_u)
     return largest, Metric(names[1], (span,)), Metric(names[2], (rms,))
 
 

@@ -35,6 +35,8 @@ class Procedure(NamedTuple):
     arm: Arm
     standard: Planned
     reach: Reach
+    measuring_range: float  # diameter of the measuring volume, mm
+    range_stated: bool  # whether it is the maker's; otherwise it is twice the reach
     sockets: tuple[ProcedureItem, ...]  # poses in sockets and at the ends of bars
     touches: tuple[ProcedureItem, ...]  # poses that touch spheres
     lengths: tuple[tuple[str, str, float], ...]  # sockets at both ends of each bar, and their distance
@@ -56,6 +58,7 @@ def plan_procedure(
     diameter: float = 25.0,
     stylus: float = 6.0,
     bars: Sequence[float] | None = None,
+    measuring_range: float | None = None,
     seed: int = 0,
 ) -> Procedure:
     """Plan the poses of an acceptance test.
@@ -71,6 +74,7 @@ def plan_procedure(
         diameter: Diameter of the sphere, mm.
         stylus: Diameter of the probe's ball, mm.
         bars: Lengths of the available bars, mm: two for "asme", five for "iso"; suitable ones by default.
+        measuring_range: Diameter of the measuring volume as the maker states it, mm; by default twice the reach.
         seed: Seed of the search.
 
     Returns:
@@ -94,16 +98,21 @@ def plan_procedure(
             f"a reach of {reach.radius:.0f} mm is too small for a sphere of {diameter:g} mm; take a smaller sphere."
         )
     rules = _STANDARDS[standard]
-    default = rules.default_bars(reach)
+    size = 2 * reach.radius if measuring_range is None else float(measuring_range)
+    if not reach.radius / 2 <= size <= 4 * reach.radius:
+        raise InputError(
+            f"a measuring range of {size:g} mm does not suit a reach of {reach.radius:.0f} mm; give a diameter in mm."
+        )
+    default = rules.default_bars(size)
     lengths = default if bars is None else sorted(float(bar) for bar in bars)
     if len(lengths) != len(default) or not all(math.isfinite(bar) and bar > 0 for bar in lengths):
         raise InputError(
             f"{len(lengths)} bars are given, but {standard} takes {len(default)} positive lengths; give as many."
         )
-    unsuitable = [] if bars is None else rules.unsuitable_bars(reach, lengths)
-    items = rules.procedure_items(ProcedureRegion(search, reach), diameter, stylus, lengths)
+    unsuitable = [] if bars is None else rules.unsuitable_bars(size, lengths)
+    items = rules.procedure_items(ProcedureRegion(search, reach._replace(radius=size / 2)), diameter, stylus, lengths)
     found = items._replace(left_out=[*unsuitable, *items.left_out])
-    return Procedure(arm, standard, reach, *(tuple(part) for part in found))
+    return Procedure(arm, standard, reach, size, measuring_range is not None, *(tuple(part) for part in found))
 
 
 def simulate_procedure(
@@ -161,7 +170,16 @@ def simulate_procedure(
     lengths = [ReferenceLength(start, end, bars[value], u_length) for start, end, value in procedure.lengths]
     spheres, diameters = [], {}
     for sphere in procedure.spheres:
-        groups = tuple(readings(item, 0.0) for item in procedure.touches if TOUCHED[item.test] == sphere.test)
+        items = (item for item in procedure.touches if (item.name, TOUCHED[item.test]) == (sphere.name, sphere.test))
+        groups = tuple(readings(item, 0.0) for item in items)
         size = diameters.setdefault(sphere.name, sphere.diameter + u_diameter * random.normal())
         spheres.append(ProbedSphere(sphere.name, sphere.test, groups, size, u_diameter, sphere.stylus))
-    return Recording(Capture(sockets, lengths), nominal, true, seed, tuple(spheres), acceptance=(procedure.standard,))
+    return Recording(
+        Capture(sockets, lengths),
+        nominal,
+        true,
+        seed,
+        tuple(spheres),
+        acceptance=(procedure.standard,),
+        measuring_range=procedure.measuring_range,
+    )

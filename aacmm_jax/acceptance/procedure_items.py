@@ -1,5 +1,6 @@
 """Parts of a planned acceptance procedure: sockets, bars and spheres, and the configurations that reach them."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,11 +10,10 @@ from ..core.errors import InputError
 from ..data.sphere import SphereTest
 from ..kinematics.workspace import Reach, SearchRegion, configurations_at, lowest_point
 from ..uncertainty.volume import sample_lengths
+from .geometry import touch_directions
 from .results import percent
 
 _POINTS_TRIED, _STARTS, _RANDOM_TIPS, _RANDOM_BARS = 16, 48, 6000, 300
-# Rings of touched points on the upper half of a sphere, by the number of points: elevation in degrees, points.
-_RINGS = {25: ((90, 1), (67.5, 4), (45, 8), (22.5, 4), (0, 8)), 9: ((90, 1), (45, 4), (0, 4)), 5: ((90, 1), (10, 4))}
 _TILT = (0.6, 0.8)  # sine and cosine of the probe's angle from the vertical in an orientation
 _OUTSIDE = 0.02  # cosine of probe and normal above which the probe does not come through the sphere
 
@@ -60,13 +60,20 @@ class OutOfReach(InputError):
 
 
 def socket_in_zone(
-    region: ProcedureRegion, zone: tuple[float, float], poses: int
+    region: ProcedureRegion,
+    zone: tuple[float, float],
+    poses: int,
+    others: Sequence[Float[np.ndarray, " 3"]] = (),
+    apart: float = 0.0,
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "c n"]]:
-    """The point in a zone of the reach with the most configurations, at least ``poses``, and these configurations."""
+    """The point in a zone of the reach with the most configurations, at least ``poses``, and these configurations; no
+    nearer to ``others`` than ``apart`` (mm)."""
     search, reach = region
     tips = np.asarray(search.arm.position(search.draw(_RANDOM_TIPS)))
     fraction = np.linalg.norm(tips - reach.shoulder, axis=1) / reach.radius
     inside = (fraction > zone[0]) & (fraction <= zone[1]) & (tips[:, 2] >= search.above)
+    for other in others:
+        inside &= np.linalg.norm(tips - other, axis=1) >= apart
     # Points near the middle of the zone first: a socket at its edge may be set up in the next zone.
     order = np.argsort(np.abs(fraction[inside] - np.mean(zone)))
     tips = tips[inside][order[: 4 * _POINTS_TRIED]]
@@ -132,7 +139,7 @@ def touch_item(
 ) -> ProcedureItem:
     """Configurations that touch a sphere from outside; with an azimuth (rad), with about one direction of the probe."""
     arm = region.search.arm
-    normals = _touch_directions(count)
+    normals = touch_directions(count)
     points = sphere.centre + (sphere.diameter + sphere.stylus) / 2 * normals
     q, owner = configurations_at(region.search, points, 3 * _STARTS)
     probe = np.asarray(arm.pose(q))[:, :3, :3] @ np.asarray(arm.probe)
@@ -151,14 +158,3 @@ def touch_item(
             raise InputError(f"the sphere at ({centre}) mm cannot be touched on all sides; give another seed.")
         rows.append(possible[np.argmax(score[possible])])
     return ProcedureItem(test, sphere.name, group, points, q[rows])
-
-
-def _touch_directions(count: int) -> Float[np.ndarray, "m 3"]:
-    """Directions of touched points over the upper half of a sphere, every second ring rotated by half a step."""
-    rows = []
-    for ring, (elevation, number) in enumerate(_RINGS[count]):
-        azimuth = 2 * np.pi * (np.arange(number) + 0.5 * (ring % 2)) / number
-        height = np.full(number, np.sin(np.radians(elevation)))
-        horizontal = [np.cos(np.radians(elevation)) * part(azimuth) for part in (np.cos, np.sin)]
-        rows.append(np.column_stack([*horizontal, height]))
-    return np.concatenate(rows)

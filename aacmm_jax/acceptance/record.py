@@ -20,8 +20,17 @@ from ..kinematics.chain import Geometry
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..model.observed import Observed
 from ..uncertainty.arm_uncertainty import Uncertainty
-from .all_tests import AcceptanceTest, Measured, checked_limits, measured_by, run, without_stated_uncertainty
-from .decision import Limit
+from .all_tests import (
+    NO_INFLUENCES,
+    AcceptanceTest,
+    Measured,
+    checked_limits,
+    measured_by,
+    run,
+    without_stated_uncertainty,
+)
+from .decision import Limit, Rule
+from .influences import Influences
 from .standards import OF_SPHERES, STANDARDS, Standard, checked_standards
 
 MAXIMA = ("rms_mm", "deltam_mm", "length_error_largest_mm")
@@ -36,10 +45,13 @@ class EvaluationRecord(NamedTuple):
     used: frozenset[str]  # sockets that the calibration was identified from
     warnings: tuple[str, ...] = ()
     limits: Mapping[str, Limit] = MappingProxyType({})  # MPE by the name of a metric (`acceptance.METRICS`)
-    u_test: float = 0.0  # standard uncertainty that seat, fixture and temperature add, mm
+    u_test: float = 0.0  # standard uncertainty that seat and fixture add, mm
     maxima: Mapping[str, float] = MappingProxyType({})  # limits of the quantities in `MAXIMA`, mm
     standards: tuple[str, ...] = tuple(STANDARDS)  # whose acceptance tests are run, in addition to those with a limit
     uncertainty: Uncertainty | None = None  # of the calibrated arm; files of earlier versions have none
+    calibration_warnings: tuple[str, ...] = ()  # what should be read about the calibration itself
+    influences: Influences = NO_INFLUENCES
+    rule: Rule | None = None  # None: that of each standard
 
     def arms(self) -> dict[str, ArmSpecification]:
         """The arm as found (nominal) and as left (calibrated)."""
@@ -81,7 +93,10 @@ class EvaluationRecord(NamedTuple):
     def acceptance(self) -> dict[str, list[AcceptanceTest]]:
         """The tests of ``standards``, and those with a limit, as far as the capture allows; as found and as left."""
         arms = self.arms() if self.standards or self.limits else {}
-        found = {stage: run(self.measured(arm.arm), self.limits, self.u_test) for stage, arm in arms.items()}
+        found = {
+            stage: run(self.measured(arm.arm), self.limits, self.u_test, influences=self.influences, rule=self.rule)
+            for stage, arm in arms.items()
+        }
         return {stage: _chosen(found.get(stage, []), self.standards, self.limits) for stage in self.arms()}
 
 
@@ -90,12 +105,15 @@ class PointsRecord(NamedTuple):
 
     measured: Measured
     limits: Mapping[str, Limit | float] = MappingProxyType({})
-    u_test: float = 0.0  # standard uncertainty that seat, fixture and temperature add, mm
+    u_test: float = 0.0  # standard uncertainty that seat and fixture add, mm
     standards: tuple[str, ...] = tuple(STANDARDS)  # whose acceptance tests are run, in addition to those with a limit
+    influences: Influences = NO_INFLUENCES
+    rule: Rule | None = None  # None: that of each standard
 
     def acceptance(self) -> list[AcceptanceTest]:
         """The tests of ``standards``, and those with a limit, as far as the points allow."""
-        return _chosen(run(self.measured, self.limits, self.u_test), self.standards, self.limits)
+        tests = run(self.measured, self.limits, self.u_test, influences=self.influences, rule=self.rule)
+        return _chosen(tests, self.standards, self.limits)
 
 
 def _chosen(
@@ -113,6 +131,9 @@ def evaluation_of(
     u_test: float = 0.0,
     maxima: Mapping[str, float] | None = None,
     standards: Iterable[str] | None = None,
+    calibration_warnings: Iterable[str] = (),
+    influences: Influences = NO_INFLUENCES,
+    rule: Rule | None = None,
 ) -> EvaluationRecord:
     """Evaluate a calibration on a capture.
 
@@ -123,10 +144,14 @@ def evaluation_of(
         record: The calibration.
         recording: The capture; its nominal arm should be that of the calibration.
         limits: MPE by the name of a metric: a `Limit`, or a number of mm.
-        u_test: Standard uncertainty that seat, fixture and temperature add to every test value, mm.
+        u_test: Standard uncertainty that seat and fixture add to every test value, mm.
         maxima: Limits of the quantities in `MAXIMA`, mm.
         standards: Standards whose acceptance tests are run: "jjf", "asme", "iso". Default: those whose procedure the
             recording was made for. Tests with a limit are run in any case.
+        calibration_warnings: What should be read about the calibration before its numbers (`warnings_of`); the
+            evaluation keeps it.
+        influences: What else adds uncertainty: in proportion to a length, and thermal expansion.
+        rule: Decision rule, a key of `RULES`; by default that of each standard.
 
     Returns:
         The record, with warnings on what makes it doubtful.
@@ -154,7 +179,7 @@ def evaluation_of(
     if partly:
         names = ", ".join(partly)
         warnings.append(f"The arm was identified from some poses of {names}; these count as identified from.")
-    if not _same(recording.nominal.arm, record.recording.nominal.arm):
+    if not same_arm(recording.nominal.arm, record.recording.nominal.arm):
         warnings.append(
             f"The capture is of '{recording.nominal.name}', but the calibration is of "
             f"'{record.recording.nominal.name}'; check that it is the same arm."
@@ -168,6 +193,9 @@ def evaluation_of(
         maxima=dict(maxima or {}),
         standards=made_for(recording) if standards is None else checked_standards(standards),
         uncertainty=to_numpy(uncertainty_of(record)),
+        calibration_warnings=tuple(calibration_warnings),
+        influences=influences,
+        rule=rule,
     )
     if not found.independent:
         warnings.append(
@@ -212,12 +240,12 @@ def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:
     if not names:
         return []
     return [
-        f"No uncertainty was stated for {', '.join(names)}, so U is 0 and the decision ignores it; state what seat, "
-        "fixture and temperature contribute (--test-u-mm)."
+        f"No uncertainty was stated for {', '.join(names)}, so U is 0 and the decision ignores it; state what seat "
+        "and fixture contribute (--test-u-mm), and the temperatures (--expansion)."
     ]
 
 
-def _same(one: Arm, other: Arm) -> bool:
+def same_arm(one: Arm, other: Arm) -> bool:
     """Whether two arms have the same parameters; without beta it is 0. A model of its joints may come
     with a calibration."""
 

@@ -1,7 +1,7 @@
 """What acceptance tests take (`Measured`) and return: metrics, and the values that each metric rests on."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +10,8 @@ from jaxtyping import Float
 from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
 from ..kinematics.workspace import Reach
-from .decision import DECISIONS, Decision, worst
+from .decision import COVERAGE_FACTOR, DECISIONS, Decision, Rule, worst
+from .standards import EDITIONS, SYMBOLS
 
 METRICS = {
     "Deltam": "largest half range of a coordinate in a socket",
@@ -23,12 +24,11 @@ METRICS = {
     "Volumetric": "largest deviation of a bar",
     "Volumetric_Range": "largest less smallest deviation of bars",
     "Volumetric_2RMS": "twice the RMS deviation of bars",
-    "P_Size": "size error of a sphere of 25 points (P_Size.Sph.1x25)",
-    "P_Form": "form error of a sphere of 25 points (P_Form.Sph.1x25)",
-    "L_Dia": "smallest sphere around five centres, one per orientation (L_Dia.5x5.Art)",
-    "E_Uni": "length error, single readings (E_Uni)",
+    "P_Size": "size error of a sphere of 25 points",
+    "P_Form": "form error of a sphere of 25 points",
+    "L_Dia": "smallest sphere around five centres, one per orientation",
+    "E_Uni": "length error of single readings, unidirectional",
 }
-_COVERAGE_FACTOR = 2.0
 
 
 class MetricValue(NamedTuple):
@@ -44,7 +44,7 @@ class MetricValue(NamedTuple):
 
 def metric_value(where: str, value: float, *u: float) -> MetricValue:
     """A value whose standard uncertainty combines the independent contributions ``u``, mm."""
-    return MetricValue(where, value, _COVERAGE_FACTOR * math.sqrt(sum(own**2 for own in u)))
+    return MetricValue(where, value, COVERAGE_FACTOR * math.sqrt(sum(own**2 for own in u)))
 
 
 class Metric(NamedTuple):
@@ -86,20 +86,31 @@ class AcceptanceTest(NamedTuple):
     standard: str  # a key of `acceptance.standards.EDITIONS`
     title: str
     metrics: tuple[Metric, ...]
-    missing: tuple[str, ...]
+    missing: tuple[str, ...]  # sentences
+    rule: Rule = "iso-2017"  # by which limits are decided
 
     @property
     def decision(self) -> Decision | None:
         """The worst decision of all metrics; None without limits."""
         return worst([metric.decision for metric in self.metrics if metric.decision is not None])
 
+    @property
+    def called(self) -> str:
+        """The standard's edition; "after" it if something that the standard requires is missing."""
+        return EDITIONS[self.standard] if not self.missing else f"after {EDITIONS[self.standard]}"
 
-def acceptance_test(
-    standard: str, title: str, metrics: Sequence[Metric], missing: Sequence[str]
-) -> AcceptanceTest | None:
-    """The test of those metrics that have values; None if none has."""
-    found = tuple(metric for metric in metrics if metric.values)
-    return AcceptanceTest(standard, title, found, tuple(missing)) if found else None
+    def symbol(self, metric: Metric) -> str:
+        """The standard's symbol of a metric; its plain name if there is none, or the test is not complete."""
+        return metric.name if self.missing else SYMBOLS.get(metric.name, metric.name)
+
+
+class Postures(NamedTuple):
+    """How the arm was held at each pose, which points do not tell."""
+
+    elbows: Mapping[str, Float[np.ndarray, " m"]]  # by socket: angle of the elbow to the left of the vertical, rad
+    probes: Mapping[
+        tuple[str, str], tuple[Float[np.ndarray, "m 3"], ...]
+    ]  # by sphere and test: of each group's touches
 
 
 class Measured(NamedTuple):
@@ -113,6 +124,8 @@ class Measured(NamedTuple):
     none_held_out: bool = False  # whether the arm was identified from all of this, so that nothing is a test
     sources: tuple[str, ...] = ()  # files that points were read from
     measured: str = ""  # day on which the points were recorded
+    measuring_range: float | None = None  # diameter of the measuring volume as the maker states it, mm
+    postures: Postures | None = None  # None of points, which do not tell how the arm was held
 
     @property
     def tested(self) -> dict[str, Float[np.ndarray, "m 3"]]:

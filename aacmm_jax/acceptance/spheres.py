@@ -12,7 +12,6 @@ from ..core.errors import InputError
 from ..data.sphere import ProbedSphere
 
 EXACT_POINTS = 4  # a sphere goes through so many points exactly, so they have no form error
-_DIAMETERS = (10.0, 51.0)  # mm: 10 to 50 after ASME B89.4.22, 10 to 51 after ISO 10360 (background knowledge)
 _COINCIDENT = 1e-7  # distance of two points, relative to the extent of all, below which they count as one
 
 
@@ -139,18 +138,3 @@ def errors_named(sphere: ProbedSphere, group: int | None = None) -> Iterator[Non
     except InputError as error:
         where = f"sphere '{sphere.name}'" + ("" if group is None else f", group {group}")
         raise InputError(f"{where}: {error}") from error
-
-
-def missing_touches(sphere: ProbedSphere, *, groups: int, points: int, of: str) -> list[str]:
-    """What a complete test of a sphere would also need; ``of`` says what its groups are."""
-    found = []
-    if not _DIAMETERS[0] <= sphere.diameter <= _DIAMETERS[1]:
-        found.append(
-            f"a sphere of {_DIAMETERS[0]:g} to {_DIAMETERS[1]:g} mm ('{sphere.name}' has {sphere.diameter:g} mm)"
-        )
-    if len(sphere.groups) < groups:
-        found.append(f"{groups} {of} of sphere '{sphere.name}' ({len(sphere.groups)} given)")
-    fewest = min(len(group) for group in sphere.groups)
-    if fewest < points:
-        found.append(f"{points} points per group on sphere '{sphere.name}' (one has {fewest})")
-    return found

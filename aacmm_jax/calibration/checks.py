@@ -1,18 +1,23 @@
 """Checks before a solve, and whether a result is plausible at all."""
 
 import math
+import warnings
 
+import jax
 import numpy as np
 
+from ..core._compat import inside_trace
 from ..core.arrays import is_concrete
-from ..core.errors import InputError
+from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import AnyArray
 from ..data.capture import Capture
 from ..data.noise import Noise, at_tip
 from ..kinematics.arm import Arm, is_single
 from ..kinematics.parameters import Bounds
+from ..kinematics.priors import Prior
 from ..kinematics.workspace import total_link_length
 from ..uncertainty.covariance import NOISE_MODELS, NoiseModel
+from ..uncertainty.identifiability import observability
 
 PLAUSIBLE_SCALE = (0.5, 2.0)
 # Repeatability of an arm or robot relative to the sum of its links: the paper's arm reaches 1e-5 (0.026 mm on 2.5 m).
@@ -62,6 +67,21 @@ def check_enough(sizes: tuple[int, ...], unknowns: int) -> None:
             f"{poses} poses in {sockets} socket{'s' if sockets > 1 else ''} give {equations} equations, but {unknowns} "
             f"unknowns need at least {needed} poses; record more poses or hold more parameters."
         )
+
+
+def check_identifiable(capture: Capture, bounds: Bounds, prior: Prior | None, strict: bool) -> None:
+    """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; not of traced values."""
+    if inside_trace() or not is_concrete(*jax.tree.leaves((capture, bounds))):
+        return
+    space = bounds.space
+    known = None if prior is None else prior.of(space.names, space.vector())
+    named = () if known is None else tuple(space.names[i] for i in known.index)
+    seen = observability(space.base, capture, space, known=named)
+    sentences, lost = seen.sentences(), seen._replace(by_prior=()).sentences()
+    if lost and strict:
+        raise InputError(" ".join(lost))
+    for sentence in sentences:
+        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
 
 
 def check_noise_model(noise_model: NoiseModel | None, noise: Noise | None, joints: int) -> NoiseModel:

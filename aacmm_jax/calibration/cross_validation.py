@@ -109,6 +109,8 @@ def cross_validate(
     noise: Noise | None = None,
     robust: LossName | None = None,
     prior: Prior | None = None,
+    replace_noise: bool = True,
+    shared_errors: bool = True,
     groups: Iterable[str] | None = None,
 ) -> CrossValidation:
     """Calibrate once without each group of sockets and observations, and evaluate the result on that group.
@@ -129,6 +131,8 @@ def cross_validate(
         noise: standard deviations of readings and seat, as for `calibrate`.
         robust: robust loss of the calibrations, as for `calibrate`; bad poses of what is left out count in full.
         prior: what is known of the parameters, as for `calibrate`.
+        replace_noise: estimate the noise of encoders that prove noisier, as for `calibrate`.
+        shared_errors: whether the predictions include errors that poses share, as for `calibrate`.
         groups: what to leave out instead, each as a name or a shell pattern: ``["monday/*", "tuesday/*"]``.
 
     Returns:
@@ -149,7 +153,11 @@ def cross_validate(
             "(--no-cross-validate)."
         )
     solving = {"method": method, "hold": hold, "noise": noise, "robust": robust, "prior": prior}
-    solving |= {"check_identifiability": False}
+    solving |= {
+        "check_identifiability": False,
+        "replace_noise": replace_noise,
+        "shared_errors": shared_errors,
+    }
     return CrossValidation(
         tuple(_left_out(calibrate(arm, rest, bounds, **solving), left, group) for rest, left, group in parts)
     )

@@ -16,7 +16,7 @@ from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.observations.socket import position_of
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, check_columns
 from ..model.measurement import Measurement, length_covariance
 from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Observed
@@ -57,10 +57,7 @@ def evaluate(
         InputError: capture and arm differ in their number of joints, the capture is a batch, or the geometry is none of
             this capture.
     """
-    if capture.joints != arm.joints:
-        raise InputError(
-            f"the capture has {capture.joints} columns, but the arm has {arm.joints} joints; give one column a joint."
-        )
+    check_columns(arm, capture.columns)
     if capture.q.ndim > 2:
         raise InputError("the capture is a batch; evaluate its captures one by one, or map over them with jax.vmap.")
     subject: tuple[Any, ...]

@@ -18,6 +18,8 @@ from .record import CalibrationRecord
 PRIOR = "prior"  # name of its rows
 PROBE = ("probe_x", "probe_y", "probe_z")
 LEAST_U = 1e-6  # mm: smallest standard deviation of a length or certified value
+_MOST_POSES = 2000  # that tests of residuals look at: more would only find errors that do not matter
+_CHUNK = 100  # poses of one observation that are kept together
 
 
 class Rows(NamedTuple):
@@ -58,8 +60,7 @@ class Equations(NamedTuple):
         """All in one group; with some of ``extra`` as unknowns that only certain observations have."""
         columns = [self.extra.index(name) for name in names]
         found = [rows.block("", columns, rows.name in members) for rows in self.rows]
-        wider = ((0, 0), (0, len(columns)))
-        return [*found, *(block._replace(shared=np.pad(block.shared, wider)) for block in self.relations)]
+        return [*found, *wider(self.relations, len(columns))]
 
     def grouped(self, groups: Mapping[str, str | None]) -> list[Block]:
         """By the group of each observation."""
@@ -75,6 +76,36 @@ def equations_of(record: CalibrationRecord) -> Equations:
         return Equations(_of_sockets(record, extra), [], extra, steps)
     rows, relations = _of_observations(record, extra)
     return Equations(rows, relations, extra, steps)
+
+
+def equations_in_chunks(record: CalibrationRecord) -> tuple[list[Rows], list[Block]]:
+    """The equations of poses in chunks, or of very many an even choice of these, and those of relations.
+
+    Unknowns of an observation that is divided become shared ones.
+    """
+    equations = equations_of(record)
+    divided = [each for each in equations.rows if len(each.poses) > _CHUNK]
+    added = sum(each.own.shape[2] for each in divided)
+    chunks, position = [], 0
+    for each in equations.rows:
+        shared = np.pad(each.shared, ((0, 0), (0, 0), (0, added)))
+        if len(each.poses) <= _CHUNK:
+            chunks.append(each._replace(shared=shared))
+            continue
+        width = each.own.shape[2]
+        shared[..., each.shared.shape[2] + position :][..., :width] = each.own
+        position += width
+        whole = each._replace(shared=shared, own=each.own[..., :0])
+        for start in range(0, len(each.poses), _CHUNK):
+            of = slice(start, start + _CHUNK)
+            chunks.append(whole._replace(**{name: getattr(whole, name)[of] for name in Rows._fields if name != "name"}))
+    step = -(-sum(len(each.poses) for each in chunks) // _MOST_POSES)
+    return chunks[:: max(step, 1)], wider(equations.relations, added)
+
+
+def wider(relations: Sequence[Block], added: int) -> list[Block]:
+    """Relations where there are further shared unknowns, of which they say nothing."""
+    return [block._replace(shared=np.pad(block.shared, ((0, 0), (0, added)))) for block in relations]
 
 
 def _of_sockets(record: CalibrationRecord, extra: tuple[str, ...]) -> list[Rows]:

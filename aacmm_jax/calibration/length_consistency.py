@@ -47,7 +47,7 @@ def length_test(
     Returns:
         None where there are too few to contradict each other.
     """
-    related = _of_sockets(record, rows) if record.observed is None else _of_observations(record, rows, relations)
+    related = lengths_of_sockets(record, rows) if record.observed is None else _of_observations(record, rows, relations)
     if related is None:
         return None
     names, units = related.names, related.units
@@ -74,7 +74,7 @@ def length_test(
     )
 
 
-class _Related(NamedTuple):
+class Related(NamedTuple):
     """Lengths and certified values, and the equations of the poses that say what they should be."""
 
     names: list[str]
@@ -85,7 +85,7 @@ class _Related(NamedTuple):
     scale: tuple[Float[np.ndarray, " R"], Float[np.ndarray, " l"]] | None  # derivatives by the scale anchor
 
 
-def _of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> _Related | None:
+def lengths_of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> Related | None:
     """The positions of sockets are eliminated: a length has the scatter of its ends besides its own u."""
     names, anchor = _names_of_lengths(record), scale_anchor_of(record)
     if not names:
@@ -105,10 +105,10 @@ def _of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> _Related | N
         scale = np.concatenate([(each.by_tip @ by_anchor[each.poses]).ravel() for each in rows]), slopes[:, ~kept][:, 0]
     further = rows[0].shared.shape[2] - int(kept.sum())  # unknowns of sockets with very many poses
     relations = Block("", None, error, np.pad(slopes[:, kept], ((0, 0), (0, further))), np.zeros((len(error), 0)))
-    return _Related(names, np.ones(len(names)), [each.block("") for each in rows], relations, covariance, scale)
+    return Related(names, np.ones(len(names)), [each.block("") for each in rows], relations, covariance, scale)
 
 
-def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block]) -> _Related | None:
+def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block]) -> Related | None:
     lengths = [block for block in relations if block.fixture != PRIOR]
     if not lengths:
         return None
@@ -125,7 +125,7 @@ def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations:
         column = record.names.index(anchor)
         scale = np.concatenate([block.shared[:, column] for block in poses]), related.shared[:, column]
         *poses, related = (b._replace(shared=np.delete(b.shared, column, axis=1)) for b in (*poses, related))
-    return _Related(names, units, poses, related, np.eye(len(units)), scale)
+    return Related(names, units, poses, related, np.eye(len(units)), scale)
 
 
 def _names_of_lengths(record: CalibrationRecord) -> list[str]:

@@ -1,20 +1,29 @@
 """What a calibration's model may lack: known functions of the readings and of the order of the poses.
 
 Of joint i, the model's angle is its reading and a zero. What it lacks is a further function phi of the readings, whose
-column is that of theta_i times phi: harmonics of an eccentric, tilted or oval encoder, a wrong gear ratio, the moment
-of gravity about the axis where the joint or the link behind it bends, a zero that drifts from pose to pose. A base that
-moves and an arm that grows meanwhile move the tip itself.
+column is that of theta_i times phi: those of `kinematics.corrections` (harmonics of an eccentric, tilted or oval
+encoder, a wrong gear ratio, the moment of gravity about the axis where the joint or the link behind it bends), and a
+zero that drifts from pose to pose. A base that moves and an arm that grows, meanwhile or with its temperature, move the
+tip itself.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from ..kinematics.arm import Arm
-from ..kinematics.chain import ForwardPass, forward_pass, joint_motion
-from .group_equations import Rows
+from ..core.numpy_or_jax import to_numpy
+from ..kinematics.arm import DOWN, Arm
+from ..kinematics.chain import forward_pass, joint_motion
+from ..kinematics.corrected_arm import function_values
+from ..kinematics.corrections.kinds import terms_of
+from ..uncertainty.group_test import Block
+from ..uncertainty.residual_tests import LEVEL, Residuals, ScoreTest, score_tests
+from .group_equations import Rows, wider
+
+MOST_TERMS = 6  # that are looked for one after the other
+_AS_WELL = 6.0  # difference of the information criterion (Akaike 1974) below which another term explains as much
 
 Kind = Literal[
     "zero",
@@ -25,7 +34,15 @@ Kind = Literal[
     "drifting zero",
     "drifting base",
     "growing arm",
+    "thermal expansion",
 ]
+# As in `kinematics.corrections`; a kind is looked for with all its functions of a joint at once.
+_FUNCTIONS: dict[Kind, str] = {
+    "gear ratio": "gear",
+    "first harmonic": "harmonics=1",
+    "second harmonic": "harmonics=2",
+    "gravity": "gravity",
+}
 
 
 class MissingTerm(NamedTuple):
@@ -36,12 +53,26 @@ class MissingTerm(NamedTuple):
     values: Float[np.ndarray, "N _k"] | Float[np.ndarray, "N 3 _k"]  # pose by pose, for coefficients of 1
 
 
+class FoundTerm(NamedTuple):
+    """A term that explains residuals, and what explains them as well."""
+
+    kind: Kind
+    joint: int | None
+    test: ScoreTest
+    probability: float  # Holm's: of all candidates
+    amplitude: float  # half the range of what the term adds over the poses, rad or mm; of a gear ratio, relative
+    alternatives: tuple[tuple[Kind, int | None], ...]
+    term: MissingTerm
+
+
 def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows], joints: int) -> list[Float[np.ndarray, "R _"]]:
-    """The columns of each term in the rows of all poses."""
+    """The columns of each term in the rows of all poses; those of the tip last."""
     of_joints = [term for term in terms if term.joint is not None]
     of_tip = [term for term in terms if term.joint is None]
     owner = np.array([term.joint for term in of_joints for _ in range(term.values.shape[1])], dtype=int) - 1
-    factors, moves = (np.concatenate([term.values for term in some], axis=-1) for some in (of_joints, of_tip))
+    poses = len(terms[0].values)
+    factors = np.concatenate([np.zeros((poses, 0)), *(term.values for term in of_joints)], axis=1)
+    moves = np.concatenate([np.zeros((poses, 3, 0)), *(term.values for term in of_tip)], axis=2)
     blocks = []
     for each in rows:
         by_joints = each.extra[..., :joints][..., owner] * factors[each.poses][:, None]
@@ -56,42 +87,110 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
 
     Args:
         arm: The calibrated arm.
-        q: All readings in their order, rad.
+        q: All readings in their order, rad; with a thermometer, the temperature last, C.
     """
-    forward = forward_pass(arm.geometry, joint_motion(arm.geometry, q))
+    arm = to_numpy(arm)
     order = np.linspace(-1.0, 1.0, len(q))[:, None]
-    tip = np.moveaxis(np.asarray(forward.tip), -1, 0)
+    tip = np.moveaxis(np.asarray(forward_pass(arm.geometry, joint_motion(arm.geometry, q)).tip), -1, 0)
+    functions = _functions(arm, q)
+    found = []
+    for joint in range(1, arm.joints + 1):
+        found += [MissingTerm("zero", joint, np.ones_like(order)), MissingTerm("drifting zero", joint, order)]
+        # A scale has no revolution to repeat, and carries what it moves.
+        kinds: list[Kind] = [kind for kind in _FUNCTIONS if joint not in arm.prismatic or kind == "gear ratio"]
+        found += [MissingTerm(kind, joint, functions[kind, joint]) for kind in kinds]
     return [
-        *(
-            term
-            for joint in range(arm.joints)
-            for term in _of_joint(forward, q[:, joint, None], order, joint, joint + 1 in arm.prismatic)
-        ),
+        *found,
         MissingTerm("drifting base", None, order[:, :, None] * np.eye(3)),
         MissingTerm("growing arm", None, order[:, :, None] * tip[:, :, None] / 1e3),  # by 1 mm a m
+        *(
+            MissingTerm("thermal expansion", None, (temperature - 20)[:, None, None] * tip[:, :, None] / 1e3)
+            for temperature in q[:, arm.joints :].T
+            if np.ptp(temperature) > 0
+        ),
     ]
 
 
-def _of_joint(
-    forward: ForwardPass, q: Float[np.ndarray, "N 1"], order: Float[np.ndarray, "N 1"], joint: int, slides: bool
-) -> Iterator[MissingTerm]:
-    yield MissingTerm("zero", joint + 1, np.ones_like(q))
-    yield MissingTerm("gear ratio", joint + 1, q)
-    yield MissingTerm("drifting zero", joint + 1, order)
-    if slides:  # a scale has no revolution to repeat, and carries what it moves
-        return
-    yield MissingTerm("first harmonic", joint + 1, np.concatenate([np.cos(q), np.sin(q)], axis=1))
-    yield MissingTerm("second harmonic", joint + 1, np.concatenate([np.cos(2 * q), np.sin(2 * q)], axis=1))
-    yield MissingTerm("gravity", joint + 1, _moments(forward, joint))
+def _functions(arm: Arm, q: Float[np.ndarray, "N n"]) -> dict[tuple[Kind, int], Float[np.ndarray, "N _k"]]:
+    """The functions of each kind and joint. Masses are not known, so each link has a coefficient of its own."""
+    nominal = arm.geometry if arm.corrections is None else arm.corrections.nominal
+    gravity = np.asarray(DOWN if arm.gravity is None else arm.gravity)
+    found = {}
+    for kind, model in _FUNCTIONS.items():
+        terms = terms_of(model, arm.joints)
+        values = function_values(nominal, terms, q, gravity)
+        for joint in range(1, arm.joints + 1):
+            found[kind, joint] = values[[term.joint == joint for term in terms]].T
+    return found
 
 
-def _moments(forward: ForwardPass, joint: int) -> Float[np.ndarray, "N k"]:
-    """Moments of gravity about a joint's axis by a unit mass at the origin of each frame that it moves, and at the tip,
-    with the base upright; m.
+def found_terms(
+    arm: Arm, q: Float[np.ndarray, "N n"], rows: Sequence[Rows], relations: Sequence[Block]
+) -> tuple[FoundTerm, ...]:
+    """Terms that the model lacks, the one that explains most first.
 
-    Masses and stiffness are not known, so each point has a coefficient of its own.
+    Args:
+        arm: The calibrated arm.
+        q: All readings in their order, rad.
+        rows: Equations of the poses.
+        relations: Equations of lengths, certified values and priors.
     """
-    points = np.concatenate([np.asarray(forward.origin)[joint:], np.asarray(forward.tip)[None]])
-    arms = points - np.asarray(forward.origin_before)[joint]
-    axis = np.asarray(forward.z_before)[joint]
-    return (axis[1] * arms[:, 0] - axis[0] * arms[:, 1]).T / 1e3
+    left = Residuals.of([*(each.block("") for each in rows), *relations])
+    candidates, others_rows = missing_terms(arm, q), sum(len(block.residual) for block in relations)
+    columns = [np.pad(each, ((0, others_rows), (0, 0))) for each in columns_of(candidates, rows, arm.joints)]
+    chosen: list[tuple[int, ScoreTest, float, list[int]]] = []
+    explained = left
+    for _ in range(MOST_TERMS):
+        tests = score_tests(explained, columns)
+        number = sum(test.degrees_of_freedom[0] > 0 for test in tests)
+        significant = [i for i, test in enumerate(tests) if test.probability * number < LEVEL]
+        if not significant:
+            break
+        criterion = [_criterion(explained, test) for test in tests]
+        best = min(significant, key=lambda i: criterion[i])
+        others = [i for i in significant if i != best and criterion[i] < criterion[best] + _AS_WELL]
+        others.sort(key=lambda i: criterion[i])
+        chosen.append((best, tests[best], min(tests[best].probability * number, 1.0), others))
+        explained = explained.extended(columns[best])
+    if not chosen:
+        return ()
+    (together,) = score_tests(left, [np.concatenate([columns[i] for i, *_ in chosen], axis=1)])
+    coefficients = np.split(together.coefficients, np.cumsum([columns[i].shape[1] for i, *_ in chosen])[:-1])
+    return tuple(
+        FoundTerm(
+            *(candidates[i].kind, candidates[i].joint, test, probability),
+            amplitude=_amplitude(candidates[i], own),
+            alternatives=tuple((candidates[j].kind, candidates[j].joint) for j in others),
+            term=candidates[i],
+        )
+        for (i, test, probability, others), own in zip(chosen, coefficients, strict=True)
+    )
+
+
+def with_terms(
+    rows: Sequence[Rows], relations: Sequence[Block], found: Sequence[FoundTerm], joints: int
+) -> tuple[list[Rows], list[Block]]:
+    """The equations with these terms as further unknowns."""
+    if not found:
+        return list(rows), list(relations)
+    columns = np.concatenate(columns_of([one.term for one in found], rows, joints), axis=1)
+    ends = np.cumsum([each.residual.size for each in rows])[:-1]
+    extended = [
+        each._replace(shared=np.concatenate([each.shared, of.reshape(*each.residual.shape, -1)], axis=2))
+        for each, of in zip(rows, np.split(columns, ends), strict=True)
+    ]
+    return extended, wider(relations, columns.shape[1])
+
+
+def _criterion(left: Residuals, test: ScoreTest) -> float:
+    """Akaike's, less what is common to all."""
+    rows, (added, _) = len(left.values), test.degrees_of_freedom
+    return rows * float(np.log(max(left.cost - test.gain, 1e-300) / left.cost)) + 2 * added if added else np.inf
+
+
+def _amplitude(term: MissingTerm, coefficients: Float[np.ndarray, " k"]) -> float:
+    if term.kind in ("gear ratio", "zero"):
+        return float(abs(coefficients[0])) * 1e-3
+    added = term.values @ coefficients
+    half = float(np.linalg.norm(np.ptp(added.reshape(len(added), -1), axis=0))) / 2
+    return half if term.joint is None else half * 1e-3

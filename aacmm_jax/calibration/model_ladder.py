@@ -20,10 +20,11 @@ from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
-from ..kinematics.arm import DOWN, Arm, correction_names
+from ..kinematics.arm import DOWN, Arm, without_corrections
 from ..kinematics.corrected_arm import with_corrections
-from ..kinematics.parameters import ArmSpecification, Bounds, Parameters, based_on
+from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
 from ..kinematics.prior_scales import default_prior
+from .joint_model import with_coefficients
 from .record import record_of
 from .results import Calibration
 from .single import calibrate
@@ -131,9 +132,9 @@ def compare_models(
     named = items_of(models, "models")
     if not named or not all(isinstance(model, str) and model.strip() for model in named):
         raise InputError("models names no model; give some, from simple to rich, such as 'dh' and 'dh,gravity'.")
-    plain = arm.replace(coefficients=None, gravity=None, corrections=None)
+    plain = without_corrections(arm)
     bounds = Bounds.around(plain, Parameters.free_of(plain)) if bounds is None else bounds
-    left_out = regions_of(to_numpy(capture), regions)
+    left_out = regions_of(to_numpy(capture), regions, arm.joints)
 
     def compared(model: str) -> ComparedModel:
         begun = time.process_time()
@@ -152,10 +153,15 @@ def _compared(
     noise: Noise | None,
     begun: float,
 ) -> ComparedModel:
-    widened = _with_coefficients(bounds, arm)
+    widened = with_coefficients(bounds, arm)
     arm = widened.space.base
     result = calibrate(
-        arm, capture, widened, method="joint", noise=noise, prior=default_prior(arm), check_identifiability=False
+        *(arm, capture, widened),
+        method="joint",
+        noise=noise,
+        prior=default_prior(arm),
+        replace_noise=False,  # so that all models are compared with the same
+        check_identifiability=False,
     )
     record = record_of(result, Recording(capture, ArmSpecification(arm)))
     assert record.observed is not None
@@ -170,15 +176,3 @@ def _compared(
         cpu_seconds=time.process_time() - begun,
         result=result,
     )
-
-
-def _with_coefficients(bounds: Bounds, arm: Arm) -> Bounds:
-    """The box of the Denavit-Hartenberg parameters, with the coefficients of a corrected arm free and without bounds:
-    their prior is enough."""
-    kept = [i for i, name in enumerate(bounds.space.names) if name not in correction_names(bounds.space.base)]
-    added = tuple(name for name in correction_names(arm) if not name.startswith("gravity_"))
-    names = (*(bounds.space.names[i] for i in kept), *added)
-    base = based_on(bounds.space, arm).base
-    endless = np.full(len(added), np.inf)
-    sides = np.asarray(bounds.lower)[kept], np.asarray(bounds.upper)[kept]
-    return Bounds(Parameters(base, names), np.concatenate([sides[0], -endless]), np.concatenate([sides[1], endless]))

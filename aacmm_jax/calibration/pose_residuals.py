@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
@@ -13,6 +13,7 @@ from ..kinematics.parameters import Parameters
 from ..model.observed import Linear, Observed, linear_rows, whitening_of
 from ..uncertainty import observed_covariance as propagation
 from .evaluation import Evaluation
+from .group_equations import equations_of
 from .record import CalibrationRecord
 
 _POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
@@ -109,3 +110,38 @@ def distances_of(capture: Capture, evaluation: Evaluation) -> tuple[Float[np.nda
 def rms(values: Sequence[float] | Float[np.ndarray, " m"]) -> float:
     """Root mean square; NaN of nothing."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+
+
+class SignedResiduals(NamedTuple):
+    """The residuals of a calibration with their directions, for those poses that have one; N poses, n joints."""
+
+    poses: Int[np.ndarray, " N"]  # their numbers among all poses: sockets first, then other observations
+    vector: Float[np.ndarray, "N 3"]  # in the base frame, mm; of a distance or plane, along what it measures
+    along_joint: Float[np.ndarray, "N n"]  # component along which each joint moves the tip, mm; NaN where it does not
+    normalised: Float[np.ndarray, " k"]  # every row of every pose, in standard deviations
+
+
+def signed_residuals(record: CalibrationRecord) -> SignedResiduals | None:
+    """The residuals of a calibration with their directions; None where no pose has one.
+
+    A joint whose angle is wrong moves the tip along its own direction alone, so that what the model lacks in one joint
+    shows in ``along_joint`` against the reading of that joint.
+
+    Args:
+        record: The calibration.
+    """
+    rows, joints = equations_of(record).rows, record.calibrated.arm.joints
+    if not rows:
+        return None
+    parts = []
+    for each in rows:
+        in_mm = np.einsum("mcr,mr->mc", each.in_mm, each.residual)
+        vector = np.einsum("mcr,mrx,mc->mx", each.in_mm, each.by_tip, in_mm)
+        moves = each.in_mm @ each.extra[..., :joints]
+        size = np.linalg.norm(moves, axis=1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            along = np.where(size > 1e-6 * size.max(), np.einsum("mc,mcn->mn", in_mm, moves) / size, np.nan)
+        parts.append((each.poses, vector, along, each.residual.ravel()))
+    poses, *arrays = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.argsort(poses, kind="stable")
+    return SignedResiduals(poses[order], arrays[0][order], arrays[1][order], arrays[2])

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -24,6 +25,7 @@ from ..model.observed import Observed, certified_and_lengths, linear_rows
 from ..model.socket_sums import means_over_sockets, sums_over_sockets
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.observed_identifiability import dense_rows
+from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
 from .observed_evaluation import fit_geometry
 
 _NULL = 1e-10  # singular values of the geometry below this, of the largest, are zero
@@ -133,7 +135,7 @@ def unseen_errors(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
     Returns:
         Errors of every socket, observation and reference length, found and predicted.
     """
-    uncertainty, capture = to_numpy((uncertainty, capture))
+    uncertainty, capture = to_numpy((uncertainty.complete, capture))
     return _of_observations(uncertainty, capture) if capture.observations else _of_sockets(uncertainty, capture)
 
 
@@ -143,6 +145,8 @@ def _of_sockets(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
     tips, slopes = np.asarray(arm.position(capture.q)), np.asarray(uncertainty.derivatives(capture.q))
     motion = joint_motion(arm.geometry, capture.q)
     noise = np.moveaxis(np.asarray(tip_covariances(arm.geometry, motion, uncertainty.noise)), -1, 0)
+    of_one, of_mean = _variances_in_places(uncertainty.shared, capture)
+    noise = noise + of_one * np.eye(3)
 
     def over(sums: Any, values: np.ndarray) -> np.ndarray:
         return np.moveaxis(np.asarray(sums(np.moveaxis(values, 0, -1), capture.sizes)), -1, 0)
@@ -174,7 +178,7 @@ def _of_sockets(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
     along = np.einsum("lc,lcp->lp", direction, means[ends[:, 1]] - means[ends[:, 0]])
     lengths = capture.lengths
     covariance = uncertainty.covariance_of_functions(along) + np.diag([float(length.u) ** 2 for length in lengths])
-    of_means = total / sizes[:, None, None] ** 2
+    of_means = total / sizes[:, None, None] ** 2 + of_mean[:, None, None] * np.eye(3)
     for one in (0, 1):
         pulled = np.einsum("lcd,ld->lc", of_means[ends[:, one]], direction)
         for other in (0, 1):
@@ -185,6 +189,25 @@ def _of_sockets(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
     return UnseenErrors(parts, shared, error, np.asarray(covariance), uncertainty.degrees_of_freedom)
 
 
+def _variances_in_places(shared: SharedErrors | None, capture: Capture) -> tuple[float, Float[np.ndarray, " s"]]:
+    """What errors that poses share add to the variance of a tip coordinate within each socket, and to that of each
+    socket's mean beside the mean of so many independent errors, mm^2."""
+    sizes = np.asarray(capture.sizes, dtype=float)
+    if shared is None:
+        return 0.0, np.zeros(len(sizes))
+    within, between = float(shared.sd_of(VISITS, SUCCESSIVE)) ** 2, float(shared.sd_of(PLACES)) ** 2
+    visits, length = capture.visits_of_sockets, float(shared.correlation_length)
+
+    def part_of_mean(name: str, size: int) -> float:
+        if name in visits:
+            return float(np.sum((np.unique(visits[name], return_counts=True)[1] / size) ** 2))
+        order = np.arange(size)
+        return float(np.mean(np.exp(-np.abs(order[:, None] - order) / length))) if np.isfinite(length) else 1.0
+
+    parts = np.array([part_of_mean(name, size) for name, size in zip(capture.names, capture.sizes, strict=True)])
+    return within, between + within * (parts - 1 / sizes)
+
+
 def _of_observations(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
     """Of observations whose geometry is fitted to the arm.
 
@@ -192,8 +215,10 @@ def _of_observations(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors
     the parameters and w of the rows leave K (A dp + w) with K = I - U U^T. In mm, with D the inverse of the whitening,
     V = D (K + K A C A^T K) D^T = D (I + W S W^T) D^T, where W = [U, K A] and S = diag(-I, C).
     """
-    observed = Observed.of(capture, uncertainty.arm)
-    fitted = fit_geometry(uncertainty.arm, observed, {}, uncertainty.noise)
+    observed, noise, shared = Observed.of(capture, uncertainty.arm), uncertainty.noise, uncertainty.shared
+    if shared is not None:
+        noise = eqx.tree_at(lambda n: n.seating, noise, np.hypot(noise.seating, shared.sd_of(VISITS, SUCCESSIVE)))
+    fitted = fit_geometry(uncertainty.arm, observed, {}, noise)
     space = uncertainty.space
     p = len(space.names)
     z = np.concatenate([np.asarray(space.vector()), fitted.geometry])
@@ -234,6 +259,8 @@ def _of_observations(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors
         )
     pull = (relations[:count, p:] * observed.steps) @ follow
     covariance = uncertainty.covariance_of_functions(pull @ along) + pull @ pull.T + np.diag(u[:count] ** 2)
+    ends = 0.0 if shared is None else float(shared.sd_of(PLACES))
+    covariance = covariance + ends**2 * relations[:count, p:] @ relations[:count, p:].T
     geometry = observed.split(fitted.geometry)
     measured = np.array([float(np.linalg.norm(geometry[end] - geometry[start])) for start, end in observed.ends])
     error = measured - np.asarray(observed.nominal)

@@ -16,10 +16,11 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..solver.reason import SCALE, Reason, numbers_of
 from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.shared_errors import SharedErrors
 from .checks import largest_plausible_residual, plausible
 from .evaluation import Evaluation, evaluate
 from .left_out import CrossValidation
-from .results import Calibration, Identification, ObservedMetrics, PriorMetrics
+from .results import Calibration, Identification, NoisyEncoder, ObservedMetrics, PriorMetrics
 from .second_stage import LARGEST_LOG_K
 
 REPEATABILITY = "repeatability"  # method of stage 1 alone
@@ -91,6 +92,8 @@ class CalibrationRecord(NamedTuple):
     others: OtherPoses | None = None
     removed: tuple[Removed, ...] = ()
     prior: PriorMetrics | None = None  # with arrays of NumPy
+    noisy_encoders: tuple[NoisyEncoder, ...] = ()  # whose noise was estimated, because it is larger than expected
+    shared: SharedErrors | None = None  # errors that poses share, likewise
 
     @property
     def given_noise(self) -> Noise | None:
@@ -164,6 +167,7 @@ def record_of(
     """
     nominal = recording.nominal
     single = isinstance(calibration, Identification)
+    shared = None if single else calibration.shared
     stage1 = calibration if single else calibration.stage1
     return CalibrationRecord(
         recording=recording,
@@ -193,6 +197,8 @@ def record_of(
         observed=None if stage1.observed is None else jax.tree.map(np.asarray, stage1.observed),
         robust=robust,
         prior=None if calibration.prior is None else jax.tree.map(np.asarray, calibration.prior),
+        noisy_encoders=calibration.noisy_encoders,
+        shared=None if shared is None else jax.tree.map(np.asarray, shared),
         others=None if others is None else _other_poses(calibration.arm, others, stage1.observed),
     )
 
@@ -234,6 +240,7 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
             open=to_jax(result.open),
             noise=result.noise,
             u_k=None if np.isnan(result.u_k) else to_jax(np.asarray(result.u_k)),
+            shared=result.shared,
             names=result.names,
             degrees_of_freedom=result.degrees_of_freedom,
         )
@@ -244,6 +251,7 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         open=result.parameter_covariance.open,
         noise=result.noise,
         u_k=None if scale is None else scale.u,
+        shared=None if isinstance(result, Identification) else result.shared,
         names=result.space.names,
         degrees_of_freedom=float(result.degrees_of_freedom),
     )

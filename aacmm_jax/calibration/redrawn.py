@@ -51,10 +51,9 @@ def trials_of(result: Calibration, capture: Capture, noise: Noise, u: Float[np.n
 
     def drawn(count: int, random: np.random.Generator, level: Any) -> Capture:
         seats = float(noise.seating) * level * random.normal(size=(count, *exact.shape[:1], 3))
-        readings = exact + np.einsum("Nic,tNc->tNi", moves, seats)
-        readings += (
-            np.asarray(noise.of_readings(result.arm.geometry.kinds)) * level * random.normal(size=readings.shape)
-        )
+        read = noise.of_columns(result.arm.geometry.kinds, result.arm.joints, exact.shape[1])
+        readings = exact + read * level * random.normal(size=(count, *exact.shape))
+        readings[..., : result.arm.joints] += np.einsum("Nic,tNc->tNi", moves, seats)
         return batch_of_captures(capture, readings, true_lengths + u * random.normal(size=(count, len(u))))
 
     return Trials(exact.size, drawn)
@@ -110,7 +109,7 @@ class ObservedTruth(NamedTuple):
     def drawn(self, count: int, noise: Noise, random: np.random.Generator, level: Any = 1.0) -> Capture:
         """A batch of captures with new errors; ``level`` (t, 1, 1) multiplies the noise of readings and seat."""
         q = np.asarray(self.observed.q)
-        encoder = np.asarray(noise.of_readings(self.errors[0].kinds))
+        encoder = noise.of_columns(self.errors[0].kinds, self.errors[0].by_readings.shape[1], q.shape[1])
         read = encoder * level * random.normal(size=(count, self.reading.max() + 1, q.shape[1]))
         values = self.values(count, random)
         errors = self.errors_of_rows(count, level * float(noise.seating), random)

@@ -1,6 +1,7 @@
 """What identifications and calibrations, of one and of many, return."""
 
 import abc
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,6 +20,7 @@ from ..model.metrics import Repeatability
 from ..model.scale import Scale
 from ..solver.reason import Reason, numbers_of
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance
+from ..uncertainty.shared_errors import SharedErrors
 from .checks import PLAUSIBLE_SCALE, largest_plausible_residual
 from .scale_anchor import ScaleAnchor
 
@@ -82,6 +84,16 @@ class PriorMetrics(eqx.Module):
         return tuple(name for name, weight in zip(self.names, np.asarray(self.weight), strict=True) if weight > 0)
 
 
+class NoisyEncoder(NamedTuple):
+    """An encoder whose readings are noisier than expected; standard deviations in rad, or mm of a prismatic joint."""
+
+    joint: int  # from 1
+    expected: float  # as it was given, or as that of the others is
+    found: float
+    u: float  # standard uncertainty of ``found``
+    probability: float  # of such residuals or larger ones, where the noise is as expected
+
+
 class AbstractSingleResult(AbstractResult):
     """What an `Identification` and a `Calibration` have in common."""
 
@@ -131,6 +143,16 @@ class AbstractSingleResult(AbstractResult):
     def given_noise(self) -> Noise | None:
         """The noise, where it was given and not estimated."""
         return None if self._stage1.reduced_chi is None else self.noise
+
+    @property
+    def noisy_encoders(self) -> tuple[NoisyEncoder, ...]:
+        """Encoders that proved noisier than given, or than the others, and whose noise was estimated."""
+        return self._stage1.noisy_encoders
+
+    @property
+    def weighting_noise(self) -> Noise | None:
+        """The noise by which poses were weighted: given, or estimated by joint; None where all count alike."""
+        return self.noise if self.noisy_encoders else self.given_noise
 
     @property
     def implausible_residual(self) -> bool:
@@ -195,6 +217,7 @@ class Identification(AbstractSingleResult):
     # Where the capture has observations besides sockets, a robust loss or a prior.
     observed: ObservedMetrics | None = None
     prior_metrics: PriorMetrics | None = None
+    noisy_encoders: tuple[NoisyEncoder, ...] = eqx.field(static=True, default=())
 
     @property
     def _stage1(self) -> "Identification":
@@ -224,6 +247,7 @@ class Calibration(AbstractSingleResult):
     length_after: Float[AnyArray, " l"]  # by the calibrated arm
     stage1: Identification
     method: str = eqx.field(static=True)
+    shared: SharedErrors | None = None  # errors that poses share, which the covariance contains; None: none were found
 
     @property
     def _stage1(self) -> Identification:

@@ -15,6 +15,7 @@ from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.parameters import Parameters
+from ..kinematics.priors import Prior
 from ..model.robust import LossName
 from ..uncertainty.volume import default_length, sample_lengths
 from .batch import BatchOptions, BatchTask, identify_many
@@ -102,7 +103,8 @@ def monte_carlo(
     Of captures with other observations, residuals are drawn about 0: readings, seat and measured values have new
     errors, by the geometry that was found. Blocks of max(100 / (1 - level), 10,000) trials are added until mean, u and
     both ends of the interval of every quantity are stable to a fifth of the tolerance (section 7.9). Bounds act in
-    every trial as they did in the calibration, so the distribution ends where one is active.
+    every trial as they did in the calibration, so the distribution ends where one is active. A prior is an observation
+    like others: its means have new errors too, of its standard deviations, learned ones as they were found.
 
     Args:
         result: what `calibrate` returned.
@@ -150,7 +152,8 @@ def monte_carlo(
                     result.degrees_of_freedom / random.chisquare(result.degrees_of_freedom, size=(count, 1, 1))
                 )
             )
-            solved, lost = task.solved(trials.drawn(count, random, level_of))
+            captures = trials.drawn(count, random, level_of)
+            solved, lost = task.solved(captures, task.prior_means(count, random, np.asarray(result.parameters)))
             parts.append(solved)
             failed += lost
         found = np.concatenate(parts)
@@ -180,7 +183,8 @@ def bootstrap(
 
     Poses are drawn from those of each socket; of other observations from those that owe the same, such as one point of
     an artefact. It only assumes that the errors of poses are independent. (The variance of a socket of m poses is
-    (m - 1) / m too small.)
+    (m - 1) / m too small.) Means of a prior are
+    drawn with its standard deviations.
 
     Args:
         result: what `calibrate` returned.
@@ -203,7 +207,9 @@ def bootstrap(
     random = random_generator(seed)
     task = _RepeatedTask.of(result, capture, None, robust)
     if result.observed is not None:
-        found, failed = task.solved(truth_of(result, capture).resampled(trials, random))
+        captures = truth_of(result, capture).resampled(trials, random)
+        means = None if result.prior is None else _of_prior(result, np.asarray(result.prior.mean))
+        found, failed = task.solved(captures, task.prior_means(trials, random, means))
     else:
         starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
         sizes = zip(starts, capture.sizes, strict=True)
@@ -222,10 +228,6 @@ def _check_level(level: float) -> None:
 
 
 def _check_loss(result: Calibration, capture: Capture, robust: LossName | None) -> None:
-    if result.prior is not None:
-        raise InputError(
-            "the calibration had a prior, which trials do not draw anew; calibrate without one, or use its covariance."
-        )
     """Refuse trials that would be solved with another loss than the calibration, or of another capture."""
     if result.observed is None:
         if capture.observations or robust is not None:
@@ -239,6 +241,16 @@ def _check_loss(result: Calibration, capture: Capture, robust: LossName | None) 
             "a robust loss took weight from poses of this calibration; name it for the bootstrap (robust='huber'), "
             "which keeps such poses, or calibrate without it."
         )
+
+
+def _of_prior(
+    result: Calibration, values: Float[np.ndarray, " q"], missing: float | None = None
+) -> Float[np.ndarray, " p"]:
+    """Numbers of the parameters of a prior in the order of all; those that it leaves out keep what was calibrated."""
+    assert result.prior is not None
+    found = np.array(result.parameters) if missing is None else np.full(len(result.space.names), missing)
+    found[[result.space.names.index(name) for name in result.prior.names]] = values
+    return found
 
 
 def numerical_tolerance(u: Float[np.ndarray, " q"], digits: int) -> Float[np.ndarray, " q"]:
@@ -294,20 +306,38 @@ class _RepeatedTask(NamedTuple):
         u = np.array([float(length.u) for length in capture.lengths])
         return cls(result, capture, np.asarray(start), np.asarray(end), u, robust)
 
-    def _many(self, captures: Capture) -> ManyCalibrations | ManyIdentifications:
+    def prior_means(
+        self, count: int, random: np.random.Generator, centre: Float[np.ndarray, " p"] | None
+    ) -> Float[np.ndarray, "t p"] | None:
+        """Parameters of so many arms in which those with a prior have its means, drawn anew about a centre."""
+        if self.result.prior is None or centre is None:
+            return None
+        weight = _of_prior(self.result, np.asarray(self.result.prior.weight), missing=0.0)
+        sd = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), 0.0)
+        return centre + sd * random.normal(size=(count, len(sd)))
+
+    def _many(
+        self, captures: Capture, means: Float[np.ndarray, "t p"] | None
+    ) -> ManyCalibrations | ManyIdentifications:
         result = self.result
         stage1, bounds = result.stage1, result.bounds
         # What sets the scale, and the noise that weights the poses, are the calibration's own.
         if result.observed is not None:
-            options = {"noise": result.given_noise, "hold": result.hold, "robust": self.robust}
-            return identify_many(result.arm, captures, bounds, start=result.parameters, **options)
-        box, options = (bounds.lower, bounds.upper), BatchOptions(noise=result.given_noise)
+            options = {"noise": result.weighting_noise, "hold": result.hold, "robust": self.robust}
+            if means is None:
+                return identify_many(result.arm, captures, bounds, start=result.parameters, **options)
+            assert result.prior is not None
+            arms = Parameters(result.arm, result.space.names).arm(means)
+            weights = zip(result.prior.names, np.asarray(result.prior.weight).tolist(), strict=True)
+            prior = Prior({name: 1 / weight for name, weight in weights if weight > 0})
+            return identify_many(arms, captures, bounds, start=result.parameters, prior=prior, **options)
+        box, options = (bounds.lower, bounds.upper), BatchOptions(noise=result.weighting_noise)
         task = BatchTask.of(stage1.arm, captures, box, stage1.parameters, result.space, options, stage1.anchor)
         return task.calibrate(result.method)
 
-    def solved(self, captures: Capture) -> tuple[np.ndarray, int]:
+    def solved(self, captures: Capture, means: Float[np.ndarray, "t p"] | None = None) -> tuple[np.ndarray, int]:
         """Outputs of the trials that converged ``(t, q)``, and how many did not."""
-        result, many = self.result, self._many(captures)
+        result, many = self.result, self._many(captures, means)
         good = many.converged
         ends = (jnp.asarray(self.start), jnp.asarray(self.end))
         lengths = _lengths_of(Parameters(result.arm, result.space.names), jnp.asarray(many.parameters), ends)

@@ -8,6 +8,7 @@ still says nothing, and neither does the quill of a SCARA, which has one height 
 """
 
 import math
+import warnings
 from typing import Literal, NamedTuple
 
 import jax
@@ -16,7 +17,7 @@ from jaxtyping import Float
 
 from ..core.arguments import shown
 from ..core.arrays import is_concrete
-from ..core.errors import InputError
+from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
 from ..data.capture import Capture
@@ -140,6 +141,16 @@ def scale_from_slides(arm: Arm, capture: Capture, space: Parameters, noise: Nois
     if not arm.prismatic or capture.lengths or any(observation.fixes_scale for observation in capture.observations):
         return False
     return bool(space.lengths.any()) and scale_anchor(space, arm, "longest", noise, capture).hold is None
+
+
+def warn_of_a_known_scale(set_by: tuple[str, ...], prismatic: bool) -> None:
+    """Warn where a division by k changes nothing: ``set_by`` names the fixed parameters that set the scale."""
+    if set_by:
+        sentence = (
+            f"{scale_set_by_clause(set_by)}, so the reference lengths change nothing; "
+            f"{'' if prismatic else 'free one of these lengths, or '}use both with method='joint'."
+        )
+        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
 
 
 def scale_set_by_clause(names: tuple[str, ...]) -> str:

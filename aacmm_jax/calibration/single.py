@@ -1,6 +1,7 @@
 """Stage 1 (`identify`), both stages (`calibrate`), and the joint solve."""
 
 import warnings
+from functools import partial
 from typing import Literal
 
 import equinox as eqx
@@ -25,14 +26,17 @@ from ..model.robust import LossName
 from ..uncertainty import propagation, scale_uncertainty
 from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
-from ..uncertainty.identifiability import observability
 from .bounded_fit import Fit, fit
-from .checks import check_enough, check_noise_model, check_single, check_start
+from .checks import check_enough, check_identifiable, check_noise_model, check_single, check_start
+from .encoder_noise import with_noise_by_joint
+from .joint_model import with_joint_model
 from .observed import calibrate_observed, identify_observed
-from .observed_state import ObservedTask, observed_task
+from .observed_state import observed_task
 from .results import Calibration, Identification
-from .scale_anchor import default_method, scale_anchor, scale_from_slides, scale_set_by_clause
+from .scale_anchor import default_method, scale_anchor, scale_from_slides, warn_of_a_known_scale
 from .second_stage import adjust_anchor, clip_to_bounds, divide_by_k, must_adjust_anchor
+from .sensitivities import sensitivities_of_observations, sensitivities_of_sockets
+from .shared_errors import with_shared_errors
 from .task import Task, fit_repeatability
 
 _MAX_STEPS = 300
@@ -50,6 +54,7 @@ def identify(
     noise_model: NoiseModel | None = None,
     robust: LossName | None = None,
     prior: Prior | None = None,
+    replace_noise: bool = True,
     max_steps: int = _MAX_STEPS,
 ) -> Identification:
     """Stage 1: the parameters that make the poses of every socket agree, within bounds.
@@ -76,6 +81,9 @@ def identify(
         robust: a robust loss, "huber", "cauchy" or "tukey", of each pose's whitened residual; None, least squares.
         prior: what is known of the parameters, as a mean (by default ``arm``'s values) and a standard deviation. It
             weighs against the data, whose noise is given or estimated; bounds hold as well. The scale anchor has none.
+        replace_noise: where the residuals show that some encoders are noisier than given, or than the others, solve
+            once more with their noise as estimated (``noisy_encoders`` of the result). Not inside jit, vmap or a
+            derivative, in batches, with a robust loss, or where ``noise_model`` is named.
         max_steps: most evaluations of the residual.
 
     Returns:
@@ -89,9 +97,14 @@ def identify(
         check_finite(arm=arm, capture=capture, noise=noise)
         alone = eqx.tree_at(lambda c: c.lengths, capture, (), is_leaf=lambda leaf: isinstance(leaf, tuple))
         task = observed_task(arm, alone, bounds, start, noise, hold, noise_model, max_steps, robust, prior)
-        return to_jax(identify_observed(to_numpy(task)))
-    task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many")
-    return to_jax(_identify(to_numpy(task)))
+        result = to_jax(identify_observed(to_numpy(task)))
+    else:
+        task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many")
+        result = to_jax(_identify(to_numpy(task)))
+    if not replace_noise or noise_model in ("common", "robust") or robust is not None:
+        return result
+    options = {"hold": hold, "start": start, "prior": prior, "max_steps": max_steps, "replace_noise": False}
+    return with_noise_by_joint(result, capture, lambda found: identify(arm, capture, bounds, noise=found, **options))
 
 
 def _prepare_task(
@@ -127,8 +140,9 @@ def _prepare_task(
 def calibrate(
     arm: Arm,
     capture: Capture,
-    bounds: Bounds,
+    bounds: Bounds | None = None,
     *,
+    model: str | None = None,
     method: Literal["two-stage", "joint"] | None = None,
     hold: str | None = "longest",
     start: Numbers | None = None,
@@ -136,6 +150,8 @@ def calibrate(
     noise_model: NoiseModel | None = None,
     robust: LossName | None = None,
     prior: Prior | None = None,
+    replace_noise: bool = True,
+    shared_errors: bool = True,
     check_identifiability: bool = True,
     strict: bool = False,
     max_steps: int = _MAX_STEPS,
@@ -155,7 +171,9 @@ def calibrate(
         arm: as for `identify`, like all arguments that are not named here.
         capture: sockets, and at least one reference length, mm; none is needed where the slides of prismatic joints
             determine the scale.
-        bounds: box of the free parameters ``(p,)``, mm and rad.
+        bounds: box of the free parameters ``(p,)``, mm and rad; by default around those of `Parameters.free_of`.
+        model: what the joints do besides their readings, as on the command line: "gravity,harmonics=1" (see
+            `kinematics.with_corrections`). Corrections that the arm has are replaced; all coefficients are free.
         method: "two-stage" or "joint"; by default two-stage, but joint where the capture has observations besides
             sockets and lengths, the arm has prismatic joints (whose readings say something about the scale too), the
             loss is robust, or there is a prior, which a division by k would ignore.
@@ -164,7 +182,10 @@ def calibrate(
         noise: standard deviations of readings and seat.
         noise_model: another model of the tips' errors.
         robust: a robust loss, as for `identify`.
-        prior: what is known of the parameters, as for `identify`.
+        prior: what is known of the parameters, as for `identify`; of a model, by default `kinematics.default_prior`.
+        replace_noise: estimate the noise of encoders that prove noisier, as for `identify`.
+        shared_errors: look for errors that poses share (of visits and places, and by functions of the readings that
+            the model lacks) and add what they do to the covariance, with known values (`SharedErrors`).
         check_identifiability: warn where free parameters are not determined by these data; the check takes about as
             long as the calibration.
         strict: raise instead of warn where free parameters are not determined by these data.
@@ -176,6 +197,7 @@ def calibrate(
     Raises:
         InputError: as `identify` does, and without a reference length.
     """
+    arm, bounds, prior = with_joint_model(arm, bounds, model, prior)
     by_slides = scale_from_slides(arm, capture, bounds.space, noise)
     general = bool(capture.observations) or robust is not None or prior is not None or by_slides
     method = default_method(arm, general) if method is None else method
@@ -196,52 +218,49 @@ def calibrate(
         check_finite(arm=arm, capture=capture, noise=noise)
         task = observed_task(arm, capture, bounds, start, noise, None, noise_model, max_steps, robust, prior)
         if check_identifiability or strict:
-            _check_identifiable(capture, task, strict)
-        return to_jax(calibrate_observed(to_numpy(task)))
-    task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
+            check_identifiable(capture, task.bounds, prior, strict)
+        task = to_numpy(task)
+        result = calibrate_observed(task)
+        sensitivities = partial(sensitivities_of_observations, task, result)
+    else:
+        task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
+        if check_identifiability or strict:
+            check_identifiable(capture, task.bounds, None, strict)
+        result, propagated = _calibrate_sockets(task, method, hold)
+        q = task.measurement.q
+        sensitivities = None if propagated is None else partial(sensitivities_of_sockets, result, q, propagated)
+    if replace_noise and noise_model not in ("common", "robust") and robust is None:
+        options = {"method": method, "hold": hold, "start": start, "prior": prior, "max_steps": max_steps}
+        options |= {"check_identifiability": False, "replace_noise": False, "shared_errors": shared_errors}
+        found = with_noise_by_joint(
+            result, capture, lambda found: calibrate(arm, capture, bounds, noise=found, **options)
+        )
+        if found is not result:
+            return found
+    if shared_errors and sensitivities is not None:
+        result = with_shared_errors(result, capture, sensitivities)
+    return to_jax(result)
+
+
+def _calibrate_sockets(task: Task, method: str, hold: str | None) -> tuple[Calibration, propagation.Propagated | None]:
+    """From sockets and reference lengths alone; and how its covariance was propagated, as far as values are known."""
+    arm, bounds = task.space.base, task.bounds
     if hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
         raise InputError(
             "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
             "hold."
         )
-    if check_identifiability or strict:
-        _check_identifiable(capture, task, strict)
-    _check_scale(task, method)
+    if method == "two-stage" and not inside_trace():
+        warn_of_a_known_scale(task.anchor.set_by, bool(arm.prismatic))
     task = to_numpy(task)
     if method == "joint":
-        return to_jax(_calibrate_jointly(task))
-    result, adjust = _calibrate_by_division(task)
+        return _calibrate_jointly(task)
+    result, propagated, adjust = _calibrate_by_division(task)
     if not task.anchor.can_scale or (is_concrete(adjust) and not bool(adjust)):
-        return to_jax(result)
+        return result, propagated
     if is_concrete(adjust):
-        return to_jax(_calibrate_by_adjustment(task, result))
-    return jax.lax.cond(adjust, lambda: _calibrate_by_adjustment(task, result), lambda: result)
-
-
-def _check_identifiable(capture: Capture, task: Task | ObservedTask, strict: bool) -> None:
-    """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; not of traced values."""
-    if inside_trace() or not is_concrete(*jax.tree.leaves((capture, task.bounds))):
-        return
-    space = task.bounds.space
-    prior = task.prior if isinstance(task, ObservedTask) else None
-    known = None if prior is None else prior.of(space.names, space.vector())
-    named = () if known is None else tuple(space.names[i] for i in known.index)
-    seen = observability(space.base, capture, space, known=named)
-    sentences, lost = seen.sentences(), seen._replace(by_prior=()).sentences()
-    if lost and strict:
-        raise InputError(" ".join(lost))
-    for sentence in sentences:
-        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=3)
-
-
-def _check_scale(task: Task, method: str) -> None:
-    """Warn where the reference lengths change nothing."""
-    if method == "two-stage" and task.anchor.set_by and not inside_trace():
-        sentence = (
-            f"{scale_set_by_clause(task.anchor.set_by)}, so the reference lengths change nothing; "
-            f"{'' if task.space.base.prismatic else 'free one of these lengths, or '}use both with method='joint'."
-        )
-        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=3)
+        return _calibrate_by_adjustment(task, result)
+    return jax.lax.cond(adjust, lambda: _calibrate_by_adjustment(task, result)[0], lambda: result), None
 
 
 @compiled(jit=eqx.filter_jit)
@@ -340,7 +359,7 @@ def _make_calibration(
 
 
 @compiled(jit=eqx.filter_jit)
-def _calibrate_by_division(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]:
+def _calibrate_by_division(task: Task) -> tuple[Calibration, propagation.Propagated, Bool[AnyArray, ""]]:
     """Stage 1 and the division by k; and whether the anchor must be adjusted instead."""
     xp = namespace(task)
     stage1, propagated = _solve_stage1(task)
@@ -348,24 +367,23 @@ def _calibrate_by_division(task: Task) -> tuple[Calibration, Bool[AnyArray, ""]]
     space, bounds, anchor = task.space, task.bounds, task.anchor
     scaled = divide_by_k(anchor, space, stage1.parameters, stage1.scale.value)
     adjust = must_adjust_anchor(anchor, bounds, stage1.active, scaled)
-    parameter_covariance = propagated.parameter_covariance
     if anchor.can_scale:
         scaled = clip_to_bounds(space, bounds.lower, bounds.upper, scaled)
         measurement = task.measurement.weighted(space.arm(task.start).geometry, task.noise)
-        parameter_covariance = scale_uncertainty.propagate_division(
+        propagated = scale_uncertainty.propagate_division(
             propagated, stage1.arm, space, measurement, stage1.after.sigma, scaled, anchor.partners
-        ).parameter_covariance
+        )
     # Divided, a length may have left its bound, which stage 1's covariance takes as exact all the same.
     active = bounds.active(scaled)
     exact = xp.where(active != 0, active, stage1.active)
     divided = Fit(scaled, xp.zeros_like(stage1.steps), stage1.result, stage1.optimality)
-    return _make_calibration(
-        task, stage1, "two-stage", divided, parameter_covariance, stage1.after.sigma, exact
-    ), adjust
+    covariance = propagated.parameter_covariance
+    calibration = _make_calibration(task, stage1, "two-stage", divided, covariance, stage1.after.sigma, exact)
+    return calibration, propagated, adjust
 
 
 @compiled(jit=eqx.filter_jit)
-def _calibrate_by_adjustment(task: Task, by_division: Calibration) -> Calibration:
+def _calibrate_by_adjustment(task: Task, by_division: Calibration) -> tuple[Calibration, propagation.Propagated]:
     """Stage 2 where the division leaves the box, or would need a fixed length to move."""
     xp = namespace(task, by_division)
     stage1, space, name = by_division.stage1, task.space, task.anchor.adjusted
@@ -379,14 +397,13 @@ def _calibrate_by_adjustment(task: Task, by_division: Calibration) -> Calibratio
     solved = propagation.propagate_solve(
         arm, space, measurement, (active != 0) | is_anchor, sigma, task.noise_model, task.noise
     )
-    parameter_covariance = scale_uncertainty.propagate_adjustment(
-        solved, arm, space, measurement, sigma, name, xp.any((active != 0) & is_anchor)
-    ).parameter_covariance
-    return _make_calibration(task, stage1, "two-stage", adjusted, parameter_covariance, sigma)
+    fixed = xp.any((active != 0) & is_anchor)
+    found = scale_uncertainty.propagate_adjustment(solved, arm, space, measurement, sigma, name, fixed)
+    return _make_calibration(task, stage1, "two-stage", adjusted, found.parameter_covariance, sigma), found
 
 
 @compiled(jit=eqx.filter_jit)
-def _calibrate_jointly(task: Task) -> Calibration:
+def _calibrate_jointly(task: Task) -> tuple[Calibration, propagation.Propagated]:
     """One weighted least squares of poses and lengths, from the arm of stage 1 divided by k."""
     stage1, _ = _solve_stage1(task)
     assert stage1.scale is not None
@@ -400,7 +417,7 @@ def _calibrate_jointly(task: Task) -> Calibration:
     bounds = task.bounds.lower, task.bounds.upper
     found = fit(joint_residual, joint_normal_equations, parameters, args, bounds, space.scale, task.max_steps)
     active = task.bounds.active(found.parameters)
-    parameter_covariance = propagation.propagate_solve(
+    solved = propagation.propagate_solve(
         space.arm(found.parameters), space, measurement, active != 0, sigma, task.noise_model, task.noise, joint_weights
-    ).parameter_covariance
-    return _make_calibration(task, stage1, "joint", found, parameter_covariance, stage1.after.sigma)
+    )
+    return _make_calibration(task, stage1, "joint", found, solved.parameter_covariance, stage1.after.sigma), solved

@@ -43,9 +43,11 @@ class UnseenRegion(NamedTuple):
     ratio: float  # mean of (error / predicted standard deviation)^2 over coordinates
 
 
-def regions_of(capture: Capture, patterns: Iterable[str] | None = None) -> tuple[Region, ...]:
+def regions_of(
+    capture: Capture, patterns: Iterable[str] | None = None, joints: int | None = None
+) -> tuple[Region, ...]:
     """The regions to leave out: groups by name; or placements, stations and the like, where there are at least three;
-    or either half of each joint's travel.
+    or either half of each joint's travel, of the first ``joints`` columns of readings.
 
     Raises:
         InputError: A pattern names nothing or everything, or there are too few poses.
@@ -61,7 +63,8 @@ def regions_of(capture: Capture, patterns: Iterable[str] | None = None) -> tuple
         found = [Region(label, poses) for label, poses in zip(common_labels(groups), members, strict=True)]
     else:
         sockets = [capture.q] if capture.sizes else []
-        found = _halves(np.concatenate([*sockets, *(observation.q for observation in capture.observations)]))
+        q = np.concatenate([*sockets, *(observation.q for observation in capture.observations)])
+        found = _halves(q[:, :joints])
     whole = [region.label for region in found if region.poses.all()]
     if whole:
         raise InputError(f"nothing is left without '{whole[0]}', so nothing can be calibrated; leave out less.")

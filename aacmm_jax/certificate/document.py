@@ -5,12 +5,14 @@ import uuid
 from collections.abc import Sequence
 from xml.etree.ElementTree import Element
 
+from ..acceptance.record import EvaluationRecord, same_arm
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..core.errors import InputError
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity, held_by_xml
 from ..summaries.contradictions import removals
 from ..summaries.observations import scale_sources
 from ..summaries.warnings import of_calibration
+from .acceptance_results import add_acceptance, overall
 from .measurement_results import add_results, uncertainty_statement
 from .observation_results import texts_of
 from .xml_elements import (
@@ -36,6 +38,7 @@ def dcc_xml(
     created: str,
     sources: Sequence[str] = (),
     command: str = "",
+    evaluation: EvaluationRecord | None = None,
 ) -> str:
     """Make the Digital Calibration Certificate of a calibration.
 
@@ -47,13 +50,16 @@ def dcc_xml(
         created: When the calibration was computed, ISO 8601, as calibration files say.
         sources: Names of the files that the calibration was made of.
         command: The command that computed it.
+        evaluation: An evaluation of the same calibration, whose acceptance tests are added. A statement of conformity
+            rests on them, and is refused without them.
 
     Returns:
         The text of an XML file in UTF-8.
 
     Raises:
         InputError: If the calibration did not converge, its scale is impossible or the nominal arm's, a name has
-            characters that XML does not allow, or the dates are out of order.
+            characters that XML does not allow, the dates are out of order, the evaluation is of another arm, or a
+            conformity is stated that no result supports.
     """
     if not record.converged:
         reason = record.reason.partition(";")[0].rstrip(".")
@@ -70,7 +76,7 @@ def dcc_xml(
             f"k = {record.k:.6g} cannot be the scale of an arm, so there is no certificate; correct the lengths and "
             "calibrate again."
         )
-    check_conformity(administrative_data, simulated=record.recording.true is not None)
+    _check_evaluation(record, administrative_data, evaluation)
     _check_texts(record, sources, command)
     root = Element("dcc:digitalCalibrationCertificate")
     for name, value in (("xmlns:dcc", DCC), ("xmlns:si", SI), ("xmlns:xsi", XSI)):
@@ -79,9 +85,35 @@ def dcc_xml(
     root.set("schemaVersion", VERSION)
     day = _day(record.recording.measured or created)
     identifier = _add_administrative(add(root, "administrativeData"), record, administrative_data, day, sources)
-    add_results(add(root, "measurementResults"), record, administrative_data, command)
+    results = add(root, "measurementResults")
+    add_results(results, record, administrative_data, command)
+    if evaluation is not None:
+        add_acceptance(results, evaluation)
     identifier.text = administrative_data.certificate.number or str(uuid.uuid5(uuid.NAMESPACE_URL, xml_text(root)))
     return xml_text(root)
+
+
+def _check_evaluation(
+    record: CalibrationRecord, administrative_data: AdministrativeData, evaluation: EvaluationRecord | None
+) -> None:
+    """Refuse an evaluation of another arm, and a conformity without results that it rests on."""
+    simulated = record.recording.true is not None
+    if evaluation is None:
+        check_conformity(administrative_data, simulated=simulated)
+        if administrative_data.conformity is not None:
+            raise InputError(
+                "conformity is stated, but the certificate has no acceptance results that it rests on; give an "
+                "evaluation with limits (--evaluation), or leave [conformity] out."
+            )
+        return
+    if not same_arm(record.calibrated.arm, evaluation.calibrated.arm):
+        raise InputError("the evaluation is of another calibration; evaluate this one.")
+    for name in evaluation.recording.capture.names:
+        held_by_xml(name, f"the name of socket {name!r}")
+    for sphere in evaluation.recording.spheres:
+        held_by_xml(sphere.name, f"the name of sphere {sphere.name!r}")
+    simulated |= evaluation.recording.true is not None
+    check_conformity(administrative_data, simulated=simulated, decision=overall(evaluation), tested=True)
 
 
 def _check_texts(record: CalibrationRecord, sources: Sequence[str], command: str) -> None:

@@ -14,6 +14,7 @@ from ..data.capture import ReferenceLength
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
 from ..kinematics.arm import Arm, parameter_names, parameter_unit
 from ..kinematics.parameters import Parameters
+from ..summaries.calibration import prior_rows, prior_sentence
 from ..summaries.observations import less_weight
 from .observation_results import add_observation_equipment, add_observations
 from .xml_elements import (
@@ -26,8 +27,10 @@ from .xml_elements import (
     add_english,
     add_identifications,
     add_real,
+    add_row,
     add_software,
     add_text,
+    decimals_of,
 )
 
 _METHODS = {"two-stage": "from repeatability first, and then the scale from the lengths", "joint": "from both jointly"}
@@ -36,6 +39,10 @@ _METRICS = {
     "Deltam": "Largest half range of a coordinate of the tip in a socket",
     "RMS": "Root mean square distance of the tip from its mean position in the socket",
 }
+
+
+_DECIMALS = 5  # of mm without an uncertainty
+_SIMPLE, _SQUARED = (MILLIMETRE, RADIAN), r"\tothe{2}"  # units that are squared as one
 
 
 class _Stage(NamedTuple):
@@ -49,6 +56,7 @@ class _Stage(NamedTuple):
 # Metres and newtons only of compliances.
 _UNITS = {"mm": MILLIMETRE, "rad": RADIAN, "1": ONE}
 _UNITS |= {"rad/m": r"\radian\metre\tothe{-1}", "rad/(kN m)": r"\radian\kilo\newton\tothe{-1}\metre\tothe{-1}"}
+_UNITS |= {"1/K": r"\kelvin\tothe{-1}"}
 _UNITS |= {"mm/m": r"\milli\metre\metre\tothe{-1}"}
 _UNITS |= {"mm/(kN m)": r"\milli\metre\kilo\newton\tothe{-1}\metre\tothe{-1}"}
 
@@ -75,12 +83,22 @@ def uncertainty_statement(record: CalibrationRecord) -> str:
     sources = "uncertainty of the reference lengths"
     if record.recording.capture.observations:
         sources = "uncertainties of what was measured and certified"
+    if record.prior is not None:
+        groups = ". ".join(map(prior_sentence, prior_rows(record.prior)))
+        sources += (
+            ", and from what was known of the parameters beforehand, as normal distributions (standard deviation of "
+            f"each group: {groups})"
+        )
+    model = "Denavit-Hartenberg model"
+    if record.calibrated.arm.corrections is not None:
+        model += " with the joint corrections below"
     return (
         f"Expanded uncertainties are standard uncertainties times {uncertainty_of(record).factor(LEVEL):.4g}, the "
         f"coverage factor of Student's t for {count} degrees of freedom and a coverage probability of {LEVEL:.0%}. "
         f"They follow, by the law of propagation of uncertainty, from the noise of the readings, {noise}, and from the "
-        f"{sources}. They apply to each parameter alone; the parameters are correlated. "
-        "Errors that the Denavit-Hartenberg model does not describe are not included."
+        f"{sources}. They apply to each parameter alone; the parameters are correlated, as the covariance matrix says. "
+        "Expanded uncertainties have two digits, and values are rounded to them. "
+        f"Errors that the {model} does not describe are not included."
     )
 
 
@@ -114,6 +132,8 @@ def _add_measurement(
         data = _add_result(results, "Observations", "Distances of the tip from the geometry of each observation.")
         add_observations(data, residuals, distances_of(capture, stage.evaluation), left)
     _add_parameters(results, record, stage, factor)
+    if left:
+        _add_covariance(results, record)
     if left and not math.isnan(record.k):
         _add_scale(results, record, factor)
 
@@ -208,7 +228,7 @@ def _add_repeatability(results: Element, stage: _Stage) -> None:
         quantity = add(data, "quantity")
         add_english(quantity, "name", name)
         add_english(quantity, "description", _METRICS[name])
-        add_real(quantity, value, MILLIMETRE)
+        add_real(quantity, value, MILLIMETRE, decimals=_DECIMALS)
 
 
 def _length_name(number: int, length: ReferenceLength) -> str:
@@ -229,10 +249,12 @@ def _add_lengths(
     for number, (length, measured, error, error_u) in enumerate(zip(lengths, *columns, strict=True), start=1):
         row = add(data, "list")
         add_text(row, "name", _length_name(number, length))
+        decimals = decimals_of(factor * float(error_u)) if _is_known(float(error_u)) else _DECIMALS
+        # The reference has the uncertainty of its own certificate, not that of this calibration's coverage factor.
         values = [
-            ("calibrated value", "basic_referenceValue", length.value, float(length.u)),
-            ("measured value", "basic_measuredValue", measured, math.nan),
-            ("error", "basic_measurementError", error, float(error_u)),
+            ("calibrated value", "basic_referenceValue", length.value, float(length.u), None),
+            ("measured value", "basic_measuredValue", measured, math.nan, decimals),
+            ("error", "basic_measurementError", error, float(error_u), decimals),
         ]
         if fixed_scale:
             add_english(
@@ -242,12 +264,13 @@ def _add_lengths(
                 "measured.",
             )
             values = values[:1]
-        for name, ref_type, value, u in values:
+        for name, ref_type, value, u, digits in values:
             quantity = add(row, "quantity", ref_type=ref_type)
             add_english(quantity, "name", name)
             if name == "calibrated value" and u == 0:
                 add_english(quantity, "description", "Taken as exact")
-            add_real(quantity, float(value), MILLIMETRE, u if _is_known(u) else None, factor)
+            scale = None if digits is None else factor
+            add_real(quantity, float(value), MILLIMETRE, u if _is_known(u) else None, scale, digits)
 
 
 def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, factor: float) -> None:
@@ -255,7 +278,13 @@ def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, 
         results,
         "Denavit-Hartenberg parameters",
         "Standard convention; of one joint: Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta). The probe is the tip in the "
-        "last frame.",
+        "last frame."
+        + (
+            ""
+            if stage.arm.corrections is None
+            else " To theta (d of a prismatic joint) each joint correction adds its "
+            "coefficient times a known function of the readings; gravity is its direction in the base frame."
+        ),
     )
     for name, value in _values(stage.arm).items():
         note, u = "", None
@@ -266,6 +295,26 @@ def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, 
         if note:
             add_english(quantity, "description", note)
         add_real(quantity, value, _UNITS[parameter_unit(stage.arm, name)], u, factor)
+
+
+def _add_covariance(results: Element, record: CalibrationRecord) -> None:
+    """The covariance matrix of the parameters that have an uncertainty of their own, a row each."""
+    own = [i for i, name in enumerate(record.names) if _note_and_uncertainty(record, name)[1] is not None]
+    if not own:
+        return
+    data = _add_result(
+        results,
+        "Covariance matrix",
+        "Of the parameters with an uncertainty of their own, a row each, columns in the same order. The diagonal has "
+        "the squares of the standard uncertainties. Expanded uncertainties elsewhere are rounded; what is computed of "
+        "several parameters needs this table.",
+    )
+    table = add(data, "list")
+    add_english(table, "name", "Covariance")
+    units = [_UNITS[parameter_unit(record.calibrated.arm, record.names[i])] for i in own]
+    for row, unit in zip(own, units, strict=True):
+        products = [f"{unit}{_SQUARED}" if unit == other and unit in _SIMPLE else unit + other for other in units]
+        add_row(table, record.names[row], np.asarray(record.covariance)[row, own].tolist(), products)
 
 
 def _values(arm: Arm) -> dict[str, float]:

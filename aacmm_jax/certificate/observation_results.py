@@ -11,6 +11,7 @@ from ..data.observations.observation import AbstractObservation, Quantity, certi
 from ..files.administrative_data import NOT_STATED
 from .xml_elements import MILLIMETRE, ONE, RADIAN, add, add_english, add_real, add_text
 
+_DECIMALS = {MILLIMETRE: 5, ONE: 3, RADIAN: 8}  # of residuals, which have no uncertainty
 _UNITS = {"mm": MILLIMETRE, "rad": RADIAN, "1": ONE}
 
 
@@ -88,4 +89,4 @@ def add_observations(
             if math.isfinite(value):
                 quantity = add(row, "quantity")
                 add_english(quantity, "name", name)
-                add_real(quantity, value, unit)
+                add_real(quantity, value, unit, decimals=_DECIMALS[unit])

@@ -4,7 +4,7 @@ Elements and their order are those of the published schemas, https://ptb.de/dcc/
 https://ptb.de/si/v2.2.1/SI_Format.xsd.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
@@ -34,23 +34,54 @@ def add_text(parent: Element, tag: str, text: str) -> None:
     add(add(parent, tag), "content", text)
 
 
-def add_real(parent: Element, value: float, unit: str, u: float | None = None, factor: float | None = None) -> None:
-    """A value, perhaps with its uncertainty: the standard one ``u``, or expanded by ``factor`` if that is given."""
+def rounded(value: float, decimals: int) -> str:
+    """A decimal number with so many decimals; negative ones round to tens, hundreds and so on."""
+    return f"{round(float(value), decimals) + 0.0:.{max(decimals, 0)}f}"
+
+
+def decimals_of(uncertainty: float) -> int:
+    """Decimals of an uncertainty that is stated with two significant digits (JCGM 100:2008, 7.2.6)."""
+    exponent = int(f"{uncertainty:.1e}".partition("e")[2])  # of the rounded number: 0.0996 becomes 0.10
+    return 1 - exponent
+
+
+def add_real(
+    parent: Element,
+    value: float,
+    unit: str,
+    u: float | None = None,
+    factor: float | None = None,
+    decimals: int | None = None,
+) -> None:
+    """A value, perhaps with its uncertainty: the standard one ``u``, as it was given; or expanded by ``factor``, which
+    is stated with two digits, and the value rounded to them. ``decimals``: of a value without uncertainty.
+    """
     quantity = SubElement(parent, "si:real")
+    if u is not None and factor is not None:
+        decimals = decimals_of(factor * u)
     # repr is the shortest text that is read back as the same number.
-    SubElement(quantity, "si:value").text = repr(float(value))
+    SubElement(quantity, "si:value").text = repr(float(value)) if decimals is None else rounded(value, decimals)
     SubElement(quantity, "si:unit").text = unit
     if u is None:
         return
     uncertainty = SubElement(quantity, "si:measurementUncertaintyUnivariate")
-    if factor is None:
+    if factor is None or decimals is None:
         standard = SubElement(uncertainty, "si:standardMU")
         SubElement(standard, "si:valueStandardMU").text = repr(float(u))
         return
     expanded = SubElement(uncertainty, "si:expandedMU")
-    SubElement(expanded, "si:valueExpandedMU").text = repr(float(factor * u))
-    SubElement(expanded, "si:coverageFactor").text = repr(float(factor))
+    SubElement(expanded, "si:valueExpandedMU").text = rounded(factor * u, decimals)
+    SubElement(expanded, "si:coverageFactor").text = f"{factor:.4g}"
     SubElement(expanded, "si:coverageProbability").text = repr(LEVEL)
+
+
+def add_row(parent: Element, name: str, values: Sequence[float], units: Sequence[str]) -> None:
+    """A row of a table: numbers with eight significant digits, and the unit of each."""
+    quantity = add(parent, "quantity")
+    add_text(quantity, "name", name)
+    row = SubElement(quantity, "si:realListXMLList")
+    SubElement(row, "si:valueXMLList").text = " ".join(f"{value:.8g}" for value in values)
+    SubElement(row, "si:unitXMLList").text = " ".join(units)
 
 
 def add_identifications(parent: Element, entries: Iterable[tuple[str, str | None, str]]) -> None:

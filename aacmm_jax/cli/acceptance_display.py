@@ -7,12 +7,14 @@ from rich.markup import escape
 
 from ..core.text import pluralise
 from ..core.units import DEG
+from ..summaries.tables import decimals_for
 from .calibration_display import print_lengths, print_stages
 from .display import (
     formatted,
     new_console,
     new_table,
     print_table,
+    print_verdict,
     print_verdicts,
     print_warnings,
     print_written,
@@ -22,10 +24,16 @@ _STYLES = {"conforms": "green", "fails": "red", "undecided": "yellow", None: "de
 
 
 def evaluation(summary: dict[str, Any]) -> None:
-    """One evaluation: held-out data come first, since they are what counts."""
+    """One evaluation: decisions first, then held-out data, since they are what counts."""
     console = new_console()
     console.print(f"[bold]{escape(summary['arm'])}[/bold]")
+    print_verdict(console, summary)
     print_warnings(console, summary)
+    print_verdicts(console, summary)
+    if summary["acceptance"] or summary["standards"]:
+        _acceptance(console, summary)
+    for sentence in summary.get("calibration_warnings", ()):
+        console.print(f"[yellow]Warning of the calibration:[/yellow] {escape(sentence)}")
     for group, text in (
         ("held_out", "Held-out data, which the calibration has not used"),
         ("identified_from", "Data used for identification"),
@@ -42,9 +50,6 @@ def evaluation(summary: dict[str, Any]) -> None:
             _predicted_lengths(console, part["lengths"], predicted, fitted)
         elif part["lengths"]:
             print_lengths(console, part["lengths"], fitted=fitted)
-    print_verdicts(console, summary)
-    if summary["acceptance"] or summary["standards"]:
-        _acceptance(console, summary)
     print_written(console, summary)
 
 
@@ -109,13 +114,15 @@ def _predicted_lengths(console: Console, rows: list[dict[str, Any]], predicted: 
     table = new_table(title, "between", "value", "measured", "error", "U", "error / U")
     for row in rows:
         ratio = row["error_over_expanded"]
-        error = "fixed the scale" if fitted else formatted(row["error_mm"])
+        decimals = decimals_for(row["expanded_mm"])
+        error = "fixed the scale" if fitted else formatted(row["error_mm"], decimals)
         mark = "-" if ratio is None or fitted else f"{ratio:+.2f}"
         table.add_row(
             escape(f"{row['from']} - {row['to']}"),
-            *(formatted(row[key]) for key in ("value_mm", "measured_mm")),
+            formatted(row["value_mm"]),
+            formatted(row["measured_mm"], decimals),
             error,
-            formatted(row["expanded_mm"]),
+            formatted(row["expanded_mm"], decimals),
             f"[red]{mark}[/red]" if ratio is not None and abs(ratio) > 1 and not fitted else mark,
         )
     print_table(console, table)
@@ -136,6 +143,7 @@ def points(summary: dict[str, Any]) -> None:
         f"{pluralise(summary['points'], 'point')}: {pluralise(summary['sockets'], 'socket')}, "
         f"{pluralise(summary['lengths'], 'length')}, {pluralise(summary['spheres'], 'sphere')}"
     )
+    print_verdict(console, summary)
     print_warnings(console, summary)
     _acceptance(console, summary)
     print_written(console, summary)
@@ -157,8 +165,9 @@ def _acceptance(console: Console, summary: dict[str, Any]) -> None:
     )
     for test in tests:
         for metric in test["figures"]:
-            cells = [formatted(metric["as_found_mm"])] if before else []
-            cells += [formatted(metric["value_mm"]), formatted(metric["expanded_mm"] or None)]
+            decimals = decimals_for(metric["expanded_mm"])
+            cells = [formatted(metric["as_found_mm"], decimals)] if before else []
+            cells += [formatted(metric["value_mm"], decimals), formatted(metric["expanded_mm"] or None, decimals)]
             if limited:
                 decision = metric["decision"]
                 count = (
@@ -167,21 +176,27 @@ def _acceptance(console: Console, summary: dict[str, Any]) -> None:
                     else ""
                 )
                 cells += [formatted(metric["limit_mm"]), f"[{_STYLES[decision]}]{decision or '-'}{count}[/]"]
-            table.add_row(test["standard"], metric["name"], *cells, escape(metric["where"]))
+            # Summaries that earlier versions stored name the standard only.
+            table.add_row(test.get("called", test["standard"]), metric["name"], *cells, escape(metric["where"]))
+    rules = dict.fromkeys(test.get("rule", "ISO 14253-1") for test in tests if test.get("decision", limited))
+    of_test = summary["u_test_mm"] or any(summary.get("influences", {}).values())
     for column in table.columns[1], table.columns[-1]:
         column.justify = "left"
     print_table(console, table, keys=2)
+    metrics = [metric for test in tests for metric in test["figures"]]
+    symbols = [metric["symbol"] for metric in metrics if metric.get("symbol", metric["name"]) != metric["name"]]
+    if symbols:
+        console.print(f"Symbols: {', '.join(symbols)}.")
     for test in tests:
         if test["missing"]:
-            lacking = "; ".join(test["missing"])
-            console.print(
-                f"Not the full procedure of {test['standard']}, {test['title']}: it also needs {escape(lacking)}."
-            )
+            console.print(f"{test.get('called', test['standard'])}, {test['title']}: not the full procedure.")
+            for sentence in test["missing"]:
+                console.print(f"  - {escape(sentence)}")
     console.print(
         "U: the uncertainty of the artefacts"
-        + (" and --test-u-mm" if summary["u_test_mm"] else "")
+        + (" and of the test (--test-u-mm, --expansion)" if of_test else "")
         + "."
-        + (" Decisions by ISO 14253-1." if limited else "")
+        + (f" Decisions: {'; '.join(rules)}." if limited else "")
         + (" As found: the nominal arm; as left: the calibrated one." if before else "")
     )
 
@@ -190,8 +205,10 @@ def procedure(summary: dict[str, Any]) -> None:
     """A planned acceptance test: positions of the artefacts, and number of poses."""
     console = new_console()
     x, y, z = summary["shoulder_mm"]
+    stated = "" if summary["measuring_range_stated"] else " (twice the reach; state the maker's)"
     console.print(
         f"[bold]{escape(summary['arm'])}[/bold]: {summary['standard']}, {summary['poses']} poses. "
+        f"Measuring range {summary['measuring_range_mm']:.0f} mm{stated}. "
         f"Reach {summary['reach_mm']:.0f} mm from the shoulder at ({x:.0f}, {y:.0f}, {z:.0f}) mm"
     )
     print_warnings(console, summary)

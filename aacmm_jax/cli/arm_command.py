@@ -189,12 +189,13 @@ def _of_capture(specification: Any, path: Path) -> Any:
     from ..summaries.reading_check import check_capture
 
     read = read_manifest if path.suffix.lower() == ".toml" else load_capture
-    capture = read(InputFile(path)).capture if read is load_capture else read(path).capture
-    if capture.joints != specification.arm.joints:
+    recording = read(InputFile(path)) if read is load_capture else read(path)
+    joints = recording.nominal.arm.joints
+    if joints != specification.arm.joints:
         raise InputError(
-            f"{path} has readings of {capture.joints} joints, but the arm has {specification.arm.joints}; name its arm."
+            f"{path} has readings of {joints} joints, but the arm has {specification.arm.joints}; name its arm."
         )
-    return with_spinner("Comparing", lambda: check_capture(specification.arm, capture))
+    return with_spinner("Comparing", lambda: check_capture(specification.arm, recording.capture))
 
 
 def _of_table(specification: Any, path: Path, unit: str | None) -> tuple[Any, str]:

@@ -118,6 +118,10 @@ def calibrate(
     encoder_arcsec: KnownEncoderNoise = None,
     linear_encoder_mm: LinearEncoderNoise = None,
     seating_mm: KnownSeatingNoise = None,
+    keep_noise: Annotated[
+        bool,
+        typer.Option("--keep-noise", help="Keep the noise as it is where an encoder proves noisier."),
+    ] = False,
     cross_validate: Annotated[
         bool | None,
         typer.Option(
@@ -195,6 +199,7 @@ def calibrate(
             "hold": None if hold == "none" else hold,
             "noise": known_noise(encoder_arcsec, seating_mm, linear_encoder_mm),
             "prior": _prior(recording.nominal, prior, model),
+            "replace_noise": not keep_noise,
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", IdentifiabilityWarning)  # the summary says it
@@ -231,11 +236,8 @@ def calibrate(
             from ..calibration.results import Calibration
             from ..calibration.sampling import monte_carlo as sample
 
-            if not isinstance(result, Calibration) or not plain:
-                raise InputError(
-                    "--monte-carlo is for calibrations without --robust, --scale nominal and priors (--model has one "
-                    "unless --prior is none)."
-                )
+            if not isinstance(result, Calibration) or robust is not None:
+                raise InputError("--monte-carlo is for calibrations without --robust and --scale nominal.")
             sampled = with_spinner("Drawing trials", lambda: sample(result, capture_used))
             record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
         summary = calibration_summary(record)

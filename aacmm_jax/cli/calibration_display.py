@@ -7,14 +7,31 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..core.text import pluralise, shorten
-from ..core.units import ARCSEC, DEG, people_read
-from ..summaries.tables import METRICS, encoders_in_words, expanded_words, observed_words, quantity_words, volume_rows
-from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
+from ..core.units import DEG, people_read, people_read_change
+from ..summaries.tables import (
+    METRICS,
+    decimals_for,
+    encoders_in_words,
+    expanded_words,
+    observed_words,
+    quantity_words,
+    two_digits,
+    volume_rows,
+)
+from .display import (
+    formatted,
+    new_console,
+    new_table,
+    print_table,
+    print_verdict,
+    print_warnings,
+    print_written,
+)
 
 _MOST_PARTS = 12  # rows of a table
 _TRUTH = (
     ("length_error_largest_mm", "largest error of a length parameter [mm]", 1.0),
-    ("angle_error_largest_rad", "largest error of an angle parameter [arcsec]", 1 / ARCSEC),
+    ("angle_error_largest_rad", "largest error of an angle parameter [deg]", 1 / DEG),
 )
 
 
@@ -40,6 +57,14 @@ def arm(summary: dict[str, Any]) -> None:
     console.print(
         f"Probe {', '.join(formatted(x) for x in summary['probe_mm'])} mm. Fixed: {', '.join(summary['held'])}."
     )
+    if summary["corrections"]:
+        others = [row for row in summary["corrections"] if row["value"] == 0]
+        title = f"\nJoint corrections ({len(others)} more coefficients are 0)" if others else "\nJoint corrections"
+        table = new_table(title, "coefficient", "value", "unit")
+        for row in (row for row in summary["corrections"] if row["value"] != 0):
+            scale, unit = people_read_change(row["unit"]) if row["unit"] == "rad" else people_read(row["unit"])
+            table.add_row(row["coefficient"], f"{scale * row['value']:.4g}", unit)
+        print_table(console, table)
     if summary["urdf"] is not None:
         base, frame = summary["urdf"]["base"], summary["urdf"]["first_frame_in_base_mm"]
         where = f"in the frame of {base}"
@@ -76,6 +101,9 @@ def capture(summary: dict[str, Any]) -> None:
         unit = " deg" if slides else ""
         table.add_row(str(row["joint"]), *(f"{row[key] / DEG:.3f}{unit}" for key in ("lowest_rad", "highest_rad")))
     print_table(console, table)
+    if summary["temperature_C"] is not None:
+        low, high = summary["temperature_C"]
+        console.print(f"Temperature: {low:.2f} to {high:.2f} C.")
     if summary["lengths"]:
         table = new_table("\nReference lengths", "from", "to", "value [mm]", "u [mm]")
         for row in summary["lengths"]:
@@ -100,11 +128,12 @@ def _observations_of_capture(console: Console, rows: list[dict[str, Any]]) -> No
 def calibration(summary: dict[str, Any]) -> None:
     """One calibration: warnings first."""
     console = new_console()
+    print_solve(console, summary)
     print_verdict(console, summary)
     anchor = f"scale anchor {summary['hold']}" if summary["hold"] else "no scale anchor"
     if summary["scale_k"] is not None:
         u = summary["scale_u"] or 0.0
-        console.print(f"Scale of stage 1: k = {summary['scale_k']:.{_decimals(u, 8)}f}, u(k) = {u:.1e} ({anchor})")
+        console.print(f"Scale of stage 1: k = {summary['scale_k']:.{decimals_for(u, 8)}f}, u(k) = {u:.1e} ({anchor})")
     print_warnings(console, summary)
     _validated(console, summary["cross_validation"])
     _sessions(console, summary.get("sessions"))
@@ -128,7 +157,7 @@ def calibration(summary: dict[str, Any]) -> None:
     print_written(console, summary)
 
 
-def print_verdict(console: Console, summary: dict[str, Any]) -> None:
+def print_solve(console: Console, summary: dict[str, Any]) -> None:
     """How the solve ended; a residual that no arm has is not called converged, whatever the solver says."""
     verdict = "[green]converged[/green]" if summary["converged"] else "[red]did not converge[/red]"
     if summary["converged"] and not summary["residual_plausible"]:
@@ -204,7 +233,7 @@ def _base(console: Console, summary: dict[str, Any]) -> None:
             ("rotation vector [deg]", "rotation_rad", "rotation_u_rad", 1 / DEG),
         ):
             expanded = [None if u is None else factor * unit * u for u in row[of_u]]
-            decimals = [_decimals(u, 4) for u in expanded]
+            decimals = [decimals_for(u) for u in expanded]
             values = (f"{unit * x:.{digits}f}" for x, digits in zip(row[key], decimals, strict=True))
             table.add_row(escape(row["in"]) if key == "position_mm" else "", escape(what), *values)
             known = zip(expanded, decimals, strict=True)
@@ -264,15 +293,21 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
     title = f"\nExpanded uncertainty U over the working volume (95 %, coverage factor {factor:.2f}) [mm]"
     table = new_table(title, "", "median", "95th percentile", "largest")
     for text, values in volume_rows(volume, factor):
-        table.add_row(text, *("not determined" if value is None else formatted(value) for value in values))
+        table.add_row(text, *("not determined" if value is None else two_digits(value) for value in values))
     print_table(console, table)
     console.print(
         "Propagated from u of the parameters to 400 positions that random poses within the joint limits reach."
     )
+    if found.get("tried"):
+        from ..summaries.calibration import tried_sentence
+
+        console.print(tried_sentence(found["tried"]))
     seat = "seat" if summary["sockets_used"] else "tip, each coordinate,"
     noise = f"{encoders_in_words(found)}, {seat} {1e3 * found['seating_mm']:.3g} um"
+    joints = ", ".join(str(row["joint"]) for row in found.get("noisy_encoders", ()))
+    replaced = f", but for joint {joints}" if joints else ""
     source = {
-        "given": f"Noise as given: {noise}; residuals are {found['misfit'] or 0:.2f} times what it predicts.",
+        "given": f"Noise as given{replaced}: {noise}; residuals are {found['misfit'] or 0:.2f} times what it predicts.",
         "estimated": f"Noise estimated from the residuals: {noise} (their sum is better known than each).",
         "common": f"One variance for all poses: {1e3 * found['seating_mm']:.3g} um a coordinate.",
         "robust": "The variance of each pose is taken from its own residual (robust noise model).",
@@ -350,7 +385,7 @@ def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
         factor, unit = people_read(row["unit"])
         nominal, value = factor * row["nominal"], factor * row["calibrated"]
         u = None if row["u"] is None else factor * row["u"]
-        decimals = 9 if u == 0 else _decimals(u, 4)
+        decimals = 9 if u == 0 else decimals_for(u)
         numbers = (
             f"{nominal:z.4f}",
             f"{value:z.{decimals}f}",
@@ -361,21 +396,17 @@ def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
     print_table(console, table)
 
 
-def _decimals(u: float | None, default: int) -> int:
-    """Decimals that show two significant digits of an uncertainty."""
-    return default if not u else min(max(1 - math.floor(math.log10(u)), 0), 9)
-
-
 def print_lengths(console: Console, rows: list[dict[str, Any]], *, fitted: bool = False) -> None:
     """Reference lengths; ``fitted``: a single one fixed the scale, so that its error is zero by construction."""
     table = new_table("\nReference lengths", "between", "value [mm]", "measured [mm]", "error [mm]", "u of error [mm]")
     for row in rows:
-        error = "fixed the scale" if fitted else formatted(row["error_mm"])
+        decimals = decimals_for(row["error_u_mm"])
+        error = "fixed the scale" if fitted else formatted(row["error_mm"], decimals)
         table.add_row(
             escape(f"{row['from']} - {row['to']}"),
             formatted(row["value_mm"]),
-            formatted(row["measured_mm"]),
+            formatted(row["measured_mm"], decimals),
             error,
-            formatted(row["error_u_mm"]),
+            formatted(row["error_u_mm"], decimals),
         )
     print_table(console, table)

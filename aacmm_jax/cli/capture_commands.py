@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from ..core.errors import InputError
-from ..core.text import quoted
+from ..core.text import number, quoted
 from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import together
@@ -80,6 +80,13 @@ def simulate(
         float, typer.Option(min=0, metavar="MM", help="Resolution of the readings of prismatic joints.")
     ] = 0.0,
     seating_mm: SeatingNoise = 0.0,
+    temperature_c: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOWEST[,HIGHEST]",
+            help="Temperature of an arm with a thermometer, or limits to draw it between, C.",
+        ),
+    ] = None,
     true_arm: Annotated[
         str | None,
         typer.Option(metavar="ARM", help="The true arm, where it is not the nominal one: a TOML file or a name."),
@@ -126,10 +133,10 @@ def simulate(
             drawn = perturbed_arm(space, length=deviate_length_mm, angle=deviate_angle_deg * DEG, seed=seed)
             true = true._replace(arm=drawn, name=f"{true.name}, deviated")
         if acceptance is not None:
-            if socket or poses or length or resolution_arcsec or linear_resolution_mm:
+            if socket or poses or length or resolution_arcsec or linear_resolution_mm or temperature_c:
                 raise InputError(
-                    "--acceptance brings its own sockets, poses and lengths; leave out --socket, --poses, --length, "
-                    "--resolution-arcsec and --linear-resolution-mm."
+                    "--acceptance brings its own sockets, poses and lengths, at 20 C; leave out --socket, --poses, "
+                    "--length, --resolution-arcsec, --linear-resolution-mm and --temperature-c."
                 )
             noise = {"encoder_arcsec": encoder_arcsec, "seating": seating_mm, "linear_encoder": linear_encoder_mm}
             noise |= {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
@@ -154,6 +161,7 @@ def simulate(
                     noise=Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm),
                     resolution_arcsec=resolution_arcsec,
                     linear_resolution=linear_resolution_mm,
+                    temperature=None if temperature_c is None else _temperature_option(temperature_c),
                     seed=seed,
                 ),
             )
@@ -186,6 +194,14 @@ def import_(
         summary = capture_summary(recording)
         save_capture(output, recording, summary)
     show_summary(summary | {"written": str(output)}, as_json, calibration_display.capture)
+
+
+def _temperature_option(text: str) -> float | list[float]:
+    try:
+        found = [number(part.strip()) for part in text.split(",")]
+    except ValueError:
+        bad_option("--temperature-c", text, "one number or two, LOWEST,HIGHEST in C")
+    return found[0] if len(found) == 1 else found
 
 
 def _poses_option(texts: Sequence[str], sockets: Iterable[str]) -> dict[str, int]:

@@ -6,7 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from ..core.units import ARCSEC, DEG
+from ..core.units import people_read, people_read_change
 from .display import (
     formatted,
     new_console,
@@ -40,22 +40,21 @@ def comparison(summary: dict[str, Any]) -> None:
 
 
 def _parameters(console: Console, summary: dict[str, Any]) -> None:
-    """Values to the digits that the uncertainty of their change allows, changes in um and arcsec."""
+    """Values to the digits that the uncertainty of their change allows, changes in small units: um, arcsec."""
     table = new_table(
         f"\nParameters: change with its expanded uncertainty U ({100 * summary['level']:g} %)",
         "parameter", "unit", "old", "new", "unit", "change", "U", "",
     )  # fmt: skip
     for row in summary["parameters"]:
-        length = row["unit"] == "mm"
-        factor, fine = (1.0, 1e3) if length else (1 / DEG, 1 / ARCSEC)
+        (factor, unit), (fine, small_unit) = people_read(row["unit"]), people_read_change(row["unit"])
         expanded = row["expanded"]
         decimals = _decimals(None if expanded is None else factor * expanded, 5)
         small = _decimals(None if expanded is None else fine * expanded, 2)
         table.add_row(
             row["parameter"],
-            "mm" if length else "deg",
+            unit,
             *(f"{factor * row[which]:.{decimals}f}" for which in ("old", "new")),
-            "um" if length else "arcsec",
+            small_unit,
             f"{fine * row['change']:+.{small}f}",
             "-" if expanded is None else f"{fine * expanded:.{small}f}",
             row["without"] or ("[bold]* beyond U[/bold]" if row["moved"] else ""),
@@ -101,13 +100,14 @@ def _changes(console: Console, rows: list[dict[str, Any]]) -> None:
     title += f", the last {_COLUMNS}; --csv and --json have all" if left_out else ""
     table = new_table(title, "parameter", "unit", *(str(number) for number, _ in shown))
     for i, first in enumerate(shown[0][1]["parameters"]):
-        length = first["unit"] == "mm"
+        fine, small_unit = people_read_change(first["unit"])
         cells = []
         for _, row in shown:
             found = row["parameters"][i]
-            change = (1e3 if length else 1 / ARCSEC) * found["change"]
-            cells.append(f"{change:+.1f}" + ("*" if found["moved"] else "?" if found["moved"] is None else " "))
-        table.add_row(first["parameter"], "um" if length else "arcsec", *cells)
+            cells.append(
+                f"{fine * found['change']:+.1f}" + ("*" if found["moved"] else "?" if found["moved"] is None else " ")
+            )
+        table.add_row(first["parameter"], small_unit, *cells)
     print_table(console, table)
     if any(row["moved"] is None for _, entry in shown for row in entry["parameters"]):
         console.print("?: without an uncertainty, since it is fixed, on a bound or not determined in one of the two.")

@@ -59,6 +59,13 @@ def correct(
             "calibrated probe, whose difference is corrected too.",
         ),
     ] = None,
+    temperature: Annotated[
+        float | None,
+        typer.Option(
+            metavar="C",
+            help="Temperature of an arm that was calibrated with its thermal expansion. Default: column temperature_C.",
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Turn commanded poses into corrected joint readings.
@@ -92,18 +99,36 @@ def correct(
                 bad_option("--probe", probe, "X,Y,Z in mm")
             nominal, calibrated = nominal.replace(probe=tip), calibrated.replace(probe=tip)
         commanded = read_commanded_poses(InputFile(poses), nominal, unit=unit, near=begin)
+        q = _at_temperature(commanded, calibrated, temperature)
         if commanded.poses is None:
-            found = corrected_readings(nominal, calibrated, commanded.q)
+            found = corrected_readings(nominal, calibrated, q)
         else:
-            found = readings_at_poses(calibrated, commanded.q, in_first_frame(record, commanded.poses), nominal.limits)
+            found = readings_at_poses(calibrated, q, in_first_frame(record, commanded.poses), nominal.limits)
         given = {"unit": commanded.unit, "of_readings": commanded.poses is None}
-        summary = correction_summary(nominal, calibrated, commanded.q, found, **given)
+        summary = correction_summary(nominal, calibrated, q, found, **given)
         write_text(output, corrected_csv(commanded, np.asarray(found.q), np.asarray(found.reached)))
         summary["written"] = str(output)
     warn_of_unusable(calibration, record)
     show_summary(summary, as_json, _display)
     if summary["not_reached"]:
         raise typer.Exit(1)
+
+
+def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) -> np.ndarray:
+    """The readings, with the temperature of an arm that expands."""
+    from ..files.temperatures import with_temperature
+    from ..kinematics.arm import correction_names
+    from ..kinematics.corrections.expansion import Expansion
+
+    if Expansion.words[0] not in correction_names(calibrated):
+        if temperature is not None:
+            raise InputError("the arm was calibrated without thermal expansion; leave out --temperature.")
+        return commanded.q
+    if commanded.temperature is None and temperature is None:
+        raise InputError(
+            "the arm was calibrated with its thermal expansion; give --temperature, or a column temperature_C."
+        )
+    return with_temperature(commanded.q, commanded.temperature, temperature, str(commanded.table.path))
 
 
 def _numbers(option: str, text: str, form: str) -> tuple[float, ...]:

@@ -24,18 +24,31 @@ from ..summaries.calibration import calibration_summary, capture_summary
 
 _DEVIATION_MM, _DEVIATION_DEG = 1.0, 0.1
 _ENCODER_ARCSEC, _SEATING_MM, _LENGTH_U_MM = 2.0, 0.005, 0.002
-_FILES = ("capture.h5", "calibration.h5", "nominal.toml", "true.toml", "calibrated.toml", "calibration.png")
+_FILES = (
+    "capture.h5",
+    "calibration.h5",
+    "nominal.toml",
+    "true.toml",
+    "calibrated.toml",
+    "calibration.png",
+    "report.html",
+)
 _TRUE = ", true"  # what the name of the true arm ends in
 _CHECKS, _CHECK_MM = 30, 300.0
 _START, _END = (400.0, 200.0, 300.0), (700.0, 500.0, 500.0)
 
 
 def run(folder: Path, seed: int) -> dict[str, Any]:
-    """Simulate, calibrate, compare, and leave capture, calibration, arms and a figure in ``folder``."""
+    """Simulate, calibrate, compare, and leave capture, calibration, arms, a figure and a report in ``folder``."""
+    from ..report import write_report
+
     nominal = load_specification("cheng2018-simulation")
     _prepare(folder, nominal.name + _TRUE)
-    with together(*(folder / name for name in _FILES)):
-        return _made(folder, nominal, seed)
+    *made, report = (folder / name for name in _FILES)
+    with together(*made):
+        summary = _made(folder, nominal, seed)
+    write_report(folder / "calibration.h5", report)  # of a file that has to be there
+    return summary
 
 
 def _prepare(folder: Path, true_name: str) -> None:

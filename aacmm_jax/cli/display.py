@@ -99,6 +99,14 @@ def print_warnings(console: Console, summary: dict[str, Any]) -> None:
         console.print(f"[yellow]Warning:[/yellow] {escape(warning)}")
 
 
+def print_verdict(console: Console, summary: dict[str, Any]) -> None:
+    """What a result is good for, in one line; summaries of earlier versions have none."""
+    verdict = summary.get("verdict")
+    if verdict:
+        style = {"good": "green", "unsure": "yellow", "bad": "red"}.get(verdict["mark"], "bold")
+        console.print(f"[{style}]{escape(verdict['says'])}[/]")
+
+
 def print_verdicts(console: Console, summary: dict[str, Any]) -> None:
     """Limits that are kept, and limits that are exceeded."""
     for sentence in summary["kept"]:

@@ -39,7 +39,7 @@ def exported(
 
         return ur_kinematics_yaml(specification.arm), ()
     if form == "offsets":
-        readings = np.asarray(record.recording.capture.readings)
+        readings = np.asarray(record.recording.capture.readings)[:, : nominal.arm.joints]
         found = controllers.zero_offsets(nominal.arm, record.calibrated.arm, readings)
         return controllers.zero_offsets_csv(found), ()
     base = None
@@ -51,7 +51,22 @@ def exported(
         title = ", ".join(part for part in (specification.name, source) if part)
         return controllers.python_program(specification.arm, title=title, base=base), ()
     convention, units = convention or "standard", units or "mm-deg"
-    return controllers.dh_table(specification.arm, convention=convention, units=units, base=base), ()
+    table = controllers.dh_table(specification.arm, convention=convention, units=units, base=base)
+    return table, _without_corrections(specification.arm, record.recording.capture.readings)
+
+
+def _without_corrections(arm: Any, readings: Any) -> tuple[str, ...]:
+    """What Denavit-Hartenberg parameters alone leave out, where they do."""
+    from ..kinematics.arm import without_corrections
+
+    if arm.corrections is None or not np.any(arm.coefficients):
+        return ()
+    q = np.asarray(readings)
+    moved = np.linalg.norm(np.asarray(arm.position(q)) - np.asarray(without_corrections(arm).position(q)), axis=1)
+    return (
+        f"The {np.count_nonzero(arm.coefficients)} coefficients of joint corrections stand in comments: by the table "
+        f"alone the tip is elsewhere by up to {moved.max():.3g} mm over the poses of the calibration.",
+    )
 
 
 def _urdf(specification: Any, nominal: Any) -> tuple[str, tuple[str, ...]]:

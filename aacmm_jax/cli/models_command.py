@@ -23,7 +23,7 @@ from .app import (
     with_spinner,
 )
 from .calibration_commands import known_noise
-from .display import formatted, new_console, new_table, print_table, print_warnings
+from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
 
 @app.command(
@@ -61,6 +61,9 @@ def compare_models(
     encoder_arcsec: KnownEncoderNoise = None,
     linear_encoder_mm: LinearEncoderNoise = None,
     seating_mm: KnownSeatingNoise = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE.h5", help="Keep the comparison, for show and report.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Compare models of the joints by unseen regions.
@@ -71,13 +74,14 @@ def compare_models(
     from ..calibration.model_ladder import compare_models as compared
     from ..data.drawing import draw_poses
     from ..files.captures import load_capture
-    from ..files.inputs import InputFile
+    from ..files.compared_models import save_compared_models
+    from ..files.inputs import InputFile, fingerprint
     from ..files.joint_models import masses_of
     from ..summaries.compared_models import compared_models_summary
 
-    with together():
+    with together(output):
         reading(capture)
-        recording = load_capture(InputFile(capture))
+        recording = load_capture(read := InputFile(capture))
     chosen = DEFAULT_MODELS if models is None else tuple(model.strip() for model in models.split(";"))
     if not all(chosen):
         raise InputError(f"--models '{models}' names an empty model; separate models by one semicolon each.")
@@ -91,7 +95,10 @@ def compare_models(
             nominal.arm, part, nominal.bounds(), models=chosen, regions=leave_out, noise=noise, **masses_of(nominal)
         ))  # fmt: skip
     summary = compared_models_summary(found, nominal.name) | {"poses": len(part.owner) + _observed(part)}
-    show_summary(summary, as_json, _display)
+    if output is not None:
+        save_compared_models(output, summary, [fingerprint(read)], None if only_poses is None else seed)
+        summary["written"] = str(output)
+    show_summary(summary, as_json, display)
     if not found.recommended.result.converged:
         raise typer.Exit(1)
 
@@ -100,7 +107,8 @@ def _observed(capture: Any) -> int:
     return sum(observation.q.shape[0] for observation in capture.observations)
 
 
-def _display(summary: dict[str, Any]) -> None:
+def display(summary: dict[str, Any]) -> None:
+    """Compared models."""
     console = new_console()
     console.print(
         f"[bold]{escape(summary['arm'])}[/bold]: {len(summary['models'])} models on {summary['poses']} poses, "
@@ -132,3 +140,4 @@ def _display(summary: dict[str, Any]) -> None:
         each = [row["regions"][i] for row in summary["models"]]
         by_region.add_row(escape(label), str(each[0]["poses"]), *(formatted(one["rms"]) for one in each))
     print_table(console, by_region)
+    print_written(console, summary)

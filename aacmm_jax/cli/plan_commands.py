@@ -152,6 +152,14 @@ def plan(
             help="Of an acceptance test: length of a bar that is available; twice for asme, five times for iso.",
         ),
     ] = None,
+    range_mm: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            metavar="MM",
+            help="Of an acceptance test: measuring range that the maker states, a diameter. Default: twice the reach.",
+        ),
+    ] = None,
     manifest: Annotated[
         Path | None,
         typer.Option(
@@ -204,6 +212,7 @@ def plan(
             "stylus": stylus_mm,
             "seed": seed,
             "bars": bar_mm or None,
+            "measuring_range": range_mm,
         }
         show_summary(
             _procedure(specification, arm, acceptance, output, manifest, options, angles),

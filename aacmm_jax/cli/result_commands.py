@@ -10,8 +10,8 @@ import typer
 from ..core.errors import InputError
 from ..core.text import printable
 from ..files.atomic_write import write_text
-from ..files.hdf5 import read_summary, read_tables
-from ..files.inputs import InputFile, fingerprint
+from ..files.hdf5 import read_summary
+from ..files.inputs import InputFile
 from ..files.outputs import together
 from ..files.sense import check_shown
 from .app import (
@@ -27,6 +27,7 @@ from .app import (
     warn_of_unusable,
     with_spinner,
 )
+from .evaluations import certificate, evaluated, evaluated_points
 from .export_formats import exported
 
 _ARM_SUFFIXES = ("", ".toml", ".urdf", ".xacro", ".yaml", ".yml")
@@ -68,7 +69,7 @@ def evaluate(
         typer.Option(
             metavar="NAME=A[+L/K]",
             help="Maximum permissible error of an acceptance test, mm (L: the length); repeatable. Exit code 1 where "
-            "one is not met by the decision rule of ISO 14253-1.",
+            "one is not met by the decision rule.",
         ),
     ] = None,
     acceptance: Annotated[
@@ -80,11 +81,32 @@ def evaluate(
         ),
     ] = None,
     test_u_mm: Annotated[
-        float,
+        str,
         typer.Option(
-            min=0, metavar="MM", help="Standard uncertainty that seat, fixture and temperature add to every test value."
+            metavar="A[+L/K]",
+            help="Standard uncertainty that seat and fixture add to every test value (L: the length).",
         ),
-    ] = 0.0,
+    ] = "0",
+    expansion: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="OF=C,U,T,U",
+            help="Thermal expansion of the artefact or the arm in an acceptance test: coefficient in 1e-6/K, "
+            "temperature in C, each with its standard uncertainty; 'artefact=11.5,1,20.8,0.2'. Lengths are corrected. "
+            "Of the arm only where it does not compensate its own.",
+        ),
+    ] = None,
+    rule: Annotated[
+        Literal["iso-2017", "iso-2013", "simple"] | None,
+        typer.Option(
+            help="Decision rule: ISO 14253-1:2017 (95 % probability), its guard band of 2013, or simple acceptance "
+            "(ASME B89.7.3.1, 4:1). Default: simple for ASME, else iso-2017."
+        ),
+    ] = None,
+    range_mm: Annotated[
+        float | None,
+        typer.Option(min=0, metavar="MM", help="Measuring range that the maker states, a diameter; else of the files."),
+    ] = None,
     max_rms_mm: Annotated[
         float | None, typer.Option(min=0, metavar="MM", help="Exit code 1 where the RMS distance is larger.")
     ] = None,
@@ -101,23 +123,31 @@ def evaluate(
     Errors on data that the calibration has not used are printed next to those that its uncertainty predicts. A manifest
     of points is tested without a calibration.
     """
-    from ..acceptance.decision import read_limits
+    from ..acceptance.decision import read_limits, read_uncertainty
+    from ..acceptance.influences import Influences, read_expansions
     from ..acceptance.results import METRICS
     from . import acceptance_display
 
-    limits = read_limits(mpe or [], METRICS)
+    u_test, bodies = read_uncertainty(test_u_mm), read_expansions(expansion or [])
+    of_test = {
+        "limits": read_limits(mpe or [], METRICS),
+        "u_test": u_test.fixed,
+        "influences": Influences(0.0, 1 / u_test.divisor, bodies.get("artefact"), bodies.get("arm")),
+        "rule": rule,
+    }
     maxima = {"rms_mm": max_rms_mm, "deltam_mm": max_deltam_mm, "length_error_largest_mm": max_length_error_mm}
     maxima = {name: value for name, value in maxima.items() if value is not None}
     if capture is None:
         if maxima or only or without:
             raise InputError(
-                "a manifest of points takes only --mpe, --acceptance, --test-u-mm, --output and --json; name a "
-                "calibration and a capture for the other options."
+                "a manifest of points takes no --max-..., --only and --without; name a calibration and a capture for "
+                "these options."
             )
-        summary = _evaluated_points(calibration, output, limits, test_u_mm, acceptance)
+        summary = evaluated_points(calibration, output, acceptance, range_mm, of_test)
         show_summary(summary, as_json, acceptance_display.points)
     else:
-        summary = _evaluated(calibration, capture, output, (only, without), limits, test_u_mm, maxima, acceptance)
+        of_test |= {"maxima": maxima, "standards": acceptance}
+        summary = evaluated(calibration, capture, output, (only, without), range_mm, of_test)
         show_summary(summary, as_json, acceptance_display.evaluation)
     undecided = [test for test in summary["acceptance"] if test["decision"] in ("fails", "undecided")]
     if summary["failed"] or undecided:
@@ -127,7 +157,11 @@ def evaluate(
 @app.command(epilog=examples("aacmm report calibration.h5 -o report.html"))
 def report(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE.h5", help="Calibration, evaluation (aacmm evaluate -o) or study.")
+        Path,
+        typer.Argument(
+            metavar="FILE.h5",
+            help="Calibration, evaluation (evaluate -o), study or compared models (compare-models -o).",
+        ),
     ],
     output: Annotated[
         Path,
@@ -155,67 +189,12 @@ def report(
     show_summary(summary, as_json, acceptance_display.report)
 
 
-def _evaluated(
-    calibration: Path,
-    capture: Path,
-    output: Path | None,
-    choice: tuple,
-    limits: Any,
-    u_test: float,
-    maxima: dict[str, float],
-    standards: list[str] | None,
-) -> dict[str, Any]:
-    from ..acceptance.record import evaluation_of
-    from ..files.calibrations import load_calibration
-    from ..files.captures import load_capture
-    from ..files.evaluations import save_evaluation
-    from ..files.inputs import InputFile, fingerprint
-    from ..summaries.evaluation import evaluation_summary
-
-    with together(output):
-        read = InputFile(calibration), InputFile(capture)
-        record, recording = load_calibration(read[0]), load_capture(read[1])
-        recording = recording._replace(
-            capture=recording.capture.select(choice[0] or None, choice[1] or ()),
-            sources=(*map(fingerprint, read), *recording.sources),
-        )
-        found = evaluation_of(record, recording, limits=limits, u_test=u_test, maxima=maxima, standards=standards)
-        summary = with_spinner("Evaluating", lambda: evaluation_summary(found))
-        if output is not None:
-            save_evaluation(output, found, summary)
-            summary["written"] = str(output)
-    return summary
-
-
-def _evaluated_points(
-    manifest: Path, output: Path | None, limits: Any, u_test: float, standards: list[str] | None
-) -> dict[str, Any]:
-    from ..acceptance.record import PointsRecord
-    from ..acceptance.standards import STANDARDS, checked_standards
-    from ..files.evaluations import save_points
-    from ..files.points import read_points
-    from ..summaries.evaluation import points_summary
-
-    if manifest.suffix != ".toml":
-        raise InputError(
-            f"{manifest} alone cannot be evaluated; name a capture as well, or a manifest of points (TOML)."
-        )
-    with together(output):
-        chosen = checked_standards(STANDARDS if standards is None else standards)
-        record = PointsRecord(read_points(manifest), limits, u_test, chosen)
-        summary = points_summary(record)
-        if output is not None:
-            save_points(output, record, summary)
-            summary["written"] = str(output)
-    return summary
-
-
 @app.command(
     epilog=examples(
         "aacmm export calibration.h5 --format toml -o arm.toml",
         "aacmm export calibration.h5 -o robot.urdf",
         "aacmm export calibration.h5 --format table --convention craig --units m-rad",
-        "aacmm export calibration.h5 --format dcc --about laboratory.toml -o certificate.xml",
+        "aacmm export calibration.h5 --format dcc --evaluation tests.h5 --about laboratory.toml -o certificate.xml",
     )
 )
 def export(
@@ -248,11 +227,19 @@ def export(
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write. Default: standard output.")
     ] = None,
     about: About = None,
+    evaluation: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.h5",
+            help="Of --format dcc: an evaluation (aacmm evaluate -o) of this calibration, whose acceptance tests are "
+            "added.",
+        ),
+    ] = None,
 ) -> None:
     """Write a calibration for other programs or controllers."""
     written_as: str = form or _FORMATS.get("" if output is None else output.suffix.lower(), "toml")
-    if about is not None and written_as != "dcc":
-        raise InputError("--about is for certificates; give it with --format dcc.")
+    if (about is not None or evaluation is not None) and written_as != "dcc":
+        raise InputError("--about and --evaluation are for certificates; give them with --format dcc.")
     if which is not None and written_as not in _OF_ONE_ARM:
         raise InputError(
             f"--arm is for --format {', '.join(_OF_ONE_ARM)}; leave it out, as {written_as} holds what it needs."
@@ -273,7 +260,7 @@ def export(
             scale = "" if math.isnan(record.k) else f", k = {record.k:.8f}"
             source = f"calibrated from {len(record.recording.capture.readings)} poses, {record.method}{scale}"
         if written_as == "dcc":
-            text, notes = _certificate(read, record, about), ()
+            text, notes = certificate(read, record, about, evaluation), ()
         else:
             text, notes = exported(record, specification, written_as, source, convention, units)
         if output is not None:
@@ -283,30 +270,14 @@ def export(
         typer.echo(printable(note), err=output is None)
 
 
-def _certificate(calibration: InputFile, record: Any, about: Path | None) -> str:
-    from ..certificate import dcc_xml
-    from ..files.administrative_data import AdministrativeData as Stated
-    from ..files.administrative_data import read_administrative_data
-
-    made = read_tables(calibration, ("calibration",)).attributes
-    sources = [fingerprint(calibration), *record.recording.sources]
-    return dcc_xml(
-        record,
-        Stated() if about is None else read_administrative_data(about),
-        created=made["created"],
-        sources=sources,
-        command=made["command"],
-    )
-
-
 @app.command(epilog=examples("aacmm show calibration.h5", "aacmm show panda"))
 def show(
     file: Annotated[
         str,
         typer.Argument(
             metavar="FILE",
-            help="Capture, calibration, evaluation or study (HDF5), or an arm: a TOML file, a URDF, a kinematics.yaml "
-            "or a shipped name.",
+            help="Capture, calibration, evaluation, study or compared models (HDF5), or an arm: a TOML file, a URDF, a "
+            "kinematics.yaml or a shipped name.",
         ),
     ],
     cell: Annotated[int | None, typer.Option(min=1, metavar="N", help="Of a study: show this cell in full.")] = None,
@@ -324,7 +295,7 @@ def show(
         return
     if base is not None or tip is not None:
         raise InputError(f"--base and --tip are links of a URDF, and {file} is none; leave them out.")
-    attributes, summary = read_summary(path, ("capture", "calibration", "evaluation", "study"))
+    attributes, summary = read_summary(path, ("capture", "calibration", "evaluation", "study", "model comparison"))
     kind = attributes["kind"]
     if kind == "study":
         from .study_commands import show_study
@@ -334,6 +305,7 @@ def show(
     if cell is not None or figures is not None:
         raise InputError(f"{file} holds a {kind}; --cell and --figures are for studies.")
     from . import acceptance_display, calibration_display
+    from .models_command import display as display_models
 
     if kind == "evaluation" and attributes.get("of") == "points":
         kind = "points"
@@ -342,6 +314,7 @@ def show(
         "calibration": calibration_display.calibration,
         "evaluation": acceptance_display.evaluation,
         "points": acceptance_display.points,
+        "model comparison": display_models,
     }[kind]
     if summary is None:
         summary = _summary_of(path, kind)
@@ -368,6 +341,7 @@ def _summary_of(file: Path, kind: str) -> dict[str, Any]:
     """The summary of a file that holds none: one written through Python, or by another version."""
     from ..files.calibrations import load_calibration
     from ..files.captures import load_capture
+    from ..files.compared_models import load_compared_models
     from ..files.evaluations import load_evaluation, load_points
     from ..summaries.calibration import calibration_summary, capture_summary
     from ..summaries.evaluation import evaluation_summary, points_summary
@@ -377,5 +351,6 @@ def _summary_of(file: Path, kind: str) -> dict[str, Any]:
         "calibration": (load_calibration, calibration_summary),
         "evaluation": (load_evaluation, evaluation_summary),
         "points": (load_points, points_summary),
+        "model comparison": (load_compared_models, dict),
     }[kind]
     return summarise(load(file))

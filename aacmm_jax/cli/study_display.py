@@ -5,7 +5,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from ..core.units import ARCSEC
+from ..core.units import error_unit
 from ..study.statistics import METRICS, concise, factor_title, level_text, level_title, metric_title, shown_unit
 from .display import new_console, new_table, print_table
 
@@ -160,7 +160,7 @@ def _full(console: Console, cell: dict[str, Any]) -> None:
         "\nParameters: estimate less truth", "parameter", "unit", "bias", "standard deviation", "on a bound [%]",
     )  # fmt: skip
     for row in cell["parameters"]:
-        factor, unit = (1.0, "mm") if row["unit"] == "mm" else (1 / ARCSEC, "arcsec")
+        factor, unit = error_unit(row["unit"])
         numbers = (_both(row["bias"], factor), _both(row["spread"], factor), _percent(row["on_a_bound"]))
         table.add_row(row["parameter"], unit, *numbers)
     print_table(console, table)

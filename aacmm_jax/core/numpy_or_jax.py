@@ -147,6 +147,16 @@ def added_to(array: AnyArray, index: Any, value: Any) -> Any:
     return array
 
 
+def broadcast_after_first(values: AnyArray, batch: tuple[int, ...]) -> AnyArray:
+    """``(k, ...)`` broadcast to ``(k, *batch)``."""
+    if values.shape[1:] == batch:
+        return values
+    missing = (1,) * (len(batch) + 1 - values.ndim)
+    return namespace(values).broadcast_to(
+        values.reshape(values.shape[:1] + missing + values.shape[1:]), (len(values), *batch)
+    )
+
+
 def stop_gradient(tree: Tree) -> Tree:
     """The tree as a constant of differentiation."""
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf, tree)

@@ -11,5 +11,24 @@ ARCSEC = math.pi / (180 * 3600)  # rad
 
 
 def people_read(unit: str) -> tuple[float, str]:
-    """The unit in which people read a value, and the factor to it: degrees for radians, others as they are."""
-    return (1 / DEG, "deg") if unit == "rad" else (1.0, "" if unit == "1" else unit)
+    """The unit in which people read a value, and the factor to it: degrees for radians, um/(m K) for 1/K, others as
+    they are."""
+    return {"rad": (1 / DEG, "deg"), "1": (1.0, ""), "1/K": (1e6, "um/(m K)")}.get(unit, (1.0, unit))
+
+
+def error_unit(unit: str) -> tuple[float, str]:
+    """The same of errors of parameters: mm, but arcsec, ppm and urad/m of others."""
+    return (1.0, "mm") if unit == "mm" else people_read_change(unit)
+
+
+def people_read_change(unit: str) -> tuple[float, str]:
+    """The unit in which people read a small change of a value, and the factor to it: um, arcsec, urad/m, ppm."""
+    if unit == "rad":
+        return 1 / ARCSEC, "arcsec"
+    if unit == "1":
+        return 1e6, "ppm"
+    if unit == "1/K":
+        return people_read(unit)
+    if unit.startswith("mm"):
+        return 1 / UM, unit.replace("mm", "um", 1)
+    return (1e6, f"u{unit}") if unit.startswith("rad") else (1.0, unit)

@@ -1,6 +1,6 @@
 """Classes of arms: the noise that plans assume of one that has not been calibrated, and how its tool comes to a socket.
 
-The only place that says so. A calibration estimates its noise from the data.
+The only place that says so. A calibration estimates its noise from the data, and compares it with what is usual.
 """
 
 import math
@@ -27,6 +27,14 @@ class ArmClass(NamedTuple):
     repeatability: float | None  # pose repeatability of ISO 9283, mm; None where the encoders are known instead
     cone: float  # half angle of the cone from which the tool comes to a socket, rad
     retract: float  # distance of the approach point from the socket, mm
+    source: str
+
+
+class ArmNoise(NamedTuple):
+    """What is usual for an arm: its class and its noise, and where the numbers come from."""
+
+    arm_class: str
+    noise: Noise
     source: str
 
 

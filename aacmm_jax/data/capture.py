@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..core.arguments import checked_arguments, items_of, shown
-from ..core.arrays import Numbers, as_array, is_concrete, joined
+from ..core.arrays import Numbers, is_concrete, joined
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.text import shorten
@@ -19,48 +19,12 @@ from ..kinematics.arm import Arm
 from .copies import NOTHING_REPEATED, Repeated, check_different, observation_without_copies, without_copies
 from .observations.observation import AbstractObservation, checked_name, checked_readings
 from .observations.socket import Socket
-
-
-class ReferenceLength(eqx.Module):
-    """A physical artefact: the certified distance between two sockets.
-
-    Args:
-        start: Name of the socket at one end.
-        end: Name of the socket at the other end.
-        value: Calibrated length, scalar, mm.
-        u: Standard uncertainty (k = 1) of ``value``, scalar, mm.
-
-    Raises:
-        InputError: Where both ends are one socket, ``value`` is not positive or ``u`` is negative.
-    """
-
-    start: str = eqx.field(static=True)
-    end: str = eqx.field(static=True)
-    value: Float[AnyArray, ""]
-    u: Float[AnyArray, ""]
-
-    def __init__(self, start: str, end: str, value: Numbers, u: Numbers = 0.0):
-        for name in (start, end):
-            if not isinstance(name, str):
-                raise InputError(f"an end of a reference length is {shown(name)}; give the name of a socket.")
-        self.start, self.end = start, end
-        where = f"reference length '{start}' to '{end}'"
-        self.value, self.u = as_array(value, where), as_array(u, f"u of {where}")
-        if start == end:
-            raise InputError(f"{where} joins a socket to itself; name two different sockets.")
-        if self.value.ndim or self.u.ndim:
-            raise InputError(f"{where} needs one value and one u, in mm.")
-        # `float`, not JAX: inside jit even a constant becomes a tracer once JAX computes with it.
-        if is_concrete(self.value) and not 0 < float(self.value) < np.inf:
-            raise InputError(f"{where} is {float(self.value):g} mm; a length must be positive and finite.")
-        if is_concrete(self.u) and not 0 <= float(self.u) < np.inf:
-            raise InputError(
-                f"{where} has u = {float(self.u):g} mm; a standard uncertainty must be zero or positive, and finite."
-            )
-
+from .reference_length import ReferenceLength
+from .visits import checked_visits, visits_by_socket
 
 # Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
 _MOST_RADIANS = 8 * np.pi
+_TEMPERATURES = (-50.0, 100.0)  # C; room temperatures in kelvins are outside
 
 
 class Capture(eqx.Module):
@@ -77,11 +41,14 @@ class Capture(eqx.Module):
 
     Args:
         sockets: Socket name -> joint readings, shape ``(m, n)``, rad, or mm of prismatic joints; m poses may differ
-            from socket to socket.
+            from socket to socket. Of an arm with a thermometer ``(m, n + 1)``, with the temperature last, C; likewise
+            in observations.
         lengths: Reference lengths between these sockets, or one.
         observations: What else ties the tip down (`data.observations`): measured points, spheres, planes, artefacts.
         repeated: Copies that were left out of these data before.
         sessions: Names of the sessions of `join_sessions`; what belongs to one is named ``session/name``.
+        visits: Socket name -> number of the visit of each of its poses ``(m,)``: the tip was lifted between visits, and
+            may have come to rest elsewhere. Where a socket is not named, or nothing is given, visits are unknown.
 
     Raises:
         InputError: For names that are empty, longer than a line or given twice, readings that are not finite,
@@ -96,6 +63,7 @@ class Capture(eqx.Module):
     sizes: tuple[int, ...] = eqx.field(static=True)
     repeated: Repeated = eqx.field(static=True)
     sessions: tuple[str, ...] = eqx.field(static=True)
+    visits: tuple[int, ...] | None = eqx.field(static=True)  # of each pose of a socket, where they are known
 
     def __init__(
         self,
@@ -104,6 +72,7 @@ class Capture(eqx.Module):
         observations: Iterable[AbstractObservation] | AbstractObservation = (),
         repeated: Repeated = NOTHING_REPEATED,
         sessions: Iterable[str] = (),
+        visits: Mapping[str, Numbers] | None = None,
     ):
         if not isinstance(sockets, Mapping):
             raise InputError(
@@ -160,6 +129,7 @@ class Capture(eqx.Module):
         )
         for name in (*self.names, *(o.name for o in self.observations)) if self.sessions else ():
             self.session_of(name)
+        self.visits = checked_visits(visits, blocks)
 
     def session_of(self, name: str) -> str:
         """The session of a socket or observation, by its name; `InputError` where it belongs to none."""
@@ -172,8 +142,8 @@ class Capture(eqx.Module):
         return max(found, key=len)
 
     @property
-    def joints(self) -> int:
-        """Number of joints, n."""
+    def columns(self) -> int:
+        """Number of columns of the readings: one a joint, and one more of an arm with a thermometer."""
         return self.q.shape[-1]
 
     @property
@@ -182,6 +152,11 @@ class Capture(eqx.Module):
         q = np.asarray(self.q) if is_concrete(self.q) else self.q
         ends = np.cumsum(self.sizes)
         return {name: q[..., end - size : end, :] for name, size, end in zip(self.names, self.sizes, ends, strict=True)}
+
+    @property
+    def visits_of_sockets(self) -> dict[str, Int[np.ndarray, " m"]]:
+        """Number of the visit of each pose, ``(m,)``, of the sockets whose visits are known."""
+        return visits_by_socket(self.visits, self.names, self.sizes)
 
     @property
     def readings(self) -> Float[AnyArray, "M n"]:
@@ -230,7 +205,8 @@ class Capture(eqx.Module):
         )
         others = [observation for observation in self.observations if observation.name in kept]
         chosen = {name: sockets[name] for name in self.names if name in kept}
-        return Capture(chosen, lengths, others, repeated=repeated, sessions=self.sessions)
+        visits = {name: rows for name, rows in self.visits_of_sockets.items() if name in kept}
+        return Capture(chosen, lengths, others, repeated=repeated, sessions=self.sessions, visits=visits)
 
 
 def names_in(capture: Capture) -> tuple[str, ...]:
@@ -244,7 +220,8 @@ def part_of(capture: Capture, names: Collection[str]) -> Capture:
     lengths = [length for length in capture.lengths if length.start in names and length.end in names]
     others = [observation for observation in capture.observations if observation.name in names]
     sockets = {name: q for name, q in capture.sockets.items() if name in names}
-    return Capture(sockets, lengths, others, sessions=capture.sessions)
+    visits = {name: rows for name, rows in capture.visits_of_sockets.items() if name in names}
+    return Capture(sockets, lengths, others, sessions=capture.sessions, visits=visits)
 
 
 def check_one_capture(capture: Capture) -> None:
@@ -331,6 +308,7 @@ def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) ->
     if not isinstance(captures, Mapping) or not captures:
         raise InputError("the sessions are no dictionary; give the captures by name: {'Monday': capture, ...}.")
     sockets: dict[str, Numbers] = {}
+    visits: dict[str, Numbers] = {}
     lengths: list[ReferenceLength] = []
     observations: list[AbstractObservation] = []
     for number, (session, capture) in enumerate(captures.items()):
@@ -343,13 +321,15 @@ def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) ->
                 observations.append(Socket(f"{session}/{name}", readings, target=f"probe of {session}"))
             else:
                 sockets[f"{session}/{name}"] = readings
+        visits |= {f"{session}/{name}": rows for name, rows in capture.visits_of_sockets.items()}
         lengths += [
             ReferenceLength(f"{session}/{length.start}", f"{session}/{length.end}", length.value, length.u)
             for length in capture.lengths
         ]
         own = f"probe of {session}" if number and own_probe else ""
         observations += [observation.in_session(session, own) for observation in capture.observations]
-    return Capture(sockets, lengths, observations, sessions=tuple(captures))
+    visits = {name: rows for name, rows in visits.items() if name in sockets}
+    return Capture(sockets, lengths, observations, sessions=tuple(captures), visits=visits)
 
 
 def stack_captures(captures: Iterable[Capture]) -> Capture:
@@ -373,7 +353,7 @@ def stack_captures(captures: Iterable[Capture]) -> Capture:
     for capture in captures:
         check_one_capture(capture)
     shapes = {
-        (c.names, c.sizes, tuple((r.start, r.end) for r in c.lengths), c.joints, _form(c.observations))
+        (c.names, c.sizes, tuple((r.start, r.end) for r in c.lengths), c.columns, _form(c.observations))
         for c in captures
     }
     if len(shapes) != 1:
@@ -394,14 +374,25 @@ def _form(observations: tuple[AbstractObservation, ...]) -> tuple[Any, ...]:
     return structure, tuple(leaf.shape for leaf in leaves)
 
 
+def _check_temperatures(where: str, temperatures: Float[np.ndarray, "..."]) -> None:
+    low, high = _TEMPERATURES
+    wrong = temperatures[(temperatures < low) | (temperatures > high)]
+    if wrong.size:
+        raise InputError(
+            f"{where} has a temperature of {wrong[0]:g} C, which is not between {low:g} and {high:g}; give degrees "
+            "Celsius in the last column."
+        )
+
+
 def check_readings(capture: Capture, arm: Arm) -> None:
     """Raise `InputError` where known readings of an arm's revolute joints look like degrees."""
     angular = np.array([i not in arm.prismatic for i in range(1, arm.joints + 1)])
     of_sockets = [(f"socket '{name}'", readings) for name, readings in capture.sockets.items()]
     for where, readings in [*of_sockets, *((f"observation '{one.name}'", one.q) for one in capture.observations)]:
-        if not is_concrete(readings) or readings.shape[-1] != arm.joints:
+        if not is_concrete(readings) or readings.shape[-1] not in (arm.joints, arm.columns):
             continue
-        size = np.where(angular, np.abs(np.asarray(readings)), 0.0).reshape(-1, arm.joints)
+        _check_temperatures(where, np.asarray(readings)[..., arm.joints :])
+        size = np.where(angular, np.abs(np.asarray(readings)[..., : arm.joints]), 0.0).reshape(-1, arm.joints)
         if size.max() > _MOST_RADIANS:
             row, column = np.argwhere(size == size.max())[0] + 1
             raise InputError(

@@ -46,7 +46,7 @@ def without_copies(block: AnyArray) -> AnyArray:
     """The first of each pose of a socket, in their order. Only known values are compared."""
     if not is_concrete(block):
         return block
-    first = _first_of_each(block)
+    first = first_of_each(block)
     return block if len(first) == block.shape[0] else np.asarray(block)[first]
 
 
@@ -55,12 +55,12 @@ def observation_without_copies(observation: AbstractObservation) -> AbstractObse
     values = [getattr(observation, field) for field in observation.by_pose]
     if not is_concrete(*values):
         return observation
-    first = _first_of_each(*values)
+    first = first_of_each(*values)
     return observation if len(first) == observation.q.shape[0] else observation.select(first)
 
 
-def _first_of_each(*values: Any) -> list[int]:
-    """Rows of arrays, or of tuples, that differ from all rows before them."""
+def first_of_each(*values: Any) -> list[int]:
+    """Numbers of the rows of arrays, or of tuples, that differ from all rows before them."""
     first: dict[tuple[bytes, ...], int] = {}
     arrays = [np.asarray(value) + 0.0 for value in values]  # which has no negative zero
     for i, rows in enumerate(zip(*arrays, strict=True)):

@@ -64,6 +64,11 @@ class Noise(eqx.Module):
         angular = self.encoder * xp.asarray(kinds.units)
         return angular if self.linear_encoder is None else xp.where(kinds.mask(), self.linear_encoder, angular)
 
+    def of_columns(self, kinds: JointKinds | None, joints: int, columns: int) -> Float[np.ndarray, " columns"]:
+        """Standard deviations of all columns of readings, rad and mm; 0 for that of a thermometer."""
+        each = np.broadcast_to(np.asarray(self.of_readings(kinds)), (joints,))
+        return np.concatenate([each, np.zeros(columns - joints)])
+
     def check(self, joints: int) -> None:
         """Check that this noise can weight the poses of an arm.
 

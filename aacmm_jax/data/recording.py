@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from ..kinematics.parameters import ArmSpecification
+from .arm_classes import ArmNoise
 from .capture import Capture
 from .sphere import ProbedSphere
 
@@ -19,6 +20,8 @@ class Recording(NamedTuple):
         sources: Files that it was read from, as name and SHA-256, the latest first.
         measured: Day of the recording, ISO 8601; empty where not stated.
         acceptance: Standards whose acceptance procedure the poses were taken for: "jjf", "asme", "iso".
+        measuring_range: Diameter of the measuring volume as the arm's maker states it, mm; None where not stated.
+        usual: Noise that the arm's file states, with which an estimated one is compared; None where it states none.
     """
 
     capture: Capture
@@ -29,3 +32,5 @@ class Recording(NamedTuple):
     sources: tuple[str, ...] = ()
     measured: str = ""
     acceptance: tuple[str, ...] = ()
+    measuring_range: float | None = None
+    usual: ArmNoise | None = None

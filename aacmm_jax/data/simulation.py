@@ -14,6 +14,8 @@ from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.units import ARCSEC
 from ..kinematics.arm import Arm, is_single, joint_limits
+from ..kinematics.chain import length_scale
+from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
 from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture, ReferenceLength
 from .noise import Noise
@@ -34,6 +36,7 @@ def simulate(
     linear_resolution: float = 0.0,
     limits: Sequence[Sequence[float]] | None = None,
     observations: Iterable[AbstractSimulated] = (),
+    temperature: Numbers | None = None,
     seed: int = 0,
 ) -> Capture:
     """Record a capture with a simulated arm; without noise unless asked for.
@@ -56,10 +59,12 @@ def simulate(
         limits: Lowest and highest reading of each joint, ``(n, 2)``, rad, or mm of prismatic joints; by default the
             arm's own, else +-pi (a prismatic joint has no default).
         observations: Other observations to record (`data.observations`), with their true geometry.
+        temperature: Of an arm with a thermometer, C: one for all poses, by default 20, or the lowest and the highest,
+            between which each pose's is drawn; the last column of the readings.
         seed: Seed of poses and noise.
 
     Returns:
-        The capture: readings in rad, lengths in mm.
+        The capture: readings in rad, lengths in mm, temperatures in C.
 
     Raises:
         InputError: For a point out of reach, negative noise, and noise given in both forms.
@@ -70,6 +75,7 @@ def simulate(
         raise InputError("simulate takes one arm, not a batch; take one of it first.")
     check_finite(arm=arm, noise=noise)
     noise.check_joints(arm.joints)
+    warmth = _Temperatures(arm, temperature, seed)
     simulated = items_of(observations, "observations")
     if not isinstance(sockets, Mapping) or not (sockets or simulated):
         raise InputError("simulate needs at least one socket with its position.")
@@ -84,10 +90,10 @@ def simulate(
     targets = exact + noise.seating * random_numbers("normal", seat_key, exact.shape)
     references = _reference_lengths(points, lengths, length_key)
     labels = [f"socket '{name}'" for name in owner]
-    angles = random_configurations(arm, targets, reach_key, limits_array, labels=labels)
+    angles = warmth.configurations(arm, targets, reach_key, limits_array, labels)
     angles = _read(arm, angles, noise, encoder_key, resolution)
     others = [
-        _recorded(arm, one, noise, jax.random.fold_in(random_key(seed), number), limits_array, resolution)
+        _recorded(arm, one, noise, jax.random.fold_in(random_key(seed), number), limits_array, resolution, warmth)
         for number, one in enumerate(simulated)
     ]
     ends = np.cumsum(list(counts.values()))
@@ -105,12 +111,36 @@ class _Resolution(NamedTuple):
 def _read(
     arm: Arm, q: Float[AnyArray, "m n"], noise: Noise, key: Array, resolution: _Resolution
 ) -> Float[np.ndarray, "m n"]:
-    """What the encoders show."""
-    kinds = arm.geometry.kinds
+    """What the encoders show; a thermometer is exact."""
+    kinds, q, temperature = arm.geometry.kinds, q[:, : arm.joints], q[:, arm.joints :]
     q = np.asarray(q + noise.of_readings(kinds) * random_numbers("normal", key, q.shape))
     linear = np.zeros(arm.joints, dtype=bool) if kinds is None else kinds.mask()
     step = np.where(linear, resolution.linear, resolution.angular)
-    return np.where(step > 0, np.round(q / np.where(step > 0, step, 1.0)) * step, q)
+    q = np.where(step > 0, np.round(q / np.where(step > 0, step, 1.0)) * step, q)
+    return np.concatenate([q, temperature], axis=1)
+
+
+class _Temperatures:
+    """The temperatures of an arm with a thermometer; without one, nothing."""
+
+    def __init__(self, arm: Arm, given: Numbers | None, seed: int):
+        if given is not None and not arm.thermometer:
+            raise InputError("a temperature is given, but the arm has no thermometer; make it with thermometer=True.")
+        self._range = np.asarray(as_floats(REFERENCE_TEMPERATURE if given is None else given, "temperature"))
+        if self._range.shape not in ((), (2,)) or np.any(np.diff(np.atleast_1d(self._range)) < 0):
+            raise InputError("temperature must be one number, or the lowest and the highest; C.")
+        self._columns, self._random = int(arm.thermometer), np.random.default_rng(seed)
+
+    def configurations(
+        self, arm: Arm, targets: Float[AnyArray, "m 3"], key: Array, limits: np.ndarray, labels: Sequence[str]
+    ) -> Float[np.ndarray, "m n"]:
+        """Random configurations at the targets, with the temperature of each."""
+        low, high = np.broadcast_to(self._range, (2,))
+        temperature = self._random.uniform(low, high, (len(labels), self._columns))
+        joints = np.zeros((len(labels), arm.joints))
+        scale = length_scale(arm.geometry, np.concatenate([joints, temperature], axis=1))
+        angles = random_configurations(arm, targets / scale[:, None], key, limits, labels=labels)
+        return np.concatenate([angles, temperature], axis=1)
 
 
 def _recorded(
@@ -120,6 +150,7 @@ def _recorded(
     key: Array,
     limits: np.ndarray,
     resolution: _Resolution,
+    warmth: _Temperatures,
 ) -> AbstractObservation:
     """One simulated observation."""
     if not isinstance(simulated, AbstractSimulated):
@@ -132,7 +163,7 @@ def _recorded(
     exact = simulated.tips(random)
     seated = exact + noise.seating * random_numbers("normal", seat_key, exact.shape)
     labels = [f"observation '{simulated.name}'"] * len(exact)
-    angles = random_configurations(holding, seated, reach_key, limits, labels=labels)
+    angles = warmth.configurations(holding, seated, reach_key, limits, labels)
     transforms = np.asarray(holding.pose(angles)).copy()
     # An instrument sees the tip where it is; what is owed to the seat moves the tip, and not what it is compared with.
     transforms[:, :3, 3] = exact

@@ -25,6 +25,7 @@ class ProbedSphere(NamedTuple):
         u: Standard uncertainty (k = 1) of the diameter, mm.
         stylus: Diameter of the probe's ball, mm; 0 where the points are on the sphere itself.
         form: Calibrated form error of the sphere, mm.
+        u_form: Standard uncertainty (k = 1) of the form error, mm.
     """
 
     name: str
@@ -34,6 +35,7 @@ class ProbedSphere(NamedTuple):
     u: float = 0.0
     stylus: float = 0.0
     form: float = 0.0
+    u_form: float = 0.0
 
 
 def checked_sphere(sphere: ProbedSphere, columns: int | None = None) -> ProbedSphere:
@@ -46,6 +48,7 @@ def checked_sphere(sphere: ProbedSphere, columns: int | None = None) -> ProbedSp
         ("u", sphere.u, 0.0),
         ("stylus", sphere.stylus, 0.0),
         ("form", sphere.form, 0.0),
+        ("u_form", sphere.u_form, 0.0),
     ):
         if not (np.isfinite(value) and value >= least):
             raise InputError(

@@ -10,8 +10,7 @@ from jaxtyping import Float
 from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..core.text import shorten
-from ..kinematics.arm import Arm, parameter_names
-from ..kinematics.parameters import Parameters
+from ..kinematics.arm import DOWN, Arm, correction_names, parameter_names, parameter_unit, value_of
 from ..uncertainty.volume import default_length, sample_lengths
 from .results import Drift, Trend
 from .statistics import FIXED, ON_BOUND, coverage_factor, effective_degrees_of_freedom, joint_test, length_change
@@ -113,7 +112,8 @@ def _compared(
     labels: Sequence[str],
 ) -> Drift:
     """``lengths``: their length, and the configurations at both ends."""
-    before, after = (_values(record.calibrated.arm, names) for record in (old, new))
+    arms = old.calibrated.arm, new.calibrated.arm
+    before, after = (_values(arm, names) for arm in arms)
     reasons = _reasons(old, new, names)
     known = np.array([not reason for reason in reasons])
     u_old, u_new = (np.where(known, _standard_uncertainties(record, names), 0.0) for record in (old, new))
@@ -121,6 +121,7 @@ def _compared(
     u = np.where(known, np.hypot(u_old, u_new), np.nan)
     return Drift(
         names=names,
+        units=tuple(_unit(arms, name) for name in names),
         old=before,
         new=after,
         u=u,
@@ -135,7 +136,15 @@ def _compared(
 
 
 def _values(arm: Arm, names: tuple[str, ...]) -> Float[np.ndarray, " p"]:
-    return np.asarray(Parameters(arm, names).vector())
+    """Values of parameters; coefficients of corrections that the arm lacks are 0."""
+    down: dict[str, float] = dict(zip(("gravity_x", "gravity_y", "gravity_z"), DOWN, strict=True))
+    known = {*parameter_names(arm), *(f"beta_{i}" for i in range(1, arm.joints + 1) if arm.beta is not None)}
+    return np.array([float(value_of(arm, name)) if name in known else down.get(name, 0.0) for name in names])
+
+
+def _unit(arms: tuple[Arm, Arm], name: str) -> str:
+    """The unit of a parameter that one of two arms may lack."""
+    return parameter_unit(next((arm for arm in arms if name in correction_names(arm)), arms[0]), name)
 
 
 def _names(records: Sequence[CalibrationRecord]) -> tuple[str, ...]:

@@ -8,15 +8,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..core.text import shorten
-from ..core.units import ARCSEC
-from ..kinematics.arm import is_length
+from ..core.units import people_read_change
 from .statistics import JointTest, LengthChange
 
 
 class Drift(NamedTuple):
-    """Two calibrations compared, as NumPy arrays in the order of ``names``: mm and rad."""
+    """Two calibrations compared, as NumPy arrays in the order of ``names``: mm, rad, or a coefficient's own unit."""
 
     names: tuple[str, ...]  # free in either
+    units: tuple[str, ...]
     old: Float[np.ndarray, " p"]
     new: Float[np.ndarray, " p"]
     u: Float[np.ndarray, " p"]  # standard uncertainty of the change; NaN if it has none
@@ -77,7 +77,7 @@ class Trend(NamedTuple):
 
     @property
     def change(self) -> Float[np.ndarray, "c p"]:
-        """Change of every parameter from the first calibration, mm and rad; the first row is zero."""
+        """Change of every parameter from the first calibration, in its unit; the first row is zero."""
         return np.stack([np.zeros(len(self.names)), *(drift.change for drift in self.drifts)])
 
     @property
@@ -108,7 +108,8 @@ def _of_all(drift: Drift) -> str:
     start = f"Together, the changes of {len(test.names)} parameters are"
     if test.p >= 1 - drift.level:
         return f"{start} no more than their uncertainties explain ({law}, {probability})."
-    causes = [f"{name} by {in_words(name, amount)}" for name, amount in test.causes]
+    units = dict(zip(drift.names, drift.units, strict=True))
+    causes = [f"{name} by {in_words(units[name], amount)}" for name, amount in test.causes]
     arm = "the arm has changed" if test.probe is None or not test.probe.remounted else "its probe has been remounted"
     few = f" A change of these alone would explain all of it: {', '.join(causes)}." if causes else ""
     return (
@@ -123,7 +124,7 @@ def _of_probe(drift: Drift) -> str:
     if probe is None:
         return ""
     share = 100 * (1 - probe.statistic / test.statistic)
-    change = ", ".join(f"{name} by {in_words(name, value)}" for name, value in probe.change)
+    change = ", ".join(f"{name} by {in_words('mm', value)}" for name, value in probe.change)
     if not probe.remounted:
         return f"Not only the probe has changed: a remounted probe would explain {share:.0f} % of the changes."
     start = f"Probe remounted: a change of the probe alone ({change}) explains {share:.0f} % of the changes, and"
@@ -151,8 +152,8 @@ def _of_each(drift: Drift) -> str:
 
 
 def _moved(drift: Drift, i: int) -> str:
-    name = drift.names[i]
-    return f"{name} by {in_words(name, drift.change[i])} (U = {in_words(name, drift.expanded[i], '')})"
+    unit = drift.units[i]
+    return f"{drift.names[i]} by {in_words(unit, drift.change[i])} (U = {in_words(unit, drift.expanded[i], '')})"
 
 
 def _of_lengths(drift: Drift) -> str:
@@ -193,8 +194,9 @@ def _of_undetermined(drift: Drift) -> str:
     return f"Without an uncertainty of change: {'; '.join(groups)}." if groups else ""
 
 
-def in_words(name: str, value: float, sign: str = "+") -> str:
-    """A change of a parameter in um or arcsec, to three digits."""
-    shown, unit = (1e3 * value, "um") if is_length(name) else (value / ARCSEC, "arcsec")
+def in_words(unit: str, value: float, sign: str = "+") -> str:
+    """A change of a parameter of this unit, such as um of mm, to three digits."""
+    factor, people_unit = people_read_change(unit)
+    shown = factor * value
     decimals = max(2 - math.floor(math.log10(abs(shown))), 0) if shown else 0
-    return f"{shown:{sign}.{min(decimals, 3)}f} {unit}"
+    return f"{shown:{sign}.{min(decimals, 3)}f} {people_unit}"

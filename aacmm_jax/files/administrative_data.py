@@ -173,8 +173,8 @@ def check_conformity(
     verdict = about.conformity.verdict
     if simulated:
         raise InputError("conformity is stated of a simulated arm, which cannot conform; leave [conformity] out.")
-    passes = {"pass": ("conforms",), "fail": ("fails",)}.get(verdict)
-    if tested and passes is not None and decision not in passes:
+    passes = {"pass": ("conforms",), "fail": ("fails",)}.get(verdict, ("conforms", "undecided", "fails"))
+    if tested and decision not in passes:
         results = {
             "conforms": "every limit is kept",
             "fails": "a limit is not kept",

@@ -1,11 +1,11 @@
-"""The noise that an arm file states, for plans: a class, a published repeatability, or standard deviations."""
+"""The noise that an arm file states: a class, a published repeatability, or standard deviations."""
 
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, FiniteFloat, NonNegativeFloat, PositiveFloat, model_validator
 
-from ..data.arm_classes import CLASSES, SEATING, class_noise, noise_of_repeatability
+from ..data.arm_classes import CLASSES, SEATING, ArmNoise, class_noise, noise_of_repeatability
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from .toml import Strict
@@ -25,14 +25,6 @@ class NoiseTable(Strict):
         if self.repeatability_mm is not None and self.encoder_arcsec is not None:
             raise ValueError("give repeatability_mm or encoder_arcsec; both say how precise the readings are.")
         return self
-
-
-class ArmNoise(NamedTuple):
-    """What plans assume of an arm: its class and its noise, and where the numbers come from."""
-
-    arm_class: str
-    noise: Noise
-    source: str
 
 
 def stated_noise(arm: Arm, table: NoiseTable | None, default: str) -> ArmNoise:

@@ -65,6 +65,9 @@ joint = [
 # Joints that slide along their axis instead of turning about it, by number; their limits are in length_unit.
 # prismatic = [1]
 
+# Whether readings have one more column, temperature_C: the temperature of the arm.
+# thermometer = true
+
 # Instead of the rows, a robot's own file, beside this one:
 # urdf = "robot.urdf"
 # base = "base_link"              # its link that does not move; left out: its root
@@ -94,7 +97,8 @@ joint = [
 
 # What joints do besides their readings.
 # [corrections]
-# model = "gravity,harmonics=1"   # also gear, coupled=2-3; or coefficients and nominal, as a calibrated arm has them
+# model = "gravity,harmonics=1"   # also gear, coupled=2-3, expansion
+#                                 # (a calibrated arm has coefficients and nominal instead)
 # gravity = [0.0, 0.0, -1.0]      # its direction in the base frame
 # mass = [...]                    # of each link, kg; with centre, [x, y, z] of each mass in its link's frame
 """

@@ -13,13 +13,14 @@ from ..core.arrays import Numbers
 from ..core.errors import InputError, nearest
 from ..core.text import printable
 from ..core.units import DEG
+from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture
 from ..kinematics.arm import Arm
 from ..kinematics.axes_to_dh import without_far_frames
 from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, Parameters, single, with_tool
 from ..uncertainty.target_parameters import independent_of_targets, only_targets
-from .arm_noise import ArmNoise, NoiseTable, stated_noise
+from .arm_noise import NoiseTable, stated_noise
 from .atomic_write import storable, write_text
 from .corrections import CorrectionsTable, corrections_toml
 from .outputs import as_path
@@ -75,6 +76,7 @@ class _ArmModel(Strict):
     urdf: str | None = None  # instead of rows of joints: a URDF beside this file
     base: str | None = None  # its links
     tip: str | None = None
+    thermometer: bool = False
     identification: _Identification | None = None
     corrections: CorrectionsTable | None = None
     noise: NoiseTable | None = None
@@ -186,41 +188,43 @@ def load_specification(
 
 
 def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str | None = None) -> ArmNoise:
-    """The noise that plans assume of the arm of a file: that of its ``[noise]`` table, else that of its class.
+    """The noise that is usual for the arm of a file: that of its ``[noise]`` table, else that of its class.
 
     A file without the table is that of a measuring arm, or of a robot where it is a URDF, names one, or is a
-    ``kinematics.yaml``; `data.arm_classes` says what that means. A calibration estimates its noise from the data.
-
-    Args:
-        source: As of `load_arm`.
-        base: As of `load_arm`.
-        tip: As of `load_arm`.
+    ``kinematics.yaml`` (`data.arm_classes`). Plans assume this noise; a calibration estimates it from the data, and
+    compares it with that of a table. The arguments are those of `load_arm`.
 
     Raises:
         InputError: There is no such arm, or the numbers are none of this arm.
     """
-    arm = load_arm(source, base=base, tip=tip)
-    shipped = isinstance(source, str) and source in shipped_arms()
-    if not shipped and as_path(source).suffix.lower() in _OTHER_FORMATS:
-        return stated_noise(arm, None, "robot")
-    if shipped:
-        with resources.as_file(resources.files("aacmm_jax.files") / "shipped_arms" / f"{source}.toml") as path:
-            model = read_toml(path, _ArmModel)
-    else:
-        model = read_toml(as_path(source), _ArmModel)
+    arm, model = load_arm(source, base=base, tip=tip), _model_of(source)
     try:
-        return stated_noise(arm, model.noise, "measuring arm" if model.urdf is None else "robot")
+        table = None if model is None else model.noise
+        return stated_noise(arm, table, "measuring arm" if model is not None and model.urdf is None else "robot")
     except InputError as error:
         raise InputError(f"{source}: [noise] {error}") from error
+
+
+def usual_noise(source: str | os.PathLike, *, base: str | None = None, tip: str | None = None) -> ArmNoise | None:
+    """The noise of the ``[noise]`` table of an arm's file; None where it has none."""
+    model = _model_of(source)
+    return None if model is None or model.noise is None else load_noise(source, base=base, tip=tip)
+
+
+def _model_of(source: str | os.PathLike) -> _ArmModel | None:
+    """What an arm file says; None for a URDF or a ``kinematics.yaml``."""
+    if isinstance(source, str) and source in shipped_arms():
+        with resources.as_file(resources.files("aacmm_jax.files") / "shipped_arms" / f"{source}.toml") as path:
+            return read_toml(path, _ArmModel)
+    path = as_path(source)
+    return None if path.suffix.lower() in _OTHER_FORMATS else read_toml(path, _ArmModel)
 
 
 def urdf_folder(source: str | os.PathLike) -> Path:
     """The folder of the URDF of an arm, in which its meshes are looked for: its own, or that of the file naming it."""
     path = as_path(source)
-    if path.suffix.lower() not in _OTHER_FORMATS and os.path.isfile(path):
-        model = read_toml(path, _ArmModel)
-        path = path if model.urdf is None else path.parent / model.urdf
-    return path.parent
+    model = _model_of(path) if os.path.isfile(path) else None
+    return (path if model is None or model.urdf is None else path.parent / model.urdf).parent
 
 
 def arm_beside(folder: Path, arm: str) -> str | Path:
@@ -273,6 +277,8 @@ def _specification(path: Path, probe: Numbers | None) -> tuple[ArmSpecification,
             found = ArmSpecification(arm, model.name or path.stem)
             if probe is not None:
                 found = found._replace(arm=with_tool(found.arm, probe))
+        if model.thermometer:
+            found = found._replace(arm=found.arm.replace(thermometer=True))
         if model.corrections is not None:
             found = found._replace(arm=model.corrections.corrected(found.arm, length, angle))
         if model.priors is not None:
@@ -399,8 +405,8 @@ def _document(specification: ArmSpecification, source: str) -> "TOMLDocument":
     document["length_unit"] = "mm"
     document["angle_unit"] = "rad"
     document["probe"] = [float(x) for x in np.asarray(arm.probe)]
-    if arm.prismatic:
-        document["prismatic"] = list(arm.prismatic)
+    facts = {"prismatic": list(arm.prismatic), "thermometer": arm.thermometer}
+    document.update({key: fact for key, fact in facts.items() if fact})
     rows = tomlkit.array().multiline(True)
     for i in range(arm.joints):
         row = tomlkit.inline_table()

@@ -9,15 +9,24 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..calibration.left_out import CrossValidation, LeftOut
 from ..calibration.record import CalibrationRecord
+from ..calibration.results import NoisyEncoder
 from ..calibration.scale_anchor import scale_anchor
 from ..core.errors import InputError
 from ..data.noise import Noise
-from ..kinematics.arm import Arm, is_length, parameter_names, value_of
+from ..kinematics.arm import Arm, is_length, parameter_names, parameter_unit, value_of
 from ..kinematics.parameters import Parameters
 from ..uncertainty.covariance import NOISE_MODELS
 from .calibration_observations import observed_of, observed_tables, other_poses_of, removed_of
 from .calibration_prior import prior_metrics_of, prior_tables
-from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
+from .captures import (
+    arm_table,
+    linear_encoder_attribute,
+    noise_of_attributes,
+    recording_attributes,
+    recording_of,
+    recording_tables,
+    specification_of,
+)
 from .hdf5 import (
     Stored,
     Table,
@@ -69,6 +78,8 @@ def save_calibration(
         tables["cross_validation"] = _validation_table(record)
     if record.sampled is not None:
         tables["monte_carlo"] = _sampled_table(record)
+    if record.noisy_encoders:
+        tables["noisy_encoders"] = _noisy_table(record)
     tables |= observed_tables(record) | prior_tables(record)
     attributes = recording_attributes(record.recording) | {
         "robust": record.robust,
@@ -125,17 +136,6 @@ def _scale_set_by(arm: Arm, names: tuple[str, ...], hold: str | None, noise: Noi
     return () if hold is not None else scale_anchor(Parameters(arm, names), arm, None, noise).set_by
 
 
-def linear_encoder_attribute(noise: Noise) -> Any:
-    """Standard deviation of the readings of prismatic joints, mm; None where it follows from the others."""
-    return None if noise.linear_encoder is None else np.asarray(noise.linear_encoder)
-
-
-def linear_encoder_of(attributes: Mapping[str, Any]) -> Any:
-    """What `linear_encoder_attribute` wrote; files of version 2 and before have none."""
-    stored = attributes.get("linear_encoder_mm")
-    return None if stored is None else np.squeeze(np.atleast_1d(stored))
-
-
 def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
     table, attributes = stored.tables["parameters"], stored.attributes
     if attributes.get("stretch_variance", 0.0) and _divided_fixed_lengths(path, stored):
@@ -144,11 +144,7 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
         )
     need(path, table, "parameter", "lower", "upper", "active_stage1", "active", "covariance", "determined", of="entry")
     recording, names = recording_of(path, stored), tuple(str(name) for name in table["parameter"])
-    noise = Noise(
-        encoder_arcsec=np.squeeze(np.atleast_1d(attributes.get("encoder_arcsec", 0.0))),
-        seating=attributes.get("seating_mm", 0.0),
-        linear_encoder=linear_encoder_of(attributes),
-    )
+    noise = noise_of_attributes(attributes)
     if "scale_set_by" in attributes:
         scale_set_by = names_in(attributes["scale_set_by"])
     else:
@@ -188,13 +184,14 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
         others=other_poses_of(stored),
         removed=removed_of(stored),
         prior=prior_metrics_of(stored),
+        noisy_encoders=_noisy_of(stored),
     )
 
 
 def _parameter_table(record: CalibrationRecord) -> Table:
     names = list(record.names)
-    units = ["mm" if is_length(name) else "rad" for name in names]
-    both, square = "mm or rad, see unit", ("parameter", "parameter_2")
+    units = [parameter_unit(record.calibrated.arm, name) for name in names]
+    both, square = "see unit", ("parameter", "parameter_2")
     variables = columns("parameter", parameter=(names, "", "free parameter"))
     variables |= columns("parameter_2", parameter_2=(names, "", "free parameter, second axis of the covariance"))
     variables |= columns(
@@ -212,6 +209,28 @@ def _parameter_table(record: CalibrationRecord) -> Table:
     for stage, vector in record.vectors().items():
         variables[stage] = Variable(("parameter",), vector, both, f"value in the {stage} arm")
     return Table(variables)
+
+
+def _noisy_table(record: CalibrationRecord) -> Table:
+    both, of = "rad, or mm of a prismatic joint", record.noisy_encoders
+    return Table(
+        columns(
+            "noisy_encoder",
+            noisy_encoder=([one.joint for one in of], "1", "joint whose encoder is noisier than expected"),
+            expected=([one.expected for one in of], both, "standard deviation as given, or as that of the others"),
+            found=([one.found for one in of], both, "standard deviation, estimated"),
+            u=([one.u for one in of], both, "its standard uncertainty"),
+            probability=([one.probability for one in of], "1", "of such residuals, were the noise as expected"),
+        )
+    )
+
+
+def _noisy_of(stored: Stored) -> tuple[NoisyEncoder, ...]:
+    table = stored.tables.get("noisy_encoders")
+    if table is None:
+        return ()
+    rows = zip(*(table[name] for name in ("noisy_encoder", "expected", "found", "u", "probability")), strict=True)
+    return tuple(NoisyEncoder(int(joint), *map(float, numbers)) for joint, *numbers in rows)
 
 
 def _validation_table(record: CalibrationRecord) -> Table:

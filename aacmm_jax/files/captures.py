@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
+from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture, ReferenceLength, check_one_capture, check_readings
 from ..data.copies import Repeated
+from ..data.noise import Noise
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm, readings_unit
@@ -31,6 +33,7 @@ from .hdf5 import (
 from .observations import observation_tables, observations_of
 from .prior_attributes import attributes_of_prior, prior_of_attributes
 from .sense import check_recording
+from .temperatures import reading_variables, readings_of
 
 _KINDS = {
     "alpha": "link twist",
@@ -79,20 +82,58 @@ def recording_attributes(recording: Recording) -> dict[str, Any]:
         "sources": list(recording.sources) or None,
         "measured": recording.measured or None,
         "acceptance": list(recording.acceptance) or None,
+        "measuring_range_mm": recording.measuring_range,
+        **_attributes_of_usual(recording.usual),
     }
+
+
+def _attributes_of_usual(usual: ArmNoise | None) -> dict[str, Any]:
+    """Of the noise that the nominal arm's file states."""
+    if usual is None:
+        return {}
+    return {
+        "usual_class": usual.arm_class,
+        "usual_source": usual.source,
+        "usual_encoder_arcsec": np.asarray(usual.noise.encoder_arcsec),
+        "usual_linear_encoder_mm": linear_encoder_attribute(usual.noise),
+        "usual_seating_mm": float(usual.noise.seating),
+    }
+
+
+def _usual_of(attributes: Mapping[str, Any]) -> ArmNoise | None:
+    """What `_attributes_of_usual` wrote; earlier files have none."""
+    if "usual_class" not in attributes:
+        return None
+    noise = noise_of_attributes({name.removeprefix("usual_"): value for name, value in attributes.items()})
+    return ArmNoise(attributes["usual_class"], noise, attributes.get("usual_source", ""))
+
+
+def linear_encoder_attribute(noise: Noise) -> Any:
+    """Standard deviation of the readings of prismatic joints, mm; None where it follows from the others."""
+    return None if noise.linear_encoder is None else np.asarray(noise.linear_encoder)
+
+
+def noise_of_attributes(attributes: Mapping[str, Any]) -> Noise:
+    """The noise of ``encoder_arcsec``, ``linear_encoder_mm`` and ``seating_mm``."""
+    linear = attributes.get("linear_encoder_mm")  # files of version 2 and before have none
+    return Noise(
+        encoder_arcsec=np.squeeze(np.atleast_1d(attributes.get("encoder_arcsec", 0.0))),
+        seating=attributes.get("seating_mm", 0.0),
+        linear_encoder=None if linear is None else np.squeeze(np.atleast_1d(linear)),
+    )
 
 
 def recording_tables(recording: Recording) -> dict[str, Table]:
     """The tables of a recording: ``capture``, ``reference``, ``nominal_arm``, and one for each observation."""
-    capture, unit = recording.capture, readings_unit(recording.nominal.arm)
+    capture, arm = recording.capture, recording.nominal.arm
+    unit = readings_unit(arm)
     check_one_capture(capture)
     owner = [capture.names[i] for i in capture.owner]
     poses, lengths = capture.repeated
     tables = {
         "capture": Table(
             numbering("pose", len(owner))
-            | numbering("joint", capture.joints)
-            | {"angle": Variable(("pose", "joint"), np.asarray(capture.q), unit, "joint reading")}
+            | reading_variables("angle", np.asarray(capture.q), arm.joints, unit)
             | columns("pose", socket=(owner, "", "socket that held the tip")),
             {
                 "repeated_sockets": [n for n, _ in poses] or None,
@@ -113,8 +154,8 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     if recording.true is not None:
         tables["true_arm"] = arm_table(recording.true)
     if recording.spheres:
-        tables["sphere"] = sphere_table(recording.spheres, unit=unit)
-    return tables | observation_tables(capture.observations, unit)
+        tables["sphere"] = sphere_table(recording.spheres, unit=unit, joints=arm.joints)
+    return tables | observation_tables(capture.observations, arm.joints, unit)
 
 
 def reference_table(lengths: Sequence[ReferenceLength]) -> Table:
@@ -137,10 +178,12 @@ def lengths_of(path: str | os.PathLike, stored: Stored) -> list[ReferenceLength]
     return [ReferenceLength(str(start), str(end), float(value), float(u)) for start, end, value, u in rows]
 
 
-def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False, unit: str = "rad") -> Table:
+def sphere_table(
+    spheres: Sequence[ProbedSphere], *, points: bool = False, unit: str = "rad", joints: int | None = None
+) -> Table:
     """Touched spheres, by poses or points, one row a touch; what belongs to a sphere is in every row of it.
 
-    ``unit`` is that of readings.
+    ``unit`` is that of readings, of so many joints.
     """
     rows = [
         (sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group
@@ -154,6 +197,7 @@ def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False, unit:
         u=([sphere.u for sphere, *_ in rows], "mm", "standard uncertainty of the diameter"),
         stylus=([sphere.stylus for sphere, *_ in rows], "mm", "diameter of the probe's ball"),
         form=([sphere.form for sphere, *_ in rows], "mm", "calibrated form error"),
+        u_form=([sphere.u_form for sphere, *_ in rows], "mm", "standard uncertainty of the form error"),
     )
     variables |= numbering("touch", len(rows))
     values = np.array([touched for *_, touched in rows])
@@ -161,8 +205,7 @@ def sphere_table(spheres: Sequence[ProbedSphere], *, points: bool = False, unit:
         return Table(
             variables | axes() | {"position": Variable(("touch", "axis"), values, "mm", "centre of the probe")}
         )
-    angle = Variable(("touch", "joint"), values, unit, "joint reading")
-    return Table(variables | numbering("joint", values.shape[1]) | {"angle": angle})
+    return Table(variables | reading_variables("angle", values, joints or values.shape[1], unit, "touch"))
 
 
 def spheres_of(path: str | os.PathLike, stored: Stored, entry: str = "angle") -> tuple[ProbedSphere, ...]:
@@ -171,14 +214,16 @@ def spheres_of(path: str | os.PathLike, stored: Stored, entry: str = "angle") ->
     if table is None:
         return ()
     need(path, table, "sphere", "test", "group", "diameter", "u", "stylus", "form", entry, of="entry")
+    touched = readings_of(table, entry)
     keys = list(zip(table["sphere"].tolist(), table["test"].tolist(), strict=True))
     found = []
     for name, test in dict.fromkeys(keys):
         rows = np.array([key == (name, test) for key in keys])
         first = int(rows.argmax())
-        groups = tuple(table[entry][rows & (table["group"] == number)] for number in np.unique(table["group"][rows]))
+        groups = tuple(touched[rows & (table["group"] == number)] for number in np.unique(table["group"][rows]))
         numbers = (float(table[what][first]) for what in ("diameter", "u", "stylus", "form"))
-        found.append(ProbedSphere(str(name), test, groups, *numbers))
+        u_form = float(table["u_form"][first]) if "u_form" in table else 0.0  # files of earlier versions have none
+        found.append(ProbedSphere(str(name), test, groups, *numbers)._replace(u_form=u_form))
     return tuple(found)
 
 
@@ -187,10 +232,11 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     need(path, stored.tables, "capture", "reference", "nominal_arm")
     poses = stored.tables["capture"]
     need(path, poses, "angle", "socket", of="entry")
+    q = readings_of(poses, "angle")
     owner = np.asarray(poses["socket"]).astype(str)
     names = list(dict.fromkeys(owner.tolist()))
     try:
-        sockets = {name: poses["angle"][owner == name] for name in names}
+        sockets = {name: q[owner == name] for name in names}
         capture = Capture(
             sockets,
             lengths_of(path, stored),
@@ -202,7 +248,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         raise InputError(f"{path}: {error}") from error
     true = specification_of(path, stored, "true_arm") if "true_arm" in stored.tables else None
     try:
-        spheres = tuple(checked_sphere(sphere, capture.joints) for sphere in spheres_of(path, stored))
+        spheres = tuple(checked_sphere(sphere, capture.columns) for sphere in spheres_of(path, stored))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     sources = tuple(stored.attributes.get("sources") or ())
@@ -222,6 +268,8 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         sources,
         attributes.get("measured", ""),
         names_in(attributes.get("acceptance")),
+        attributes.get("measuring_range_mm"),
+        _usual_of(attributes),
     )
 
 
@@ -269,6 +317,7 @@ def arm_table(specification: ArmSpecification) -> Table:
     attributes: dict[str, Any] = {
         "name": specification.name,
         "prismatic": list(arm.prismatic) or None,
+        "thermometer": arm.thermometer or None,
         "half_width_length_mm": specification.length,
         "half_width_angle_rad": specification.angle,
         "override_names": list(specification.override) or None,
@@ -299,6 +348,7 @@ def specification_of(path: str | os.PathLike, stored: Stored, table: str) -> Arm
             probe=arrays["probe"],
             limits=limits,
             prismatic=[int(joint) for joint in np.atleast_1d(attributes.get("prismatic", ()))],
+            thermometer=bool(attributes.get("thermometer", False)),
         )
         arm = corrected_of(path, arm, arrays)
     except InputError as error:

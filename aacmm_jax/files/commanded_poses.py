@@ -14,6 +14,7 @@ from ..core.rotations import rotation_matrix
 from ..core.units import DEG, INCH, UM, M
 from ..kinematics.arm import Arm, by_joint
 from .manifest_observations import reading_unit_of
+from .temperatures import TEMPERATURE
 from .text_table import TextTable
 
 _ANGLES = {"deg": DEG, "rad": 1.0}
@@ -33,6 +34,7 @@ class CommandedPoses(NamedTuple):
     arm: Arm
     table: TextTable
     columns: tuple[int, ...]  # of the readings, counted from 0; none: `near` was used
+    temperature: Float[np.ndarray, " N"] | None  # C
 
 
 def read_commanded_poses(
@@ -43,7 +45,7 @@ def read_commanded_poses(
     Either joint readings, in columns named q_1, q_2, ... (or q1, joint_1, j1, a1; with a unit, as q_1_deg, if the
     header states it), or in all columns of a table without such names. Or positions and orientations: x, y, z (mm, or
     the header's unit) with qw, qx, qy, qz (quaternion) or rx, ry, rz (rotation vector, in ``unit`` unless the header
-    says it), and the readings to begin with in columns as above, or ``near``.
+    says it), and the readings to begin with in columns as above, or ``near``. A column temperature_C is the arm's.
 
     Args:
         path: The table (CSV or other text).
@@ -71,7 +73,9 @@ def read_commanded_poses(
         raise InputError(f"--near has {len(near)} readings, but the arm {joints} joints; give one per joint.")
     poses = None if orientation is None else _poses(path, table, _ANGLES[found])
     readings = table.numbers([i + 1 for i in columns]) if near is None else np.tile(near, (table.length, 1))
-    return CommandedPoses(np.array(by_joint(arm, _ANGLES[found], 1.0)) * readings, poses, found, arm, table, columns)
+    temperature = table.numbers([TEMPERATURE])[:, 0] if table.has([TEMPERATURE]) else None
+    q = np.array(by_joint(arm, _ANGLES[found], 1.0)) * readings
+    return CommandedPoses(q, poses, found, arm, table, columns, temperature)
 
 
 class KnownPoses(NamedTuple):

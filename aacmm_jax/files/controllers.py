@@ -9,7 +9,16 @@ from jaxtyping import Float
 from ..core.errors import InputError
 from ..core.rotations import roll_pitch_yaw
 from ..core.units import DEG
-from ..kinematics.arm import Arm, by_joint, natural_steps, with_arrays
+from ..kinematics.arm import (
+    Arm,
+    by_joint,
+    correction_names,
+    natural_steps,
+    parameter_unit,
+    value_of,
+    with_arrays,
+    without_corrections,
+)
 from ..kinematics.axes_to_dh import Transform, canonical_origins, geometry_of
 from ..kinematics.parameters import Parameters, single
 
@@ -48,7 +57,7 @@ def dh_table(arm: Arm, *, convention: str = "standard", units: str = "mm-deg", b
     if units not in _UNITS:
         raise InputError(f"the units are '{units}'; give {' or '.join(_UNITS)}.")
     length_unit, angle_unit, length, angle = _UNITS[units]
-    geometry = geometry_of(single(arm))
+    geometry = geometry_of(without_corrections(single(arm)))
     beta = np.zeros(arm.joints) if geometry.beta is None else geometry.beta
     after = np.stack([length * geometry.a, angle * geometry.alpha, angle * beta], axis=1)
     links, tip = after, length * geometry.probe
@@ -69,6 +78,10 @@ def dh_table(arm: Arm, *, convention: str = "standard", units: str = "mm-deg", b
     lines += [
         f"{i},{_row((*joint, *link))}" for i, (joint, link) in enumerate(zip(joints, links, strict=True), start=1)
     ]
+    if arm.corrections is not None:
+        lines.append("# coefficients of joint corrections, which are no Denavit-Hartenberg parameters:")
+        coefficients = ((name, float(value_of(arm, name))) for name in correction_names(arm))
+        lines += [f"# {name} = {value!r} {parameter_unit(arm, name)}" for name, value in coefficients if value != 0]
     return "\n".join(lines) + "\n"
 
 

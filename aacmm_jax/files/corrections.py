@@ -64,7 +64,7 @@ def corrections_toml(arm: Arm) -> "TomlTable":
     assert arm.corrections is not None
     table = tomlkit.table()
     table["gravity"] = np.asarray(arm.gravity).tolist()
-    loads = _loads(arm)
+    loads = loads_of(arm)
     if loads is not None:
         table["mass"], table["centre"] = list(loads.mass), [list(centre) for centre in loads.centre]
     names = correction_names(arm)
@@ -91,7 +91,7 @@ def correction_variables(arm: Arm) -> dict[str, Variable]:
     for kind, array in _arrays(arm.corrections.nominal).items():
         unit, dimension = "mm" if kind in _LENGTHS else "rad", "axis" if kind == "probe" else "joint"
         variables[f"nominal_{kind}"] = Variable((dimension,), array, unit, f"{kind} of the arm of the functions")
-    loads = _loads(arm)
+    loads = loads_of(arm)
     if loads is not None:
         variables["mass"] = Variable(("joint",), list(loads.mass), "kg", "mass of the link")
         variables["centre"] = Variable(("joint", "axis"), np.array(loads.centre), "mm", "centre of mass in its frame")
@@ -119,7 +119,8 @@ def _arrays(geometry: Geometry) -> dict[str, Float[np.ndarray, "..."]]:
     return {kind: np.asarray(values) for kind, values in arrays.items() if values is not None}
 
 
-def _loads(arm: Arm) -> Loads | None:
+def loads_of(arm: Arm) -> Loads | None:
+    """Masses and centres of the links, where functions of an arm's corrections know them."""
     assert arm.corrections is not None
     loads = (getattr(term, "loads", None) for term in arm.corrections.functions.each)
     return next((found for found in loads if found is not None), None)

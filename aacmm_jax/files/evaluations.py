@@ -7,19 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.all_tests import checked_limits
-from ..acceptance.decision import Limit
+from ..acceptance.all_tests import NO_INFLUENCES, checked_limits
+from ..acceptance.decision import Limit, Rule, checked_rule
+from ..acceptance.influences import Expansion, Influences, checked_influences
 from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord
 from ..acceptance.results import METRICS, Measured
 from ..acceptance.standards import STANDARDS
-from ..data.noise import Noise
 from ..kinematics.arm import Arm, parameter_names
 from ..kinematics.workspace import Reach
 from ..uncertainty.arm_uncertainty import Uncertainty
-from .calibrations import linear_encoder_attribute, linear_encoder_of
 from .captures import (
     arm_table,
     lengths_of,
+    linear_encoder_attribute,
+    noise_of_attributes,
     recording_attributes,
     recording_of,
     recording_tables,
@@ -67,8 +68,10 @@ def save_evaluation(
         tables["uncertainty"] = _uncertainty_table(record.uncertainty)
     attributes = recording_attributes(record.recording) | {
         "warnings": list(record.warnings) or None,
+        "calibration_warnings": list(record.calibration_warnings) or None,
         "standards": list(record.standards) or "",
         "u_test_mm": record.u_test,
+        **_influence_attributes(record.influences, record.rule),
         **{f"most_{name}": value for name, value in record.maxima.items()},
     }
     write_tables(path, "evaluation", tables, attributes, summary=summary)
@@ -107,11 +110,7 @@ def _uncertainty_of(path: str | os.PathLike, stored: Stored, calibrated: Arm) ->
         arm=calibrated,
         covariance=table["covariance"],
         open=table["open"],
-        noise=Noise(
-            encoder_arcsec=np.squeeze(np.atleast_1d(attributes["encoder_arcsec"])),
-            seating=attributes["seating_mm"],
-            linear_encoder=linear_encoder_of(attributes),
-        ),
+        noise=noise_of_attributes(attributes),
         u_k=None,
         names=names,
         degrees_of_freedom=float(attributes["degrees_of_freedom"]),
@@ -156,7 +155,7 @@ def _metric_table(record: EvaluationRecord) -> Table:
         value=([metric.value for *_, metric, _ in rows], "mm", "value of the worst part"),
         expanded=([worst.expanded for *_, worst in rows], "mm", "expanded uncertainty, coverage factor 2"),
         limit=([math.nan if worst.limit is None else worst.limit for *_, worst in rows], "mm", "MPE"),
-        decision=([metric.decision or "" for *_, metric, _ in rows], "", "decision by ISO 14253-1"),
+        decision=([metric.decision or "" for *_, metric, _ in rows], "", "decision by the rule of the test"),
         where=([worst.where for *_, worst in rows], "", "what gave the worst part"),
     )
     return Table(numbering("row", len(rows)) | results)
@@ -195,7 +194,30 @@ def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
             maxima,
             _standards_of(stored),
             _uncertainty_of(path, stored, calibrated.arm),
+            tuple(map(str, np.atleast_1d(attributes.get("calibration_warnings") or []))),
+            *_influences_of(attributes),
         )
+
+
+def _influence_attributes(influences: Influences, rule: str | None) -> dict[str, Any]:
+    """What adds uncertainty to test values, and the decision rule where one was asked for."""
+    bodies = {f"expansion_{of}": getattr(influences, of) for of in ("artefact", "arm")}
+    return {
+        "u_relative": influences.u_relative,
+        "rule": rule,
+        **{name: None if body is None else np.array(body) for name, body in bodies.items()},
+    }
+
+
+def _influences_of(attributes: Mapping[str, Any]) -> tuple[Influences, Rule | None]:
+    """The same, read; files of earlier versions have none, and were decided by the guard band of 2013."""
+    if "u_relative" not in attributes:
+        return NO_INFLUENCES, "iso-2013"
+    bodies = {of: attributes.get(f"expansion_{of}") for of in ("artefact", "arm")}
+    expansions = {of: None if row is None else Expansion(*map(float, row)) for of, row in bodies.items()}
+    rule = attributes.get("rule")
+    influences = Influences(0.0, float(attributes["u_relative"]), expansions["artefact"], expansions["arm"])
+    return checked_influences(influences), None if rule is None else checked_rule(str(rule))
 
 
 def _standards_of(stored: Stored) -> tuple[str, ...]:
@@ -234,6 +256,8 @@ def save_points(path: str | os.PathLike, record: PointsRecord, summary: Mapping[
         "of": "points",
         "standards": list(record.standards) or "",
         "u_test_mm": record.u_test,
+        **_influence_attributes(record.influences, record.rule),
+        "measuring_range_mm": measured.measuring_range,
         "sources": list(measured.sources) or None,
         "measured": measured.measured or None,
         "reach_mm": None if reach is None else reach.radius,
@@ -271,5 +295,12 @@ def load_points(path: str | os.PathLike) -> PointsRecord:
             reach,
             sources=tuple(attributes.get("sources") or ()),
             measured=attributes.get("measured", ""),
+            measuring_range=attributes.get("measuring_range_mm"),
         )
-        return PointsRecord(measured, _limits_in(stored), float(attributes["u_test_mm"]), _standards_of(stored))
+        return PointsRecord(
+            measured,
+            _limits_in(stored),
+            float(attributes["u_test_mm"]),
+            _standards_of(stored),
+            *_influences_of(attributes),
+        )

@@ -26,14 +26,15 @@ from ..data.observations.observation import AbstractObservation
 from ..data.observations.socket import Socket
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
-from .arms import arm_beside, read_arm, with_parameters
+from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
+from .arms import arm_beside, read_arm, usual_noise, with_parameters
 from .inputs import InputFile, fingerprint
 from .manifest_angles import Angles, angles_of, in_rad
 from .manifest_observations import FIELDS, TABLES, Source, observations
 from .manifest_sessions import in_sessions, session_name
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
-from .text_table import read_numbers
+from .temperatures import numbers_and_temperature, with_temperature
 from .toml import Strict, each_once, read_toml
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -44,6 +45,7 @@ class _Files(Strict):
 
     file: str | None = None
     files: Annotated[list[str], Field(min_length=1), AfterValidator(each_once)] | None = None
+    temperature_C: FiniteFloat | None = None  # of the arm, where the files have no such column
 
     @property
     def paths(self) -> list[str]:
@@ -70,6 +72,20 @@ class _Length(Strict):
     end: str = Field(alias="to")
     value: float
     u: NonNegativeFloat = 0.0
+    expansion: FiniteFloat = 0.0  # of the artefact, 1/K
+    temperature_C: FiniteFloat = REFERENCE_TEMPERATURE  # at which it was measured
+    u_expansion: NonNegativeFloat = 0.0
+    u_temperature: NonNegativeFloat = 0.0  # K
+
+    def between(self, start: str, end: str) -> ReferenceLength:
+        """The length between these sockets, as long as it was when it was measured."""
+        return ReferenceLength.at_temperature(
+            *(start, end, self.value, self.u),
+            expansion=self.expansion,
+            temperature=self.temperature_C,
+            u_expansion=self.u_expansion,
+            u_temperature=self.u_temperature,
+        )
 
 
 class _Sphere(_Files):
@@ -79,6 +95,7 @@ class _Sphere(_Files):
     u: NonNegativeFloat = 0.0
     stylus: NonNegativeFloat = 0.0
     form: NonNegativeFloat = 0.0
+    u_form: NonNegativeFloat = 0.0
 
     @model_validator(mode="after")
     def _one(self) -> "_Sphere":
@@ -91,6 +108,7 @@ class _Points(Strict):
     unit: Literal["mm", "m", "um", "inch"]
     columns: Annotated[list[PositiveInt], Field(min_length=3, max_length=3), AfterValidator(each_once)] | None = None
     reach: PositiveFloat | None = None  # mm
+    measuring_range: PositiveFloat | None = None  # diameter of the measuring volume as the maker states it, mm
     shoulder: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None  # mm
 
     @model_validator(mode="after")
@@ -127,6 +145,7 @@ class _Poses(_Recorded):
     tip: str | None = None
     probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None  # mm, from the tip link
     acceptance: Standard | Annotated[list[Standard], AfterValidator(each_once)] = Field(default_factory=list)
+    measuring_range: PositiveFloat | None = None  # diameter of the measuring volume as the maker states it, mm
     angles: Angles | None = None
     sessions: _Sessions | None = None
 
@@ -141,11 +160,14 @@ class PointsManifest(_Recorded):
 
     @model_validator(mode="after")
     def _own_tip(self) -> "PointsManifest":
-        named = [f"'{entry.name or entry.paths[0]}'" for entry in self.socket if entry.target or entry.session]
+        own = [entry for entry in self.socket if entry.target or entry.session]
+        named = [
+            entry for entry in (*own, *self.socket, *self.sphere) if entry in own or entry.temperature_C is not None
+        ]
         if named:
             raise ValueError(
-                f"target and session are for manifests of poses, but socket {named[0]} has points, which say where the "
-                "tip was; leave them out."
+                "target, session and temperature_C are for manifests of poses, but "
+                f"'{named[0].name or named[0].paths[0]}' has points, which say where the tip was; leave them out."
             )
         return self
 
@@ -165,6 +187,9 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     "-" only, so that ``hole_0_pose.csv`` is left alone. ``exclude = ["*_old.csv"]`` in ``[[socket]]`` leaves out the
     files that match such a shell pattern. Angles: reading -> sign * (reading - offset), in the stated unit. Readings of
     prismatic joints are in ``linear_unit`` of ``[angles]``, by default mm; sign and offset hold for them too.
+    A column temperature_C, by that name in the header of every table, is the temperature of the arm, C;
+    ``temperature_C = 22.5`` in a table of the manifest states it for all of its poses. In ``[[length]]`` it is that of
+    the artefact, with its ``expansion`` (1/K), where ``value`` holds at 20 C.
 
     ``[[points]]``, ``[[transforms]]``, ``[[touched_sphere]]``, ``[[touched_cylinder]]``, ``[[plane]]``,
     ``[[parallel_planes]]``, ``[[artefact]]`` and ``[[distances]]`` are observations of these kinds. Their ``file``
@@ -177,7 +202,8 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     ``session = "monday"`` in such tables, with fields in braces if needed, or ``columns = { session = "day" }`` for
     each row, makes sessions of one arm (`data.capture.join_sessions`); names are then ``monday/name``, in lengths too.
     ``[sessions] probe = "same"`` says that the probe was not remounted between them.
-    ``acceptance`` (jjf, asme, iso, or a list) says for which standards' acceptance procedure the poses were taken.
+    ``acceptance`` (jjf, asme, iso, or a list) says for which standards' acceptance procedure the poses were taken, and
+    ``measuring_range`` the diameter of the measuring volume that the arm's maker states, mm.
 
     ``arm`` is a shipped name, an arm file (TOML), a URDF, or a ``kinematics.yaml``. Of a URDF, ``base`` and ``tip``
     name the links at the ends of the chain; ``probe`` is a tool's tip in the last frame, mm, of an arm that states
@@ -208,14 +234,15 @@ def read_manifest(path: str | os.PathLike) -> Recording:
             files.append(read := InputFile(file))
             return read
 
-        def angles(file: Path) -> np.ndarray:
-            table = read_numbers(opened(file), columns)
+        def angles(file: Path, stated: float | None) -> np.ndarray:
+            read = opened(file)
+            table, temperature = numbers_and_temperature(read, columns)
             if table.shape[1] != joints:
                 raise InputError(
                     f"{file} has {table.shape[1]} columns, but the arm has {joints} joints; give one column a joint, "
                     "or pick them with columns = [...] in [angles]."
                 )
-            return in_rad(table, angles_of(model.angles), nominal.arm)
+            return with_temperature(in_rad(table, angles_of(model.angles), nominal.arm), temperature, stated, str(file))
 
         sockets, lengths, spheres = recorded(path.parent, model, angles)
 
@@ -242,6 +269,8 @@ def read_manifest(path: str | os.PathLike) -> Recording:
             raise InputError("[sessions] is for tables with a session, but there is none; leave it out.")
         else:
             capture = Capture(sockets, lengths, [observation for _, observation in observations])
+        if capture.columns == joints + 1:
+            nominal = nominal._replace(arm=nominal.arm.replace(thermometer=True))
         check_readings(capture, nominal.arm)
         return Recording(
             capture,
@@ -250,6 +279,8 @@ def read_manifest(path: str | os.PathLike) -> Recording:
             sources=sources,
             measured=str(model.date or ""),
             acceptance=(model.acceptance,) if isinstance(model.acceptance, str) else tuple(model.acceptance),
+            measuring_range=model.measuring_range,
+            usual=usual_noise(arm, base=model.base, tip=model.tip),
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
@@ -279,7 +310,7 @@ def _observations(model: _Poses, source: Source) -> Iterator[tuple[str, Abstract
 
 
 def recorded(
-    folder: Path, model: _Recorded, read: Callable[[Path], np.ndarray]
+    folder: Path, model: _Recorded, read: Callable[[Path, float | None], np.ndarray]
 ) -> tuple[dict[str, np.ndarray], list[ReferenceLength], tuple[ProbedSphere, ...]]:
     """The sockets, lengths and spheres that a manifest names, each file read by ``read``."""
     sockets: dict[str, np.ndarray] = {}
@@ -289,15 +320,15 @@ def recorded(
             check_name(name)
             if name in sockets:
                 raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
-            sockets[name] = np.concatenate([read(file) for file in files])
+            sockets[name] = np.concatenate([read(file, entry.temperature_C) for file in files])
             fields.append(values)
     spheres = []
     for entry in model.sphere:
         if any((entry.name, entry.test) == (other.name, other.test) for other in spheres):
             raise InputError(f"sphere '{entry.name}' is defined twice for one test; give its files in one [[sphere]].")
-        groups = tuple(read(folder / file) for file in entry.paths)
-        sphere = ProbedSphere(entry.name, entry.test, groups, entry.diameter, entry.u, entry.stylus, entry.form)
-        spheres.append(checked_sphere(sphere))
+        groups = tuple(read(folder / file, entry.temperature_C) for file in entry.paths)
+        numbers = (entry.diameter, entry.u, entry.stylus, entry.form, entry.u_form)
+        spheres.append(checked_sphere(ProbedSphere(entry.name, entry.test, groups, *numbers)))
     return sockets, _lengths(model.length, fields, sockets), tuple(spheres)
 
 
@@ -343,7 +374,7 @@ def _lengths(
         check_fields(entry.end)
         names = fields_of(entry.start) | fields_of(entry.end)
         if not names:
-            lengths.append(ReferenceLength(entry.start, entry.end, entry.value, entry.u))
+            lengths.append(entry.between(entry.start, entry.end))
             continue
         choices = {tuple((name, values[name]) for name in sorted(names)) for values in fields if names <= values.keys()}
         if not choices:
@@ -354,7 +385,7 @@ def _lengths(
         pairs = [(fill(entry.start, dict(choice)), fill(entry.end, dict(choice))) for choice in sorted(choices)]
         # The field may also be in the names of sockets that this length is not between.
         known = [pair for pair in pairs if pair[0] in sockets or pair[1] in sockets]
-        lengths += [ReferenceLength(*pair, entry.value, entry.u) for pair in known or pairs]
+        lengths += [entry.between(*pair) for pair in known or pairs]
     # Repeated measurements have other values, or are named in the other direction.
     given = [(length.start, length.end, float(length.value)) for length in lengths]
     for start, end, value in given:

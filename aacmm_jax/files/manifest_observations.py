@@ -21,6 +21,7 @@ from .inputs import InputFile
 from .manifest_sessions import session_name
 from .observation_kinds import kinds
 from .patterns import check_name, fields_of, fill
+from .temperatures import TEMPERATURE, with_temperature
 from .text_table import Column, TextTable
 from .toml import Strict, each_once
 
@@ -101,6 +102,7 @@ class _Table(Strict):
     skip: NonNegativeInt = 0
     group: Column | None = None
     session: str | None = None  # of all rows; columns.session, of each
+    temperature_C: FiniteFloat | None = None  # of the arm, where the table has no such column
 
     @property
     def paths(self) -> list[str]:
@@ -267,7 +269,9 @@ class _Reader:
                 "joints; give one column a joint."
             )
         header = reading_unit_of(text, wanted, source.arm)
-        return source.radians(numbers, table.units.get("q"), self._preset.units.get("q"), header)
+        readings = source.radians(numbers, table.units.get("q"), self._preset.units.get("q"), header)
+        temperature = text.numbers([TEMPERATURE])[:, 0] if text.has([TEMPERATURE]) else None
+        return with_temperature(readings, temperature, table.temperature_C, str(text.path))
 
     def _column(self, text: TextTable, entry: Entry, wanted: Sequence[Column]) -> np.ndarray:
         if entry.dimensions[:1] != ("pose",):

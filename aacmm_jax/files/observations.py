@@ -10,20 +10,21 @@ from ..core.errors import InputError
 from ..data.observations.observation import READINGS, AbstractObservation
 from .hdf5 import Stored, Table, Variable, axes, columns, need, numbering
 from .observation_kinds import kinds
+from .temperatures import reading_variables, readings_of
 
 _PREFIX = "observation_"
 
 
-def observation_tables(observations: Iterable[AbstractObservation], unit: str = "rad") -> dict[str, Table]:
+def observation_tables(observations: Iterable[AbstractObservation], joints: int, unit: str = "rad") -> dict[str, Table]:
     """A table for each observation: arrays over its poses, and single values as attributes with the unit in the name.
 
     They are named by number, since names of observations may hold what names of groups may not. ``unit`` is that of
-    readings.
+    readings, of so many joints.
     """
-    return {f"{_PREFIX}{number}": _table(one, unit) for number, one in enumerate(observations, start=1)}
+    return {f"{_PREFIX}{number}": _table(one, joints, unit) for number, one in enumerate(observations, start=1)}
 
 
-def _table(observation: AbstractObservation, unit: str) -> Table:
+def _table(observation: AbstractObservation, joints: int, unit: str) -> Table:
     variables: dict[str, Variable] = {}
     attributes: dict[str, Any] = {"kind": observation.kind, "name": observation.name}
     stored = observation.stored()
@@ -34,7 +35,10 @@ def _table(observation: AbstractObservation, unit: str) -> Table:
         if not entry.dimensions:
             attributes[_attribute(entry.name, entry.unit)] = value.item()
             continue
-        variables[entry.name] = Variable(entry.dimensions, value, unit if entry is READINGS else entry.unit, entry.says)
+        if entry is READINGS:
+            variables |= reading_variables(entry.name, value, joints, unit)
+            continue
+        variables[entry.name] = Variable(entry.dimensions, value, entry.unit, entry.says)
         for dimension, size in zip(entry.dimensions, value.shape, strict=True):
             if dimension not in variables and dimension != entry.name:
                 variables |= _coordinate(dimension, size)
@@ -72,6 +76,9 @@ def _observation(
         )
     values: dict[str, Any] = {}
     for entry in kind.entries:
+        if entry is READINGS and entry.name in table:
+            values[entry.name] = readings_of(table, entry.name)
+            continue
         found = table.get(entry.name) if entry.dimensions else attributes.get(_attribute(entry.name, entry.unit))
         if found is not None:
             values[entry.name] = found.astype(str) if entry.dimensions and entry.content == "text" else found

@@ -244,7 +244,7 @@ def file_of(procedure: Procedure, item: ProcedureItem) -> str:
     """The file that a manifest of `procedure_manifest` expects an item's readings in."""
     if item.test not in TOUCHED:
         return f"{item.name}.csv"
-    several = sum(other.test == item.test for other in procedure.touches) > 1
+    several = sum((other.test, other.name) == (item.test, item.name) for other in procedure.touches) > 1
     return f"{item.name}/{item.test.replace(' ', '-')}" + (f"-{item.group}" if several else "") + ".csv"
 
 
@@ -262,6 +262,8 @@ def procedure_manifest(procedure: Procedure, arm: str, urdf: UrdfSource | None =
         acceptance=procedure.standard,
         angles=angles,
     )
+    size = f"measuring_range = {procedure.measuring_range:.0f}   # mm: its diameter, as the maker states it"
+    lines.insert(lines.index(""), size if procedure.range_stated else f"# {size}; planned: twice the reach")
     kinds = dict.fromkeys(item.name.split("/")[0] for item in procedure.sockets)
     for kind in kinds:
         pattern = f"{kind}/{{zone}}" if kind == "spat" else f"{kind}/{{position}}/{{side}}"
@@ -294,6 +296,7 @@ def procedure_manifest(procedure: Procedure, arm: str, urdf: UrdfSource | None =
         lines += [
             f"stylus = {sphere.stylus!r}   # mm: diameter of the probe's ball",
             "form = 0.0   # mm: its calibrated form error",
+            "u_form = 0.0   # mm: the standard uncertainty of that",
         ]
     return "\n".join(lines) + "\n"
 

@@ -21,9 +21,9 @@ _UNITS = {"mm": 1.0, "m": M, "um": UM, "inch": INCH}
 def read_points(path: str | os.PathLike) -> Measured:
     """Read a manifest of points and every file that it names; paths are relative to the manifest.
 
-    ``[points]`` has ``unit`` (mm, m, um, inch), optionally ``columns``, and, for the zones of ASME B89.4.22, the arm's
-    ``reach`` and ``shoulder`` (x, y, z) in mm. ``[[socket]]``, ``[[length]]`` and ``[[sphere]]`` are those of
-    `read_manifest`, with files of x, y, z.
+    ``[points]`` has ``unit`` (mm, m, um, inch), optionally ``columns``, the ``measuring_range`` that the maker states
+    (a diameter, mm), and, for the zones of ASME B89.4.22, the arm's ``reach`` and ``shoulder`` (x, y, z) in mm.
+    ``[[socket]]``, ``[[length]]`` and ``[[sphere]]`` are those of `read_manifest`, with files of x, y, z.
 
     Args:
         path: the manifest (TOML).
@@ -39,7 +39,7 @@ def read_points(path: str | os.PathLike) -> Measured:
     try:
         files = [manifest]
 
-        def points(file: Path) -> np.ndarray:
+        def points(file: Path, _: float | None) -> np.ndarray:
             files.append(read := InputFile(file))
             table = read_numbers(read, model.points.columns)
             if table.shape[1] != 3:
@@ -61,6 +61,14 @@ def read_points(path: str | os.PathLike) -> Measured:
             raise InputError("there is neither a [[socket]] nor a [[sphere]], so nothing can be tested; add one.")
         reach = None if model.points.reach is None else Reach(np.array(model.points.shoulder), model.points.reach)
         sources = tuple(fingerprint(file, path.parent) for file in files)
-        return Measured(sockets, tuple(lengths), spheres, reach, sources=sources, measured=str(model.date or ""))
+        return Measured(
+            sockets,
+            tuple(lengths),
+            spheres,
+            reach,
+            sources=sources,
+            measured=str(model.date or ""),
+            measuring_range=model.points.measuring_range,
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

@@ -18,10 +18,11 @@ _UNITS = {
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": DEG, "arcsec": ARCSEC},
     # Of joint corrections.
     "rad/m": {"rad/m": 1.0, "mrad/m": 1e-3},
+    "1/K": {"um/m/K": 1e-6, "/K": 1.0},
     "1": {"": 1.0},
 }
 _LEARN = "learn"
-_VALUE = re.compile(r"(?:(?P<mean>[^\s]+?)\s*\+-\s*)?(?P<sd>[^\s]+?)\s*(?P<unit>[a-z/]*)")
+_VALUE = re.compile(r"(?:(?P<mean>[^\s]+?)\s*\+-\s*)?(?P<sd>[^\s]+?)\s*(?P<unit>[a-zK/]*)")
 
 
 class PriorTable(Strict):

@@ -48,6 +48,8 @@ class Arm(eqx.Module):
         gravity: Direction of gravity in the base frame ``(..., 3)``, for corrections by its moments; by default
             (0, 0, -1).
         corrections: What joints do besides their readings; `kinematics.with_corrections` makes them.
+        thermometer: Whether readings have one more, last column: the temperature of the arm, C, of which only thermal
+            expansion makes use. Where it is missing, the arm is taken to be at 20 C.
 
     Raises:
         InputError: Shapes do not fit together, a value is not finite, or there is no joint of such a number.
@@ -64,6 +66,7 @@ class Arm(eqx.Module):
     coefficients: Float[AnyArray, "... k"] | None  # of the corrections
     gravity: Float[AnyArray, "... 3"] | None  # its direction in the base frame
     corrections: Corrections | None
+    thermometer: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -79,6 +82,7 @@ class Arm(eqx.Module):
         coefficients: Numbers | None = None,
         gravity: Numbers | None = None,
         corrections: Corrections | None = None,
+        thermometer: bool = False,
     ):
         self.alpha = as_floats(alpha, "alpha")
         self.a = as_floats(a, "a")
@@ -108,6 +112,8 @@ class Arm(eqx.Module):
             ) from error
         self.prismatic = _joint_numbers(prismatic, joints)
         self.limits = None if limits is None else checked_limits(limits, joints, self.prismatic)
+        expands = corrections is not None and bool(corrections.functions.of_lengths.any())
+        self.thermometer = bool(thermometer) or expands
 
     def _correct(self, coefficients: Numbers | None, gravity: Numbers | None, corrections: Corrections | None) -> None:
         """Set what the corrections need: of the constructor."""
@@ -132,6 +138,11 @@ class Arm(eqx.Module):
     def joints(self) -> int:
         """Number of joints, n."""
         return self.alpha.shape[-1]
+
+    @property
+    def columns(self) -> int:
+        """Number of columns of readings: the joints, and the thermometer where there is one."""
+        return self.joints + self.thermometer
 
     @property
     def geometry(self) -> Geometry:
@@ -178,7 +189,7 @@ class Arm(eqx.Module):
             InputError: A name is unknown, or the arm that results is refused.
         """
         whole = ("alpha", "a", "d", "theta", "beta", "probe", "limits", "prismatic")
-        whole = (*whole, "coefficients", "gravity", "corrections")
+        whole = (*whole, "coefficients", "gravity", "corrections", "thermometer")
         arguments: dict[str, Any] = {key: changes.get(key, getattr(self, key)) for key in whole}
         for name, value in changes.items():
             if name in whole:
@@ -204,9 +215,10 @@ class Arm(eqx.Module):
 
     def _checked(self, q: Numbers) -> Float[AnyArray, "... n"]:
         array = as_array(q, "q", like=self.alpha)
-        if array.shape[-1:] != (self.joints,):
+        if array.shape[-1:] not in ((self.joints,), (self.columns,)):
+            other = ", and a thermometer" if self.thermometer else ""
             raise InputError(
-                f"q has shape {array.shape}, but the arm has {self.joints} joints; the last axis is the joint."
+                f"q has shape {array.shape}, but the arm has {self.joints} joints{other}; the last axis is the joint."
             )
         return array
 
@@ -257,6 +269,19 @@ def checked_limits(
                 "upper."
             )
     return tuple((low, high) for low, high in rows)
+
+
+def check_columns(arm: Arm, columns: int) -> None:
+    """Raise `InputError` where readings of a capture have not the columns of an arm; without temperatures it was at
+    20 C."""
+    if columns not in (arm.joints, arm.columns):
+        temperature = ", and the temperature last" if arm.thermometer else ""
+        if columns == arm.joints + 1:
+            temperature = ", or, with the temperature in the last one, an arm with thermometer=True"
+        raise InputError(
+            f"the capture has {columns} columns, but the arm has {arm.joints} joints; give one column a joint"
+            f"{temperature}."
+        )
 
 
 def is_single(arm: Arm) -> bool:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.numpy_or_jax import AnyArray, compiled, namespace, scan
+from ..core.numpy_or_jax import AnyArray, broadcast_after_first, compiled, namespace, scan
 
 _UNIT = 1000.0  # mm: a slide of 1 mm counts as much as a rotation of 1 mrad, like the natural steps of parameters
 
@@ -48,7 +48,7 @@ class KnownFunction(Protocol):
 
     @property
     def joint(self) -> int:
-        """The joint that it moves, from 1."""
+        """The joint that it moves, from 1; 0 where it scales all lengths."""
         ...
 
     @property
@@ -95,7 +95,10 @@ class KnownFunctions:
 
     def values(self, q: Float[AnyArray, "n ... 1 N"], forward: "ForwardPass") -> Float[AnyArray, "rows ... 1 N"]:
         """All rows at N configurations, with the nominal arm's frames there."""
-        return namespace(q, forward).concatenate([own[0].kind.values(own, q, forward) for own in self._of_one_kind])
+        values = [own[0].kind.values(own, q, forward) for own in self._of_one_kind]
+        # Those of frames have the batch of the nominal arms, others that of the readings alone.
+        batch = np.broadcast_shapes(*(each.shape[1:] for each in values))
+        return namespace(q, forward).concatenate([broadcast_after_first(each, batch) for each in values])
 
     @cached_property
     def _of_one_kind(self) -> list[tuple[KnownFunction, ...]]:
@@ -138,6 +141,11 @@ class KnownFunctions:
     def of_joints(self, joints: int) -> Float[np.ndarray, "n k"]:
         """1 where a function moves a joint, else 0."""
         return (np.arange(joints)[:, None] == self.moved).astype(float)
+
+    @property
+    def of_lengths(self) -> Float[np.ndarray, " k"]:
+        """1 for the functions that scale all lengths, else 0."""
+        return np.array([float(function.joint == 0) for function in self.each])
 
 
 class Corrections(NamedTuple):
@@ -182,9 +190,10 @@ class JointMotion(NamedTuple):
 class JointErrors(NamedTuple):
     """Derivatives of what the corrections add to each joint's theta, or d of a prismatic joint."""
 
-    by_coefficient: Float[AnyArray, "k ... 1 N"]  # of the one joint that it moves
+    by_coefficient: Float[AnyArray, "k ... 1 N"]  # of the one joint that it moves, or of the scale
     by_gravity: Float[AnyArray, "n 3 ... 1 N"]
     functions: KnownFunctions
+    scale: Float[AnyArray, "... 1 N"] | None  # of all lengths, by thermal expansion; None without a term of it
 
 
 class ForwardPass(NamedTuple):
@@ -227,20 +236,28 @@ def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion
 
     Args:
         geometry: The chain, whose parameters may be anything.
-        q: Readings ``(..., n)``, rad, or mm of prismatic joints.
+        q: Readings ``(..., n)``, rad, or mm of prismatic joints; ``(..., n + 1)`` with a thermometer, C.
     """
     return joint_motion_of_rows(geometry, joints_first(q, max(q.ndim - 1, 1)))
 
 
+def of_joints(geometry: Geometry, rows: Float[AnyArray, "columns ..."]) -> Float[AnyArray, "n ..."]:
+    """The readings of the joints alone, which come first, without that of a thermometer."""
+    joints = geometry.alpha.shape[-1]
+    return rows if rows.shape[0] == joints else rows[:joints]
+
+
 def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"]) -> JointMotion:
     """`joint_motion` of readings that have the joints first and the configurations last."""
-    xp, corrections = namespace(rows), geometry.corrections
+    corrections = geometry.corrections
+    xp = namespace(rows, corrections)
+    readings = of_joints(geometry, rows)
     if geometry.kinds is None:
-        motion = JointMotion(xp.cos(rows), xp.sin(rows), None)
+        motion = JointMotion(xp.cos(readings), xp.sin(readings), None)
     else:
         prismatic = geometry.kinds.mask(rows.ndim)
-        angle = xp.where(prismatic, 0.0, rows)
-        motion = JointMotion(xp.cos(angle), xp.sin(angle), xp.where(prismatic, rows, 0.0))
+        angle = xp.where(prismatic, 0.0, readings)
+        motion = JointMotion(xp.cos(angle), xp.sin(angle), xp.where(prismatic, readings, 0.0))
     if corrections is None:
         return motion
     forward = forward_pass(corrections.nominal, motion)
@@ -295,7 +312,7 @@ def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> Fo
     rank = max(motion.cos.ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
     motion = _with_rank(motion, rank)
     parameters = jax.tree.map(lambda leaf: joints_first(leaf, rank), geometry)
-    theta, d, errors = parameters.theta, parameters.d, None
+    theta, d, a, probe, errors = parameters.theta, parameters.d, parameters.a, parameters.probe, None
     if motion.slide is not None:
         d = d + motion.slide
     if geometry.corrections is not None:
@@ -303,12 +320,14 @@ def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> Fo
         mask = np.zeros(()) if geometry.kinds is None else geometry.kinds.mask(added.ndim)
         theta = theta + (added if geometry.kinds is None else xp.where(mask, 0.0, added))
         d = d if geometry.kinds is None else d + xp.where(mask, added, 0.0)
+        if errors.scale is not None:
+            d, a, probe = (lengths * errors.scale[None] for lengths in (d, a, probe))
     cos_theta, sin_theta = xp.cos(theta), xp.sin(theta)
     inputs = (
         (motion.cos * cos_theta - motion.sin * sin_theta, motion.sin * cos_theta + motion.cos * sin_theta),
         (xp.cos(parameters.alpha), xp.sin(parameters.alpha)),
         None if parameters.beta is None else (xp.cos(parameters.beta), xp.sin(parameters.beta)),
-        parameters.a,
+        a,
         d,
     )
 
@@ -331,7 +350,6 @@ def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> Fo
     axes_of_base = [xp.broadcast_to(axis.reshape((1,) * len(batch[:-2]) + (3, 1)), shape) for axis in xp.eye(3)]
     start = ((axes_of_base[0], axes_of_base[1], axes_of_base[2]), xp.zeros(shape))
     (frame, origin), axes = loop(joint, start, inputs)
-    probe = parameters.probe
     tip = origin + probe[0] * frame[0] + probe[1] * frame[1] + probe[2] * frame[2]
     return ForwardPass(frame, tip, *axes, kinds=geometry.kinds, errors=errors)
 
@@ -358,15 +376,28 @@ def _joint_errors(
         weighted = xp.stack([parameters.coefficients[heavy] * each for each in moments], axis=1)
         by_gravity = xp.tensordot(joints[:, heavy], weighted, axes=1)
     added = xp.tensordot(joints, parameters.coefficients * by_coefficient, axes=1)
-    return added, JointErrors(by_coefficient, by_gravity, functions)
+    of_lengths, scale = functions.of_lengths, None
+    if of_lengths.any():
+        scale = 1.0 + xp.tensordot(of_lengths, parameters.coefficients * by_coefficient, axes=1)
+    return added, JointErrors(by_coefficient, by_gravity, functions, scale)
 
 
-def joint_errors(geometry: Geometry, motion: JointMotion) -> Float[AnyArray, "n ... 1 N"]:
-    """What the corrections add to each joint's theta, rad, or to d of a prismatic joint, mm."""
+def joint_errors(
+    geometry: Geometry, motion: JointMotion
+) -> tuple[Float[AnyArray, "n ... 1 N"], Float[AnyArray, "... 1 N"]]:
+    """What the corrections add to each joint's theta, rad, or to d of a prismatic joint, mm; the scale of lengths."""
     assert geometry.corrections is not None
     rank = max(motion.cos.ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
     parameters = jax.tree.map(lambda leaf: joints_first(leaf, rank), geometry)
-    return _joint_errors(parameters, _with_rank(motion, rank), geometry.corrections.functions)[0]
+    added, errors = _joint_errors(parameters, _with_rank(motion, rank), geometry.corrections.functions)
+    return added, namespace(added).ones_like(added[0]) if errors.scale is None else errors.scale
+
+
+def length_scale(geometry: Geometry, q: Float[AnyArray, "N n"]) -> Float[AnyArray, " N"]:
+    """What all lengths of one arm are multiplied by at readings with a thermometer; 1 without thermal expansion."""
+    if geometry.corrections is None or not geometry.corrections.functions.of_lengths.any():
+        return namespace(q).ones_like(q[:, 0])
+    return joint_errors(geometry, joint_motion(geometry, q))[1][0]
 
 
 def components_last(

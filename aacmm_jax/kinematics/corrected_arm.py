@@ -8,13 +8,14 @@ from jaxtyping import Float
 from ..core.arguments import items_of
 from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError
-from ..core.numpy_or_jax import to_numpy
+from ..core.numpy_or_jax import namespace, to_numpy
 from .arm import DOWN, Arm, is_single, joint_limits, without_corrections
 from .chain import Corrections, Geometry, KnownFunctions, forward_pass, joint_motion, joints_first
 from .corrections.kind import Loads, Term
 from .corrections.kinds import term_of, terms_of
 
 _CONFIGURATIONS = 300
+_TEMPERATURES = (10.0, 30.0)  # C
 _INDEPENDENT = 1e-6  # of a function's size: what must be left of it beside the constant and those before it
 
 
@@ -93,9 +94,10 @@ def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"
     if not terms:
         return ()
     limits = joint_limits(arm, None)
-    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_CONFIGURATIONS, arm.joints))
+    limits = np.concatenate([limits, [_TEMPERATURES]])
+    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_CONFIGURATIONS, arm.joints + 1))
     values, taken = function_values(arm.geometry, terms, q, gravity), []
-    for joint in range(1, arm.joints + 1):
+    for joint in range(arm.joints + 1):  # 0: functions that scale all lengths
         basis = np.full((_CONFIGURATIONS, 1), _CONFIGURATIONS**-0.5)
         for term, column in zip(terms, values, strict=True):
             if term.joint != joint:
@@ -118,3 +120,18 @@ def function_values(
     rows = functions.values(joints_first(q, 1), forward_pass(nominal, joint_motion(nominal, q)))[:, 0]
     weight = np.array([*gravity, 1.0])[functions.component_of_row]
     return np.add.reduceat(weight[:, None] * rows, functions.first_row)
+
+
+def with_further_corrections(arm: Arm, names: Sequence[str]) -> Arm:
+    """The same arm with more corrections than it has, by the names of their coefficients, which are 0."""
+    added = tuple(term for term in (term_of(name, arm.joints) for name in names) if term is not None)
+    if arm.corrections is None:
+        return arm.replace(corrections=Corrections(KnownFunctions(added), arm.geometry), gravity=np.array(DOWN))
+    assert arm.coefficients is not None
+    each = (*arm.corrections.functions.each, *added)
+    coefficients = namespace(arm.coefficients).concatenate([arm.coefficients, np.zeros(len(added))])
+    return arm.replace(
+        corrections=Corrections(KnownFunctions(each), arm.corrections.nominal),
+        coefficients=coefficients,
+        gravity=arm.gravity,
+    )

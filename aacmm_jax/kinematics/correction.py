@@ -15,7 +15,7 @@ from ..core.linear_algebra import solve_positive_definite
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, numpy_if_known
 from ..core.rotations import cross
 from .arm import Arm, checked_limits, is_single
-from .chain import ForwardPass, Geometry, forward_pass, joint_motion, joint_motion_of_rows, reading_units
+from .chain import ForwardPass, Geometry, forward_pass, joint_motion, joint_motion_of_rows, length_scale, reading_units
 from .jacobian import reading_columns, reading_rotations
 
 FULL_POSE = 6  # joints from which on the orientation can be reached as well
@@ -48,7 +48,8 @@ def corrected_readings(
     Args:
         nominal: The arm that the controller has.
         calibrated: The calibrated arm.
-        q: Commanded joint readings ``(..., n)``, rad.
+        q: Commanded joint readings ``(..., n)``, rad; ``(..., n + 1)`` with the temperature of an arm that has a
+            thermometer, C, of which a controller knows nothing.
         limits: Lowest and highest reading of each joint, n pairs, rad; by default those of the nominal arm, if any.
 
     Raises:
@@ -56,7 +57,9 @@ def corrected_readings(
     """
     if nominal.joints != calibrated.joints:
         raise InputError(f"the arms have {nominal.joints} and {calibrated.joints} joints; give arms with as many.")
-    return readings_at_poses(calibrated, q, nominal.pose(q), nominal.limits if limits is None else limits)
+    q = as_array(q, "q", like=calibrated.alpha)
+    wanted = nominal.pose(q[..., : nominal.joints])
+    return readings_at_poses(calibrated, q, wanted, nominal.limits if limits is None else limits)
 
 
 @numpy_if_known
@@ -71,7 +74,8 @@ def readings_at_poses(
 
     Args:
         arm: One arm.
-        q: Readings to begin with ``(..., n)``, rad.
+        q: Readings to begin with ``(..., n)``, rad; ``(..., n + 1)`` with the temperature of an arm with a
+            thermometer, C.
         poses: The pose wanted for each, with the tip (mm) as its origin, in the arm's base frame ``(..., 4, 4)``.
         limits: Lowest and highest reading of each joint, n pairs, rad; by default none.
 
@@ -81,7 +85,7 @@ def readings_at_poses(
     if not is_single(arm):
         raise InputError("poses are reached by one arm, but this is a batch; use jax.vmap, or take one of it.")
     q = as_array(q, "q", like=arm.alpha)
-    if q.shape[-1:] != (arm.joints,) or poses.shape != (*q.shape[:-1], 4, 4):
+    if q.shape[-1:] not in ((arm.joints,), (arm.columns,)) or poses.shape != (*q.shape[:-1], 4, 4):
         raise InputError(
             f"q has shape {q.shape}, poses {poses.shape} and the arm {arm.joints} joints; give (..., n) and "
             "(..., 4, 4) with a pose for each configuration."
@@ -90,7 +94,9 @@ def readings_at_poses(
     if limits is not None:
         allowed = np.asarray(checked_limits(limits, arm.joints, arm.prismatic))
     count = math.prod(q.shape[:-1])
-    rows, wanted = q.reshape(count, arm.joints), poses.reshape(count, 4, 4)
+    rows, wanted = q.reshape(count, q.shape[-1]), poses.reshape(count, 4, 4)
+    scale = length_scale(arm.geometry, rows)
+    rows, wanted = rows[:, : arm.joints], _at_20_degrees(wanted, scale)
     if namespace(arm.geometry, rows, wanted) is np:
         starts = range(0, max(count, 1), _ROWS)
         parts = [
@@ -104,7 +110,15 @@ def readings_at_poses(
     if arm.joints >= FULL_POSE:
         reached = reached & (angle <= _ALIGNED)
     shape = q.shape[:-1]
-    return ReadingsAtPoses(found.reshape(q.shape), *(x.reshape(shape) for x in (distance, angle, reached)))
+    found = found.reshape(*shape, arm.joints)
+    return ReadingsAtPoses(found, *(x.reshape(shape) for x in (scale * distance, angle, reached)))
+
+
+def _at_20_degrees(poses: Float[AnyArray, "c 4 4"], scale: Float[AnyArray, " c"]) -> Float[AnyArray, "c 4 4"]:
+    """The poses that the arm has at 20 C where, with its lengths multiplied by ``scale``, it has those given."""
+    xp = namespace(poses, scale)
+    factor = xp.broadcast_to(scale[:, None, None], poses.shape)
+    return poses / xp.where(np.array([[False] * 3 + [True]] * 3 + [[False] * 4])[None], factor, 1.0)
 
 
 @compiled(jit=partial(jax.jit, static_argnames=("steps",)))

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.arrays import in_chunks
-from ..core.errors import InputError
 from .arm import (
     LENGTHS,
     Arm,
+    check_columns,
     correction_names,
     jacobian_at,
     joint_limits,
@@ -66,10 +66,7 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
     before it, or after it, are all that the orientation of the next axis has. At last the first parameter of every
     near-degenerate combination is fixed (`near_degeneracy`).
     """
-    if arm.joints != capture.joints:
-        raise InputError(
-            f"the capture has {capture.joints} columns, but the arm has {arm.joints} joints; give one column per joint."
-        )
+    check_columns(arm, capture.columns)
     parallel = nearly_parallel(arm)
     if parallel and arm.beta is None:
         arm = with_arrays(arm, beta=np.zeros_like(arm.alpha))
@@ -111,8 +108,8 @@ class PosesInSockets:
     sizes: tuple[int, ...]
 
     @property
-    def joints(self) -> int:
-        """Number of joints."""
+    def columns(self) -> int:
+        """Number of columns of the readings."""
         return self.q.shape[1]
 
     @property

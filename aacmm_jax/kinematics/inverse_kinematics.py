@@ -19,7 +19,7 @@ from ..core.arrays import in_chunks, random_numbers
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from .arm import Arm
-from .chain import ForwardPass, Geometry, forward_pass, joint_motion, joint_motion_of_rows
+from .chain import ForwardPass, Geometry, forward_pass, joint_motion, joint_motion_of_rows, length_scale
 from .jacobian import reading_columns
 
 _BATCH = 256  # candidates per call: one compiled shape for every number of targets
@@ -46,8 +46,8 @@ class SocketPoses(Protocol):
         ...
 
     @property
-    def joints(self) -> int:
-        """Number of joints."""
+    def columns(self) -> int:
+        """Number of columns of the readings."""
         ...
 
     @property
@@ -192,16 +192,16 @@ def random_configurations(
 
 def project_to_targets(
     arm: Arm,
-    q: Float[np.ndarray, "N n"],
+    q: Float[np.ndarray, "N columns"],
     targets: Float[np.ndarray, "N 3"],
     limits: Float[np.ndarray, "n 2"] | None = None,
     steps: int = _STEPS,
-) -> tuple[Float[np.ndarray, "N n"], Bool[np.ndarray, " N"]]:
+) -> tuple[Float[np.ndarray, "N columns"], Bool[np.ndarray, " N"]]:
     """Configurations moved by least-norm steps until the tip is at its target.
 
     Args:
         arm: The arm.
-        q: Joint readings to begin with ``(N, n)``, rad, or mm of prismatic joints.
+        q: Joint readings to begin with ``(N, n)``, rad, or mm of prismatic joints; a thermometer's stay as they are.
         targets: Positions of the tip, one each ``(N, 3)``, mm.
         limits: Lowest and highest reading of each joint ``(n, 2)``, rad or mm; by default none.
         steps: Most steps of each configuration.
@@ -216,8 +216,10 @@ def project_to_targets(
         found, distance = solve_to_targets(geometry, rows[:, :-3], rows[:, -3:], allowed, steps)
         return np.hstack([found, distance[:, None]])
 
-    found = in_chunks(moved, np.hstack([q, targets]), _ROWS)
-    return found[:, :-1], found[:, -1] <= _ARRIVED
+    # An arm that has expanded is at the target where the arm at 20 C is at the target divided by the scale of lengths.
+    joints, temperature = q[:, : arm.joints], q[:, arm.joints :]
+    found = in_chunks(moved, np.hstack([joints, targets / length_scale(geometry, q)[:, None]]), _ROWS)
+    return np.hstack([found[:, :-1], temperature]), found[:, -1] <= _ARRIVED
 
 
 def project_to_centroids(arm: Arm, capture: SocketPoses, targets_of: Arm | None = None) -> Float[np.ndarray, "N n"]:

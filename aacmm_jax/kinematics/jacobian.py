@@ -27,6 +27,7 @@ from .chain import (
     joint_errors,
     joint_motion,
     joints_first,
+    of_joints,
 )
 
 
@@ -45,12 +46,15 @@ def jacobian_columns(forward: ForwardPass) -> dict[str, Float[AnyArray, "k ... 3
 def _columns_of_kind(forward: ForwardPass, kind: str) -> Float[AnyArray, "k ... 3 N"]:
     xp = namespace(forward.tip)
     if kind == "probe":
-        return xp.stack(forward.frame)
+        return _of_length(forward, xp.stack(forward.frame))
     if kind == "gravity":
         return xp.stack([_correction_column(forward, kind, i) for i in range(3)])
     if kind == "coefficients":  # all at once: there may be hundreds
         assert forward.errors is not None
-        return forward.errors.by_coefficient * reading_columns(forward)[forward.errors.functions.moved]
+        functions, by_each = forward.errors.functions, reading_columns(forward)
+        if functions.of_lengths.any():  # the last column, -1, is that of the scale of lengths
+            by_each = xp.concatenate([by_each, _tip_by_scale(forward)[None]])
+        return forward.errors.by_coefficient * by_each[functions.moved]
     return _columns_of(forward, kind, slice(None))
 
 
@@ -63,7 +67,20 @@ def reading_columns(forward: ForwardPass) -> Float[AnyArray, "n ... 3 N"]:
     rotations = _columns_of(forward, "theta", slice(None))
     if forward.kinds is None:
         return rotations
-    return namespace(forward).where(forward.kinds.mask(rotations.ndim), forward.z_before, rotations)
+    slides = _columns_of(forward, "d", slice(None))
+    return namespace(forward).where(forward.kinds.mask(rotations.ndim), slides, rotations)
+
+
+def _of_length(forward: ForwardPass, columns: Float[AnyArray, "... 3 N"]) -> Float[AnyArray, "... 3 N"]:
+    """Columns of lengths, which grow with the temperature."""
+    if forward.errors is None or forward.errors.scale is None:
+        return columns
+    return columns * (forward.errors.scale if columns.ndim == forward.tip.ndim else forward.errors.scale[None])
+
+
+def _tip_by_scale(forward: ForwardPass) -> Float[AnyArray, "... 3 N"]:
+    """Derivative of the tip by the scale of all lengths."""
+    return forward.tip if forward.errors is None or forward.errors.scale is None else forward.tip / forward.errors.scale
 
 
 def reading_rotations(forward: ForwardPass) -> Float[AnyArray, "n ... 3 N"]:
@@ -93,15 +110,15 @@ def _columns_of(forward: ForwardPass, kind: str, at: int | slice) -> Float[AnyAr
     if kind in ("coefficients", "gravity"):
         assert isinstance(at, int)
         return _correction_column(forward, kind, at)
-    return {"a": forward.x, "d": forward.z_before, "probe": forward.frame}[kind][at]
+    return _of_length(forward, {"a": forward.x, "d": forward.z_before, "probe": forward.frame}[kind][at])
 
 
 def moved_by_correction(forward: ForwardPass, kind: str, i: int) -> list[tuple[int, Float[AnyArray, "... 1 N"]]]:
-    """The joints that a coefficient, or a component of gravity, moves, and by how much."""
+    """The joints that a coefficient, or a component of gravity, moves, and by how much; none of thermal expansion."""
     assert forward.errors is not None
     functions = forward.errors.functions
     if kind == "coefficients":
-        return [(int(functions.moved[i]), forward.errors.by_coefficient[i])]
+        return [(int(functions.moved[i]), forward.errors.by_coefficient[i])] if functions.moved[i] >= 0 else []
     return [
         (joint, forward.errors.by_gravity[joint, i])
         for joint in sorted(set(functions.moved[functions.by_gravity].tolist()))
@@ -110,6 +127,9 @@ def moved_by_correction(forward: ForwardPass, kind: str, i: int) -> list[tuple[i
 
 def _correction_column(forward: ForwardPass, kind: str, i: int) -> Float[AnyArray, "... 3 N"]:
     """Derivative of the tip by a coefficient, or by a component of the direction of gravity."""
+    assert forward.errors is not None
+    if kind == "coefficients" and forward.errors.functions.of_lengths[i]:
+        return forward.errors.by_coefficient[i] * _tip_by_scale(forward)
     column = namespace(forward.tip).zeros_like(forward.tip)
     for joint, by in moved_by_correction(forward, kind, i):
         column = column + by * _columns_of(forward, _parameter_of(forward.kinds, "q", joint), joint)
@@ -248,9 +268,9 @@ _tip_position = jax.custom_jvp(_plain_tip_position)
 
 
 def _errors_by_readings(
-    geometry: Geometry, q: Float[AnyArray, "... n"], q_dot: Float[AnyArray, "... n"]
-) -> Float[AnyArray, "n ... 1 N"]:
-    """How the corrections of each joint change with the readings, by JAX."""
+    geometry: Geometry, q: Float[AnyArray, "... columns"], q_dot: Float[AnyArray, "... columns"]
+) -> tuple[Float[AnyArray, "n ... 1 N"], Float[AnyArray, "... 1 N"]]:
+    """How the corrections of each joint, and the scale of all lengths, change with the readings, by JAX."""
     errors = lambda readings: joint_errors(geometry, joint_motion(geometry, readings))  # noqa: E731
     return jax.jvp(errors, (q,), (jnp.broadcast_to(q_dot, q.shape),))[1]
 
@@ -261,14 +281,17 @@ def _tip_position_jvp(primals, tangents):
     forward = forward_pass(geometry, joint_motion(geometry, q))
     columns = jacobian_columns(forward)
     rank = forward.tip.ndim - 1
-    pairs = [(column, getattr(geometry_dot, kind)) for kind, column in columns.items()]
     moved = jnp.zeros_like(forward.tip)
-    for column, tangent in [*pairs, (reading_columns(forward), q_dot)]:
+    for kind, column in columns.items():
+        tangent = getattr(geometry_dot, kind)
         # Unperturbed arguments arrive as symbolic zeros: a derivative by parameters then never touches q.
         if not isinstance(tangent, SymbolicZero):
             moved = moved + jnp.sum(column * joints_first(tangent, rank), axis=0)
-    if geometry.corrections is not None and not isinstance(q_dot, SymbolicZero):
-        moved = moved + jnp.sum(reading_columns(forward) * _errors_by_readings(geometry, q, q_dot), axis=0)
+    if not isinstance(q_dot, SymbolicZero):
+        moved = moved + jnp.sum(reading_columns(forward) * of_joints(geometry, joints_first(q_dot, rank)), axis=0)
+        if geometry.corrections is not None:
+            by_joints, by_scale = _errors_by_readings(geometry, q, q_dot)
+            moved = moved + jnp.sum(reading_columns(forward) * by_joints, axis=0) + by_scale * _tip_by_scale(forward)
     return components_last(forward.tip, geometry, q), components_last(moved, geometry, q)
 
 
@@ -292,12 +315,12 @@ def tip_jacobian(
     forward = forward_pass(geometry, joint_motion(geometry, q))
     stacked, xp = stacked_jacobian_columns(forward, indices), namespace(geometry, q)
     if geometry.corrections is not None and any(kind == "q" for kind, _ in indices):
-        units, none = jnp.eye(q.shape[-1]), jnp.zeros_like(forward.tip)
-        columns = reading_columns(forward)
-        added = [
-            jnp.sum(columns * _errors_by_readings(geometry, jnp.asarray(q), units[i]), axis=0) if kind == "q" else none
-            for kind, i in indices
-        ]
+        units, columns, added = jnp.eye(q.shape[-1]), reading_columns(forward), []
+        for kind, i in indices:
+            added.append(jnp.zeros_like(forward.tip))
+            if kind == "q":
+                by_joints, _ = _errors_by_readings(geometry, jnp.asarray(q), units[i])
+                added[-1] = jnp.sum(columns * by_joints, axis=0)
         stacked = stacked + xp.asarray(jnp.stack(added, axis=-3))
     columns = xp.moveaxis(stacked, -1, -3)
     batched = max(leaf.ndim for leaf in jax.tree.leaves((geometry, q))) > 1

@@ -8,6 +8,7 @@ for each joint fails where a joint moves little, since high orders imitate anyth
 from ..core.arguments import checked_arguments
 from .arm import Arm, correction_names
 from .corrections.coupling import Coupling
+from .corrections.expansion import Expansion
 from .corrections.gear_ratio import GearRatio
 from .corrections.gravity import Gravity
 from .corrections.harmonics import HIGHEST, Harmonics
@@ -18,6 +19,7 @@ _HARMONIC = 5e-5  # rad: 10 arcsec
 _RATIO = 2e-4  # of a gear, or part of another joint's reading
 _BY_LINK = 1e-3  # rad/m: 1 mrad for links with levers of 1 m
 _COMPLIANCE = 1e-2  # rad/(kN m): 1 mrad for 100 N m
+_EXPANSION = 2e-5  # 1/K: steel has 1.15e-5, aluminium 2.3e-5
 _SLIDE = 0.05  # mm, of the harmonics of a prismatic joint
 
 
@@ -26,8 +28,8 @@ def default_prior(arm: Arm) -> Prior:
     """The prior with which an arm with joint corrections is calibrated where no other is given.
 
     Learned from the data, each expected to a factor of 4.5: lengths (1 mm), angles (1 mrad), gravity (1 mrad for links
-    with levers of 1 m, or for 100 N m), gear and coupled (0.02 %), and one group for each octave of harmonics
-    (0.05 mrad).
+    with levers of 1 m, or for 100 N m), gear and coupled (0.02 %), thermal expansion (20 um/(m K)), and one group for
+    each octave of harmonics (0.05 mrad).
 
     Args:
         arm: The nominal arm, with the corrections that are calibrated.
@@ -38,6 +40,7 @@ def default_prior(arm: Arm) -> Prior:
     with_masses = any(name.startswith("compliance_") for name in correction_names(arm))
     octaves = [(2**k, min(2 ** (k + 1) - 1, HIGHEST)) for k in range(HIGHEST.bit_length())]
     kinds = {Gravity.model: _COMPLIANCE if with_masses else _BY_LINK, GearRatio.model: _RATIO, Coupling.model: _RATIO}
+    kinds[Expansion.model] = _EXPANSION
     kinds |= {f"{Harmonics.model}={low}" + (f"-{high}" if high > low else ""): _HARMONIC for low, high in octaves}
     # Coefficients of a slide are in mm, so that they cannot share a scale with those of joints that turn.
     slides = {f"{word}*_{joint}": _SLIDE for joint in arm.prismatic for word in ("cos", "sin", "compliance", "coupled")}

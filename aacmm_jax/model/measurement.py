@@ -4,11 +4,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
 from ..data.capture import Capture, check_one_capture, check_readings, check_sockets_only
 from ..data.noise import Noise, tip_covariances
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, check_columns
 from ..kinematics.chain import Geometry, JointMotion, joint_motion
 from ..kinematics.parameters import Parameters
 from .socket_sums import means_over_sockets, to_poses
@@ -99,11 +98,7 @@ def between_ends(centroids: Float[AnyArray, "... s"], ends: tuple[tuple[int, int
 
 def check_joints(capture: Capture, space: Parameters) -> None:
     """Raise `InputError` where capture and arm differ in their number of joints."""
-    if capture.joints != space.base.joints:
-        raise InputError(
-            f"the capture has {capture.joints} columns, but the arm has {space.base.joints} joints; give one column a "
-            "joint."
-        )
+    check_columns(space.base, capture.columns)
 
 
 def length_covariance(

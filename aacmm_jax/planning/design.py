@@ -38,7 +38,15 @@ from .placement import (
     random_placements,
     random_scores,
 )
-from .plan_arguments import check_counts, check_ranges, check_retract, checked_cones, given_placement, with_table
+from .plan_arguments import (
+    check_counts,
+    check_ranges,
+    check_retract,
+    checked_cones,
+    given_placement,
+    planned_parameters,
+    with_table,
+)
 from .pose_refinement import refined
 from .predictions import Prediction, prediction_of, predictions
 from .unreachable import explained
@@ -157,7 +165,7 @@ def plan(
     report = progress or (lambda stage, fraction: None)
     if not is_single(arm):
         raise InputError("plan takes one arm, not a batch; give one of its arms.")
-    space = Parameters.free_of(arm) if space is None else space
+    space = planned_parameters(Parameters.free_of(arm) if space is None else space)
     if arm.beta is None and space.base.beta is not None:  # free, and 0 so far
         arm = arm.replace(beta=np.zeros(arm.joints))
     check_length = default_length(arm) if check_length is None else check_length

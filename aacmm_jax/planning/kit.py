@@ -33,7 +33,7 @@ from .fedorov_exchange import Candidates, covariance_of, exchange
 from .kit_placement import KitItem, PlacedKit, approachable, place, region_of, set_up
 from .motion import Motion, ordered_motion
 from .placement import PRIOR, DesignProblem, Ranges, check_region
-from .plan_arguments import check_retract, with_table
+from .plan_arguments import check_retract, planned_parameters, with_table
 from .predictions import MORE, Prediction, prediction_of
 
 _LEAST_U = 1e-4  # mm: an exact certified value would be a row of infinite weight
@@ -138,7 +138,7 @@ def plan_kit(
     ranges = {"z": (0.0, np.inf)} if region is None else region
     check_region(ranges)
     check_retract(retract)
-    space = Parameters.free_of(arm) if space is None else space
+    space = planned_parameters(Parameters.free_of(arm) if space is None else space)
     check_length = default_length(arm) if check_length is None else check_length
     problem, functions = design_problem(
         search_region(

@@ -10,12 +10,19 @@ from ..data.simulation import socket_point
 from ..kinematics.arm import Arm
 from ..kinematics.collisions import Cell, HalfSpace
 from ..kinematics.cones import Cone, Cones, cones_of
+from ..kinematics.corrections.expansion import Expansion
+from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import total_link_length
 from .placement import LEAST_POSES, FixturePlacement, Ranges, check_region
 
 _U_RANGE = (1e-6, 100.0)  # mm
 _LARGEST_RETRACT = 1000.0  # mm
 TABLE = "table"
+
+
+def planned_parameters(space: Parameters) -> Parameters:
+    """Those that a plan is made for: not thermal expansion, since plans are at 20 C."""
+    return Parameters(space.base, tuple(name for name in space.names if name != Expansion.words[0]))
 
 
 def check_counts(sockets: int | Mapping, poses: int, parameters: int, u: float, lengths: Sequence[tuple]) -> None:

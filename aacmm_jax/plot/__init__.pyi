@@ -14,6 +14,7 @@ from .drift import parameter_trend as parameter_trend
 from .drift import save_drift_trend as save_drift_trend
 from .joint_models import compared_models as compared_models
 from .joint_models import joint_function as joint_function
+from .patterns import residual_patterns as residual_patterns
 from .study import save_study_figures as save_study_figures
 from .study import study_convergence as study_convergence
 from .study import study_correlation as study_correlation

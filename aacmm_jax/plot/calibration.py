@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.pose_residuals import ObservationResiduals, distances_of, observation_residuals
+from ..calibration.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
-from ..core.units import ARCSEC, DEG
+from ..core.units import DEG
 from ..kinematics.arm import is_length, parameter_unit
 from .style import ACCENT, DARK, LIGHT, axes_or_new, label_axes, label_parameters, logarithmic, save_figure
 
@@ -27,7 +27,8 @@ _UNITS = {"mm": "distance from the geometry [mm]", "standard deviations": "resid
           "deg": "angle between orientations [deg]"}  # fmt: skip
 _LITTLE_WEIGHT = 0.5
 _MOST_IN_A_ROW = 3  # panels of a figure
-_NAMED = 12  # most observations whose names fit an axis
+_MOST_NAMES = 30  # of lengths along an axis
+_NAMED = 16  # most sockets or observations whose names fit an axis
 
 
 def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
@@ -49,7 +50,7 @@ def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
         by_stage["calibrated"] = tuple(one.distance for one in found)  # with the geometry of the calibration
     for stage, distances in by_stage.items():
         distance = np.concatenate(distances)
-        style = {**_STAGES[stage]} | {"label": f"{_STAGES[stage]['label']} (mean {distance.mean():.3g} mm)"}
+        style = {**_STAGES[stage]} | {"label": f"{_STAGES[stage]['label']} (RMS {rms(distance):.3g} mm)"}
         axes.plot(np.arange(1, len(distance) + 1), distance, linestyle="none", markersize=3.5, **style)
     logarithmic(axes)
     names = (*capture.names, *(observation.name for observation in capture.observations))
@@ -116,13 +117,13 @@ def _in_unit(one: ObservationResiduals, unit: str) -> np.ndarray:
 
 
 def _separate(axes: Any, names: Sequence[str], sizes: Sequence[int], word: str) -> str:
-    """Separate groups of poses by dashed lines, name observations where there is room, and return the axis' title."""
+    """Separate groups of poses by dashed lines, name them where there is room, and return the axis' title."""
     if len(sizes) == 1:
         return "pose"
     ends = np.cumsum(sizes)
     for border in ends[:-1] if len(sizes) <= 40 else ():
         axes.axvline(border + 0.5, color="0.3", linewidth=0.8, linestyle="--", zorder=0)
-    if word == "observation" and len(sizes) <= _NAMED:
+    if len(sizes) <= _NAMED:
         axes.set_xticks(ends - (np.array(sizes) - 1) / 2, names, rotation=30, ha="right")
         return ""
     return f"pose (dashed lines separate {word}s)"
@@ -168,7 +169,7 @@ def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any
 
     Args:
         record: The calibration.
-        kind: ``"length"`` for the length parameters, mm; ``"angle"`` for the angle parameters, arcsec.
+        kind: ``"length"`` for the length parameters, mm; ``"angle"`` for the angle parameters, deg.
         axes: Axes to plot into; new ones if None.
 
     Returns:
@@ -182,18 +183,23 @@ def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any
     axes = axes_or_new(axes)
     uncertainty, vectors, wanted = uncertainty_of(record), record.vectors(), "mm" if kind == "length" else "rad"
     chosen = [i for i, name in enumerate(record.names) if parameter_unit(record.recording.nominal.arm, name) == wanted]
-    scale = 1.0 if kind == "length" else 1 / ARCSEC
+    scale = 1.0 if kind == "length" else 1 / DEG
     change = scale * (vectors["calibrated"] - vectors["nominal"])[chosen]
     expanded = scale * uncertainty.factor() * np.asarray(uncertainty.u)[chosen]
     known = np.isfinite(expanded)
     axes.axhline(0, color="0.4", linewidth=0.8)
     style = {"fmt": "o", "color": DARK, "capsize": 3, "markersize": 4, "label": "with U (95 %)"}
-    axes.errorbar(np.arange(len(chosen)), change, yerr=np.where(known, expanded, 0.0), **style)
+    axes.errorbar(np.flatnonzero(known), change[known], yerr=expanded[known], **style)
     if not np.all(known):
+        # Such values are arbitrary: they do not stretch the axis of those that are known.
+        low, high = axes.get_ylim()
         style = {"color": ACCENT, "markersize": 8, "label": "only determined with others"}
-        axes.plot(np.flatnonzero(~known), change[~known], "x", **style)
+        shown = np.clip(change[~known], low, high) if np.any(known) else change[~known]
+        axes.plot(np.flatnonzero(~known), shown, "x", clip_on=False, **style)
+        if np.any(known):
+            axes.set_ylim(low, high)
     label_parameters(axes, [record.names[i] for i in chosen])
-    label_axes(axes, "", f"calibrated - nominal [{'mm' if kind == 'length' else 'arcsec'}]")
+    label_axes(axes, "", f"calibrated - nominal [{'mm' if kind == 'length' else 'deg'}]")
     _legend_above(axes, 2)
     return axes
 
@@ -225,12 +231,23 @@ def reference_length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
     style = {"fmt": "s", "color": DARK, "capsize": 3, "markersize": 4, "label": "calibrated, with U (95 %)"}
     axes.errorbar(x + 0.1 * two, np.asarray(calibrated.error), yerr=bars, **style)
     axes.axhline(0, color="0.4", linewidth=0.8)
-    names = [f"{length.start} - {length.end}" for length in lengths]
-    label_parameters(axes, names if len(names) <= 20 else [str(i + 1) for i in x])
+    label_parameters(axes, _names_of_lengths([(length.start, length.end) for length in lengths]))
     axes.set_xlim(-0.5, len(lengths) - 0.5)
     label_axes(axes, "", "measured - value [mm]")
     _legend_above(axes, 2)
     return axes
+
+
+def _names_of_lengths(ends: Sequence[tuple[str, str]]) -> list[str]:
+    """The placement of each length where that is one of its own ("front" of "front/0" and "front/1"), else both ends;
+    where there are very many, some of them."""
+    folders = [
+        start.rpartition("/")[0] if start.rpartition("/")[0] == end.rpartition("/")[0] else "" for start, end in ends
+    ]
+    alone = [folder if folder and folders.count(folder) == 1 else "" for folder in folders]
+    names = [name or f"{start} - {end}" for name, (start, end) in zip(alone, ends, strict=True)]
+    every = -(-len(names) // _MOST_NAMES)
+    return [name if i % every == 0 else "" for i, name in enumerate(names)]
 
 
 def _legend_above(axes: Any, columns: int) -> None:

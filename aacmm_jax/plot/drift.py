@@ -6,13 +6,10 @@ from typing import Any
 import numpy as np
 
 from ..drift.results import Drift, Trend, in_words
-from .style import ACCENT, DARK, check_format, save_figure
+from .style import ACCENT, COLORS, DARK, LINES, MARKERS, check_format, save_figure
 
 _LIGHT = "0.72"
-_LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (2, 1)), (0, (4, 1, 1, 1)))
-_MARKERS = "os^Dv<>p"
-_COLORS = ("#1b3a6b", "#d95f02", "#111111", "#1b7a5a", "#7a3b8f", "#555555", "#a33b3b", "#3a6fb0")
-_NAMED = len(_MARKERS)  # lines that remain distinct, each with its name
+_NAMED = len(MARKERS)  # lines that remain distinct, each with its name
 _CROWDED = 0.03  # calibrations nearer in time than this fraction of the whole are spaced evenly
 _FAR = 8.0  # changes beyond so many expanded uncertainties need a logarithmic axis
 
@@ -83,10 +80,10 @@ def parameter_trend(trend: Trend, axes: Any, positions: np.ndarray | None = None
             open_circles = {"color": "white", "markeredgecolor": "0.45", "markersize": 4, "zorder": 2}
             axes.plot(positions[beyond], ratio[beyond, i], "o", **open_circles)
     drift, labels = trend.drifts[-1], []
-    for i, color, line, marker in zip(named, _COLORS, _LINES, _MARKERS, strict=False):
+    for i, color, line, marker in zip(named, COLORS, LINES, MARKERS, strict=False):
         style = {"color": color, "linestyle": line, "marker": marker, "markersize": 5, "linewidth": 1.5, "zorder": 3}
         axes.plot(positions, ratio[:, i], **style)
-        labels.append((ratio[-1, i], f"{trend.names[i]} {in_words(trend.names[i], float(drift.change[i]))}", color))
+        labels.append((ratio[-1, i], f"{trend.names[i]} {in_words(drift.units[i], float(drift.change[i]))}", color))
     _label_ends(axes, labels, positions)
     _title_changes(
         axes,
@@ -132,7 +129,7 @@ def parameter_drift(drift: Drift, axes: Any) -> Any:
     for i in positions[moved]:
         up = ratio[i] > 0
         style = {"va": "bottom" if up else "top", "ha": "center", "rotation": 90 if crowded else 0, "fontsize": 8}
-        text = in_words(drift.names[chosen[i]], float(drift.change[chosen[i]]))
+        text = in_words(drift.units[chosen[i]], float(drift.change[chosen[i]]))
         offset = {"xytext": (0, 7 if up else -7), "textcoords": "offset points"}
         axes.annotate(text, (i, ratio[i]), color=DARK, **offset, **style)
     style = {"rotation": 60, "ha": "right", "rotation_mode": "anchor", "fontsize": 8}
@@ -162,7 +159,7 @@ def length_drift(drift: Drift, axes: Any) -> Any:
             axes.axvline(1e3 * side * rms, **style)
     axes.set_xlabel(f"change of {lengths.length:g} mm lengths over the volume [um]")
     axes.set_ylabel("lengths")
-    axes.legend(frameon=False, fontsize=8, loc="upper right")
+    axes.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.1)
     return axes
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -17,14 +18,15 @@ from ..study.statistics import (
     metric_title,
     shown_unit,
 )
-from .style import ACCENT, DARK, axes_or_new, label_axes, save_figure
+from .style import ACCENT, COLORS, DARK, LINES, MARKERS, axes_or_new, label_axes, logarithmic, save_figure
 
 _WIDTHS = ("bounds.length_mm", "bounds.angle_deg")
 _SHIFTS = ("bounds.length_shift_mm", "bounds.angle_shift_deg")
 
 
 def study_metric(results: Results, metric: str = "length_error", axes: Any = None) -> Any:
-    """Plot one metric in every cell of a study: median, 5th and 95th percentile of the converged trials.
+    """Plot one metric of a study against the factor with the most levels: median, 5th and 95th percentile of the
+    converged trials, the other factors side by side.
 
     Args:
         results: The study.
@@ -40,15 +42,26 @@ def study_metric(results: Results, metric: str = "length_error", axes: Any = Non
     if metric not in METRICS:
         raise InputError(f"a study has no metric '{metric}'; choose one of {', '.join(METRICS)}.")
     axes = axes_or_new(axes)
-    cells = range(len(results.study.cells))
-    for cell in cells:
-        values = _values(results, metric, [cell])
-        if len(values):
-            low, middle, high = np.percentile(values, (5, 50, 95))
-            bars = [[middle - low], [high - middle]]
-            axes.errorbar(cell + 1, middle, yerr=bars, fmt="s", color=DARK, capsize=4)
-    axes.set_xticks([cell + 1 for cell in cells] if len(cells) <= 30 else axes.get_xticks())
-    label_axes(axes, "cell", metric_title(metric))
+    factors = results.study.factors
+    along = max(factors, key=lambda name: len(factors[name])) if factors else None
+    runs = {"": [0]} if along is None else _runs(results, along, most=len(MARKERS))
+    positive, values = True, []
+    for i, (words, cells) in enumerate(runs.items()):
+        low, middle, high = _percentiles(results, metric, cells)
+        x = np.array([0 if along is None else _index(results, cell)[along] for cell in cells])
+        x = x + 0.6 * ((i + 0.5) / len(runs) - 0.5)  # side by side at each level
+        style = {"fmt": MARKERS[i], "color": COLORS[i], "capsize": 3, "markersize": 5, "label": words or None}
+        axes.errorbar(x, middle, yerr=[middle - low, high - middle], **style)
+        positive &= bool(np.all(low[np.isfinite(low)] > 0))
+        values.append(middle[np.isfinite(middle)])
+    if positive and _spans_decades(list(np.concatenate(values)[:, None])):
+        logarithmic(axes)
+    axes.set_xticks(
+        *([[0], ["all trials"]] if along is None else [range(len(factors[along])), _levels(results, along)])
+    )
+    label_axes(axes, "" if along is None else factor_title(along), metric_title(metric))
+    if len(runs) > 1:
+        axes.legend(frameon=False, fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return axes
 
 
@@ -152,8 +165,8 @@ def study_errors(results: Results, factor: str) -> Any:
         panel.set_yscale("log")
         panel.set_xticks(x, [f"{value:g}" for value in x])
         panel.minorticks_off()
-        _finish(panel, factor_title(factor), _title(kind) if panel is axes[0, 0] else "", words)
-    axes[0, 0].legend(frameon=False)
+        _finish(panel, factor_title(factor), _title(kind) if panel is axes[0, 0] else "", fill(words, 60))
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", frameon=False, ncols=2)
     return figure
 
 
@@ -167,20 +180,20 @@ def study_scale(results: Results, factor: str) -> Any:
     Returns:
         The figure, with medians and bands from the 5th to the 95th percentile.
     """
-    figure, axes = _panels(1, 1, (6, 4.2))
+    runs = _runs(results, factor, most=len(MARKERS))
+    figure, axes = _panels(1, 1, (6.4, 4.2 + 0.16 * len(runs)))
     panel = axes[0, 0]
-    runs = _runs(results, factor, most=10)
     for i, (words, cells) in enumerate(runs.items()):
         x = [float(results.study.factors[factor][_index(results, cell)[factor]]) for cell in cells]
         low, middle, high = _percentiles(results, "scale", cells)
-        grey = str(0.65 * i / max(len(runs) - 1, 1))
         if len(runs) <= 4:
-            panel.fill_between(x, low, high, color=grey, alpha=0.12, linewidth=0)
-        panel.plot(x, middle, color=grey, marker="os^Dv<>p*h"[i % 10], label=words or None)
-    panel.axhline(1.0, color=ACCENT, linewidth=0.9, linestyle="--")
+            panel.fill_between(x, low, high, color=COLORS[i], alpha=0.12, linewidth=0)
+        style = {"color": COLORS[i], "linestyle": LINES[i], "marker": MARKERS[i], "label": words or None}
+        panel.plot(x, middle, **style)
+    panel.axhline(1.0, color="0.4", linewidth=0.9, linestyle="--")
     _finish(panel, factor_title(factor), "scale of stage 1, found / true")
     if len(runs) > 1:
-        panel.legend(frameon=False, fontsize=8)
+        figure.legend(loc="outside upper center", frameon=False, fontsize=8)
     return figure
 
 
@@ -201,7 +214,8 @@ def study_correlation(results: Results, cell: int) -> Any:
     panel.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
     panel.set_yticks(range(len(names)), names, fontsize=8)
     words = _cell_label(results, cell - 1)
-    panel.set_title(f"correlation of parameter errors, cell {cell}{': ' if words else ''}{words}", fontsize=10)
+    title = f"correlation of parameter errors, cell {cell}{': ' if words else ''}{words}"
+    panel.set_title(fill(title, 70), fontsize=10)
     figure.colorbar(image, ax=panel, shrink=0.85)
     return figure
 
@@ -225,17 +239,19 @@ def study_convergence(results: Results) -> Any:
         total[at] += np.sum(converged >= 0)
         good[at] += np.sum(converged == 1)
     percentage = np.divide(100 * good, total, out=np.full_like(good, np.nan), where=total > 0)
-    figure, axes = _panels(1, 1, (1.6 + 0.75 * max(len(levels[0]), 4), 1.7 + 0.45 * len(levels[1])))
+    least = min(float(np.nanmin(percentage, initial=100.0)), 99.0)
+    darkest = 100 - 2.5 * (100 - least)  # so that the least that was found is a middle grey
+    figure, axes = _panels(1, 1, (1.9 + 0.75 * max(len(levels[0]), 4), 1.9 + 0.5 * len(levels[1])))
     panel = axes[0, 0]
-    panel.imshow(percentage, vmin=0, vmax=100, cmap="Greys_r", aspect="auto")
+    panel.imshow(percentage, vmin=darkest, vmax=100, cmap="Greys_r", aspect="auto")
     for (row, column), value in np.ndenumerate(percentage):
         text = "-" if np.isnan(value) else f"{value:.0f}" if value in (0, 100) else f"{value:.1f}"
-        color = "white" if value < 50 else "black"
+        color = "white" if value < (darkest + 100) / 2 else "black"
         panel.text(column, row, text, ha="center", va="center", fontsize=8, color=color)
     panel.set_xticks(range(len(levels[0])), levels[0])
     panel.set_yticks(range(len(levels[1])), levels[1])
     panel.set_xlabel(factor_title(factors[0]) if factors else "")
-    panel.set_ylabel(factor_title(factors[1]) if len(factors) > 1 else "")
+    panel.set_ylabel(fill(factor_title(factors[1]), 14 + 8 * len(levels[1])) if len(factors) > 1 else "")
     panel.set_title("trials that converged [%]", fontsize=10)
     return figure
 

@@ -9,15 +9,19 @@ from ..files.atomic_write import write_atomically
 
 _FORMATS = ("png", "svg", "pdf")
 DARK, ACCENT, LIGHT = "#1b3a6b", "#d95f02", "0.65"
+# Lines that remain distinct, in grey too.
+LINES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (2, 1)), (0, (4, 1, 1, 1)))
+MARKERS = "os^Dv<>p"
+COLORS = ("#1b3a6b", "#d95f02", "#111111", "#1b7a5a", "#7a3b8f", "#555555", "#a33b3b", "#3a6fb0")
 
 
-def axes_or_new(axes: Any) -> Any:
-    """The given axes, or those of a new figure outside matplotlib's global state."""
+def axes_or_new(axes: Any, size: tuple[float, float] = (6.4, 4.2)) -> Any:
+    """The given axes, or those of a new figure outside matplotlib's global state, its size in inches."""
     if axes is not None:
         return axes
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(6.4, 4.2), layout="constrained").subplots()
+    return Figure(figsize=size, layout="constrained").subplots()
 
 
 def label_axes(axes: Any, x: str, y: str) -> None:

@@ -8,7 +8,7 @@ from ..core.errors import InputError
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
-from .style import ACCENT, DARK, axes_or_new, label_axes
+from .style import ACCENT, DARK, axes_or_new, label_axes, logarithmic
 
 
 def volumetric_uncertainty_map(volume: VolumetricUncertainty, factor: float = 2.0, axes: Any = None) -> Any:
@@ -33,8 +33,9 @@ def volumetric_uncertainty_map(volume: VolumetricUncertainty, factor: float = 2.
     if not np.any(known):
         raise InputError("no length over the volume is determined, so there is no uncertainty to draw.")
     start, expanded = volume.start[known], expanded[known]
-    size = 8 + 60 * (expanded / expanded.max()) ** 2
-    style = {"cmap": "Blues", "vmin": 0, "edgecolors": "0.4", "linewidths": 0.4}
+    low, high = float(expanded.min()), float(expanded.max())
+    size = 8 + 60 * ((expanded - low) / max(high - low, 1e-12)) ** 2
+    style = {"cmap": "Blues", "vmin": low - 0.1 * (high - low), "edgecolors": "0.4", "linewidths": 0.4}
     marks = axes.scatter(np.hypot(start[:, 0], start[:, 1]), start[:, 2], s=size, c=expanded, **style)
     axes.figure.colorbar(marks, ax=axes, label=f"U of a {volume.length:g} mm length [mm]")
     label_axes(axes, "distance from the first axis [mm]", "height [mm]")
@@ -51,7 +52,7 @@ def correlation_matrix(uncertainty: Uncertainty, axes: Any = None) -> Any:
     Returns:
         The axes.
     """
-    axes = axes_or_new(axes)
+    axes = axes_or_new(axes, (6.8, 5.8))
     table, names = np.asarray(uncertainty.correlation), uncertainty.names
     image = axes.imshow(np.abs(table), cmap="Blues", vmin=0, vmax=1)
     axes.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=7)
@@ -81,6 +82,7 @@ def singular_values(observed: Observability, axes: Any = None) -> Any:
     if rank < len(values):
         axes.plot(numbers[rank:], values[rank:], "x", color=ACCENT, label="not determined")
         axes.legend(frameon=False)
-    axes.set_yscale("log")
+    logarithmic(axes)
+    axes.xaxis.get_major_locator().set_params(integer=True)
     label_axes(axes, "number", "singular value")
     return axes

@@ -1,4 +1,5 @@
-"""Reports for laboratories and their customers: one HTML file for a calibration, an evaluation or a study.
+"""Reports for laboratories and their customers: one HTML file for a calibration, an evaluation, a study or
+compared models.
 
 Warnings and tables that the command line shows too are worded in `summaries`; figures for papers are in `plot`.
 """

@@ -1,61 +1,83 @@
-"""The section of administrative data: laboratory, customer, item, persons and dates, and what is not stated of them."""
+"""The administrative data of a report: laboratory, customer, item, persons, dates; and what is not stated of them."""
 
 from ..files.administrative_data import NOT_STATED, AdministrativeData
-from .elements import ReportTable, Section, text_cell
 
-# Part, key and title: shown always, and shown if stated.
-_ALWAYS = (
-    ("laboratory", "name", "Laboratory"),
-    ("customer", "name", "Customer"),
-    ("item", "manufacturer", "Manufacturer of the arm"),
-    ("item", "model", "Model"),
-    ("item", "serial_number", "Serial number"),
-    ("certificate", "number", "Certificate number"),
-    ("certificate", "begin", "Begun on"),
-    ("certificate", "end", "Ended on"),
-)
-_IF_STATED = (
-    ("laboratory", "code", "Accreditation of the laboratory"),
-    ("item", "name", "Arm"),
-    ("item", "customer_number", "Customer's number of the arm"),
-    ("certificate", "received", "Received on"),
-    ("certificate", "issued", "Issued on"),
-    ("certificate", "place", "Place"),
-    ("certificate", "remarks", "Remarks"),
-)
+# Group of rows: part, key, title, and whether it is shown where it is not stated.
+_ROWS: dict[str, tuple[tuple[str, str, str, bool], ...]] = {
+    "Laboratory": (("laboratory", "name", "Name", True), ("laboratory", "code", "Accreditation", False)),
+    "Customer": (("customer", "name", "Name", True),),
+    "Item": (
+        ("item", "name", "Arm", False),
+        ("item", "manufacturer", "Manufacturer", True),
+        ("item", "model", "Model", True),
+        ("item", "serial_number", "Serial number", True),
+        ("item", "customer_number", "Customer's number", False),
+    ),
+    "Calibration": (
+        ("certificate", "number", "Certificate number", True),
+        ("certificate", "received", "Received on", False),
+        ("certificate", "begin", "Begun on", True),
+        ("certificate", "end", "Ended on", True),
+        ("certificate", "issued", "Issued on", False),
+        ("certificate", "place", "Place", False),
+        ("certificate", "remarks", "Remarks", False),
+    ),
+}
 _ADDRESS = ("street", "postal_code", "city", "country", "email", "phone")
 
+Groups = list[tuple[str, list[tuple[str, str]]]]
 
-def administrative_section(given: AdministrativeData, tested: bool) -> Section:
-    """The administrative data of a report; ``tested``: whether the report contains acceptance tests."""
+
+def administrative_groups(given: AdministrativeData, tested: bool) -> Groups:
+    """The administrative data of a report, in the order in which they are read: groups of titles and values.
+
+    Args:
+        given: What was stated.
+        tested: Whether the report contains acceptance tests.
+    """
 
     def stated(part: str, key: str) -> str:
         value = getattr(getattr(given, part), key)
         return "" if value is None else str(value)
 
-    rows = [(title, stated(part, key) or NOT_STATED) for part, key, title in _ALWAYS]
-    for part in ("laboratory", "customer"):
-        address = ", ".join(filter(None, (stated(part, key) for key in _ADDRESS)))
-        rows += [(f"Address of the {part}", address)] if address else []
-    rows += [(title, value) for part, key, title in _IF_STATED if (value := stated(part, key)) and value != "other"]
-    temperature, u = given.certificate.temperature_celsius, given.certificate.temperature_u_celsius
-    words = NOT_STATED if temperature is None else f"{temperature:g} °C" + ("" if u is None else f", u = {u:g} °C")
-    rows.append(("Temperature", words))
-    for person in given.person:
-        parts = (person.name, person.role, "signs the certificate" if person.main_signer else "")
-        rows.append(("Responsible", ", ".join(filter(None, parts))))
-    if not given.person:
-        rows.append(("Responsible", NOT_STATED))
-    for artefact in given.reference:
-        number = artefact.certificate_number and f"certificate {artefact.certificate_number}"
-        parts = (artefact.name, artefact.manufacturer, artefact.model, artefact.serial_number, number)
-        rows.append(("Reference artefact", ", ".join(filter(None, parts))))
-    if not given.reference:
-        rows.append(("Reference artefacts", NOT_STATED))
+    found: Groups = []
+    for group, rows in _ROWS.items():
+        values = [(title, stated(part, key), always) for part, key, title, always in rows]
+        shown = [
+            (title, value or NOT_STATED) for title, value, always in values if always or (value and value != "other")
+        ]
+        if group in ("Laboratory", "Customer"):
+            address = ", ".join(filter(None, (stated(group.lower(), key) for key in _ADDRESS)))
+            shown += [("Address", address)] if address else []
+        found.append((group, shown))
+    found[-1][1].append(("Temperature", _temperature(given)))
+    found.append(("Reference artefacts", _artefacts(given)))
+    found.append(("Responsible", _persons(given)))
     if given.conformity is not None:
         source = "" if tested else " (stated by the laboratory; this file contains no acceptance test)"
         conformity = given.conformity
         words = f"{conformity.verdict}: {conformity.specification}; {conformity.decision_rule}{source}"
-        rows.append(("Statement of conformity", words))
-    table = ReportTable("As stated", ("", ""), [[text_cell(title), text_cell(value)] for title, value in rows])
-    return Section("about", "Laboratory, customer and item", [table])
+        found.append(("Statement of conformity", [("", words)]))
+    return found
+
+
+def _temperature(given: AdministrativeData) -> str:
+    temperature, u = given.certificate.temperature_celsius, given.certificate.temperature_u_celsius
+    return NOT_STATED if temperature is None else f"{temperature:g} °C" + ("" if u is None else f", u = {u:g} °C")
+
+
+def _artefacts(given: AdministrativeData) -> list[tuple[str, str]]:
+    rows = []
+    for artefact in given.reference:
+        number = artefact.certificate_number and f"certificate {artefact.certificate_number}"
+        parts = (artefact.name, artefact.manufacturer, artefact.model, artefact.serial_number, number)
+        rows.append(("", ", ".join(filter(None, parts))))
+    return rows or [("", NOT_STATED)]
+
+
+def _persons(given: AdministrativeData) -> list[tuple[str, str]]:
+    rows = []
+    for person in given.person:
+        parts = (person.name, person.role, "signs the certificate" if person.main_signer else "")
+        rows.append(("", ", ".join(filter(None, parts))))
+    return rows or [("", NOT_STATED)]

@@ -9,9 +9,10 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.pose_residuals import distances_of, observation_residuals
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise
-from ..core.units import ARCSEC, people_read
-from ..summaries.calibration import calibration_summary, prior_sentence
+from ..core.units import DEG, people_read
+from ..summaries.calibration import calibration_summary
 from ..summaries.observations import capture_words
+from ..summaries.tables import decimals_for, two_digits
 from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
 from . import charts
@@ -22,12 +23,12 @@ from .elements import (
     Report,
     ReportTable,
     Section,
-    decimals_for,
     format_number,
     number_cell,
     scientific,
     text_cell,
 )
+from .lengths import length_chart
 from .observations import (
     agreement_tables,
     geometry_section,
@@ -37,7 +38,9 @@ from .observations import (
     residuals_section,
     stages_chart,
 )
+from .patterns import patterns_sections
 from .residuals import length_rows, metrics_table, pose_distances, residual_chart, socket_table, validation_tables
+from .tried import tried_sections
 from .uncertainty import (
     bounds_section,
     correlations_section,
@@ -69,8 +72,10 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
         _scale(record, summary, evaluations, factor),
         _parameters(summary, factor),
         *_residuals(record, summary, evaluations["calibrated"]),
+        *patterns_sections(record),
         Section("arm", "The arm in its poses", [_view(record, evaluations["calibrated"])]),
         volume_section(volume, summary, factor),
+        *tried_sections(record, volume, factor),
         *([] if record.sampled is None else [monte_carlo_section(record)]),
         correlations_section(record, uncertainty),
         observability_section(observability),
@@ -78,16 +83,12 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
     ]
     method = _OBSERVED if record.method == "joint" and capture.observations else _METHODS[record.method]
     robust = f", robust loss {record.robust}" if record.robust else ""
-    verdict, good = record.reason, record.converged and not record.implausible_residual
-    if not good:
-        verdict = "Not to be used" + (": data and arm do not belong together." if record.converged else f". {verdict}")
-    if not record.plausible_scale:
-        verdict = "Not to be used: the reference lengths give the arm a scale that it cannot have."
+    verdict = summary["verdict"]
     report = Report(
         title="Calibration of " + (record.recording.nominal.name or "an arm"),
         subtitle=f"{method}{robust}; {pluralise(summary['poses'], 'pose')} in {capture_words(capture)}",
-        verdict=verdict,
-        verdict_mark="good" if good else "bad",
+        verdict=verdict["says"],
+        verdict_mark=verdict["mark"],
         warnings=summary["warnings"],
         facts=_facts(summary, factor),
         sections=sections,
@@ -121,9 +122,8 @@ def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
     length = f"U of a {volume['length_mm']:g} mm length"
     largest, median = volume["u_length_largest_mm"], volume["u_length_median_mm"]
     if median is not None and largest is not None:
-        facts.append(
-            (f"{length} (95 %)", f"median {_two_digits(factor * median)}, largest {_two_digits(factor * largest)}")
-        )
+        typical, worst = (f"{two_digits(factor * u)}\u00a0mm" for u in (median, largest))
+        facts.append((f"{length} (95 %)", f"median {typical}, largest {worst}"))
     else:
         facts.append((length, "not determined everywhere"))
     if summary["scale_k"] is not None:
@@ -134,21 +134,20 @@ def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
     return facts
 
 
-def _two_digits(expanded: float) -> str:
-    """An uncertainty in mm to two digits, which no line break divides."""
-    return f"{format_number(expanded, decimals_for(expanded))}\u00a0mm"
-
-
 def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     capture = record.recording.capture
     sockets = [[text_cell(name), number_cell(size, 0)] for name, size in zip(capture.names, capture.sizes, strict=True)]
     lengths = [
-        [text_cell(f"{row['from']} – {row['to']}"), number_cell(row["value_mm"]), number_cell(float(length.u))]
+        [
+            text_cell(f"{row['from']} – {row['to']}"),
+            number_cell(row["value_mm"], decimals_for(float(length.u))),
+            number_cell(float(length.u), decimals_for(float(length.u))),
+        ]
         for row, length in zip(summary["lengths"], capture.lengths, strict=True)
     ]
     introduction = (
         f"The poses {'are simulated' if record.recording.true is not None else 'were recorded'}. "
-        f"{len(record.names)} parameters of {capture.joints} joints were identified. "
+        f"{len(record.names)} parameters of {record.recording.nominal.arm.joints} joints were identified. "
         f"Fixed at their nominal values: {', '.join(record.held) or 'none'}."
     )
     if record.hold and record.method == REPEATABILITY:
@@ -196,7 +195,7 @@ def _nominal_and_calibrated(
     if record.observed is not None or record.method == REPEATABILITY:
         del stages["stage1"]  # which is the calibrated arm
     if summary.get("prior"):
-        blocks.append("Prior (standard deviation of each group): " + ". ".join(map(prior_sentence, summary["prior"])))
+        blocks.append(_prior_table(summary["prior"]))
     if record.observed is not None:
         blocks += [*agreement_tables(summary), *other_poses_table(summary)]
     if summary["nominal"]:
@@ -216,11 +215,25 @@ def _nominal_and_calibrated(
             [text_cell(title), *(number_cell(scale * summary["truth"][stage][key]) for stage in stages)]
             for key, title, scale in (
                 ("length_error_largest_mm", "largest error of a length parameter [mm]", 1.0),
-                ("angle_error_largest_rad", "largest error of an angle parameter [arcsec]", 1 / ARCSEC),
+                ("angle_error_largest_rad", "largest error of an angle parameter [deg]", 1 / DEG),
             )
         ]
         blocks.append(ReportTable("Against the true arm of the simulation", ("", *stages.values()), rows))
     return Section("stages", "Nominal and calibrated arm", blocks)
+
+
+def _prior_table(prior: list[dict[str, Any]]) -> ReportTable:
+    """Each group of parameters that has a prior: its standard deviation, and how many parameters the data determine."""
+    rows = []
+    for row in prior:
+        scale, unit = people_read(row["unit"])
+        sd = text_cell("0: not supported by the data, so exact")
+        if row["supported"]:
+            sd = text_cell(f"{row['sd'] * scale:.3g} {unit}".strip())
+        cells = (text_cell(row["group"]), text_cell("learned" if row["learned"] else "given"), sd)
+        rows.append([*cells, number_cell(row["parameters"], 0), number_cell(row["effective_parameters"], 1)])
+    columns = ("group", "prior", "standard deviation", "parameters", "of these determined by the data")
+    return ReportTable("Priors of the parameters, and effective parameters", columns, rows)
 
 
 def _scale(
@@ -261,26 +274,10 @@ def _scale(
     table = ReportTable(
         "Reference lengths [mm]", columns, length_rows(summary["lengths"], factor, before, 0 if single else None)
     )
-    block = table if single else _length_chart(summary["lengths"], errors, two, factor, table)
+    drawn = {"stage 1": errors["stage1"]} if two else {}
+    drawn["calibrated"] = errors["calibrated"]
+    block = table if single else length_chart(summary["lengths"], drawn, factor, table)
     return Section("scale", "Scale and reference lengths", [introduction, block])
-
-
-def _length_chart(
-    lengths: list[dict[str, Any]], errors: dict[str, np.ndarray], two: bool, factor: float, table: ReportTable
-) -> Chart:
-    names = [f"{row['from']} – {row['to']}" for row in lengths]
-    x = list(range(1, len(names) + 1))
-    u = [factor * (row["error_u_mm"] or np.nan) for row in lengths]
-    traces = [charts.markers("calibrated, with U", x, errors["calibrated"], charts.DARK, "square", hover=names, bars=u)]
-    if two:
-        stage1 = charts.markers("stage 1", x, errors["stage1"], charts.WARM, "triangle-up-open", hover=names)
-        traces = [stage1, *traces]
-    shapes = charts.horizontal([0.0], "solid")
-    figure = {"data": traces, "layout": charts.layout("reference length", "measured − value [mm]", shapes=shapes)}
-    if len(names) <= 12 and max(map(len, names)) <= 12:
-        figure["layout"]["xaxis"] |= {"tickvals": x, "ticktext": [charts.escaped(name) for name in names]}
-    description = "Measured minus calibrated value" + (", before and after the scale fix." if two else ".")
-    return Chart("lengths", "Errors of the reference lengths", description, figure, table)
 
 
 def _parameters(summary: dict[str, Any], factor: float) -> Section:
@@ -312,26 +309,34 @@ def _parameters(summary: dict[str, Any], factor: float) -> Section:
 
 
 def _change_chart(unit: str, parameters: list[dict[str, Any]], factor: float) -> Chart:
-    kind, label, scale = ("length", "mm", 1.0) if unit == "mm" else ("angle", "arcsec", 1 / ARCSEC)
+    scale, label = people_read(unit)
+    kind = "length" if unit == "mm" else "angle"
     names = [row["parameter"] for row in parameters]
-    y = [scale * (row["calibrated"] - row["nominal"]) for row in parameters]
-    bars = [np.nan if row["u"] is None else factor * scale * row["u"] for row in parameters]
-    hover = [
-        f"{name}: {format_number(value)} ± {'–' if math.isnan(bar) else format_number(bar)} {label}"
-        for name, value, bar in zip(names, y, bars, strict=True)
-    ]
-    trace = charts.markers("calibrated − nominal, with U", names, y, charts.DARK, "circle", hover=hover, bars=bars)
-    trace["marker"]["symbol"] = ["x-thin" if math.isnan(bar) else "circle" for bar in bars]
-    shapes = charts.horizontal([0.0], "solid")
-    layout = charts.layout("", f"change [{label}]", shapes=shapes, showlegend=False)
-    return Chart(
-        f"change-{unit}",
-        f"Change of {kind} parameters",
-        "Calibrated minus nominal; bars are U (95 %), and smaller than the marker if not visible. Crosses have no U of "
-        "their own.",
-        {"data": [trace], "layout": layout},
-        height=320,
-    )
+    x, change = np.arange(len(names)), scale * np.array([row["calibrated"] - row["nominal"] for row in parameters])
+    expanded = np.array([np.nan if row["u"] is None else factor * scale * row["u"] for row in parameters])
+    known = np.isfinite(expanded)
+    decimals = [decimals_for(bar) if there else 4 for bar, there in zip(expanded.tolist(), known, strict=True)]
+    hover = np.array([
+        f"{name}: {format_number(value, digits, signed=True)} {label}"
+        + (f", U {format_number(bar, digits)} {label}" if there else ", no uncertainty of its own")
+        for name, value, bar, digits, there in zip(
+            names, change.tolist(), expanded.tolist(), decimals, known.tolist(), strict=True
+        )
+    ])  # fmt: skip
+    low, high = (change - expanded)[known], (change + expanded)[known]
+    marks = [charts.Marks("with U (95 %)", x[known], change[known], "dot", "main", hover[known].tolist(), low, high)]
+    # What has no uncertainty of its own has an arbitrary value: within the range of the others it has a cross.
+    axis = charts.linear(f"change [{label}]", *((change[known], low, high) if np.any(known) else (change,)), [0.0])
+    if not np.all(known):
+        at = np.clip(change[~known], axis.low, axis.high)
+        says = "without U of its own: known only together with others, or on a bound"
+        marks.append(charts.Marks(says, x[~known], at, "cross", "accent", hover[~known].tolist()))
+    outside = int(np.sum((change < axis.low) | (change > axis.high)))
+    plot = charts.Plot(charts.names("", names), axis, tuple(marks), horizontal=[0.0], height=260)
+    description = "Calibrated minus nominal; bars are U, and smaller than the mark where none is visible."
+    if outside:
+        description += f" At the edge: {outside} without U, whose values (in the table) lie outside."
+    return Chart(f"change-{unit}", f"Change of {kind} parameters", description, (plot,))
 
 
 def _residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Evaluation) -> list[Section]:

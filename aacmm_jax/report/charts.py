@@ -1,135 +1,143 @@
-"""Charts of a report, as plain dictionaries for Plotly; shapes and shades remain distinct in grey."""
+"""Charts of a report as data: marks of a few symbols and tones on two axes; `chart_svg` draws them.
 
+Symbols and tones remain distinct in grey, and positions along an axis are fractions of it, so that one drawing fits
+every width of a screen and of paper.
+"""
+
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from .elements import escaped
-
-DARK, WARM, LIGHT = "#1b3a6b", "#c8560a", "#9aa3ad"
-_FONT = {"family": "system-ui, sans-serif", "size": 13, "color": "#1a1a1a"}
-
-
-def layout(x: str, y: str, **more: Any) -> dict[str, Any]:
-    """Layout with titled axes and narrow margins, so that it fits a narrow screen."""
-    axis = {
-        "showgrid": True,
-        "gridcolor": "#dde2e8",
-        "zeroline": False,
-        "linecolor": "#555",
-        "ticks": "outside",
-        "automargin": True,
-    }
-    found: dict[str, Any] = {
-        "xaxis": axis | {"title": {"text": x, "standoff": 8}},
-        "yaxis": axis | {"title": {"text": y, "standoff": 6}},
-        "margin": {"l": 10, "r": 10, "t": 36, "b": 10},
-        "legend": {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom", "xanchor": "left"},
-        "font": _FONT,
-        "paper_bgcolor": "#fff",
-        "plot_bgcolor": "#fff",
-        "hovermode": "closest",
-    }
-    for key, value in more.items():
-        found[key] = found[key] | value if isinstance(found.get(key), dict) else value
-    return found
+Symbol = Literal["dot", "square", "diamond", "cross", "line", "dashed", "band", "bars", "boxes"]
+Tone = Literal["main", "accent", "soft", "ink"]
+SHADES = 6  # of a sequential colour scale, from little to much
+_MOST_NAMES = 45  # along an axis; more would overlap
 
 
-def markers(
-    name: str,
-    x: Any,
-    y: Any,
-    color: str,
-    symbol: str,
-    *,
-    hover: Sequence[str] = (),
-    bars: Any = None,
-    size: int = 7,
-    **more: Any,
-) -> dict[str, Any]:
-    """Markers, perhaps with error bars."""
-    trace: dict[str, Any] = {
-        "type": "scatter",
-        "mode": "markers",
-        "name": name,
-        "x": list(x),
-        "y": _numbers(y),
-        "marker": {"color": color, "symbol": symbol, "size": size, "line": {"width": 1, "color": color}},
-    }
-    if len(hover):
-        trace |= {"text": [escaped(line) for line in hover], "hoverinfo": "text"}
-    if bars is not None:
-        trace["error_y"] = {"type": "data", "array": _numbers(bars), "color": color, "thickness": 1.2, "width": 4}
-    return trace | more
+class Marks(NamedTuple):
+    """One series of a chart; numbers that are not finite are left out."""
+
+    name: str  # in the key; empty: not in it
+    x: Sequence[float] | np.ndarray
+    y: Sequence[float] | np.ndarray
+    symbol: Symbol = "dot"
+    tone: Tone = "main"
+    hover: Sequence[str] = ()  # said of each mark under the pointer
+    low: Sequence[float] | np.ndarray | None = None  # ends of bars, or of a band
+    high: Sequence[float] | np.ndarray | None = None
+    size: float = 6.0  # pixels
+    shade: Sequence[int] | np.ndarray | None = None  # of each mark or box, 0 to SHADES - 1, instead of the tone
+    box: tuple[float, float] = (1.0, 0.0)  # width and height of boxes; height 0: from the axis up to y
 
 
-def logarithmic(*values: Any) -> dict[str, Any]:
+class Axis(NamedTuple):
+    """One axis: its range, and the positions that are labelled."""
+
+    title: str
+    low: float
+    high: float
+    ticks: tuple[tuple[float, str], ...]
+    log: bool = False
+    named: bool = False  # the labels are names, not numbers
+
+    @property
+    def slanted(self) -> bool:
+        """Whether names have no room side by side."""
+        return self.named and sum(len(words) + 2 for _, words in self.ticks) > 40
+
+    def at(self, values: Any) -> np.ndarray:
+        """Positions as fractions of the axis; NaN for what has none on a logarithmic one."""
+        values, low, high = np.asarray(values, dtype=float), self.low, self.high
+        if self.log:
+            with np.errstate(invalid="ignore", divide="ignore"):
+                values, low, high = np.log10(np.where(values > 0, values, np.nan)), math.log10(low), math.log10(high)
+        return (values - low) / (high - low)
+
+
+class Plot(NamedTuple):
+    """One pair of axes with everything drawn in it."""
+
+    x: Axis
+    y: Axis
+    marks: tuple[Marks, ...]
+    vertical: Sequence[float] = ()  # thin lines at these abscissas
+    horizontal: Sequence[float] = ()
+    title: str = ""
+    written: Sequence[tuple[float, float, str]] = ()  # characters at positions
+    height: int = 300  # pixels, of the axes
+    square: bool = False  # both axes equally long
+
+
+def linear(title: str, *values: Any, zero: bool = False, margin: float = 0.06) -> Axis:
+    """An axis around values, with round numbers; ``zero``: it begins at 0, for numbers that are not negative."""
+    low, high = _range(values)
+    if low == high:
+        low, high = low - (abs(low) or 1.0) / 2, high + (abs(high) or 1.0) / 2
+    space = margin * (high - low)
+    low, high = (0.0 if zero else low - space), high + space
+    return Axis(title, low, high, round_ticks(low, high))
+
+
+def round_ticks(low: float, high: float, most: int = 6) -> tuple[tuple[float, str], ...]:
+    """At most ``most`` round numbers between two, with as many decimals as they need."""
+    raw = (high - low) / most
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(step for step in (1, 2, 5, 10) if step * power >= raw * (1 - 1e-9)) * power
+    numbers = np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
+    decimals = max(-math.floor(math.log10(step) + 1e-9), 0)
+    if decimals > 5 or abs(high) >= 1e6:
+        return tuple((float(n * step), f"{n * step:g}".replace("-", "−")) for n in numbers)
+    return tuple((float(n * step), f"{n * step:z.{decimals}f}".replace("-", "−")) for n in numbers)
+
+
+def logarithmic(title: str, *values: Any) -> Axis:
     """A logarithmic axis with plain numbers at every decade, and at 2 and 5 if there are few decades."""
-    shown = np.concatenate([np.asarray(part, dtype=float).ravel() for part in values])
+    shown = np.concatenate([np.asarray(part, dtype=float).ravel() for part in values] or [np.zeros(0)])
     shown = shown[np.isfinite(shown) & (shown > 0)]
-    low, high = (float(shown.min()), float(shown.max())) if len(shown) else (0.1, 1.0)
-    first, last = int(np.floor(np.log10(low))), int(np.ceil(np.log10(high)))
+    low, high = (float(shown.min()) / 1.4, float(shown.max()) * 1.4) if len(shown) else (0.1, 1.0)
+    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     steps = (1, 2, 5) if last - first <= 3 else (1,)
-    marks = [step * 10.0**power for power in range(first, last + 1) for step in steps]
-    return {
-        "type": "log",
-        "tickvals": marks,
-        "ticktext": [f"{mark:g}" for mark in marks],
-        "range": [float(np.log10(low / 1.4)), float(np.log10(high * 1.4))],
-    }
+    every = max(1, (last - first) // 6)
+    marks = (step * 10.0**power for power in range(first, last + 1, every) for step in steps)
+    return Axis(title, low, high, tuple((mark, f"{mark:g}") for mark in marks if low <= mark <= high), log=True)
 
 
-def vertical(positions: Sequence[float]) -> list[dict[str, Any]]:
-    """Thin vertical lines over the whole height."""
-    line = {"color": "#777", "width": 1, "dash": "dot"}
-    return [
-        {"type": "line", "xref": "x", "yref": "paper", "x0": x, "x1": x, "y0": 0, "y1": 1, "line": line}
-        for x in positions
-    ]
+def names(title: str, labels: Sequence[str]) -> Axis:
+    """An axis of names at 0, 1, 2, ...; of very many, as many as have room."""
+    every = -(-len(labels) // _MOST_NAMES)
+    ticks = tuple((float(i), label) for i, label in enumerate(labels) if i % max(every, 1) == 0)
+    return Axis(title, -0.6, len(labels) - 0.4, ticks, named=True)
 
 
-def horizontal(positions: Sequence[float], dash: str = "dash") -> list[dict[str, Any]]:
-    """Thin horizontal lines over the whole width."""
-    line = {"color": "#444", "width": 1, "dash": dash}
-    return [
-        {"type": "line", "xref": "paper", "yref": "y", "x0": 0, "x1": 1, "y0": y, "y1": y, "line": line}
-        for y in positions
-    ]
+def shades(values: Any) -> tuple[np.ndarray, tuple[float, ...]]:
+    """The shade of each value, and the limits between them: round numbers that divide the values' range."""
+    values = np.asarray(values, dtype=float)
+    low, high = _range((values,))
+    limits = np.linspace(low, high, SHADES + 1)
+    shade = np.clip(np.digitize(np.nan_to_num(values, nan=low), limits[1:-1]), 0, SHADES - 1)
+    return shade, tuple(float(limit) for limit in limits)
 
 
-def correlation_heatmap(names: Sequence[str], table: np.ndarray) -> list[dict[str, Any]]:
+def correlations(names_: Sequence[str], table: np.ndarray) -> Plot:
     """Correlations: darker is stronger, with the sign written where it is at least 0.5."""
-    strength = np.abs(table)
-    written = [
-        ["" if i == j or strength[i, j] < 0.5 else ("+" if table[i, j] > 0 else "−") for j in range(len(names))]
-        for i in range(len(names))
-    ]
+    strength, count = np.abs(np.asarray(table, dtype=float)), len(names_)
+    rows, columns = np.nonzero(strength > 0.05)
+    shade = np.minimum((strength[rows, columns] * SHADES).astype(int), SHADES - 1)
+    said = strength[rows, columns] >= 0.3
     hover = [
-        [f"{escaped(one)} with {escaped(other)}: {table[i, j]:+.3f}" for j, other in enumerate(names)]
-        for i, one in enumerate(names)
+        f"{names_[i]} with {names_[j]}: {table[i, j]:+.3f}".replace("-", "−") if known and i != j else ""
+        for i, j, known in zip(rows, columns, said, strict=True)
     ]
-    labels = [escaped(name) for name in names]
-    return [
-        {
-            "type": "heatmap",
-            "x": labels,
-            "y": labels,
-            "z": [_numbers(row) for row in strength],
-            "zmin": 0,
-            "zmax": 1,
-            "colorscale": [[0, "#ffffff"], [0.5, "#b9c4d6"], [1, "#1b3a6b"]],
-            "text": written,
-            "texttemplate": "%{text}",
-            "customdata": hover,
-            "hovertemplate": "%{customdata}<extra></extra>",
-            "colorbar": {"title": {"text": "|r|"}, "thickness": 12, "len": 0.8},
-            "xgap": 1,
-            "ygap": 1,
-        }
-    ]
+    boxes = Marks("", columns, rows, "boxes", hover=hover, shade=shade, box=(1.0, 1.0))
+    signs = [(float(j), float(i), "+" if table[i, j] > 0 else "−") for i, j in np.argwhere(strength >= 0.5) if i != j]
+    x = names("", names_)
+    y = Axis("", count - 0.5, -0.5, x.ticks, named=True)
+    return Plot(x._replace(low=-0.5, high=count - 0.5), y, (boxes,), written=signs, height=560, square=True)
 
 
-def _numbers(values: Any) -> list[float | None]:
-    """Numbers for JSON, which has no infinity."""
-    return [float(f"{value:.7g}") if np.isfinite(value) else None for value in np.asarray(values, dtype=float)]
+def _range(values: Sequence[Any]) -> tuple[float, float]:
+    shown = np.concatenate([np.asarray(part, dtype=float).ravel() for part in values] or [np.zeros(0)])
+    shown = shown[np.isfinite(shown)]
+    return (float(shown.min()), float(shown.max())) if len(shown) else (0.0, 1.0)

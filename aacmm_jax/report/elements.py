@@ -1,8 +1,10 @@
 """The elements of a report, independent of how they are shown: sections of text, tables, charts and views."""
 
-import html
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
+
+from .charts import Plot
 
 _ZERO = 1e-9  # mm: smaller numbers are rounding errors
 
@@ -21,6 +23,7 @@ class ReportTable(NamedTuple):
     caption: str
     columns: tuple[str, ...]
     rows: list[list[Cell]]
+    folded: bool = False  # shown on demand only, and not printed
 
     @property
     def numeric(self) -> list[bool]:
@@ -29,15 +32,16 @@ class ReportTable(NamedTuple):
 
 
 class Chart(NamedTuple):
-    """A figure for Plotly (traces and layout as plain dictionaries), a description, and the table of its numbers."""
+    """One or several plots side by side, a description, and the table of their numbers."""
 
     id: str
     title: str
     description: str
-    figure: dict[str, Any]
+    plots: tuple[Plot, ...]
     table: ReportTable | None = None
-    height: int = 380
     printed: bool = False  # whether the table is printed on paper as well
+    shade_limits: tuple[float, ...] = ()  # of a sequential scale, for its key
+    shade_unit: str = ""
 
 
 class ArmView(NamedTuple):
@@ -67,6 +71,7 @@ class Report(NamedTuple):
     warnings: list[str]
     facts: list[tuple[str, str]]
     sections: list[Section]
+    administrative: Sequence[tuple[str, list[tuple[str, str]]]] = ()  # groups of titles and values
 
 
 def text_cell(value: object, mark: str = "") -> Cell:
@@ -94,15 +99,3 @@ def format_number(value: float, decimals: int = 4, *, signed: bool = False) -> s
 def scientific(value: float) -> str:
     """A number with two digits in powers of ten, which no line break divides."""
     return f"{value:.1e}".replace("-", "−")
-
-
-def decimals_for(u: float | None, default: int = 4) -> int:
-    """Decimals that show two digits of an uncertainty."""
-    if u is None or not math.isfinite(u) or u <= 0:
-        return default
-    return min(max(1 - math.floor(math.log10(u)), 0), 9)
-
-
-def escaped(value: object) -> str:
-    """Text for Plotly, which interprets some tags: names appear as they are."""
-    return html.escape(str(value), quote=False)

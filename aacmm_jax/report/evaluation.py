@@ -5,10 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.decision import worst
 from ..acceptance.record import EvaluationRecord, PointsRecord
 from ..acceptance.results import METRICS, AcceptanceTest, Metric
-from ..acceptance.standards import EDITIONS
 from ..calibration.evaluation import Evaluation, evaluate
 from ..core.text import pluralise
 from ..data.capture import Capture, ReferenceLength
@@ -16,9 +14,11 @@ from ..data.sphere import ProbedSphere
 from ..kinematics.arm import Arm
 from ..summaries.evaluation import evaluation_summary, points_summary
 from ..summaries.observations import capture_words
+from ..summaries.tables import decimals_for
 from . import charts
 from .arm_view import view_of_arm
 from .elements import ArmView, Cell, Chart, Report, ReportTable, Section, format_number, number_cell, text_cell
+from .lengths import by_placement
 from .residuals import length_rows, metrics_table, pose_distances, residual_chart, socket_table
 
 _MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}
@@ -33,7 +33,7 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
     summary = evaluation_summary(record, tests)
     evaluations = {stage: evaluate(arm.arm, capture) for stage, arm in record.arms().items()}
     calibrated = evaluations["calibrated"]
-    verdict, mark = _verdict(summary)
+    verdict = summary["verdict"]
     residuals = residual_chart(
         "residuals", "Residuals of the calibrated arm", capture, {"calibrated": calibrated}, mark=True
     )
@@ -42,9 +42,13 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
         title="Evaluation of " + (record.recording.nominal.name or "an arm"),
         subtitle=f"{pluralise(len(capture.readings), 'pose')} in {capture_words(capture)}"
         + (f", {pluralise(tested, 'touched sphere')}" if (tested := len(record.recording.spheres)) else ""),
-        verdict=verdict,
-        verdict_mark=mark,
-        warnings=summary["warnings"] + [f"Over the limit: {sentence}" for sentence in summary["failed"]],
+        verdict=verdict["says"],
+        verdict_mark=verdict["mark"],
+        warnings=[
+            *summary["warnings"],
+            *(f"Over the limit: {sentence}" for sentence in summary["failed"]),
+            *(f"Of the calibration: {sentence}" for sentence in record.calibration_warnings),
+        ],
         facts=_facts(summary),
         sections=[
             _acceptance_section(tests["calibrated"], summary, capture.lengths, record.recording.spheres),
@@ -93,7 +97,7 @@ def points_report(record: PointsRecord) -> tuple[Report, dict[str, Any]]:
     """The report of an evaluation of points, and the summary that it was made from."""
     tests, measured = record.acceptance(), record.measured
     summary = points_summary(record, tests)
-    verdict, mark = _verdict(summary)
+    verdict = summary["verdict"]
     chart = _length_chart(tests)
     sections = [
         _acceptance_section(tests, summary, measured.lengths, measured.spheres),
@@ -103,29 +107,8 @@ def points_report(record: PointsRecord) -> tuple[Report, dict[str, Any]]:
         f"{pluralise(summary['points'], 'point')} as recorded: {pluralise(summary['sockets'], 'socket')}, "
         f"{pluralise(summary['lengths'], 'length')}, {pluralise(summary['spheres'], 'sphere')}"
     )
-    report = Report("Acceptance test of points", subtitle, verdict, mark, summary["warnings"], [], sections)
-    return report, summary
-
-
-def overall_decision(summary: dict[str, Any]) -> str | None:
-    """The decision on all limits together: "fails", "undecided" or "conforms"; None without limits."""
-    decisions = [
-        metric["decision"] for test in summary["acceptance"] for metric in test["figures"] if metric["decision"]
-    ]
-    return "fails" if summary["failed"] else worst(decisions) or ("conforms" if summary["kept"] else None)
-
-
-def _verdict(summary: dict[str, Any]) -> tuple[str, str]:
-    decision = overall_decision(summary)
-    if decision == "fails":
-        return "A limit is not kept", "bad"
-    if decision == "undecided":
-        return "Undecided: the measurement is too uncertain for a limit", "unsure"
-    if decision == "conforms":
-        incomplete = any(test["missing"] for test in summary["acceptance"] if test["decision"])
-        verdict = "Every limit is kept" + ("; a procedure was not complete" if incomplete else "")
-        return verdict, "unsure" if incomplete or summary["warnings"] else "good"
-    return "Measured; no limit was given", "neutral"
+    title = "Acceptance test of points"
+    return Report(title, subtitle, verdict["says"], verdict["mark"], summary["warnings"], [], sections), summary
 
 
 def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
@@ -139,7 +122,8 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
         by_construction = group and key.startswith("length") and summary[group]["fixed_by_one_length"]
         if group and key in summary[group]["calibrated"] and not by_construction:
             values = " → ".join(format_number(summary[group][stage][key]) for stage in _STAGES)
-            facts.append((f"{name}, {title[0].lower()}{title[1:]}, nominal → calibrated", f"{values}\u00a0mm"))
+            what = f"{title}: {name}, nominal → calibrated"
+            facts.append((what, f"{values}\u00a0mm"))
     return facts
 
 
@@ -169,26 +153,26 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
     blocks: list = [
         "Every metric is of single readings. U, with coverage factor 2, is what the tester contributes: the artefacts' "
         f"uncertainty; {stated}. The arm's own scatter is what is tested (ISO 14253-5). What standards allow about "
-        "repeating a reading is not applied, and the distribution of positions and directions is not checked. "
-        "Procedures and formulas follow secondary sources of the editions named.",
+        "repeating a reading is not applied. A test that lacks something its standard requires is called 'after' it. "
+        "Requirements and formulas follow secondary sources of the editions named.",
     ]
     limited = any(metric["limit_mm"] is not None for test in rows for metric in test["figures"])
     if limited:
-        blocks.append(
-            "A metric conforms if |value| ≤ MPE − U, fails if |value| ≥ MPE + U, and is undecided in between (ISO "
-            "14253-1, with U as guard band as in its editions up to 2013)."
-        )
+        used = dict.fromkeys(f"{test['standard']}: {test['rule']}" for test in rows if test["decision"])
+        blocks.append(f"Decision rules: {'; '.join(used)}. What no rule decides is undecided.")
     before = any(metric["as_found_mm"] is not None for test in rows for metric in test["figures"])
     if before:
         blocks.append("As found is the nominal arm, as left the calibrated one.")
     for test in rows:
         blocks.append(_test_table(test, before, limited))
         if test["missing"]:
-            blocks.append(f"This was not the full procedure; it also needs {'; '.join(test['missing'])}.")
+            blocks.append(f"This was not the full procedure. {' '.join(test['missing'])}")
     parts = [
         [
             *(text_cell(word) for word in (test.standard, metric.name, part.where)),
-            *(number_cell(part.value), _expanded(part.expanded), number_cell(part.limit)),
+            number_cell(part.value, decimals_for(part.expanded)),
+            _expanded(part.expanded),
+            number_cell(part.limit),
             text_cell(part.decision or "–", _MARKS[part.decision]),
         ]
         for test in tests
@@ -203,27 +187,26 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
 
 def _test_table(test: dict[str, Any], before: bool, limited: bool) -> ReportTable:
     """One acceptance test; ``before``: with columns of the arm as found; ``limited``: with limits and decisions."""
-    columns = ["metric", "what it is"]
-    if before:
-        columns += ["as found", *(["decision as found"] if limited else [])]
-    columns += ["as left" if before else "value", "U"]
-    columns += ["MPE", "decision as left" if before else "decision"] if limited else []
+    columns = ["metric", *(["decision as left" if before else "decision"] if limited else [])]
+    columns += ["as left" if before else "value", "U", *(["MPE"] if limited else [])]
+    columns += ["as found", *(["decision as found"] if limited else [])] if before else []
     rows = []
     for metric in test["figures"]:
-        row = [text_cell(metric["name"]), text_cell(METRICS[metric["name"]])]
+        row, decimals = [text_cell(metric["symbol"])], decimals_for(metric["expanded_mm"])
+        row += [_decision(metric["decision"], metric["failing"], len(metric["parts"]))] if limited else []
+        row += [number_cell(metric["value_mm"], decimals), _expanded(metric["expanded_mm"])]
+        row += [number_cell(metric["limit_mm"])] if limited else []
         if before:
-            row += [number_cell(metric["as_found_mm"]), *([_decision(metric["as_found_decision"])] if limited else [])]
-        row += [number_cell(metric["value_mm"]), _expanded(metric["expanded_mm"])]
-        if limited:
-            decision = _decision(metric["decision"], metric["failing"], len(metric["parts"]))
-            row += [number_cell(metric["limit_mm"]), decision]
-        rows.append([*row, text_cell(metric["where"])])
-    return ReportTable(f"{EDITIONS[test['standard']]}: {test['title']} [mm]", (*columns, "worst at"), rows)
+            row.append(number_cell(metric["as_found_mm"], decimals))
+            row += [_decision(metric["as_found_decision"])] if limited else []
+        rows.append([*row, text_cell(metric["where"]), text_cell(METRICS[metric["name"]])])
+    caption = f"{test['called']}: {test['title']} [mm]"
+    return ReportTable(caption, (*columns, "worst at", "what it is"), rows)
 
 
 def _expanded(value: float) -> Cell:
     """U, or that nothing was stated to compute it from."""
-    return number_cell(value) if value > 0 else text_cell("not stated")
+    return number_cell(value, decimals_for(value)) if value > 0 else text_cell("not stated")
 
 
 def _decision(decision: Any, failing: int = 0, of: int = 1) -> Cell:
@@ -239,8 +222,8 @@ def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSpher
     rows = [
         [
             text_cell("length"),
-            number_cell(value),
-            number_cell(u),
+            number_cell(value, decimals_for(u)),
+            number_cell(u, decimals_for(u)),
             text_cell(f"in {count} position{'' if count == 1 else 's'}"),
         ]
         for (value, u), count in sorted(bars.items())
@@ -249,7 +232,8 @@ def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSpher
         name = f"sphere '{sphere.name}' for {sphere.test.replace('-', ' ')}"
         touches = "+".join(str(len(group)) for group in sphere.groups)
         use = f"touched {touches} times by a ball of {sphere.stylus:g} mm; form error {format_number(sphere.form)} mm"
-        rows.append([text_cell(name), number_cell(sphere.diameter), number_cell(sphere.u), text_cell(use)])
+        numbers = (number_cell(value, decimals_for(sphere.u)) for value in (sphere.diameter, sphere.u))
+        rows.append([text_cell(name), *numbers, text_cell(use)])
     return [ReportTable("Artefacts", ("artefact", "calibrated value [mm]", "u [mm]", "used"), rows)] if rows else []
 
 
@@ -258,7 +242,7 @@ def _metrics_chart(tests: list[AcceptanceTest]) -> Chart:
     metrics = [metric for test in tests for metric in test.metrics]
     limited = [metric for metric in metrics if metric.worst.limit is not None]
     if limited:
-        metrics, y, shapes = limited, "|value| / MPE", charts.horizontal([1.0], "solid")
+        metrics, y, lines = limited, "|value| / MPE", [1.0]
         least = 1e-6  # mm: drawn for a limit of zero
         divisors = [max(metric.worst.limit or 0.0, least) for metric in metrics]
         title = "Metrics against their limits"
@@ -266,17 +250,20 @@ def _metrics_chart(tests: list[AcceptanceTest]) -> Chart:
             "The value of each metric, divided by its limit, with U: it conforms if the whole bar lies below 1."
         )
     else:
-        y, shapes, divisors = "|value| [mm]", [], [1.0] * len(metrics)
+        y, lines, divisors = "|value| [mm]", [], [1.0] * len(metrics)
         title, description = "Metrics", "The value of each metric, with U. No limit was given."
-    values = [abs(metric.value) / divisor for metric, divisor in zip(metrics, divisors, strict=True)]
-    bars = [metric.worst.expanded / divisor for metric, divisor in zip(metrics, divisors, strict=True)]
+    values = np.array([abs(metric.value) / divisor for metric, divisor in zip(metrics, divisors, strict=True)])
+    bars = np.array([metric.worst.expanded / divisor for metric, divisor in zip(metrics, divisors, strict=True)])
     hover = [f"{metric.name}: {format_number(metric.value)} mm at {metric.worst.where}" for metric in metrics]
-    names = [metric.name for metric in metrics]
-    trace = charts.markers("as left", names, values, charts.DARK, "square", hover=hover, bars=bars)
     # An absolute value is not negative, so a bar that is longer than its value ends at 0.
-    top = 1.05 * max([value + bar for value, bar in zip(values, bars, strict=True)] + [1.0 if limited else 0.0])
-    layout = charts.layout("", y, shapes=shapes, showlegend=False, yaxis={"range": [0.0, top]})
-    return Chart("margins", title, description, {"data": [trace], "layout": layout}, height=320)
+    low = np.maximum(values - bars, 0.0)
+    x = np.arange(len(metrics))
+    marks = charts.Marks("as left", x, values, "square", "main", hover, low, values + bars, size=8)
+    axes = (
+        charts.names("", [metric.name for metric in metrics]),
+        charts.linear(y, values + bars, lines, [0.0], zero=True),
+    )
+    return Chart("margins", title, description, (charts.Plot(*axes, (marks,), horizontal=lines, height=240),))
 
 
 def _nominal_and_calibrated(
@@ -330,29 +317,27 @@ def _lengths(
 
 
 def _length_chart(tests: list[AcceptanceTest]) -> Chart | None:
-    """Errors of single readings of lengths (E_Uni), and their limits."""
+    """Errors of single readings of lengths (E_Uni), placement by placement, and their limits."""
     metric: Metric | None = next((m for test in tests for m in test.metrics if m.name == "E_Uni"), None)
     if metric is None:
         return None
-    lengths = [part.length or 0.0 for part in metric.values]
-    x_title = "length [mm]"
-    if max(lengths) - min(lengths) < 0.01 * max(lengths):  # of one nominal length, which would be one vertical line
-        x_title = f"reading of a length of {np.mean(lengths):g} mm"
-        lengths = [float(i + 1) for i in range(len(lengths))]
-    hover = [f"{part.where}: {format_number(part.value, signed=True)} mm" for part in metric.values]
-    style = {"hover": hover, "bars": [part.expanded for part in metric.values], "size": 5}
-    values = [part.value for part in metric.values]
-    traces = [charts.markers("single readings, with U", lengths, values, charts.DARK, "circle", **style)]
-    pairs = zip(lengths, metric.values, strict=True)
-    limits = sorted((length, part.limit) for length, part in pairs if part.limit is not None)
-    if limits:
-        x, y = [length for length, _ in limits], np.array([limit for _, limit in limits])
-        line = {"mode": "lines", "line": {"color": "#444", "dash": "dash", "width": 1.5}}
-        traces += [
-            charts.markers("MPE", x, y, "#444", "circle", **line),
-            charts.markers("MPE", x, -y, "#444", "circle", showlegend=False, **line),
-        ]
-    layout = charts.layout(x_title, "measured − value [mm]", shapes=charts.horizontal([0.0], "dot"))
+    ends = [part.where.partition(", reading ")[0].split(" - ", 1) for part in metric.values]
+    x, axis, borders = by_placement([(one[0], one[-1]) for one in ends])
+    values, bars = (np.array([getattr(part, name) for part in metric.values]) for name in ("value", "expanded"))
+    hover = [
+        f"{part.where}: {format_number(part.value, signed=True)} mm; length {part.length:g} mm"
+        + (f", MPE {format_number(part.limit)} mm" if part.limit is not None else "")
+        for part in metric.values
+    ]
+    says = "single readings" + (", with U" if np.any(bars > 0) else "")
+    marks = [charts.Marks(says, x, values, "dot", "main", hover, values - bars, values + bars, size=5)]
+    limits = np.array([np.nan if part.limit is None else part.limit for part in metric.values])
+    if np.any(np.isfinite(limits)):
+        order = np.argsort(x)
+        for side, name in ((1, "MPE"), (-1, "MPE")):
+            marks.append(charts.Marks(name, x[order], side * limits[order], "dashed", "ink"))
+    axis_of_errors = charts.linear("measured − value [mm]", values - bars, values + bars, limits, -limits, [0.0])
     description = "Errors of the reference lengths, reading by reading, by the calibrated arm"
-    description += ", and their limits." if limits else "."
-    return Chart("length-errors", "Errors of lengths", description, {"data": traces, "layout": layout})
+    description += ", and their limits." if len(marks) > 1 else "."
+    plot = charts.Plot(axis, axis_of_errors, tuple(marks), borders, [0.0])
+    return Chart("length-errors", "Errors of lengths", description, (plot,))

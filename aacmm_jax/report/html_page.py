@@ -13,20 +13,21 @@ from ..files.atomic_write import write_text
 from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
-from .administrative_data import administrative_section
+from .administrative_data import administrative_groups
+from .chart_svg import drawn, key, points, shade_key
 from .elements import ArmView, Chart, Report, ReportTable
 
-KINDS = ("calibration", "evaluation", "study")
+KINDS = ("calibration", "evaluation", "study", "model comparison")
 _FOLDER = Path(__file__).parent
 
 
 def write_report(
     source: str | os.PathLike, target: str | os.PathLike, administrative_data: AdministrativeData | None = None
 ) -> dict[str, Any]:
-    """Write the report of a calibration, an evaluation or a study as one HTML file.
+    """Write the report of a calibration, an evaluation, a study or compared models as one HTML file.
 
     Args:
-        source: The HDF5 file of the calibration, the evaluation or the study.
+        source: The HDF5 file of the calibration, the evaluation, the study or the compared models.
         target: The HTML file to write, whole or not at all.
         administrative_data: Laboratory, customer, item, persons, dates and artefacts, shown in a section of their own.
 
@@ -53,8 +54,7 @@ def _written(source: Path, target: Path, administrative_data: AdministrativeData
     if administrative_data is not None:
         tested = kind == "evaluation"
         check_conformity(administrative_data, simulated=simulated, decision=decision, tested=tested)
-        section = administrative_section(administrative_data, tested)
-        report = report._replace(sections=[section, *report.sections])
+        report = report._replace(administrative=administrative_groups(administrative_data, tested))
     page = _render(report, _origin(read, stored.attributes))
     write_text(target, page)
     return {
@@ -77,7 +77,8 @@ def _calibration(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple
 
 
 def _evaluation(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
-    from .evaluation import evaluation_report, overall_decision, points_report
+    from ..summaries.verdicts import overall_decision
+    from .evaluation import evaluation_report, points_report
 
     if attributes.get("of") == "points":
         from ..files.evaluations import load_points
@@ -89,6 +90,13 @@ def _evaluation(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[
     record = load_evaluation(source)
     report, summary = evaluation_report(record)
     return report, record.recording.true is not None, overall_decision(summary)
+
+
+def _models(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+    from ..files.compared_models import load_compared_models
+    from .models import models_report
+
+    return models_report(load_compared_models(source)), False, None
 
 
 def _study(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
@@ -103,6 +111,7 @@ _REPORTS: dict[str, Callable[[str | os.PathLike, dict[str, Any]], tuple[Report, 
     "calibration": _calibration,
     "evaluation": _evaluation,
     "study": _study,
+    "model comparison": _models,
 }
 
 
@@ -123,7 +132,6 @@ def _origin(source: str | os.PathLike, attributes: dict[str, Any]) -> list[tuple
 def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
     """The HTML of a report. Jinja escapes texts given by people, and only the page's own scripts run."""
     import jinja2
-    from plotly.offline import get_plotlyjs
 
     def read(name: str) -> str:
         return (_FOLDER / name).read_text(encoding="utf-8")
@@ -131,7 +139,7 @@ def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
     template = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     ).from_string(read("page_template.html"))
-    scripts = [get_plotlyjs(), read("page_script.js")]
+    script = read("page_script.js")
     blocks = [block for section in report.sections for block in section.blocks]
     return template.render(
         report=report,
@@ -139,13 +147,21 @@ def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
         is_chart=lambda block: isinstance(block, Chart),
         is_table=lambda block: isinstance(block, ReportTable),
         is_arm_view=lambda block: isinstance(block, ArmView),
-        charts={block.id: block.figure for block in blocks if isinstance(block, Chart)},
+        plots=lambda chart: [drawn(plot, f"chart-{chart.id}") for plot in chart.plots],
+        keys=_key,
+        points={block.id: [points(plot) for plot in block.plots] for block in blocks if isinstance(block, Chart)},
         scenes={block.id: block.data for block in blocks if isinstance(block, ArmView)},
         style=read("page_style.css"),
-        scripts=scripts,
+        script=script,
         mark=hashlib.sha256(repr(origin).encode()).hexdigest()[:12],
-        hashes=[_script_hash(script) for script in scripts],
+        allowed=_script_hash(script),
     )
+
+
+def _key(chart: Chart) -> list[tuple[str, str]]:
+    if not chart.shade_limits:
+        return key(chart.plots)
+    return [*shade_key(chart.shade_limits, chart.shade_unit), *key(chart.plots, least=1)]
 
 
 def _script_hash(script: str) -> str:

@@ -117,7 +117,7 @@ def stages_chart(record: CalibrationRecord, nominal: tuple[np.ndarray, ...]) -> 
     left = [one.distance for one in observation_residuals(record)]
     residuals = {"nominal": np.concatenate(nominal), "calibrated": np.concatenate(left)}
     title = "Distance of every pose from its geometry"
-    return pose_chart("stages", title, Groups.of(record.recording.capture), residuals)
+    return pose_chart("stages", title, Groups.of(record.recording.capture), residuals)._replace(table=None)
 
 
 def other_poses_table(summary: dict[str, Any]) -> list[ReportTable]:

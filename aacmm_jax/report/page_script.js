@@ -2,25 +2,39 @@
 (() => {
   const parsed = (id) => JSON.parse(document.getElementById(id).textContent);
 
-  // Charts: drawn by Plotly, and again as a picture of fixed width for paper.
-  const charts = parsed("charts");
-  const narrow = () => document.documentElement.clientWidth < 600;
-  async function draw(container) {
-    const { data, layout } = charts[container.dataset.chart];
-    const config = { responsive: true, displaylogo: false, displayModeBar: narrow() ? false : "hover",
-      modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
-    const size = narrow() ? 11 : 13;
-    await Plotly.newPlot(container, data, { ...layout, autosize: true, font: { ...layout.font, size } }, config);
-    const height = Math.round(container.clientHeight);
-    const image = { format: "svg", width: 700, height };
-    const url = await Plotly.toImage({ data, layout: { ...layout, autosize: false } }, image);
-    const picture = new Image();
-    picture.className = "paper";
-    picture.alt = container.getAttribute("aria-label");
-    picture.src = url;
-    container.append(picture);
-    await picture.decode().catch(() => {});
-    container.dataset.drawn = "yes";
+  // What is said of the mark nearest to the pointer: positions are in thousandths of the axes.
+  const points = parsed("points"), near = 24; // pixels
+  const tip = document.createElement("div"), ring = document.createElement("div");
+  tip.className = "tip";
+  ring.className = "ring";
+  for (const one of [tip, ring]) one.setAttribute("aria-hidden", "true");
+  const hide = () => { tip.remove(); ring.remove(); };
+  for (const container of document.querySelectorAll("[data-chart]")) {
+    container.querySelectorAll(".axes").forEach((axes, number) => {
+      const known = points[container.dataset.chart][number], svg = axes.querySelector("svg");
+      if (!known.length) return;
+      function show(event) {
+        const box = svg.getBoundingClientRect(), outer = axes.getBoundingClientRect();
+        const x = event.clientX - box.left, y = event.clientY - box.top;
+        let best = null, least = near;
+        for (const [a, b, words] of known) {
+          const distance = Math.hypot((a / 1000) * box.width - x, (b / 1000) * box.height - y);
+          if (distance < least) [best, least] = [[a, b, words], distance];
+        }
+        if (!best) { hide(); return; }
+        const left = box.left - outer.left + (best[0] / 1000) * box.width;
+        const top = box.top - outer.top + (best[1] / 1000) * box.height;
+        tip.textContent = best[2];
+        axes.append(ring, tip);
+        Object.assign(ring.style, { left: `${left}px`, top: `${top}px` });
+        const most = outer.width - tip.offsetWidth;
+        tip.style.left = `${Math.max(0, Math.min(left + 10, most))}px`;
+        tip.style.top = `${top > tip.offsetHeight + 14 ? top - tip.offsetHeight - 10 : top + 14}px`;
+      }
+      axes.addEventListener("pointermove", show);
+      axes.addEventListener("pointerdown", show);
+      axes.addEventListener("pointerleave", hide);
+    });
   }
 
   // Lists of files and the tables of parts are collapsed on the screen and open on paper.
@@ -28,6 +42,30 @@
   let opened = [];
   window.addEventListener("beforeprint", () => { opened = folded(); for (const one of opened) one.open = true; });
   window.addEventListener("afterprint", () => { for (const one of opened) one.open = false; });
+
+  // A table that is scrolled is a Tab stop; its headings are one more, and the arrow keys go from one to the next.
+  const scrolled = new ResizeObserver((entries) => {
+    for (const { target } of entries) {
+      const over = target.scrollWidth > target.clientWidth + 1 || target.scrollHeight > target.clientHeight + 1;
+      if (over) target.tabIndex = 0; else target.removeAttribute("tabindex");
+    }
+  });
+  for (const region of document.querySelectorAll(".wide")) scrolled.observe(region);
+  for (const heading of document.querySelectorAll("thead")) {
+    const buttons = [...heading.querySelectorAll("button.sort")];
+    buttons.forEach((button, i) => {
+      button.tabIndex = i ? -1 : 0;
+      button.addEventListener("keydown", (event) => {
+        const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+        const next = step && buttons[i + step];
+        if (!next) return;
+        event.preventDefault();
+        button.tabIndex = -1;
+        next.tabIndex = 0;
+        next.focus();
+      });
+    });
+  }
 
   // Tables: a click on a heading sorts by its column, a second click in reverse.
   for (const button of document.querySelectorAll("button.sort")) {
@@ -60,6 +98,8 @@
     const { marks, from, poses, reach } = parsed("scenes")[container.dataset.scene];
     const view = { turn: -0.9, tilt: 0.45, size: 1, pose: 0 };
     const svg = document.createElementNS(SVG, "svg");
+    svg.setAttribute("role", "img");
+    svg.setAttribute("aria-label", container.getAttribute("aria-label"));
     container.append(svg);
     const all = [[0, 0, 0], ...marks.map((mark) => mark.at), ...poses.flatMap((p) => p.points)];
     const middle = [0, 1, 2].map((i) => (Math.min(...all.map((p) => p[i])) + Math.max(...all.map((p) => p[i]))) / 2);
@@ -90,45 +130,55 @@
       for (const fraction of [0.25, 0.5, 0.75, 1]) {
         const angles = Array.from({ length: 73 }, (_, i) => (i * Math.PI) / 36);
         const ring = angles.map((angle) => [fraction * reach * Math.cos(angle), fraction * reach * Math.sin(angle), 0]);
-        add("polyline", { points: path(ring), fill: "none", stroke: "#d5dae0", "stroke-width": 1 });
+        add("polyline", { points: path(ring), class: "ring-line" });
       }
       for (const [axis, name] of [[[1, 0, 0], "x"], [[0, 1, 0], "y"], [[0, 0, 1], "z"]]) {
         const end = axis.map((v) => v * 0.3 * reach);
         const points = path([[0, 0, 0], end]);
-        add("polyline", { points, stroke: "#333", "stroke-width": 1.5, "stroke-dasharray": "5 3" });
+        add("polyline", { points, class: "base-axis" });
         const [x, y] = project(axis.map((v) => v * 0.34 * reach));
-        add("text", { x, y, "font-size": 13, "font-style": "italic", "text-anchor": "middle" }, name);
+        add("text", { x, y, class: "base-name" }, name);
       }
       for (const pose of shadows) {
-        add("polyline", { points: path(pose.points), fill: "none", stroke: "#9aa3ad", "stroke-width": 1,
-          "stroke-opacity": 0.55, "stroke-linejoin": "round" });
+        add("polyline", { points: path(pose.points), class: "other-pose" });
       }
       const now = poses[view.pose];
-      add("polyline", { points: path(now.points), fill: "none", stroke: "#1b3a6b", "stroke-width": 5,
-        "stroke-linejoin": "round", "stroke-linecap": "round" });
+      add("polyline", { points: path(now.points), class: "this-pose" });
       for (const point of now.points) {
         const [cx, cy] = project(point);
-        add("circle", { cx, cy, r: 4, fill: "#fff", stroke: "#1b3a6b", "stroke-width": 2 });
+        add("circle", { cx, cy, r: 4, class: "joint" });
       }
-      // From the lowest mark upwards: a label that would cover an earlier one moves up and is joined to its mark.
-      const labelled = marks.length <= 30, labels = [], line = 15;
-      const projected = marks.map(({ name, at }) => [name, ...project(at)]).sort((one, other) => other[2] - one[2]);
-      for (const [name, x, y] of projected) {
-        add("path", { d: `M${x - 6},${y}h12M${x},${y - 6}v12`, stroke: "#c8560a", "stroke-width": 2.5 });
-        if (!labelled) continue;
-        const style = { "font-size": 13, fill: "#7a3400", stroke: "#fff", "stroke-width": 3, "paint-order": "stroke" };
-        const text = add("text", { x: x + 9, y: y - 7, ...style }, name);
-        const left = x + 9, right = left + text.getComputedTextLength();
-        let height = y - 7;
-        const covers = (label) => Math.abs(label.height - height) < line && label.left < right && left < label.right;
-        while (labels.some(covers)) height -= line;
-        labels.push({ left, right, height });
-        text.setAttribute("y", height);
-        if (height < y - 7) add("path", { d: `M${x},${y}L${left},${height}`, stroke: "#7a3400", "stroke-width": 0.7 });
-      }
+      label(marks.map(({ name, at }) => [name, ...project(at)]), width, height);
       container.dataset.turn = view.turn.toFixed(3);
       container.dataset.tilt = view.tilt.toFixed(3);
       container.dataset.drawn = "yes";
+    }
+    // Names beside their marks, from the top down, each in the first free place around its mark; where there is none, the
+    // mark has no name but is drawn.
+    function label(projected, width, height) {
+      const taken = projected.map(([, x, y]) => [x - 7, y - 7, x + 7, y + 7]), line = 16;
+      const free = (box) => box[0] >= 2 && box[1] >= 2 && box[2] <= width - 2 && box[3] <= height - 2 &&
+        !taken.some((other) => box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3]);
+      for (const [name, x, y] of [...projected].sort((one, other) => one[2] - other[2])) {
+        add("path", { d: `M${x - 6},${y}h12M${x},${y - 6}v12`, class: "mark" });
+        const text = add("text", { x, y, class: "mark-name" }, name), wide = text.getComputedTextLength() + 4;
+        const places = [];
+        for (const far of [0, 1, 2, 3, 4, 5, 6]) {
+          for (const side of [1, -1]) {
+            for (const way of [-1, 1]) {
+              const left = side > 0 ? x + 9 : x - 9 - wide, middle = y + way * (far ? 6 + far * line : 0);
+              places.push([left, middle - line / 2, left + wide, middle + line / 2]);
+            }
+          }
+        }
+        const box = places.find(free);
+        if (!box) { text.remove(); continue; }
+        taken.push(box);
+        text.setAttribute("x", box[0] + 2);
+        text.setAttribute("y", box[3] - 4);
+        const near = box[0] > x ? box[0] : box[2], middle = (box[1] + box[3]) / 2;
+        if (Math.abs(middle - y) > line) add("path", { d: `M${x},${y}L${near},${middle}`, class: "leader" });
+      }
     }
     function change(what) {
       if (what === "left") view.turn -= 0.15;
@@ -180,8 +230,5 @@
   }
 
   for (const container of document.querySelectorAll("[data-scene]")) scene(container);
-  (async () => {
-    for (const container of document.querySelectorAll("[data-chart]")) await draw(container);
-    document.body.dataset.ready = "yes";
-  })();
+  document.body.dataset.ready = "yes";
 })();

@@ -9,12 +9,12 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.pose_residuals import distances_of
 from ..data.capture import Capture
 from ..model.metrics import pose_outliers
-from ..summaries.tables import METRICS
+from ..summaries.tables import METRICS, decimals_for
 from . import charts
 from .elements import Cell, Chart, ReportTable, format_number, number_cell, text_cell
 
-_DRAWN, _LISTED = 2000, 1000  # most poses in a chart, and in its table
-_NAMED = 12  # most observations that are named along an axis
+_DRAWN, _LISTED = 1000, 400  # most poses in a chart, and in its table
+_NAMED = 16  # most sockets or observations that are named along an axis
 _LEAST = 1e-5  # a residual of zero on a logarithmic axis, mm
 
 
@@ -39,6 +39,19 @@ class Groups(NamedTuple):
     def owner(self) -> np.ndarray:
         """Index of the group of each pose."""
         return np.repeat(np.arange(len(self.sizes)), self.sizes)
+
+    def parts(self) -> tuple[tuple[tuple[float, str], ...], np.ndarray]:
+        """Names at the middle of each group, or of those that share a folder ("monday/"), and the borders between them;
+        without names where even these are too many."""
+        ends = np.cumsum(self.sizes)
+        for depth in range(max(name.count("/") for name in self.names), -1, -1):
+            names = ["/".join(name.split("/")[: depth + 1]) for name in self.names]
+            last = [i for i in range(len(names)) if i + 1 == len(names) or names[i] != names[i + 1]]
+            if 1 < len(last) <= _NAMED:
+                borders = np.array([0, *ends[last]]) + 0.5
+                middle = (borders[:-1] + borders[1:]) / 2
+                return tuple((float(x), names[i]) for x, i in zip(middle, last, strict=True)), borders[1:-1]
+        return (), ends[:-1] + 0.5 if len(ends) <= 60 else np.zeros(0)
 
     @property
     def numbers(self) -> np.ndarray:
@@ -96,12 +109,13 @@ def residual_chart(
     id: str, title: str, capture: Capture, evaluations: Mapping[str, Evaluation], *, mark: bool = False
 ) -> Chart:
     """Distance of every pose from its socket's centroid, or the geometry of its observation, by arm; ``mark``: poses of
-    the last arm that are far off are marked."""
+    the last arm that are far off are marked, and a table lists the distances."""
     groups = Groups.of(capture)
     last = np.concatenate(distances_of(capture, list(evaluations.values())[-1]))
     far = pose_outliers(last, groups.sizes)[0] if mark else None
     distances = {name: pose_distances(capture, evaluation) for name, evaluation in evaluations.items()}
-    return pose_chart(id, title, groups, distances, far=far)
+    chart = pose_chart(id, title, groups, distances, far=far)
+    return chart if mark else chart._replace(table=None)
 
 
 def pose_chart(
@@ -116,7 +130,7 @@ def pose_chart(
     far_says: str = "far from its socket",
     normal: float | None = None,
 ) -> Chart:
-    """The residual of every pose, by arm, on a logarithmic axis; the table lists at most the 1000 largest.
+    """The residual of every pose, by arm, on a logarithmic axis; the table lists at most the 400 largest.
 
     Args:
         id: Identifier of the chart.
@@ -135,38 +149,39 @@ def pose_chart(
     last_arm, last = list(residuals.items())[-1]
     known = np.flatnonzero(np.isfinite(last))
     if not len(known):
-        empty = {"data": [], "layout": charts.layout("", "")}
-        return Chart(id, title, "Every socket has one pose only, so there is no scatter to show.", empty)
+        return Chart(id, title, "Every socket has one pose only, so there is no scatter to show.", ())
     owner, numbers = groups.owner, groups.numbers
     labels = [f"{groups.names[group]}, pose {number}" for group, number in zip(owner, numbers, strict=True)]
     marked = np.asarray([] if far is None else far, dtype=int)
     drawn = known if len(known) <= _DRAWN else known[np.linspace(0, len(known) - 1, _DRAWN).round().astype(int)]
     drawn = np.union1d(drawn, marked)
-    styles = [(charts.LIGHT, "circle-open"), (charts.DARK, "circle")][-len(residuals) :]
-    traces = []
-    for (name, values), (color, symbol) in zip(residuals.items(), styles, strict=True):
+    marks = []
+    for number, (name, values) in enumerate(residuals.items(), start=2 - len(residuals)):
         hover = [f"{labels[i]}: {format_number(float(values[i]))} {unit} ({name})" for i in drawn]
+        found = values[np.isfinite(values)]
+        says = f"{name}, RMS {format_number(float(np.sqrt(np.mean(found**2))), 3)} {unit}"
+        symbol, tone = (("square", "soft"), ("dot", "main"))[number]
         y = np.maximum(values[drawn], _LEAST)
-        traces.append(charts.markers(name, (drawn + 1).tolist(), y, color, symbol, hover=hover, size=5))
+        marks.append(charts.Marks(says, drawn + 1, y, symbol, tone, hover, size=5))
     if len(marked):
-        hover = [f"{labels[i]}: {format_number(float(last[i]))} {unit}" for i in marked]
-        x, y = (marked + 1).tolist(), np.maximum(last[marked], _LEAST)
-        traces.append(charts.markers(far_says, x, y, charts.WARM, "diamond-open", hover=hover, size=13))
-    borders = [] if len(groups.sizes) > 40 else charts.vertical((np.cumsum(groups.sizes)[:-1] + 0.5).tolist())
-    lines = borders + ([] if normal is None else charts.horizontal([normal]))
-    x = f"pose, {groups.word} after {groups.word}" if len(groups.sizes) > 1 else "pose"
-    scale = charts.logarithmic(*([y for y in trace["y"] if y is not None] for trace in traces))
-    layout = charts.layout(x, f"{axis} [{unit}]", yaxis=scale, shapes=lines)
-    if 1 < len(groups.sizes) <= _NAMED and groups.word != "socket":
-        middle = np.cumsum(groups.sizes) - (np.array(groups.sizes) - 1) / 2
-        layout["xaxis"] |= {"tickvals": middle.tolist(), "ticktext": [charts.escaped(name) for name in groups.names]}
+        marks.append(charts.Marks(far_says, marked + 1, np.maximum(last[marked], _LEAST), "diamond", "accent"))
+    ticks, borders = groups.parts()
+    axis_of_poses = charts.Axis(
+        f"pose, {groups.word} after {groups.word}" if len(groups.sizes) > 1 else "pose",
+        0.0,
+        len(owner) + 1.0,
+        ticks or charts.round_ticks(0, len(owner) + 1),
+        named=bool(ticks),
+    )
+    y = charts.logarithmic(f"{axis} [{unit}]", *(mark.y for mark in marks), [] if normal is None else [normal])
+    plot = charts.Plot(axis_of_poses, y, tuple(marks), borders, [] if normal is None else [normal])
     median, largest = (format_number(float(reduced)) for reduced in (np.median(last[known]), last[known].max()))
-    description = f"Dotted lines separate the {groups.word}s. " if borders else ""
+    description = f"Dotted lines separate the {groups.word}s. " if len(borders) else ""
     description += f"Median {median} {unit}, largest {largest} {unit} ({last_arm} arm)."
     description += " The only pose of a socket has no distance." if len(known) < len(owner) else ""
     description += f" {len(drawn)} of {len(known)} poses are drawn." if len(drawn) < len(known) else ""
     table = _pose_table(groups, residuals, unit, None if far is None else marked, far_says)
-    return Chart(id, title, description, {"data": traces, "layout": layout}, table)
+    return Chart(id, title, description, (plot,), table)
 
 
 def _pose_table(
@@ -229,13 +244,16 @@ def length_rows(
 
     ``fixed_scale``: index of the length that fixed the scale, so that its error is zero by construction.
     """
-    return [
-        [
+    found = []
+    for i, row in enumerate(rows):
+        expanded = None if row["error_u_mm"] is None else factor * row["error_u_mm"]
+        decimals = decimals_for(expanded)
+        error = number_cell(row["error_mm"], decimals, signed=True)
+        found.append([
             text_cell(f"{row['from']} – {row['to']}"),
             number_cell(row["value_mm"]),
-            *(number_cell(float(errors[i]), signed=True) for errors in before),
-            text_cell("fixed the scale") if i == fixed_scale else number_cell(row["error_mm"], signed=True),
-            number_cell(None if row["error_u_mm"] is None else factor * row["error_u_mm"]),
-        ]
-        for i, row in enumerate(rows)
-    ]
+            *(number_cell(float(errors[i]), decimals, signed=True) for errors in before),
+            text_cell("fixed the scale") if i == fixed_scale else error,
+            number_cell(expanded, decimals),
+        ])  # fmt: skip
+    return found

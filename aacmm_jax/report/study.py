@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.units import ARCSEC
+from ..core.units import error_unit
 from ..study.results import Results
 from ..study.statistics import METRICS, factor_title, level_text, level_title, shown_unit, study_summary
 from . import charts
@@ -14,7 +14,7 @@ _SHOWN = (
     *("length_error", "angle_error", "de", "deltam", "scale_error"),
     *("length_error_stage1", "angle_error_stage1", "de_stage1", "deltam_stage1", "k"),
 )
-_MOST_CELLS, _MOST_ROWS, _MOST_WARNINGS = 400, 4000, 12
+_MOST_CELLS, _MOST_ROWS, _NAMED, _MOST_PLOTS = 400, 2000, 6, 12
 
 
 def study_report(results: Results) -> tuple[Report, dict[str, Any]]:
@@ -55,19 +55,18 @@ def _warnings(summary: dict[str, Any]) -> list[str]:
         found.append(
             "The study is not finished; the same command continues it. Metrics are of the trials that were run."
         )
-    for cell in summary["results"]:
-        if cell["trials_run"] and (cell["converged"]["value"] or 0.0) < 0.99:
-            found.append(
-                f"Cell {cell['cell']}: only {100 * cell['converged']['value']:.3g} % of {cell['trials_run']} trials "
-                "converged; its metrics are of those, if any."
-            )
-        if (cell["truth_inside"]["value"] or 0.0) < 1.0 and cell["trials_run"]:
-            found.append(
-                f"Cell {cell['cell']}: the true arm lies within the bounds in "
-                f"{100 * cell['truth_inside']['value']:.3g} % of the trials."
-            )
-    more = len(found) - _MOST_WARNINGS
-    return found[:_MOST_WARNINGS] + ([f"And {more} more of this kind; see the table of cells."] if more > 0 else [])
+    cells = zip(_labels(summary), summary["results"], strict=True)
+    ran = [(label, cell) for label, cell in cells if cell["trials_run"]]
+    for key, least, says in (
+        ("converged", 0.99, "Not all trials converged, and metrics are of those that did"),
+        ("truth_inside", 1.0, "The true arm lies within the bounds in some of the trials only"),
+    ):
+        shares = [(label, cell[key]["value"] or 0.0) for label, cell in ran]
+        named = [f"{label} ({100 * share:.3g} %)" for label, share in shares if share < least]
+        if named:
+            more = f"; and {len(named) - _NAMED} more cells" if len(named) > _NAMED else ""
+            found.append(f"{says}: {'; '.join(named[:_NAMED])}{more}.")
+    return found
 
 
 def _varied(summary: dict[str, Any]) -> list[str]:
@@ -126,56 +125,60 @@ def _metric_section(summary: dict[str, Any], name: str) -> Section:
         [text_cell(label), *(_statistic_cell(None if found is None else found[key], factor) for key in keys)]
         for label, found in cells
     ]
-    known = [(i + 1, label, found) for i, (label, found) in enumerate(cells) if found is not None]
-    x = [number for number, *_ in known]
-    low, middle, high = (
-        np.array([factor * found[key]["value"] for *_, found in known]) for key in ("p5", "p50", "p95")
-    )
-    hover = [
-        f"{label}: median {format_number(m)} {unit}, 5 % {format_number(a)}, 95 % {format_number(b)}"
-        for (_, label, _), a, m, b in zip(known, low.tolist(), middle.tolist(), high.tolist(), strict=True)
-    ]
-    trace = charts.markers("median, 5 to 95 %", x, middle, charts.DARK, "square", hover=hover)
-    error = {"type": "data", "symmetric": False, "color": charts.DARK, "thickness": 1.4, "width": 5}
-    trace["error_y"] = error | {"array": (high - middle).tolist(), "arrayminus": (middle - low).tolist()}
     title = METRICS[name] if name == "k" else f"{METRICS[name][0].upper()}{METRICS[name][1:]}"
-    axis, axis_title = _cell_axis(summary, x)
-    # Positive values that span a wide range need a logarithmic axis.
-    wide = len(low) > 0 and low.min() > 0 and high.max() > 20 * low.min()
-    y_axis = charts.logarithmic(low, high) if wide else {}
-    layout = charts.layout(axis_title, unit or name, xaxis=axis, yaxis=y_axis, showlegend=False)
     heading = f"{title} [{unit}]" if unit else title
     columns = ("cell", "mean", "standard deviation", "5 %", "50 %", "95 %")
     table = ReportTable(f"{heading}; ± one Monte Carlo standard error", columns, rows)
-    description = "Squares are medians, bars reach from the 5th to the 95th percentile of the converged trials."
-    figure = {"data": [trace], "layout": layout}
-    return Section(f"figure-{name}", title, [Chart(f"chart-{name}", heading, description, figure, table, 320)])
+    description = "Marks are medians, bars reach from the 5th to the 95th percentile of the converged trials."
+    plots = _plots(summary, name, unit, factor)
+    return Section(f"figure-{name}", title, [Chart(f"chart-{name}", heading, description, plots, table)])
 
 
-def _cell_axis(summary: dict[str, Any], numbers: list[int]) -> tuple[dict[str, Any], str]:
-    """The axis of cells, labelled with the levels of the varied factors if there are few cells; and its title."""
-    varied = _varied(summary)
-    if not varied or len(numbers) > 16:
-        return ({"dtick": 1} if len(numbers) <= 24 else {}), "cell"
-    cells = {cell["cell"]: cell["factors"] for cell in summary["results"]}
-    ticks = [
-        "<br>".join([str(number), *(charts.escaped(level_text(cells[number][name])[:14]) for name in varied)])
-        for number in numbers
-    ]
-    names = ", ".join(charts.escaped(factor_title(name)) for name in varied)
-    return {"tickvals": numbers, "ticktext": ticks, "tickangle": 0}, f"cell, and under it {names}"
+def _plots(summary: dict[str, Any], name: str, unit: str, factor: float) -> tuple[charts.Plot, ...]:
+    """The metric against the factor with the most levels, one plot for each combination of the others."""
+    varied = sorted(_varied(summary), key=lambda one: -len(summary["factors"][one]))
+    along = varied[0] if varied else None
+    groups: dict[str, list[tuple[int, str, np.ndarray]]] = {}
+    for label, cell in zip(_labels(summary), summary["results"], strict=True):
+        found = cell["figures"].get(name)
+        if found is None or any(found[key]["value"] is None for key in ("p5", "p50", "p95")):
+            continue
+        words = ", ".join(level_title(other, cell["factors"][other]) for other in varied[1:])
+        at = 0 if along is None else summary["factors"][along].index(cell["factors"][along])
+        values = factor * np.array([found[key]["value"] for key in ("p5", "p50", "p95")])
+        groups.setdefault(words, []).append((at, label, values))
+    shown = dict(list(groups.items())[:_MOST_PLOTS])
+    if not shown:
+        return ()
+    every = np.concatenate([values for group in shown.values() for _, _, values in group])
+    # Positive values that span a wide range need a logarithmic axis.
+    wide = every.min() > 0 and every.max() > 20 * every.min()
+    y = charts.logarithmic(unit or name, every) if wide else charts.linear(unit or name, every)
+    levels = ["all trials"] if along is None else [level_text(level) for level in summary["factors"][along]]
+    x = charts.names("" if along is None else factor_title(along), levels)
+    plots = []
+    for words, group in shown.items():
+        at, low, middle, high = np.array([(at, *values) for at, _, values in group]).T
+        hover = [
+            f"{label}: median {format_number(m)} {unit}, 5 % {format_number(a)}, 95 % {format_number(b)}"
+            for (_, label, _), a, m, b in zip(group, low.tolist(), middle.tolist(), high.tolist(), strict=True)
+        ]
+        marks = charts.Marks("median, 5 to 95 %", at, middle, "square", "main", hover, low, high, size=7)
+        height = 280 if len(shown) == 1 else 200
+        plots.append(charts.Plot(x, y, (marks,), title=words[:1].upper() + words[1:], height=height))
+    return tuple(plots)
 
 
 def _parameter_sections(summary: dict[str, Any]) -> list[Section]:
     """Bias and standard deviation of every parameter, cell by cell."""
     rows = []
-    for label, cell in zip(_labels(summary), summary["results"], strict=True):
+    for cell in summary["results"]:
         for row in cell.get("parameters", [])[: _MOST_ROWS // max(summary["cells"], 1)]:
-            factor, unit = (1 / ARCSEC, "arcsec") if row.get("unit") == "rad" else (1.0, "mm")
+            factor, unit = error_unit(row.get("unit", "mm"))
             statistics = (_statistic_cell(row.get(key), factor) for key in ("bias", "spread"))
-            rows.append([text_cell(label), text_cell(row["parameter"]), text_cell(unit), *statistics])
+            rows.append([number_cell(cell["cell"], 0), text_cell(row["parameter"]), text_cell(unit), *statistics])
     if not rows:
         return []
     columns = ("cell", "parameter", "unit", "bias", "standard deviation")
-    table = ReportTable("Errors of the parameters; ± one Monte Carlo standard error", columns, rows)
+    table = ReportTable("Errors of the parameters; ± one Monte Carlo standard error", columns, rows, folded=True)
     return [Section("parameters", "Parameters", [table])]

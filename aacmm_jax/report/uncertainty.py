@@ -8,13 +8,14 @@ import numpy as np
 from ..calibration.record import CalibrationRecord
 from ..core.units import people_read
 from ..kinematics.arm import parameter_unit
-from ..summaries.tables import encoders_in_words, volume_rows
+from ..summaries.tables import decimals_for, encoders_in_words, volume_rows
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
 from . import charts
-from .elements import Chart, ReportTable, Section, format_number, number_cell, text_cell
+from .elements import Cell, Chart, ReportTable, Section, format_number, number_cell, text_cell
 
+_MOST_CORRELATED = 45  # parameters in a chart
 _INDICES = {
     "O1": "geometric mean of the singular values (Menq, Borm)",
     "O2": "smallest over largest (Driels, Pathre)",
@@ -28,7 +29,7 @@ def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], facto
     """Expanded uncertainty of tips and lengths over the working volume."""
     found = summary["uncertainty"]["volume"]
     length = f"{volume.length:g} mm length"
-    rows = [[text_cell(title), *map(number_cell, values)] for title, values in volume_rows(found, factor)]
+    rows = [[text_cell(title), *map(_expanded, values)] for title, values in volume_rows(found, factor)]
     low, high = volume.start.min(axis=0), volume.start.max(axis=0)
     box = ", ".join(f"{axis} from {a:.0f} to {b:.0f}" for axis, a, b in zip("xyz", low, high, strict=True))
     introduction = (
@@ -46,37 +47,42 @@ def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], facto
     )
 
 
+def _expanded(u: float | None) -> Cell:
+    """An expanded uncertainty, to two digits."""
+    return number_cell(u, decimals_for(u))
+
+
 def _volume_chart(volume: VolumetricUncertainty, factor: float, length: str) -> Chart:
     expanded = factor * volume.u_length
     known = np.isfinite(expanded)
     radius = np.hypot(volume.start[:, 0], volume.start[:, 1])
-    scale = expanded[known] / max(float(expanded[known].max(initial=0.0)), 1e-12)
     hover = [
-        f"({', '.join(f'{x:.0f}' for x in point)}) mm: U = {format_number(value)} mm"
-        for point, value in zip(volume.start[known], expanded[known], strict=True)
+        f"({', '.join(f'{x:.0f}' for x in point)}) mm: U = {format_number(value, decimals_for(value))} mm"
+        for point, value in zip(volume.start[known], expanded[known].tolist(), strict=True)
     ]
-    title = "U of a length that starts here"
-    trace = charts.markers(title, radius[known], volume.start[known, 2], charts.DARK, "circle", hover=hover)
-    trace["marker"] |= {
-        "size": [round(float(x), 1) for x in 4 + 10 * scale],
-        "color": [float(f"{x:.4g}") for x in expanded[known]],
-        "colorscale": [[0, "#d7dee9"], [1, "#0d2347"]],
-        "line": {"width": 0.5, "color": "#555"},
-        "colorbar": {"title": {"text": "U [mm]"}, "thickness": 12, "len": 0.8},
-    }
-    layout = charts.layout("distance from the first axis [mm]", "height [mm]", showlegend=False)
+    shade, limits = charts.shades(expanded[known])
+    order = np.argsort(shade, kind="stable")
+    marks = charts.Marks(
+        "", radius[known][order], volume.start[known, 2][order], hover=[hover[i] for i in order], shade=shade[order]
+    )
+    axes = (
+        charts.linear("distance from the first axis [mm]", radius, [0.0]),
+        charts.linear("height [mm]", volume.start[:, 2]),
+    )
+    plot = charts.Plot(*axes, (marks,), height=380)
     columns = ("x [mm]", "y [mm]", "z [mm]", "U of the tip [mm]", f"U of a {length} [mm]", "with readings [mm]")
     data = [
-        [*(number_cell(float(x), 0) for x in point), *(number_cell(factor * float(value)) for value in u)]
+        [*(number_cell(float(x), 0) for x in point), *(_expanded(factor * float(value)) for value in u)]
         for point, *u in zip(volume.start, volume.u_tip, volume.u_length, volume.u_length_reading, strict=True)
     ]
     return Chart(
         "volume",
         f"U of a {length} over the volume",
         "Larger and darker marks are more uncertain; height against distance from the first axis.",
-        {"data": [trace], "layout": layout},
+        (plot,),
         ReportTable("All positions", columns, data),
-        420,
+        shade_limits=limits if np.any(known) else (),
+        shade_unit="mm",
     )
 
 
@@ -84,8 +90,11 @@ def _noise_sentence(found: dict[str, Any]) -> str:
     seating = 1e3 * found["seating_mm"]
     noise = f"{encoders_in_words(found)}, seat {seating:.3g} µm"
     basis = "All uncertainties are based on"
+    joints = ", ".join(str(row["joint"]) for row in found.get("noisy_encoders", ()))
+    replaced = f", but for joint {joints}, whose noise was estimated" if joints else ""
     return {
-        "given": f"{basis} the given noise: {noise}. Residuals are {found['misfit'] or 0:.2f} times its prediction.",
+        "given": f"{basis} the given noise{replaced}: {noise}. Residuals are {found['misfit'] or 0:.2f} times its "
+        "prediction.",
         "estimated": f"{basis} the noise estimated from the residuals: {noise}.",
         "common": f"{basis} one variance for all poses: {seating:.3g} µm in each coordinate.",
         "robust": "Each pose's own residual is taken as its error (robust covariance).",
@@ -103,12 +112,14 @@ def correlations_section(record: CalibrationRecord, uncertainty: Uncertainty) ->
         "parameters are determined better in combination than one by one."
     )
     table = ReportTable("Pairs correlated by 0.5 or more", ("parameter", "with", "correlation"), pairs)
-    traces = charts.correlation_heatmap(list(record.names), np.asarray(uncertainty.correlation))
-    layout = charts.layout("", "")
-    layout["yaxis"] |= {"autorange": "reversed", "showgrid": False, "tickfont": {"size": 10}}
-    layout["xaxis"] |= {"showgrid": False, "tickangle": -90, "tickfont": {"size": 10}}
-    figure = {"data": traces, "layout": layout}
-    chart = Chart("correlations", "Correlation of the parameters", description, figure, table, 520)
+    names, strength = list(record.names), np.abs(np.asarray(uncertainty.correlation) - np.eye(len(record.names)))
+    chosen = np.sort(np.argsort(-strength.max(axis=1), kind="stable")[:_MOST_CORRELATED])
+    if len(chosen) < len(names):
+        description += f" Of {len(names)} parameters, the {len(chosen)} that are correlated most are drawn."
+    plot = charts.correlations([names[i] for i in chosen], np.asarray(uncertainty.correlation)[np.ix_(chosen, chosen)])
+    limits = tuple(i / charts.SHADES for i in range(charts.SHADES + 1))
+    title = "Correlation of the parameters"
+    chart = Chart("correlations", title, description, (plot,), table, shade_limits=limits)
     return Section("correlations", "Correlations", [chart])
 
 
@@ -124,15 +135,15 @@ def observability_section(observability: Observability) -> Section:
     values = np.maximum(singular, 1e-12 * singular.max())
     order = list(range(1, len(singular) + 1))
     cells = [[number_cell(i, 0), number_cell(float(value), 6)] for i, value in zip(order, singular, strict=True)]
-    trace = charts.markers("singular value", order, values, charts.DARK, "circle")
-    layout = charts.layout("number", "singular value", yaxis=charts.logarithmic(values), showlegend=False)
+    hover = [f"{i}: {value:.3g}" for i, value in zip(order, singular.tolist(), strict=True)]
+    axes = charts.linear("number", order), charts.logarithmic("singular value", values)
+    plot = charts.Plot(*axes, (charts.Marks("", order, values, hover=hover),), height=240)
     chart = Chart(
         "singular",
         "Singular values",
         "Sensitivity of the data to each independent direction of the parameters, in steps of 1 mm and 1 mrad.",
-        {"data": [trace], "layout": layout},
+        (plot,),
         ReportTable("Singular values", ("number", "value"), cells),
-        300,
     )
     metrics = ReportTable("Metrics", ("", "value", "meaning"), [[text_cell(word) for word in row] for row in rows])
     return Section("observability", "Observability", [" ".join(sentences), metrics, chart])
@@ -156,18 +167,23 @@ def bounds_section(record: CalibrationRecord, summary: dict[str, Any]) -> Sectio
     introduction = f"On a bound: {', '.join(on_bound)}." if on_bound else "No bound is active."
     if record.method == "two-stage":
         introduction += " Bounds are those of stage 1; the scale fix comes after it."
-    trace = charts.markers("calibrated", record.names, positions, charts.DARK, "circle")
-    trace["marker"]["symbol"] = ["diamond" if name in on_bound else "circle" for name in record.names]
-    axis = {"range": [-1.15, 1.15], "tickvals": [-1, 0, 1], "ticktext": ["lower", "middle", "upper"]}
-    shapes = charts.horizontal([-1, 1], "solid")
-    layout = charts.layout("", "position within bounds", yaxis=axis, showlegend=False, shapes=shapes)
+    at, on = np.asarray(positions), np.array([name in on_bound for name in record.names])
+    x = np.arange(len(at))
+    hover = [f"{name}: {position:+.2f}" for name, position in zip(record.names, positions, strict=True)]
+    marks = [charts.Marks("within", x[~on], at[~on], hover=[hover[i] for i in x[~on]])]
+    if np.any(on):
+        # Stage 1 may have been on a bound that the calibrated value has left.
+        edge = np.clip(at[on], -1, 1)
+        marks.append(charts.Marks("on a bound", x[on], edge, "diamond", "accent", [hover[i] for i in x[on]]))
+    ticks = ((-1.0, "lower"), (0.0, "middle"), (1.0, "upper"))
+    axes = charts.names("", record.names), charts.Axis("position within bounds", -1.15, 1.15, ticks)
+    plot = charts.Plot(*axes, tuple(marks), horizontal=[-1.0, 1.0], height=220)
     chart = Chart(
         "bounds",
         "Position of every parameter within its bounds",
-        "Diamonds are on a bound.",
-        {"data": [trace], "layout": layout},
+        "Diamonds are on a bound." if np.any(on) else "None is on a bound.",
+        (plot,),
         ReportTable("Bounds", ("parameter", "unit", "lower", "calibrated", "upper", ""), rows),
-        300,
     )
     return Section("bounds", "Bounds", [introduction, chart])
 

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core.errors import InputError
-from .definition import Setting, Study
+from .definition import Study
+from .settings import Setting
 
 MOST_BLOCKS = 10_000  # each takes 80 kB of memory when the study's file is made
 NOT_RUN = -1  # of whole numbers; NaN of others, and -128 of active, where -1 is a bound

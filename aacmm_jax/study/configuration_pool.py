@@ -17,11 +17,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
 from ..kinematics import chain
 from ..kinematics.arm import Arm
 from ..kinematics.inverse_kinematics import damped_inverse, least_norm_inverse, solve_to_targets
 from ..kinematics.jacobian import reading_columns
-from .definition import POOL_PARTS, Fixture, Setting, Study, pool_capacity
+from .definition import POOL_PARTS, Study, pool_capacity
+from .settings import Fixture, Setting
 from .specification import Region
 
 _ROUNDS, _STEPS, _ROWS = 100, 20, 2048
@@ -33,7 +35,8 @@ _STARTS = 8  # configurations tried at each end of a candidate placement
 
 
 class Pool(NamedTuple):
-    """A row for each configuration: q, cos and sin of q + theta, damped inverse (n, 3), and the point that it reaches.
+    """A row for each configuration: q, cos and sin of q + theta, damped inverse (n, 3), and the point that it reaches,
+    of the nominal arm without corrections: what its joints do, and not what they read.
 
     ``first``, ``placements`` and ``poses`` are the first row and the capacity of each fixture:
     row = first + ((part * placements + placement) * ends + end) * poses + pose.
@@ -81,13 +84,21 @@ def _recorded(study: Study) -> Pool:
     assert capture is not None
     points = np.repeat([fixture.points[0] for fixture in setting.fixtures if fixture.points], capture.sizes, axis=0)
     first = np.cumsum([0, *capture.sizes])[:-1]
-    table = _rows(study.nominal.arm, np.asarray(capture.q), points)
+    table = _rows(study.plain_arm, _joint_values(study.nominal.arm, np.asarray(capture.q)), points)
     return Pool(table, tuple(map(int, first)), (1,) * len(first), capture.sizes)
+
+
+def _joint_values(arm: Arm, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
+    """What the joints do at these readings, corrections included."""
+    if arm.corrections is None:
+        return q
+    geometry = to_numpy(arm.geometry)
+    return q + np.asarray(chain.joint_errors(geometry, chain.joint_motion(geometry, q)))[:, 0].T
 
 
 @lru_cache(maxsize=16)
 def _fixture_table(study: Study, fixture: Fixture, limits: tuple, capacity: tuple[int, int]) -> np.ndarray:
-    arm, (placements, poses) = study.nominal.arm, capacity
+    arm, (placements, poses) = study.plain_arm, capacity
     key = pool_key(study.specification.seed, fixture, limits, capacity)
     if fixture.points is not None:
         points = np.tile(np.array(fixture.points), (POOL_PARTS, 1))
@@ -108,7 +119,7 @@ def pool_key(seed: int, fixture: Fixture, limits: tuple, capacity: tuple[int, in
 
 def check_reach(study: Study) -> None:
     """Raise `InputError` where a fixture is out of reach, or has no placement in its region: before any work."""
-    arm = study.nominal.arm
+    arm = study.plain_arm
     # Reach does not depend on the number of poses, nor for random placements on the number in the name.
     fixtures = {
         (fixture._replace(name=fixture.name if fixture.points else fixture.name[0], poses=0), setting.limits)

@@ -8,7 +8,7 @@ from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..calibration.checks import check_enough
 from ..calibration.observed_state import check_observed
@@ -18,16 +18,25 @@ from ..core.units import ARCSEC, DEG, M
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..files.arms import specification_toml
-from ..kinematics.arm import Arm, is_length, joint_limits
+from ..kinematics.arm import Arm, correction_names, joint_limits, without_corrections
 from ..kinematics.parameters import ArmSpecification, Parameters, single
+from ..kinematics.priors import Prior
 from ..model.observed import Observed
-from .specification import Point, Region, Specification, label
+from .joint_models import (
+    Identified,
+    all_joints,
+    check_deviations,
+    coefficients_of,
+    deviation_of,
+    identified,
+    prior_of,
+)
+from .settings import CellValues, Fixture, Setting
+from .specification import Distribution, Point, Region, Specification, label
 
+_MODEL = "identification.model"
+_NONE = Distribution(uniform=0.0)
 POOL_PARTS = 32  # independent parts of a pose pool; trial t draws from part t modulo this
-_DEVIATIONS = {
-    **{"a": "a_mm", "d": "d_mm", "probe": "probe_mm"},
-    **{"alpha": "alpha_deg", "theta": "theta_deg", "beta": "beta_deg"},
-}
 
 
 @contextmanager
@@ -37,53 +46,6 @@ def _naming(key: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
-
-
-class Fixture(NamedTuple):
-    """What fixes the tip: a socket (one end), or a reference length (two ends)."""
-
-    name: str
-    poses: int  # at each end
-    points: tuple[Point, ...] | None  # positions of the ends, mm; None: drawn at random in the region
-    region: Region | None = None
-    length: float | None = None  # of a reference length at random, mm
-
-    @property
-    def ends(self) -> int:
-        """Number of points at which the tip is fixed."""
-        return len(self.points) if self.points is not None else 1 if self.length is None else 2
-
-
-class Setting(NamedTuple):
-    """What determines the compiled program of a cell, and its pose pool."""
-
-    fixtures: tuple[Fixture, ...]
-    limits: tuple[tuple[float, float], ...]  # rad, or mm of prismatic joints
-    hold: str | None
-    method: str
-    random_start: bool
-    recorded: bool  # the poses are those of the recording
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Poses in each socket."""
-        return tuple(fixture.poses for fixture in self.fixtures for _ in range(fixture.ends))
-
-
-class CellValues(NamedTuple):
-    """What differs from cell to cell within one compiled program; the first axis is the cell. mm and rad."""
-
-    width: Float[np.ndarray, "c p"]  # of the deviation
-    normal: Bool[np.ndarray, "c p"]
-    lower: Float[np.ndarray, "c p"]
-    upper: Float[np.ndarray, "c p"]
-    encoder: Float[np.ndarray, " c"]
-    resolution: Float[np.ndarray, " c"]
-    seating: Float[np.ndarray, " c"]
-    eccentricity: Float[np.ndarray, " c"]
-    linear_encoder: Float[np.ndarray, " c"]  # of prismatic joints
-    linear_resolution: Float[np.ndarray, " c"]
-    u: Float[np.ndarray, " c"]  # of reference lengths; NaN: as recorded
 
 
 class _Contents(NamedTuple):
@@ -170,16 +132,50 @@ class Study:
 
     @cached_property
     def space(self) -> Parameters:
-        """The free parameters, on the nominal arm."""
-        held = self.specification.identification.held
+        """What true arms deviate in and any cell identifies, on the nominal arm: the free parameters, and coefficients
+        of joint corrections."""
+        spaces = list(self._spaces.values())
+        names = [name for space in spaces for name in space.names]
+        coefficients = [name for name in correction_names(self._joints) if not name.startswith("gravity_")]
+        beta = spaces[0].base.beta
+        base = self._joints if beta is None else self._joints.replace(beta=beta)
+        return Parameters(base, tuple(dict.fromkeys([*names, *coefficients])))
+
+    def identified(self, setting: Setting) -> Identified:
+        """The free parameters of the cells of a setting, and their prior."""
+        return Identified(self._spaces[setting.model], self._prior(setting.model, setting.prior))
+
+    def _prior(self, model: str | None, text: str | None) -> Prior | None:
+        with _naming("identification.prior"):
+            return prior_of(self.nominal, self._spaces[model], model, text)
+
+    @property
+    def plain_arm(self) -> Arm:
+        """The nominal arm whose joints do what they read: of configurations that trials begin with."""
+        return without_corrections(self.nominal.arm) if self.nominal.arm.corrections is not None else self.nominal.arm
+
+    @cached_property
+    def _joints(self) -> Arm:
+        """The nominal arm with all corrections of the study."""
+        found = self.nominal.arm
+        for key in ("deviation.model", _MODEL):
+            with _naming(key):
+                models = dict.fromkeys(cell[key] for cell in self.cells if key in cell)
+                found = all_joints(self.nominal._replace(arm=found), models)
+        return found
+
+    @cached_property
+    def _spaces(self) -> dict[str | None, Parameters]:
+        """The free parameters by model of the joints."""
+        held, models = self.specification.identification.held, dict.fromkeys(cell.get(_MODEL) for cell in self.cells)
         with _naming("identification.held"):
-            return self.nominal.space() if held is None else Parameters.free_of(self.nominal.arm, held=held)
+            return {model: identified(self.nominal, self._joints, held, model) for model in models}
 
     @cached_property
     def digest(self) -> str:
         """SHA-256 of all that the numbers depend on: studies with the same digest give the same numbers."""
         arm = specification_toml(self.nominal._replace(name=""))
-        content = [self.specification.model_dump_json(exclude={"name", "arm"}), arm]
+        content = [self.specification.content(), arm]
         if self.capture is not None:
             q, names, sizes = np.asarray(self.capture.q), self.capture.names, self.capture.sizes
             lengths = [(r.start, r.end, float(r.value), float(r.u)) for r in self.capture.lengths]
@@ -196,11 +192,10 @@ class Study:
     @cached_property
     def settings(self) -> list[Setting]:
         """The setting of each cell."""
-        anchors = {
-            hold: self._scale_anchor(hold) for hold in dict.fromkeys(c["identification.hold"] for c in self.cells)
-        }
+        keys = [(cell["identification.hold"], cell.get(_MODEL)) for cell in self.cells]
+        anchors = {key: self._scale_anchor(*key) for key in dict.fromkeys(keys)}
         recorded = self._recorded_fixtures()
-        return [self._setting(cell, anchors[cell["identification.hold"]], recorded) for cell in self.cells]
+        return [self._setting(cell, anchors[key], recorded) for cell, key in zip(self.cells, keys, strict=True)]
 
     @cached_property
     def eccentric(self) -> bool:
@@ -225,9 +220,11 @@ class Study:
         return tuple(Fixture(name, size, (point,)) for name, size, point in rows)
 
     def _setting(self, cell: Mapping[str, Any], hold: str | None, recorded: tuple[Fixture, ...] | None) -> Setting:
-        arm, method, random_start = self.nominal.arm, self._method(cell), cell["identification.start"] == "random"
+        arm, random_start = self.nominal.arm, cell["identification.start"] == "random"
+        joints = cell.get(_MODEL), cell.get("identification.prior")
+        method = self._method(cell, self._prior(*joints))
         if recorded is not None:
-            return Setting(recorded, (), hold, method, random_start, recorded=True)
+            return Setting(recorded, (), hold, method, random_start, True, *joints)
         region, poses = cell.get("capture.region"), cell["capture.poses"]
         points = cell.get("capture.positions_mm")
         if points is not None:
@@ -248,17 +245,23 @@ class Study:
             )
         limits = joint_limits(arm, None if degrees is None else [[math.radians(x) for x in pair] for pair in degrees])
         return Setting(
-            tuple(fixtures), tuple((float(a), float(b)) for a, b in limits), hold, method, random_start, False
+            tuple(fixtures), tuple((float(a), float(b)) for a, b in limits), hold, method, random_start, False, *joints
         )
 
-    def _method(self, cell: Mapping[str, Any]) -> str:
+    def _method(self, cell: Mapping[str, Any], prior: Prior | None) -> str:
+        asked = cell.get("identification.method")
         if self.observed:
-            return self._observed_method(cell.get("identification.method"))
-        if "identification.method" in cell:
-            return cell["identification.method"]
+            return self._observed_method(asked)
+        if asked == "two-stage" and prior is not None:
+            raise InputError(
+                "identification.method is 'two-stage', which ignores a prior; use 'joint', or prior = 'none' in "
+                "[identification]."
+            )
+        if asked is not None:
+            return asked
         reference = self.specification.reference is not None
         scaled = reference if self.capture is None else bool(self.capture.lengths)
-        return default_method(self.nominal.arm, general=False) if scaled else "stage1"
+        return default_method(self.nominal.arm, general=prior is not None) if scaled else "stage1"
 
     def _observed_method(self, asked: str | None) -> str:
         """All observations are solved at once: jointly, or as stage 1 where nothing fixes the scale."""
@@ -272,23 +275,28 @@ class Study:
             )
         return possible
 
-    def _scale_anchor(self, hold: str) -> str | None:
+    def _scale_anchor(self, hold: str, model: str | None) -> str | None:
+        space = self._spaces[model]
         with _naming("identification.hold"):
-            return scale_anchor(
-                self.space, self.nominal.arm, None if hold == "none" else hold, capture=self.capture
-            ).hold
+            return scale_anchor(space, space.base, None if hold == "none" else hold, capture=self.capture).hold
 
     def _values_of(self, cell: Mapping[str, Any]) -> tuple:
         """The fields of `CellValues` for one cell."""
         space, nominal, override = self.space, self.nominal, self.specification.bounds.override
         is_length_of = space.lengths
-        deviations = [_deviation(cell, name) for name in space.names]
-        unit = np.where(is_length_of, 1.0, DEG)
-        width = unit * [one.uniform if one.normal is None else one.normal for one in deviations]
+        coefficients = np.isin(space.names, correction_names(self._joints))
+        drawn, units = zip(*(deviation_of(cell, self._joints, name) for name in space.names), strict=True)
+        true = coefficients_of(nominal, cell["deviation.model"]) if "deviation.model" in cell else space.names
+        deviations = [
+            _NONE if one is None or (corrects and name not in true) else one
+            for one, corrects, name in zip(drawn, coefficients, space.names, strict=True)
+        ]
+        unit = np.where(coefficients, 1.0, np.where(is_length_of, 1.0, DEG))
+        width = np.array(units) * [one.uniform if one.normal is None else one.normal for one in deviations]
         length, angle = cell.get("bounds.length_mm"), cell.get("bounds.angle_deg")
         length = nominal.length if length is None else length
         angle = nominal.angle if angle is None else math.radians(angle)
-        half = np.where(is_length_of, length, angle)
+        half = np.where(coefficients, np.inf, np.where(is_length_of, length, angle))
         for name, value in (nominal.override if override is None else override).items():
             if override is not None or name in space.names:
                 with _naming("bounds.override"):
@@ -316,20 +324,20 @@ class Study:
     def _check(self) -> None:
         """Refuse everything that can be known to be wrong before work starts, but for what cannot be reached."""
         capture, pool = self.capture, self.specification.capture.pool
-        for what, there in (("corrections", self.nominal.arm.corrections), ("priors", self.nominal.prior)):
-            if there is not None:
-                raise InputError(f"studies do not know {what} of an arm; leave [{what}] out of its file.")
         if capture is not None and self.specification.reference is not None:
             raise InputError("the capture file brings its reference lengths; leave [reference] out.")
-        if capture is not None and capture.joints != self.nominal.arm.joints:
+        if capture is not None and capture.columns not in (self.nominal.arm.joints, self.nominal.arm.columns):
             raise InputError("the capture and the arm differ in their number of joints; name the arm that recorded it.")
-        unknowns = len(self.space.names) - int(self.space.lengths.any())
-        if capture is not None and self.observed:
-            anchored = any(setting.method == "stage1" for setting in self.settings)
-            observed = Observed.of(capture, self.nominal.arm)
-            check_observed(observed, self.space, self._nominal_vector, len(self.space.names) - anchored)
-        for setting in () if self.observed else dict.fromkeys(self.settings):
-            check_enough(setting.sizes, unknowns)
+        deviations = self.specification.deviation
+        given = [key for key in type(deviations).model_fields if getattr(deviations, key) is not None]
+        check_deviations(given, self._joints, self.space.names)
+        for setting in dict.fromkeys(self.settings):
+            space = self._spaces[setting.model]
+            if capture is not None and self.observed:
+                observed, unknowns = Observed.of(capture, space.base), len(space.names) - (setting.method == "stage1")
+                check_observed(observed, space, np.asarray(space.vector()), unknowns)
+                continue
+            check_enough(setting.sizes, len(space.names) - int(space.lengths.any()))
             if setting.method != "stage1" and capture is not None and not capture.lengths:
                 raise InputError("the capture file has no reference length; use method = 'stage1', or another file.")
             for fixture in () if capture is not None else setting.fixtures:
@@ -397,9 +405,3 @@ def _reference_fixtures(cell: Mapping[str, Any], region: Region | None) -> list[
         return [Fixture(f"L{i + 1}", poses, (tuple(a), tuple(b))) for i, (a, b) in enumerate(pairs)]
     length = cell["reference.length_mm"]
     return [Fixture(f"L{i + 1}", poses, None, region, length) for i in range(cell["reference.positions"])]
-
-
-def _deviation(cell: Mapping[str, Any], name: str) -> Any:
-    """The distribution of one free parameter: that of its kind, else that of all lengths or angles."""
-    general = "length_mm" if is_length(name) else "angle_deg"
-    return cell.get(f"deviation.{_DEVIATIONS[name.rpartition('_')[0]]}", cell[f"deviation.{general}"])

@@ -19,8 +19,9 @@ from ..kinematics.arm import Arm, by_joint
 from ..kinematics.chain import reading_units
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed, residual_rows
-from .definition import CellValues, Setting, Study
+from .definition import Study
 from .drawn_trials import DrawnTrials
+from .settings import CellValues, Setting
 
 _ROUNDS = 4  # of the configurations' way to their tips, each of which leaves about a hundredth
 _LONGEST_STEP = 0.1  # rad
@@ -38,7 +39,8 @@ class _Recorded(NamedTuple):
 @lru_cache(maxsize=4)
 def _recorded(study: Study) -> _Recorded:
     assert study.capture is not None
-    arm, space, observed = to_numpy((study.nominal.arm, study.space, Observed.of(study.capture, study.nominal.arm)))
+    arm = study.space.base
+    arm, space, observed = to_numpy((arm, study.space, Observed.of(study.capture, arm)))
     geometry = np.asarray(fit_geometry(arm, observed, {}, None).geometry)
     truth = ObservedTruth.at(study.capture, space, space.vector(), observed.split(geometry))
     units = reading_units(space.base.geometry)
@@ -81,7 +83,9 @@ def _trial(
     fraction = random.uniform(size=len(nominal))
     if setting.random_start:
         fixed = np.array([name == setting.hold for name in study.space.names])
-        start = np.where(fixed, nominal, values.lower + fraction * (values.upper - values.lower))
+        bounded = np.isfinite(values.lower) & np.isfinite(values.upper)  # coefficients of corrections are not
+        lower, upper = (np.where(bounded, side, nominal) for side in (values.lower, values.upper))
+        start = np.where(fixed, nominal, lower + fraction * (upper - lower))
     q, left = _taken(recorded, true)
     read = _read(recorded.space.base, q, truth.reading, values, random)
     errors = truth.errors_of_rows(1, float(values.seating), random)

@@ -20,8 +20,9 @@ from ..files.outputs import as_path
 from . import store
 from .blocks import Block, Layout, parts_of
 from .configuration_pool import check_reach
-from .definition import Setting, Study
+from .definition import Study
 from .local_processes import THREADS
+from .settings import Setting
 from .trials import run_block
 
 _CHUNK_CPU, _CHUNK_ELSEWHERE = 1000, 65_536

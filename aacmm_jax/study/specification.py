@@ -93,7 +93,9 @@ class Distribution(_Table):
 class DeviationTable(_Table):
     """Deviation of the true arm from the nominal one, independent for every free parameter.
 
-    ``length_mm`` and ``angle_deg`` apply to all lengths and angles that have no table entry of their own.
+    ``length_mm`` and ``angle_deg`` apply to all lengths and angles that have no table entry of their own. Coefficients
+    of joint corrections deviate where one of the last keys says so: those of ``model``, what the joints of true arms
+    do; by default those of all models of the study.
     """
 
     length_mm: Levels[Distribution] = [Distribution(uniform=0.0)]
@@ -104,6 +106,13 @@ class DeviationTable(_Table):
     alpha_deg: Levels[Distribution] | None = None
     theta_deg: Levels[Distribution] | None = None
     beta_deg: Levels[Distribution] | None = None
+    model: Levels[str] | None = None
+    harmonics_arcsec: Levels[Distribution] | None = None
+    harmonics_mm: Levels[Distribution] | None = None  # of prismatic joints
+    gear_ppm: Levels[Distribution] | None = None
+    coupled_ppm: Levels[Distribution] | None = None
+    gravity_mrad_per_m: Levels[Distribution] | None = None
+    gravity_mrad_per_knm: Levels[Distribution] | None = None  # of links whose masses are known
 
 
 class Region(_Table):
@@ -214,13 +223,29 @@ class ReferenceTable(_Table):
 
 
 class IdentificationTable(_Table):
-    """How the arm is identified. ``start``: the nominal arm, or random within the bounds (but for the scale anchor)."""
+    """How the arm is identified. ``start``: the nominal arm, or random within the bounds (but for the scale anchor).
 
+    ``model``: what the joints do besides their readings, as ``--model`` of calibrate, in place of the corrections of
+    the arm's file; ``prior`` as ``--prior``, with the same defaults.
+    """
+
+    model: Levels[str] | None = None
+    prior: Levels[str] | None = None
     method: Levels[Literal["stage1", "two-stage", "joint"]] | None = None
     hold: Levels[str] = ["longest"]
     start: Levels[Literal["nominal", "random"]] = ["nominal"]
     held: list[str] | None = None
     max_steps: Annotated[int, Field(ge=1, le=1_000_000)] = 300
+
+
+# Keys that a study made before they existed lacks: its digest must stay what it was.
+_LATER = {
+    "deviation": (
+        *("model", "harmonics_arcsec", "harmonics_mm", "gear_ppm", "coupled_ppm"),
+        *("gravity_mrad_per_m", "gravity_mrad_per_knm"),
+    ),
+    "identification": ("model", "prior"),
+}
 
 
 class Specification(_Table):
@@ -258,6 +283,14 @@ class Specification(_Table):
             raise ValueError("a reference length at random needs a region; give it in [reference], or give ends_mm.")
         return self
 
+    def content(self) -> str:
+        """All that the numbers of a study depend on, as JSON; keys that came later, only where they are given."""
+        later = {
+            table: {name for name in names if getattr(getattr(self, table), name) is None}
+            for table, names in _LATER.items()
+        }
+        return self.model_dump_json(exclude={"name": True, "arm": True, **later})
+
     def factors(self) -> dict[str, list]:
         """Values with more than one level: dotted name -> levels, in the order of the tables."""
         return {name: levels for name, levels in self._levels() if len(levels) > 1}
@@ -294,8 +327,10 @@ def _label(level: Any) -> str:
 
 def unit(name: str) -> str:
     """The unit that a dotted name ends in; "1" for counts and choices."""
+    if "_mrad_per_" in name:
+        return "mrad/(kN m)" if name.endswith("knm") else "mrad/m"
     last = name.rpartition("_")[2]
-    return last if last in ("mm", "deg", "arcsec") else "1"
+    return last if last in ("mm", "deg", "arcsec", "ppm") else "1"
 
 
 def checked(**tables: Any) -> Specification:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.units import ARCSEC
+from ..kinematics.arm import parameter_unit
 from ..solver.reason import Reason, numbers_of
 from .results import Results
 from .specification import label, unit
@@ -38,6 +39,14 @@ _FACTORS = {
     "bounds.angle_shift_deg": "shift of the centre, angles [deg]",
     "identification.hold": "scale anchor",
     "identification.method": "method",
+    "identification.model": "model of the joints",
+    "identification.prior": "prior",
+    "deviation.model": "what the true joints do",
+    "deviation.harmonics_arcsec": "encoder harmonics [arcsec]",
+    "deviation.gear_ppm": "errors of gear ratios [ppm]",
+    "deviation.coupled_ppm": "couplings of joints [ppm]",
+    "deviation.gravity_mrad_per_m": "compliance under gravity [mrad/m]",
+    "deviation.gravity_mrad_per_knm": "compliance under gravity [mrad/(kN m)]",
     "noise.encoder_arcsec": "encoder noise [arcsec]",
     "noise.linear_encoder_mm": "noise of linear encoders [mm]",
     "noise.seating_mm": "seating noise [mm]",
@@ -189,9 +198,11 @@ def _percentiles(ordered: Float[np.ndarray, " t"]) -> Float[np.ndarray, " q"]:
 
 
 def _parameters(results: Results, cell: int) -> dict[str, Any]:
-    """Bias and standard deviation of every parameter and how often it is on a bound, from sums over groups."""
-    space = results.study.space
-    names, lengths, groups = space.names, space.lengths, {}
+    """Bias and standard deviation of every parameter that the cell identifies, and how often it is on a bound, from
+    sums over groups."""
+    study = results.study
+    space, groups = study.space, {}
+    names, identified = space.names, study.identified(study.settings[cell]).space.names
     for error, active, group in results.errors(cell):
         for g in np.unique(group):
             rows = group == g
@@ -219,9 +230,10 @@ def _parameters(results: Results, cell: int) -> dict[str, Any]:
         return {"value": float(value[row, i]), "se": None if np.isnan(se[row, i]) else float(se[row, i])}
 
     parameters = [
-        {"parameter": name, "unit": "mm" if lengths[i] else "rad"}
+        {"parameter": name, "unit": parameter_unit(space.base, name)}
         | {key: entry(row, i) for row, key in enumerate(("bias", "spread", "on_a_bound"))}
         for i, name in enumerate(names)
+        if name in identified
     ]
     return {"on_a_bound": entry(3, 0), "parameters": parameters}
 

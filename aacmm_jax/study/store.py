@@ -40,7 +40,7 @@ from ..files.hdf5 import (
     undamaged,
     write_tables,
 )
-from ..kinematics.arm import is_length
+from ..kinematics.arm import parameter_unit
 from .blocks import NOT_RUN, VARIABLES, Block, Layout, fill_of, part_of, parts_of
 from .definition import Study
 from .specification import Specification, unit
@@ -205,7 +205,7 @@ def _write(
 
 def _tables(study: Study) -> dict[str, Table]:
     names = list(study.space.names)
-    units = ["mm" if is_length(name) else "rad" for name in names]
+    units = [parameter_unit(study.space.base, name) for name in names]
     nominal = np.asarray(study.space.vector())
     text = study.specification.model_dump_json(exclude_unset=True)
     parameter = columns("parameter", parameter=(names, "", "free parameter"))

@@ -3,6 +3,7 @@
 from functools import lru_cache
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -11,11 +12,14 @@ from ..calibration.redrawn import batch_of_captures
 from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..data.capture import Capture, ReferenceLength
+from ..kinematics.arm import correction_names
+from ..kinematics.parameters import Parameters
 from ..solver.reason import numbers_of
 from .blocks import Block
-from .definition import Setting, Study
+from .definition import Study
 from .drawn_trials import DrawnTrials
 from .observed_trials import draw_observed
+from .settings import Setting
 from .trial_simulation import draw, ends_of
 
 
@@ -68,27 +72,39 @@ def _drawn(
 def _identified(
     study: Study, setting: Setting, drawn: DrawnTrials, capture: Capture, devices: list[Any], workers: int | None
 ) -> dict[str, np.ndarray]:
+    space, prior = study.identified(setting)
+    chosen = np.array([study.space.index(name) for name in space.names])
+    fixed = np.asarray(Parameters(space.base, study.space.names).vector())
+    # Coefficients that a model frees begin at 0, whatever the nominal arm's are.
+    corrects = np.isin(study.space.names, correction_names(space.base)) & (setting.model is not None)
+    start = np.where(corrects, fixed, drawn.start)[:, chosen]
+    if setting.method == "stage1" and prior is not None:  # lengths would take part in its one least squares
+        capture = eqx.tree_at(lambda c: c.lengths, capture, (), is_leaf=lambda leaf: isinstance(leaf, tuple))
     options = {
-        "space": study.space,
+        "space": space,
+        "prior": prior,
         "hold": setting.hold,
         "max_steps": study.specification.identification.max_steps,
         "devices": devices,
         "workers": workers,
     }
-    problem = (study.nominal.arm, capture, drawn.lower, drawn.upper, drawn.start)
+    problem = (space.base, capture, drawn.lower[:, chosen], drawn.upper[:, chosen], start)
     if setting.method == "stage1":
         many = stage1 = identify_many(*problem, **options)
     else:
         many = calibrate_many(*problem, method=setting.method, **options)  # pyright: ignore[reportArgumentType]
         stage1 = many.stage1
+    identified = _identified_of_all(fixed, chosen, many.parameters)
+    identified1 = _identified_of_all(fixed, chosen, stage1.parameters)
     k = np.full(len(many.de), np.nan) if many.k is None else many.k
     lengths = study.space.lengths
+    angles = np.array([kind in ("alpha", "theta", "beta") for kind, _ in study.space.indices()])
     # Scale of the arm: the factor that best maps the true lengths onto the identified ones. Rows are contiguous, so
     # that each is summed in the same order however many there are.
     true = np.ascontiguousarray(np.where(lengths, drawn.true, 0.0))
     scale, scale_after = (
-        np.ascontiguousarray(found.parameters * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300)
-        for found in (stage1, many)
+        np.ascontiguousarray(found * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300)
+        for found in (identified1, identified)
     )
     scaled = setting.method != "stage1"
     return {
@@ -100,17 +116,24 @@ def _identified(
         "scale_error": scale_after - 1 if scaled else np.full(len(k), np.nan),
         "de_stage1": stage1.de,
         "deltam_stage1": stage1.deltam,
-        "length_error_stage1": _largest(stage1.parameters - drawn.true, lengths),
-        "angle_error_stage1": _largest(stage1.parameters - drawn.true, ~lengths),
+        "length_error_stage1": _largest(identified1 - drawn.true, lengths),
+        "angle_error_stage1": _largest(identified1 - drawn.true, angles),
         "de": many.de if scaled else np.full(len(k), np.nan),
         "deltam": many.deltam if scaled else np.full(len(k), np.nan),
-        "length_error": _largest(many.parameters - drawn.true, lengths, scaled),
-        "angle_error": _largest(many.parameters - drawn.true, ~lengths, scaled),
+        "length_error": _largest(identified - drawn.true, lengths, scaled),
+        "angle_error": _largest(identified - drawn.true, angles, scaled),
         "truth_inside": np.all((drawn.true >= drawn.lower) & (drawn.true <= drawn.upper), axis=1).astype(np.int8),
-        "active": many.active.astype(np.int8),
-        "estimate": many.parameters,
+        "active": _identified_of_all(np.zeros(len(fixed), np.int8), chosen, many.active),
+        "estimate": identified,
         "true": drawn.true,
     }
+
+
+def _identified_of_all(fixed: np.ndarray, chosen: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values of all parameters of a study, of which a cell identifies some."""
+    found = np.tile(fixed, (len(values), 1))
+    found[:, chosen] = values
+    return found
 
 
 def _largest(error: np.ndarray, which: np.ndarray, present: bool = True) -> np.ndarray:

@@ -10,17 +10,19 @@ from ..calibration.model_errors import model_tests
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import PriorMetrics, active_names
 from ..core.text import pluralise
-from ..core.units import DEG
+from ..core.units import DEG, people_read
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
-from ..kinematics.arm import by_joint, is_length, parameter_unit
+from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
+from ..uncertainty.tried_poses import tried_poses
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
-from .model_errors import summary_of_tests
+from .model_errors import noisy_encoder_rows, summary_of_tests
 from .observations import capture_observations, observed_summary
 from .validation import cross_validation_summary
+from .verdicts import calibration_verdict
 from .warnings import observed, of_calibration, of_import
 
 _CORRELATED = 0.95
@@ -48,6 +50,10 @@ def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
         "name": specification.name,
         "joints": joints,
         "probe_mm": np.asarray(arm.probe).tolist(),
+        "corrections": [
+            {"coefficient": name, "unit": parameter_unit(arm, name), "value": float(value_of(arm, name))}
+            for name in correction_names(arm)
+        ],
         "held": list(specification.space().held),
         "urdf": None
         if specification.urdf is None
@@ -69,10 +75,12 @@ def parameters_csv(record: CalibrationRecord) -> str:
 def capture_summary(recording: Recording) -> dict[str, Any]:
     """A capture: sockets with their poses, lengths, the nominal arm."""
     capture, units = recording.capture, by_joint(recording.nominal.arm, "rad", "mm")
+    q = np.asarray(capture.readings)
+    warmth = q[:, len(units) :]
     return {
         "kind": "capture",
         "arm": recording.nominal.name,
-        "joints": capture.joints,
+        "joints": recording.nominal.arm.joints,
         "poses": len(capture.readings),
         "sockets": [{"socket": name, "poses": size} for name, size in zip(capture.names, capture.sizes, strict=True)],
         "observations": capture_observations(capture),
@@ -80,9 +88,10 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
         "ranges": [
             {"joint": i + 1, f"lowest_{unit}": float(low), f"highest_{unit}": float(high)}
             for i, (low, high, unit) in enumerate(
-                zip(np.min(capture.readings, axis=0), np.max(capture.readings, axis=0), units, strict=True)
+                zip(np.min(q[:, : len(units)], axis=0), np.max(q[:, : len(units)], axis=0), units, strict=True)
             )
         ],
+        "temperature_C": [float(end) for end in (warmth.min(), warmth.max())] if warmth.size else None,
         "simulated": recording.true is not None,
         "warnings": of_import(recording),
     }
@@ -170,6 +179,7 @@ def calibration_summary(
         "method": record.method,
         "converged": record.converged,
         "residual_plausible": not record.implausible_residual,
+        "scale_plausible": record.plausible_scale,
         "reason": record.reason,
         "steps": record.steps,
         "poses": len(record.recording.capture.readings),
@@ -196,7 +206,7 @@ def calibration_summary(
         summary["truth"] = {
             stage: truth_errors(record, vectors, stage) for stage in ("nominal", "stage1", "calibrated")
         }
-    return summary
+    return summary | {"verdict": calibration_verdict(summary)._asdict()}
 
 
 def prior_rows(prior: PriorMetrics) -> list[dict[str, Any]]:
@@ -220,8 +230,9 @@ def prior_sentence(row: Mapping[str, Any]) -> str:
     spent = f"{row['effective_parameters']:.1f} of {pluralise(row['parameters'], 'parameter')} determined by the data"
     if not row["supported"]:
         return f"{row['group']}: learned, no deviation from the mean is supported, so it counts as exact; {spent}"
-    scale, unit = (1 / DEG, "deg") if row["unit"] == "rad" else (1.0, row["unit"])
-    return f"{row['group']}: {'learned' if row['learned'] else 'given'}, {row['sd'] * scale:.3g} {unit}; {spent}"
+    scale, unit = people_read(row["unit"])
+    scale_in_words = f"{row['sd'] * scale:.3g} {unit}".strip()
+    return f"{row['group']}: {'learned' if row['learned'] else 'given'}, {scale_in_words}; {spent}"
 
 
 def uncertainty_summary(
@@ -229,14 +240,16 @@ def uncertainty_summary(
 ) -> dict[str, Any]:
     """Noise behind the uncertainty, standard uncertainties (k = 1) over the working volume, and observability."""
     uncertainty = uncertainty_of(record)
+    volume = volumetric_uncertainty(uncertainty) if volume is None else volume
     found = {
         "form": record.noise_model,
         "encoder_arcsec": np.asarray(record.noise.encoder_arcsec).tolist(),
         "linear_encoder_mm": linear_encoder_mm(record.noise, record.calibrated.arm),
         "seating_mm": float(record.noise.seating),
+        "noisy_encoders": noisy_encoder_rows(record.noisy_encoders, record.calibrated.arm.prismatic),
         "misfit": record.reduced_chi,
         "coverage_factor_95": uncertainty.factor(0.95),
-        "volume": (volumetric_uncertainty(uncertainty) if volume is None else volume).summary,
+        "volume": volume.summary,
         "correlated": [{"one": one, "other": other, "r": r} for one, other, r in uncertainty.correlated(_CORRELATED)],
         "rank": observability.rank,
         "parameters": len(observability.names),
@@ -245,8 +258,28 @@ def uncertainty_summary(
     }
     # JSON has no infinity: None for what is not determined.
     found["volume"] = {key: value if np.isfinite(value) else None for key, value in found["volume"].items()}
+    found["tried"] = _tried(record, volume)
     found["condition"] = found["condition"] if np.isfinite(found["condition"]) else None
     return found
+
+
+def _tried(record: CalibrationRecord, volume: VolumetricUncertainty) -> dict[str, Any] | None:
+    """How many of the volume's poses are near those of the calibration; None of a single pose."""
+    readings = np.asarray(record.recording.capture.readings)
+    if len(readings) < 2:
+        return None
+    found = tried_poses(record.calibrated.arm, readings, volume.q)
+    return {"poses": len(found.distance), "tried": int(found.tried.sum()), "spacing_rad": found.spacing}
+
+
+def tried_sentence(found: Mapping[str, Any]) -> str:
+    """How much of the volume a calibration has tried, in words."""
+    percentage = 100 * found["tried"] / found["poses"]
+    return (
+        f"Of {found['poses']} random poses within the joint limits, {percentage:.2g} % lie as near to a pose of the "
+        f"calibration as its poses lie to one another ({found['spacing_rad'] / DEG:.2g} deg RMS over the joints). "
+        "Elsewhere the calibration was never tried, and U rests on the model alone."
+    )
 
 
 def active_names_of(record: CalibrationRecord, active: np.ndarray) -> dict[str, str]:
@@ -257,8 +290,8 @@ def active_names_of(record: CalibrationRecord, active: np.ndarray) -> dict[str, 
 def truth_errors(record: CalibrationRecord, vectors: dict[str, np.ndarray], stage: str) -> dict[str, float]:
     """Largest parameter errors against the true arm of a simulation."""
     difference = np.abs(vectors[stage] - vectors["true"])
-    length = np.array([is_length(name) for name in record.names])
+    units = np.array([parameter_unit(record.calibrated.arm, name) for name in record.names])
     return {
-        "length_error_largest_mm": float(difference[length].max(initial=0.0)),
-        "angle_error_largest_rad": float(difference[~length].max(initial=0.0)),
+        "length_error_largest_mm": float(difference[units == "mm"].max(initial=0.0)),
+        "angle_error_largest_rad": float(difference[units == "rad"].max(initial=0.0)),
     }

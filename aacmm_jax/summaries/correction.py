@@ -27,7 +27,7 @@ def correction_summary(
     Args:
         nominal: The arm that the controller has.
         calibrated: The calibrated arm.
-        q: Commanded readings, or those that the search for a pose began with, rad and mm.
+        q: Commanded readings, or those that the search for a pose began with, rad and mm; perhaps with temperatures.
         found: The corrected readings.
         unit: Of readings in the tables, deg or rad.
         of_readings: Whether readings were commanded; of positions with orientations nothing is known of the arm
@@ -56,7 +56,9 @@ def correction_summary(
     summary["largest_distance_mm"] = float(np.asarray(found.distance)[reached].max())
     summary["largest_angle_deg"] = float(np.asarray(found.angle)[reached].max() / DEG)
     if of_readings:
-        before = np.asarray(nominal.position(q[reached])) - np.asarray(calibrated.position(q[reached]))
+        before = np.asarray(calibrated.position(q[reached]))
+        q = q[:, : nominal.joints]
+        before = before - np.asarray(nominal.position(q[reached]))
         summary["largest_distance_before_mm"] = float(np.linalg.norm(before, axis=1).max())
         moved = np.where(reached[:, None], np.abs(np.asarray(found.q) - q), 0.0)
         change, slide = (moved * np.array(by_joint(nominal, *of)) for of in ((1 / DEG, 0.0), (0.0, 1.0)))

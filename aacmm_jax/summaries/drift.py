@@ -8,12 +8,11 @@ import numpy as np
 
 from ..drift.results import Drift, Trend
 from ..drift.statistics import LengthChange, ProbeTest
-from ..kinematics.arm import is_length
 
 
 def drift_summary(drift: Drift) -> dict[str, Any]:
     """Two calibrations compared; None for what is unknown or infinite."""
-    joint = drift.joint_test
+    joint, units = drift.joint_test, dict(zip(drift.names, drift.units, strict=True))
     return {
         "kind": "comparison",
         "level": drift.level,
@@ -29,10 +28,7 @@ def drift_summary(drift: Drift) -> dict[str, Any]:
             "freedom": _finite(joint.degrees_of_freedom),
             "p": _finite(joint.p),
             "parameters": list(joint.names),
-            "causes": [
-                {"parameter": name, "unit": "mm" if is_length(name) else "rad", "change": amount}
-                for name, amount in joint.causes
-            ],
+            "causes": [{"parameter": name, "unit": units[name], "change": amount} for name, amount in joint.causes],
             "probe": None if joint.probe is None else _probe_summary(joint.probe),
         },
         "lengths": lengths_summary(drift.lengths),
@@ -104,7 +100,7 @@ def trend_summary(trend: Trend, labels: list[str]) -> list[dict[str, Any]]:
 
 
 def drift_csv(trend: Trend, labels: list[str]) -> str:
-    """Every parameter of every calibration but the first, compared with the first: mm and rad, empty if unknown."""
+    """Every parameter of every calibration but the first, compared with the first, in its unit; empty if unknown."""
     text = io.StringIO()
     columns = ("parameter", "unit", "old", "new", "change", "u", "expanded", "moved", "without")
     writer = csv.writer(text, lineterminator="\n")
@@ -120,7 +116,7 @@ def _rows(drift: Drift) -> list[dict[str, Any]]:
     return [
         {
             "parameter": name,
-            "unit": "mm" if is_length(name) else "rad",
+            "unit": drift.units[i],
             "old": float(drift.old[i]),
             "new": float(drift.new[i]),
             "change": float(drift.change[i]),

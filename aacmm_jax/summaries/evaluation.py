@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from ..acceptance.decision import RULES
+from ..acceptance.influences import Influences
 from ..acceptance.record import EvaluationRecord, PointsRecord, check_geometry, unstated_uncertainty_warning
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from ..calibration.cross_validation import groups_of
@@ -18,6 +20,7 @@ from ..kinematics.arm import Arm
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .calibration import length_metrics, metrics, metrics_by_socket_and_length
 from .validation import agreement_row, finite, no_better, surprise
+from .verdicts import evaluation_verdict
 
 _LIMITED = {"rms_mm": "RMS distance", "deltam_mm": "Deltam", "length_error_largest_mm": "largest length error"}
 _GROUPS = ("held_out", "identified_from")
@@ -72,6 +75,9 @@ def evaluation_summary(
     summary["acceptance"] = acceptance_summary(found["calibrated"], found["nominal"])
     summary["standards"] = list(record.standards)
     summary["u_test_mm"] = record.u_test
+    summary["influences"] = influences_row(record.influences)
+    summary["verdict"] = evaluation_verdict(summary, len(summary["warnings"]))._asdict()
+    summary["calibration_warnings"] = list(record.calibration_warnings)
     return summary
 
 
@@ -163,7 +169,7 @@ def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = No
     """Acceptance tests of points; ``tests`` (`PointsRecord.acceptance`) are run if not given."""
     tests = record.acceptance() if tests is None else tests
     sockets = record.measured.sockets
-    return {
+    summary = {
         "kind": "acceptance",
         "points": sum(map(len, sockets.values()))
         + sum(len(group) for sphere in record.measured.spheres for group in sphere.groups),
@@ -176,6 +182,24 @@ def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = No
         "acceptance": acceptance_summary(tests),
         "standards": list(record.standards),
         "u_test_mm": record.u_test,
+        "influences": influences_row(record.influences),
+    }
+    return summary | {"verdict": evaluation_verdict(summary, len(summary["warnings"]))._asdict()}
+
+
+def influences_row(influences: Influences) -> dict[str, Any]:
+    """What adds uncertainty to test values, besides what is the same for all of them."""
+    bodies = {of: getattr(influences, of) for of in ("artefact", "arm")}
+    return {"u_relative": influences.u_relative} | {
+        f"{of}_expansion": None
+        if body is None
+        else {
+            "coefficient_per_k": body.coefficient,
+            "u_coefficient_per_k": body.u_coefficient,
+            "temperature_celsius": body.temperature,
+            "u_temperature_celsius": body.u_temperature,
+        }
+        for of, body in bodies.items()
     }
 
 
@@ -185,10 +209,15 @@ def acceptance_summary(tests: list[AcceptanceTest], before: list[AcceptanceTest]
     return [
         {
             "standard": test.standard,
+            "called": test.called,
+            "rule": RULES[test.rule],
             "title": test.title,
             "decision": test.decision,
             "missing": list(test.missing),
-            "figures": [_metric(metric, earlier.get((test.title, metric.name))) for metric in test.metrics],
+            "figures": [
+                _metric(metric, earlier.get((test.title, metric.name))) | {"symbol": test.symbol(metric)}
+                for metric in test.metrics
+            ],
         }
         for test in tests
     ]

@@ -177,6 +177,12 @@ def _roots(shape: tuple[int, ...], lever: float) -> Float[np.ndarray, "m r r"]:
 
 
 def _readings(q: Float[np.ndarray, "M n"], arm: Arm) -> Iterator[_Tried]:
+    """The columns of the joints corrected; that of a thermometer stays."""
+    for tried in _of_joints(q[:, : arm.joints], arm):
+        yield tried._replace(q=np.concatenate([tried.q, q[:, arm.joints :]], axis=1))
+
+
+def _of_joints(q: Float[np.ndarray, "M n"], arm: Arm) -> Iterator[_Tried]:
     joints = range(q.shape[1])
     for several in (1, 2):
         for chosen in itertools.combinations(joints, several):

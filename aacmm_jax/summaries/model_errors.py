@@ -1,10 +1,14 @@
 """Tests of a calibration's model and noise in sentences, and as JSON has them."""
 
 import math
+from collections.abc import Collection, Sequence
 from typing import Any
 
-from ..calibration.model_errors import LEVEL, FoundTerm, Lengths, Misfit, ModelTests
+from ..calibration.length_consistency import Lengths
+from ..calibration.missing_terms import FoundTerm
+from ..calibration.model_errors import LEVEL, Misfit, ModelTests
 from ..calibration.record import REPEATABILITY
+from ..calibration.results import NoisyEncoder
 from ..core.text import shorten
 from ..core.units import ARCSEC
 
@@ -18,7 +22,9 @@ _TERMS: dict[str, tuple[str, str, str]] = {
     "drifting zero": ("the order of the poses in joint {i}", "a zero that drifts", ""),
     "drifting base": ("the order of the poses in the tip", "a base or socket that moves", ""),
     "growing arm": ("the order of the poses in the arm's size", "an arm that warms or cools", ""),
+    "thermal expansion": ("temperature", "an arm that expands", "expansion"),
 }
+_FAR_MORE = 100.0  # ratio of noise beyond which the number says nothing
 _MODEL_OPTION = "--model dh,"  # of the command line, which takes further terms into the model
 
 
@@ -52,6 +58,42 @@ def sentences_of_tests(tests: ModelTests, method: str = "") -> list[str]:
     return found
 
 
+def sentence_of_noisy_encoders(encoders: Sequence[NoisyEncoder], slides: Collection[int], given: bool) -> str:
+    """That the noise of some encoders was replaced; ``slides`` are the numbers of prismatic joints."""
+    named = [
+        f"joint {one.joint} scatter by {_noise(one, slides)}, {_times(one)} "
+        f"{'given' if given else 'those of the others'} ({_chance(one.probability)})"
+        for one in encoders
+    ]
+    return (
+        f"Readings of {shorten(named, 3)}. This noise was estimated, and weights and every u follow from it "
+        f"(--keep-noise: from {'the noise as given' if given else 'one noise of all encoders'}). Check the encoder, "
+        "and the joint for play."
+    )
+
+
+def _times(one: NoisyEncoder) -> str:
+    # Of the others nothing may be left beside the noise of the tip, and what is given may be 0.
+    known = one.found < _FAR_MORE * one.expected
+    return f"{one.found / one.expected:.2g} times as much as" if known else "far more than"
+
+
+def _noise(one: NoisyEncoder, slides: Collection[int]) -> str:
+    if one.joint in slides:
+        return f"{_rounded(1e3 * one.found)} um (u = {_rounded(1e3 * one.u)})"
+    return f"{_rounded(one.found / ARCSEC)} arcsec (u = {_rounded(one.u / ARCSEC)})"
+
+
+def noisy_encoder_rows(encoders: Sequence[NoisyEncoder], slides: Collection[int]) -> list[dict[str, Any]]:
+    """Encoders whose noise was replaced, as JSON has them; arcsec, or mm of prismatic joints."""
+    rows = []
+    for one in encoders:
+        unit, factor = ("mm", 1.0) if one.joint in slides else ("arcsec", 1 / ARCSEC)
+        values = {name: factor * getattr(one, name) for name in ("expected", "found", "u")}
+        rows.append({"joint": one.joint, "probability": one.probability, "unit": unit, **values})
+    return rows
+
+
 def _terms(terms: tuple[FoundTerm, ...]) -> str:
     named = [f"{_TERMS[term.kind][0].format(i=term.joint)} ({_amplitude(term)})" for term in terms]
     kinds = dict.fromkeys(term.kind for term in terms)
@@ -80,10 +122,10 @@ def _rounded(value: float) -> str:
 
 def _misfit(misfit: Misfit) -> str:
     chance = _chance(misfit.probability)
-    if misfit.of_class:
+    if misfit.usual:
         return (
-            f"Residuals are {misfit.ratio:.2g} times what encoders and seat of this class of arms predict ({chance}): "
-            "errors that the model lacks, or worse encoders."
+            f"Residuals are {misfit.ratio:.2g} times what is usual for such an arm ({misfit.usual}; {chance}): errors "
+            "that the model lacks, or worse encoders."
         )
     word = "small" if misfit.ratio > 1 else "large"
     return (
@@ -118,7 +160,7 @@ def summary_of_tests(tests: ModelTests) -> dict[str, Any]:
             "ratio": misfit.ratio,
             "degrees_of_freedom": misfit.degrees_of_freedom,
             "probability": misfit.probability,
-            "against": "class" if misfit.of_class else "given noise",
+            "against": misfit.usual or "given noise",
         },
         "lengths": None
         if lengths is None

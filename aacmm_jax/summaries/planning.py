@@ -137,6 +137,8 @@ def procedure_summary(procedure: Procedure, arm: str) -> dict[str, Any]:
         "standard": PLANNED[procedure.standard],
         "poses": procedure.poses,
         "reach_mm": procedure.reach.radius,
+        "measuring_range_mm": procedure.measuring_range,
+        "measuring_range_stated": procedure.range_stated,
         "shoulder_mm": procedure.reach.shoulder.tolist(),
         "bars": [{"length_mm": value, "positions": count} for value, count in lengths.items()],
         "spheres": [

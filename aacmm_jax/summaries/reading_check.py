@@ -29,7 +29,7 @@ def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
         InputError: There is neither a socket of two poses nor a measured point.
     """
     if any(size > 1 for size in capture.sizes):
-        return check_readings(arm, np.asarray(capture.q), sockets=capture.owner)
+        return check_readings(arm, np.asarray(capture.q)[:, : arm.joints], sockets=capture.owner)
     measured = [one for one in capture.observations if isinstance(one, AbstractMeasured)]
     if not measured:
         raise InputError(
@@ -39,7 +39,7 @@ def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
     alike = [one for one in measured if (one.station, one.target) == (first.station, first.target)]
     return check_readings(
         arm,
-        np.concatenate([np.asarray(one.q) for one in alike]),
+        np.concatenate([np.asarray(one.q)[:, : arm.joints] for one in alike]),
         positions=np.concatenate([np.asarray(one.points) for one in alike]),
         own_frame=True,
         free_tip=bool(first.target),

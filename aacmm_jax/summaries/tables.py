@@ -51,6 +51,19 @@ def expanded_words(row: Mapping[str, Any], factor: float) -> str:
     return (f"({words})" if len(row["u_found"]) > 1 else words) + unit
 
 
+def two_digits(u: float) -> str:
+    """An uncertainty to two digits: 0.0123 is "0.012"."""
+    return f"{u:.{decimals_for(u)}f}"
+
+
+def decimals_for(u: float | None, default: int = 4) -> int:
+    """Decimals that show two digits of an uncertainty, and that its value is rounded to."""
+    if u is None or not math.isfinite(u) or u <= 0:
+        return default
+    # 0.0996 is 0.10 and not 0.100.
+    return min(max(1 - math.floor(math.log10(float(f"{u:.1e}"))), 0), 9)
+
+
 def volume_rows(volume: Mapping[str, Any], factor: float) -> list[tuple[str, list[float | None]]]:
     """U over the working volume: what it is of, and its median, 95th percentile and largest value, mm."""
     length = f"{volume['length_mm']:g} mm length"

@@ -22,7 +22,7 @@ from ..model.metrics import pose_outliers
 from ..uncertainty.identifiability import Observability, observability
 from .contradictions import contradictions, removals
 from .likely_cause import likely_cause
-from .model_errors import sentences_of_tests
+from .model_errors import sentence_of_noisy_encoders, sentences_of_tests
 from .validation import contradicted_prediction
 
 _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a reference length is wrong
@@ -103,6 +103,9 @@ def of_calibration(
     found += removals(record)
     found += _implausible(record)
     found += contradictions(record)
+    if record.noisy_encoders:
+        slides, given = record.calibrated.arm.prismatic, record.given_noise is not None
+        found.append(sentence_of_noisy_encoders(record.noisy_encoders, slides, given))
     found += [] if record.validation is None else contradicted_prediction(record.validation)
     if not record.implausible_residual:
         found += sentences_of_tests(model_tests(record) if tests is None else tests, record.method)

@@ -11,14 +11,17 @@ from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm
 from ..kinematics.chain import joint_motion
+from ..kinematics.corrected_arm import with_further_corrections
 from ..kinematics.parameters import Parameters
+from .shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
 
 
 class Uncertainty(eqx.Module):
     """Standard uncertainties of a calibrated arm, in mm and rad.
 
     They are the calibration's contribution; with ``reading=True`` the noise of the readings is added, as given to the
-    calibration or as estimated by it. What depends on a direction that the data do not determine is infinitely
+    calibration or as estimated by it, and the errors that poses in one place share (``shared``). Functions of the
+    readings that the model was found to lack count in both: they move every pose. What depends on a direction that the data do not determine is infinitely
     uncertain. Fixed parameters count as exact, and so does the base frame (``d_1`` and ``theta_1`` only define it).
     """
 
@@ -27,6 +30,7 @@ class Uncertainty(eqx.Module):
     open: Float[AnyArray, "p p"]  # projector onto undetermined directions, natural steps
     noise: Noise
     u_k: Float[AnyArray, ""] | None
+    shared: SharedErrors | None = eqx.field(default=None, kw_only=True)
     names: tuple[str, ...] = eqx.field(static=True)
     degrees_of_freedom: float = eqx.field(static=True)  # degrees of freedom; infinite where the noise was given
 
@@ -34,6 +38,32 @@ class Uncertainty(eqx.Module):
     def space(self) -> Parameters:
         """The free parameters."""
         return Parameters(self.arm, self.names)
+
+    @property
+    def complete(self) -> "Uncertainty":
+        """The same with the coefficients of the functions that the model lacks as further parameters, which are 0."""
+        shared = self.shared
+        if shared is None or not shared.names:
+            return self
+        xp, k = namespace(self), len(shared.names)
+        crossed = shared.follow @ shared.moments
+        above = xp.concatenate([self.covariance, crossed], axis=1)
+        below = xp.concatenate([crossed.T, shared.moments], axis=1)
+        return Uncertainty(
+            arm=with_further_corrections(self.arm, shared.names),
+            covariance=xp.concatenate([above, below]),
+            open=xp.asarray(np.pad(np.asarray(self.open), (0, k))),
+            noise=self.noise,
+            u_k=self.u_k,
+            shared=shared.without_functions(),
+            names=(*self.names, *shared.names),
+            degrees_of_freedom=self.degrees_of_freedom,
+        )
+
+    @property
+    def in_one_place(self) -> Float[AnyArray, ""] | float:
+        """Standard deviation of a tip coordinate by errors that the poses of one visit to a place share, mm."""
+        return 0.0 if self.shared is None else self.shared.sd_of(PLACES, VISITS, SUCCESSIVE)
 
     @property
     @numpy_if_known
@@ -74,7 +104,8 @@ class Uncertainty(eqx.Module):
     def tip(self, q: Numbers, *, reading: bool = False) -> Float[AnyArray, "... 3 3"]:
         """Covariance of the tip's position in the base frame at joint angles ``(..., n)``, mm^2."""
         q = self._checked(q)
-        covariance = self.covariance_of_functions(self.derivatives(q))
+        whole = self.complete
+        covariance = whole.covariance_of_functions(whole.derivatives(q))
         return covariance + self._reading(q) if reading else covariance
 
     @numpy_if_known
@@ -93,9 +124,9 @@ class Uncertainty(eqx.Module):
             raise InputError(
                 "both poses put the tip in the same place, so there is no length between them; give others."
             )
-        direction = between / xp.linalg.norm(between, axis=-1, keepdims=True)
-        along = xp.einsum("...c,...cp->...p", direction, self.derivatives(end) - self.derivatives(start))
-        variance = self.covariance_of_functions(along[..., None, :])[..., 0, 0]
+        direction, whole = between / xp.linalg.norm(between, axis=-1, keepdims=True), self.complete
+        along = xp.einsum("...c,...cp->...p", direction, whole.derivatives(end) - whole.derivatives(start))
+        variance = whole.covariance_of_functions(along[..., None, :])[..., 0, 0]
         if reading:
             both = self._reading(start) + self._reading(end)
             variance = variance + xp.einsum("...c,...cd,...d->...", direction, both, direction)
@@ -122,7 +153,7 @@ class Uncertainty(eqx.Module):
         flat = q.reshape(-1, q.shape[-1])
         geometry = self.arm.geometry
         covariance = xp.moveaxis(tip_covariances(geometry, joint_motion(geometry, flat), self.noise), -1, 0)
-        return covariance.reshape(*q.shape[:-1], 3, 3)
+        return covariance.reshape(*q.shape[:-1], 3, 3) + self.in_one_place**2 * xp.asarray(np.eye(3))
 
     def _is_open(self, derivatives: Float[AnyArray, "... k p"]) -> Bool[AnyArray, "... k"]:
         """Which rows follow an undetermined direction."""

@@ -299,16 +299,21 @@ def _remedy(arm: Arm, capture: Capture, space: Parameters, rank: int) -> str:
     random = np.random.default_rng(0)
     limits = np.asarray(joint_limits(arm, None))
     # The zero byte keeps the invented sockets apart from those of the capture.
-    more_sockets = {
-        f"\0{i}": q[None] for i, q in enumerate(random.uniform(limits[:, 0], limits[:, 1], (4, arm.joints)))
-    }
+    q = random.uniform(limits[:, 0], limits[:, 1], (4, arm.joints))
+    temperature = np.asarray(capture.readings)[: len(q), arm.joints :][:1]
+    q = np.concatenate([q, np.repeat(temperature, len(q), axis=0)], axis=1)
+    more_sockets = {f"\0{i}": row[None] for i, row in enumerate(q)}
     one = [ReferenceLength("\0000", "\0001", 1.0)]
     two = [*one, ReferenceLength("\0002", "\0003", 1.0)]
     more_poses = {}
     for first, readings in list(capture.sockets.items())[:1]:
         more_poses = {f"\0 {first}": _other_configurations(arm, np.asarray(readings)[0], random)}
+    warmer = {}
+    if capture.columns > arm.joints:
+        warmer = {f"\0 {name}": _warmer_too(np.asarray(readings)) for name, readings in capture.sockets.items()}
     length = "a second position of the reference length" if capture.lengths else "a reference length"
     for text, sockets, lengths in (
+        ("Poses in the same sockets at other temperatures would determine them.", warmer, []),
         (f"{length[0].upper()}{length[1:]} would determine them.", more_sockets, one),
         ("Reference lengths at two more positions would determine them.", more_sockets, two),
         ("More poses in a socket, as different as possible, would determine them.", more_poses, []),
@@ -322,8 +327,16 @@ def _remedy(arm: Arm, capture: Capture, space: Parameters, rank: int) -> str:
     return ""
 
 
+def _warmer_too(q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "2*m n"]:
+    """The same configurations, and once more 10 K warmer."""
+    warmer = q.copy()
+    warmer[:, -1] += 10.0
+    return np.concatenate([q, warmer])
+
+
 def _other_configurations(arm: Arm, q: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Other configurations with the tip where ``q`` has it."""
-    starts = q + random.uniform(-1.5, 1.5, (60, arm.joints))
+    starts = np.tile(q, (60, 1))
+    starts[:, : arm.joints] += random.uniform(-1.5, 1.5, (60, arm.joints))
     found, reached = project_to_targets(arm, starts, np.tile(np.asarray(arm.position(q)), (60, 1)))
     return found[reached] if reached.any() else q[None]

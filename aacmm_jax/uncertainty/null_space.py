@@ -55,7 +55,10 @@ def structural(null: Float[np.ndarray, "p nullity"], arm: Arm, space: Parameters
     if not null.shape[1]:
         return np.zeros(0, dtype=bool)
     count = _CONFIGURATIONS
-    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (count, arm.joints))
+    random = np.random.default_rng(0)
+    q = random.uniform(-np.pi, np.pi, (count, arm.joints))
+    if arm.thermometer:
+        q = np.concatenate([q, random.uniform(10.0, 30.0, (count, 1))], axis=1)
     movements = (jacobian_at(arm, q, space.names) * np.asarray(space.scale) @ null).reshape(3 * count, -1)
     tips = np.asarray(arm.position(q))
     rotations = np.cross(np.eye(3)[None, :, :], tips[:, None, :]).transpose(0, 2, 1)

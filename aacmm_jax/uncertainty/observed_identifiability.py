@@ -145,7 +145,9 @@ def _moved(observed: Observed, arm: Arm, linear: list[Linear], errors: list[ArmE
         step = np.einsum("mnr,rm->mn", np.linalg.pinv(by_units, rcond=1e-6), np.asarray(part.rows.values))
         size = np.linalg.norm(step, axis=1, keepdims=True)
         step = step * np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300))
-        new.append(np.asarray(observation.q) - units * step)
+        q = np.asarray(observation.q).copy()
+        q[:, : len(units)] -= units * step
+        new.append(q)
     observations = tuple(
         eqx.tree_at(lambda o: o.q, observation, q) for observation, q in zip(observed.observations, new, strict=True)
     )

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from ..core.distributions import chi_square_tail, f_tail
 from .group_test import Block
 
+LEVEL = 0.01  # of false alarms of one family of tests
 _NULL = 1e-5  # singular values of scaled columns below this, of the largest, are zero
 _EXPLAINED = 1e-8  # squared part of a column that the model leaves, below which it counts as the model's own
 
@@ -190,7 +191,36 @@ def form_test(left: Residuals, form: Form, relative: bool) -> FormTest:
         form: The form.
         relative: Compare with the variance of all residuals instead of 1.
     """
-    value, traces = _value_and_traces(left, form)
+    return _tested(left, *_value_and_traces(left, form), relative)
+
+
+def form_of_poses(left: Residuals, columns: Sequence[np.ndarray | None], kernel: Sequence[np.ndarray | None]) -> Form:
+    """A form of the rows of poses; relations, which come last, have no part in it."""
+    none = (None,) * (len(left.slices) - len(columns))
+    return Form((*columns, *none), (*kernel, *none))
+
+
+def block_diagonal(columns: Float[np.ndarray, "m r c"]) -> Float[np.ndarray, "R C"]:
+    """Columns of single poses, 0 in the rows of all others."""
+    poses, size, width = columns.shape
+    found = np.zeros((poses, size, poses, width))
+    found[np.arange(poses), :, np.arange(poses)] = columns
+    return found.reshape(poses * size, poses * width)
+
+
+def pose_form_test(left: Residuals, kernels: Sequence[Float[np.ndarray, "m k k"] | None], relative: bool) -> FormTest:
+    """The same of a form in which rows of different poses do not meet: r'A r is the sum of r_i' K_i r_i.
+
+    Args:
+        left: The residuals.
+        kernels: Part by part, the symmetric K of each of its poses, whose rows follow each other; None for a part that
+            has none.
+        relative: Compare with the variance of all residuals instead of 1.
+    """
+    return _tested(left, *_value_and_traces_by_pose(left, kernels), relative)
+
+
+def _tested(left: Residuals, value: float, traces: tuple[float, float, float], relative: bool) -> FormTest:
     spare = left.degrees_of_freedom
     if relative:
         # r'A r > x r'r, which is r'(A - x I) r > 0.
@@ -228,6 +258,48 @@ def _value_and_traces(left: Residuals, form: Form) -> tuple[float, tuple[float, 
         one - float(np.trace(g)),
         two - 2 * float(np.trace(h)) + float(np.sum(g * g.T)),
         three - 3 * float(np.trace(h2)) + 3 * float(np.sum(h * g.T)) - float(np.trace(g @ g @ g)),
+    )
+
+
+def _value_and_traces_by_pose(
+    left: Residuals, kernels: Sequence[Float[np.ndarray, "m k k"] | None]
+) -> tuple[float, tuple[float, float, float]]:
+    """r'A r, and the traces of the first powers of MA, with M = I - Q Q' and the columns Q of all unknowns.
+
+    With G_k = Q' A^k Q, tr (MA)^2 = tr A^2 - 2 tr G_2 + tr G_1^2, and tr (MA)^3 = tr A^3 - 3 tr G_3 + 3 tr G_1 G_2 -
+    tr G_1^3. Q is [O B] with the parts' own columns O, of which those of different parts do not meet in G.
+    """
+    size = left.basis.shape[1]
+    shared = np.zeros((3, size, size))  # B' A^k B
+    mixed = np.zeros((size, size))  # B' A O O' A B
+    value = one = two = three = 0.0
+    for rows, own, kernel in zip(left.slices, left.own, kernels, strict=True):
+        if kernel is None:
+            continue
+        poses, each = kernel.shape[:2]
+        k2 = kernel @ kernel
+        r, basis = left.values[rows].reshape(poses, each), left.basis[rows]
+        o = own.reshape(poses, each, -1)
+        value += float(np.einsum("ma,mab,mb->", r, kernel, r))
+        ko, k2o = (kernel @ o).reshape(own.shape), (k2 @ o).reshape(own.shape)
+        kb, k2b = ((k @ basis.reshape(poses, each, -1)).reshape(basis.shape) for k in (kernel, k2))
+        shared += np.stack([basis.T @ kb, basis.T @ k2b, kb.T @ k2b])
+        d1, d2, d3, e1, e2 = own.T @ ko, own.T @ k2o, ko.T @ k2o, own.T @ kb, own.T @ k2b
+        mixed += e1.T @ e1
+        one += float(np.einsum("maa->", kernel)) - float(np.trace(d1))
+        two += float(np.sum(kernel**2)) - 2 * float(np.trace(d2)) + float(np.sum(d1**2)) + 2 * float(np.sum(e1**2))
+        three += float(np.sum(kernel * k2)) - 3 * float(np.trace(d3))
+        three += 3 * float(np.sum(d1 * d2)) + 6 * float(np.sum(e1 * e2))
+        three -= float(np.trace(d1 @ d1 @ d1)) + 3 * float(np.sum((d1 @ e1) * e1))
+    g1, g2, g3 = shared
+    return value, (
+        one - float(np.trace(g1)),
+        two - 2 * float(np.trace(g2)) + float(np.sum(g1**2)),
+        three
+        - 3 * float(np.trace(g3))
+        + 3 * float(np.sum(g1 * g2))
+        - float(np.trace(g1 @ g1 @ g1))
+        - 3 * float(np.sum(mixed * g1)),
     )
 
 

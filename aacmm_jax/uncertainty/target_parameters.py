@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.observations.measured_transforms import MeasuredTransforms
 from ..data.observations.observation import offset_of
@@ -28,7 +29,8 @@ def independent_of_targets(arm: Arm, capture: Capture) -> Parameters:
         arm: The nominal arm.
         capture: At least one observation, each of a target.
     """
-    observed, space = Observed.of(capture, arm), Parameters(arm, ("probe_x",))
+    # NumPy compiles nothing.
+    observed, space = to_numpy((Observed.of(capture, arm), Parameters(arm, ("probe_x",))))
     found = observed.split(np.asarray(observed.start(space, np.asarray(space.vector()))))
     places = [np.asarray(found[offset_of(observation.target)]) for observation in observed.observations]
     tip = max(places, key=lambda place: float(np.hypot(place[0], place[1])))

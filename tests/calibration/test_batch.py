@@ -31,7 +31,7 @@ def starts(box):
     return lower + (upper - lower) * np.random.default_rng(3).uniform(size=(BATCH, 21))
 
 
-@pytest.mark.parametrize("hold", ["d_3", None])
+@pytest.mark.parametrize("hold", ["d_3", pytest.param(None, marks=pytest.mark.slow)])
 def test_equals_single_identifications(paper_arm, noisy_capture, box, starts, hold):
     many = aj.identify_many(paper_arm, noisy_capture, *box, starts, hold=hold)
     assert np.all(many.converged)
@@ -48,6 +48,7 @@ def test_equals_single_identifications(paper_arm, noisy_capture, box, starts, ho
         assert many.k[i] == pytest.approx(float(single.scale.value), rel=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.optimised
 def test_the_chunk_changes_no_bit(paper_arm, noisy_capture, box, starts):
     whole = aj.identify_many(paper_arm, noisy_capture, *box, starts, slots=8)
@@ -57,6 +58,7 @@ def test_the_chunk_changes_no_bit(paper_arm, noisy_capture, box, starts):
             np.testing.assert_array_equal(getattr(whole, field), getattr(parts, field))
 
 
+@pytest.mark.slow
 def test_batches_of_arms_and_captures(paper_arm):
     """Every problem its own arm and its own recording: each finds its own truth."""
     space = aj.Parameters.free_of(paper_arm)
@@ -74,6 +76,7 @@ def test_batches_of_arms_and_captures(paper_arm):
         np.testing.assert_allclose(lengths, np.asarray(space.vector(arm))[space.lengths], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_bounds_of_a_space_equal_arrays(paper_arm, noisy_capture, box, starts):
     """A space of fewer parameters in another order, and what is fixed taken from the arm."""
     space = aj.Parameters(paper_arm, tuple(reversed([n for n in aj.Parameters.free_of(paper_arm).names if n != "a_2"])))
@@ -160,7 +163,7 @@ np.save(sys.argv[2], many.parameters)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_number_of_devices_changes_nothing(tmp_path):
     root = Path(__file__).resolve().parents[2]
     for devices in ("1", "2"):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration import model_errors, model_tests
+from aacmm_jax.calibration import group_equations, model_errors, model_tests
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.summaries.model_errors import sentences_of_tests, summary_of_tests
 
@@ -53,11 +53,15 @@ def captured(paper_arm):
     return make
 
 
-def checked(arm, capture, given, **options):
+def calibrated(arm, capture, given, **options):
     space = aj.Parameters.free_of(arm)
     bounds = aj.Bounds.around(arm, space, length=10.0, angle=0.0175)
-    result = aj.calibrate(arm, capture, bounds, noise=NOISE if given else None, check_identifiability=False)
-    return model_tests(result, capture, **options)
+    options = {"noise": NOISE if given else None, "check_identifiability": False} | options
+    return aj.calibrate(arm, capture, bounds, **options)
+
+
+def checked(arm, capture, given, **options):
+    return model_tests(calibrated(arm, capture, given, replace_noise=False), capture, **options)
 
 
 @pytest.mark.parametrize("given", [True, False])
@@ -107,7 +111,7 @@ def test_gravity_is_named(paper_arm, captured):
 @pytest.mark.parametrize("given", [True, False])
 def test_a_noisy_encoder_is_named(paper_arm, captured, given):
     found = checked(paper_arm, captured(noise=FIVE_TIMES), given)
-    assert (found.noisy_joint.joint, found.noisy_joint.probability < 1e-6) == (3, True)
+    assert (found.noisy_joint.joint, found.noisy_joint.probability < 1e-4) == (3, True)
     assert any("reading of joint 3 moves the tip" in text for text in sentences_of_tests(found))
     assert found.lengths.probability > model_errors.LEVEL
 
@@ -139,20 +143,19 @@ def test_a_wrong_length_among_three(paper_arm, captured):
 
 def test_estimated_noise_against_that_of_the_class(paper_arm, captured):
     usual = checked(paper_arm, captured(), False, class_noise=NOISE)
-    assert usual.misfit.of_class
+    assert usual.misfit.usual
     assert usual.misfit.ratio == pytest.approx(1, abs=0.15)
     fine = aj.Noise(encoder_arcsec=0.4, seating=0.001)
     unusual = checked(paper_arm, captured(), False, class_noise=fine)
     assert unusual.misfit.ratio == pytest.approx(5 * usual.misfit.ratio, rel=0.02)
     assert unusual.misfit.probability < model_errors.LEVEL < usual.misfit.probability
-    assert any("of this class of arms" in text for text in sentences_of_tests(unusual))
+    assert any("usual for such an arm" in text for text in sentences_of_tests(unusual))
 
 
 @pytest.mark.parametrize(("stated", "too"), [(0.5, "small"), (2.0, "large")])
 def test_noise_that_is_stated_wrongly(paper_arm, captured, stated, too):
     noise = aj.Noise(encoder_arcsec=2.0 * stated, seating=0.005 * stated)
-    bounds = aj.Bounds.around(paper_arm, aj.Parameters.free_of(paper_arm), length=10.0, angle=0.0175)
-    result = aj.calibrate(paper_arm, captured(), bounds, noise=noise, check_identifiability=False)
+    result = calibrated(paper_arm, captured(), True, noise=noise)
     said = [text for text in aj.warnings_of(result, captured()) if "given noise" in text]
     assert len(said) == 1
     assert f"times too {too}" in said[0]
@@ -183,12 +186,12 @@ def test_observations_and_their_division_into_chunks(paper_arm, monkeypatch):
     found = checked(paper_arm, wrong, True)
     assert [one.name for one in found.noisy_observations][:1] == ["camera"]
     assert any("camera (" in text and "their u" in text for text in sentences_of_tests(found))
-    monkeypatch.setattr(model_errors, "_CHUNK", 25)
+    monkeypatch.setattr(group_equations, "_CHUNK", 25)
     divided = checked(paper_arm, wrong, True)
     assert divided.misfit.ratio == pytest.approx(found.misfit.ratio)
     assert [term[:2] for term in divided.terms] == [term[:2] for term in found.terms]
-    assert divided.noisy_joint.test.ratio == pytest.approx(found.noisy_joint.test.ratio)
-    monkeypatch.setattr(model_errors, "_MOST_POSES", 45)
+    assert divided.noisy_joint.ratio == pytest.approx(found.noisy_joint.ratio)
+    monkeypatch.setattr(group_equations, "_MOST_POSES", 45)
     assert checked(paper_arm, wrong, True).misfit.degrees_of_freedom < found.misfit.degrees_of_freedom / 1.5
 
 
@@ -199,7 +202,7 @@ def test_without_noise_nothing_is_checked(paper_arm):
     assert not found.warns
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_rates_of_false_alarms_and_of_warnings(monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
     import model_warnings

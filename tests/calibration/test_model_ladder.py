@@ -102,6 +102,28 @@ def test_an_eccentric_encoder_is_recognised(paper_arm, space, bounds):
         assert abs(float(chosen.result.parameters[i]) - true) < 3 * u[i]
 
 
+def test_a_model_by_name_is_a_corrected_arm_with_its_prior(paper_arm, space, bounds):
+    """In one line what takes four; in place of other corrections, and with the prior that is given instead."""
+    capture = seen_by_a_tracker(paper_arm, space, "harmonics=1", cos1_2=4e-4)
+    arm = with_corrections(paper_arm, "harmonics=1")
+    names = (*space.names, *(name for name in aj.kinematics.parameter_names(arm) if name[:3] in ("cos", "sin")))
+    own = aj.Parameters(arm, names)
+    box = [np.concatenate([side, np.full(12, end)]) for side, end in ((bounds.lower, -np.inf), (bounds.upper, np.inf))]
+    options = {"check_identifiability": False}
+    expected = aj.calibrate(arm, capture, aj.Bounds(own, *box), prior=aj.kinematics.default_prior(arm), **options)
+    found = aj.calibrate(with_corrections(paper_arm, "gear"), capture, bounds, model="dh,harmonics=1", **options)
+    np.testing.assert_array_equal(found.parameters, expected.parameters)
+    assert (found.space.names, found.prior.groups) == (names, ("lengths", "angles", "harmonics=1"))
+    tight = aj.calibrate(paper_arm, capture, bounds, model="harmonics=1", prior=aj.Prior({"all": 1e-4}), **options)
+    assert tight.prior.groups == ("all",)
+    plain = aj.calibrate(paper_arm, capture, model="dh", **options)
+    assert plain.prior is None
+    assert plain.space.names == aj.Parameters.free_of(paper_arm).names
+    for model, message in (("grvity", "did you mean 'gravity'"), (5, "the model is 5; give a text")):
+        with pytest.raises(aj.InputError, match=message):
+            aj.calibrate(paper_arm, capture, bounds, model=model)
+
+
 def test_placements_are_the_regions_where_there_are_several(paper_arm, space):
     capture = sockets(paper_arm, space)
     assert [region.label for region in regions_of(capture)] == ["A, B", "C", "D"]

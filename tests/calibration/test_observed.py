@@ -296,10 +296,15 @@ def test_what_cannot_be_determined_is_refused(paper_arm, bounds, observation, me
     ("kind", "field"),
     [
         ("points", "points"),
-        ("spheres", "diameter"),
-        ("planes", "distance"),
-        ("bars", "coordinates"),
-        ("distances", "values"),
+        *(
+            pytest.param(*case, marks=pytest.mark.exhaustive)
+            for case in (
+                ("spheres", "diameter"),
+                ("planes", "distance"),
+                ("bars", "coordinates"),
+                ("distances", "values"),
+            )
+        ),
     ],
 )
 def test_derivatives_of_a_calibration(paper_arm, true, bounds, kind, field):

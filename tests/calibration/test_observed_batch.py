@@ -31,8 +31,11 @@ def captures(space):
     return [aj.simulate(true, {}, observations=SIMULATED, noise=NOISE, seed=seed) for seed in range(3)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "options", [{}, pytest.param({"noise": NOISE, "robust": "tukey"}, marks=pytest.mark.slow)], ids=["plain", "robust"]
+    "options",
+    [{}, pytest.param({"noise": NOISE, "robust": "tukey"}, marks=pytest.mark.exhaustive)],
+    ids=["plain", "robust"],
 )
 def test_as_one_by_one(paper_arm, bounds, captures, options):
     many = aj.calibrate_many(paper_arm, aj.stack_captures(captures), bounds, covariance=True, slots=2, **options)
@@ -49,7 +52,7 @@ def test_as_one_by_one(paper_arm, bounds, captures, options):
         assert abs(many.steps[i] - one.steps) < 3
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_starts_bounds_and_arms(paper_arm, space, bounds, captures):
     """A batch of starts and of bounds on one capture, then of arms; a result does not depend on its neighbours."""
     start = np.asarray(space.vector())
@@ -74,7 +77,7 @@ def test_starts_bounds_and_arms(paper_arm, space, bounds, captures):
     np.testing.assert_allclose(of_arms.parameters, np.stack([many.parameters[0]] * 2), rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_sockets_with_covariances(paper_arm, space, bounds):
     points = {"A": (400, 200, 300), "B": (500, 300, 100)}
     capture = aj.simulate(paper_arm, points, poses=15, lengths=[("A", "B", 0.001)], noise=NOISE)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration import record_of
+from aacmm_jax.calibration import record_of, sampling
 from aacmm_jax.calibration.prior_fit import _History
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.summaries.calibration import calibration_summary, prior_sentence
@@ -159,9 +159,40 @@ def test_refused(paper_arm, bounds, capture, options, message):
         calibrate(paper_arm, capture, bounds, **options)
 
 
-def test_trials_are_refused(paper_arm, bounds, capture):
-    with pytest.raises(aj.InputError, match="had a prior"):
-        aj.monte_carlo(calibrate(paper_arm, capture, bounds, prior=MAKER), capture)
+def test_trials_draw_the_means_of_the_prior(paper_arm, space, bounds, capture):
+    """About the calibrated parameters, with the prior's standard deviations; other parameters stay."""
+    found = calibrate(paper_arm, capture, bounds, prior=aj.Prior({"lengths": 0.3}))
+    task = sampling._RepeatedTask.of(found, capture, None)
+    means = task.prior_means(20_000, np.random.default_rng(0), np.asarray(found.parameters))
+    np.testing.assert_allclose(means.std(axis=0), np.where(space.lengths, 0.3, 0.0), rtol=0.03, atol=1e-9)
+    np.testing.assert_allclose(means.mean(axis=0), found.parameters, atol=0.01)
+    assert task.prior_means(10, np.random.default_rng(0), None) is None
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_trials_scatter_as_the_posterior_does(paper_arm, true):
+    """Of an arm with corrections, a prior that the data hardly exceed (without its errors the trials would scatter too
+    little), and noise that is estimated in each trial."""
+    true = aj.kinematics.with_corrections(true, "harmonics=1").replace(cos1_2=5e-5, sin1_3=-4e-5)
+    arm = aj.kinematics.with_corrections(paper_arm, "harmonics=1")
+    names = (*aj.Parameters.independent(paper_arm).names, "cos1_2", "sin1_2", "cos1_3", "sin1_3")
+    space = aj.Parameters(arm, names)
+    bounds = aj.Bounds.around(arm, space)
+    capture = aj.simulate(true, POINTS, poses=20, lengths=[LENGTH], noise=NOISE)
+    prior = aj.Prior({"lengths": 0.1, "angles": 2e-4, "harmonics": 5e-5}, learn=["angles"])
+    found = calibrate(arm, capture, bounds, prior=prior)
+    task = sampling._RepeatedTask.of(found, capture, None)
+    trials, random = sampling.trials_of(found, capture, found.noise, task.u), np.random.default_rng(1)
+    values, failed = task.solved(
+        trials.drawn(1200, random, 1.0), task.prior_means(1200, random, np.asarray(found.parameters))
+    )
+    assert failed == 0
+    sampled = task.sampled(found, values, True, failed, 0.95, 1)
+    np.testing.assert_allclose(sampled.u, sampled.linear_u, rtol=0.1)
+    assert set(sampled.quantities) >= {"cos1_2", "sin1_3", "d_3"}
+    drawn = aj.bootstrap(found, capture, trials=400)
+    assert 0.75 < np.median(drawn.u / drawn.linear_u) < 1.25
 
 
 def test_cross_validation_takes_the_prior(paper_arm, bounds, true):
@@ -211,7 +242,7 @@ def test_many_are_as_one(paper_arm, space, bounds, true):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("active", [False, True])
+@pytest.mark.parametrize("active", [pytest.param(False, marks=pytest.mark.exhaustive), True])
 def test_derivatives_are_exact(paper_arm, space, active):
     """By readings, bounds, the length, the prior's mean and scale: of parameters, learned scales and effective numbers;
     against differences of calibrations in NumPy. With two bounds active too."""
@@ -243,7 +274,7 @@ def test_derivatives_are_exact(paper_arm, space, active):
         np.testing.assert_allclose(reverse, jacobian, atol=1e-10 * np.abs(jacobian).max())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_coverage_where_the_truth_is_drawn_from_the_prior(paper_arm, space):
     """Six poses in each of two sockets, so that half of the angles are the prior's."""
     draw, nominal = np.random.default_rng(0), np.asarray(space.vector())

@@ -130,7 +130,7 @@ def test_noise_of_linear_encoders():
         aj.Noise(linear_encoder=[1, 2]).check(GANTRY.joints)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", ["SCARA", "six axes on a linear axis"])
 def test_intervals_hold_the_truth(name):
     """As `benchmarks/prismatic.py` shows for 2,000 trials."""

@@ -72,14 +72,15 @@ def mixed(paper_arm, bounds):
     return calibrated(paper_arm, bounds, few, sockets, [("A", "B", 0.002)])
 
 
-# One program is compiled for a capture: a sphere for every run, a mixture of kinds among the slow ones.
-@pytest.fixture(scope="module", params=["sphere", pytest.param("mixed", marks=pytest.mark.slow)])
+# One program is compiled for a capture: a sphere, and exhaustively a mixture of kinds.
+@pytest.fixture(scope="module", params=["sphere", pytest.param("mixed", marks=pytest.mark.exhaustive)])
 def repeated(request, paper_arm, bounds):
     if request.param == "mixed":
         return request.getfixturevalue("mixed")
     return calibrated(paper_arm, bounds, SIMULATED["spheres"][:1])
 
 
+@pytest.mark.slow
 def test_bootstrap_of_observations(repeated):
     """Poses are drawn within what they owe, and the result scatters about as the noise says."""
     capture, result = repeated
@@ -104,7 +105,7 @@ def test_drawn_solves_scatter_as_the_linear_result(repeated):
     assert np.abs(found[:, : len(FEW)].mean(axis=0) - result.parameters).max() < 4 * u.max() / np.sqrt(200)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_monte_carlo_of_observations(mixed):
     capture, result = mixed
     sampled = aj.monte_carlo(result, capture, most=20_000)

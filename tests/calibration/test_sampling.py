@@ -53,7 +53,7 @@ def sampled(arm, bounds, capture) -> aj.calibration.Sampled:
 
 # The tests after it are its small version: fewer trials, and a case where the linear result fails. All of them compute
 # more than they compile.
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.optimised
 def test_monte_carlo_agrees_with_the_linear_result_and_is_stable(arm, sampled):
     assert (sampled.stable, sampled.trials) == (True, 20_000)
@@ -67,7 +67,7 @@ def test_monte_carlo_agrees_with_the_linear_result_and_is_stable(arm, sampled):
     assert np.all((sampled.low < sampled.estimate) & (sampled.estimate < sampled.high))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.optimised
 def test_two_stages_with_fixed_lengths(arm, capture, bounds):
     """Most lengths are fixed here, and set the scale: stage 2 changes nothing, in the linear result and in every
@@ -189,6 +189,7 @@ def test_refused(arm, bounds, capture, options, text):
         aj.monte_carlo(aj.calibrate(arm, capture, bounds), capture, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.* the scale, so the reference lengths change nothing")
 def test_files_keep_all_of_it(arm, bounds, capture, tmp_path):
     sampled = aj.bootstrap(aj.calibrate(arm, capture, bounds, method="joint", noise=NOISE), capture, trials=100)

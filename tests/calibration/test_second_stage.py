@@ -181,6 +181,7 @@ def test_the_result_is_inside_the_box(too_long, capture, cut):
     assert float(again.k) == pytest.approx(1, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_many_equal_single_ones_on_bounds_and_with_fixed_lengths(too_long, paper_arm, capture, cut):
     start = np.clip(cut.space.vector(too_long), cut.lower, cut.upper)
     wide = aj.Bounds.around(too_long, cut.space, length=15.0)
@@ -240,9 +241,10 @@ def tight(paper_arm, width: float, **nominal: float) -> tuple[aj.Arm, aj.Bounds]
 @pytest.mark.parametrize(
     ("d_3", "width"),
     [
-        *((753.0, 0.05), (745.0, 0.2)),
+        (745.0, 0.2),
+        pytest.param(753.0, 0.05, marks=pytest.mark.slow),
         *(
-            pytest.param(d_3, width, marks=pytest.mark.slow)
+            pytest.param(d_3, width, marks=pytest.mark.exhaustive)
             for d_3, width in ((753.0, 0.2), (753.0, 1.0), (745.0, 0.05), (745.0, 1.0))
         ),
     ],
@@ -301,7 +303,7 @@ def test_many_start_inside_their_boxes(too_long, capture, cut):
     assert many.parameters[0, cut.space.index("d_3")] == float(cut.upper[cut.space.index("d_3")])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_covariance_on_a_bound_is_what_trials_show(too_long, paper_arm, capture, cut):
     """300 recordings of the same poses; the bound is active in all of them, and the other parameters scatter as
     predicted."""
@@ -401,7 +403,7 @@ def test_results_of_one_and_of_many_have_the_same_fields(paper_arm, capture, cut
     assert value_of(one.arm, "d_1") == value_of(paper_arm, "d_1")
 
 
-@pytest.mark.slow  # test_coverage of tests/uncertainty has the paper's arm
+@pytest.mark.exhaustive  # test_coverage of tests/uncertainty has the paper's arm
 def test_coverage_of_a_shipped_arm_with_a_fixed_length_along_the_probe():
     """100 calibrations of the Panda, which fixes d_7: every 95 % interval holds the truth (probe_z did in 6 of 100
     once).

@@ -136,6 +136,16 @@ def test_metrics_by_hand():
     np.testing.assert_allclose(figures.centroids, [[1, 2, 0], [7, 7, 7]])
 
 
+def test_a_record_evaluates_each_of_its_arms_once(paper_arm, noisy_capture, bounds):
+    nominal = aj.kinematics.ArmSpecification(paper_arm, "test")
+    result = aj.calibrate(paper_arm, noisy_capture, bounds)
+    record = aj.calibration.record_of(result, aj.Recording(noisy_capture, nominal))
+    first, again = record.evaluations(), record.evaluations()
+    assert all(again[stage] is evaluation for stage, evaluation in first.items())
+    other = record._replace(calibrated=nominal._replace(arm=paper_arm.replace(a_2=70.0))).evaluations()
+    assert float(other["calibrated"].repeatability.rms) > 10 * float(first["calibrated"].repeatability.rms)
+
+
 @pytest.mark.slow  # tests/core/test_numpy_or_jax.py compares whole calibrations
 def test_identify_under_vmap_equals_single_runs(paper_arm, noisy_capture, bounds, space):
     starts = jnp.stack([space.vector() + shift * space.scale for shift in (-2.0, 0.5, 3.0)])
@@ -158,7 +168,7 @@ def central(function, point, direction, step=2e-3):
     return sum(w * (at(n) - at(-n)) for n, w in ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))) / step
 
 
-@pytest.fixture(scope="module", params=["identify", pytest.param("calibrate", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["identify", pytest.param("calibrate", marks=pytest.mark.exhaustive)])
 def differentiated(request, paper_arm, noisy_capture, space):
     """Both stages, or the first, as a function of angles, bounds, length and start; and its derivatives."""
     solve = {"identify": aj.identify, "calibrate": aj.calibrate}[request.param]
@@ -178,7 +188,7 @@ def differentiated(request, paper_arm, noisy_capture, space):
 
 
 # Reverse has forward within it, and takes all inputs at once; the suite compiles reverse alone.
-@pytest.mark.parametrize("mode", ["reverse", pytest.param("forward", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mode", ["reverse", pytest.param("forward", marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("case", ["inactive", "active", "repeated"])
 @pytest.mark.parametrize("by", ["angles", "bounds", "length"])
 def test_derivatives_of_a_calibration(paper_arm, noisy_capture, space, start, differentiated, by, case, mode):
@@ -240,7 +250,7 @@ def test_hayatis_angle_tells_parallel_axes_apart():
     assert float(result.arm.beta[1]) == pytest.approx(2e-3, abs=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_uncertainties_are_those_that_trials_show(paper_arm, space, bounds):
     """150 simulated calibrations with lengths that share sockets: normalised errors of every parameter, of k and of a
     length elsewhere have a root mean square near 1, for each method and whether a length is held or not."""

@@ -26,7 +26,8 @@ def write(path, header, rows):
     path.write_text("\n".join([",".join(header)] * bool(header) + [",".join(map(str, row)) for row in rows]) + "\n")
 
 
-def test_a_template_is_written_looked_at_and_not_overwritten(aacmm, tmp_path):
+def test_a_template_is_written_looked_at_and_not_overwritten(aacmm, tmp_path, monkeypatch):
+    monkeypatch.setattr(first_capture, "_PLACEMENTS", 1)
     assert "Written: my.toml" in aacmm("arm", "--new", "my.toml", "--joints", 4).stdout
     assert "my.toml exists" in aacmm("arm", "--new", "my.toml", expect=2).stderr
     said = aacmm("arm", "my.toml", "--figure", "arm.png")

@@ -35,6 +35,7 @@ def test_help_has_an_example(aacmm, command):
     assert re.search(rf"Examples?: aacmm {command}", " ".join(text.split()))
 
 
+@pytest.mark.slow
 def test_demo_recovers_the_truth_and_leaves_its_files(aacmm, tmp_path):
     result = json.loads(aacmm("demo", "out", "--json", "--seed", 3).stdout)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(result["files"])
@@ -160,7 +161,7 @@ def test_a_process_of_its_own(aacmm_process, cache, tmp_path, monkeypatch):
         ("show panda", "| true", "utf-8", 141, ""),
         pytest.param("show panda --json", "| true", "utf-8", 141, "", marks=pytest.mark.slow),
         ("show panda", "> /dev/full", "utf-8", 1, "Error: standard output cannot be written: no space left"),
-        ("show named.toml", "> out.txt", "ascii", 0, ""),
+        pytest.param("show named.toml", "> out.txt", "ascii", 0, "", marks=pytest.mark.slow),
     ],
 )
 def test_standard_output(tmp_path, arguments, redirection, encoding, code, error):
@@ -304,7 +305,7 @@ try:
 finally:
     print(*sys.modules, file=sys.stderr)
 """
-_PLOTS = "matplotlib plotly jinja2"
+_PLOTS = "matplotlib jinja2"
 _NEVER_NEEDED = "optimistix lineax jax.experimental.pallas xarray matplotlib"
 
 
@@ -315,10 +316,15 @@ _NEVER_NEEDED = "optimistix lineax jax.experimental.pallas xarray matplotlib"
         ("--version", f"jax scipy h5py {_PLOTS}"),
         ("calibrate --help", f"jax scipy h5py {_PLOTS}"),
         ("show p.h5", f"jax scipy {_PLOTS}"),
-        ("calibrate p.h5 -o again.h5", f"{_NEVER_NEEDED} plotly jinja2"),
-        ("evaluate c.h5 p.h5 -o e.h5", f"{_NEVER_NEEDED} plotly jinja2 scipy"),
-        ("compare c.h5 c.h5", f"{_NEVER_NEEDED} plotly jinja2"),
-        ("report c.h5 -o r.html", _NEVER_NEEDED),
+        ("calibrate p.h5 -o again.h5", f"{_NEVER_NEEDED} jinja2"),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                ("evaluate c.h5 p.h5 -o e.h5", f"{_NEVER_NEEDED} jinja2 scipy"),
+                ("compare c.h5 c.h5", f"{_NEVER_NEEDED} jinja2"),
+                ("report c.h5 -o r.html", _NEVER_NEEDED),
+            )
+        ),
     ],
 )
 def test_a_command_imports_and_compiles_no_more_than_it_needs(panda_files, tmp_path, monkeypatch, arguments, absent):
@@ -336,7 +342,7 @@ def test_a_command_imports_and_compiles_no_more_than_it_needs(panda_files, tmp_p
     [
         (lambda q: q * [1, 1, -1, 1, 1, 1], "joint 3 read with the wrong sign."),
         (lambda q: q[:, [0, 2, 1, 3, 4, 5]], "the columns of joints 2 and 3 are exchanged."),
-        (lambda q: q / 0.9, "readings in gon are taken for degrees."),
+        pytest.param(lambda q: q / 0.9, "readings in gon are taken for degrees.", marks=pytest.mark.slow),
     ],
     ids=["sign", "order", "gon"],
 )

@@ -53,6 +53,7 @@ def test_refused(aacmm, folder, options, message):
     assert message in aacmm("compare-models", folder / "c.h5", *options, expect=2).stderr
 
 
+@pytest.mark.slow
 def test_a_model_has_a_default_prior(aacmm, folder, tmp_path):
     """All coefficients are free, and no trade-off of theirs is warned of."""
     command = ("calibrate", folder / "c.h5", "-o", tmp_path / "r.h5", "--model", "harmonics=1-3", "--json")
@@ -62,3 +63,14 @@ def test_a_model_has_a_default_prior(aacmm, folder, tmp_path):
     assert groups["harmonics=1"]["learned"]
     assert groups["harmonics=1"]["parameters"] == 12
     assert not [sentence for sentence in found["warnings"] if "cos" in sentence or "sin" in sentence]
+    shown = aacmm("export", tmp_path / "r.h5", "--format", "table")
+    assert "# cos1_2 = " in shown.stdout
+    assert "The 36 coefficients of joint corrections stand in comments: by the table alone the tip is" in shown.stderr
+    aacmm("export", tmp_path / "r.h5", "--format", "toml", "-o", tmp_path / "r.toml")
+    assert "arcsec" in aacmm("show", tmp_path / "r.toml").stdout
+    rows = {
+        row["coefficient"]: row
+        for row in json.loads(aacmm("show", tmp_path / "r.toml", "--json").stdout)["corrections"]
+    }
+    assert (len(rows), rows["cos1_2"]["unit"]) == (36, "rad")
+    assert rows["cos1_2"]["value"] == pytest.approx(5e-4, rel=0.2)

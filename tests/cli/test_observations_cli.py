@@ -101,6 +101,7 @@ def test_a_tracker_and_a_sphere(aacmm, folder, tmp_path):
     assert parts["radius of ball"]["certified_u"] == [0.0005]
 
 
+@pytest.mark.slow
 def test_names_of_points_are_shown_as_they_are(aacmm, folder, observed_record):
     """Brackets are markup for the terminal's library."""
     from aacmm_jax.cli import calibration_display
@@ -123,6 +124,7 @@ def test_names_of_points_are_shown_as_they_are(aacmm, folder, observed_record):
     assert "[b]normal" in written.getvalue()
 
 
+@pytest.mark.slow
 def test_a_robust_loss_lists_what_lost_weight(aacmm, folder, tmp_path):
     aacmm("calibrate", folder / "bad.h5", "-o", "plain.h5", "--method", "joint")
     shown = aacmm("calibrate", folder / "bad.h5", "-o", "c.h5", "--robust", "tukey").stdout
@@ -139,6 +141,7 @@ def test_a_robust_loss_lists_what_lost_weight(aacmm, folder, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_sessions_have_a_probe_each(aacmm, folder):
     apart = aacmm("calibrate", folder / "monday.h5", folder / "tuesday.h5", "-o", "c.h5").stdout
     found = json.loads(aacmm("show", "c.h5", "--json").stdout)
@@ -160,6 +163,7 @@ def test_sessions_have_a_probe_each(aacmm, folder):
     assert all(row["rms_alone_mm"] < 0.02 < 0.1 < row["rms_mm"] for row in together["sessions"])
 
 
+@pytest.mark.slow
 def test_what_contradicts_is_left_out_on_request(aacmm, folder, tmp_path):
     recording = aj.files.load_capture(folder / "tracker.h5")
     points, ball = recording.capture.observations
@@ -263,6 +267,7 @@ def test_an_evaluation_stands_beside_its_prediction(aacmm, folder, calibrated, t
     assert moved["held_out"]["predicted"]["poses"]["probability"] < 1e-6
 
 
+@pytest.mark.slow
 def test_poses_that_a_calibration_did_not_use_are_held_out(aacmm, folder):
     aacmm("calibrate", folder / "tracker.h5", "-o", "c.h5", "--only-poses", 60, "--seed", 1)
     found = json.loads(aacmm("evaluate", "c.h5", folder / "tracker.h5", "--json").stdout)
@@ -284,6 +289,7 @@ def test_a_robust_cross_validation_names_the_group(aacmm, folder):
     assert any("Held out one after the other" in text and "C, D (" in text for text in found["warnings"])
 
 
+@pytest.mark.slow
 def test_cross_validation_is_printed_group_by_group(aacmm, folder):
     """What is named, or what shares no geometry and no length."""
     left = [word for pattern in ("[AB]", "D") for word in ("--leave-out", pattern)]
@@ -299,6 +305,7 @@ def test_cross_validation_is_printed_group_by_group(aacmm, folder):
     assert not found["surprising"]
 
 
+@pytest.mark.slow
 def test_the_robot_of_the_examples(aacmm, mukca):
     """500 poses drawn at random predict the others; 0.490 mm is what the D-H model can do, by SciPy too."""
     aacmm("import", mukca.parent / "ipa_ur10" / "positions.toml", "-o", "ur10.h5")

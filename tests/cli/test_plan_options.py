@@ -15,6 +15,7 @@ PLAN = (
 CELL = '[body]\nradius = 50.0\n[[box]]\nname = "cabinet"\ncentre = [0, 700, 300]\nsize = [400, 200, 600]\n'
 
 
+@pytest.mark.slow
 def test_cones_obstacles_and_radians(aacmm, tmp_path):
     (tmp_path / "cell.toml").write_text(CELL)
     options = (

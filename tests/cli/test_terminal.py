@@ -148,7 +148,7 @@ def test_a_residual_that_no_arm_has_is_not_called_converged():
     ],
 )
 def test_verdict(capsys, converged, plausible, said, unsaid):
-    calibration_display.print_verdict(
+    calibration_display.print_solve(
         new_console(),
         {"arm": "arm", "method": "joint", "steps": 3, "poses": 9, "sockets_used": ["A"], "observations": []}
         | {"converged": converged, "residual_plausible": plausible},

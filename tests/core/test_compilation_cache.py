@@ -42,11 +42,9 @@ FOLDERS = {
     ("case", "imports"),
     [
         *((case, "aacmm_jax") for case in FOLDERS),
-        ("default", "aacmm_jax, jax"),
-        ("default", "jax, aacmm_jax"),
         *(
             pytest.param(case, imports, marks=pytest.mark.slow)
-            for case in list(FOLDERS)[1:]
+            for case in FOLDERS
             for imports in ("aacmm_jax, jax", "jax, aacmm_jax")
         ),
     ],
@@ -108,6 +106,7 @@ def test_a_folder_of_another_user_is_not_used(tmp_path):
     assert "it belongs to another user" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_truncated_program_is_replaced(tmp_path):
     """It is compiled again without a warning, and the next process reads it."""
     settings = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}

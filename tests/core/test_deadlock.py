@@ -60,7 +60,7 @@ def batches_of_calibrations(method, count):
     return program, jnp.asarray(starts)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_independent_factorisations_and_calibrations_in_one_program_end():
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
     done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, timeout=600, capture_output=True, text=True)
@@ -73,6 +73,7 @@ def test_a_batch_of_calibrations_calls_no_lapack(method):
     assert "lapack" not in program.lower(starts).as_text()
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_solve_and_the_factorisations_call_no_lapack():
     def optimum(target):
         return aj.least_squares(

@@ -75,6 +75,7 @@ def test_singular_matrices():
     assert np.all(np.asarray(DECOMPOSED(np.zeros((6, 6)))[1]) == 0)
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(spectra(smallest=-12), st.floats(-10, 10))
 def test_inverse_solution_and_whitening(spectrum, decades):
@@ -127,6 +128,7 @@ def test_batches_and_vmap_equal_single_matrices(batch):
     np.testing.assert_allclose(matrices @ vectors, vectors * values[..., None, :], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("function", ["inverse_cholesky", "inverse_positive_definite", "solve_positive_definite"])
 def test_derivatives(function):
     random = np.random.default_rng(2)

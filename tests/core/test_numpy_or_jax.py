@@ -41,9 +41,9 @@ CALLS = {
     ("call", "width"),
     [
         pytest.param("two-stage", 10.0, marks=pytest.mark.slow),
-        pytest.param("two-stage", 0.2, marks=pytest.mark.slow),  # on bounds
-        ("joint, noise", 0.2),
-        pytest.param("joint, noise", 10.0, marks=pytest.mark.slow),
+        pytest.param("two-stage", 0.2, marks=pytest.mark.exhaustive),  # on bounds
+        pytest.param("joint, noise", 0.2, marks=pytest.mark.slow),
+        pytest.param("joint, noise", 10.0, marks=pytest.mark.exhaustive),
         ("evaluate", 10.0),
         ("fix_scale", 10.0),
         ("jacobian", 10.0),

@@ -101,6 +101,18 @@ def test_zero_offsets_leave_the_error_that_they_cannot_take(arm):
     np.testing.assert_allclose([float(row[1]) for row in rows], np.degrees(found.offsets))
 
 
+def test_tables_list_the_coefficients_of_corrections_with_their_units(paper_arm):
+    plain = aj.files.dh_table(paper_arm)
+    arm = aj.kinematics.with_corrections(paper_arm, "gear,gravity,harmonics=1")
+    assert aj.files.dh_table(arm).startswith(plain)
+    text = aj.files.dh_table(arm.replace(gear_2=1e-3, cos1_3=5e-5, compliance3_2=-2e-4))
+    assert text.startswith(plain)
+    lines = text.splitlines()
+    for line in ("# gear_2 = 0.001 1", "# cos1_3 = 5e-05 rad", "# compliance3_2 = -0.0002 rad/m"):
+        assert line in lines
+    assert not any("gear_3" in line for line in lines)
+
+
 def test_refusals(arm, paper_arm):
     assert_refused(lambda: aj.files.dh_table(arm, convention="dh"), "'dh'", "standard or craig")
     assert_refused(lambda: aj.files.dh_table(arm, units="inch"), "'inch'", "mm-deg or m-rad")

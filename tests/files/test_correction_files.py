@@ -1,14 +1,16 @@
 """Arms with joint corrections in files: they come back to the bit, with the nominal arm that their functions are of."""
 
+import h5py
 import jax
 import numpy as np
 import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.files.arms import arm_toml, load_specification, save_arm
-from aacmm_jax.files.controllers import dh_table
+from aacmm_jax.files.controllers import python_program
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.kinematics.arm import correction_names
+from tests.prismatic_arms import SCARA
 
 MASSES = {"mass": [1.0, 2.0, 0.5], "centre": np.arange(9.0).reshape(3, 3)}
 
@@ -25,7 +27,7 @@ def same(one: aj.Arm, other: aj.Arm) -> bool:
     return jax.tree.structure(one) == jax.tree.structure(other) and all(map(np.array_equal, *leaves))
 
 
-@pytest.mark.parametrize("masses", [{}, MASSES])
+@pytest.mark.parametrize("masses", [pytest.param({}, marks=pytest.mark.slow), MASSES])
 def test_files_bring_the_same_arm_back(masses, tmp_path):
     arm = corrected(**masses)
     save_arm(arm, tmp_path / "arm.toml")
@@ -34,6 +36,26 @@ def test_files_bring_the_same_arm_back(masses, tmp_path):
     capture = aj.Capture({"A": np.zeros((4, 3))})
     aj.files.save_capture(tmp_path / "capture.h5", aj.Recording(capture, specification))
     assert same(arm, aj.files.load_capture(tmp_path / "capture.h5").nominal.arm)
+
+
+def test_an_arm_with_a_thermometer_comes_back(tmp_path):
+    """Readings in every table, with their temperatures; and the arm that they are of, with and without expansion."""
+    plain = SCARA.replace(thermometer=True)
+    q = np.random.default_rng(0).uniform(-1, 1, (12, 5)) + np.array([0, 0, 0, 0, 21.5])
+    points = aj.data.observations.MeasuredPoints("T", q[4:8], q[4:8, :3], u=0.01)
+    ball = aj.data.ProbedSphere("ball", "probing", (q[8:],), 25.0)
+    for arm in (plain, with_corrections(plain, "expansion,gear").replace(expansion=12e-6)):
+        save_arm(arm, tmp_path / "arm.toml")
+        assert same(arm, aj.load_arm(tmp_path / "arm.toml"))
+        recording = aj.Recording(aj.Capture({"A": q[:4]}, [], [points]), load_specification(tmp_path / "arm.toml"))
+        aj.files.save_capture(tmp_path / "capture.h5", recording._replace(spheres=(ball,)))
+        found = aj.files.load_capture(tmp_path / "capture.h5")
+        assert same(arm, found.nominal.arm)
+        np.testing.assert_array_equal(found.capture.readings, q[:8])
+        np.testing.assert_array_equal(found.spheres[0].groups[0], q[8:])
+    with h5py.File(tmp_path / "capture.h5") as file:
+        assert file["capture/angle"].shape == (4, 4)
+        assert dict(file["capture/temperature"].attrs)["units"] == "degC"
 
 
 def test_a_model_in_an_arm_file(tmp_path):
@@ -55,6 +77,6 @@ def test_a_model_in_an_arm_file(tmp_path):
             aj.load_arm(file)
 
 
-def test_formats_of_dh_tables_refuse_corrections():
+def test_formats_without_a_place_for_corrections_refuse_them():
     with pytest.raises(aj.InputError, match="joint corrections, which this format cannot hold"):
-        dh_table(corrected())
+        python_program(corrected(), title="")

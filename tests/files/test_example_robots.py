@@ -1,6 +1,6 @@
-"""Every serial chain of the robots of example-robot-data, against two independent readers; slow, as these are many.
+"""Every serial chain of the robots of example-robot-data, against two independent readers; of some robots, or of all.
 
-``pytest -m slow -s`` on this file prints the largest differences by robot.
+``pytest -m exhaustive -s`` on this file prints the largest differences by robot.
 """
 
 from importlib import metadata
@@ -19,8 +19,6 @@ from aacmm_jax.kinematics.parameters import ArmSpecification, UrdfSource
 CONFIGURATIONS = 1000
 # Files that the independent readers cannot read (a robot without a name).
 UNREADABLE = ("ur3.urdf",)
-
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
 
 def robots() -> list[Path]:
@@ -111,14 +109,19 @@ class Differences:
         assert self.rotation <= 1e-12
 
 
-def test_every_chain_in_and_out(tmp_path):
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    "every", [pytest.param(15, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.exhaustive)]
+)
+def test_every_chain_in_and_out(tmp_path, every):
+    """Of each robot, or of each fifteenth."""
     import pinocchio
     import yourdfpy
 
     random = np.random.default_rng(0)
     arms, slides, seen = 0, 0, set()
     print("\nlargest differences, mm and rad, with yourdfpy and Pinocchio; after a calibration; its errors in mm")
-    for path in robots():
+    for path in robots()[::every]:
         text = path.read_text(encoding="utf-8")
         robot = parse_urdf(text)
         model = yourdfpy.URDF.load(str(path), load_meshes=False, build_scene_graph=True)
@@ -165,9 +168,9 @@ def test_every_chain_in_and_out(tmp_path):
         found = f"{errors[0][0]:9.4f} {errors[0][1]:8.4f}" if errors else ""
         print(f"{path.stem:28}", *differences, found)
     print(len(seen), "chains")
-    assert arms >= 15
-    assert slides >= 5
-    assert len(seen) >= 150
+    assert arms >= 15 // every
+    assert slides >= 5 // every
+    assert len(seen) >= 150 // every
 
 
 def calibrated(arm: aj.Arm) -> tuple[aj.Arm, tuple[float, float]]:

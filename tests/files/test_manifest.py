@@ -38,6 +38,29 @@ JOINTS = np.arange(1.0, 7.0)
 SIGNS = np.array([1, -1, 1, 1, -1, -1])
 
 
+def test_temperatures(tmp_path, motion):
+    """A column by its name in one table, one number for another; the artefact has its own."""
+    warm = np.column_stack([motion[:, :2], [21.0, 22.0, 23.0, 24.0], motion[:, 2:]])
+    record(tmp_path / "warm.csv", warm, header="q1,q2,temperature_C,q3,q4,q5,q6\n")
+    sockets = '[[socket]]\nfile = "warm.csv"\n[[socket]]\nfile = "b.csv"\ntemperature_C = 22.5\n'
+    record(tmp_path / "b.csv", motion + 0.1)
+    length = '[[length]]\nfrom = "warm"\nto = "b"\nvalue = 500\nu = 0.001\ntemperature_C = 23\n'
+    artefact = "expansion = 11.5e-6\nu_expansion = 1e-6\nu_temperature = 0.5\n"
+    capture = read(tmp_path, HEAD + ANGLES + sockets + length + artefact)
+    assert capture.columns == 7
+    np.testing.assert_array_equal(capture.sockets["warm"], np.column_stack([motion, warm[:, 2]]))
+    np.testing.assert_array_equal(capture.sockets["b"][:, 6], np.full(4, 22.5))
+    (found,) = capture.lengths  # 3 K and 11.5 um/(m K): 17.25 um longer
+    np.testing.assert_allclose([found.value, found.u], [500.01725, np.hypot(0.001, np.hypot(0.0015, 0.002875))])
+    for text, sentence in (
+        (SMALL + "temperature_C = 295.6\n", "temperature of 295.6 C, which is not between"),
+        (SMALL + "temperature_C = 22\n" + SOCKET.replace("a.csv", "b.csv"), "has 6 columns, but"),
+        (SMALL.replace("a.csv", "warm.csv") + "temperature_C = 22\n", "is stated besides; give one of them"),
+    ):
+        with pytest.raises(aj.InputError, match=sentence):
+            read(tmp_path, text)
+
+
 @pytest.mark.parametrize(
     ("angles", "reading"),
     [

@@ -93,6 +93,7 @@ def test_refused_text(paper_arm, text, message):
         prior_of_text(text, paper_arm)
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path, aacmm, paper_arm):
     """The arm file's prior applies, unless the command line states one."""
     space = aj.Parameters.independent(paper_arm)

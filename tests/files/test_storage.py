@@ -267,6 +267,7 @@ except aj.InputError as error:
     assert target.read_bytes() == b"as it was"
 
 
+@pytest.mark.slow
 def test_interrupted_by_a_real_signal(tmp_path, good):
     """Ctrl-C at any moment of writing a larger capture over an old one leaves the old or the new one.
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.calibration.redrawn import trials_of
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.kinematics import parameter_names, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
@@ -35,13 +36,24 @@ def scara() -> aj.Arm:
     )
 
 
+def warmed(arm: aj.Arm) -> aj.Arm:
+    """With thermal expansion besides, ten times too large to be real."""
+    names = [name for name in correction_names(arm) if not name.startswith("gravity_")]
+    values = dict(coefficients=[*np.asarray(arm.coefficients), 2e-4], gravity=arm.gravity)
+    return with_corrections(arm, [*names, "expansion"]).replace(**values)
+
+
 def readings(arm: aj.Arm) -> np.ndarray:
-    return np.random.default_rng(0).uniform(-2, 2, (4, arm.joints))
+    """Some, the last column a temperature where the arm has a thermometer."""
+    random = np.random.default_rng(0)
+    q = random.uniform(-2, 2, (4, arm.joints))
+    return np.concatenate([q, random.uniform(10, 30, (4, arm.columns - arm.joints))], axis=1)
 
 
-@pytest.mark.parametrize("name", ["elbow", "scara"])
+@pytest.mark.parametrize("name", [pytest.param("elbow", marks=pytest.mark.slow), "scara", "warm elbow", "warm scara"])
 def test_derivatives_are_exact(name, request):
-    arm = request.getfixturevalue(name)
+    arm = request.getfixturevalue(name.removeprefix("warm "))
+    arm = warmed(arm) if name.startswith("warm") else arm
     q, names = readings(arm), parameter_names(arm)
     space = aj.Parameters(arm, names)
     analytic = np.asarray(arm.jacobian(q, (*names, *(f"q_{i}" for i in range(1, arm.joints + 1)))))
@@ -51,10 +63,11 @@ def test_derivatives_are_exact(name, request):
         central = (np.asarray(space.arm(vector + step).position(q)) - space.arm(vector - step).position(q)) / 2e-5
         np.testing.assert_allclose(analytic[..., i], central, atol=2e-6)
     for i in range(arm.joints):
-        step = 1e-6 * np.eye(arm.joints)[i]
+        step = 1e-6 * np.eye(arm.columns)[i]
         central = (np.asarray(arm.position(q + step)) - arm.position(q - step)) / 2e-6
         np.testing.assert_allclose(analytic[..., len(names) + i], central, atol=1e-5)
-    moved = jax.jvp(lambda v, q: space.arm(v).position(q), (vector, q), (np.ones_like(vector), np.ones_like(q)))[1]
+    along = np.ones_like(q) * (np.arange(arm.columns) < arm.joints)
+    moved = jax.jvp(lambda v, q: space.arm(v).position(q), (vector, q), (np.ones_like(vector), along))[1]
     np.testing.assert_allclose(moved, analytic.sum(-1), rtol=1e-10, atol=1e-9)
     turned = rotation_columns(forward_pass(*to_numpy((arm.geometry, joint_motion(arm.geometry, q)))), space.indices())
     for i, name in enumerate(names):
@@ -66,6 +79,31 @@ def test_derivatives_are_exact(name, request):
                 [spin[:, 2, 1] - spin[:, 1, 2], spin[:, 0, 2] - spin[:, 2, 0], spin[:, 1, 0] - spin[:, 0, 1]]
             )
             np.testing.assert_allclose(turned[i], central, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["elbow", "scara"])
+def test_all_lengths_grow_with_the_temperature(name, request):
+    """2e-4 / K: at 25 C everything is 1.001 times as large, at 20 C and without a thermometer as it was."""
+    warm = warmed(request.getfixturevalue(name))
+    q = readings(warm)[:, : warm.joints]
+    cold = np.asarray(warm.position(q))
+    at_25 = np.concatenate([q, np.full((len(q), 1), 25.0)], axis=1)
+    np.testing.assert_allclose(warm.position(at_25), 1.001 * cold, rtol=1e-12)
+    np.testing.assert_allclose(np.asarray(warm.pose(at_25))[:, :3, :3], np.asarray(warm.pose(q))[:, :3, :3])
+    at_20 = np.concatenate([q, np.full((len(q), 1), 20.0)], axis=1)
+    np.testing.assert_array_equal(warm.position(at_20), cold)
+    by_columns = jax.jacfwd(warm.position)(jax.numpy.asarray(at_25[0]))
+    np.testing.assert_allclose(by_columns[:, -1], 2e-4 * cold[0], rtol=1e-9)
+
+
+def test_an_arm_that_is_wider_than_the_readings():
+    arm = with_corrections(aj.load_arm("panda"), "expansion")
+    assert (arm.joints, arm.columns, arm.thermometer) == (7, 8, True)
+    assert not arm.replace(corrections=None, coefficients=None, gravity=None).replace(thermometer=False).thermometer
+    with pytest.raises(aj.InputError, match="the arm has 7 joints, and a thermometer"):
+        arm.position(np.zeros(9))
+    with pytest.raises(aj.InputError, match="an arm with thermometer=True"):
+        aj.evaluate(aj.load_arm("panda"), aj.Capture({"A": np.zeros((2, 8)) + np.eye(2, 8)}))
 
 
 def test_moment_of_gravity():
@@ -122,6 +160,9 @@ def test_the_nominal_arm_decides_the_functions(elbow):
         ("harmonics=1-100", "has no orders from 1 to 99"),
         ("functions,harmonics=1", "the model names 'harmonics' twice"),
         ("gear=2", "gear takes no option"),
+        ("expansion=2", "expansion takes no option"),
+        (["expansion_1"], "is of the whole arm and has no number"),
+        (["cos1"], "is of a joint from 1 to 7"),
         ("coupled=2", "names no joints"),
         ("coupled=2-9", "names joint 9 of 7"),
         (["cos1_9"], "is of a joint from 1 to 7"),
@@ -132,6 +173,52 @@ def test_the_nominal_arm_decides_the_functions(elbow):
 def test_refused(model, sentence):
     with pytest.raises(aj.InputError, match=sentence):
         with_corrections(aj.load_arm("panda"), model)
+
+
+def warm_capture(low: float, high: float) -> tuple[aj.Capture, aj.Bounds]:
+    """120 poses of the paper's arm, which expands by 15 um/(m K), with the noise of its encoders."""
+    nominal = with_corrections(aj.load_arm("cheng2018-simulation"), "expansion")
+    sockets = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (300, -400, 300)}
+    options = dict(poses=40, lengths=[("A", "B", 0.001), ("B", "C", 0.001)], encoder_arcsec=2, temperature=(low, high))
+    capture = aj.simulate(nominal.replace(expansion=15e-6), sockets, **options, seed=1)
+    return capture, aj.Bounds.around(nominal, aj.Parameters.free_of(nominal))
+
+
+@pytest.mark.parametrize("method", ["joint", "two-stage"])
+def test_expansion_is_found(method):
+    capture, bounds = warm_capture(15, 25)
+    result = aj.calibrate(bounds.space.base, capture, bounds, method=method)
+    i = bounds.space.index("expansion")
+    u = np.sqrt(result.covariance[i, i])
+    assert u < 5e-7
+    assert abs(result.parameters[i] - 15e-6) < 3 * u
+
+
+def test_expansion_at_one_temperature_is_a_scale():
+    """All lengths of the arm may be wrong by as much: the observability names them, and what would help."""
+    capture, bounds = warm_capture(23, 23)
+    seen = aj.observability(bounds.space.base, capture, bounds.space)
+    assert seen.null.shape[1] == 1
+    assert set(bounds.space.names[i] for i in np.argsort(-np.abs(seen.null[:, 0]))[:3]) == {"d_3", "d_5", "expansion"}
+    assert seen.remedy == "Poses in the same sockets at other temperatures would determine them."
+
+
+def test_redrawn_readings_keep_their_temperature():
+    capture, bounds = warm_capture(15, 25)
+    result = aj.calibrate(bounds.space.base, capture, bounds)
+    trials = trials_of(result, capture, aj.Noise(encoder_arcsec=2, seating=0.005), np.full(2, 0.001))
+    drawn = np.asarray(trials.drawn(2, np.random.default_rng(0), np.ones((2, 1, 1))).q)
+    np.testing.assert_array_equal(drawn[..., 6], np.broadcast_to(capture.q[:, 6], (2, 120)))
+    assert np.all(np.ptp(drawn[..., :6], axis=0) > 0)
+
+
+def test_an_arm_that_expands_is_noticed():
+    capture, bounds = warm_capture(15, 25)
+    plain = with_corrections(bounds.space.base, "dh")
+    result = aj.calibrate(plain, capture, aj.Bounds.around(plain, aj.Parameters.free_of(plain)))
+    (sentence,) = [one for one in aj.warnings_of(result, capture) if "Residuals follow" in one]
+    assert "Residuals follow temperature" in sentence
+    assert "try --model dh,expansion" in sentence
 
 
 def eccentric() -> tuple[aj.Capture, aj.Bounds, np.ndarray]:
@@ -149,6 +236,27 @@ def test_found_by_a_calibration():
     assert {"cos1_1", "sin1_4", "gear_2"} <= set(bounds.space.names)
     result = aj.calibrate(bounds.space.base, capture, bounds, method="joint")
     np.testing.assert_allclose(result.parameters, true, atol=1e-7)
+
+
+def test_batches_of_corrected_arms(paper_arm):
+    """As results of many have them, the nominal arms of their functions batched too; under vmap as well."""
+    names = ["cos1_2", "gear_3", "compliance4_3", "compliance3_2"]
+    single = with_corrections(paper_arm, names)
+    arms = [single.replace(cos1_2=1e-3 * i, compliance4_3=2e-3 * i, d_3=400.0 + i) for i in range(3)]
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *arms)
+    q = np.random.default_rng(0).uniform(-1, 1, (5, 6))
+    expected = np.stack([arm.position(q) for arm in arms])
+    np.testing.assert_allclose(np.moveaxis(batch.position(q[:, None, :]), 1, 0), expected, atol=1e-9)
+    np.testing.assert_allclose(batch.position(q[:3]), expected[np.arange(3), np.arange(3)], atol=1e-9)
+    np.testing.assert_allclose(jax.vmap(lambda arm: arm.position(q))(batch), expected, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_expansion_is_found_by_a_batch():
+    capture, bounds = warm_capture(15, 25)
+    one = aj.calibrate(bounds.space.base, capture, bounds, method="joint")
+    many = aj.calibrate_many(bounds.space.base, aj.stack_captures([capture] * 2), bounds, method="joint")
+    np.testing.assert_allclose(many.parameters, np.stack([one.parameters] * 2), atol=1e-6)
 
 
 @pytest.mark.slow

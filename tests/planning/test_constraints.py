@@ -150,6 +150,7 @@ def test_sockets_are_placed_within_their_own_cones(panda, monkeypatch):
     assert found.motion.clearance is None
 
 
+@pytest.mark.slow
 def test_a_low_ceiling(panda, monkeypatch):
     """Most poses would break through it, and nothing but the choice of poses keeps them below."""
     monkeypatch.setattr(pose_refinement, "_ITERATIONS", 3)

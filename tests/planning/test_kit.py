@@ -44,7 +44,9 @@ def problem(space):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("which", [slice(1, 4, 2), slice(None)], ids=["two", "all"])
+@pytest.mark.parametrize(
+    "which", [slice(1, 4, 2), pytest.param(slice(None), marks=pytest.mark.exhaustive)], ids=["two", "all"]
+)
 def test_information_is_that_of_a_calibration(paper_arm, space, problem, which):
     """The covariance that a plan predicts is what the calibration of its poses finds, for every kind at once."""
     simulated = [dataclasses.replace(one, poses=8) for one in EVERYTHING[which]]
@@ -79,6 +81,7 @@ def test_candidates_of_six_rows(kind):
     np.testing.assert_array_equal(exchange(three, 4, objective), exchange(six, 4, objective))
 
 
+@pytest.mark.slow
 def test_a_whole_plan(paper_arm, space, monkeypatch):
     """Placed within the region, every place with its poses, better than random poses, and what each part adds."""
     monkeypatch.setattr(kit_placement, "_PLACEMENTS", 4)

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 import aacmm_jax as aj
 from tests.refusals import assert_refused
+from tests.written_study import write_study
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def made(record, tmp_path_factory):
         noise={"encoder_arcsec": [2, 4]}, identification={"method": "stage1"},
     )  # fmt: skip
     path = tmp_path_factory.mktemp("plot") / "study.h5"
-    aj.study.run_study(study, path)
+    write_study(path, study)
     arm, capture = record.calibrated.arm, record.recording.capture
     sockets = {name: np.asarray(arm.position(q)) for name, q in capture.sockets.items()}
 
@@ -78,6 +79,7 @@ def test_residuals_of_observations(observed_record, unit, count):
     assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1
 
 
+@pytest.mark.slow
 def test_figures_of_a_calibration_from_observations(observed_record, tmp_path):
     """The file has the distances, the residuals in standard deviations and the orientations."""
     aj.plot.save_calibration_figure(observed_record, tmp_path / "figure.svg")
@@ -106,10 +108,26 @@ def test_figures_hold_the_numbers(record, made):
     changes = aj.plot.parameter_changes(record, "angle").containers[0].lines[0].get_ydata()
     vectors = record.vectors()
     angles = [i for i, name in enumerate(record.names) if name.startswith(("alpha", "theta"))]
-    expected = (vectors["calibrated"] - vectors["nominal"])[angles] / aj.units.ARCSEC
+    expected = (vectors["calibrated"] - vectors["nominal"])[angles] / aj.units.DEG
     np.testing.assert_allclose(changes, expected)
     values = aj.plot.singular_values(*made["singular_values"]).lines[0].get_ydata()
     np.testing.assert_allclose(values, made["singular_values"][0].singular)
+
+
+def test_patterns_in_the_residuals(record):
+    """A panel for each joint, one for each axis, and the histogram; with the numbers of the calibration."""
+    from aacmm_jax.calibration.pose_residuals import signed_residuals
+
+    panels = aj.plot.residual_patterns(record).axes
+    assert len(panels) == 6 + 3 + 1
+    found = signed_residuals(record)
+    drawn = panels[2].lines[1].get_xydata()
+    np.testing.assert_allclose(drawn[:, 0], np.asarray(record.recording.capture.readings)[:, 2] / aj.units.DEG)
+    inside = np.abs(found.along_joint[:, 2]) < panels[2].get_ylim()[1]
+    np.testing.assert_allclose(drawn[inside, 1], found.along_joint[inside, 2])
+    single = aj.Capture({name: q[:1] for name, q in record.recording.capture.sockets.items()})
+    alone = record._replace(recording=record.recording._replace(capture=single))
+    assert_refused(lambda: aj.plot.residual_patterns(alone), "no pose has a residual with a direction")
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ def solve(problem):
     return solution.value, cost, stats["optimality"], aj.calibration.converged(stats["reason"])
 
 
-@pytest.mark.parametrize("count", [25, pytest.param(70, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [12, pytest.param(70, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("third", range(3))
 def test_never_worse_than_scipy_in_random_boxes(third, count):
     """Cost against SciPy's TRF at its tightest tolerances; the drawn boxes must hold both active and inactive
@@ -137,7 +137,7 @@ _COMPILED = ("BoxBOD", "MGH10")
     ("solver", "name"),
     [(_by_steps, name) for name in nist_problems.MODELS]
     + [
-        pytest.param(_by_optimistix, name, marks=() if name in _COMPILED else pytest.mark.slow)
+        pytest.param(_by_optimistix, name, marks=pytest.mark.slow if name in _COMPILED else pytest.mark.exhaustive)
         for name in nist_problems.MODELS
     ],
 )

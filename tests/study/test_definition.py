@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.files.arms import arm_toml
 from aacmm_jax.study import configuration_pool
-from aacmm_jax.study.definition import Fixture
+from aacmm_jax.study.settings import Fixture
 from aacmm_jax.study.specification import Region
 
 COPIES = {
@@ -68,16 +67,3 @@ def test_pools_have_the_keys_of_all_versions(fixture, data):
     """Published results were drawn from these keys."""
     key = configuration_pool.pool_key(7, fixture, ((1.0, 2.0),), (3, 4))
     np.testing.assert_array_equal(jax.random.key_data(key), np.array(data, dtype=np.uint32))
-
-
-@pytest.mark.parametrize("table", ['[corrections]\nmodel = "harmonics=1"', "[priors]\nsd = { lengths = 0.5 }"])
-def test_what_studies_do_not_know_of_an_arm_is_refused(tmp_path, table):
-    """Trials without them would be calibrations of another arm."""
-    (tmp_path / "arm.toml").write_text(f"{arm_toml(aj.load_arm('panda'))}\n{table}\n")
-    study = tmp_path / "study.toml"
-    study.write_text(
-        'arm = "arm.toml"\ntrials = 2\n[deviation]\nlength_mm = 0.1\n[capture]\npositions_mm = [[400, 200, 300]]\n'
-        'poses = 60\npool = 4096\n[noise]\nencoder_arcsec = 2\n[identification]\nmethod = "stage1"\n'
-    )
-    with pytest.raises(aj.InputError, match=r"studies do not know (corrections|priors) of an arm; leave \["):
-        aj.study.read_study(study)

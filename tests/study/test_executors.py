@@ -90,7 +90,7 @@ def test_the_cache_of_a_worker_is_that_of_its_environment(tmp_path, monkeypatch)
     assert worker_setup.CacheSettings.current() == before
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_dask_workers_find_what_others_have_compiled(home, study, tmp_path):
     """Two clusters, one after the other, whose workers have imported JAX before they hear of a study."""
     distributed = pytest.importorskip("distributed")
@@ -112,7 +112,9 @@ def test_dask_workers_find_what_others_have_compiled(home, study, tmp_path):
     assert kept[0] == kept[1]
 
 
-@pytest.mark.parametrize("where", [(), ("--dask", "local")], ids=["threads", "processes"])
+@pytest.mark.parametrize(
+    "where", [(), pytest.param(("--dask", "local"), marks=pytest.mark.slow)], ids=["threads", "processes"]
+)
 def test_an_interrupt_is_answered_while_programs_compile(home, tmp_path, prepared, where):
     """First blocks that would take an hour, as a compilation that Python cannot interrupt; Ctrl-C reaches all."""
     path = tmp_path / "s.h5"
@@ -136,7 +138,9 @@ def test_an_interrupt_is_answered_while_programs_compile(home, tmp_path, prepare
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("where", [(), ("--dask", "local")], ids=["threads", "processes"])
+@pytest.mark.parametrize(
+    "where", [(), pytest.param(("--dask", "local"), marks=pytest.mark.exhaustive)], ids=["threads", "processes"]
+)
 def test_an_interrupt_lets_running_blocks_end(home, tmp_path, prepared, where):
     path = tmp_path / "s.h5"
     options = ("--chunk", CHUNK, "--workers", 1, *where)
@@ -164,7 +168,7 @@ def test_an_interrupt_is_answered_in_the_middle_of_xla(home, tmp_path):
     assert "Stopped; 0 of 96 trials are kept" in errors
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_any_executor(home, study, tmp_path):
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         assert aj.study.run_study(study, tmp_path / "s.h5", executor=pool, chunk=CHUNK).finished

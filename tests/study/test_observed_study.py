@@ -67,7 +67,7 @@ def test_trials_scatter_as_a_calibration_says(paper_arm, held, capture):
 
 
 @pytest.mark.parametrize(
-    "which", [slice(3, 4), pytest.param(slice(None), marks=pytest.mark.slow)], ids=["sphere", "all"]
+    "which", [slice(3, 4), pytest.param(slice(None), marks=pytest.mark.exhaustive)], ids=["sphere", "all"]
 )
 def test_without_errors_every_arm_agrees_with_its_data(paper_arm, held, which):
     """Exact trials of every kind have no residual by the true arm, so the true arm is what is found."""
@@ -96,6 +96,7 @@ def test_without_errors_every_arm_agrees_with_its_data(paper_arm, held, which):
     assert np.abs(drawn.true[0] - drawn.true[1]).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_study_with_a_kit(paper_arm, held, tmp_path):
     """From TOML to a file and its summary; cells differ in noise."""
     (tmp_path / "kit.toml").write_text(KIT)

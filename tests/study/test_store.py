@@ -33,7 +33,7 @@ def written_in_blocks(home, study, path, chunk):
 @pytest.mark.optimised
 @pytest.mark.parametrize(
     ("chunk", "trials"),
-    [(1, 3), (7, 24), pytest.param(500, 24, marks=pytest.mark.slow)],
+    [(1, 3), pytest.param(7, 24, marks=pytest.mark.slow), pytest.param(500, 24, marks=pytest.mark.exhaustive)],
 )
 def test_the_chunk_changes_no_bit(home, study, tmp_path, chunk, trials):
     study = aj.study.Study(study.specification.model_copy(update={"trials": trials}), study.nominal)
@@ -158,6 +158,7 @@ def test_results_without_their_parts_are_missed(home, study, tmp_path):
         aj.study.open_study(tmp_path / "none.h5")
 
 
+@pytest.mark.slow
 def test_blocks_of_a_study_whose_file_is_gone_are_not_taken_for_anothers(home, study, tmp_path):
     path = tmp_path / "s.h5"
     other = aj.study.Study(study.specification.model_copy(update={"seed": 6}), study.nominal)
@@ -180,7 +181,9 @@ def test_a_moved_and_oddly_named_study_still_reads(home, study, tmp_path):
     same(home / "whole.h5", moved / path.name)
 
 
-@pytest.mark.parametrize("computed", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "computed", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.exhaustive)]
+)
 def test_killed_and_resumed_it_is_the_same(home, tmp_path, prepared, computed):
     """SIGKILL at random moments of the real command, start-up and finishing included."""
     path, generator = tmp_path / "s.h5", np.random.default_rng(1)
@@ -201,7 +204,7 @@ def test_killed_and_resumed_it_is_the_same(home, tmp_path, prepared, computed):
     assert {item.name for item in tmp_path.iterdir()} <= {"s.h5", "started"}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_interrupt_finishes_the_blocks_in_work_and_says_how_to_go_on(home, tmp_path):
     path = tmp_path / "s.h5"
     process = command(home, "-o", path, "--chunk", 4, "--trials", 200, "--workers", 1)
@@ -265,7 +268,7 @@ aj.study.run_study(aj.study.read_study(sys.argv[2]), sys.argv[3], chunk=8)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_number_of_devices_changes_nothing(home, tmp_path):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     subprocess.run(
@@ -279,6 +282,7 @@ def test_the_number_of_devices_changes_nothing(home, tmp_path):
             )
 
 
+@pytest.mark.slow
 def test_parts_may_stay(home, study, tmp_path):
     path = tmp_path / "s.h5"
     assert aj.study.run_study(study, path, chunk=CHUNK, keep_parts=True).finished

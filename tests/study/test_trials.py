@@ -38,7 +38,7 @@ def hayati() -> "aj.Arm":
     [
         ("cheng2018-simulation", DEVIATION),
         ("cheng2018-simulation", {"length_mm": 10.0, "angle_deg": 1.0}),
-        pytest.param("panda", DEVIATION, marks=pytest.mark.slow),
+        pytest.param("panda", DEVIATION, marks=pytest.mark.exhaustive),
         pytest.param(hayati(), DEVIATION, marks=pytest.mark.slow),
     ],
     ids=["paper", "far off", "panda", "beta"],
@@ -87,6 +87,7 @@ def test_slides_have_noise_of_their_own(noise, spread):
     assert np.std(noisy - exact) == pytest.approx(spread, rel=0.05)
 
 
+@pytest.mark.slow
 def test_no_pose_twice_and_all_within_the_limits():
     limits = [[-170, 170], [-100, 100], [-150, 150], [-120, 120], [-170, 170], [-90, 90]]
     q = drawn(made(capture=CAPTURE | {"joint_limits_deg": limits}, deviation=None)).q
@@ -184,6 +185,7 @@ def test_starts_at_random_fill_the_box():
     assert np.delete(np.ptp(held.start, axis=0), d_3).min() > 0
 
 
+@pytest.mark.slow
 def test_a_recording_gives_its_poses(noisy_capture):
     study = made(arm=aj.load_arm("cheng2018-simulation"), capture=noisy_capture, reference=None)
     trials = drawn(study, 20)
@@ -204,9 +206,9 @@ STUDIES = {
     scope="module",
     params=[
         ("two-stage", 8),
-        ("joint", 8),
-        pytest.param(("stage1", 8), marks=pytest.mark.slow),
-        pytest.param(("two-stage", 40), marks=pytest.mark.slow),  # another size of program
+        pytest.param(("joint", 8), marks=pytest.mark.slow),
+        pytest.param(("stage1", 8), marks=pytest.mark.exhaustive),
+        pytest.param(("two-stage", 40), marks=pytest.mark.exhaustive),  # another size of program
     ],
     ids=str,
 )
@@ -273,6 +275,7 @@ def test_trials_are_drawn_one_by_one():
         aj.study.draw_trials(study, -1, [0])
 
 
+@pytest.mark.slow
 def test_pools_are_the_same_in_every_study_of_a_seed(pools_built_once, monkeypatch):
     monkeypatch.setattr(configuration_pool, "_fixture_table", pools_built_once)
     one_socket = {"capture": CAPTURE | {"positions_mm": [[400, 200, 300]]}, "reference": None}

@@ -73,6 +73,7 @@ def test_noise_and_bounds_decide(paper_arm, paper_capture):
         assert bool(seen.trade_offs) == found
 
 
+@pytest.mark.slow
 def test_shipped_arms_are_what_independent_chooses():
     for name in aj.files.shipped_arms():
         specification = aj.files.load_specification(name)

@@ -162,10 +162,10 @@ def test_many_weighted_calibrations_equal_single_ones(paper_arm, bounds, capture
     ("trials", "noise", "noise_model", "least", "most"),
     [
         (100, None, "estimated", 0.86, 1.0),
-        pytest.param(400, None, "estimated", 0.91, 1.0, marks=pytest.mark.slow),
-        pytest.param(400, NOISE, "given", 0.91, 1.0, marks=pytest.mark.slow),
-        pytest.param(400, None, "common", 0.0, 0.91, marks=pytest.mark.slow),
-        pytest.param(400, None, "robust", 0.92, 1.0, marks=pytest.mark.slow),
+        pytest.param(400, None, "estimated", 0.91, 1.0, marks=pytest.mark.exhaustive),
+        pytest.param(400, NOISE, "given", 0.91, 1.0, marks=pytest.mark.exhaustive),
+        pytest.param(400, None, "common", 0.0, 0.91, marks=pytest.mark.exhaustive),
+        pytest.param(400, None, "robust", 0.92, 1.0, marks=pytest.mark.exhaustive),
     ],
     ids=["few-estimated", "estimated", "given", "common", "robust"],
 )

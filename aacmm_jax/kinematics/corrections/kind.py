@@ -5,7 +5,8 @@ What a joint really does is its reading plus coefficients times known functions 
     theta_i = q_i + theta_i0 + sum_b c_ib phi_b(q),
 
 so the derivative of the tip by a coefficient is the Jacobian column of the joint's theta (of a prismatic joint, of its
-d) times phi. A new kind is one file with one class, and its entry in `kinds.KINDS`.
+d) times phi. Thermal expansion moves no joint: all lengths grow by 1 + c (T - 20 C). A new kind is one file with one
+class, and its entry in `kinds.KINDS`.
 """
 
 import abc
@@ -68,7 +69,7 @@ class AbstractCorrection(eqx.Module):
 
         Args:
             terms: Of this kind.
-            q: Joint readings, rad (mm of prismatic joints), joints first.
+            q: Joint readings, rad (mm of prismatic joints), joints first; with a thermometer, its reading is last, C.
             forward: The frames of the nominal arm at these readings, mm.
         """
 
@@ -80,7 +81,7 @@ class Term(NamedTuple):
         kind: What it is one of.
         word: Which function.
         number: Which of them: an order, a link, another joint; 0 where there is only one.
-        joint: The joint that it moves, from 1.
+        joint: The joint that it moves, from 1; 0 where it scales all lengths of the arm.
         loads: Masses of the arm, where the function needs them.
     """
 
@@ -93,7 +94,7 @@ class Term(NamedTuple):
     @property
     def name(self) -> str:
         """The coefficient's name as a parameter."""
-        return f"{self.word}{self.number or ''}_{self.joint}"
+        return f"{self.word}{self.number or ''}_{self.joint}" if self.joint else self.word
 
     @property
     def unit(self) -> str:

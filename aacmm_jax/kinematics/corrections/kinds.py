@@ -4,16 +4,17 @@ import re
 
 from ...core.errors import InputError, nearest
 from .coupling import Coupling
+from .expansion import Expansion
 from .gear_ratio import GearRatio
 from .gravity import Gravity
 from .harmonics import Harmonics
 from .kind import AbstractCorrection, Loads, Term
 
-KINDS: tuple[AbstractCorrection, ...] = (Harmonics(), GearRatio(), Gravity(), Coupling())
+KINDS: tuple[AbstractCorrection, ...] = (Harmonics(), GearRatio(), Gravity(), Coupling(), Expansion())
 # Short forms. An error function of each joint, whatever its cause: with a prior, 62 coefficients a joint are few enough
 # to be found in seconds from 500 poses, and orders to 63 were hardly better (`benchmarks/NOTES.md`).
 _SHORT_FORMS = {"functions": "harmonics=1-31"}
-COEFFICIENT = re.compile(r"([a-z]+)([1-9][0-9]*)?_([1-9][0-9]*)")
+COEFFICIENT = re.compile(r"([a-z]+)([1-9][0-9]*)?(?:_([1-9][0-9]*))?")
 
 
 def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
@@ -27,8 +28,8 @@ def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
     if found is None or kind is None:
         return None
     number = int(found[2] or 0)
-    term = Term(kind, found[1], number, int(found[3]), loads if kind.rows == 3 and not number else None)
-    wrong = f"is of a joint from 1 to {joints}" if term.joint > joints else kind.wrong(term, joints)
+    term = Term(kind, found[1], number, int(found[3] or 0), loads if kind.rows == 3 and not number else None)
+    wrong = f"is of a joint from 1 to {joints}" if _is_outside(term, joints) else kind.wrong(term, joints)
     if wrong:
         raise InputError(f"the coefficient '{name}' {wrong}; correct its name.")
     return term
@@ -63,7 +64,12 @@ def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term,
         terms = kinds[0].terms(joints, option, loads)
         for term in terms:
             wrong = kinds[0].wrong(term, joints)
-            if wrong or not 1 <= term.joint <= joints:
+            if wrong or _is_outside(term, joints):
                 raise InputError(f"{part} {wrong or f'names joint {term.joint} of {joints}'}; correct it.")
         found += terms
     return tuple(dict.fromkeys(found))
+
+
+def _is_outside(term: Term, joints: int) -> bool:
+    """Whether an arm has no such joint; 0, no joint, is for thermal expansion alone."""
+    return not (0 if isinstance(term.kind, Expansion) else 1) <= term.joint <= joints

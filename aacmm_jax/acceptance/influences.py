@@ -1,0 +1,105 @@
+"""What a test adds to the uncertainty of its values: seat, fixture, and the thermal expansion of artefact and arm."""
+
+import math
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from ..core.errors import InputError
+from ..core.text import number
+
+REFERENCE_TEMPERATURE = 20.0  # C (ISO 1)
+_LARGEST_COEFFICIENT, _TEMPERATURES = 1e-3, (-100.0, 200.0)  # 1/K; C: what no test is beyond
+_EXPANSION = re.compile(r"\s*(?P<of>artefact|arm)\s*=(?P<numbers>[^=]*)")
+
+
+class Expansion(NamedTuple):
+    """Thermal expansion of a body in a test: coefficient in 1/K, temperature in C, and their standard uncertainties."""
+
+    coefficient: float
+    u_coefficient: float = 0.0
+    temperature: float = REFERENCE_TEMPERATURE
+    u_temperature: float = 0.0
+
+    @property
+    def relative(self) -> float:
+        """Growth of a length since 20 C, relative to it."""
+        return self.coefficient * (self.temperature - REFERENCE_TEMPERATURE)
+
+    @property
+    def u(self) -> float:
+        """Standard uncertainty of `relative`.
+
+        Source: JCGM 100:2008, 5.1 and, for the product of both uncertainties, which counts near 20 C, H.1.7.
+        """
+        away = self.temperature - REFERENCE_TEMPERATURE
+        return math.hypot(
+            away * self.u_coefficient, self.coefficient * self.u_temperature, self.u_coefficient * self.u_temperature
+        )
+
+
+class Influences(NamedTuple):
+    """The tester's contributions to the uncertainty of test values, besides the certificates of the artefacts."""
+
+    u: float = 0.0  # standard uncertainty of every value: seat and fixture, mm
+    u_relative: float = 0.0  # standard uncertainty in proportion to a length
+    artefact: Expansion | None = None  # None: at 20 C, or corrected for
+    arm: Expansion | None = None  # None: the arm compensates its own expansion, or is tested as it is
+
+    def u_of(self, length: float = 0.0) -> float:
+        """Standard uncertainty of a value that measures a length, mm."""
+        bodies = [body.u for body in (self.artefact, self.arm) if body is not None]
+        return math.hypot(self.u, length * self.u_relative, *(length * u for u in bodies))
+
+    def correction(self, length: float) -> float:
+        """What is added to the error of a measured length, mm.
+
+        A warm artefact is longer, and a warm arm, whose model is that of 20 C, measures too short.
+        """
+        return length * (_relative(self.arm) - _relative(self.artefact))
+
+
+def _relative(body: Expansion | None) -> float:
+    return 0.0 if body is None else body.relative
+
+
+def read_expansions(texts: Sequence[str]) -> dict[str, Expansion]:
+    """Expansions of ``artefact`` and ``arm``, from texts ``artefact=C,u,T,u``: coefficient in 1e-6/K, T in C."""
+    found: dict[str, Expansion] = {}
+    for text in texts:
+        match = _EXPANSION.fullmatch(text)
+        try:
+            values = [] if match is None else [number(part.strip()) for part in match["numbers"].split(",")]
+        except ValueError:
+            values = []
+        if match is None or len(values) != 4:
+            raise InputError(
+                f"--expansion '{text}' is not artefact=C,u,T,u or arm=C,u,T,u with C in 1e-6/K and T in C; for example "
+                "artefact=11.5,1,20.8,0.2."
+            )
+        if match["of"] in found:
+            raise InputError(f"--expansion gives the {match['of']} two expansions; give it one.")
+        found[match["of"]] = checked_expansion(Expansion(1e-6 * values[0], 1e-6 * values[1], *values[2:]), match["of"])
+    return found
+
+
+def checked_expansion(body: Expansion, of: str) -> Expansion:
+    """The same expansion, or `InputError` where no body has it."""
+    low, high = _TEMPERATURES
+    if not (abs(body.coefficient) <= _LARGEST_COEFFICIENT and 0 <= body.u_coefficient <= _LARGEST_COEFFICIENT):
+        raise InputError(f"the {of} expands by {body.coefficient:g} per K; give a coefficient such as 11.5e-6.")
+    if not (low <= body.temperature <= high and 0 <= body.u_temperature <= high):
+        raise InputError(
+            f"the {of} has a temperature of {body.temperature:g} C with u = {body.u_temperature:g}; give both in C."
+        )
+    return body
+
+
+def checked_influences(found: Influences) -> Influences:
+    """The same influences, or `InputError` where one is impossible."""
+    if not (0 <= found.u_relative <= 1):
+        raise InputError(f"u_relative is {found.u_relative:g}; give a part of the length, such as 2e-6.")
+    for of in ("artefact", "arm"):
+        if (body := getattr(found, of)) is not None:
+            checked_expansion(body, of)
+    return found

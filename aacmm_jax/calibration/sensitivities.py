@@ -1,0 +1,70 @@
+"""How the parameters of a calibration follow errors of its tips and joints, at its solution."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.numpy_or_jax import to_numpy
+from ..kinematics.arm import by_joint
+from ..kinematics.parameters import Parameters
+from ..model.observed import PriorRows, linear_rows, observed_model
+from ..uncertainty import observed_covariance as propagation
+from ..uncertainty.covariance import inverse_information
+from ..uncertainty.propagation import Propagated
+from .observed_state import ObservedTask, State, whitening_at
+from .results import Calibration
+
+
+class Sensitivities(NamedTuple):
+    """Derivatives of the parameters (mm and rad, in the order of ``space.names``) by errors of M poses, those of
+    sockets first, and what lengths between sockets' means owe to them."""
+
+    tips: Float[np.ndarray, "p 3 M"]  # by displacements of the tip, mm
+    joints: Float[np.ndarray, "p n M"]  # by errors of the joints, rad (mm of prismatic ones)
+    lengths: Float[np.ndarray, "l 3 M"]  # of measured lengths by the tips, where positions of sockets are means
+
+
+def sensitivities_of_sockets(result: Calibration, q: Float[np.ndarray, "M n"], propagated: Propagated) -> Sensitivities:
+    """Of a calibration from sockets and lengths, whose covariance was propagated so."""
+    result, propagated = to_numpy((result, propagated))
+    tips = result.space.scale[:, None, None] * propagated.sensitivity.tips
+    joints = tuple(f"{kind}_{i}" for i, kind in enumerate(by_joint(result.arm, "theta", "d"), start=1))
+    by_joints = np.asarray(result.arm.jacobian(q, joints))
+    return Sensitivities(tips, np.einsum("pcN,Ncj->pjN", tips, by_joints), propagated.linear.lengths_by_tips)
+
+
+def sensitivities_of_observations(task: ObservedTask, result: Calibration) -> Sensitivities:
+    """Of a calibration from observations of all kinds: with the weights of its last solve."""
+    task, result = to_numpy((task, result))
+    metrics, prior = result.observed, result.prior
+    assert metrics is not None
+    names = task.bounds.space.names
+    free = np.flatnonzero([name != task.anchor.hold for name in names])
+    space = Parameters(result.arm, tuple(names[i] for i in free))
+    p, observed = len(free), task.observed
+    geometry = [np.asarray(metrics.geometry[part]) for part in observed.blocks]
+    z = np.concatenate([np.asarray(result.parameters)[free], *geometry])
+    linear = linear_rows(space, observed, z)
+    state = State(
+        linear, propagation.arm_errors(observed.forward(space, z[:p], z[p:]), linear, observed), metrics.sigma
+    )
+    rows = None if prior is None else PriorRows(prior.mean, prior.weight)
+    whitening = whitening_at(task, state, rows)
+    fixed = np.concatenate([np.asarray(result.active)[free] != 0, np.zeros(len(z) - p, dtype=bool)])
+    scaled = np.where(fixed, 0.0, np.concatenate([space.scale, observed.steps]))
+    gram = observed_model(z, (space, observed, whitening, task.loss)).gram
+    inverse = inverse_information(gram * scaled[:, None] * scaled[None, :], fixed)[0]
+    by_rows = propagation.stacked(linear, observed, whitening, len(z))
+    tips, joints = [], []
+    for part, error, root, by_row, weights in zip(
+        linear, state.errors, whitening.roots, by_rows, metrics.weights, strict=True
+    ):
+        gain = (scaled[:p, None] * inverse[:p]) @ (scaled[:, None] * by_row.reshape(len(z), -1))
+        gain = np.einsum("pam,mab->pbm", gain.reshape(p, *by_row.shape[1:]) * weights, root)
+        tips.append(-np.einsum("pbm,bcm->pcm", gain, part.rows.by_tip))
+        joints.append(-np.einsum("pbm,bnm->pnm", gain, error.by_readings))
+    found = [np.zeros((len(names), *parts[0].shape[1:2], observed.q.shape[0])) for parts in (tips, joints)]
+    for whole, parts in zip(found, (tips, joints), strict=True):
+        whole[free] = np.concatenate(parts, axis=2)
+    return Sensitivities(*found, np.zeros((0, 3, observed.q.shape[0])))

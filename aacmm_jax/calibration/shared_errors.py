@@ -1,0 +1,450 @@
+"""Errors that poses share, found in the residuals of a calibration and added to its uncertainty.
+
+Looked for are, each only where a test of the residuals says so with a probability below 10 %: errors of the tip that
+all poses of a visit share (marked in the capture, or successive poses where none are), functions of the readings that
+the model lacks (`uncertainty.shared_errors`), and errors that all poses of a socket share, which only reference lengths
+show. The gate keeps the intervals of a calibration in which nothing is wrong as they are.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ..core._compat import inside_trace
+from ..core.arrays import is_concrete
+from ..core.distributions import chi_square_tail, f_tail
+from ..core.numpy_or_jax import to_numpy
+from ..data.capture import Capture
+from ..data.recording import Recording
+from ..kinematics.arm import DOWN, Arm, correction_names, natural_steps
+from ..kinematics.corrected_arm import function_values, with_corrections, with_further_corrections
+from ..kinematics.parameters import ArmSpecification
+from ..kinematics.prior_scales import default_prior
+from ..uncertainty.group_test import Block
+from ..uncertainty.residual_tests import Residuals, block_diagonal, form_of_poses, form_test, score_tests
+from ..uncertainty.shared_errors import (
+    NULL,
+    PLACES,
+    SUCCESSIVE,
+    VISITS,
+    Effects,
+    SharedErrors,
+    group_deviations,
+    one_variance,
+    second_moments,
+)
+from .group_equations import LEAST_U, PRIOR, Rows, equations_in_chunks
+from .length_consistency import lengths_of_sockets
+from .model_errors import weighted_by_loss
+from .record import CalibrationRecord, record_of
+from .results import Calibration
+from .sensitivities import Sensitivities
+
+_GATE = 0.1  # probability of a test below which an effect is looked at
+_MODEL = "gravity,gear,harmonics=1-3"  # functions that joints may follow
+# Poses over which successive errors may be alike. Over a third of the poses of a socket and more they are as good as
+# alike in all, which poses do not show.
+_LENGTHS, _PART = (2.0, 5.0, 15.0), 3
+_MOST_PATTERNS = 8  # of successive poses of one socket: slower ones matter, faster ones are like noise
+_NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are alike
+_FEWEST = 6  # degrees of freedom
+_EXACT = 1e-6  # mm: smaller residuals are rounding errors of a simulation without noise
+
+
+def with_shared_errors(
+    result: Calibration, capture: Capture, sensitivities: Callable[[], Sensitivities]
+) -> Calibration:
+    """The calibration with the errors that its poses share in its covariance; as it is where its values are traced."""
+    if inside_trace() or not is_concrete(*jax.tree.leaves((result, capture))):
+        return result
+    with np.errstate(all="ignore"):
+        found = _found(to_numpy(result), to_numpy(capture), sensitivities)
+    if found is None:
+        return result
+    before = result.parameter_covariance
+    covariance = before._replace(
+        # What a prior determines does not follow the noise.
+        matrix=(found.variance if result.prior is None else 1.0) * before.matrix + found.added,
+        noise=jax.tree.map(lambda leaf: np.sqrt(found.variance) * leaf, before.noise),
+    )
+    if not np.all(np.isfinite(covariance.matrix)):
+        return result
+    return eqx.tree_at(
+        lambda r: (r.parameter_covariance, r.shared), result, (covariance, found.shared), is_leaf=lambda x: x is None
+    )
+
+
+class _Found(NamedTuple):
+    shared: SharedErrors
+    added: Float[np.ndarray, "p p"]
+    variance: float  # of independent errors, over that of all
+
+
+class _Problem(NamedTuple):
+    """The equations of a calibration, and how its parameters follow its data."""
+
+    record: CalibrationRecord
+    rows: list[Rows]
+    left: Residuals
+    sensitivities: Sensitivities
+    lengths: Float[np.ndarray, "l k"] | None  # whitening of the lengths between means of sockets, their last rows
+
+    def moved(self, patterns: Float[np.ndarray, "M c"]) -> Float[np.ndarray, "R k"]:
+        """Columns of tips that move by a pattern over the poses, along x, y and z each."""
+        blocks = [
+            np.einsum("mra,mc->mrca", each.by_tip, patterns[each.poses]).reshape(each.residual.size, -1)
+            for each in self.rows
+        ]
+        return self._columns(blocks, np.einsum("laN,Nc->lca", self.sensitivities.lengths, patterns))
+
+    def turned(
+        self, values: Float[np.ndarray, "M k"], joints: np.ndarray, steps: Float[np.ndarray, " k"]
+    ) -> Float[np.ndarray, "R k"]:
+        """Columns of joints that turn by functions of the readings times a step."""
+        arm, q = self.record.calibrated.arm, np.asarray(self.record.recording.capture.readings)
+        natural = np.array([1.0 if i + 1 in arm.prismatic else 1e-3 for i in range(arm.joints)])
+        factors = values * (steps / natural[joints])
+        blocks = [
+            (each.extra[..., joints] * factors[each.poses][:, None]).reshape(each.residual.size, -1)
+            for each in self.rows
+        ]
+        of_lengths = np.zeros((len(self.sensitivities.lengths), len(steps)))
+        if len(of_lengths):
+            names = [f"{'d' if i + 1 in arm.prismatic else 'theta'}_{i + 1}" for i in range(arm.joints)]
+            slopes = np.einsum("laN,Naj->ljN", self.sensitivities.lengths, np.asarray(arm.jacobian(q, names)))
+            of_lengths = np.einsum("lkN,Nk->lk", slopes[:, joints], values * steps)
+        return self._columns(blocks, of_lengths)
+
+    def _columns(self, blocks: list[np.ndarray], of_lengths: np.ndarray) -> np.ndarray:
+        whole = np.zeros((len(self.left.values), blocks[0].shape[1]))
+        poses = np.concatenate(blocks)
+        whole[: len(poses)] = poses
+        if self.lengths is not None:
+            whole[-len(self.lengths) :] = self.lengths @ of_lengths.reshape(len(of_lengths), -1)
+        return self.left.unexplained(whole)
+
+    def by_patterns(self, patterns: Float[np.ndarray, "M c"]) -> Float[np.ndarray, "p k"]:
+        """How the parameters follow `moved`."""
+        found = np.einsum("paN,Nc->pca", self.sensitivities.tips, patterns)
+        return found.reshape(len(found), -1)
+
+    def by_functions(self, values: Float[np.ndarray, "M k"], joints: np.ndarray) -> Float[np.ndarray, "p k"]:
+        """How the parameters follow `turned`, by coefficients in their own units."""
+        return np.einsum("pkN,Nk->pk", self.sensitivities.joints[:, joints], values)
+
+
+def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Sensitivities]) -> _Found | None:
+    record = record_of(result, Recording(capture, ArmSpecification(result.space.base)))
+    if not record.converged or weighted_by_loss(record):
+        return None
+    rows, relations = equations_in_chunks(record)
+    if not rows or _rms(rows) < _EXACT:
+        return None
+    of_poses = _of_poses(record, rows, [block for block in relations if block.fixture == PRIOR], sensitivities)
+    if of_poses.left.degrees_of_freedom < _FEWEST:
+        return None
+    problem = _with_lengths(of_poses, relations)
+    tips, functions = _visits(of_poses), _functions(of_poses)
+    # All but places by the poses alone: lengths that contradict each other would be put down to whatever moves them.
+    effects = Effects.none(of_poses.left, record.given_noise is not None)
+    for probability, effect in sorted([(tips.probability, tips.kind), (functions.probability, "")]):
+        if probability >= _GATE:
+            continue
+        if effect == tips.kind:
+            tips = tips.learned(of_poses, effects)
+            effects = tips.joined(of_poses, effects)
+        else:
+            functions = functions._replace(sd=group_deviations(effects, functions.columns, functions.members))
+            effects = effects.joined(functions.columns, functions.sd**2 @ functions.members)
+    with_tips = tips.joined(problem, Effects.none(problem.left, effects.given))
+    every = functions.joined(problem, with_tips)
+    places = _places(problem, every)
+    if not (tips.variance or places.variance or len(functions.sd)):
+        return None
+    return _summed(problem, (tips, places), functions, places.joined(problem, with_tips), places.joined(problem, every))
+
+
+def _summed(
+    problem: "_Problem", tips: "tuple[_Tips, ...]", functions: "_Functions", without: Effects, every: Effects
+) -> _Found:
+    """What all effects add; ``without`` knows those of the tips, and ``every`` all."""
+    found = [effect for effect in tips if effect.variance]
+    kinds, units = [effect.kind for effect in found], ["mm" for _ in found]
+    sds = [np.sqrt(effect.variance) for effect in found]
+    p = len(problem.record.names)
+    added, follow, moments, names = np.zeros((p, p)), np.zeros((p, 0)), np.zeros((0, 0)), ()
+    for effect in found:
+        by_effect = problem.by_patterns(effect.patterns[0])
+        added = added + effect.variance * by_effect @ by_effect.T
+    if len(functions.sd):
+        names, follow, steps = functions.names, functions.follow, functions.steps
+        moments = second_moments(without, problem.turned(*functions.turned), functions.sd @ functions.members)
+        moments = moments * steps[:, None] * steps
+        added = added + follow @ moments @ follow.T
+        kinds, units = [*kinds, *functions.kinds], [*units, *functions.units]
+        sds += [sd * steps[np.argmax(own)] for sd, own in zip(functions.sd, functions.members, strict=True)]
+    lengths = [effect.length for effect in found if np.isfinite(effect.length)]
+    shared = SharedErrors(
+        kinds=tuple(kinds),
+        units=tuple(units),
+        names=names,
+        sd=np.array(sds),
+        moments=moments,
+        follow=follow,
+        correlation_length=np.asarray(lengths[0] if lengths else np.nan),
+    )
+    return _Found(shared, added, every.variance)
+
+
+def _of_poses(
+    record: CalibrationRecord, rows: list[Rows], prior: list[Block], sensitivities: Callable[[], Sensitivities]
+) -> _Problem:
+    left = Residuals.of([*(each.block("") for each in rows), *prior])
+    return _Problem(record, rows, left, sensitivities(), None)
+
+
+def _with_lengths(problem: _Problem, relations: list[Block]) -> _Problem:
+    """The same with what lengths and certified values say, of all but the scale.
+
+    Fixed lengths or a prior may contradict the scale of all lengths, which errors of single places do not explain.
+    """
+    record, rows = problem.record, problem.rows
+    blocks = [*(each.block("") for each in rows), *relations]
+    values = np.array([float(length.value) for length in record.recording.capture.lengths])
+    if record.observed is not None:
+        u = np.maximum([float(length.u) for length in record.recording.capture.lengths], LEAST_U)
+        return problem._replace(left=_without_scale(Residuals.of(blocks), sum(map(_size, rows)), values / u))
+    related = lengths_of_sockets(record, rows)
+    if related is None:
+        return problem
+    whitening = np.linalg.inv(np.linalg.cholesky(related.covariance))
+    residual, shared = whitening @ related.relations.residual, whitening @ related.relations.shared
+    blocks.append(related.relations._replace(residual=residual, shared=shared))
+    if related.scale is not None:
+        blocks = _with_column(blocks, related.scale[0], whitening @ related.scale[1])
+    left = _without_scale(Residuals.of(blocks), sum(map(_size, rows)), whitening @ values)
+    return problem._replace(left=left, lengths=whitening)
+
+
+def _size(rows: Rows) -> int:
+    return rows.residual.size
+
+
+def _without_scale(left: Residuals, first: int, by_scale: Float[np.ndarray, " l"]) -> Residuals:
+    """With the scale of the lengths, which begin at a row, as one more unknown."""
+    column = np.zeros((len(left.values), 1))
+    column[first : first + len(by_scale), 0] = by_scale
+    return left.extended(column) if len(by_scale) else left
+
+
+def _rms(rows: list[Rows]) -> float:
+    """Of a coordinate of the residuals, mm."""
+    residuals = [np.einsum("mcr,mr->mc", each.in_mm, each.residual).ravel() for each in rows]
+    return float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
+
+
+def _with_column(blocks: list[Block], of_rows: np.ndarray, of_lengths: np.ndarray) -> list[Block]:
+    """With the scale anchor, which the lengths determine, as one more unknown."""
+    parts = np.split(np.concatenate([of_rows, of_lengths]), np.cumsum([len(b.residual) for b in blocks])[:-1])
+    return [b._replace(shared=np.column_stack([b.shared, part])) for b, part in zip(blocks, parts, strict=True)]
+
+
+def _usual(problem: _Problem) -> tuple[float, float]:
+    """Standard deviations of an effect of the tip: below which it is nothing, and above which it is improbable."""
+    scatter = _rms(problem.rows)
+    return scatter / np.sqrt(np.mean([len(each.poses) for each in problem.rows])), scatter
+
+
+class _Tips(NamedTuple):
+    """Errors of the tip that poses share: patterns over all poses, of which the most likely ones are taken."""
+
+    kind: str
+    probability: float
+    patterns: list[Float[np.ndarray, "M c"]]
+    lengths: tuple[float, ...] = (np.nan,)  # of correlation, for each of the patterns
+    variance: float = 0.0  # mm^2
+    length: float = np.nan
+
+    def learned(self, problem: _Problem, effects: Effects) -> "_Tips":
+        """With the variance of the most likely patterns."""
+        every = [one_variance(effects, problem.moved(patterns), *_usual(problem)) for patterns in self.patterns]
+        best = int(np.argmax([one.log_likelihood for one in every]))
+        return self._replace(patterns=[self.patterns[best]], variance=every[best].variance, length=self.lengths[best])
+
+    def joined(self, problem: _Problem, effects: Effects) -> Effects:
+        """Effects with this one."""
+        if not self.variance:
+            return effects
+        columns = problem.moved(self.patterns[0])
+        return effects.joined(columns, np.full(columns.shape[1], self.variance))
+
+
+def _visits(problem: _Problem) -> _Tips:
+    """Of visits as they are marked, or of successive poses."""
+    capture, rows = problem.record.recording.capture, problem.rows
+    relative = problem.record.given_noise is None
+    total = len(np.asarray(capture.readings))
+    marked = np.full(total, -1)
+    if capture.visits is not None:
+        marked[: len(capture.visits)] = capture.visits
+    columns, kernel, patterns = [], [], []
+    for each in rows:
+        own = marked[each.poses]
+        columns.append(block_diagonal(each.by_tip))
+        if capture.visits is not None:
+            alike = ((own[:, None] == own) & (own >= 0)[:, None]).astype(float)
+        else:
+            alike = (np.eye(len(own), k=1) + np.eye(len(own), k=-1)) / 2
+        kernel.append(np.kron(alike - np.diag(np.diag(alike)), np.eye(3)))
+    nothing = _Tips(VISITS if capture.visits is not None else SUCCESSIVE, 1.0, [])
+    if not any(np.any(matrix) for matrix in kernel):
+        return nothing
+    probability = form_test(problem.left, form_of_poses(problem.left, columns, kernel), relative).probability
+    if not probability < _GATE:
+        return nothing
+    if capture.visits is not None:
+        numbers = [number for number in np.unique(marked) if number >= 0]
+        return _Tips(VISITS, probability, [(marked[:, None] == numbers).astype(float)])
+    most = max(float(np.median([len(each.poses) for each in rows])) / _PART, _LENGTHS[0])
+    lengths = tuple(length for length in _LENGTHS if length <= most)
+    for length in lengths:
+        found = []
+        for each in rows:
+            order = np.arange(len(each.poses))
+            values, vectors = np.linalg.eigh(np.exp(-np.abs(order[:, None] - order) / length))
+            chosen = np.argsort(values)[::-1][:_MOST_PATTERNS]
+            own = np.zeros((total, len(chosen)))
+            own[each.poses] = vectors[:, chosen] * np.sqrt(values[chosen])
+            found.append(own)
+        patterns.append(np.concatenate(found, axis=1))
+    return _Tips(SUCCESSIVE, probability, patterns, lengths)
+
+
+class _Functions(NamedTuple):
+    """Functions of the readings that the model lacks, in groups."""
+
+    probability: float
+    names: tuple[str, ...]
+    kinds: list[str]
+    units: list[str]
+    members: Float[np.ndarray, "g k"]
+    steps: Float[np.ndarray, " k"]
+    turned: tuple[Float[np.ndarray, "M k"], np.ndarray, Float[np.ndarray, " k"]]  # what `_Problem.turned` takes
+    columns: Float[np.ndarray, "R k"]
+    follow: Float[np.ndarray, "p k"]
+    sd: Float[np.ndarray, " g"] = np.zeros(0)  # of each group, natural steps
+
+    def joined(self, problem: _Problem, effects: Effects) -> Effects:
+        """Effects with these."""
+        if not len(self.sd):
+            return effects
+        return effects.joined(problem.turned(*self.turned), self.sd**2 @ self.members)
+
+    @classmethod
+    def none(cls, parameters: int) -> "_Functions":
+        """No function."""
+        empty, none = np.zeros(0), np.zeros((0, 0))
+        turned = none, np.zeros(0, dtype=int), empty
+        return cls(1.0, (), [], [], none, empty, turned, none, np.zeros((parameters, 0)))
+
+
+def _functions(problem: _Problem) -> _Functions:
+    """What the arm does not have of the functions that joints may follow."""
+    arm: Arm = to_numpy(problem.record.calibrated.arm)
+    q = np.asarray(problem.record.recording.capture.readings)
+    names, nothing = missing_functions(arm), _Functions.none(len(problem.record.names))
+    if not names:
+        return nothing
+    wider = with_further_corrections(arm, names)
+    assert wider.corrections is not None
+    terms = wider.corrections.functions.each[-len(names) :]
+    gravity = np.asarray(DOWN if wider.gravity is None else wider.gravity)
+    values = function_values(wider.corrections.nominal, terms, q, gravity).T
+    joints, steps = np.array([term.joint - 1 for term in terms]), natural_steps(names)
+    columns = problem.turned(values, joints, steps)
+    prior = default_prior(wider).of(names, np.zeros(len(names)))
+    assert prior is not None
+    members = np.zeros((len(prior.members), len(names)))
+    for row, own in zip(members, prior.members, strict=True):
+        row[list(own)] = 1.0
+    groups = [members[:, i] for i in range(len(names))]
+    candidates = {}
+    for i in range(len(names)):
+        candidates.setdefault((joints[i], tuple(groups[i])), []).append(i)
+    tests = score_tests(problem.left, [columns[:, own] for own in candidates.values()])
+    number = sum(test.degrees_of_freedom[0] > 0 for test in tests)
+    probability = min(min((test.probability for test in tests), default=1.0) * number, 1.0)
+    return nothing._replace(
+        probability=probability,
+        names=names,
+        kinds=list(prior.groups),
+        units=list(prior.units),
+        members=members,
+        steps=steps,
+        turned=(values, joints, steps),
+        columns=columns,
+        follow=problem.by_functions(values, joints),
+    )
+
+
+def missing_functions(arm: Arm) -> tuple[str, ...]:
+    """Coefficients of the functions that joints may follow and that an arm does not have."""
+    if arm.prismatic:
+        return ()
+    known = correction_names(arm)
+    every = correction_names(with_corrections(arm, _MODEL))
+    bends = any(name.startswith("compliance") for name in known)
+    return tuple(
+        name
+        for name in every
+        if name not in known and not name.startswith("gravity_") and not (bends and name.startswith("compliance"))
+    )
+
+
+def _places(problem: _Problem, effects: Effects) -> _Tips:
+    """Errors that all poses of a socket share, which only lengths show."""
+    capture = problem.record.recording.capture
+    sizes = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
+    owner = np.repeat(np.arange(len(sizes)), sizes)
+    names = [*capture.names, *(observation.name for observation in capture.observations)]
+    ends = {end for length in capture.lengths for end in (length.start, length.end)}
+    used = [i for i, name in enumerate(names) if name in ends]
+    nothing = _Tips(PLACES, 1.0, [])
+    if len(capture.lengths) < 2:
+        return nothing
+    patterns = (owner[:, None] == used).astype(float)
+    columns = problem.moved(patterns)
+    information, r = effects.product(columns, columns), effects.left.values[:, None]
+    values, vectors = np.linalg.eigh(information)
+    known = values > NULL * max(values.max(initial=0.0), 1e-300)
+    if not known.any():
+        return nothing
+    square = float(np.sum((vectors[:, known].T @ effects.product(columns, r)[:, 0]) ** 2 / values[known]))
+    number, spare = int(known.sum()), effects.left.degrees_of_freedom - int(known.sum())
+    if effects.given:
+        probability = chi_square_tail(square, number)
+    else:
+        rest = max(float(effects.product(r, r)[0, 0]) - square, 1e-300)
+        probability = f_tail(square / number / (rest / spare), number, spare)
+    if not len(effects.variances):
+        probability = min(probability, _neighbours(problem))
+    if not probability < _GATE:
+        return nothing
+    return nothing._replace(probability=probability, patterns=[patterns]).learned(problem, effects)
+
+
+def _neighbours(problem: _Problem) -> float:
+    """Probability that poses of one socket at neighbouring configurations err so much alike by chance."""
+    q = np.asarray(problem.record.recording.capture.readings)
+    columns, kernel = [], []
+    for each in problem.rows:
+        own = q[each.poses]
+        distance = np.sqrt(np.sum(4 * np.sin((own[:, None] - own) / 2) ** 2, axis=2))
+        columns.append(block_diagonal(each.by_tip))
+        kernel.append(np.kron(np.exp(-distance / _NEIGHBOURS) - np.eye(len(own)), np.eye(3)))
+    relative = problem.record.given_noise is None
+    return form_test(problem.left, form_of_poses(problem.left, columns, kernel), relative).probability

@@ -1,0 +1,81 @@
+"""Reference lengths: certified distances between two sockets."""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..core.arguments import shown
+from ..core.arrays import Numbers, as_array, is_concrete
+from ..core.errors import InputError
+from ..core.numpy_or_jax import AnyArray
+from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
+
+
+class ReferenceLength(eqx.Module):
+    """A physical artefact: the certified distance between two sockets.
+
+    Args:
+        start: Name of the socket at one end.
+        end: Name of the socket at the other end.
+        value: Calibrated length, scalar, mm.
+        u: Standard uncertainty (k = 1) of ``value``, scalar, mm.
+
+    Raises:
+        InputError: Where both ends are one socket, ``value`` is not positive or ``u`` is negative.
+    """
+
+    start: str = eqx.field(static=True)
+    end: str = eqx.field(static=True)
+    value: Float[AnyArray, ""]
+    u: Float[AnyArray, ""]
+
+    def __init__(self, start: str, end: str, value: Numbers, u: Numbers = 0.0):
+        for name in (start, end):
+            if not isinstance(name, str):
+                raise InputError(f"an end of a reference length is {shown(name)}; give the name of a socket.")
+        self.start, self.end = start, end
+        where = f"reference length '{start}' to '{end}'"
+        self.value, self.u = as_array(value, where), as_array(u, f"u of {where}")
+        if start == end:
+            raise InputError(f"{where} joins a socket to itself; name two different sockets.")
+        if self.value.ndim or self.u.ndim:
+            raise InputError(f"{where} needs one value and one u, in mm.")
+        # `float`, not JAX: inside jit even a constant becomes a tracer once JAX computes with it.
+        if is_concrete(self.value) and not 0 < float(self.value) < np.inf:
+            raise InputError(f"{where} is {float(self.value):g} mm; a length must be positive and finite.")
+        if is_concrete(self.u) and not 0 <= float(self.u) < np.inf:
+            raise InputError(
+                f"{where} has u = {float(self.u):g} mm; a standard uncertainty must be zero or positive, and finite."
+            )
+
+    @classmethod
+    def at_temperature(
+        cls,
+        start: str,
+        end: str,
+        value: float,
+        u: float = 0.0,
+        *,
+        expansion: float,
+        temperature: float,
+        u_expansion: float = 0.0,
+        u_temperature: float = 0.0,
+    ) -> "ReferenceLength":
+        """A length that is certified at 20 C and was measured at another temperature: value (1 + expansion (T - 20)).
+
+        Args:
+            start: Name of the socket at one end.
+            end: Name of the socket at the other end.
+            value: Calibrated length at 20 C, mm.
+            u: Standard uncertainty of ``value``, mm.
+            expansion: Coefficient of thermal expansion of the artefact, 1/K.
+            temperature: Of the artefact when it was measured, C.
+            u_expansion: Standard uncertainty of ``expansion``, 1/K.
+            u_temperature: Standard uncertainty of ``temperature``, K.
+
+        Raises:
+            InputError: As of a `ReferenceLength`.
+        """
+        warmer = temperature - REFERENCE_TEMPERATURE
+        parts = (u, value * warmer * u_expansion, value * expansion * u_temperature)
+        return cls(start, end, value * (1 + expansion * warmer), float(np.linalg.norm(parts)))

@@ -1,0 +1,56 @@
+"""Visits to sockets: which poses were taken without lifting the tip in between."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Int
+
+from ..core.arrays import Numbers, is_concrete
+from ..core.errors import InputError, nearest
+from ..core.numpy_or_jax import AnyArray
+from .copies import first_of_each
+
+UNKNOWN = -1
+
+
+def checked_visits(visits: Mapping[str, Numbers] | None, blocks: Mapping[str, AnyArray]) -> tuple[int, ...] | None:
+    """A number for the visit of each pose of the sockets, each other visit another one; None where none is known.
+
+    Args:
+        visits: Number of the visit of each pose by socket.
+        blocks: Readings of all sockets ``(m, n)``; the first of each pose is kept, as in a capture.
+
+    Raises:
+        InputError: A socket is unknown, or its visits are not one whole number a pose.
+    """
+    if not visits:
+        return None
+    if not isinstance(visits, Mapping):
+        raise InputError("the visits must be a dictionary: {'A': [1, 1, 2, 2]}, one number for each pose of a socket.")
+    found, known = [], 0
+    for name in visits:
+        if name not in blocks:
+            raise InputError(f"visits are given for the unknown socket '{name}'{nearest(name, list(blocks))}")
+    for name, block in blocks.items():
+        if name not in visits:
+            rows = np.full(block.shape[0], UNKNOWN)
+        else:
+            given = np.asarray(visits[name])
+            if given.shape != block.shape[:1] or not np.all(np.isfinite(given)) or np.any(given != np.round(given)):
+                raise InputError(
+                    f"the visits of socket '{name}' must be {block.shape[0]} whole numbers, one for each of its poses."
+                )
+            rows = known + np.unique(given, return_inverse=True)[1]
+            known = int(rows.max()) + 1
+        found.append(rows[first_of_each(block)] if is_concrete(block) else rows)
+    return tuple(int(number) for number in np.concatenate(found))
+
+
+def visits_by_socket(
+    visits: tuple[int, ...] | None, names: tuple[str, ...], sizes: tuple[int, ...]
+) -> dict[str, Int[np.ndarray, " m"]]:
+    """The visit of each pose of the sockets whose visits are known."""
+    if visits is None:
+        return {}
+    parts = np.split(np.array(visits, dtype=int), np.cumsum(sizes)[:-1])
+    return {name: rows for name, rows in zip(names, parts, strict=True) if np.all(rows != UNKNOWN)}

@@ -1,0 +1,46 @@
+"""Thermal expansion: all lengths of the arm grow by 1 + c (T - 20 C), c the coefficient of its material.
+
+Typical are 11.5e-6 / K for steel, 23e-6 for aluminium and about 1e-6 for carbon fibre along its fibres. The reference
+temperature is that of ISO 1.
+"""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+from jaxtyping import Float
+
+from ...core.errors import InputError
+from ...core.numpy_or_jax import AnyArray
+from ..chain import ForwardPass
+from .kind import AbstractCorrection, Loads, Term
+
+REFERENCE_TEMPERATURE = 20.0  # C, by ISO 1
+
+
+class Expansion(AbstractCorrection):
+    """The difference of the thermometer from 20 C; 0 for readings without one.
+
+    One coefficient for the whole arm: a, d and the probe, and the travel of carriages, whose scales expand with them.
+    """
+
+    model: ClassVar[str] = "expansion"
+    words: ClassVar[tuple[str, ...]] = ("expansion",)
+    description: ClassVar[str] = "thermal expansion of all lengths"
+    rows: ClassVar[int] = 1
+
+    def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
+        if option:
+            raise InputError(f"expansion takes no option such as '{option}'; write expansion alone.")
+        return (Term(self, "expansion", 0, 0),)
+
+    def wrong(self, term: Term, joints: int) -> str:
+        return "is of the whole arm and has no number" if term.number or term.joint else ""
+
+    def unit_of(self, term: Term) -> str:
+        return "1/K"
+
+    def values(
+        self, terms: Sequence[Term], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
+    ) -> Float[AnyArray, "rows ... 1 N"]:
+        measured = q.shape[0] > len(forward.x)
+        return q[-1:] - REFERENCE_TEMPERATURE if measured else 0.0 * q[:1]

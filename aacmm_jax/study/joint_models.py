@@ -1,0 +1,130 @@
+"""What the joints of a study's arms do besides their readings, and what of it each cell identifies, with which prior.
+
+The true arms of all cells have the corrections of every model that the study names, so that trials of all cells are
+drawn by one program; a cell whose true arms or model lack some of them has zeros there.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+from ..core.errors import InputError
+from ..core.units import ARCSEC, DEG
+from ..files.corrections import loads_of
+from ..files.joint_models import masses_of
+from ..files.priors import prior_of_text
+from ..kinematics.arm import DOWN, Arm, correction_names, is_length, parameter_unit, value_of, without_corrections
+from ..kinematics.corrected_arm import with_corrections
+from ..kinematics.parameters import ArmSpecification, Parameters
+from ..kinematics.prior_scales import default_prior
+from ..kinematics.priors import Prior, is_of_group
+
+# By kind of parameter or correction: the key of `DeviationTable`, and its unit in mm, rad or that of the coefficient.
+_DEVIATIONS = {
+    **{"a": ("a_mm", 1.0), "d": ("d_mm", 1.0), "probe": ("probe_mm", 1.0)},
+    **{"alpha": ("alpha_deg", DEG), "theta": ("theta_deg", DEG), "beta": ("beta_deg", DEG)},
+}
+_COEFFICIENTS = (
+    ("harmonics", "rad", "harmonics_arcsec", ARCSEC),
+    ("harmonics", "mm", "harmonics_mm", 1.0),
+    ("gear", "1", "gear_ppm", 1e-6),
+    ("coupled", "1", "coupled_ppm", 1e-6),
+    ("gravity", "rad/m", "gravity_mrad_per_m", 1e-3),
+    ("gravity", "rad/(kN m)", "gravity_mrad_per_knm", 1e-3),
+)
+
+
+class Identified(NamedTuple):
+    """What cells of one setting identify."""
+
+    space: Parameters  # the free parameters, on the arm that is the start
+    prior: Prior | None
+
+
+def plain(nominal: ArmSpecification) -> ArmSpecification:
+    """The nominal arm without corrections, and its identification."""
+    names = set(correction_names(nominal.arm))
+    return nominal._replace(
+        arm=without_corrections(nominal.arm),
+        held=None if nominal.held is None else tuple(name for name in nominal.held if name not in names),
+        free=tuple(name for name in nominal.free if name not in names),
+    )
+
+
+def coefficients_of(nominal: ArmSpecification, model: str | None) -> tuple[str, ...]:
+    """Coefficients of a model of the joints; without one, those of the nominal arm's own corrections."""
+    if model is not None and not model.strip():
+        raise InputError("a model is empty; name dh alone for joints that do what they read.")
+    arm = nominal.arm if model is None else _modelled(nominal, model)
+    return tuple(name for name in correction_names(arm) if not name.startswith("gravity_"))
+
+
+def all_joints(nominal: ArmSpecification, models: Iterable[str | None]) -> Arm:
+    """The nominal arm with the corrections of all models, 0 where it has not got them itself."""
+    own = correction_names(nominal.arm)
+    names = tuple(dict.fromkeys(name for model in (None, *models) for name in coefficients_of(nominal, model)))
+    if not set(names) - set(own):
+        return nominal.arm
+    arm = _modelled(nominal, names)
+    return arm.replace(**{name: value_of(nominal.arm, name) for name in own})
+
+
+def identified(nominal: ArmSpecification, joints: Arm, held: list[str] | None, model: str | None) -> Parameters:
+    """The free parameters of a cell, on an arm with all corrections: with a model, from coefficients of 0."""
+    specification = nominal if model is None else plain(nominal)
+    chosen = specification.held if held is None else tuple(held)
+    if model is None:
+        own = specification.space() if held is None else Parameters.free_of(specification.arm, held=held)
+        names = own.names
+    else:
+        coefficients = coefficients_of(nominal, model)
+        without = None if chosen is None else tuple(name for name in chosen if name not in correction_names(joints))
+        own = Parameters.free_of(specification.arm, held=without, free=specification.free if held is None else ())
+        names = (*own.names, *(name for name in coefficients if name not in (chosen or ())))
+        joints = joints.replace(**{name: 0.0 for name in correction_names(joints) if not name.startswith("gravity_")})
+    return Parameters(joints if own.base.beta is None else joints.replace(beta=own.base.beta), names)
+
+
+def prior_of(nominal: ArmSpecification, space: Parameters, model: str | None, text: str | None) -> Prior | None:
+    """The prior of a cell: what it states, else that of the arm's file, or the default one of a model of joints."""
+    if text is not None:
+        return prior_of_text(text, space.base)
+    if nominal.prior is None and model is not None and coefficients_of(nominal, model):
+        return default_prior(_modelled(nominal, model))
+    return nominal.prior
+
+
+def deviation_of(cell: Mapping[str, Any], arm: Arm, name: str) -> tuple[Any, float]:
+    """The distribution of a parameter's deviation, that of its kind or of all lengths or angles, and its unit in mm,
+    rad or that of the coefficient; None where it does not deviate."""
+    if name not in correction_names(arm):
+        key, unit = _DEVIATIONS[name.rpartition("_")[0]]
+        general = "length_mm" if is_length(name) else "angle_deg"
+        return cell.get(f"deviation.{key}", cell[f"deviation.{general}"]), unit
+    key, unit = _coefficient(arm, name)
+    return cell.get(f"deviation.{key}"), unit
+
+
+def check_deviations(given: Iterable[str], arm: Arm, names: Iterable[str]) -> None:
+    """Raise `InputError` for a deviation of coefficients that no arm of the study has."""
+    known = {_coefficient(arm, name)[0] for name in names if name in correction_names(arm)}
+    for kind, _, key, _ in _COEFFICIENTS:
+        if key in given and key not in known:
+            raise InputError(
+                f"deviation.{key} is of coefficients that no arm of this study has; name them in deviation.model, such "
+                f"as model = '{kind}'."
+            )
+
+
+def _coefficient(arm: Arm, name: str) -> tuple[str, float]:
+    unit = parameter_unit(arm, name)
+    found = (row[2:] for row in _COEFFICIENTS if is_of_group(row[0], name) and row[1] == unit)
+    return next(found, ("", 1.0))
+
+
+def _modelled(nominal: ArmSpecification, model: str | tuple[str, ...]) -> Arm:
+    """The plain nominal arm with corrections, with the masses and the gravity that are known of it."""
+    arm, masses = nominal.arm, masses_of(nominal)
+    loads = None if arm.corrections is None else loads_of(arm)
+    if loads is not None:
+        masses = {"mass": loads.mass, "centre": loads.centre}
+    return with_corrections(arm, model, gravity=DOWN if arm.gravity is None else arm.gravity, **masses)
