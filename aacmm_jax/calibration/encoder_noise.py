@@ -29,7 +29,7 @@ from ..data.noise import Noise, one_arcsec
 from ..data.recording import Recording
 from ..kinematics.parameters import ArmSpecification
 from ..uncertainty.group_test import Block
-from ..uncertainty.residual_tests import LEVEL, Residuals, pose_form_test
+from ..uncertainty.residual_tests import LEVEL, Residuals, pose_form_ratio, pose_form_test
 from .group_equations import Rows, equations_in_chunks
 from .missing_terms import found_terms
 from .record import CalibrationRecord, record_of
@@ -171,9 +171,9 @@ class _Equations(NamedTuple):
             known = self.variances.seat * trace_t > _LEAST * spare and below > 1e-9 * trace_t**2
             c = (spare * trace_both - trace * trace_t) / below if known else 0.0
             test = pose_form_test(left, [*(k - c * t for k, t in zip(kernels, tips, strict=True)), *none], True)
-            plain = pose_form_test(left, [*kernels, *none], True)
-            if np.isfinite(plain.ratio):
-                found.append(NoisyJoint(joint + 1, plain.ratio, test.probability))
+            ratio = pose_form_ratio(left, [*kernels, *none])
+            if np.isfinite(ratio):
+                found.append(NoisyJoint(joint + 1, ratio, test.probability))
         if not found:
             return None
         worst = min(found, key=lambda one: (one.probability, -one.ratio))

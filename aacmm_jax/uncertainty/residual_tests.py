@@ -16,10 +16,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.distributions import chi_square_tail, f_tail
+from ..core.linear_algebra import inverse_cholesky
 from .group_test import Block
 
 LEVEL = 0.01  # of false alarms of one family of tests
 _NULL = 1e-5  # singular values of scaled columns below this, of the largest, are zero
+_MANY = 60  # columns, from which singular values are avoided where possible
 _EXPLAINED = 1e-8  # squared part of a column that the model leaves, below which it counts as the model's own
 
 
@@ -69,8 +71,22 @@ def _orthonormal(columns: Float[np.ndarray, "R c"], before: Float[np.ndarray, "R
     """A basis of some columns, which were those ``before`` something was taken from them."""
     lengths = np.linalg.norm(columns if before is None else before, axis=0)
     scaled = columns / np.where(lengths > 0, lengths, 1.0)
+    if scaled.shape[1] >= _MANY and (basis := _of_full_rank(scaled)) is not None:
+        return basis
     vectors, values, _ = np.linalg.svd(scaled, full_matrices=False)
     return vectors[:, values > _NULL * values.max(initial=0.0)]
+
+
+def _of_full_rank(columns: Float[np.ndarray, "R c"]) -> Float[np.ndarray, "R c"] | None:
+    """An orthonormal basis by the Cholesky factor, twice, in a third of the time of singular values (Yamamoto et al.
+    2015, ETNA 44, 306-326); None where a singular value could be below `_NULL` of the largest."""
+    for _ in range(2):
+        whitening = inverse_cholesky(columns.T @ columns)
+        size = np.linalg.norm(whitening) * np.linalg.norm(columns)  # at least the largest over the smallest
+        if not size * _NULL < 1:
+            return None
+        columns = columns @ whitening.T
+    return columns
 
 
 class Consistency(NamedTuple):
@@ -218,6 +234,19 @@ def pose_form_test(left: Residuals, kernels: Sequence[Float[np.ndarray, "m k k"]
         relative: Compare with the variance of all residuals instead of 1.
     """
     return _tested(left, *_value_and_traces_by_pose(left, kernels), relative)
+
+
+def pose_form_ratio(left: Residuals, kernels: Sequence[Float[np.ndarray, "m k k"] | None]) -> float:
+    """`FormTest.ratio` of `pose_form_test` with ``relative``, without its probability."""
+    value = trace = 0.0
+    for rows, own, kernel in zip(left.slices, left.own, kernels, strict=True):
+        if kernel is not None:
+            columns = np.concatenate([own, left.basis[rows]], axis=1).reshape(*kernel.shape[:2], -1)
+            r = left.values[rows].reshape(kernel.shape[:2])
+            value += float(np.einsum("ma,mab,mb->", r, kernel, r))
+            trace += float(np.einsum("maa->", kernel)) - float(np.sum(columns * (kernel @ columns)))
+    expected = trace * left.cost / max(left.degrees_of_freedom, 1)
+    return value / expected if expected > 0 else float("nan")
 
 
 def _tested(left: Residuals, value: float, traces: tuple[float, float, float], relative: bool) -> FormTest:
