@@ -10,5 +10,5 @@ def test_terms_that_a_model_leaves_out_are_named_with_the_reason():
     found = _left_out(arm, "gravity,harmonics=1")
     assert found[0].startswith("The axis of joint 1 is vertical, so gravity has no moment about it: compliance1_1, ")
     assert "What loads compliance2_2 lies on the axis of joint 2, so it has no moment: left out." in found
-    assert found[-1].startswith("Left out as constant, or as combinations of other functions of their joint: ")
+    assert any(text.startswith("Left out as constant, or as combinations of other functions") for text in found)
     assert _left_out(arm, None) == []
