@@ -77,6 +77,12 @@ def arm(
             help="Standard deviation of the tip in its socket, for each coordinate. Default 0.005.",
         ),
     ] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODEL", help="What its joints do besides their readings, as for calibrate: gravity,harmonics=1."
+        ),
+    ] = None,
     base: BaseLink = None,
     tip: TipLink = None,
     probe: Annotated[
@@ -114,11 +120,17 @@ def arm(
     if check is not None:
         if figure is not None or encoder_arcsec is not None or seating_mm is not None:
             raise InputError("--check compares readings alone; leave out --figure, --encoder-arcsec and --seating-mm.")
+        if model is not None:
+            raise InputError("--check compares readings alone; leave out --model.")
         _check(specification, check, unit, as_json)
         return
     if unit is not None:
         raise InputError("--unit is for the table of --check; leave it out.")
-    _survey(specification, figure, encoder_arcsec, seating_mm, as_json)
+    if model is not None:
+        from ..files.joint_models import with_model
+
+        specification = with_model(specification, model)
+    _survey(specification, figure, encoder_arcsec, seating_mm, model, as_json)
 
 
 def _template(path: Path, joints: int, as_json: bool) -> None:
@@ -136,7 +148,12 @@ def _template(path: Path, joints: int, as_json: bool) -> None:
 
 
 def _survey(
-    specification: Any, figure: Path | None, encoder_arcsec: float | None, seating_mm: float | None, as_json: bool
+    specification: Any,
+    figure: Path | None,
+    encoder_arcsec: float | None,
+    seating_mm: float | None,
+    model: str | None,
+    as_json: bool,
 ) -> None:
     from ..data.noise import Noise
     from ..summaries.arm_survey import arm_survey
@@ -151,7 +168,9 @@ def _survey(
 
         base = urdf_chain(specification.urdf).base
     with together(figure):
-        summary = with_spinner("Looking at the arm", lambda: arm_survey(specification, noise=noise, base=base))
+        summary = with_spinner("Looking at the arm", lambda: arm_survey(
+            specification, noise=noise, base=base, model=model
+        ))  # fmt: skip
         if base is not None:
             summary["urdf"]["first_frame_in_base_mm"] = base.tolist()
         if figure is not None:

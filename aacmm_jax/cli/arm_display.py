@@ -43,6 +43,11 @@ def _determined(console: Console, summary: dict[str, Any]) -> None:
         console.print("[bold]Hardly determined[/bold], even by poses all over the workspace:")
         for text in summary["weak"]:
             console.print(f"  {escape(text)}")
+    why = [text for row in summary["determined"][1:2] for text in row["corrections"]]
+    if summary["corrections_left_out"] or why:
+        console.print("[bold]Joint corrections[/bold]:")
+        for text in (*summary["corrections_left_out"], *why):
+            console.print(f"  {escape(text)}")
     for i in summary["parallel"]:
         console.print(f"  Axes {i} and {i + 1} are nearly parallel: beta_{i} takes the place of d_{i}.")
     table = new_table("\nWhat data determine at their best", "data", "parameters", "well", "scale")

@@ -82,6 +82,14 @@ def plan(
     u_mm: Annotated[
         float, typer.Option(metavar="MM", help="Standard uncertainty of the reference length to position.")
     ] = 0.002,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODEL",
+            help="What the joints do besides their readings, as for calibrate: the poses determine its coefficients "
+            "too.",
+        ),
+    ] = None,
     encoder_arcsec: PlanEncoderNoise = None,
     linear_encoder_mm: LinearEncoderNoise = None,
     seating_mm: PlanSeatingNoise = None,
@@ -183,6 +191,10 @@ def plan(
 
     with together(output, manifest):  # refuses outputs that are inputs or cannot be written, before the work
         specification = load_specification(arm, base=base, tip=tip)
+    if model is not None:
+        from ..files.joint_models import with_model
+
+        specification = with_model(specification, model)
     if socket and sockets is not None:
         raise InputError("--sockets has sockets positioned and --socket gives their positions; give one of the two.")
     if length and not socket:
@@ -245,7 +257,7 @@ def plan(
             tool_axis, retract_mm, (cell, collisions, link_radius_mm), names,
         )  # fmt: skip
     shared |= assumed.options
-    stated = {"noise_source": assumed.noise_source, "notes": list(assumed.notes), "angles": angles}
+    stated = {"noise_source": assumed.noise_source, "notes": list(assumed.notes), "angles": angles, "model": model}
     urdf = specification.urdf if _is_urdf(arm) else None
     if kit is not None:
         from ..files.kits import read_kit

@@ -129,7 +129,8 @@ def _print_noise(console: Console, summary: dict[str, Any]) -> None:
     linear, option = ("", "")
     if slide is not None:
         linear, option = f", linear ones of {1e3 * slide:.3g} um", f"--linear-encoder-mm {slide:.3g} "
-    options = "" if each else f" (--method joint --encoder-arcsec {encoders:.3g} {option}--seating-mm {seat:g})"
+    model = "" if summary.get("model") is None else f"--model {summary['model']} "
+    options = "" if each else f" (--method joint {model}--encoder-arcsec {encoders:.3g} {option}--seating-mm {seat:g})"
     console.print(
         f"For a joint calibration with encoders of {text} arcsec{linear} and a seat of {1e3 * seat:g} um{options}; "
         f"{escape(summary['noise_source'])}."

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .arm import is_length
+from .priors import unit_of_coefficient
 
 LEAST_MOVEMENT = 2e-3  # mm at the tips per natural step
 SHARE_OF_BOUNDS = 0.5  # of a half-width, that a standard uncertainty may reach
@@ -138,7 +139,9 @@ def reduced_echelon(basis: Float[np.ndarray, "p r"]) -> tuple[Float[np.ndarray, 
 
 
 def _step(name: str) -> str:
-    return "mm" if is_length(name) else "mrad"
+    """The natural step of a parameter; 0.001 in the unit of a coefficient of a joint correction."""
+    unit = unit_of_coefficient(name)
+    return "mm" if is_length(name) else "per mille" if unit == "1" else unit.replace("rad", "mrad") or "mrad"
 
 
 def _listed(items: list[str]) -> str:

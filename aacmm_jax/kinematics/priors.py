@@ -218,7 +218,7 @@ def unit_of_group(group: str, names: Iterable[str]) -> str:
 
 def _unit(names: Iterable[str]) -> str:
     names = list(names)
-    own = {_unit_of_coefficient(name) for name in names}
+    own = {unit_of_coefficient(name) for name in names}
     if len(own) == 1 and "" not in own:
         return own.pop()
     lengths = {is_length(name) for name in names}
@@ -226,8 +226,8 @@ def _unit(names: Iterable[str]) -> str:
 
 
 @cache
-def _unit_of_coefficient(name: str) -> str:
-    """Of a joint correction; empty for other parameters."""
+def unit_of_coefficient(name: str) -> str:
+    """Unit of a joint correction's coefficient, of a joint that rotates; empty for other parameters."""
     found = _correction(name)
     kind = next((kind for kind in KINDS if found is not None and kind.model == found[0]), None)
     return "" if found is None or kind is None else kind.unit_of(Term(kind, "", found[1], 1))

@@ -79,7 +79,8 @@ def determined_by(arm: Arm) -> tuple[Determined, ...]:
     """
     arm = to_numpy(arm)
     sockets, length, points = _thorough(arm, None)
-    every = Parameters(arm, parameter_names(arm))
+    # While coefficients are 0, gravity's direction changes nothing.
+    every = Parameters(arm, tuple(name for name in parameter_names(arm) if not name.startswith("gravity_")))
     target = [MeasuredPoints("tracker", one.q, one.points, station="tracker", target="target") for one in points]
     kinds = {
         "sockets": Capture(sockets),

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import Arm, by_joint, locate
-from ..kinematics.chain import ForwardPass, forward_pass, joint_motion, reading_units
+from ..kinematics.chain import ForwardPass, forward_pass, joint_errors, joint_motion, reading_units
 from ..kinematics.jacobian import moved_by_correction, reading_columns, readings_gradient
 from ..kinematics.workspace import reached
 from .fedorov_exchange import covariance_of
@@ -82,7 +82,7 @@ class TangentProjection(NamedTuple):
     ) -> "TangentProjection":
         """The projection for the neighbourhood of q."""
         units = reading_units(problem.arm.geometry)
-        return cls(problem, targets, _tip_columns(_forward(problem, q)) * units**2)
+        return cls(problem, targets, _tip_columns(problem.arm, q, _forward(problem, q)) * units**2)
 
     def projected(self, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
         """q + normals^T x, with x of each pose such that its tip is in its socket: by Newton's method."""
@@ -91,7 +91,7 @@ class TangentProjection(NamedTuple):
             gap = self.targets - forward.tip.T
             if np.abs(gap).max() < _ARRIVED:
                 break
-            multipliers = np.linalg.solve(self._mixed(forward), gap[:, :, None])
+            multipliers = np.linalg.solve(self._mixed(q, forward), gap[:, :, None])
             q = q + np.einsum("nc,ncj->nj", multipliers[:, :, 0], self.normals)
         return q
 
@@ -99,11 +99,11 @@ class TangentProjection(NamedTuple):
         """The derivative by what was projected, from that by the projection ``q``."""
         forward = _forward(self.problem, q)
         normal_part = np.einsum("ncj,nj->nc", self.normals, gradient)
-        multipliers = np.linalg.solve(np.swapaxes(self._mixed(forward), 1, 2), normal_part[:, :, None])
-        return gradient - np.einsum("nc,ncj->nj", multipliers[:, :, 0], _tip_columns(forward))
+        multipliers = np.linalg.solve(np.swapaxes(self._mixed(q, forward), 1, 2), normal_part[:, :, None])
+        return gradient - np.einsum("nc,ncj->nj", multipliers[:, :, 0], _tip_columns(self.problem.arm, q, forward))
 
-    def _mixed(self, forward: ForwardPass) -> Float[np.ndarray, "N 3 3"]:
-        return _tip_columns(forward) @ np.swapaxes(self.normals, 1, 2)
+    def _mixed(self, q: Float[np.ndarray, "N n"], forward: ForwardPass) -> Float[np.ndarray, "N 3 3"]:
+        return _tip_columns(self.problem.arm, q, forward) @ np.swapaxes(self.normals, 1, 2)
 
 
 def _forward(problem: DesignProblem, q: Float[np.ndarray, "N n"]) -> ForwardPass:
@@ -111,8 +111,33 @@ def _forward(problem: DesignProblem, q: Float[np.ndarray, "N n"]) -> ForwardPass
     return forward_pass(geometry, joint_motion(geometry, q))
 
 
-def _tip_columns(forward: ForwardPass) -> Float[np.ndarray, "N 3 n"]:
-    return np.asarray(reading_columns(forward)).transpose(2, 1, 0)
+def _tip_columns(arm: Arm, q: Float[np.ndarray, "N n"], forward: ForwardPass) -> Float[np.ndarray, "N 3 n"]:
+    """Derivative of the tips by the readings, that of joint corrections by them included."""
+    columns = np.asarray(reading_columns(forward)).transpose(2, 1, 0)
+    slopes = _slopes_of_errors(arm, q)
+    return columns if slopes is None else columns + columns @ slopes
+
+
+def _slopes_of_errors(arm: Arm, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n n"] | None:
+    """How the errors of the joints (rows) change with the readings; None where coefficients are 0."""
+    if arm.corrections is None or not np.any(np.asarray(arm.coefficients)):
+        return None
+    geometry = to_numpy(arm.geometry)
+
+    def errors(readings: np.ndarray) -> np.ndarray:
+        return np.asarray(joint_errors(geometry, joint_motion(geometry, readings)))[:, 0].T
+
+    return np.moveaxis(_by_readings(arm, q, errors), 0, 2)
+
+
+def _by_readings(arm: Arm, q: Float[np.ndarray, "N n"], function: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Derivative of a smooth function of the readings, ``(n, ...)``, by central differences."""
+    found = []
+    for joint, unit in enumerate(reading_units(arm.geometry)):
+        step = np.zeros(arm.joints)
+        step[joint] = 1e-5 * unit
+        found.append((function(q + step) - function(q - step)) / (2 * step[joint]))
+    return np.stack(found)
 
 
 def _value(problem: DesignProblem, placement: FixturePlacement, q: np.ndarray, owner: np.ndarray) -> float:
@@ -156,6 +181,9 @@ def value_and_gradient(
         cotangents.setdefault(kind, np.zeros((3 if kind == "probe" else len(readings), *readings.shape[1:])))
         cotangents[kind][i] += cotangent
     gradient = np.asarray(readings_gradient(forward, cotangents)).T
+    slopes = _slopes_of_errors(problem.arm, q)
+    if slopes is not None:  # the joints move by their readings and by what corrections change with these
+        gradient = gradient + np.einsum("njk,nj->nk", slopes, gradient)
     if np.any(by_functions):
         gradient = gradient + _gradient_of_functions(problem.arm, q, by_functions)
     return problem.objective.value(of_parameters), gradient
@@ -183,13 +211,9 @@ def _gradient_of_functions(
     arm: Arm, q: Float[np.ndarray, "N n"], by_functions: Float[np.ndarray, "rows N"]
 ) -> Float[np.ndarray, "N n"]:
     """Derivative by the readings through the known functions, by central differences: they are smooth and cheap."""
-    geometry, gradient = to_numpy(arm.geometry), np.empty(q.shape)
+    geometry = to_numpy(arm.geometry)
 
     def weighted(readings: np.ndarray) -> np.ndarray:
         return np.sum(by_functions * np.asarray(joint_motion(geometry, readings).functions)[:, 0], axis=0)
 
-    for joint, unit in enumerate(reading_units(geometry)):
-        step = np.zeros(arm.joints)
-        step[joint] = 1e-5 * unit
-        gradient[:, joint] = (weighted(q + step) - weighted(q - step)) / (2 * step[joint])
-    return gradient
+    return _by_readings(arm, q, weighted).T

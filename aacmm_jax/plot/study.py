@@ -21,6 +21,7 @@ from ..study.statistics import (
 from .style import ACCENT, COLORS, DARK, LINES, MARKERS, axes_or_new, label_axes, logarithmic, save_figure
 
 _WIDTHS = ("bounds.length_mm", "bounds.angle_deg")
+_WIDE = 10  # characters of a level: longer ones do not fit beside each other
 _SHIFTS = ("bounds.length_shift_mm", "bounds.angle_shift_deg")
 
 
@@ -129,6 +130,10 @@ def study_distributions(
             [v if len(v) else [np.nan] for v in values], whis=(5, 95), showfliers=False,
             tick_labels=_levels(results, factor), medianprops={"color": DARK, "linewidth": 1.8},
         )  # fmt: skip
+        if max(len(label.get_text()) for label in panel.get_xticklabels()) > _WIDE:
+            panel.tick_params(axis="x", labelrotation=20)
+            for label in panel.get_xticklabels():
+                label.set(ha="right", rotation_mode="anchor")
         _finish(panel, factor_title(factor), _title(name))
         if all(np.nanmin(v, initial=np.inf) > 0 for v in values) and _spans_decades(values):
             panel.set_yscale("log")

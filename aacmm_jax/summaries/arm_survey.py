@@ -12,19 +12,30 @@ from ..core.text import pluralise, shorten
 from ..core.units import ARCSEC
 from ..data.arm_classes import class_noise
 from ..data.noise import Noise
-from ..kinematics.arm import Arm, without_corrections
+from ..files.corrections import loads_of
+from ..kinematics.arm import Arm, correction_names, joint_limits, without_corrections
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, tip_frame
+from ..kinematics.corrected_arm import function_values
+from ..kinematics.corrections.kinds import terms_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..kinematics.workspace import arm_reach, closest_approach, total_link_length
 from ..planning.first_capture import Determined, FirstCapture, determined_by, first_capture, still_joints
+from ..uncertainty.correction_limits import is_vertical
 from .calibration import arm_summary
 
 _SHORTEST, _LONGEST = 20.0, 20_000.0  # mm: of an arm's links together
 _SHOWN = (15, 30, 60, 120)  # poses
+_VERTICAL = "The axis of joint {joint} is vertical, so gravity has no moment about it: {names} left out."
+_ON_AXIS = "What loads {names} lies on the axis of joint {joint}, so it has no moment: left out."
+_OTHERS = "Left out as constant, or as combinations of other functions of their joint: {names}."
 
 
 def arm_survey(
-    specification: ArmSpecification, *, noise: Noise | None = None, base: Transform | None = None
+    specification: ArmSpecification,
+    *,
+    noise: Noise | None = None,
+    base: Transform | None = None,
+    model: str | None = None,
 ) -> dict[str, Any]:
     """Plain values for JSON and display.
 
@@ -32,6 +43,7 @@ def arm_survey(
         specification: The arm, with the identification that its file proposes.
         noise: Of its readings and of the seat; by default that of the usual classes of arms.
         base: The first frame in a robot's base link, mm; frames are in the base link then.
+        model: The model that the arm's corrections are of, where one was named.
     """
     arm: Arm = to_numpy(specification.arm)
     plain = without_corrections(arm)
@@ -46,6 +58,7 @@ def arm_survey(
             "links": total_link_length(arm),
         },
     }
+    summary["corrections_left_out"] = _left_out(arm, model)
     empty: dict[str, Any] = {"redundant": [], "weak": [], "parallel": [], "free": [], "fixed": []}
     empty |= {"determined": [], "still": [], "needed": [], "advice": ""}
     summary |= empty | {"warnings": _warnings(arm)}
@@ -97,6 +110,22 @@ def _redundant(found: Sequence[Determined]) -> list[str]:
     return [text for text, always in zip(seen.undetermined, seen.structural, strict=True) if always]
 
 
+def _left_out(arm: Arm, model: str | None) -> list[str]:
+    """Terms of a model that the arm's corrections leave out, and why."""
+    if model is None or arm.corrections is None:
+        return []
+    loads, known = loads_of(arm), correction_names(arm)
+    gone = [term for term in terms_of(model, arm.joints, loads) if term.name not in known]
+    limits = joint_limits(arm, None)
+    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (50, arm.joints))
+    values = function_values(arm.corrections.nominal, gone, q, np.asarray(arm.gravity))
+    why: dict[tuple[int, str], list[str]] = {}
+    for term, row in zip(gone, values, strict=True):
+        reason = _OTHERS if np.abs(row).max() > 1e-9 else _VERTICAL if is_vertical(arm, q, term.joint) else _ON_AXIS
+        why.setdefault((0 if reason == _OTHERS else term.joint, reason), []).append(term.name)
+    return [reason.format(joint=joint, names=shorten(names)) for (joint, reason), names in why.items()]
+
+
 def _row(one: Determined) -> dict[str, Any]:
     seen = one.seen
     return {
@@ -105,6 +134,7 @@ def _row(one: Determined) -> dict[str, Any]:
         "well_determined": seen.rank - len(seen.trade_offs),
         "scale": not any("the scale" in text for text in seen.undetermined),
         "undetermined": list(seen.undetermined),
+        "corrections": list(seen.corrections),
         "hardly_determined": [trade_off.text for trade_off in seen.trade_offs],
     }
 

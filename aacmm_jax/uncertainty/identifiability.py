@@ -13,13 +13,14 @@ from ..data.capture import Capture, ReferenceLength, check_one_capture
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, correction_names, joint_limits, neighbouring_arm, with_arrays
 from ..kinematics.chain import joint_motion
-from ..kinematics.independence import equations, nearly_parallel, tip_movements
+from ..kinematics.independence import equations, generic_poses, nearly_parallel, tip_movements
 from ..kinematics.inverse_kinematics import project_to_centroids, project_to_targets
 from ..kinematics.near_degeneracy import TradeOff, trade_offs
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.measurement import Measurement, check_joints
 from ..model.observed import Observed
 from ..model.residuals import JointWeights
+from .correction_limits import by_more_sockets, why_undetermined
 from .covariance import linearised
 from .null_space import complement, named_directions, structural
 from .observed_identifiability import Agreeing
@@ -49,6 +50,8 @@ class Observability(NamedTuple):
     # What a prior determines, and these data do not or hardly; without coefficients of joint corrections, many of which
     # no data tell apart: that is what their prior is for.
     by_prior: tuple[str, ...] = ()
+    # Why coefficients of joint corrections are among what is not determined: one sentence for each joint and cause.
+    corrections: tuple[str, ...] = ()
 
     @property
     def rank(self) -> int:
@@ -99,6 +102,7 @@ class Observability(NamedTuple):
                 f"Hardly determined by these data: {'; '.join(texts)}. Fix one of each, such as {first} (--held); "
                 "wider bounds do not help."
             )
+        found += self.corrections
         for i in self.parallel:
             found.append(
                 f"Axes {i} and {i + 1} are nearly parallel, where d_{i} and d_{i + 1} trade off and a small tilt has "
@@ -167,6 +171,13 @@ def observability(
     if spectrum.agreeing is not None:
         undetermined = spectrum.agreeing.named(undetermined, null)
     weak = _trade_offs(spectrum, capture, space, sigma, bounds)
+    q = np.concatenate([capture.q, *(observation.q for observation in capture.observations)])
+    sockets = 0 if capture.observations else len(capture.names)
+    unknown = [(_chief(one, space, 0.5), _chief(one, space, _FOLLOWS)) for one in np.abs(null.T)]
+    # Of a trade-off, the parameter to fix, or its strongest partner where that is no coefficient.
+    leads = [one for one in weak if not set(one.names) & set(known)]
+    unknown += [(one.names[: 1 + (one.names[0] not in correction_names(base))], one.names) for one in leads]
+    reasons, others = why_undetermined(base, q, unknown, sockets)
     functions = set(correction_names(base)) & set(known)
     rows = [name in functions for name in space.names]
     by_prior = named_directions(of_prior[:, ~np.any(np.abs(of_prior[rows]) > _FOLLOWS, axis=0)], base, space)[1]
@@ -185,6 +196,7 @@ def observability(
             *by_prior,
             *(one.text for one in weak if set(one.names) & set(known) and not set(one.names) & functions),
         ),
+        corrections=reasons + _by_more_sockets(base, capture, space, others),
     )
 
 
@@ -292,6 +304,28 @@ def whitened_equations(arm: Arm, space: Parameters, measurement: Measurement) ->
     linear = linearised(arm, space, measurement, xp.zeros(len(space.names), dtype=bool))
     lengths = JointWeights.of(arm.position(measurement.q), measurement, xp.zeros(())).whitening @ linear.lengths
     return xp.concatenate([linear.counted.reshape(linear.counted.shape[0], -1).T, lengths])
+
+
+def _chief(direction: Float[np.ndarray, " p"], space: Parameters, share: float) -> tuple[str, ...]:
+    """Parameters with at least this share of the largest component of a direction."""
+    return tuple(space.names[i] for i in np.flatnonzero(direction > share * direction.max()))
+
+
+def _by_more_sockets(arm: Arm, capture: Capture, space: Parameters, names: tuple[str, ...]) -> tuple[str, ...]:
+    """A sentence on which of these coefficients poses in more sockets would determine, where some do."""
+    if not names or capture.observations:
+        return ()
+    # The zero byte keeps the invented sockets apart from those of the capture.
+    generic = generic_poses(arm)
+    parts = np.split(np.asarray(generic.q), np.cumsum(generic.sizes)[:-1])
+    others = {f"\0{i}": q for i, q in enumerate(parts)}
+    more = Capture({**capture.sockets, **others}, capture.lengths)
+    spectrum = _spectrum(arm, arm, more, space, None)
+    lost = complement(spectrum.vectors[: spectrum.rank], len(space.names))
+    left = {space.names[i] for i in np.flatnonzero(np.any(np.abs(lost) > _FOLLOWS, axis=1))}
+    left |= {one.names[0] for one in _trade_offs(spectrum, more, space, None, None)}
+    found = [name for name in names if name not in left]
+    return (by_more_sockets(found),) if found else ()
 
 
 def _remedy(arm: Arm, capture: Capture, space: Parameters, rank: int) -> str:

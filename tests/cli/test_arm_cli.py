@@ -124,6 +124,8 @@ def test_readings_that_nothing_explains(aacmm, tmp_path, few):
         (("panda", "--check", "none.csv"), "none.csv"),
         (("panda", "--figure", "a.gif"), ".png, .svg or .pdf"),
         (("panda", "--probe", "1,2"), "--probe"),
+        (("panda", "--check", "x.csv", "--model", "gear"), "leave out --model"),
+        (("panda", "--model", "grvity"), "did you mean 'gravity'"),
         (("no-arm",), "neither a file"),
     ],
 )

@@ -60,6 +60,7 @@ def test_a_robot_by_default(aacmm):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
+        (("--model", "grvity"), "unknown model 'grvity'; did you mean 'gravity'"),
         (("--cone-deg", "wide"), "--cone-deg 'wide' is not of the form DEG or NAME=DEG"),
         (("--cone-deg", "50", "--cone-deg", "40"), "--cone-deg is given twice for all sockets"),
         (("--cone-deg", "Q=40"), "unknown socket 'Q'"),

@@ -100,13 +100,19 @@ def test_criteria_are_what_they_say(name):
 
 
 @pytest.mark.parametrize(
-    ("kind", "model"), [("functions", ""), ("trace", ""), ("determinant", ""), ("functions", "gravity,gear")]
+    ("kind", "model", "size"),
+    [
+        *(("functions", "", 0.0), ("trace", "", 0.0), ("determinant", "", 0.0)),
+        *(("functions", "gravity,gear", 0.0), ("functions", "gravity", 0.02), ("functions", "gear", 0.02)),
+    ],
 )
-def test_the_gradient_of_the_refinement_is_exact(paper_arm, kind, model):
-    """By differences, also through the projection to the sockets, with an arm that has Hayati's angle, and one with
-    joint corrections."""
+def test_the_gradient_of_the_refinement_is_exact(paper_arm, kind, model, size):
+    """By differences, also through the projection to the sockets, with an arm that has Hayati's angle, and ones with
+    joint corrections, of coefficients that are 0 and that are large."""
     arm = paper_arm.replace(beta=np.linspace(0.1, 0.3, 6))
     arm = aj.kinematics.with_corrections(arm, model) if model else arm
+    if size:
+        arm = arm.replace(coefficients=size * np.random.default_rng(1).normal(size=len(arm.coefficients)))
     space = aj.Parameters.free_of(arm, held=HELD, free=("beta_2",))
     random = np.random.default_rng(0)
     problem = DesignProblem(
