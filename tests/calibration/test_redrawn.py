@@ -93,6 +93,7 @@ def test_bootstrap_of_observations(repeated):
     assert "every parameter and lengths" in " ".join(sampled.sentences()) or not sampled.agrees.all()
 
 
+@pytest.mark.slow
 def test_drawn_solves_scatter_as_the_linear_result(repeated):
     """The Monte Carlo's own trials, fewer than its adaptive blocks."""
     capture, result = repeated

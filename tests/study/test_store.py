@@ -304,6 +304,7 @@ def test_parts_may_stay(home, study, tmp_path):
     same(home / "whole.h5", path)
 
 
+@pytest.mark.slow
 def test_a_spoilt_block_runs_again(home, study, tmp_path):
     """Whatever the disk did to it: a bit, the middle, the end, all of it."""
     path = tmp_path / "s.h5"
