@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import hypothesis
 import jax
 import numpy as np
 import pytest
@@ -18,6 +19,8 @@ from . import run_time_types
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 run_time_types.install()
+hypothesis.settings.register_profile("tests", deadline=None)  # a busy machine is no failure
+hypothesis.settings.load_profile("tests")
 import aacmm_jax as aj  # noqa: E402 - the hook checks every module imported after it
 from aacmm_jax.cli import main  # noqa: E402
 
@@ -155,50 +158,53 @@ def _few_memory_maps():
 
 # Modules in decreasing order of their run time: a long one started last would keep a single worker busy at the end.
 LONGEST = (
-    *("test_notebooks", "files/test_example_robots", "test_readme"),  # of the slow tests
-    "study/test_results",
+    *("test_notebooks", "files/test_example_robots", "test_readme", "test_hostile"),  # of the slow tests
+    "study/test_results",  # and with it all of studies
     "cli/test_cli",
-    "cli/test_observations_cli",
     "report/test_report",
-    "study/test_store",  # finds the programs of the first in the cache, as the next two do
-    "study/test_trials",
-    "study/test_observed_study",
-    "test_hostile",
-    "calibration/test_redrawn",
+    "cli/test_observations_cli",
     "solver/test_solver",
-    "calibration/test_observed_batch",
-    "uncertainty/test_uncertainty",
-    "drift/test_drift",
-    "files/test_storage",
-    "calibration/test_observed",
-    "study/test_executors",
-    "core/test_numpy_or_jax",
+    "calibration/test_prior",
     "calibration/test_single",
-    "calibration/test_observed_cross_validation",
-    "calibration/test_batch",
-    "calibration/test_second_stage",
+    "drift/test_drift",
+    "calibration/test_observed",
+    "core/test_numpy_or_jax",
+    "calibration/test_observed_batch",
+    "calibration/test_redrawn",
+    "kinematics/test_reading_check",
+    "files/test_storage",
+    "uncertainty/test_uncertainty",
     "acceptance/test_acceptance",
-    "summaries/test_likely_cause",
-    "data/test_observations",
+    "calibration/test_second_stage",
+    "calibration/test_batch",
+    "calibration/test_observed_cross_validation",
     "planning/test_kit",
+    "cli/test_arm_cli",
     "kinematics/test_chain",
-    "calibration/test_observed_evaluation",
     "core/test_linear_algebra",
-    "plot/test_plot",
-    "uncertainty/test_observed_identifiability",
+    "planning/test_constraints",
+    "data/test_observations",
+    "kinematics/test_corrections",
     "test_package",
-    "test_paper",
+    "cli/test_models_cli",
+    "summaries/test_likely_cause",
+    "uncertainty/test_observed_identifiability",
     "certificate/test_document",
-    "calibration/test_sampling",
     "files/test_observation_files",
     "cli/test_outputs",
-    "core/test_compilation_cache",
-    "test_real_captures",
-    "uncertainty/test_identifiability",
+    "calibration/test_sampling",
+    "plot/test_plot",
     "files/test_content_digest",
-    "model/test_residuals",
     "test_inputs",
+    "calibration/test_prismatic",
+    "calibration/test_model_ladder",
     "planning/test_planning",
+    "core/test_compilation_cache",
+    "core/test_deadlock",
+    "calibration/test_observed_evaluation",
+    "uncertainty/test_identifiability",
+    "test_real_captures",
+    "test_paper",
 )
 
 
@@ -214,13 +220,16 @@ def pytest_collection_finish():
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """A module's tests share its fixtures, so one worker runs them all; notebooks share nothing, and take long."""
+    """A module's tests share its fixtures, so one worker runs them all, and the tests of studies share their programs;
+    notebooks share nothing, and take long."""
     if config.getvalue("dist") != "loadscope":
         return None
     from xdist.scheduler import LoadScopeScheduling
 
     class ByModule(LoadScopeScheduling):
         def _split_scope(self, nodeid):
+            if nodeid.startswith("tests/study/"):
+                return "tests/study"
             return nodeid if nodeid.startswith("tests/test_notebooks.py") else super()._split_scope(nodeid)
 
     return ByModule(config, log)

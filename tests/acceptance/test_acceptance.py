@@ -8,7 +8,7 @@ from inspect import unwrap  # calls a function without the run-time type checker
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -100,7 +100,6 @@ def test_smallest_sphere_by_hand(points, diameter):
     )
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=2, max_size=8))
 def test_smallest_sphere_holds_all_and_none_smaller_does(points):
     points = np.array(points, dtype=float)
@@ -187,7 +186,6 @@ def test_decisions_by_rule(error, limit, expanded, rule, expected):
     assert acceptance.decide(error, limit, expanded, rule) == expected
 
 
-@settings(deadline=None)
 @given(st.floats(-1, 1), st.floats(0, 1), st.floats(0, 1), st.floats(0, 0.5), st.sampled_from(sorted(acceptance.RULES)))
 def test_a_larger_uncertainty_never_decides_otherwise(error, limit, expanded, more, rule):
     before, after = (acceptance.decide(error, limit, u, rule) for u in (expanded, expanded + more))

@@ -86,6 +86,7 @@ def test_nothing_wrong_needs_no_correction(paper_arm, space, bounds):
     assert 0.6 < found.recommended.ratio < 1.5
 
 
+@pytest.mark.slow
 def test_an_eccentric_encoder_is_recognised(paper_arm, space, bounds):
     """Also in an arm that comes with other corrections, which do not count."""
     capture = seen_by_a_tracker(paper_arm, space, "harmonics=1", cos1_2=4e-4, sin1_2=-3e-4)

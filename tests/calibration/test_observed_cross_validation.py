@@ -34,7 +34,9 @@ def true(space):
     return aj.perturbed_arm(space, length=1.0, angle=np.deg2rad(0.1), seed=1)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.slow if case in ("kinds", "placements") else ()) for case in CASES]
+)
 def test_honest_data_err_as_predicted(paper_arm, true, bounds, case):
     capture = aj.simulate(true, {}, observations=CASES[case], noise=NOISE, seed=3)
     checked = aj.cross_validate(paper_arm, capture, bounds, noise=NOISE)

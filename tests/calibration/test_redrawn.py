@@ -31,7 +31,9 @@ def calibrated(arm, bounds, simulated, sockets=(), lengths=(), **options):
     return capture, aj.calibrate(arm, capture, bounds, noise=NOISE, **options)
 
 
-@pytest.mark.parametrize("kind", SIMULATED)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=() if kind in ("spheres", "planes") else pytest.mark.slow) for kind in SIMULATED]
+)
 def test_residuals_scatter_as_the_weights_say(paper_arm, bounds, kind):
     """Whitened residuals of drawn data, by the arm and the geometry about which they are drawn, have variance 1."""
     capture, result = calibrated(paper_arm, bounds, SIMULATED[kind])
@@ -93,6 +95,7 @@ def test_bootstrap_of_observations(repeated):
     assert "every parameter and lengths" in " ".join(sampled.sentences()) or not sampled.agrees.all()
 
 
+@pytest.mark.slow
 def test_drawn_solves_scatter_as_the_linear_result(repeated):
     """The Monte Carlo's own trials, fewer than its adaptive blocks."""
     capture, result = repeated

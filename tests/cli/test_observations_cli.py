@@ -235,6 +235,7 @@ def calibrated(folder, paper_arm):
     return folder
 
 
+@pytest.mark.slow
 def test_an_evaluation_stands_beside_its_prediction(aacmm, folder, calibrated, tmp_path):
     """All kinds on a capture of the same arm: as predicted; with the probe remounted: beyond chance, and said."""
     shown = " ".join(aacmm("evaluate", calibrated / "c.h5", folder / "fresh.h5", "-o", "e.h5").stdout.split())
@@ -322,6 +323,7 @@ def test_the_robot_of_the_examples(aacmm, mukca):
     assert "position [mm]" in shown
 
 
+@pytest.mark.slow
 def test_a_plan_with_a_kit(aacmm, tmp_path):
     """A bar that stands and a tracker: the plan, its manifest, and what each part adds."""
     (tmp_path / "kit.toml").write_text(

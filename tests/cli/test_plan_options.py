@@ -42,6 +42,7 @@ def test_cones_obstacles_and_radians(aacmm, tmp_path):
     np.testing.assert_allclose(tips, np.tile([450, 100, 200], (len(tips), 1)), atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_robot_by_default(aacmm):
     """Cones of 60 deg, approach points 50 mm above, the noise of its data sheet; no obstacles unless asked for."""
     printed = " ".join(aacmm(*PLAN, "--collisions").stdout.split())

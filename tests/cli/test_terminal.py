@@ -64,7 +64,7 @@ texts = st.lists(cells, min_size=1, max_size=6).map(" ".join)
 
 
 @given(st.integers(30, 200), st.integers(1, 2), st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_nothing_in_a_table_is_cut(columns, keys, data):
     """Each word of each cell is printed whole, in lines that are not wider than the console."""
     count = data.draw(st.integers(keys + 1, 8))

@@ -67,6 +67,7 @@ def test_independent_factorisations_and_calibrations_in_one_program_end():
     assert (done.returncode, done.stdout) == (0, "finite: True\n"), done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [pytest.param("two-stage", marks=pytest.mark.slow), "joint"])
 def test_a_batch_of_calibrations_calls_no_lapack(method):
     program, starts = batches_of_calibrations(method, 1)

@@ -34,7 +34,7 @@ def symmetric(values, seed):
     return (matrix + matrix.T) / 2
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(spectra(), st.booleans())
 def test_eigenvalues_and_eigenvectors(spectrum, singular):
     values, seed = spectrum
@@ -50,7 +50,7 @@ def test_eigenvalues_and_eigenvectors(spectrum, singular):
     np.testing.assert_allclose((vectors * found) @ vectors.T, matrix, rtol=0, atol=3 * size)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.sampled_from(SIZES), st.integers(0, 2**32 - 1), st.floats(0, 60))
 def test_singular_values_keep_their_relative_accuracy_whatever_the_scale_of_columns(size, seed, decades):
     """Columns of very different size have singular values just as different; each keeps its leading digits."""
@@ -76,7 +76,7 @@ def test_singular_matrices():
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(spectra(smallest=-12), st.floats(-10, 10))
 def test_inverse_solution_and_whitening(spectrum, decades):
     """Errors relative to the condition number that is left after scaling the diagonal to 1, which Cholesky does not

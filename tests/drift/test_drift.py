@@ -569,6 +569,7 @@ def test_command_refuses(run, files):
     assert sorted(files.iterdir()) == before
 
 
+@pytest.mark.slow
 def test_command_in_a_process_of_its_own(aacmm_process, files):
     refused = aacmm_process("compare", "a.h5", "b.h5", "--length-mm", 100000, expect=2)
     assert refused.stderr.startswith("Error: a length of 100000 mm does not fit")

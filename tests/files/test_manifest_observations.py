@@ -324,6 +324,7 @@ def test_bad_cells(tmp_path):
     assert_refused(lambda: read(tmp_path, f'[[points]]\nfile = "a.csv"\n{ALL}'), "a.csv holds no numbers")
 
 
+@pytest.mark.slow
 def test_the_robot_of_the_examples(mukca):
     """R = Rx(rx) Ry(ry) Rz(rz): the angle between two poses is that of the robot's, to its accuracy."""
     recording = aj.files.read_manifest(mukca.parent / "ipa_ur10" / "transforms.toml")

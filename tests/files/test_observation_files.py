@@ -76,7 +76,7 @@ def same(one, other):
 
 @pytest.mark.parametrize("kind", known_kinds())
 @given(seed=st.integers(0, 10**6), some=st.booleans())
-@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_file_gives_back_what_was_saved(tmp_path, kind, seed, some):
     draw = np.random.default_rng(seed)
     one = make(kind, draw, some)

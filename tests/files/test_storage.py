@@ -249,6 +249,7 @@ def child(script: str, *arguments: object) -> subprocess.Popen:
     return subprocess.Popen(command, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
+@pytest.mark.slow
 def test_full_disk(tmp_path, good):
     """HDF5 itself dies of a full disk (segmentation fault); a limit on the size of files stands in for one."""
     script = """
@@ -389,7 +390,7 @@ def plain(value):
     return None if value is None else np.asarray(value).tobytes()
 
 
-quickly = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+quickly = settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow])
 
 
 @given(st.data())

@@ -76,7 +76,7 @@ def assert_same(poses, expected):
     np.testing.assert_allclose(poses[:3, :3], expected[:3, :3], rtol=0, atol=1e-12)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     chain=st.lists(st.tuples(TRANSFORMS, DIRECTIONS, st.booleans()), min_size=1, max_size=8),
     last=TRANSFORMS,
@@ -181,7 +181,7 @@ def test_far_frames_come_back_and_keep_the_probe():
 
 
 @given(st.tuples(ANGLES, ANGLES, ANGLES))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_roll_pitch_yaw_reproduce_the_rotation(angles):
     matrix = roll_pitch_yaw_matrix(np.array(angles))
     again = roll_pitch_yaw_matrix(roll_pitch_yaw(matrix))

@@ -70,7 +70,9 @@ def test_pose_is_the_textbook_product(joints, prismatic, beta):
     np.testing.assert_allclose(arm.position(q), expected[:, :3, 3], atol=1e-11)
 
 
-@pytest.mark.parametrize(("beta", "prismatic"), [(False, ()), (True, ()), (True, (1, 4))])
+@pytest.mark.parametrize(
+    ("beta", "prismatic"), [(False, ()), pytest.param(True, (), marks=pytest.mark.slow), (True, (1, 4))]
+)
 def test_the_tips_and_columns_of_a_batch_are_those_of_the_loop(beta, prismatic):
     arm = random_arm(6, 1, beta=beta, batch=(4, 1), prismatic=prismatic)
     q = random_readings(arm, 0, 5)

@@ -32,7 +32,7 @@ def within_limits(arm: aj.Arm, seed: int, count: int, part: float = 0.8) -> np.n
 
 
 @pytest.mark.parametrize("name", ARMS)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**31))
 def test_the_calibrated_arm_has_the_pose_that_the_controller_means(name, seed):
     nominal = ARMS[name]

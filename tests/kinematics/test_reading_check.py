@@ -105,7 +105,7 @@ def test_number_of_changes(order, signs, offsets, changes):
     ("order", "signs", "offsets"),
     [
         (PLAIN, (1,) * 7, NONE),
-        (PLAIN, (1, 1, -1, 1, 1, 1, 1), NONE),
+        pytest.param(PLAIN, (1, 1, -1, 1, 1, 1, 1), NONE, marks=pytest.mark.slow),
         ((0, 1, 2, 3, 5, 4, 6), (1, 1, -1, 1, 1, 1, 1), (0, np.pi / 2, 0, 0, 0, 0, 0)),
         (PLAIN, (1,) * 7, (0, 0, 0, 37 * DEG, 0, 0, 0)),
     ],
@@ -143,7 +143,7 @@ def ur10(mukca):
 @pytest.mark.parametrize(
     ("order", "signs", "offsets"),
     [
-        (range(6), (1,) * 6, (0,) * 6),
+        pytest.param(range(6), (1,) * 6, (0,) * 6, marks=pytest.mark.slow),
         ((2, 1, 0, 3, 4, 5), (1, 1, 1, -1, 1, 1), (0,) * 6),
     ],
 )

@@ -163,6 +163,7 @@ def test_a_low_ceiling(panda, monkeypatch):
     assert np.mean((points[..., 2] + radii).max(axis=1) > 480) > 0.3
 
 
+@pytest.mark.slow
 def test_a_plate_carries_its_normal(panda, monkeypatch):
     """A plate that lies on its side: the cone is about the plate's own normal, and approach points are along it."""
     monkeypatch.setattr(kit_placement, "_PLACEMENTS", 4)

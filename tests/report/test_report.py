@@ -704,9 +704,8 @@ def test_tables_sort_by_click_and_by_keyboard(shown):
     assert names == sorted(names)
 
 
-@pytest.mark.parametrize(
-    "kind", ["calibration", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("evaluation", "study"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["calibration", "evaluation", "study"])
 def test_it_prints_to_pdf(shown, tmp_path, kind):
     opened = shown(kind, 1600)
     content = opened.pdf(path=tmp_path / "report.pdf", format="A4", print_background=True)

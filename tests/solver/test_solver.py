@@ -31,8 +31,14 @@ def solve(problem):
     return solution.value, cost, stats["optimality"], aj.calibration.converged(stats["reason"])
 
 
-@pytest.mark.parametrize("count", [12, pytest.param(70, marks=pytest.mark.exhaustive)])
-@pytest.mark.parametrize("third", range(3))
+@pytest.mark.parametrize(
+    ("third", "count"),
+    [
+        (0, 25),
+        *(pytest.param(third, 25, marks=pytest.mark.slow) for third in (1, 2)),
+        *(pytest.param(third, 70, marks=pytest.mark.exhaustive) for third in range(3)),
+    ],
+)
 def test_never_worse_than_scipy_in_random_boxes(third, count):
     """Cost against SciPy's TRF at its tightest tolerances; the drawn boxes must hold both active and inactive
     bounds."""
@@ -135,7 +141,10 @@ _COMPILED = ("BoxBOD", "MGH10")
 
 @pytest.mark.parametrize(
     ("solver", "name"),
-    [(_by_steps, name) for name in nist_problems.MODELS]
+    [
+        pytest.param(_by_steps, name, marks=pytest.mark.slow if name in ("Bennett5", "MGH17") else ())
+        for name in nist_problems.MODELS
+    ]
     + [
         pytest.param(_by_optimistix, name, marks=pytest.mark.slow if name in _COMPILED else pytest.mark.exhaustive)
         for name in nist_problems.MODELS

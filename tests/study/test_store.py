@@ -168,6 +168,7 @@ def test_blocks_of_a_study_whose_file_is_gone_are_not_taken_for_anothers(home, s
     same(home / "whole.h5", path)
 
 
+@pytest.mark.slow
 def test_a_moved_and_oddly_named_study_still_reads(home, study, tmp_path):
     """The folder is found next to the file wherever both are moved; percent signs are no patterns."""
     path = tmp_path / "50% of it.h5"
@@ -304,6 +305,7 @@ def test_parts_may_stay(home, study, tmp_path):
     same(home / "whole.h5", path)
 
 
+@pytest.mark.slow
 def test_a_spoilt_block_runs_again(home, study, tmp_path):
     """Whatever the disk did to it: a bit, the middle, the end, all of it."""
     path = tmp_path / "s.h5"

@@ -161,7 +161,7 @@ def test_many_weighted_calibrations_equal_single_ones(paper_arm, bounds, capture
 @pytest.mark.parametrize(
     ("trials", "noise", "noise_model", "least", "most"),
     [
-        (100, None, "estimated", 0.86, 1.0),
+        (50, None, "estimated", 0.82, 1.0),
         pytest.param(400, None, "estimated", 0.91, 1.0, marks=pytest.mark.exhaustive),
         pytest.param(400, NOISE, "given", 0.91, 1.0, marks=pytest.mark.exhaustive),
         pytest.param(400, None, "common", 0.0, 0.91, marks=pytest.mark.exhaustive),
