@@ -8,11 +8,11 @@ from .arms import save_arm as save_arm
 from .arms import shipped_arms as shipped_arms
 from .calibrations import load_calibration as load_calibration
 from .calibrations import save_calibration as save_calibration
-from .compared_models import load_compared_models as load_compared_models
-from .compared_models import save_compared_models as save_compared_models
 from .captures import load_capture as load_capture
 from .captures import save_capture as save_capture
 from .cells import load_cell as load_cell
+from .compared_models import load_compared_models as load_compared_models
+from .compared_models import save_compared_models as save_compared_models
 from .controllers import dh_table as dh_table
 from .controllers import python_program as python_program
 from .controllers import zero_offsets as zero_offsets
