@@ -120,8 +120,8 @@ def _without_limits(summary: Mapping[str, Any]) -> Verdict:
     held_out = summary.get("held_out")
     if held_out is None:
         return Verdict("neutral", "Measured; no limit was given.")
-    predicted = held_out.get("predicted")
-    poses = {} if predicted is None else predicted["poses"]
+    predicted = held_out.get("predicted") or {"poses": {}, "lengths": {}}
+    poses = predicted["poses"]
     if poses.get("rms_mm") is None or poses.get("rms_predicted_mm") is None:
         return Verdict("neutral", "Measured on held-out data; no limit was given.")
     found, expected = poses["rms_mm"], poses["rms_predicted_mm"]

@@ -660,7 +660,8 @@ def test_a_browser_draws_everything_and_asks_for_nothing(shown, written, kind, w
     hidden = opened.evaluate(
         """() => [...document.querySelectorAll("td.mark-good, td.mark-bad")].filter((cell) => {
             if (cell.closest("details:not([open])")) return false;
-            return cell.getBoundingClientRect().right > cell.closest(".wide").getBoundingClientRect().right; }).length"""
+            const right = (element) => element.getBoundingClientRect().right;
+            return right(cell) > right(cell.closest(".wide")); }).length"""
     )
     assert hidden == 0
     if kind == "evaluation":
