@@ -292,13 +292,13 @@ def _parameters(summary: dict[str, Any], factor: float) -> Section:
         rows.append([
             text_cell(row["parameter"]),
             text_cell(unit),
-            number_cell(scale * row["nominal"], 4),
             number_cell(scale * row["calibrated"], decimals),
-            number_cell(scale * (row["calibrated"] - row["nominal"]), decimals, signed=True),
             number_cell(expanded, decimals),
+            number_cell(scale * (row["calibrated"] - row["nominal"]), decimals, signed=True),
+            number_cell(scale * row["nominal"], 4),
             text_cell(state, "unsure" if state else ""),
         ])  # fmt: skip
-    columns = ("parameter", "unit", "nominal", "calibrated", "change", "U (95 %)", "")
+    columns = ("parameter", "unit", "calibrated", "U (95 %)", "change", "nominal", "")
     introduction = (
         f"U is the expanded uncertainty, coverage factor {factor:.2f}. A parameter on a bound, or one that the data "
         "determine only together with others, has none of its own."

@@ -62,7 +62,7 @@ class Plot(NamedTuple):
     x: Axis
     y: Axis
     marks: tuple[Marks, ...]
-    vertical: Sequence[float] = ()  # thin lines at these abscissas
+    vertical: Sequence[float] | np.ndarray = ()  # thin lines at these abscissas
     horizontal: Sequence[float] = ()
     title: str = ""
     written: Sequence[tuple[float, float, str]] = ()  # characters at positions
@@ -120,19 +120,19 @@ def shades(values: Any) -> tuple[np.ndarray, tuple[float, ...]]:
     return shade, tuple(float(limit) for limit in limits)
 
 
-def correlations(names_: Sequence[str], table: np.ndarray) -> Plot:
+def correlations(parameters: Sequence[str], table: np.ndarray) -> Plot:
     """Correlations: darker is stronger, with the sign written where it is at least 0.5."""
-    strength, count = np.abs(np.asarray(table, dtype=float)), len(names_)
+    strength, count = np.abs(np.asarray(table, dtype=float)), len(parameters)
     rows, columns = np.nonzero(strength > 0.05)
     shade = np.minimum((strength[rows, columns] * SHADES).astype(int), SHADES - 1)
     said = strength[rows, columns] >= 0.3
     hover = [
-        f"{names_[i]} with {names_[j]}: {table[i, j]:+.3f}".replace("-", "−") if known and i != j else ""
-        for i, j, known in zip(rows, columns, said, strict=True)
+        f"{parameters[i]} with {parameters[j]}: {table[i, j]:+.3f}".replace("-", "−") if known and i != j else ""
+        for i, j, known in zip(rows.tolist(), columns.tolist(), said, strict=True)
     ]
     boxes = Marks("", columns, rows, "boxes", hover=hover, shade=shade, box=(1.0, 1.0))
     signs = [(float(j), float(i), "+" if table[i, j] > 0 else "−") for i, j in np.argwhere(strength >= 0.5) if i != j]
-    x = names("", names_)
+    x = names("", parameters)
     y = Axis("", count - 0.5, -0.5, x.ticks, named=True)
     return Plot(x._replace(low=-0.5, high=count - 0.5), y, (boxes,), written=signs, height=560, square=True)
 

@@ -6,6 +6,9 @@ from typing import Any, NamedTuple
 
 from .charts import Plot
 
+_MOST_STACKED = 16  # rows
+_NARROW, _CHARACTER, _GAP = 370.0, 7.2, 10.0  # pixels: a telephone's page, a character, between columns
+_LONGEST = 14  # characters: longer texts are wrapped
 _ZERO = 1e-9  # mm: smaller numbers are rounding errors
 
 
@@ -29,6 +32,17 @@ class ReportTable(NamedTuple):
     def numeric(self) -> list[bool]:
         """Which columns contain numbers."""
         return [any(row[i].value is not None for row in self.rows) for i in range(len(self.columns))]
+
+    @property
+    def stacked(self) -> bool:
+        """Whether a narrow screen shows each row as a list: a table of few rows that has no room on a telephone."""
+        if len(self.rows) > _MOST_STACKED:
+            return False
+        texts = [[column, *(row[i].text for row in self.rows)] for i, column in enumerate(self.columns)]
+        words = [max((len(word) for text in column for word in text.split()), default=0) for column in texts]
+        whole = [max(map(len, column[1:]), default=0) if i else 0 for i, column in enumerate(texts)]
+        characters = sum(max(word, min(text, _LONGEST)) for word, text in zip(words, whole, strict=True))
+        return characters * _CHARACTER + _GAP * len(texts) > _NARROW
 
 
 class Chart(NamedTuple):

@@ -31,7 +31,11 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
     """The report, except for the origin of its file; and the summary that it was made from."""
     tests, capture = record.acceptance(), record.recording.capture
     summary = evaluation_summary(record, tests)
-    evaluations = {stage: evaluate(arm.arm, capture) for stage, arm in record.arms().items()}
+    noise = None if record.uncertainty is None or not capture.observations else record.uncertainty.noise
+    evaluations = {
+        stage: evaluate(arm.arm, capture, noise=noise if stage == "calibrated" else None)
+        for stage, arm in record.arms().items()
+    }
     calibrated = evaluations["calibrated"]
     verdict = summary["verdict"]
     residuals = residual_chart(
@@ -51,7 +55,7 @@ def evaluation_report(record: EvaluationRecord) -> tuple[Report, dict[str, Any]]
         ],
         facts=_facts(summary),
         sections=[
-            _acceptance_section(tests["calibrated"], summary, capture.lengths, record.recording.spheres),
+            *_acceptance_sections(tests["calibrated"], summary, capture.lengths, record.recording.spheres),
             Section("stages", "Nominal and calibrated arm", _nominal_and_calibrated(record, summary, evaluations)),
             *_lengths(record, tests["calibrated"], evaluations),
             Section("residuals", "Residuals by observation and pose", [*residual_tables, residuals]),
@@ -100,7 +104,7 @@ def points_report(record: PointsRecord) -> tuple[Report, dict[str, Any]]:
     verdict = summary["verdict"]
     chart = _length_chart(tests)
     sections = [
-        _acceptance_section(tests, summary, measured.lengths, measured.spheres),
+        *_acceptance_sections(tests, summary, measured.lengths, measured.spheres),
         *([] if chart is None else [Section("lengths", "Lengths", [chart])]),
     ]
     subtitle = (
@@ -115,7 +119,8 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
     facts = []
     group, title = next(((group, title) for group, title in _GROUPS if summary[group] is not None), ("", ""))
     for key, name in (
-        ("rms_mm", "RMS distance"),
+        ("observed_rms_mm", "RMS distance from the geometry"),
+        ("rms_mm", "RMS distance in sockets"),
         ("deltam_mm", "Deltam"),
         ("length_error_largest_mm", "largest length error"),
     ):
@@ -127,20 +132,18 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
     return facts
 
 
-def _acceptance_section(
+def _acceptance_sections(
     tests: list[AcceptanceTest],
     summary: dict[str, Any],
     lengths: Sequence[ReferenceLength],
     spheres: Sequence[ProbedSphere],
-) -> Section:
-    rows, u_test = summary["acceptance"], summary["u_test_mm"]
+) -> list[Section]:
+    """The acceptance tests, if there were any, and the artefacts."""
+    rows, artefacts = summary["acceptance"], _artefacts(lengths, spheres)
     if rows:
-        blocks = _acceptance_blocks(tests, rows, u_test)
-    else:
-        blocks = [
-            "The data contain nothing for an acceptance test: no socket with several poses, no length, no sphere."
-        ]
-    return Section("acceptance", "Acceptance tests", [*blocks, *_artefacts(lengths, spheres)])
+        blocks = _acceptance_blocks(tests, rows, summary["u_test_mm"])
+        return [Section("acceptance", "Acceptance tests", [*blocks, *artefacts])]
+    return [Section("artefacts", "Artefacts", artefacts)] if artefacts else []
 
 
 def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], u_test: float) -> list:
@@ -169,11 +172,12 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
             blocks.append(f"This was not the full procedure. {' '.join(test['missing'])}")
     parts = [
         [
-            *(text_cell(word) for word in (test.standard, metric.name, part.where)),
+            text_cell(part.where),
+            text_cell(part.decision or "–", _MARKS[part.decision]),
             number_cell(part.value, decimals_for(part.expanded)),
             _expanded(part.expanded),
             number_cell(part.limit),
-            text_cell(part.decision or "–", _MARKS[part.decision]),
+            *(text_cell(word) for word in (metric.name, test.standard)),
         ]
         for test in tests
         for metric in test.metrics
@@ -181,7 +185,7 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
         if not limited or part.limit is not None
     ]
     title = "Every part of every metric with a limit [mm]" if limited else "Every part of every metric [mm]"
-    columns = ("standard", "metric", "at", "as left" if before else "value", "U", "MPE", "decision")
+    columns = ("at", "decision", "as left" if before else "value", "U", "MPE", "metric", "standard")
     return [*blocks, _metrics_chart(tests)._replace(table=ReportTable(title, columns, parts), printed=limited)]
 
 

@@ -160,9 +160,9 @@ def pose_chart(
         hover = [f"{labels[i]}: {format_number(float(values[i]))} {unit} ({name})" for i in drawn]
         found = values[np.isfinite(values)]
         says = f"{name}, RMS {format_number(float(np.sqrt(np.mean(found**2))), 3)} {unit}"
-        symbol, tone = (("square", "soft"), ("dot", "main"))[number]
         y = np.maximum(values[drawn], _LEAST)
-        marks.append(charts.Marks(says, drawn + 1, y, symbol, tone, hover, size=5))
+        last_one = charts.Marks(says, drawn + 1, y, hover=hover, size=5)
+        marks.append(last_one if number else last_one._replace(symbol="square", tone="soft"))
     if len(marked):
         marks.append(charts.Marks(far_says, marked + 1, np.maximum(last[marked], _LEAST), "diamond", "accent"))
     ticks, borders = groups.parts()

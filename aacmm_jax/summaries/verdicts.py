@@ -120,8 +120,8 @@ def _without_limits(summary: Mapping[str, Any]) -> Verdict:
     held_out = summary.get("held_out")
     if held_out is None:
         return Verdict("neutral", "Measured; no limit was given.")
-    predicted = held_out.get("predicted")
-    poses = {} if predicted is None else predicted["poses"]
+    predicted = held_out.get("predicted") or {"poses": {}, "lengths": {}}
+    poses = predicted["poses"]
     if poses.get("rms_mm") is None or poses.get("rms_predicted_mm") is None:
         return Verdict("neutral", "Measured on held-out data; no limit was given.")
     found, expected = poses["rms_mm"], poses["rms_predicted_mm"]
@@ -129,7 +129,7 @@ def _without_limits(summary: Mapping[str, Any]) -> Verdict:
     rms = f"held-out poses are {found:.3g} mm RMS from their geometry, predicted {expected:.3g} mm"
     ratio = predicted["lengths"]["normalised_error_rms"]
     if ratio is not None:
-        rms += f", and lengths err by {ratio:.2g} times their predicted standard uncertainty"
+        rms += f", and lengths err by {ratio:.2g} times what is predicted"
     if any(chance < LEVEL / len(chances) for chance in chances):
         return Verdict("unsure", f"The calibration does not hold here: {rms}.")
     return Verdict("neutral", f"The calibration holds on unseen data: {rms}. No limit was given.")

@@ -236,10 +236,15 @@ def test_numbers_of_a_report_are_under_the_right_heading(written):
     assert marks.high[0] - marks.y[0] == pytest.approx(factor * u[i], rel=1e-5)
 
 
-def test_a_report_of_observations_by_kind_observation_and_pose(observed_record):
+@pytest.fixture(scope="module")
+def observed_report(observed_record):
     from aacmm_jax.report.calibration import calibration_report
 
-    report = calibration_report(observed_record)[0]
+    return calibration_report(observed_record)[0]
+
+
+def test_a_report_of_observations_by_kind_observation_and_pose(observed_record, observed_report):
+    report = observed_report
     assert report.subtitle.endswith("robust loss tukey; 92 poses in 2 sockets, 4 other observations")
     found, tables = observed_record.observed, tables_of(report)
     nominal = observed_record.evaluations()["nominal"].observed
@@ -310,20 +315,19 @@ def test_groups_held_out_are_listed_one_by_one_the_worst_first(written):
 
 
 @pytest.mark.slow
-def test_a_report_says_where_the_scale_comes_from(observed_record):
+def test_a_report_says_where_the_scale_comes_from(observed_record, observed_report):
     from aacmm_jax.report.calibration import calibration_report
 
-    def text_of(record):
-        report = calibration_report(record)[0]
+    def text_of(report):
         blocks = [block for section in report.sections for block in section.blocks if isinstance(block, str)]
         return report.subtitle + " ".join(blocks)
 
-    said = text_of(observed_record)
+    said = text_of(observed_report)
     assert "the scale comes from tracker (transforms), ball (sphere), block (parallel planes), bar (artefact)." in said
     recording = observed_record.recording
     alone = recording._replace(capture=aj.Capture(recording.capture.sockets))
     found = aj.identify(recording.nominal.arm, alone.capture, recording.nominal.bounds())
-    said = text_of(aj.calibration.record_of(found, alone))
+    said = text_of(calibration_report(aj.calibration.record_of(found, alone))[0])
     assert "with the scale of the nominal arm" in said
     assert "The scale is that of the nominal arm: nothing that was measured set it." in said
     assert "not traceable" in said
@@ -655,6 +659,14 @@ def test_a_browser_draws_everything_and_asks_for_nothing(shown, written, kind, w
         assert min(0.5 * width, 200) < chart["width"] < width
         assert 0 < chart["size"] < width
     assert opened.evaluate("document.documentElement.scrollWidth") <= width
+    # No decision is cut off: each is within the part of its table that is seen.
+    hidden = opened.evaluate(
+        """() => [...document.querySelectorAll("td.mark-good, td.mark-bad")].filter((cell) => {
+            if (cell.closest("details:not([open])")) return false;
+            const right = (element) => element.getBoundingClientRect().right;
+            return right(cell) > right(cell.closest(".wide")); }).length"""
+    )
+    assert hidden == 0
     if kind == "evaluation":
         assert opened.title().startswith("Evaluation of Arm <script>")
 
@@ -686,11 +698,35 @@ def test_the_arm_turns_under_mouse_keys_and_buttons(shown, kind):
     assert "pose 3" in opened.locator(".controls output").inner_text()
 
 
+def test_the_mark_under_the_pointer_is_said_and_tab_stops_are_few(shown):
+    opened = shown("calibration", 1600)
+    axes = opened.locator("[data-chart=residuals] .axes")
+    axes.scroll_into_view_if_needed()
+    first = json.loads(opened.locator("#points").inner_text())["residuals"][0][0]
+    box = axes.locator("> svg").bounding_box()
+    opened.mouse.move(box["x"] + first[0] / 1000 * box["width"] + 2, box["y"] + first[1] / 1000 * box["height"])
+    assert axes.locator(".tip").inner_text() == first[2]
+    opened.mouse.move(5, 5)
+    assert axes.locator(".tip").count() == 0
+    stops = 0
+    while not opened.evaluate("document.activeElement.matches('[data-scene]')"):
+        opened.keyboard.press("Tab")
+        stops += 1
+        assert stops <= 30
+    button = opened.locator("table", has=opened.locator("caption", has_text=re.compile("^Bounds$"))).locator(
+        "th button"
+    )
+    opened.locator("summary", has_text="Bounds").click()
+    button.first.focus()
+    opened.keyboard.press("ArrowRight")
+    assert opened.evaluate("document.activeElement.textContent") == "unit"
+
+
 def test_tables_sort_by_click_and_by_keyboard(shown):
     opened = shown("calibration", 1600)
     table = opened.locator("table", has=opened.locator("caption", has_text=re.compile("^Parameters$")))
     column = lambda: [  # noqa: E731
-        float(cell.get_attribute("data-value")) for cell in table.locator("tbody tr td:nth-child(4)").all()
+        float(cell.get_attribute("data-value")) for cell in table.locator("tbody tr td:nth-child(3)").all()
     ]
     heading = table.locator("th button", has_text="calibrated")
     heading.click()
