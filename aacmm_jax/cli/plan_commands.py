@@ -136,6 +136,10 @@ def plan(
             help="Length whose uncertainty is predicted all over the volume. Default 300, or half a small arm's reach.",
         ),
     ] = None,
+    farthest: Annotated[
+        float,
+        typer.Option(metavar="PART", help="Largest distance of what is placed from the shoulder, part of the reach."),
+    ] = 0.95,
     kit: Annotated[
         Path | None,
         typer.Option(
@@ -239,6 +243,7 @@ def plan(
     shared: dict[str, Any] = {
         "poses": poses,
         "region": dict(axes) if axes else None,
+        "farthest": farthest,
         "space": specification.space(),
         "criterion": criterion,
         "margin": margin_deg * DEG,

@@ -23,9 +23,11 @@ from ..uncertainty.volume import default_length, sample_lengths
 from .fedorov_exchange import Kind, Objective, exchange
 from .motion import Motion, approaches, ordered_motion
 from .placement import (
+    FARTHEST,
     LEAST_POSES,
     DesignProblem,
     FixturePlacement,
+    PlacementRegion,
     Pool,
     Ranges,
     candidates_of,
@@ -33,6 +35,7 @@ from .placement import (
     in_order,
     moved_pool,
     neighbour,
+    placement_region,
     pool_at,
     pool_of,
     random_placements,
@@ -103,6 +106,7 @@ def plan(
     u: float = 0.002,
     lengths: Sequence[tuple] = (),
     region: Ranges | None = None,
+    farthest: float = FARTHEST,
     space: Parameters | None = None,
     noise: Noise | None = None,
     criterion: Criterion = "length",
@@ -136,6 +140,7 @@ def plan(
         lengths: ``(start, end)`` or ``(start, end, u)`` for each length between given sockets.
         region: Ranges of ``x``, ``y``, ``z`` and of the ``distance`` from the origin for placed sockets, mm (default:
             z at least 0).
+        farthest: Largest distance of placed sockets from the shoulder, as a part of the reach.
         space: Free parameters (default: those of `Parameters.free_of`).
         noise: Noise of the readings, which weights them; by default that of a small measuring arm.
         criterion: "length" (largest uncertainty of a length over the volume); or "A", "D", "E" of the parameters'
@@ -173,14 +178,14 @@ def plan(
     check_plannable(arm, criterion, noise)
     check_counts(sockets, poses, len(space.names), u, lengths)
     check_retract(retract)
-    ranges = {"z": (0.0, np.inf)} if region is None else region
+    ranges = placement_region(to_numpy(arm), region, farthest)
     own = (length, length) if isinstance(length, int | float) else length
     if isinstance(sockets, Mapping):
         names, placement = given_placement(sockets, u, lengths)
     else:
         names = [chr(ord("A") + i) if sockets <= 26 else f"S{i + 1}" for i in range(sockets)]
         placement = None
-        check_ranges(arm, own, lengths, ranges)
+        check_ranges(arm, own, lengths, ranges.ranges)
     cones = checked_cones(cone, names, tool_axis)
     problem, functions = design_problem(
         search_region(to_numpy(arm), limits, margin, above, seed, cones, with_table(cell, above)),
@@ -306,7 +311,7 @@ def _best_placement(
     poses: int,
     length: tuple[float, float],
     u: float,
-    ranges: Ranges,
+    ranges: PlacementRegion,
     report: Progress,
 ) -> FixturePlacement:
     """The best placement found: random ones scored by random poses, the best few by chosen poses, then neighbours."""

@@ -32,7 +32,7 @@ from .design import Criterion, Progress, check_plannable, design_problem
 from .fedorov_exchange import Candidates, covariance_of, exchange
 from .kit_placement import KitItem, PlacedKit, approachable, place, region_of, set_up
 from .motion import Motion, ordered_motion
-from .placement import PRIOR, DesignProblem, Ranges, check_region
+from .placement import FARTHEST, PRIOR, DesignProblem, Ranges, check_region, placement_region
 from .plan_arguments import check_retract, planned_parameters, with_table
 from .predictions import MORE, Prediction, prediction_of
 
@@ -80,6 +80,7 @@ def plan_kit(
     *,
     poses: int = 60,
     region: Ranges | None = None,
+    farthest: float = FARTHEST,
     space: Parameters | None = None,
     noise: Noise | None = None,
     criterion: Criterion = "length",
@@ -107,6 +108,7 @@ def plan_kit(
         poses: Number of poses in all.
         region: Ranges of ``x``, ``y``, ``z`` and of the ``distance`` from the origin for the tip in what is placed, mm
             (default: z at least 0).
+        farthest: Largest distance from the shoulder of the tip in what is placed, as a part of the reach.
         space: Free parameters (default: those of `Parameters.free_of`).
         noise: Noise of readings and seat; by default that of a small measuring arm.
         criterion: As in `plan`.
@@ -135,8 +137,8 @@ def plan_kit(
     noise = small_arm_noise() if noise is None else noise
     check_plannable(arm, criterion, noise)
     items = _checked(kit)
-    ranges = {"z": (0.0, np.inf)} if region is None else region
-    check_region(ranges)
+    ranges = placement_region(to_numpy(arm), region, farthest)
+    check_region(ranges.ranges)
     check_retract(retract)
     space = planned_parameters(Parameters.free_of(arm) if space is None else space)
     check_length = default_length(arm) if check_length is None else check_length

@@ -17,7 +17,7 @@ from ..kinematics.cones import TOOL_AXIS, Cone, cones_of
 from ..kinematics.workspace import SearchRegion, reached, total_link_length
 from .fedorov_exchange import Candidates, relaxed_value
 from .motion import approaches
-from .placement import DesignProblem, Ranges, inside
+from .placement import DesignProblem, PlacementRegion, inside
 
 _PLACEMENTS, _DESIGNED, _NEIGHBOURS = 120, 8, 60
 _STARTS, _DESIGN_STARTS = 120, 400  # random configurations for each thing: of the first score, and of the second
@@ -129,7 +129,7 @@ def place(
     problem: DesignProblem,
     items: Sequence[KitItem],
     poses: int,
-    ranges: Ranges,
+    ranges: PlacementRegion,
     candidates_of: CandidatesOf,
     report: Callable[[str, float], None],
 ) -> PlacedKit:
@@ -156,7 +156,7 @@ class _Search(NamedTuple):
     problem: DesignProblem
     things: list[tuple[KitItem, str]]  # each with the name of its observation
     poses: int
-    ranges: Ranges
+    ranges: PlacementRegion
     candidates_of: CandidatesOf
 
     def best(self, report: Callable[[str, float], None]) -> _Layout:

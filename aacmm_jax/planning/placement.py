@@ -15,7 +15,7 @@ from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, jacobian_at
 from ..kinematics.chain import Geometry, joint_motion
 from ..kinematics.parameters import Parameters
-from ..kinematics.workspace import SearchRegion, configurations_at, reached, total_link_length
+from ..kinematics.workspace import SearchRegion, arm_reach, configurations_at, reached, total_link_length
 from ..model.weights import inverse_root
 from .fedorov_exchange import Candidates, Objective, relaxed_value
 
@@ -29,6 +29,15 @@ _SHIFT, _ROTATION = 0.05, 0.4  # of a neighbour: relative to the sum of the link
 PRIOR = 1e-4  # parameters are known to 100 mm or 100 mrad in advance: makes the first information matrices invertible
 
 Ranges = Mapping[str, tuple[float, float]]  # of x, y, z and the distance from the origin, mm
+FARTHEST = 0.95  # part of the reach: beyond it an arm is stretched, and hardly any pose can be taken
+
+
+class PlacementRegion(NamedTuple):
+    """Where sockets and artefacts may be placed."""
+
+    ranges: Ranges
+    shoulder: Float[np.ndarray, " 3"]  # mm
+    farthest: float  # from the shoulder, mm
 
 
 class DesignProblem(NamedTuple):
@@ -135,7 +144,7 @@ def designed_score(problem: DesignProblem, placement: FixturePlacement, pool: Po
 
 
 def random_placements(
-    problem: DesignProblem, count: int, sockets: int, length: tuple[float, float], u: float, ranges: Ranges
+    problem: DesignProblem, count: int, sockets: int, length: tuple[float, float], u: float, ranges: PlacementRegion
 ) -> list[FixturePlacement]:
     """Random placements of sockets within ranges, two by two as the ends of the reference length."""
     random = problem.region.random
@@ -162,7 +171,7 @@ def random_placements(
     )
 
 
-def neighbour(problem: DesignProblem, placement: FixturePlacement, ranges: Ranges) -> FixturePlacement | None:
+def neighbour(problem: DesignProblem, placement: FixturePlacement, ranges: PlacementRegion) -> FixturePlacement | None:
     """A placement with one length, or single socket, shifted and rotated a little; None if that leaves the ranges."""
     random = problem.region.random
     points = placement.points.copy()
@@ -207,11 +216,21 @@ def check_region(ranges: Ranges) -> None:
         raise InputError(f"the region has no '{unknown[0]}'; give ranges of x, y, z and distance, in mm.")
 
 
-def inside(points: Float[np.ndarray, "... 3"], ranges: Ranges) -> Bool[np.ndarray, "..."]:
-    """Which points are within the ranges."""
+def placement_region(arm: Arm, ranges: Ranges | None, farthest: float) -> PlacementRegion:
+    """The region with the given ranges (default: z at least 0), no farther than a part of the reach."""
+    if not 0 < farthest <= 1:
+        raise InputError(
+            f"farthest is {farthest:g}; give a part of the reach, such as {FARTHEST:g}, or 1 for all of it."
+        )
+    reach = arm_reach(arm)
+    return PlacementRegion({"z": (0.0, np.inf)} if ranges is None else ranges, reach.shoulder, farthest * reach.radius)
+
+
+def inside(points: Float[np.ndarray, "... 3"], region: PlacementRegion) -> Bool[np.ndarray, "..."]:
+    """Which points are within the region."""
     values = {"x": points[..., 0], "y": points[..., 1], "z": points[..., 2]}
     values["distance"] = np.linalg.norm(points, axis=-1)
-    inside = np.ones(points.shape[:-1], dtype=bool)
-    for key, (low, high) in ranges.items():
+    inside = np.linalg.norm(points - region.shoulder, axis=-1) <= region.farthest
+    for key, (low, high) in region.ranges.items():
         inside &= (values[key] >= low) & (values[key] <= high)
     return inside

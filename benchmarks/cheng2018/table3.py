@@ -33,7 +33,7 @@ def noise_models(made: twin.Pool, rows: list[Row], search: bool) -> tuple[twin.N
         shown = twin.medians(twin.identified(twin.draw(made, noise, 400, SEED + 1), hold="d_3"))
         table.append({"noise": name} | noise._asdict() | shown)
         chosen = noise if len(kinds) > 1 else chosen
-    printed = wanted["Deltam of Data2 and Data3"] / wanted["Deltam of Data1"]
+    printed = wanted["Deltam of Data2 and Data3"] / PUBLISHED["table3"]["Data1"]
     ratios = {line["noise"]: line["Deltam of Data2 and Data3"] / line["Deltam of Data1"] for line in table}
     nearest = min(ratios, key=lambda name: abs(np.log(ratios[name] / printed)))
     rows.append(

@@ -1,5 +1,6 @@
 """Planning: exchange against all sets, plans that can be carried out, predictions that calibrations confirm."""
 
+import inspect
 import itertools
 from inspect import unwrap  # calls a function without the run-time type checker of the tests
 
@@ -11,7 +12,7 @@ from aacmm_jax.files.plans import plan_csv, plan_manifest, save_plan
 from aacmm_jax.kinematics.workspace import search_region
 from aacmm_jax.planning import design, pose_refinement
 from aacmm_jax.planning.fedorov_exchange import Candidates, Objective, covariance_of, exchange, relaxed_value
-from aacmm_jax.planning.placement import DesignProblem, FixturePlacement, pool_at
+from aacmm_jax.planning.placement import DesignProblem, FixturePlacement, inside, placement_region, pool_at
 from aacmm_jax.summaries.planning import plan_summary
 
 FUNCTIONS = np.random.default_rng(5).normal(size=(12, 3))
@@ -202,6 +203,7 @@ def test_placements_are_in_the_region_and_the_range(paper_arm, quick):
         poses=15,
         length=(300.0, 600.0),
         region=region,
+        farthest=0.7,
         candidates=300,
         criterion="D",
         progress=lambda stage, fraction: reported.append((stage, fraction)),
@@ -211,10 +213,23 @@ def test_placements_are_in_the_region_and_the_range(paper_arm, quick):
     assert np.all((points[:, 2] >= 100) & (points[:, 2] <= 900))
     assert np.all((np.linalg.norm(points, axis=1) >= 300) & (np.linalg.norm(points, axis=1) <= 1200))
     assert 300 <= float(found.lengths[0].value) <= 600
+    reach = aj.kinematics.arm_reach(paper_arm)
+    assert np.linalg.norm(points - reach.shoulder, axis=1).max() <= 0.7 * reach.radius
     assert list(dict.fromkeys(stage for stage, _ in reported)) == [
         "Placing the sockets", "Choosing poses", "Moving poses"
     ]  # fmt: skip
     assert all(0 <= fraction <= 1 for _, fraction in reported)
+
+
+def test_placements_keep_off_the_end_of_the_reach(paper_arm):
+    """By default off the last 5 %, in whatever ranges are given."""
+    reach = aj.kinematics.arm_reach(paper_arm)
+    along = reach.shoulder + reach.radius * np.outer([0.94, 0.96, 1.0], [1.0, 0.0, 0.0])
+    defaults = inspect.signature(unwrap(aj.planning.plan)).parameters["farthest"].default
+    for ranges in (None, {"x": (-5000.0, 5000.0)}):
+        assert inside(along, placement_region(paper_arm, ranges, defaults)).tolist() == [True, False, False]
+        assert inside(along, placement_region(paper_arm, ranges, 1.0)).tolist() == [True, True, True]
+    assert inspect.signature(unwrap(aj.planning.plan_kit)).parameters["farthest"].default == defaults
 
 
 def test_the_same_seed_gives_the_same_plan(paper_arm, quick):
@@ -276,6 +291,7 @@ REFUSED = {
         {"sockets": {"A": (400, 200, 300), "B": (400, 200, 300)}, "lengths": [("A", "B")]},
         "in the same position",
     ),
+    "beyond the reach": ({"farthest": 1.2}, "farthest is 1.2; give a part of the reach"),
     "no range": ({"region": {"z": (10.0, 0.0)}}, "which is no range"),
     "under the table": ({"above": 2000.0}, "can be reached well"),
     "no length": ({"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}}, "determine the parameters.*the scale"),
