@@ -1,9 +1,10 @@
 """Which model of its joints an arm needs: models from simple to rich, judged by regions that they have not seen.
 
 Errors of poses like those that a model was fitted to hardly tell models apart, and a random part of the poses is such.
-Chosen is the simplest model whose mean square error over the regions exceeds that of the best one by no more than a
-standard error of the difference, region by region: what two models have in common (a region that is hard for both)
-cancels in it (Breiman et al. 1984, section 3.4.3, with paired differences).
+Regions exclude each model whose mean square error exceeds that of the best by more than chance explains, region by
+region: what two models have in common (a region that is hard for both) cancels in the difference (Breiman et al. 1984,
+section 3.4.3, with paired differences). Of those left, which predict equally well as far as the regions can tell, the
+simplest is chosen that makes the measurement nearly as probable as the most probable one (`log_evidence`).
 """
 
 import time
@@ -15,6 +16,7 @@ from jaxtyping import Float
 
 from ..core.arguments import checked_arguments, items_of
 from ..core.arrays import Numbers
+from ..core.distributions import student_quantile
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
@@ -24,11 +26,15 @@ from ..kinematics.arm import DOWN, Arm, correction_names
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.parameters import ArmSpecification, Bounds, Parameters, based_on
 from ..kinematics.prior_scales import default_prior
+from .group_equations import equations_of
+from .log_evidence import log_evidence
 from .record import record_of
 from .results import Calibration
 from .single import calibrate
 from .unseen_regions import Region, UnseenRegion, regions_of, unseen_regions
 
+_LEVEL = 0.05  # of the test by regions
+_EVIDENCE = 3.0  # of a log evidence, up to which the evidence is "not worth more than a bare mention" (Kass and Raftery)
 DEFAULT_MODELS = ("dh", "gravity", "harmonics=1", "gravity,harmonics=1", "functions", "gravity,functions")
 
 
@@ -42,6 +48,7 @@ class ComparedModel(NamedTuple):
     regions: tuple[UnseenRegion, ...]
     cpu_seconds: float
     result: Calibration  # with all poses
+    log_evidence: float = 0.0  # but for what all models of the capture have in common
 
     @property
     def mean_squares(self) -> Float[np.ndarray, " f"]:
@@ -83,10 +90,17 @@ class ComparedModels(NamedTuple):
         return [(float(np.mean(each)), float(np.std(each, ddof=1) / np.sqrt(len(each)))) for each in paired]
 
     @property
+    def as_good(self) -> tuple[ComparedModel, ...]:
+        """Models that the regions cannot tell from the best: by Student's t of the difference, at 5 %."""
+        factor = float(student_quantile(1 - _LEVEL / 2, len(self.models[0].regions) - 1))
+        differences = zip(self.models, self.differences, strict=True)
+        return tuple(model for model, (mean, u) in differences if mean <= factor * u)
+
+    @property
     def recommended(self) -> ComparedModel:
-        """The simplest model whose difference from the best is within one standard error of that difference."""
-        within = (mean <= u for mean, u in self.differences)
-        return next(model for model, is_within in zip(self.models, within, strict=True) if is_within)
+        """The simplest of these whose log evidence is within 3 of the largest among them."""
+        least = max(model.log_evidence for model in self.as_good) - _EVIDENCE
+        return next(model for model in self.as_good if model.log_evidence >= least)
 
 
 @checked_arguments
@@ -154,21 +168,21 @@ def _compared(
 ) -> ComparedModel:
     widened = _with_coefficients(bounds, arm)
     arm = widened.space.base
-    result = calibrate(
-        arm, capture, widened, method="joint", noise=noise, prior=default_prior(arm), check_identifiability=False
-    )
+    prior = default_prior(arm)
+    result = calibrate(arm, capture, widened, method="joint", noise=noise, prior=prior, check_identifiability=False)
     record = record_of(result, Recording(capture, ArmSpecification(arm)))
     assert record.observed is not None
     assert record.prior is not None
-    poses = [len(weights) for weights in record.observed.weights]
+    poses, equations = [len(weights) for weights in record.observed.weights], equations_of(record)
     return ComparedModel(
         model=model,
         parameters=len(record.names),
         effective_parameters=float(np.sum(record.prior.effective)),
         rms_inside=float(np.sqrt(np.average(np.asarray(record.observed.rms_after) ** 2, weights=poses))),
-        regions=unseen_regions(record, regions),
+        regions=unseen_regions(record, regions, equations),
         cpu_seconds=time.process_time() - begun,
         result=result,
+        log_evidence=log_evidence(equations, record.prior, {group: float(sd) for group, sd in prior.sd.items()}),
     )
 
 
