@@ -34,7 +34,9 @@ from .single import calibrate
 from .unseen_regions import Region, UnseenRegion, regions_of, unseen_regions
 
 _LEVEL = 0.05  # of the test by regions
-_EVIDENCE = 3.0  # of a log evidence, up to which the evidence is "not worth more than a bare mention" (Kass and Raftery)
+_EVIDENCE = (
+    3.0  # of a log evidence, up to which the evidence is "not worth more than a bare mention" (Kass and Raftery)
+)
 DEFAULT_MODELS = ("dh", "gravity", "harmonics=1", "gravity,harmonics=1", "functions", "gravity,functions")
 
 
@@ -103,13 +105,21 @@ class ComparedModels(NamedTuple):
         return next(model for model in self.as_good if model.log_evidence >= least)
 
 
+def default_models(arm: Arm, capture: Capture) -> tuple[str, ...]:
+    """`DEFAULT_MODELS`; where the capture has temperatures, each of them also with thermal expansion."""
+    if capture.columns == arm.joints:
+        return DEFAULT_MODELS
+    warmed = ((model, "expansion" if model == "dh" else f"{model},expansion") for model in DEFAULT_MODELS)
+    return tuple(model for pair in warmed for model in pair)
+
+
 @checked_arguments
 def compare_models(
     arm: Arm,
     capture: Capture,
     bounds: Bounds | None = None,
     *,
-    models: Iterable[str] = DEFAULT_MODELS,
+    models: Iterable[str] | None = None,
     regions: Iterable[str] | None = None,
     noise: Noise | None = None,
     mass: Numbers | None = None,
@@ -118,9 +128,10 @@ def compare_models(
 ) -> ComparedModels:
     """Fit models of the joints, each with its prior's scales learned, and predict regions that they have not seen.
 
-    A region is a placement, a station or another group that shares an unknown geometry, where there are at least three;
-    otherwise either half of each joint's travel. Errors are distances of the poses from their geometry; reference
-    lengths take part in the fits only.
+    Recommended is, of the models that the regions cannot tell from the best, the simplest whose log evidence is within
+    3 of the largest. A region is a placement, a station or another group that shares an unknown geometry, where there
+    are at least three; otherwise either half of each joint's travel. Errors are distances of the poses from their
+    geometry; reference lengths take part in the fits only.
 
     Args:
         arm: The nominal arm; corrections that it has are replaced by those of each model.
@@ -128,8 +139,8 @@ def compare_models(
         bounds: Box of the free Denavit-Hartenberg parameters, mm and rad; by default around those of
             `Parameters.free_of`. Coefficients of corrections are free in each model that has them.
         models: Models from simple to rich, as for `kinematics.with_corrections`; "dh" is the arm alone. The default
-            takes some ten seconds for 500 poses, most of them for "functions" (harmonics=1-31, 62 coefficients a
-            joint).
+            (`default_models`) takes some ten seconds for 500 poses, most of them for "functions" (harmonics=1-31, 62
+            coefficients a joint).
         regions: What to leave out instead, each as a name or a shell pattern: ``["monday/*", "tuesday/*"]``.
         noise: Standard deviations of readings and seat, as for `calibrate`.
         mass: Mass of each link ``(n,)``, kg, as for `kinematics.with_corrections`.
@@ -142,7 +153,7 @@ def compare_models(
     Raises:
         InputError: A model is unknown, fewer than two regions can be left out, or as `calibrate` does.
     """
-    named = items_of(models, "models")
+    named = default_models(arm, capture) if models is None else items_of(models, "models")
     if not named or not all(isinstance(model, str) and model.strip() for model in named):
         raise InputError("models names no model; give some, from simple to rich, such as 'dh' and 'dh,gravity'.")
     plain = arm.replace(coefficients=None, gravity=None, corrections=None)

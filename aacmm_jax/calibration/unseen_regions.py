@@ -137,7 +137,9 @@ def unseen_regions(
         regions: What to leave out, one after the other.
         equations: Those of the calibration, where they are known already.
     """
-    dense = _dense(equations_of(record) if equations is None else equations, len(record.names) - (record.hold is not None))
+    dense = _dense(
+        equations_of(record) if equations is None else equations, len(record.names) - (record.hold is not None)
+    )
     flat = dense.white.reshape(-1, dense.white.shape[2])
     whole = flat.T @ flat, flat.T @ dense.residual.ravel()
     return tuple(_without(dense, *whole, region) for region in regions)

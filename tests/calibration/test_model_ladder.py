@@ -6,7 +6,13 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.calibration.group_equations import equations_of
 from aacmm_jax.calibration.log_evidence import log_evidence
-from aacmm_jax.calibration.model_ladder import ComparedModel, ComparedModels, compare_models
+from aacmm_jax.calibration.model_ladder import (
+    DEFAULT_MODELS,
+    ComparedModel,
+    ComparedModels,
+    compare_models,
+    default_models,
+)
 from aacmm_jax.calibration.prediction import unseen_errors
 from aacmm_jax.calibration.record import record_of
 from aacmm_jax.calibration.unseen_regions import Region, UnseenRegion, _dense, regions_of, unseen_regions
@@ -164,3 +170,12 @@ def test_refused(paper_arm, space, bounds):
         compare_models(paper_arm, sockets(paper_arm, space), bounds, models=[])
     with pytest.raises(aj.InputError, match="unknown model 'grvity'"):
         compare_models(paper_arm, sockets(paper_arm, space), bounds, models=["dh,grvity"])
+
+
+def test_default_models_of_a_capture_with_temperatures(paper_arm, space):
+    capture = sockets(paper_arm, space)
+    assert default_models(paper_arm, capture) == DEFAULT_MODELS
+    warm = {name: np.pad(q, ((0, 0), (0, 1)), constant_values=21.0) for name, q in capture.sockets.items()}
+    found = default_models(paper_arm, aj.Capture(warm))
+    assert found[:4] == ("dh", "expansion", "gravity", "gravity,expansion")
+    assert len(found) == 2 * len(DEFAULT_MODELS)
