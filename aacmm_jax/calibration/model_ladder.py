@@ -1,9 +1,10 @@
 """Which model of its joints an arm needs: models from simple to rich, judged by regions that they have not seen.
 
 Errors of poses like those that a model was fitted to hardly tell models apart, and a random part of the poses is such.
-Chosen is the simplest model whose mean square error over the regions exceeds that of the best one by no more than a
-standard error of the difference, region by region: what two models have in common (a region that is hard for both)
-cancels in it (Breiman et al. 1984, section 3.4.3, with paired differences).
+Regions exclude each model whose mean square error exceeds that of the best by more than chance explains, region by
+region: what two models have in common (a region that is hard for both) cancels in the difference (Breiman et al. 1984,
+section 3.4.3, with paired differences). Of those left, which predict equally well as far as the regions can tell, the
+simplest is chosen that makes the measurement nearly as probable as the most probable one (`log_evidence`).
 """
 
 import time
@@ -15,6 +16,7 @@ from jaxtyping import Float
 
 from ..core.arguments import checked_arguments, items_of
 from ..core.arrays import Numbers
+from ..core.distributions import student_quantile
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
@@ -24,12 +26,18 @@ from ..kinematics.arm import DOWN, Arm, without_corrections
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
 from ..kinematics.prior_scales import default_prior
+from .group_equations import equations_of
 from .joint_model import with_coefficients
+from .log_evidence import log_evidence
 from .record import record_of
 from .results import Calibration
 from .single import calibrate
 from .unseen_regions import Region, UnseenRegion, regions_of, unseen_regions
 
+_LEVEL = 0.05  # of the test by regions
+_EVIDENCE = (
+    3.0  # of a log evidence, up to which the evidence is "not worth more than a bare mention" (Kass and Raftery)
+)
 DEFAULT_MODELS = ("dh", "gravity", "harmonics=1", "gravity,harmonics=1", "functions", "gravity,functions")
 
 
@@ -43,6 +51,7 @@ class ComparedModel(NamedTuple):
     regions: tuple[UnseenRegion, ...]
     cpu_seconds: float
     result: Calibration  # with all poses
+    log_evidence: float = 0.0  # but for what all models of the capture have in common
 
     @property
     def mean_squares(self) -> Float[np.ndarray, " f"]:
@@ -84,10 +93,25 @@ class ComparedModels(NamedTuple):
         return [(float(np.mean(each)), float(np.std(each, ddof=1) / np.sqrt(len(each)))) for each in paired]
 
     @property
+    def as_good(self) -> tuple[ComparedModel, ...]:
+        """Models that the regions cannot tell from the best: by Student's t of the difference, at 5 %."""
+        factor = float(student_quantile(1 - _LEVEL / 2, len(self.models[0].regions) - 1))
+        differences = zip(self.models, self.differences, strict=True)
+        return tuple(model for model, (mean, u) in differences if mean <= factor * u)
+
+    @property
     def recommended(self) -> ComparedModel:
-        """The simplest model whose difference from the best is within one standard error of that difference."""
-        within = (mean <= u for mean, u in self.differences)
-        return next(model for model, is_within in zip(self.models, within, strict=True) if is_within)
+        """The simplest of these whose log evidence is within 3 of the largest among them."""
+        least = max(model.log_evidence for model in self.as_good) - _EVIDENCE
+        return next(model for model in self.as_good if model.log_evidence >= least)
+
+
+def default_models(arm: Arm, capture: Capture) -> tuple[str, ...]:
+    """`DEFAULT_MODELS`; where the capture has temperatures, each of them also with thermal expansion."""
+    if capture.columns == arm.joints:
+        return DEFAULT_MODELS
+    warmed = ((model, "expansion" if model == "dh" else f"{model},expansion") for model in DEFAULT_MODELS)
+    return tuple(model for pair in warmed for model in pair)
 
 
 @checked_arguments
@@ -96,7 +120,7 @@ def compare_models(
     capture: Capture,
     bounds: Bounds | None = None,
     *,
-    models: Iterable[str] = DEFAULT_MODELS,
+    models: Iterable[str] | None = None,
     regions: Iterable[str] | None = None,
     noise: Noise | None = None,
     mass: Numbers | None = None,
@@ -105,9 +129,10 @@ def compare_models(
 ) -> ComparedModels:
     """Fit models of the joints, each with its prior's scales learned, and predict regions that they have not seen.
 
-    A region is a placement, a station or another group that shares an unknown geometry, where there are at least three;
-    otherwise either half of each joint's travel. Errors are distances of the poses from their geometry; reference
-    lengths take part in the fits only.
+    Recommended is, of the models that the regions cannot tell from the best, the simplest whose log evidence is within
+    3 of the largest. A region is a placement, a station or another group that shares an unknown geometry, where there
+    are at least three; otherwise either half of each joint's travel. Errors are distances of the poses from their
+    geometry; reference lengths take part in the fits only.
 
     Args:
         arm: The nominal arm; corrections that it has are replaced by those of each model.
@@ -115,8 +140,8 @@ def compare_models(
         bounds: Box of the free Denavit-Hartenberg parameters, mm and rad; by default around those of
             `Parameters.free_of`. Coefficients of corrections are free in each model that has them.
         models: Models from simple to rich, as for `kinematics.with_corrections`; "dh" is the arm alone. The default
-            takes some ten seconds for 500 poses, most of them for "functions" (harmonics=1-31, 62 coefficients a
-            joint).
+            (`default_models`) takes some ten seconds for 500 poses, most of them for "functions" (harmonics=1-31, 62
+            coefficients a joint).
         regions: What to leave out instead, each as a name or a shell pattern: ``["monday/*", "tuesday/*"]``.
         noise: Standard deviations of readings and seat, as for `calibrate`.
         mass: Mass of each link ``(n,)``, kg, as for `kinematics.with_corrections`.
@@ -129,7 +154,7 @@ def compare_models(
     Raises:
         InputError: A model is unknown, fewer than two regions can be left out, or as `calibrate` does.
     """
-    named = items_of(models, "models")
+    named = default_models(arm, capture) if models is None else items_of(models, "models")
     if not named or not all(isinstance(model, str) and model.strip() for model in named):
         raise InputError("models names no model; give some, from simple to rich, such as 'dh' and 'dh,gravity'.")
     plain = without_corrections(arm)
@@ -155,24 +180,26 @@ def _compared(
 ) -> ComparedModel:
     widened = with_coefficients(bounds, arm)
     arm = widened.space.base
+    prior = default_prior(arm)
     result = calibrate(
         *(arm, capture, widened),
         method="joint",
         noise=noise,
-        prior=default_prior(arm),
+        prior=prior,
         replace_noise=False,  # so that all models are compared with the same
         check_identifiability=False,
     )
     record = record_of(result, Recording(capture, ArmSpecification(arm)))
     assert record.observed is not None
     assert record.prior is not None
-    poses = [len(weights) for weights in record.observed.weights]
+    poses, equations = [len(weights) for weights in record.observed.weights], equations_of(record)
     return ComparedModel(
         model=model,
         parameters=len(record.names),
         effective_parameters=float(np.sum(record.prior.effective)),
         rms_inside=float(np.sqrt(np.average(np.asarray(record.observed.rms_after) ** 2, weights=poses))),
-        regions=unseen_regions(record, regions),
+        regions=unseen_regions(record, regions, equations),
         cpu_seconds=time.process_time() - begun,
         result=result,
+        log_evidence=log_evidence(equations, record.prior, {group: float(sd) for group, sd in prior.sd.items()}),
     )

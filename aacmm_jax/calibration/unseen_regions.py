@@ -125,7 +125,9 @@ def _dense(equations: Equations, parameters: int) -> _Dense:
     )
 
 
-def unseen_regions(record: CalibrationRecord, regions: Iterable[Region]) -> tuple[UnseenRegion, ...]:
+def unseen_regions(
+    record: CalibrationRecord, regions: Iterable[Region], equations: Equations | None = None
+) -> tuple[UnseenRegion, ...]:
     """Errors of each region, of a calibration without it; geometry that only the region shows is fitted to its poses.
 
     Reference lengths with an end that only the region shows are left out with it.
@@ -133,8 +135,11 @@ def unseen_regions(record: CalibrationRecord, regions: Iterable[Region]) -> tupl
     Args:
         record: The calibration of everything, solved with observations or a prior.
         regions: What to leave out, one after the other.
+        equations: Those of the calibration, where they are known already.
     """
-    dense = _dense(equations_of(record), len(record.names) - (record.hold is not None))
+    dense = _dense(
+        equations_of(record) if equations is None else equations, len(record.names) - (record.hold is not None)
+    )
     flat = dense.white.reshape(-1, dense.white.shape[2])
     whole = flat.T @ flat, flat.T @ dense.residual.ravel()
     return tuple(_without(dense, *whole, region) for region in regions)

@@ -41,7 +41,8 @@ def compare_models(
         typer.Option(
             metavar="MODELS",
             help="Models from simple to rich, separated by semicolons, as for calibrate --model. Default: dh; gravity; "
-            "harmonics=1; gravity,harmonics=1; functions (harmonics=1-31); gravity,functions.",
+            "harmonics=1; gravity,harmonics=1; functions (harmonics=1-31); gravity,functions; of a capture with "
+            "temperatures each of these also with expansion.",
         ),
     ] = None,
     leave_out: Annotated[
@@ -70,7 +71,6 @@ def compare_models(
 
     Each model is calibrated with all poses, its prior learned from them, and predicts every region from the others.
     """
-    from ..calibration.model_ladder import DEFAULT_MODELS
     from ..calibration.model_ladder import compare_models as compared
     from ..data.drawing import draw_poses
     from ..files.captures import load_capture
@@ -82,8 +82,8 @@ def compare_models(
     with together(output):
         reading(capture)
         recording = load_capture(read := InputFile(capture))
-    chosen = DEFAULT_MODELS if models is None else tuple(model.strip() for model in models.split(";"))
-    if not all(chosen):
+    chosen = None if models is None else tuple(model.strip() for model in models.split(";"))
+    if chosen is not None and not all(chosen):
         raise InputError(f"--models '{models}' names an empty model; separate models by one semicolon each.")
     part, nominal = recording.capture.select(only or None, without or ()), recording.nominal
     if only_poses is not None:
@@ -119,9 +119,10 @@ def display(summary: dict[str, Any]) -> None:
         console.print(escape(sentence))
     table = new_table(
         "\nRMS distance from the geometry [mm]; u: standard error by the scatter of the regions; ratio: mean of "
-        "(error / predicted standard deviation)^2 outside",
-        "model", "parameters", "determined", "inside", "outside", "u", "ratio", "CPU [s]",
+        "(error / predicted standard deviation)^2 outside; evidence: its logarithm, less the largest",
+        "model", "parameters", "determined", "inside", "outside", "u", "ratio", "evidence", "CPU [s]",
     )  # fmt: skip
+    most_probable = max(row["log_evidence"] for row in summary["models"])
     for row in summary["models"]:
         numbers = (formatted(row[key]) for key in ("rms_inside", "rms_outside", "u_outside"))
         table.add_row(
@@ -130,6 +131,7 @@ def display(summary: dict[str, Any]) -> None:
             f"{row['effective_parameters']:.1f}",
             *numbers,
             f"{row['ratio']:.2f}",
+            f"{row['log_evidence'] - most_probable:.1f}",
             f"{row['cpu_seconds']:.1f}",
         )
     print_table(console, table)

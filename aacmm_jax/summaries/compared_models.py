@@ -37,6 +37,7 @@ def _row(model: ComparedModel, difference: float, u_difference: float) -> dict[s
         "rms_outside": model.rms_outside,
         "u_outside": model.u_outside,
         "ratio": model.ratio,
+        "log_evidence": model.log_evidence,
         "difference": difference,
         "u_difference": u_difference,
         "converged": bool(model.result.converged),
@@ -53,8 +54,8 @@ def _finding(found: ComparedModels) -> str:
     if chosen is best:
         return f"Recommended: {chosen.model}, which predicts regions that it has not seen best."
     return (
-        f"Recommended: {chosen.model}, the simplest model whose error outside is within one standard error of the "
-        f"best's ({best.model})."
+        f"Recommended: {chosen.model}. Regions that it has not seen cannot tell it from the best outside "
+        f"({best.model}), and it is the simplest of such models that makes the measurement as probable."
     )
 
 

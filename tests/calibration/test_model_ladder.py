@@ -4,10 +4,18 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.model_ladder import ComparedModel, ComparedModels, compare_models
+from aacmm_jax.calibration.group_equations import equations_of
+from aacmm_jax.calibration.log_evidence import log_evidence
+from aacmm_jax.calibration.model_ladder import (
+    DEFAULT_MODELS,
+    ComparedModel,
+    ComparedModels,
+    compare_models,
+    default_models,
+)
 from aacmm_jax.calibration.prediction import unseen_errors
 from aacmm_jax.calibration.record import record_of
-from aacmm_jax.calibration.unseen_regions import Region, UnseenRegion, regions_of, unseen_regions
+from aacmm_jax.calibration.unseen_regions import Region, UnseenRegion, _dense, regions_of, unseen_regions
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.data.recording import Recording
 from aacmm_jax.kinematics import with_corrections
@@ -137,22 +145,47 @@ def test_placements_are_the_regions_where_there_are_several(paper_arm, space):
 
 
 @pytest.mark.parametrize(
-    ("squares", "expected"),
+    ("squares", "evidence", "expected"),
     [
-        ([[4.0, 4.0, 4.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]], "b"),
-        # 0.1 on average with a standard error of 0.11, although both are as uncertain as 4: one region is hard.
-        ([[1.0, 1.1, 13.2], [1.0, 1.0, 13.0], [1.1, 1.1, 12.9]], "b"),
-        ([[1.0, 1.0, 13.1], [1.0, 1.0, 13.0], [2.0, 2.0, 14.0]], "a"),
-        ([[1.2, 1.2, 13.1], [1.0, 1.0, 13.0], [1.0, 1.0, 12.9]], "b"),
+        ([[4.0, 4.1, 4.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]], (0.0, 0.0, 0.0), "b"),
+        # However probable, a model that regions exclude is not recommended. One that is hard for all does not count.
+        ([[1.5, 1.6, 13.5], [1.0, 1.0, 13.0], [1.0, 1.0, 13.0]], (50.0, 0.0, 0.0), "b"),
+        # 0.1 on average, with a standard error of 0.06 from three regions: Student's factor is 4.3.
+        ([[1.0, 1.1, 13.2], [1.0, 1.0, 13.0], [2.0, 2.0, 14.0]], (0.0, 2.9, 50.0), "a"),
+        ([[1.0, 1.1, 13.2], [1.0, 1.0, 13.0], [2.0, 2.0, 14.0]], (0.0, 3.1, 50.0), "b"),
     ],
 )
-def test_the_simplest_model_within_a_paired_standard_error(squares, expected):
-    def model(name, values):
+def test_regions_exclude_and_evidence_decides_among_the_others(squares, evidence, expected):
+    def model(name, values, log_evidence):
         regions = tuple(UnseenRegion(str(i), 10, value, 1.0) for i, value in enumerate(values))
-        return ComparedModel(name, 1, 1.0, 0.1, regions, 0.0, None)
+        return ComparedModel(name, 1, 1.0, 0.1, regions, 0.0, None, log_evidence)
 
-    models = tuple(model(name, values) for name, values in zip("abc", squares, strict=True))
+    models = tuple(model(*of) for of in zip("abc", squares, evidence, strict=True))
     assert ComparedModels(models).recommended.model == expected
+
+
+def test_the_evidence_is_that_of_a_gaussian(paper_arm, space, bounds):
+    """Of two models that differ in one scale alone, by the covariance of the data: B S B^T + 1, all in one matrix."""
+    capture, found = sockets(paper_arm, space), []
+    for sd in (0.3, 3.0):
+        solving = {"noise": NOISE, "prior": aj.Prior({"lengths": sd, "angles": 5e-4}), "check_identifiability": False}
+        result = aj.calibrate(paper_arm, capture, bounds, **solving)
+        record = record_of(result, Recording(capture, ArmSpecification(paper_arm)))
+        equations = equations_of(record)
+        dense = _dense(equations, len(record.names))
+        data = [dense.white.reshape(-1, dense.white.shape[2]), dense.relations[~dense.of_prior]]
+        by, of_geometry = np.concatenate(data), dense.geometry
+        left = np.concatenate([dense.residual.ravel(), dense.relation_residual[~dense.of_prior]])
+        prior = dense.relations[dense.of_prior][:, ~of_geometry]
+        basis = np.linalg.qr(by[:, of_geometry], mode="complete")[0][:, int(of_geometry.sum()) :]
+        by = basis.T @ by[:, ~of_geometry] @ np.linalg.inv(prior)
+        covariance = by @ by.T + np.eye(len(by))
+        # At the prior's mean, where the residual is what the solution left and what the parameters explain.
+        mean = basis.T @ left - by @ dense.relation_residual[dense.of_prior]
+        expected = -0.5 * (mean @ np.linalg.solve(covariance, mean) + np.linalg.slogdet(covariance)[1])
+        found.append((log_evidence(equations, record.prior, {}), expected))
+    (one, first), (other, second) = found
+    assert other - one == pytest.approx(second - first, abs=0.02)
 
 
 def test_refused(paper_arm, space, bounds):
@@ -160,3 +193,12 @@ def test_refused(paper_arm, space, bounds):
         compare_models(paper_arm, sockets(paper_arm, space), bounds, models=[])
     with pytest.raises(aj.InputError, match="unknown model 'grvity'"):
         compare_models(paper_arm, sockets(paper_arm, space), bounds, models=["dh,grvity"])
+
+
+def test_default_models_of_a_capture_with_temperatures(paper_arm, space):
+    capture = sockets(paper_arm, space)
+    assert default_models(paper_arm, capture) == DEFAULT_MODELS
+    warm = {name: np.pad(q, ((0, 0), (0, 1)), constant_values=21.0) for name, q in capture.sockets.items()}
+    found = default_models(paper_arm, aj.Capture(warm))
+    assert found[:4] == ("dh", "expansion", "gravity", "gravity,expansion")
+    assert len(found) == 2 * len(DEFAULT_MODELS)
