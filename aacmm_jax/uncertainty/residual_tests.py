@@ -194,7 +194,7 @@ def form_test(left: Residuals, form: Form, relative: bool) -> FormTest:
     return _tested(left, *_value_and_traces(left, form), relative)
 
 
-def pose_form_test(left: Residuals, kernels: Sequence[Float[np.ndarray, "m k k"] | None], relative: bool) -> FormTest:
+def pose_form_test(left: Residuals, kernels: Sequence[Float[np.ndarray, "_ _ _"] | None], relative: bool) -> FormTest:
     """The same of a form in which rows of different poses do not meet: r'A r is the sum of r_i' K_i r_i.
 
     Args:
@@ -248,7 +248,7 @@ def _value_and_traces(left: Residuals, form: Form) -> tuple[float, tuple[float, 
 
 
 def _value_and_traces_by_pose(
-    left: Residuals, kernels: Sequence[Float[np.ndarray, "m k k"] | None]
+    left: Residuals, kernels: Sequence[Float[np.ndarray, "_ _ _"] | None]
 ) -> tuple[float, tuple[float, float, float]]:
     """r'A r, and the traces of the first powers of MA, with M = I - Q Q' and the columns Q of all unknowns.
 
