@@ -147,7 +147,8 @@ class PriorProblem(NamedTuple):
         covariance = covariance_of_log_variances(model, self.groups, scales[1:], moving)
         members, known = xp.asarray(self.prior.membership), 1 / self.sd(scales) ** 2
         pull = (model.deviation * known)[:, None] * members.T
-        lost = known * (xp.minimum(xp.diagonal(covariance), _MOST_SPREAD) @ members)
+        alone = xp.asarray(~self.groups.expected)
+        lost = known * (xp.where(alone, xp.minimum(xp.diagonal(covariance), _MOST_SPREAD), 0.0) @ members)
         lost = set_at(xp.zeros(z.shape[0]), index, xp.where(model.pinned, 0.0, lost))
         return ByScales(set_at(xp.zeros((z.shape[0], pull.shape[1])), index, pull), covariance, lost)
 
@@ -183,7 +184,9 @@ class ByScales(NamedTuple):
     The expectation of the covariance, and the covariance of the expectation. A variance that is learned from the
     deviations of few parameters has an inverse gamma distribution, of shape 1 / c where c is the variance of its
     logarithm, so that its expectation is 1 / (1 - c) times what the evidence makes most probable. Where the prior is
-    all that is known of a parameter, this is the variance of Student's t, with 2 / c degrees of freedom.
+    all that is known of a parameter, this is the variance of Student's t, with 2 / c degrees of freedom. Scales that
+    are expected have a distribution of their own, and predictions with them are cautious enough as they are (the UR10
+    of `benchmarks/NOTES.md`).
     """
 
     pull: Float[AnyArray, "z g"]  # of the prior on the unknowns, by log variances, in natural steps
