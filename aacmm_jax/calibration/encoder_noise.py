@@ -95,7 +95,7 @@ class _Equations(NamedTuple):
             rows.append(each._replace(residual=residual, in_mm=each.in_mm @ factor, **whitened))
         return self._replace(rows=rows, variances=new)
 
-    def blocks(self, left: Residuals) -> list[Float[np.ndarray, "m r r"]]:
+    def blocks(self, left: Residuals) -> list[Float[np.ndarray, "_ _ _"]]:
         """M of single poses."""
         found = []
         for each, rows, own in zip(self.rows, left.slices, left.own, strict=False):

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core._compat import member_numbers
-from ..core.linear_algebra import singular_values, solve_positive_definite
+from ..core.linear_algebra import inverse_positive_definite, singular_values, solve_positive_definite
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, stop_gradient, while_loop
 from ..kinematics.parameters import Parameters
 from ..kinematics.priors import LEAST_STEPS, MIXED, ParameterPrior
@@ -39,6 +39,7 @@ _TOLERANCE, _BATCH_TOLERANCE = 1e-10, 1e-6
 _UNDAMPED = 15  # rounds
 _REMEMBERED = 3  # rounds that are extrapolated
 _NEAR = 0.5  # change of the log of a variance, below which they are
+_MOST_SPREAD = 2 / 3  # variance of the log of a variance that counts: three degrees of freedom
 _LEAST_GIVEN = 1e-7  # natural steps: a smaller standard deviation would be a row of infinite weight
 _LEAST_LOG = 2 * np.log(LEAST_STEPS)
 # Of the steps of the solve: so small that a tight prior does not dominate the damping, but not so small that the value
@@ -151,8 +152,12 @@ class PriorProblem(NamedTuple):
         xp, index = namespace(scales, z), self.prior.index
         moving = xp.asarray(self.learned) & (scales[1:] > _LEAST_LOG + 1e-9)
         covariance = covariance_of_log_variances(model, self.groups, scales[1:], moving)
-        pull = (model.deviation / self.sd(scales) ** 2)[:, None] * xp.asarray(self.prior.membership.T)
-        return ByScales(set_at(xp.zeros((z.shape[0], pull.shape[1])), index, pull), covariance)
+        members, known = xp.asarray(self.prior.membership), 1 / self.sd(scales) ** 2
+        pull = (model.deviation * known)[:, None] * members.T
+        alone = xp.asarray(~self.groups.expected)
+        lost = known * (xp.where(alone, xp.minimum(xp.diagonal(covariance), _MOST_SPREAD), 0.0) @ members)
+        lost = set_at(xp.zeros(z.shape[0]), index, xp.where(model.pinned, 0.0, lost))
+        return ByScales(set_at(xp.zeros((z.shape[0], pull.shape[1])), index, pull), covariance, lost)
 
     def metrics(
         self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]
@@ -181,15 +186,30 @@ class PriorProblem(NamedTuple):
 
 
 class ByScales(NamedTuple):
-    """What the uncertainty of learned scales adds to that of the unknowns (Kass and Steffey 1989, JASA 84, 717-726)."""
+    """What the uncertainty of learned scales adds to that of the unknowns (Kass and Steffey 1989, JASA 84, 717-726).
+
+    The expectation of the covariance, and the covariance of the expectation. A variance that is learned from the
+    deviations of few parameters has an inverse gamma distribution, of shape 1 / c where c is the variance of its
+    logarithm, so that its expectation is 1 / (1 - c) times what the evidence makes most probable. Where the prior is
+    all that is known of a parameter, this is the variance of Student's t, with 2 / c degrees of freedom. Scales that
+    are expected have a distribution of their own, and predictions with them are cautious enough as they are (the UR10
+    of `benchmarks/NOTES.md`).
+    """
 
     pull: Float[AnyArray, "z g"]  # of the prior on the unknowns, by log variances, in natural steps
     covariance: Float[AnyArray, "g g"]  # of the log variances
+    lost: Float[AnyArray, " z"]  # information of the prior, less that of one with the expectation of its variance
 
     def added(self, inverse: Float[AnyArray, "z z"]) -> Float[AnyArray, "z z"]:
         """To the covariance, given the inverse of the information."""
+        xp = namespace(inverse, self)
         moved = inverse @ self.pull
-        return moved @ self.covariance @ moved.T
+        # (G^-1 - L)^-1 - G, with the information L that is lost.
+        some = self.lost > 0
+        root = xp.where(some, xp.sqrt(xp.where(some, self.lost, 1.0)), 0.0)
+        half = inverse * root[None, :]
+        left = xp.asarray(np.eye(len(root))) - root[:, None] * half
+        return moved @ self.covariance @ moved.T + half @ inverse_positive_definite(left) @ half.T
 
 
 class _History(NamedTuple):

@@ -6,6 +6,7 @@ from .arms import load_noise as load_noise
 from .arms import load_specification as load_specification
 from .arms import save_arm as save_arm
 from .arms import shipped_arms as shipped_arms
+from .arms import usual_noise as usual_noise
 from .calibrations import load_calibration as load_calibration
 from .calibrations import save_calibration as save_calibration
 from .captures import load_capture as load_capture

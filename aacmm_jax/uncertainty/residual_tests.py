@@ -224,7 +224,7 @@ def block_diagonal(columns: Float[np.ndarray, "m r c"]) -> Float[np.ndarray, "R 
     return found.reshape(poses * size, poses * width)
 
 
-def pose_form_test(left: Residuals, kernels: Sequence[Float[np.ndarray, "m k k"] | None], relative: bool) -> FormTest:
+def pose_form_test(left: Residuals, kernels: Sequence[Float[np.ndarray, "_ _ _"] | None], relative: bool) -> FormTest:
     """The same of a form in which rows of different poses do not meet: r'A r is the sum of r_i' K_i r_i.
 
     Args:
@@ -291,7 +291,7 @@ def _value_and_traces(left: Residuals, form: Form) -> tuple[float, tuple[float, 
 
 
 def _value_and_traces_by_pose(
-    left: Residuals, kernels: Sequence[Float[np.ndarray, "m k k"] | None]
+    left: Residuals, kernels: Sequence[Float[np.ndarray, "_ _ _"] | None]
 ) -> tuple[float, tuple[float, float, float]]:
     """r'A r, and the traces of the first powers of MA, with M = I - Q Q' and the columns Q of all unknowns.
 

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from aacmm_jax.uncertainty.group_test import Block
-from aacmm_jax.uncertainty.residual_tests import Form, Residuals, consistency, form_test, score_tests
+from aacmm_jax.uncertainty.residual_tests import Form, Residuals, consistency, form_test, pose_form_test, score_tests
 
 SIZES, PARAMETERS = (12, 9, 15), 4
 
@@ -87,6 +87,19 @@ def test_quadratic_forms_have_the_distribution_of_their_draws(problem, rng, rela
         assert found.ratio == pytest.approx(value / draws.mean(), rel=0.03)
         product = projector @ matrix
         assert found.degrees_of_freedom == pytest.approx(np.trace(product) ** 2 / np.trace(product @ product))
+
+
+@pytest.mark.parametrize("relative", [True, False])
+def test_forms_by_pose_are_those_with_one_large_kernel(problem, rng, relative):
+    left = Residuals.of(problem[0])
+    kernels = [k + k.swapaxes(1, 2) for k in (rng.normal(size=(size // 3, 3, 3)) for size in SIZES[:2])]
+    large = [np.kron(np.eye(len(k)), np.ones((3, 3))) for k in kernels]
+    for whole, each in zip(large, kernels, strict=True):
+        for number, k in enumerate(each):
+            whole[3 * number : 3 * number + 3, 3 * number : 3 * number + 3] = k
+    form = Form((np.eye(SIZES[0]), np.eye(SIZES[1]), None), (*large, None))
+    found, expected = pose_form_test(left, [*kernels, None], relative), form_test(left, form, relative)
+    assert found == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("opened", [False, True])
