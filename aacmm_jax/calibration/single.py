@@ -218,8 +218,8 @@ def calibrate(
     _check_scale(task, method)
     result, propagated = _solve(to_numpy(task), method)
     if shared_errors and propagated is not None:
-        q = task.measurement.q
-        result = with_shared_errors(result, capture, lambda: sensitivities_of_sockets(result, q, propagated))
+        measured = task.measurement
+        result = with_shared_errors(result, capture, lambda: sensitivities_of_sockets(result, measured, propagated))
     return to_jax(result)
 
 

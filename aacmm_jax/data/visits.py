@@ -13,9 +13,7 @@ from .copies import first_of_each
 UNKNOWN = -1
 
 
-def checked_visits(
-    visits: Mapping[str, Numbers] | None, blocks: Mapping[str, AnyArray]
-) -> tuple[int, ...] | None:
+def checked_visits(visits: Mapping[str, Numbers] | None, blocks: Mapping[str, AnyArray]) -> tuple[int, ...] | None:
     """A number for the visit of each pose of the sockets, each other visit another one; None where none is known.
 
     Args:

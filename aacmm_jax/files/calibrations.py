@@ -16,6 +16,7 @@ from ..kinematics.parameters import Parameters
 from ..uncertainty.covariance import NOISE_MODELS
 from .calibration_observations import observed_of, observed_tables, other_poses_of, removed_of
 from .calibration_prior import prior_metrics_of, prior_tables
+from .calibration_shared import shared_errors_of, shared_tables
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .hdf5 import (
     Stored,
@@ -67,7 +68,7 @@ def save_calibration(
         tables["cross_validation"] = _validation_table(record)
     if record.sampled is not None:
         tables["monte_carlo"] = _sampled_table(record)
-    tables |= observed_tables(record) | prior_tables(record)
+    tables |= observed_tables(record) | prior_tables(record) | shared_tables(record.shared)
     attributes = recording_attributes(record.recording) | {
         "robust": record.robust,
         "sampled_says": record.sampled_says,
@@ -186,6 +187,7 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
         others=other_poses_of(stored),
         removed=removed_of(stored),
         prior=prior_metrics_of(stored),
+        shared=shared_errors_of(stored),
     )
 
 

@@ -65,6 +65,7 @@ def save_evaluation(
     tables["figures"] = _metric_table(record)
     if record.uncertainty is not None:
         tables["uncertainty"] = _uncertainty_table(record.uncertainty)
+        tables |= shared_tables(record.uncertainty.shared)
     attributes = recording_attributes(record.recording) | {
         "warnings": list(record.warnings) or None,
         "standards": list(record.standards) or "",
@@ -113,6 +114,7 @@ def _uncertainty_of(path: str | os.PathLike, stored: Stored, calibrated: Arm) ->
             linear_encoder=linear_encoder_of(attributes),
         ),
         u_k=None,
+        shared=shared_errors_of(stored),
         names=names,
         degrees_of_freedom=float(attributes["degrees_of_freedom"]),
     )

@@ -10,7 +10,7 @@ from ..calibration.pose_residuals import distances_of, observation_residuals
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise
 from ..core.units import ARCSEC, people_read
-from ..summaries.calibration import calibration_summary, prior_sentence
+from ..summaries.calibration import calibration_summary, prior_sentence, shared_sentence
 from ..summaries.observations import capture_words
 from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
@@ -197,6 +197,8 @@ def _nominal_and_calibrated(
         del stages["stage1"]  # which is the calibrated arm
     if summary.get("prior"):
         blocks.append("Prior (standard deviation of each group): " + ". ".join(map(prior_sentence, summary["prior"])))
+    if summary.get("shared_errors"):
+        blocks.append(shared_sentence(summary["shared_errors"]))
     if record.observed is not None:
         blocks += [*agreement_tables(summary), *other_poses_table(summary)]
     if summary["nominal"]:

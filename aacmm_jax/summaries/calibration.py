@@ -1,6 +1,6 @@
 """Arms, captures and calibrations as plain dictionaries with the unit in every key; ``--json`` prints them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,13 +10,14 @@ from ..calibration.model_errors import model_tests
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import PriorMetrics, active_names
 from ..core.text import pluralise
-from ..core.units import DEG
+from ..core.units import ARCSEC, DEG
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
 from ..kinematics.arm import by_joint, is_length, parameter_unit
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
+from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .model_errors import summary_of_tests
 from .observations import capture_observations, observed_summary
@@ -189,6 +190,7 @@ def calibration_summary(
         "monte_carlo": record.sampled_says,
         "model_tests": None if tests is None else summary_of_tests(tests),
         "prior": None if record.prior is None else prior_rows(record.prior),
+        "shared_errors": None if record.shared is None else shared_rows(record.shared),
         "warnings": of_calibration(record, observability, tests),
         **observed_summary(record, evaluations["nominal"]),
     }
@@ -222,6 +224,25 @@ def prior_sentence(row: Mapping[str, Any]) -> str:
         return f"{row['group']}: learned, no deviation from the mean is supported, so it counts as exact; {spent}"
     scale, unit = (1 / DEG, "deg") if row["unit"] == "rad" else (1.0, row["unit"])
     return f"{row['group']}: {'learned' if row['learned'] else 'given'}, {row['sd'] * scale:.3g} {unit}; {spent}"
+
+
+def shared_rows(shared: SharedErrors) -> list[dict[str, Any]]:
+    """Errors that poses share, kind by kind, with their standard deviations in mm, or in the unit of coefficients."""
+    return [{"kind": kind, "sd": float(shared.sd[i]), "unit": shared.units[i]} for i, kind in enumerate(shared.kinds)]
+
+
+def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Errors that poses share in words."""
+    words = {PLACES: "poses of a socket", VISITS: "poses of a visit"}
+
+    def shown(row: Mapping[str, Any]) -> str:
+        scale, unit = (1 / ARCSEC, "arcsec") if row["unit"] == "rad" else (1.0, row["unit"])
+        return f"{words.get(row['kind'], row['kind'])} {row['sd'] * scale:.3g} {unit}"
+
+    tips = [shown(row) for row in rows if row["kind"] in (PLACES, VISITS, SUCCESSIVE)]
+    functions = [shown(row) for row in rows if row["kind"] not in (PLACES, VISITS, SUCCESSIVE)]
+    parts = [*tips, *(["functions that the model lacks: " + ", ".join(functions)] if functions else [])]
+    return f"Errors that poses share, part of the uncertainty (standard deviations): {'; '.join(parts)}."
 
 
 def uncertainty_summary(

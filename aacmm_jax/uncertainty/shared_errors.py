@@ -49,7 +49,15 @@ class SharedErrors(eqx.Module):
         own = [i for i, kind in enumerate(self.kinds) if kind in (PLACES, VISITS, SUCCESSIVE)]
         none = np.zeros(0)
         kinds, units = tuple(self.kinds[i] for i in own), tuple(self.units[i] for i in own)
-        return SharedErrors(kinds, units, (), self.sd[np.array(own, dtype=int)], none[:, None], self.follow[:, :0], self.correlation_length)
+        return SharedErrors(
+            kinds,
+            units,
+            (),
+            self.sd[np.array(own, dtype=int)],
+            none[:, None],
+            self.follow[:, :0],
+            self.correlation_length,
+        )
 
     def sd_of(self, *kinds: str) -> Float[AnyArray, ""] | float:
         """Standard deviation of a tip coordinate by effects of some kinds, mm; 0 without."""
