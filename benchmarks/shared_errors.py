@@ -178,7 +178,9 @@ def ur10() -> dict[str, Any]:
                     "found_mm": round(every.rms, 4),
                     "predicted_mm": round(every.predicted, 4),
                     "ratio": round((every.rms / every.predicted) ** 2, 3),
-                    "kinds": {} if result.shared is None else dict(zip(result.shared.kinds, np.round(result.shared.sd, 6).tolist(), strict=True)),
+                    "kinds": {}
+                    if result.shared is None
+                    else dict(zip(result.shared.kinds, np.round(result.shared.sd, 6).tolist(), strict=True)),
                     "cpu_s": round(time.process_time() - begun, 1),
                 }
                 found[f"{model}, seed {seed}, {'shared' if shared else 'plain'}"] = row

@@ -26,6 +26,7 @@ from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..model.observed import Linear, Observed, linear_rows
 from ..uncertainty.observed_covariance import ArmErrors, arm_errors
+from .drawn_errors import DrawnErrors, draw_shared
 from .observed_state import configurations
 from .results import Calibration
 
@@ -34,14 +35,25 @@ class Trials(NamedTuple):
     """Captures of a calibrated arm with new errors."""
 
     size: int  # numbers in one of them
-    drawn: Callable[[int, np.random.Generator, Any], Capture]
+    # And the coefficients of functions that the model lacks, of each trial.
+    drawn: Callable[[int, np.random.Generator, Any], tuple[Capture, Float[np.ndarray, "t k"]]]
 
 
 def trials_of(result: Calibration, capture: Capture, noise: Noise, u: Float[np.ndarray, " l"]) -> Trials:
     """Of a calibration; ``u`` are those of its reference lengths, mm."""
+    shared = to_numpy(result.shared)
+
+    def coefficients(found: DrawnErrors | None, count: int) -> Float[np.ndarray, "t k"]:
+        return np.zeros((count, 0)) if found is None else found.coefficients
+
     if result.observed is not None:
         truth = truth_of(result, capture)
-        return Trials(truth.size, lambda count, random, level: truth.drawn(count, noise, random, level))
+
+        def drawn_observations(count: int, random: np.random.Generator, level: Any) -> Any:
+            alike = draw_shared(shared, result.arm, capture, count, random)
+            return truth.drawn(count, noise, random, level, alike), coefficients(alike, count)
+
+        return Trials(truth.size, drawn_observations)
     # Poses that hold their socket exactly, and the least change of the joints for each mm that the tip shall move.
     exact = project_to_centroids(result.arm, capture)
     by_joints = np.asarray(result.arm.jacobian(exact, [f"q_{i}" for i in range(1, result.arm.joints + 1)]))
@@ -49,12 +61,17 @@ def trials_of(result: Calibration, capture: Capture, noise: Noise, u: Float[np.n
     moves = units[:, None] * np.linalg.pinv(by_joints * units, rcond=1e-8)
     true_lengths = np.asarray(_lengths_by(result.arm, capture))
 
-    def drawn(count: int, random: np.random.Generator, level: Any) -> Capture:
+    def drawn(count: int, random: np.random.Generator, level: Any) -> Any:
         seats = float(noise.seating) * level * random.normal(size=(count, *exact.shape[:1], 3))
+        alike = draw_shared(shared, result.arm, capture, count, random)
+        if alike is not None:
+            seats = seats + alike.tips
         read = noise.of_columns(result.arm.geometry.kinds, result.arm.joints, exact.shape[1])
         readings = exact + read * level * random.normal(size=(count, *exact.shape))
         readings[..., : result.arm.joints] += np.einsum("Nic,tNc->tNi", moves, seats)
-        return batch_of_captures(capture, readings, true_lengths + u * random.normal(size=(count, len(u))))
+        readings[..., : result.arm.joints] += 0.0 if alike is None else alike.joints
+        lengths = true_lengths + u * random.normal(size=(count, len(u)))
+        return batch_of_captures(capture, readings, lengths), coefficients(alike, count)
 
     return Trials(exact.size, drawn)
 
@@ -106,8 +123,16 @@ class ObservedTruth(NamedTuple):
         """Numbers in the data of one trial."""
         return sum(one.q.size + part.rows.values.size for one, part in self._parts())
 
-    def drawn(self, count: int, noise: Noise, random: np.random.Generator, level: Any = 1.0) -> Capture:
-        """A batch of captures with new errors; ``level`` (t, 1, 1) multiplies the noise of readings and seat."""
+    def drawn(
+        self,
+        count: int,
+        noise: Noise,
+        random: np.random.Generator,
+        level: Any = 1.0,
+        alike: DrawnErrors | None = None,
+    ) -> Capture:
+        """A batch of captures with new errors; ``level`` (t, 1, 1) multiplies the noise of readings and seat, ``alike``
+        are errors that poses share."""
         q = np.asarray(self.observed.q)
         encoder = noise.of_columns(self.errors[0].kinds, self.errors[0].by_readings.shape[1], q.shape[1])
         read = encoder * level * random.normal(size=(count, self.reading.max() + 1, q.shape[1]))
@@ -115,8 +140,11 @@ class ObservedTruth(NamedTuple):
         errors = self.errors_of_rows(count, level * float(noise.seating), random)
         found = []
         for (observation, part), rows, error in zip(self._parts(), self.observed.slices, errors, strict=True):
-            shift = error - np.asarray(part.rows.values)
-            found.append(shifted(observation, q[rows] + read[:, self.reading[rows]], shift, values))
+            shift, readings = error - np.asarray(part.rows.values), q[rows] + read[:, self.reading[rows]]
+            if alike is not None:
+                shift = shift + np.einsum("rcm,tmc->trm", np.asarray(part.rows.by_tip), alike.tips[:, rows])
+                readings = readings + alike.joints[:, rows]
+            found.append(shifted(observation, readings, shift, values))
         return batch_of_observations(found, self.ends, self.lengths(count, random))
 
     def errors_of_rows(self, count: int, seating: Any, random: np.random.Generator) -> list[Float[np.ndarray, "t r m"]]:

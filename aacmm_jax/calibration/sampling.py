@@ -17,6 +17,7 @@ from ..data.noise import Noise
 from ..kinematics.parameters import Parameters
 from ..kinematics.priors import Prior
 from ..model.robust import LossName
+from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.volume import default_length, sample_lengths
 from .batch import BatchOptions, BatchTask, identify_many
 from .record import uncertainty_of
@@ -100,11 +101,12 @@ def monte_carlo(
     """Propagation of distributions (JCGM 101:2008): the whole calibration is repeated on readings drawn anew.
 
     Readings are drawn about poses in which the calibrated arm meets its sockets exactly, certified values with their u.
-    Of captures with other observations, residuals are drawn about 0: readings, seat and measured values have new
-    errors, by the geometry that was found. Blocks of max(100 / (1 - level), 10,000) trials are added until mean, u and
-    both ends of the interval of every quantity are stable to a fifth of the tolerance (section 7.9). Bounds act in
-    every trial as they did in the calibration, so the distribution ends where one is active. A prior is an observation
-    like others: its means have new errors too, of its standard deviations, learned ones as they were found.
+    Errors that poses share (``result.shared``) are drawn too. Of captures with other observations, residuals are drawn
+    about 0: readings, seat and measured values have new errors, by the geometry that was found. Blocks of
+    max(100 / (1 - level), 10,000) trials are added until mean, u and both ends of the interval of every quantity are
+    stable to a fifth of the tolerance (section 7.9). Bounds act in every trial as they did in the calibration, so the
+    distribution ends where one is active. A prior is an observation like others: its means have new errors too, of its
+    standard deviations, learned ones as they were found.
 
     Args:
         result: what `calibrate` returned.
@@ -152,8 +154,9 @@ def monte_carlo(
                     result.degrees_of_freedom / random.chisquare(result.degrees_of_freedom, size=(count, 1, 1))
                 )
             )
-            captures = trials.drawn(count, random, level_of)
-            solved, lost = task.solved(captures, task.prior_means(count, random, np.asarray(result.parameters)))
+            captures, coefficients = trials.drawn(count, random, level_of)
+            means = task.prior_means(count, random, np.asarray(result.parameters))
+            solved, lost = task.solved(captures, means, coefficients)
             parts.append(solved)
             failed += lost
         found = np.concatenate(parts)
@@ -335,15 +338,35 @@ class _RepeatedTask(NamedTuple):
         task = BatchTask.of(stage1.arm, captures, box, stage1.parameters, result.space, options, stage1.anchor)
         return task.calibrate(result.method)
 
-    def solved(self, captures: Capture, means: Float[np.ndarray, "t p"] | None = None) -> tuple[np.ndarray, int]:
-        """Outputs of the trials that converged ``(t, q)``, and how many did not."""
+    def solved(
+        self,
+        captures: Capture,
+        means: Float[np.ndarray, "t p"] | None = None,
+        coefficients: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, int]:
+        """Outputs of the trials that converged ``(t, q)``, and how many did not.
+
+        ``means`` are those of the prior; ``coefficients`` those of functions that the model lacks: with them lengths
+        are off by more than follows from the parameters.
+        """
         result, many = self.result, self._many(captures, means)
         good = many.converged
         ends = (jnp.asarray(self.start), jnp.asarray(self.end))
         lengths = _lengths_of(Parameters(result.arm, result.space.names), jnp.asarray(many.parameters), ends)
+        shared = self.result.shared
+        if coefficients is not None and shared is not None and shared.names:
+            lengths = np.asarray(lengths) + coefficients @ self._by_functions(shared).T
         scale = np.zeros((len(good), 0)) if many.k is None else many.k[:, None]
         found = np.hstack([many.parameters, scale, np.asarray(lengths)])
         return found[good], int(np.sum(~good))
+
+    def _by_functions(self, shared: SharedErrors) -> Float[np.ndarray, "v k"]:
+        """Derivatives of the lengths by the coefficients of functions that the model lacks."""
+        whole = uncertainty_of(self.result).complete
+        by_tips = [np.asarray(whole.derivatives(q))[..., -len(shared.names) :] for q in (self.start, self.end)]
+        between = np.subtract(*(np.asarray(whole.arm.position(q)) for q in (self.end, self.start)))
+        direction = between / np.linalg.norm(between, axis=1, keepdims=True)
+        return np.einsum("vc,vck->vk", direction, by_tips[1] - by_tips[0])
 
     def sampled(
         self, result: Calibration, values: np.ndarray, stable: bool, failed: int, level: float, digits: int

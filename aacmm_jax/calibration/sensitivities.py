@@ -8,10 +8,11 @@ from jaxtyping import Float
 from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import by_joint
 from ..kinematics.parameters import Parameters
+from ..model.measurement import Measurement
 from ..model.observed import PriorRows, linear_rows, observed_model
 from ..uncertainty import observed_covariance as propagation
-from ..uncertainty.covariance import inverse_information
-from ..uncertainty.propagation import Propagated
+from ..uncertainty.covariance import covariance_of, inverse_information
+from ..uncertainty.propagation import Propagated, in_units
 from .observed_state import ObservedTask, State, whitening_at
 from .results import Calibration
 
@@ -23,15 +24,24 @@ class Sensitivities(NamedTuple):
     tips: Float[np.ndarray, "p 3 M"]  # by displacements of the tip, mm
     joints: Float[np.ndarray, "p n M"]  # by errors of the joints, rad (mm of prismatic ones)
     lengths: Float[np.ndarray, "l 3 M"]  # of measured lengths by the tips, where positions of sockets are means
+    # What lengths that contradict each other have added to the covariance of the parameters: errors of places instead.
+    surplus: Float[np.ndarray, "p p"]
 
 
-def sensitivities_of_sockets(result: Calibration, q: Float[np.ndarray, "M n"], propagated: Propagated) -> Sensitivities:
+def sensitivities_of_sockets(result: Calibration, measurement: Measurement, propagated: Propagated) -> Sensitivities:
     """Of a calibration from sockets and lengths, whose covariance was propagated so."""
-    result, propagated = to_numpy((result, propagated))
+    result, measurement, propagated = to_numpy((result, measurement, propagated))
+    linear, sensitivity = propagated.linear, propagated.sensitivity
+    without = in_units(covariance_of(sensitivity, linear, measurement, propagated.errors), result.space)
     tips = result.space.scale[:, None, None] * propagated.sensitivity.tips
     joints = tuple(f"{kind}_{i}" for i, kind in enumerate(by_joint(result.arm, "theta", "d"), start=1))
-    by_joints = np.asarray(result.arm.jacobian(q, joints))
-    return Sensitivities(tips, np.einsum("pcN,Ncj->pjN", tips, by_joints), propagated.linear.lengths_by_tips)
+    by_joints = np.asarray(result.arm.jacobian(measurement.q, joints))
+    return Sensitivities(
+        tips,
+        np.einsum("pcN,Ncj->pjN", tips, by_joints),
+        linear.lengths_by_tips,
+        propagated.parameter_covariance.matrix - without,
+    )
 
 
 def sensitivities_of_observations(task: ObservedTask, result: Calibration) -> Sensitivities:
@@ -67,4 +77,4 @@ def sensitivities_of_observations(task: ObservedTask, result: Calibration) -> Se
     found = [np.zeros((len(names), *parts[0].shape[1:2], observed.q.shape[0])) for parts in (tips, joints)]
     for whole, parts in zip(found, (tips, joints), strict=True):
         whole[free] = np.concatenate(parts, axis=2)
-    return Sensitivities(*found, np.zeros((0, 3, observed.q.shape[0])))
+    return Sensitivities(*found, np.zeros((0, 3, observed.q.shape[0])), np.zeros((len(names),) * 2))

@@ -20,8 +20,8 @@ from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.recording import Recording
-from ..kinematics.arm import DOWN, Arm, correction_names, natural_steps
-from ..kinematics.corrected_arm import function_values, with_corrections, with_further_corrections
+from ..kinematics.arm import Arm, correction_names, natural_steps
+from ..kinematics.corrected_arm import with_corrections, with_further_corrections
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.prior_scales import default_prior
 from ..uncertainty.group_test import Block
@@ -37,6 +37,7 @@ from ..uncertainty.shared_errors import (
     one_variance,
     second_moments,
 )
+from .drawn_errors import functions_of
 from .group_equations import LEAST_U, PRIOR, Rows, equations_in_chunks
 from .length_consistency import lengths_of_sockets
 from .model_errors import weighted_by_loss
@@ -51,14 +52,20 @@ _MODEL = "gravity,gear,harmonics=1-3"  # functions that joints may follow
 _LENGTHS, _PART = (2.0, 5.0, 15.0), 3
 _MOST_PATTERNS = 8  # of successive poses of one socket: slower ones matter, faster ones are like noise
 _NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are alike
+_USUAL = 3.0  # standard deviation of an effect of the tip above which it is improbable, of that of the residuals
 _FEWEST = 6  # degrees of freedom
+_EXPLAINED = 1e-3  # part of a column that the model leaves, below which it counts as the model's own
 _EXACT = 1e-6  # mm: smaller residuals are rounding errors of a simulation without noise
 
 
 def with_shared_errors(
     result: Calibration, capture: Capture, sensitivities: Callable[[], Sensitivities]
 ) -> Calibration:
-    """The calibration with the errors that its poses share in its covariance; as it is where its values are traced."""
+    """The calibration with the errors that its poses share in its covariance; as it is where its values are traced.
+
+    What is left of an estimated noise is that of single poses. The covariance by the noise of all stays: where chance
+    looks like shared errors, intervals do not become narrower.
+    """
     if inside_trace() or not is_concrete(*jax.tree.leaves((result, capture))):
         return result
     with np.errstate(all="ignore"):
@@ -67,8 +74,7 @@ def with_shared_errors(
         return result
     before = result.parameter_covariance
     covariance = before._replace(
-        # What a prior determines does not follow the noise.
-        matrix=(found.variance if result.prior is None else 1.0) * before.matrix + found.added,
+        matrix=before.matrix + found.added,
         noise=jax.tree.map(lambda leaf: np.sqrt(found.variance) * leaf, before.noise),
     )
     if not np.all(np.isfinite(covariance.matrix)):
@@ -176,7 +182,8 @@ def _summed(
     kinds, units = [effect.kind for effect in found], ["mm" for _ in found]
     sds = [np.sqrt(effect.variance) for effect in found]
     p = len(problem.record.names)
-    added, follow, moments, names = np.zeros((p, p)), np.zeros((p, 0)), np.zeros((0, 0)), ()
+    added = -problem.sensitivities.surplus if PLACES in kinds else np.zeros((p, p))
+    follow, moments, names = np.zeros((p, 0)), np.zeros((0, 0)), ()
     for effect in found:
         by_effect = problem.by_patterns(effect.patterns[0])
         added = added + effect.variance * by_effect @ by_effect.T
@@ -238,7 +245,8 @@ def _without_scale(left: Residuals, first: int, by_scale: Float[np.ndarray, " l"
     """With the scale of the lengths, which begin at a row, as one more unknown."""
     column = np.zeros((len(left.values), 1))
     column[first : first + len(by_scale), 0] = by_scale
-    return left.extended(column) if len(by_scale) else left
+    unknown = np.linalg.norm(left.unexplained(column)) > _EXPLAINED * np.linalg.norm(column)
+    return left.extended(column) if unknown else left
 
 
 def _rms(rows: list[Rows]) -> float:
@@ -256,7 +264,7 @@ def _with_column(blocks: list[Block], of_rows: np.ndarray, of_lengths: np.ndarra
 def _usual(problem: _Problem) -> tuple[float, float]:
     """Standard deviations of an effect of the tip: below which it is nothing, and above which it is improbable."""
     scatter = _rms(problem.rows)
-    return scatter / np.sqrt(np.mean([len(each.poses) for each in problem.rows])), scatter
+    return scatter / np.sqrt(np.mean([len(each.poses) for each in problem.rows])), _USUAL * scatter
 
 
 class _Tips(NamedTuple):
@@ -359,14 +367,10 @@ def _functions(problem: _Problem) -> _Functions:
     names, nothing = missing_functions(arm), _Functions.none(len(problem.record.names))
     if not names:
         return nothing
-    wider = with_further_corrections(arm, names)
-    assert wider.corrections is not None
-    terms = wider.corrections.functions.each[-len(names) :]
-    gravity = np.asarray(DOWN if wider.gravity is None else wider.gravity)
-    values = function_values(wider.corrections.nominal, terms, q, gravity).T
-    joints, steps = np.array([term.joint - 1 for term in terms]), natural_steps(names)
+    values, joints = functions_of(names, arm, q)
+    steps = natural_steps(names)
     columns = problem.turned(values, joints, steps)
-    prior = default_prior(wider).of(names, np.zeros(len(names)))
+    prior = default_prior(with_further_corrections(arm, names)).of(names, np.zeros(len(names)))
     assert prior is not None
     members = np.zeros((len(prior.members), len(names)))
     for row, own in zip(members, prior.members, strict=True):

@@ -213,6 +213,7 @@ def calibrate(
             "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, "
             "from Python, identify for stage 1 alone)."
         )
+    sensitivities = None
     if general:
         check_single(arm, capture, bounds, "calibrate_many")
         check_finite(arm=arm, capture=capture, noise=noise)
@@ -227,8 +228,8 @@ def calibrate(
         if check_identifiability or strict:
             check_identifiable(capture, task.bounds, None, strict)
         result, propagated = _calibrate_sockets(task, method, hold)
-        q = task.measurement.q
-        sensitivities = None if propagated is None else partial(sensitivities_of_sockets, result, q, propagated)
+        if propagated is not None:
+            sensitivities = partial(sensitivities_of_sockets, result, to_numpy(task.measurement), propagated)
     if replace_noise and noise_model not in ("common", "robust") and robust is None:
         options = {"method": method, "hold": hold, "start": start, "prior": prior, "max_steps": max_steps}
         options |= {"check_identifiability": False, "replace_noise": False, "shared_errors": shared_errors}

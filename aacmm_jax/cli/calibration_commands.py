@@ -122,6 +122,10 @@ def calibrate(
         bool,
         typer.Option("--keep-noise", help="Keep the noise as it is where an encoder proves noisier."),
     ] = False,
+    shared_errors: Annotated[
+        bool,
+        typer.Option(help="Look for errors that poses share, and add what they do to the uncertainties."),
+    ] = True,
     cross_validate: Annotated[
         bool | None,
         typer.Option(
@@ -206,7 +210,7 @@ def calibrate(
 
             def solved(part: Any) -> Any:
                 options = solving | {"robust": robust, "max_steps": max_steps}
-                return _solved(bounds, part, scale, method, options, strict)
+                return _solved(bounds, part, scale, method, options, strict, shared_errors)
 
             result = with_spinner("Calibrating", lambda: solved(recording.capture))
             record = record_of(result, recording, robust=robust, others=others)
@@ -229,7 +233,8 @@ def calibrate(
                 if scale != "measured":
                     raise InputError("--cross-validate needs a calibrated scale; leave out --scale nominal.")
                 found = with_spinner("Cross-validating", lambda: validated(
-                    bounds.space.base, capture_used, bounds, method=method, robust=robust, groups=leave_out, **solving,
+                    bounds.space.base, capture_used, bounds, method=method, robust=robust, groups=leave_out,
+                    shared_errors=shared_errors, **solving,
                 ))  # fmt: skip
                 record = record._replace(validation=found)
         if monte_carlo:
@@ -292,13 +297,16 @@ def same_arm(one: Any, other: Any) -> bool:
     return jax.tree.structure(one) == jax.tree.structure(other) and all(map(np.array_equal, *leaves))
 
 
-def _solved(bounds: Any, capture: Any, scale: str, method: Any, solving: dict[str, Any], strict: bool) -> Any:
+def _solved(
+    bounds: Any, capture: Any, scale: str, method: Any, solving: dict[str, Any], strict: bool, shared_errors: bool
+) -> Any:
     """Both stages, or stage 1 alone."""
     from ..calibration.single import calibrate as run
     from ..calibration.single import identify
 
     if scale == "measured":
-        options = solving | {"strict": strict, "check_identifiability": False}  # the summary has its own
+        options = solving | {"strict": strict, "shared_errors": shared_errors}
+        options |= {"check_identifiability": False}  # the summary has its own
         return run(bounds.space.base, capture, bounds, method=method, **options)
     if method is not None or strict:
         raise InputError("--scale nominal is stage 1 alone; leave out --method and --strict.")

@@ -154,6 +154,10 @@ def calibration(summary: dict[str, Any]) -> None:
     if summary["lengths"]:
         print_lengths(console, summary["lengths"], fitted=summary["fixed_by_one_length"])
     _uncertainty(console, summary)
+    if summary.get("shared_errors"):
+        from ..summaries.calibration import shared_sentence
+
+        console.print(shared_sentence(summary["shared_errors"]))
     print_written(console, summary)
 
 

@@ -37,5 +37,11 @@ def draw_poses(capture: Capture, count: int, seed: int = 0) -> tuple[Capture, Ca
         others = [observation.select(chosen) for observation, chosen in of_others if chosen]
         known = {*sockets, *(observation.name for observation in others)}
         lengths = [length for length in capture.lengths if {length.start, length.end} <= known]
-        halves.append(Capture(sockets, lengths, others, sessions=capture.sessions))
+        known_visits = capture.visits_of_sockets
+        visits = {
+            name: known_visits[name][chosen]
+            for name, chosen in zip(capture.names, rows, strict=False)
+            if chosen and name in known_visits
+        }
+        halves.append(Capture(sockets, lengths, others, sessions=capture.sessions, visits=visits))
     return halves[0], halves[1]

@@ -18,6 +18,7 @@ from ..kinematics.parameters import Parameters
 from ..uncertainty.covariance import NOISE_MODELS
 from .calibration_observations import observed_of, observed_tables, other_poses_of, removed_of
 from .calibration_prior import prior_metrics_of, prior_tables
+from .calibration_shared import shared_errors_of, shared_tables
 from .captures import (
     arm_table,
     linear_encoder_attribute,
@@ -80,7 +81,7 @@ def save_calibration(
         tables["monte_carlo"] = _sampled_table(record)
     if record.noisy_encoders:
         tables["noisy_encoders"] = _noisy_table(record)
-    tables |= observed_tables(record) | prior_tables(record)
+    tables |= observed_tables(record) | prior_tables(record) | shared_tables(record.shared)
     attributes = recording_attributes(record.recording) | {
         "robust": record.robust,
         "sampled_says": record.sampled_says,
@@ -185,6 +186,7 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
         removed=removed_of(stored),
         prior=prior_metrics_of(stored),
         noisy_encoders=_noisy_of(stored),
+        shared=shared_errors_of(stored),
     )
 
 

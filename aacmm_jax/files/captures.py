@@ -13,6 +13,7 @@ from ..data.copies import Repeated
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
+from ..data.visits import UNKNOWN
 from ..kinematics.arm import Arm, readings_unit
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
 from .corrections import corrected_of, correction_variables
@@ -134,7 +135,8 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
         "capture": Table(
             numbering("pose", len(owner))
             | reading_variables("angle", np.asarray(capture.q), arm.joints, unit)
-            | columns("pose", socket=(owner, "", "socket that held the tip")),
+            | columns("pose", socket=(owner, "", "socket that held the tip"))
+            | _visits_of(capture),
             {
                 "repeated_sockets": [n for n, _ in poses] or None,
                 "repeated_poses": [n for _, n in poses] or None,
@@ -243,6 +245,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
             observations_of(path, stored),
             repeated=_repeated_of(stored),
             sessions=stored.table_attributes["capture"].get("sessions") or (),
+            visits=_known_visits(poses, owner),
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
@@ -271,6 +274,22 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         attributes.get("measuring_range_mm"),
         _usual_of(attributes),
     )
+
+
+def _visits_of(capture: Capture) -> dict[str, Variable]:
+    """The visit of each pose, where some are known."""
+    if capture.visits is None:
+        return {}
+    return columns("pose", visit=(np.array(capture.visits), "1", "number of the visit to the socket; -1 unknown"))
+
+
+def _known_visits(poses: Mapping[str, np.ndarray], owner: np.ndarray) -> dict[str, np.ndarray] | None:
+    """Visits by socket; files of earlier versions have none."""
+    if "visit" not in poses:
+        return None
+    visits = np.asarray(poses["visit"])
+    known = [name for name in dict.fromkeys(owner.tolist()) if np.all(visits[owner == name] != UNKNOWN)]
+    return {name: visits[owner == name] for name in known}
 
 
 def _repeated_of(stored: Stored) -> Repeated:

@@ -16,6 +16,7 @@ from ..acceptance.standards import STANDARDS
 from ..kinematics.arm import Arm, parameter_names
 from ..kinematics.workspace import Reach
 from ..uncertainty.arm_uncertainty import Uncertainty
+from .calibration_shared import shared_errors_of, shared_tables
 from .captures import (
     arm_table,
     lengths_of,
@@ -66,6 +67,7 @@ def save_evaluation(
     tables["figures"] = _metric_table(record)
     if record.uncertainty is not None:
         tables["uncertainty"] = _uncertainty_table(record.uncertainty)
+        tables |= shared_tables(record.uncertainty.shared)
     attributes = recording_attributes(record.recording) | {
         "warnings": list(record.warnings) or None,
         "calibration_warnings": list(record.calibration_warnings) or None,
@@ -112,6 +114,7 @@ def _uncertainty_of(path: str | os.PathLike, stored: Stored, calibrated: Arm) ->
         open=table["open"],
         noise=noise_of_attributes(attributes),
         u_k=None,
+        shared=shared_errors_of(stored),
         names=names,
         degrees_of_freedom=float(attributes["degrees_of_freedom"]),
     )

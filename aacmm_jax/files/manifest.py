@@ -56,6 +56,7 @@ class _Socket(_Files):
     name: str | None = None
     target: str = ""  # another tip than the arm's own probe
     session: str | None = None
+    visits: Literal["files"] | None = None  # each file is one visit to the socket
     exclude: list[str] = Field(default_factory=list)
 
     @model_validator(mode="after")
@@ -185,7 +186,8 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     ``to = "{place}/1"`` is measured at every place. A field that makes up a whole folder or file name, such as
     ``{place}``, matches anything but "/"; next to other text in a name, as ``{hole}``, it matches letters, digits and
     "-" only, so that ``hole_0_pose.csv`` is left alone. ``exclude = ["*_old.csv"]`` in ``[[socket]]`` leaves out the
-    files that match such a shell pattern. Angles: reading -> sign * (reading - offset), in the stated unit. Readings of
+    files that match such a shell pattern. ``visits = "files"`` says that the tip was lifted between the ``files`` of a
+    socket. Angles: reading -> sign * (reading - offset), in the stated unit. Readings of
     prismatic joints are in ``linear_unit`` of ``[angles]``, by default mm; sign and offset hold for them too.
     A column temperature_C, by that name in the header of every table, is the temperature of the arm, C;
     ``temperature_C = 22.5`` in a table of the manifest states it for all of its poses. In ``[[length]]`` it is that of
@@ -244,7 +246,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
                 )
             return with_temperature(in_rad(table, angles_of(model.angles), nominal.arm), temperature, stated, str(file))
 
-        sockets, lengths, spheres = recorded(path.parent, model, angles)
+        sockets, lengths, spheres, visits = recorded(path.parent, model, angles)
 
         def radians(readings: np.ndarray, unit: str | None, preset: str | None, header: str | None) -> np.ndarray:
             stated = angles_of(model.angles, unit, header or preset)
@@ -268,7 +270,9 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         elif model.sessions is not None:
             raise InputError("[sessions] is for tables with a session, but there is none; leave it out.")
         else:
-            capture = Capture(sockets, lengths, [observation for _, observation in observations])
+            others = [observation for _, observation in observations]
+            visits = {name: rows for name, rows in visits.items() if name in sockets}
+            capture = Capture(sockets, lengths, others, visits=visits)
         if capture.columns == joints + 1:
             nominal = nominal._replace(arm=nominal.arm.replace(thermometer=True))
         check_readings(capture, nominal.arm)
@@ -311,16 +315,20 @@ def _observations(model: _Poses, source: Source) -> Iterator[tuple[str, Abstract
 
 def recorded(
     folder: Path, model: _Recorded, read: Callable[[Path, float | None], np.ndarray]
-) -> tuple[dict[str, np.ndarray], list[ReferenceLength], tuple[ProbedSphere, ...]]:
-    """The sockets, lengths and spheres that a manifest names, each file read by ``read``."""
+) -> tuple[dict[str, np.ndarray], list[ReferenceLength], tuple[ProbedSphere, ...], dict[str, np.ndarray]]:
+    """The sockets, lengths and spheres that a manifest names, each file read by ``read``; and the visits to sockets."""
     sockets: dict[str, np.ndarray] = {}
+    visits: dict[str, np.ndarray] = {}
     fields: list[dict[str, str]] = []
     for entry in model.socket:
         for name, files, values in _expand(folder, entry):
             check_name(name)
             if name in sockets:
                 raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
-            sockets[name] = np.concatenate([read(file, entry.temperature_C) for file in files])
+            parts = [read(file, entry.temperature_C) for file in files]
+            sockets[name] = np.concatenate(parts)
+            if entry.visits is not None:
+                visits[name] = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
             fields.append(values)
     spheres = []
     for entry in model.sphere:
@@ -329,7 +337,7 @@ def recorded(
         groups = tuple(read(folder / file, entry.temperature_C) for file in entry.paths)
         numbers = (entry.diameter, entry.u, entry.stylus, entry.form, entry.u_form)
         spheres.append(checked_sphere(ProbedSphere(entry.name, entry.test, groups, *numbers)))
-    return sockets, _lengths(model.length, fields, sockets), tuple(spheres)
+    return sockets, _lengths(model.length, fields, sockets), tuple(spheres), visits
 
 
 def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:

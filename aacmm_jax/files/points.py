@@ -49,7 +49,7 @@ def read_points(path: str | os.PathLike) -> Measured:
                 )
             return table * _UNITS[model.points.unit]
 
-        sockets, lengths, spheres = recorded(path.parent, model, points)
+        sockets, lengths, spheres, _ = recorded(path.parent, model, points)
         for length in lengths:
             for end in (length.start, length.end):
                 if end not in sockets:

@@ -10,7 +10,7 @@ from ..calibration.pose_residuals import distances_of, observation_residuals
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise
 from ..core.units import DEG, people_read
-from ..summaries.calibration import calibration_summary
+from ..summaries.calibration import calibration_summary, shared_sentence
 from ..summaries.observations import capture_words
 from ..summaries.tables import decimals_for, two_digits
 from ..summaries.warnings import observed
@@ -196,6 +196,8 @@ def _nominal_and_calibrated(
         del stages["stage1"]  # which is the calibrated arm
     if summary.get("prior"):
         blocks.append(_prior_table(summary["prior"]))
+    if summary.get("shared_errors"):
+        blocks.append(shared_sentence(summary["shared_errors"]))
     if record.observed is not None:
         blocks += [*agreement_tables(summary), *other_poses_table(summary)]
     if summary["nominal"]:

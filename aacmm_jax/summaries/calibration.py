@@ -1,6 +1,6 @@
 """Arms, captures and calibrations as plain dictionaries with the unit in every key; ``--json`` prints them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,13 +10,14 @@ from ..calibration.model_errors import model_tests
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import PriorMetrics, active_names
 from ..core.text import pluralise
-from ..core.units import DEG, people_read
+from ..core.units import DEG, people_read, people_read_change
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
 from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
+from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
 from ..uncertainty.tried_poses import tried_poses
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .model_errors import noisy_encoder_rows, summary_of_tests
@@ -199,6 +200,7 @@ def calibration_summary(
         "monte_carlo": record.sampled_says,
         "model_tests": None if tests is None else summary_of_tests(tests),
         "prior": None if record.prior is None else prior_rows(record.prior),
+        "shared_errors": None if record.shared is None else shared_rows(record.shared),
         "warnings": of_calibration(record, observability, tests),
         **observed_summary(record, evaluations["nominal"]),
     }
@@ -233,6 +235,25 @@ def prior_sentence(row: Mapping[str, Any]) -> str:
     scale, unit = people_read(row["unit"])
     scale_in_words = f"{row['sd'] * scale:.3g} {unit}".strip()
     return f"{row['group']}: {'learned' if row['learned'] else 'given'}, {scale_in_words}; {spent}"
+
+
+def shared_rows(shared: SharedErrors) -> list[dict[str, Any]]:
+    """Errors that poses share, kind by kind, with their standard deviations in mm, or in the unit of coefficients."""
+    return [{"kind": kind, "sd": float(shared.sd[i]), "unit": shared.units[i]} for i, kind in enumerate(shared.kinds)]
+
+
+def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Errors that poses share in words."""
+    words = {PLACES: "poses of a socket", VISITS: "poses of a visit"}
+
+    def shown(row: Mapping[str, Any]) -> str:
+        scale, unit = (1.0, "mm") if row["unit"] == "mm" else people_read_change(row["unit"])
+        return f"{words.get(row['kind'], row['kind'])} {row['sd'] * scale:.3g} {unit}"
+
+    tips = [shown(row) for row in rows if row["kind"] in (PLACES, VISITS, SUCCESSIVE)]
+    functions = [shown(row) for row in rows if row["kind"] not in (PLACES, VISITS, SUCCESSIVE)]
+    parts = [*tips, *(["functions that the model lacks: " + ", ".join(functions)] if functions else [])]
+    return f"Errors that poses share, part of the uncertainty (standard deviations): {'; '.join(parts)}."
 
 
 def uncertainty_summary(

@@ -192,7 +192,6 @@ def test_a_larger_uncertainty_never_decides_otherwise(error, limit, expanded, mo
     assert after in (before, "undecided")
 
 
-@settings(deadline=None)
 @given(st.floats(-1, 1), st.floats(0.01, 1), st.floats(0.001, 1))
 def test_what_is_proven_is_proven_with_95_percent(error, limit, expanded):
     decision = acceptance.decide(error, limit, expanded)
