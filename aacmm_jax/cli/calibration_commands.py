@@ -298,7 +298,10 @@ def _solved(bounds: Any, capture: Any, scale: str, method: Any, solving: dict[st
     from ..calibration.single import identify
 
     if scale == "measured":
-        options = solving | {"strict": strict, "check_identifiability": False}  # the summary has its own
+        options: dict[str, Any] = solving | {
+            "strict": strict,
+            "check_identifiability": False,
+        }  # the summary has its own
         return run(bounds.space.base, capture, bounds, method=method, **options)
     if method is not None or strict:
         raise InputError("--scale nominal is stage 1 alone; leave out --method and --strict.")
