@@ -305,8 +305,9 @@ def _solved(
     from ..calibration.single import identify
 
     if scale == "measured":
-        options = solving | {"strict": strict, "shared_errors": shared_errors}
-        options |= {"check_identifiability": False}  # the summary has its own
+        # The summary has its own look at what is determined.
+        options: dict[str, Any] = {"strict": strict, "shared_errors": shared_errors, "check_identifiability": False}
+        options |= solving
         return run(bounds.space.base, capture, bounds, method=method, **options)
     if method is not None or strict:
         raise InputError("--scale nominal is stage 1 alone; leave out --method and --strict.")

@@ -10,7 +10,7 @@ from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError
 from ..core.numpy_or_jax import namespace, to_numpy
 from .arm import DOWN, Arm, is_single, joint_limits, without_corrections
-from .chain import Corrections, Geometry, KnownFunctions, forward_pass, joint_motion, joints_first
+from .chain import Corrections, Geometry, KnownFunction, KnownFunctions, forward_pass, joint_motion, joints_first
 from .corrections.kind import Loads, Term
 from .corrections.kinds import term_of, terms_of
 
@@ -113,7 +113,7 @@ def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"
 
 
 def function_values(
-    nominal: Geometry, terms: Sequence[Term], q: Float[np.ndarray, "N n"], gravity: Float[np.ndarray, " 3"]
+    nominal: Geometry, terms: Sequence[KnownFunction], q: Float[np.ndarray, "N n"], gravity: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "k N"]:
     """The function of each term at N configurations, in units of its coefficient's effect (rad, or mm)."""
     functions = KnownFunctions(tuple(terms))
