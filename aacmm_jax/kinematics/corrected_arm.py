@@ -116,3 +116,10 @@ def function_values(
     values = (term.values(rows, forward)[:, 0] for term in terms)
     found = [gravity @ value if len(value) == 3 else value[0] for value in values]
     return np.array(found).reshape(len(terms), len(q))
+
+
+def loads_of(arm: Arm) -> Loads | None:
+    """Masses and centres of the links, where functions of an arm's corrections know them."""
+    assert arm.corrections is not None
+    loads = (getattr(term, "loads", None) for term in arm.corrections.functions.each)
+    return next((found for found in loads if found is not None), None)
