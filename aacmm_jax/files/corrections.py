@@ -10,8 +10,7 @@ from pydantic import Field, FiniteFloat, NonNegativeFloat, model_validator
 
 from ..kinematics.arm import Arm, correction_names
 from ..kinematics.chain import Geometry
-from ..kinematics.corrected_arm import corrected_like, with_corrections
-from ..kinematics.corrections.kind import Loads
+from ..kinematics.corrected_arm import corrected_like, loads_of, with_corrections
 from .hdf5 import Variable, columns, need
 from .toml import Strict
 
@@ -117,10 +116,3 @@ def corrected_of(path: str | os.PathLike, arm: Arm, arrays: Mapping[str, np.ndar
 def _arrays(geometry: Geometry) -> dict[str, Float[np.ndarray, "..."]]:
     arrays = {kind: getattr(geometry, kind) for kind in (*_KINDS, "probe")}
     return {kind: np.asarray(values) for kind, values in arrays.items() if values is not None}
-
-
-def loads_of(arm: Arm) -> Loads | None:
-    """Masses and centres of the links, where functions of an arm's corrections know them."""
-    assert arm.corrections is not None
-    loads = (getattr(term, "loads", None) for term in arm.corrections.functions.each)
-    return next((found for found in loads if found is not None), None)

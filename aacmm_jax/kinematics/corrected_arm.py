@@ -135,3 +135,10 @@ def with_further_corrections(arm: Arm, names: Sequence[str]) -> Arm:
         coefficients=coefficients,
         gravity=arm.gravity,
     )
+
+
+def loads_of(arm: Arm) -> Loads | None:
+    """Masses and centres of the links, where functions of an arm's corrections know them."""
+    assert arm.corrections is not None
+    loads = (getattr(term, "loads", None) for term in arm.corrections.functions.each)
+    return next((found for found in loads if found is not None), None)

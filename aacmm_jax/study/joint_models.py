@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG
-from ..files.corrections import loads_of
 from ..files.joint_models import masses_of
 from ..files.priors import prior_of_text
 from ..kinematics.arm import DOWN, Arm, correction_names, is_length, parameter_unit, value_of, without_corrections
-from ..kinematics.corrected_arm import with_corrections
+from ..kinematics.corrected_arm import loads_of, with_corrections
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..kinematics.prior_scales import default_prior
 from ..kinematics.priors import Prior, is_of_group
