@@ -16,7 +16,7 @@ import aacmm_jax as aj
 from aacmm_jax.data.arm_classes import small_arm_noise
 
 HERE = Path(__file__).parent
-POSES, SEEDS, CANDIDATES = (10, 15, 25, 40, 70), (0,), 800
+POSES, SEEDS, CANDIDATES = (12, 17, 25, 40, 70), (0,), 800
 
 
 def curves(sockets: int, seed: int) -> dict:
