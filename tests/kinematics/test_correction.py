@@ -132,3 +132,18 @@ def test_refusals():
     assert_refused(lambda: correct(paper, paper, q, [(0.0, 1.0)]), "6 rows")
     batch = paper.replace(d_1=np.array([1.0, 2.0]))
     assert_refused(lambda: aj.kinematics.readings_at_poses(batch, q, np.eye(4)), "a batch")
+
+
+def test_an_arm_that_has_expanded():
+    """At 25 C the calibrated arm reaches what the nominal one means at the readings, whatever the temperature then."""
+    nominal = aj.load_arm("ur5e")
+    calibrated = aj.kinematics.with_corrections(nominal, "expansion").replace(expansion=23e-6)
+    q = np.random.default_rng(0).uniform(-1, 1, (5, 6)) + np.array([0, -1, 1.2, 0, 1.3, 0])
+    warm = np.column_stack([q, np.full(5, 25.0)])
+    found = aj.kinematics.corrected_readings(nominal, calibrated, warm, limits=[(-7.0, 7.0)] * 6)
+    assert found.reached.all()
+    assert found.q.shape == (5, 6)
+    reached = calibrated.pose(np.column_stack([found.q, warm[:, 6]]))
+    np.testing.assert_allclose(reached, nominal.pose(q), atol=1e-8)
+    assert np.abs(found.q - q).max() > 1e-5
+    np.testing.assert_allclose(aj.kinematics.corrected_readings(nominal, calibrated, q).q, q, atol=1e-12)
