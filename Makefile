@@ -1,5 +1,5 @@
 # make demo         set up and run the demonstration: the paper's simulated arm, and a real Franka Panda
-# make test         set up and run the tests, in 3 minutes on two cores
+# make test         set up and run the tests (budget: 3 minutes on two cores)
 # make test-slow    the tests that take long, or need optimised programs; the other half of what CI runs
 # make test-exhaustive  before a release: coverage by many trials, every robot, every notebook, all variants
 # make check        lint, types and import contracts
