@@ -50,7 +50,8 @@ def written(tmp_path_factory, observed_record):
     evaluation = aj.acceptance.evaluation_of(
         record, recording, limits={"Deltam": aj.acceptance.Limit(5.0), "E_Uni": aj.acceptance.Limit(1e-4)}, u_test=0.001
     )
-    evaluation = evaluation._replace(warnings=(*evaluation.warnings, f"Beware of {HOSTILE}"))
+    doubts = {"warnings": (*evaluation.warnings, f"Beware of {HOSTILE}"), "calibration_warnings": (f"Not {HOSTILE}",)}
+    evaluation = evaluation._replace(**doubts)
     aj.files.save_evaluation(folder / "evaluation.h5", evaluation)
     write_study(folder / "study.h5", aj.study.make_study(**{**STUDY, "arm": nominal.arm}))
     aj.files.save_calibration(folder / "observations.h5", with_hostile_names(observed_record))
@@ -123,6 +124,7 @@ def test_text_of_people_never_becomes_markup(page):
     assert not [attributes for _, attributes in page.elements if any(name.startswith("on") for name in attributes)]
     if page.kind == "evaluation":
         assert f"Beware of {HOSTILE}" in page.text
+        assert f"Of the calibration: Not {HOSTILE}" in page.text
     if page.kind != "study":  # a study knows its arm by the name that its maker gave in Python: none
         assert HOSTILE in page.text
     for name in ("points", "scenes"):

@@ -1,0 +1,94 @@
+"""The one line on a result: what it is good for, and whether its numbers can be trusted."""
+
+import pytest
+
+from aacmm_jax.summaries.tables import decimals_for, two_digits
+from aacmm_jax.summaries.verdicts import calibration_verdict, evaluation_verdict
+
+VOLUME = {"length_mm": 300.0, "u_length_reading_median_mm": 0.01, "u_length_reading_largest_mm": 0.05}
+SOUND = {
+    "converged": True, "reason": "stopped", "residual_plausible": True, "method": "two-stage", "hold": "d_3",
+    "active": {}, "active_stage1": {}, "cross_validation": {"rms_mm": 0.1, "surprising": False}, "model_tests": None,
+    "uncertainty": {"volume": VOLUME, "coverage_factor_95": 2.0},
+}  # fmt: skip
+TESTS = dict.fromkeys(("misfit", "lengths", "noisy_joint", "successive_poses")) | {
+    "level": 0.01, "missing_terms": [], "noisy_observations": []
+}  # fmt: skip
+UNKNOWN = {"volume": VOLUME | {"u_length_reading_largest_mm": None}, "coverage_factor_95": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("changed", "mark", "says"),
+    [
+        (
+            {},
+            "good",
+            "U (95 %) of a measured length of 300 mm, 0.020 mm (at worst 0.10 mm); held-out data agree with it.",
+        ),
+        ({"truth": {}}, "good", "The simulated arm is fit for use"),
+        ({"cross_validation": None}, "good", "no held-out data confirm it"),
+        ({"model_tests": TESTS}, "good", "Fit for use"),
+        ({"converged": False}, "bad", "Not to be used. stopped"),
+        ({"residual_plausible": False}, "bad", "data and arm do not belong together"),
+        ({"scale_plausible": False}, "bad", "a scale that it cannot have"),
+        ({"cross_validation": {"rms_mm": 0.1, "surprising": True}}, "unsure", "held-out data disagree"),
+        ({"model_tests": TESTS | {"lengths": {"probability": 0.001}}}, "unsure", "errors that the model lacks"),
+        ({"model_tests": TESTS | {"missing_terms": [{}]}}, "unsure", "so errors may exceed the stated U"),
+        ({"active_stage1": {"a_2": "upper"}}, "unsure", "on a bound: a_2"),
+        ({"method": "repeatability"}, "unsure", "nothing that was measured set its scale"),
+        ({"uncertainty": UNKNOWN}, "unsure", "the data do not determine lengths all over the working volume."),
+    ],
+)
+def test_of_a_calibration(changed, mark, says):
+    verdict = calibration_verdict(SOUND | changed)
+    assert verdict.mark == mark
+    assert says in verdict.says
+
+
+def evaluated(*decisions, missing=(), **more):
+    figures = [{"name": f"E_{i}", "decision": decision} for i, decision in enumerate(decisions)]
+    test = {"decision": decisions[0] if decisions else None, "missing": list(missing), "figures": figures}
+    return {"acceptance": [test], "failed": [], "kept": [], "held_out": None} | more
+
+
+def held_out(probability, predicted=0.1):
+    poses = {"rms_mm": 0.2, "rms_predicted_mm": predicted, "probability": probability}
+    return {"predicted": {"poses": poses, "lengths": {"probability": None, "normalised_error_rms": 0.7}}}
+
+
+@pytest.mark.parametrize(
+    ("summary", "own", "mark", "says"),
+    [
+        (evaluated("conforms"), 0, "good", "Conforms: every limit is kept."),
+        (evaluated("conforms"), 1, "unsure", "Conforms"),
+        (evaluated("conforms", missing=["more bars"]), 0, "unsure", "a procedure was not complete"),
+        (evaluated("conforms", "fails", "undecided"), 0, "bad", "Fails: E_1 is over its limit."),
+        (evaluated("conforms", failed=["RMS is 2 mm, over."]), 0, "bad", "Fails: RMS is 2 mm, over."),
+        (evaluated("conforms", "undecided"), 0, "unsure", "too uncertain for E_1"),
+        (evaluated(kept=["RMS is 2 mm."]), 0, "good", "Conforms"),
+        (evaluated(), 0, "neutral", "Measured; no limit was given."),
+        (
+            evaluated(held_out=held_out(0.001)),
+            0,
+            "unsure",
+            "The calibration does not hold here: held-out poses are 0.2 mm",
+        ),
+        (evaluated(held_out=held_out(0.5)), 0, "neutral", "and lengths err by 0.7 times what is predicted. No limit"),
+        (evaluated(held_out=held_out(0.5, None)), 0, "neutral", "Measured on held-out data"),
+    ],
+)
+def test_of_an_evaluation(summary, own, mark, says):
+    verdict = evaluation_verdict(summary, own)
+    assert verdict.mark == mark
+    assert says in verdict.says
+
+
+@pytest.mark.parametrize(
+    ("u", "says"), [(0.0123, "0.012"), (0.0996, "0.10"), (0.099, "0.099"), (12.3, "12"), (1.0, "1.0")]
+)
+def test_uncertainties_have_two_digits(u, says):
+    assert two_digits(u) == says
+
+
+def test_what_has_no_uncertainty_has_the_usual_decimals():
+    assert [decimals_for(u) for u in (None, 0.0, float("inf"))] == [4, 4, 4]
