@@ -206,6 +206,12 @@ def pose_form_test(left: Residuals, kernels: Sequence[Float[np.ndarray, "_ _ _"]
     return _tested(left, *_value_and_traces_by_pose(left, kernels), relative)
 
 
+def chance_above_zero(left: Residuals, kernels: Sequence[Float[np.ndarray, "_ _ _"] | None]) -> float:
+    """Probability that independent errors make a form by pose (as of `pose_form_test`) positive: with A - x B for A,
+    where x is the ratio of r'A r to r'B r that was found, that of a larger ratio."""
+    return _tail(0.0, _value_and_traces_by_pose(left, kernels)[1])
+
+
 def _tested(left: Residuals, value: float, traces: tuple[float, float, float], relative: bool) -> FormTest:
     spare = left.degrees_of_freedom
     if relative:
