@@ -4,8 +4,8 @@ Rows of poses are whitened by the noise of the calibration, V_0. With the column
 of the tip in its seat, and F of what was measured, the covariance of a pose is V = F + sum_j v_j z_j z_j' + s T T'.
 
 The test is whether r'A r is too large, with the residuals r = M e and A = z_j z_j' - c T T' pose by pose. It is
-compared with r'r, so that a common factor of all noise does not matter; and c is such that a wrong noise of the seat
-does not, to first order: the expectation of r'A r over that of r'r has no derivative by s.
+compared with r'r of the poses, so that a common factor of all noise does not matter; and c is such that a wrong noise
+of the seat does not, to first order: the expectation of r'A r over that of r'r has no derivative by s.
 
 Variances that are not stated are those of restricted maximum likelihood (Patterson and Thompson 1971, Biometrika 58,
 545-554). With K = z_j z_j' whitened by V, twice the log likelihood has the derivative r'K r - tr MK by v_j, and the
@@ -29,7 +29,7 @@ from ..data.noise import Noise, one_arcsec
 from ..data.recording import Recording
 from ..kinematics.parameters import ArmSpecification
 from ..uncertainty.group_test import Block
-from ..uncertainty.residual_tests import LEVEL, Residuals, pose_form_ratio, pose_form_test
+from ..uncertainty.residual_tests import LEVEL, Residuals, chance_above_zero
 from .group_equations import Rows, equations_in_chunks
 from .missing_terms import found_terms
 from .record import CalibrationRecord, record_of
@@ -159,7 +159,10 @@ class _Equations(NamedTuple):
     def tests(self, joints: Sequence[int]) -> NoisyJoint | None:
         """The joint (from 0) of some whose readings are the noisiest; its probability is Holm's, of all."""
         left = self.left()
-        blocks, spare = self.blocks(left), left.degrees_of_freedom
+        blocks = self.blocks(left)
+        poses = [left.values[rows].reshape(e.residual.shape) for e, rows in zip(self.rows, left.slices, strict=False)]
+        # Rows of priors, which may be far wider than what they say, are not what the others are compared with.
+        cost, spare = (float(sum(map(np.sum, of))) for of in ([r**2 for r in poses], [_traced(b) for b in blocks]))
         tips = [each.by_tip @ each.by_tip.swapaxes(1, 2) for each in self.rows]
         trace_t, trace_tt = (sum(np.sum(x) for x in of) for of in _traces(blocks, tips, tips))
         none, found = [None] * (len(left.slices) - len(self.rows)), []
@@ -167,17 +170,28 @@ class _Equations(NamedTuple):
             columns = [self.readings(each)[..., joint, None] for each in self.rows]
             kernels = [column @ column.swapaxes(1, 2) for column in columns]
             trace, trace_both = (sum(np.sum(x) for x in of) for of in _traces(blocks, kernels, tips))
+            ratio = _value(kernels, poses) * spare / max(trace * cost, 1e-300)
             below = spare * trace_tt - trace_t**2
             known = self.variances.seat * trace_t > _LEAST * spare and below > 1e-9 * trace_t**2
             c = (spare * trace_both - trace * trace_t) / below if known else 0.0
-            test = pose_form_test(left, [*(k - c * t for k, t in zip(kernels, tips, strict=True)), *none], True)
-            ratio = pose_form_ratio(left, [*kernels, *none])
-            if np.isfinite(ratio):
-                found.append(NoisyJoint(joint + 1, ratio, test.probability))
+            kernels = [k - c * t for k, t in zip(kernels, tips, strict=True)]
+            x = _value(kernels, poses) / max(cost, 1e-300)
+            chance = chance_above_zero(left, [*(k - x * np.eye(k.shape[1]) for k in kernels), *none])
+            if trace > 0:
+                found.append(NoisyJoint(joint + 1, ratio, chance))
         if not found:
             return None
         worst = min(found, key=lambda one: (one.probability, -one.ratio))
         return worst._replace(probability=min(worst.probability * len(found), 1.0))
+
+
+def _traced(matrices: Float[np.ndarray, "m r r"]) -> Float[np.ndarray, " m"]:
+    return np.einsum("maa->m", matrices)
+
+
+def _value(kernels: Sequence[np.ndarray], residuals: Sequence[np.ndarray]) -> float:
+    each = zip(kernels, residuals, strict=True)
+    return float(sum(np.einsum("ma,mab,mb->", r, kernel, r) for kernel, r in each))
 
 
 def _traces(blocks: Sequence[np.ndarray], one: Sequence[np.ndarray], other: Sequence[np.ndarray]):

@@ -236,17 +236,10 @@ def pose_form_test(left: Residuals, kernels: Sequence[Float[np.ndarray, "_ _ _"]
     return _tested(left, *_value_and_traces_by_pose(left, kernels), relative)
 
 
-def pose_form_ratio(left: Residuals, kernels: Sequence[Float[np.ndarray, "m k k"] | None]) -> float:
-    """`FormTest.ratio` of `pose_form_test` with ``relative``, without its probability."""
-    value = trace = 0.0
-    for rows, own, kernel in zip(left.slices, left.own, kernels, strict=True):
-        if kernel is not None:
-            columns = np.concatenate([own, left.basis[rows]], axis=1).reshape(*kernel.shape[:2], -1)
-            r = left.values[rows].reshape(kernel.shape[:2])
-            value += float(np.einsum("ma,mab,mb->", r, kernel, r))
-            trace += float(np.einsum("maa->", kernel)) - float(np.sum(columns * (kernel @ columns)))
-    expected = trace * left.cost / max(left.degrees_of_freedom, 1)
-    return value / expected if expected > 0 else float("nan")
+def chance_above_zero(left: Residuals, kernels: Sequence[Float[np.ndarray, "_ _ _"] | None]) -> float:
+    """Probability that independent errors make a form by pose (as of `pose_form_test`) positive: with A - x B for A,
+    where x is the ratio of r'A r to r'B r that was found, that of a larger ratio."""
+    return _tail(0.0, _value_and_traces_by_pose(left, kernels)[1])
 
 
 def _tested(left: Residuals, value: float, traces: tuple[float, float, float], relative: bool) -> FormTest:
