@@ -32,9 +32,9 @@ from .observed import calibrate_observed, identify_observed
 from .observed_state import ObservedTask, observed_task
 from .results import Calibration, Identification
 from .scale_anchor import default_method, scale_anchor, scale_from_slides, scale_set_by_clause
+from .second_stage import adjust_anchor, clip_to_bounds, divide_by_k, must_adjust_anchor
 from .sensitivities import sensitivities_of_observations, sensitivities_of_sockets
 from .shared_errors import with_shared_errors
-from .second_stage import adjust_anchor, clip_to_bounds, divide_by_k, must_adjust_anchor
 from .task import Task, fit_repeatability
 
 _MAX_STEPS = 300

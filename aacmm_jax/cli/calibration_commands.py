@@ -303,7 +303,7 @@ def _solved(
     from ..calibration.single import identify
 
     if scale == "measured":
-        options = solving | {"strict": strict, "shared_errors": shared_errors}
+        options: dict[str, Any] = solving | {"strict": strict, "shared_errors": shared_errors}
         return run(bounds.space.base, capture, bounds, method=method, **options)
     if method is not None or strict:
         raise InputError("--scale nominal is stage 1 alone; leave out --method and --strict.")

@@ -16,6 +16,7 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm, parameter_names
 from ..kinematics.workspace import Reach
 from ..uncertainty.arm_uncertainty import Uncertainty
+from .calibration_shared import shared_errors_of, shared_tables
 from .calibrations import linear_encoder_attribute, linear_encoder_of
 from .captures import (
     arm_table,
