@@ -168,8 +168,7 @@ def calibrate(
         noise_model: another model of the tips' errors.
         robust: a robust loss, as for `identify`.
         prior: what is known of the parameters, as for `identify`.
-        shared_errors: look for errors that poses share (of visits and places, and by functions of the readings that
-            the model lacks) and add what they do to the covariance, with known values (`SharedErrors`).
+        shared_errors: add errors that poses share, as far as residuals show any, to the covariance (`SharedErrors`).
         check_identifiability: warn where free parameters are not determined by these data; the check takes about as
             long as the calibration.
         strict: raise instead of warn where free parameters are not determined by these data.
@@ -218,8 +217,8 @@ def calibrate(
     _check_scale(task, method)
     result, propagated = _solve(to_numpy(task), method)
     if shared_errors and propagated is not None:
-        measured = task.measurement
-        result = with_shared_errors(result, capture, lambda: sensitivities_of_sockets(result, measured, propagated))
+        by_errors = lambda: sensitivities_of_sockets(result, task.measurement, propagated)  # noqa: E731
+        result = with_shared_errors(result, capture, by_errors)
     return to_jax(result)
 
 

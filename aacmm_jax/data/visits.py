@@ -49,7 +49,7 @@ def checked_visits(visits: Mapping[str, Numbers] | None, blocks: Mapping[str, An
 def visits_by_socket(
     visits: tuple[int, ...] | None, names: tuple[str, ...], sizes: tuple[int, ...]
 ) -> dict[str, Int[np.ndarray, " m"]]:
-    """The visit of each pose of the sockets whose visits are known."""
+    """The visit of each pose of the sockets of a capture whose visits are known."""
     if visits is None:
         return {}
     parts = np.split(np.array(visits, dtype=int), np.cumsum(sizes)[:-1])

@@ -22,7 +22,8 @@ class Uncertainty(eqx.Module):
     They are the calibration's contribution; with ``reading=True`` the noise of the readings is added, as given to the
     calibration or as estimated by it, and the errors that poses in one place share (``shared``). Functions of the
     readings that the model was found to lack count in both: they move every pose. What depends on a direction that the
-    data do not determine is infinitely uncertain. Fixed parameters count as exact, and so does the base frame (``d_1`` and ``theta_1`` only define it).
+    data do not determine is infinitely uncertain. Fixed parameters count as exact, and so does the base frame
+    (``d_1`` and ``theta_1`` only define it).
     """
 
     arm: Arm
