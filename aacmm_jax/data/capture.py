@@ -19,7 +19,7 @@ from ..kinematics.arm import Arm
 from .copies import NOTHING_REPEATED, Repeated, check_different, observation_without_copies, without_copies
 from .observations.observation import AbstractObservation, checked_name, checked_readings
 from .observations.socket import Socket
-from .visits import checked_visits, visits_by_socket
+from .visits import checked_visits, visits_of
 
 
 class ReferenceLength(eqx.Module):
@@ -235,10 +235,7 @@ class Capture(eqx.Module):
         )
         others = [observation for observation in self.observations if observation.name in kept]
         chosen = {name: sockets[name] for name in self.names if name in kept}
-        visits = {
-            name: rows for name, rows in visits_by_socket(self.visits, self.names, self.sizes).items() if name in kept
-        }
-        return Capture(chosen, lengths, others, repeated=repeated, sessions=self.sessions, visits=visits)
+        return Capture(chosen, lengths, others, repeated, self.sessions, visits_of(self, kept))
 
 
 def names_in(capture: Capture) -> tuple[str, ...]:
@@ -252,12 +249,7 @@ def part_of(capture: Capture, names: Collection[str]) -> Capture:
     lengths = [length for length in capture.lengths if length.start in names and length.end in names]
     others = [observation for observation in capture.observations if observation.name in names]
     sockets = {name: q for name, q in capture.sockets.items() if name in names}
-    visits = {
-        name: rows
-        for name, rows in visits_by_socket(capture.visits, capture.names, capture.sizes).items()
-        if name in names
-    }
-    return Capture(sockets, lengths, others, sessions=capture.sessions, visits=visits)
+    return Capture(sockets, lengths, others, sessions=capture.sessions, visits=visits_of(capture, names))
 
 
 def check_one_capture(capture: Capture) -> None:
@@ -357,10 +349,7 @@ def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) ->
                 observations.append(Socket(f"{session}/{name}", readings, target=f"probe of {session}"))
             else:
                 sockets[f"{session}/{name}"] = readings
-        visits |= {
-            f"{session}/{name}": rows
-            for name, rows in visits_by_socket(capture.visits, capture.names, capture.sizes).items()
-        }
+        visits |= {f"{session}/{name}": rows for name, rows in visits_of(capture).items()}
         lengths += [
             ReferenceLength(f"{session}/{length.start}", f"{session}/{length.end}", length.value, length.u)
             for length in capture.lengths
