@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import h5py
+import jax
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
