@@ -9,6 +9,7 @@ from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..kinematics.arm import Arm
 from ..kinematics.corrected_arm import function_values, with_further_corrections
+from ..kinematics.corrections.kinds import term_of
 from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
 
 
@@ -48,7 +49,7 @@ def functions_of(
         return np.zeros((len(q), 0)), np.zeros(0, dtype=int)
     wider: Arm = to_numpy(with_further_corrections(arm, names))
     assert wider.corrections is not None
-    terms = wider.corrections.functions.each[-len(names) :]
+    terms = [term for name in names if (term := term_of(name, arm.joints)) is not None]
     values = function_values(wider.corrections.nominal, terms, q, np.asarray(wider.gravity)).T
     return values, np.array([term.joint - 1 for term in terms])
 

@@ -20,6 +20,7 @@ from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.noise import tip_covariances
+from ..data.visits import visits_of
 from ..kinematics.chain import joint_motion
 from ..model.observed import Observed, certified_and_lengths, linear_rows
 from ..model.socket_sums import means_over_sockets, sums_over_sockets
@@ -196,7 +197,7 @@ def _variances_in_places(shared: SharedErrors | None, capture: Capture) -> tuple
     if shared is None:
         return 0.0, np.zeros(len(sizes))
     within, between = float(shared.sd_of(VISITS, SUCCESSIVE)) ** 2, float(shared.sd_of(PLACES)) ** 2
-    visits, length = capture.visits_of_sockets, float(shared.correlation_length)
+    visits, length = visits_of(capture), float(shared.correlation_length)
 
     def part_of_mean(name: str, size: int) -> float:
         if name in visits:

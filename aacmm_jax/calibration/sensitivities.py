@@ -37,10 +37,10 @@ def sensitivities_of_sockets(result: Calibration, measurement: Measurement, prop
     joints = tuple(f"{kind}_{i}" for i, kind in enumerate(by_joint(result.arm, "theta", "d"), start=1))
     by_joints = np.asarray(result.arm.jacobian(measurement.q, joints))
     return Sensitivities(
-        tips,
+        np.asarray(tips),
         np.einsum("pcN,Ncj->pjN", tips, by_joints),
-        linear.lengths_by_tips,
-        propagated.parameter_covariance.matrix - without,
+        np.asarray(linear.lengths_by_tips),
+        np.asarray(propagated.parameter_covariance.matrix - without),
     )
 
 
@@ -77,4 +77,5 @@ def sensitivities_of_observations(task: ObservedTask, result: Calibration) -> Se
     found = [np.zeros((len(names), *parts[0].shape[1:2], observed.q.shape[0])) for parts in (tips, joints)]
     for whole, parts in zip(found, (tips, joints), strict=True):
         whole[free] = np.concatenate(parts, axis=2)
-    return Sensitivities(*found, np.zeros((0, 3, observed.q.shape[0])), np.zeros((len(names),) * 2))
+    none = np.zeros((0, 3, observed.q.shape[0]))
+    return Sensitivities(found[0], found[1], none, np.zeros((len(names), len(names))))

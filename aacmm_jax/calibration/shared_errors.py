@@ -24,8 +24,7 @@ from ..kinematics.arm import Arm, correction_names, natural_steps
 from ..kinematics.corrected_arm import with_corrections, with_further_corrections
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.prior_scales import default_prior
-from ..uncertainty.group_test import Block
-from ..uncertainty.residual_tests import Residuals, block_diagonal, form_of_poses, form_test, score_tests
+from ..uncertainty.residual_tests import block_diagonal, form_of_poses, form_test, score_tests
 from ..uncertainty.shared_errors import (
     NULL,
     PLACES,
@@ -38,12 +37,12 @@ from ..uncertainty.shared_errors import (
     second_moments,
 )
 from .drawn_errors import functions_of
-from .group_equations import LEAST_U, PRIOR, Rows, equations_in_chunks
-from .length_consistency import lengths_of_sockets
+from .group_equations import PRIOR, equations_in_chunks
 from .model_errors import weighted_by_loss
-from .record import CalibrationRecord, record_of
+from .record import record_of
 from .results import Calibration
 from .sensitivities import Sensitivities
+from .shared_equations import SharedProblem, problem_of_poses, rms_of, usual_deviations, with_lengths
 
 _GATE = 0.1  # probability of a test below which an effect is looked at
 _MODEL = "gravity,gear,harmonics=1-3"  # functions that joints may follow
@@ -52,9 +51,7 @@ _MODEL = "gravity,gear,harmonics=1-3"  # functions that joints may follow
 _LENGTHS, _PART = (2.0, 5.0, 15.0), 3
 _MOST_PATTERNS = 8  # of successive poses of one socket: slower ones matter, faster ones are like noise
 _NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are alike
-_USUAL = 3.0  # standard deviation of an effect of the tip above which it is improbable, of that of the residuals
 _FEWEST = 6  # degrees of freedom
-_EXPLAINED = 1e-3  # part of a column that the model leaves, below which it counts as the model's own
 _EXACT = 1e-6  # mm: smaller residuals are rounding errors of a simulation without noise
 
 
@@ -90,70 +87,17 @@ class _Found(NamedTuple):
     variance: float  # of independent errors, over that of all
 
 
-class _Problem(NamedTuple):
-    """The equations of a calibration, and how its parameters follow its data."""
-
-    record: CalibrationRecord
-    rows: list[Rows]
-    left: Residuals
-    sensitivities: Sensitivities
-    lengths: Float[np.ndarray, "l k"] | None  # whitening of the lengths between means of sockets, their last rows
-
-    def moved(self, patterns: Float[np.ndarray, "M c"]) -> Float[np.ndarray, "R k"]:
-        """Columns of tips that move by a pattern over the poses, along x, y and z each."""
-        blocks = [
-            np.einsum("mra,mc->mrca", each.by_tip, patterns[each.poses]).reshape(each.residual.size, -1)
-            for each in self.rows
-        ]
-        return self._columns(blocks, np.einsum("laN,Nc->lca", self.sensitivities.lengths, patterns))
-
-    def turned(
-        self, values: Float[np.ndarray, "M k"], joints: np.ndarray, steps: Float[np.ndarray, " k"]
-    ) -> Float[np.ndarray, "R k"]:
-        """Columns of joints that turn by functions of the readings times a step."""
-        arm, q = self.record.calibrated.arm, np.asarray(self.record.recording.capture.readings)
-        natural = np.array([1.0 if i + 1 in arm.prismatic else 1e-3 for i in range(arm.joints)])
-        factors = values * (steps / natural[joints])
-        blocks = [
-            (each.extra[..., joints] * factors[each.poses][:, None]).reshape(each.residual.size, -1)
-            for each in self.rows
-        ]
-        of_lengths = np.zeros((len(self.sensitivities.lengths), len(steps)))
-        if len(of_lengths):
-            names = [f"{'d' if i + 1 in arm.prismatic else 'theta'}_{i + 1}" for i in range(arm.joints)]
-            slopes = np.einsum("laN,Naj->ljN", self.sensitivities.lengths, np.asarray(arm.jacobian(q, names)))
-            of_lengths = np.einsum("lkN,Nk->lk", slopes[:, joints], values * steps)
-        return self._columns(blocks, of_lengths)
-
-    def _columns(self, blocks: list[np.ndarray], of_lengths: np.ndarray) -> np.ndarray:
-        whole = np.zeros((len(self.left.values), blocks[0].shape[1]))
-        poses = np.concatenate(blocks)
-        whole[: len(poses)] = poses
-        if self.lengths is not None:
-            whole[-len(self.lengths) :] = self.lengths @ of_lengths.reshape(len(of_lengths), -1)
-        return self.left.unexplained(whole)
-
-    def by_patterns(self, patterns: Float[np.ndarray, "M c"]) -> Float[np.ndarray, "p k"]:
-        """How the parameters follow `moved`."""
-        found = np.einsum("paN,Nc->pca", self.sensitivities.tips, patterns)
-        return found.reshape(len(found), -1)
-
-    def by_functions(self, values: Float[np.ndarray, "M k"], joints: np.ndarray) -> Float[np.ndarray, "p k"]:
-        """How the parameters follow `turned`, by coefficients in their own units."""
-        return np.einsum("pkN,Nk->pk", self.sensitivities.joints[:, joints], values)
-
-
 def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Sensitivities]) -> _Found | None:
     record = record_of(result, Recording(capture, ArmSpecification(result.space.base)))
     if not record.converged or weighted_by_loss(record):
         return None
     rows, relations = equations_in_chunks(record)
-    if not rows or _rms(rows) < _EXACT:
+    if not rows or rms_of(rows) < _EXACT:
         return None
-    of_poses = _of_poses(record, rows, [block for block in relations if block.fixture == PRIOR], sensitivities)
+    of_poses = problem_of_poses(record, rows, [block for block in relations if block.fixture == PRIOR], sensitivities)
     if of_poses.left.degrees_of_freedom < _FEWEST:
         return None
-    problem = _with_lengths(of_poses, relations)
+    problem = with_lengths(of_poses, relations)
     tips, functions = _visits(of_poses), _functions(of_poses)
     # All but places by the poses alone: lengths that contradict each other would be put down to whatever moves them.
     effects = Effects.none(of_poses.left, record.given_noise is not None)
@@ -175,7 +119,7 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
 
 
 def _summed(
-    problem: "_Problem", tips: "tuple[_Tips, ...]", functions: "_Functions", without: Effects, every: Effects
+    problem: SharedProblem, tips: "tuple[_Tips, ...]", functions: "_Functions", without: Effects, every: Effects
 ) -> _Found:
     """What all effects add; ``without`` knows those of the tips, and ``every`` all."""
     found = [effect for effect in tips if effect.variance]
@@ -207,66 +151,6 @@ def _summed(
     return _Found(shared, added, every.variance)
 
 
-def _of_poses(
-    record: CalibrationRecord, rows: list[Rows], prior: list[Block], sensitivities: Callable[[], Sensitivities]
-) -> _Problem:
-    left = Residuals.of([*(each.block("") for each in rows), *prior])
-    return _Problem(record, rows, left, sensitivities(), None)
-
-
-def _with_lengths(problem: _Problem, relations: list[Block]) -> _Problem:
-    """The same with what lengths and certified values say, of all but the scale.
-
-    Fixed lengths or a prior may contradict the scale of all lengths, which errors of single places do not explain.
-    """
-    record, rows = problem.record, problem.rows
-    blocks = [*(each.block("") for each in rows), *relations]
-    values = np.array([float(length.value) for length in record.recording.capture.lengths])
-    if record.observed is not None:
-        u = np.maximum([float(length.u) for length in record.recording.capture.lengths], LEAST_U)
-        return problem._replace(left=_without_scale(Residuals.of(blocks), sum(map(_size, rows)), values / u))
-    related = lengths_of_sockets(record, rows)
-    if related is None:
-        return problem
-    whitening = np.linalg.inv(np.linalg.cholesky(related.covariance))
-    residual, shared = whitening @ related.relations.residual, whitening @ related.relations.shared
-    blocks.append(related.relations._replace(residual=residual, shared=shared))
-    if related.scale is not None:
-        blocks = _with_column(blocks, related.scale[0], whitening @ related.scale[1])
-    left = _without_scale(Residuals.of(blocks), sum(map(_size, rows)), whitening @ values)
-    return problem._replace(left=left, lengths=whitening)
-
-
-def _size(rows: Rows) -> int:
-    return rows.residual.size
-
-
-def _without_scale(left: Residuals, first: int, by_scale: Float[np.ndarray, " l"]) -> Residuals:
-    """With the scale of the lengths, which begin at a row, as one more unknown."""
-    column = np.zeros((len(left.values), 1))
-    column[first : first + len(by_scale), 0] = by_scale
-    unknown = np.linalg.norm(left.unexplained(column)) > _EXPLAINED * np.linalg.norm(column)
-    return left.extended(column) if unknown else left
-
-
-def _rms(rows: list[Rows]) -> float:
-    """Of a coordinate of the residuals, mm."""
-    residuals = [np.einsum("mcr,mr->mc", each.in_mm, each.residual).ravel() for each in rows]
-    return float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
-
-
-def _with_column(blocks: list[Block], of_rows: np.ndarray, of_lengths: np.ndarray) -> list[Block]:
-    """With the scale anchor, which the lengths determine, as one more unknown."""
-    parts = np.split(np.concatenate([of_rows, of_lengths]), np.cumsum([len(b.residual) for b in blocks])[:-1])
-    return [b._replace(shared=np.column_stack([b.shared, part])) for b, part in zip(blocks, parts, strict=True)]
-
-
-def _usual(problem: _Problem) -> tuple[float, float]:
-    """Standard deviations of an effect of the tip: below which it is nothing, and above which it is improbable."""
-    scatter = _rms(problem.rows)
-    return scatter / np.sqrt(np.mean([len(each.poses) for each in problem.rows])), _USUAL * scatter
-
-
 class _Tips(NamedTuple):
     """Errors of the tip that poses share: patterns over all poses, of which the most likely ones are taken."""
 
@@ -277,13 +161,15 @@ class _Tips(NamedTuple):
     variance: float = 0.0  # mm^2
     length: float = np.nan
 
-    def learned(self, problem: _Problem, effects: Effects) -> "_Tips":
+    def learned(self, problem: SharedProblem, effects: Effects) -> "_Tips":
         """With the variance of the most likely patterns."""
-        every = [one_variance(effects, problem.moved(patterns), *_usual(problem)) for patterns in self.patterns]
+        every = [
+            one_variance(effects, problem.moved(patterns), *usual_deviations(problem)) for patterns in self.patterns
+        ]
         best = int(np.argmax([one.log_likelihood for one in every]))
         return self._replace(patterns=[self.patterns[best]], variance=every[best].variance, length=self.lengths[best])
 
-    def joined(self, problem: _Problem, effects: Effects) -> Effects:
+    def joined(self, problem: SharedProblem, effects: Effects) -> Effects:
         """Effects with this one."""
         if not self.variance:
             return effects
@@ -291,7 +177,7 @@ class _Tips(NamedTuple):
         return effects.joined(columns, np.full(columns.shape[1], self.variance))
 
 
-def _visits(problem: _Problem) -> _Tips:
+def _visits(problem: SharedProblem) -> _Tips:
     """Of visits as they are marked, or of successive poses."""
     capture, rows = problem.record.recording.capture, problem.rows
     relative = problem.record.given_noise is None
@@ -341,12 +227,12 @@ class _Functions(NamedTuple):
     units: list[str]
     members: Float[np.ndarray, "g k"]
     steps: Float[np.ndarray, " k"]
-    turned: tuple[Float[np.ndarray, "M k"], np.ndarray, Float[np.ndarray, " k"]]  # what `_Problem.turned` takes
+    turned: tuple[Float[np.ndarray, "M k"], np.ndarray, Float[np.ndarray, " k"]]  # what `SharedProblem.turned` takes
     columns: Float[np.ndarray, "R k"]
     follow: Float[np.ndarray, "p k"]
     sd: Float[np.ndarray, " g"] = np.zeros(0)  # of each group, natural steps
 
-    def joined(self, problem: _Problem, effects: Effects) -> Effects:
+    def joined(self, problem: SharedProblem, effects: Effects) -> Effects:
         """Effects with these."""
         if not len(self.sd):
             return effects
@@ -360,7 +246,7 @@ class _Functions(NamedTuple):
         return cls(1.0, (), [], [], none, empty, turned, none, np.zeros((parameters, 0)))
 
 
-def _functions(problem: _Problem) -> _Functions:
+def _functions(problem: SharedProblem) -> _Functions:
     """What the arm does not have of the functions that joints may follow."""
     arm: Arm = to_numpy(problem.record.calibrated.arm)
     q = np.asarray(problem.record.recording.capture.readings)
@@ -409,7 +295,7 @@ def missing_functions(arm: Arm) -> tuple[str, ...]:
     )
 
 
-def _places(problem: _Problem, effects: Effects) -> _Tips:
+def _places(problem: SharedProblem, effects: Effects) -> _Tips:
     """Errors that all poses of a socket share, which only lengths show."""
     capture = problem.record.recording.capture
     sizes = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
@@ -441,7 +327,7 @@ def _places(problem: _Problem, effects: Effects) -> _Tips:
     return nothing._replace(probability=probability, patterns=[patterns]).learned(problem, effects)
 
 
-def _neighbours(problem: _Problem) -> float:
+def _neighbours(problem: SharedProblem) -> float:
     """Probability that poses of one socket at neighbouring configurations err so much alike by chance."""
     q = np.asarray(problem.record.recording.capture.readings)
     columns, kernel = [], []

@@ -184,8 +184,7 @@ def calibrate(
         robust: a robust loss, as for `identify`.
         prior: what is known of the parameters, as for `identify`; of a model, by default `kinematics.default_prior`.
         replace_noise: estimate the noise of encoders that prove noisier, as for `identify`.
-        shared_errors: look for errors that poses share (of visits and places, and by functions of the readings that
-            the model lacks) and add what they do to the covariance, with known values (`SharedErrors`).
+        shared_errors: add errors that poses share, as far as residuals show any, to the covariance (`SharedErrors`).
         check_identifiability: warn where free parameters are not determined by these data; the check takes about as
             long as the calibration.
         strict: raise instead of warn where free parameters are not determined by these data.

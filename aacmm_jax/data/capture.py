@@ -20,7 +20,7 @@ from .copies import NOTHING_REPEATED, Repeated, check_different, observation_wit
 from .observations.observation import AbstractObservation, checked_name, checked_readings
 from .observations.socket import Socket
 from .reference_length import ReferenceLength
-from .visits import checked_visits, visits_by_socket
+from .visits import checked_visits, visits_of
 
 # Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
 _MOST_RADIANS = 8 * np.pi
@@ -47,8 +47,7 @@ class Capture(eqx.Module):
         observations: What else ties the tip down (`data.observations`): measured points, spheres, planes, artefacts.
         repeated: Copies that were left out of these data before.
         sessions: Names of the sessions of `join_sessions`; what belongs to one is named ``session/name``.
-        visits: Socket name -> number of the visit of each of its poses ``(m,)``: the tip was lifted between visits, and
-            may have come to rest elsewhere. Where a socket is not named, or nothing is given, visits are unknown.
+        visits: Socket name -> number of the visit of each of its poses ``(m,)``; the tip was lifted between visits.
 
     Raises:
         InputError: For names that are empty, longer than a line or given twice, readings that are not finite,
@@ -154,11 +153,6 @@ class Capture(eqx.Module):
         return {name: q[..., end - size : end, :] for name, size, end in zip(self.names, self.sizes, ends, strict=True)}
 
     @property
-    def visits_of_sockets(self) -> dict[str, Int[np.ndarray, " m"]]:
-        """Number of the visit of each pose, ``(m,)``, of the sockets whose visits are known."""
-        return visits_by_socket(self.visits, self.names, self.sizes)
-
-    @property
     def readings(self) -> Float[AnyArray, "M n"]:
         """Joint readings of all poses, those of sockets first, ``(M, n)``; rad."""
         blocks = [self.q, *(observation.q for observation in self.observations)]
@@ -205,8 +199,7 @@ class Capture(eqx.Module):
         )
         others = [observation for observation in self.observations if observation.name in kept]
         chosen = {name: sockets[name] for name in self.names if name in kept}
-        visits = {name: rows for name, rows in self.visits_of_sockets.items() if name in kept}
-        return Capture(chosen, lengths, others, repeated=repeated, sessions=self.sessions, visits=visits)
+        return Capture(chosen, lengths, others, repeated, self.sessions, visits_of(self, kept))
 
 
 def names_in(capture: Capture) -> tuple[str, ...]:
@@ -220,8 +213,7 @@ def part_of(capture: Capture, names: Collection[str]) -> Capture:
     lengths = [length for length in capture.lengths if length.start in names and length.end in names]
     others = [observation for observation in capture.observations if observation.name in names]
     sockets = {name: q for name, q in capture.sockets.items() if name in names}
-    visits = {name: rows for name, rows in capture.visits_of_sockets.items() if name in names}
-    return Capture(sockets, lengths, others, sessions=capture.sessions, visits=visits)
+    return Capture(sockets, lengths, others, sessions=capture.sessions, visits=visits_of(capture, names))
 
 
 def check_one_capture(capture: Capture) -> None:
@@ -321,7 +313,7 @@ def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) ->
                 observations.append(Socket(f"{session}/{name}", readings, target=f"probe of {session}"))
             else:
                 sockets[f"{session}/{name}"] = readings
-        visits |= {f"{session}/{name}": rows for name, rows in capture.visits_of_sockets.items()}
+        visits |= {f"{session}/{name}": rows for name, rows in visits_of(capture).items()}
         lengths += [
             ReferenceLength(f"{session}/{length.start}", f"{session}/{length.end}", length.value, length.u)
             for length in capture.lengths

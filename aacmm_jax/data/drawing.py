@@ -3,6 +3,7 @@
 from ..core.arrays import random_generator
 from ..core.errors import InputError
 from .capture import Capture, check_one_capture
+from .visits import visits_of
 
 
 def draw_poses(capture: Capture, count: int, seed: int = 0) -> tuple[Capture, Capture]:
@@ -37,7 +38,7 @@ def draw_poses(capture: Capture, count: int, seed: int = 0) -> tuple[Capture, Ca
         others = [observation.select(chosen) for observation, chosen in of_others if chosen]
         known = {*sockets, *(observation.name for observation in others)}
         lengths = [length for length in capture.lengths if {length.start, length.end} <= known]
-        known_visits = capture.visits_of_sockets
+        known_visits = visits_of(capture)
         visits = {
             name: known_visits[name][chosen]
             for name, chosen in zip(capture.names, rows, strict=False)

@@ -1,6 +1,7 @@
 """Visits to sockets: which poses were taken without lifting the tip in between."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -46,11 +47,10 @@ def checked_visits(visits: Mapping[str, Numbers] | None, blocks: Mapping[str, An
     return tuple(int(number) for number in np.concatenate(found))
 
 
-def visits_by_socket(
-    visits: tuple[int, ...] | None, names: tuple[str, ...], sizes: tuple[int, ...]
-) -> dict[str, Int[np.ndarray, " m"]]:
-    """The visit of each pose of the sockets whose visits are known."""
-    if visits is None:
+def visits_of(capture: Any, names: Collection[str] | None = None) -> dict[str, Int[np.ndarray, " m"]]:
+    """The visit of each pose of the sockets of a capture whose visits are known: of all, or of some names."""
+    if capture.visits is None:
         return {}
-    parts = np.split(np.array(visits, dtype=int), np.cumsum(sizes)[:-1])
-    return {name: rows for name, rows in zip(names, parts, strict=True) if np.all(rows != UNKNOWN)}
+    parts = np.split(np.array(capture.visits, dtype=int), np.cumsum(capture.sizes)[:-1])
+    found = {name: rows for name, rows in zip(capture.names, parts, strict=True) if np.all(rows != UNKNOWN)}
+    return found if names is None else {name: rows for name, rows in found.items() if name in names}

@@ -47,14 +47,13 @@ class SharedErrors(eqx.Module):
     def without_functions(self) -> "SharedErrors | None":
         """Those that move the tips of poses alike."""
         own = [i for i, kind in enumerate(self.kinds) if kind in (PLACES, VISITS, SUCCESSIVE)]
-        none = np.zeros(0)
         kinds, units = tuple(self.kinds[i] for i in own), tuple(self.units[i] for i in own)
         return SharedErrors(
             kinds,
             units,
             (),
             self.sd[np.array(own, dtype=int)],
-            none[:, None],
+            np.zeros((0, 0)),
             self.follow[:, :0],
             self.correlation_length,
         )
@@ -155,8 +154,10 @@ def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], low: float
 def group_deviations(
     effects: Effects, columns: Float[np.ndarray, "R k"], members: Float[np.ndarray, "g k"]
 ) -> Float[np.ndarray, " g"]:
-    """Standard deviations of groups of effects at which the residuals are most probable, natural steps. Each group is expected, to a factor of 4.5, to explain an equal share of the residuals: else groups of
-    which the data say little would be as large as anybody fears, or collapse (`benchmarks/NOTES.md`).
+    """Standard deviations of groups of effects at which the residuals are most probable, natural steps.
+
+    Each group is expected, to a factor of 4.5, to explain an equal share of the residuals: else groups of which the
+    data say little would be as large as anybody fears, or collapse (`benchmarks/NOTES.md`).
 
     Args:
         effects: What is known.

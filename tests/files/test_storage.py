@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import h5py
+import jax
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
@@ -436,6 +437,9 @@ def test_round_trip_of_a_calibration(tmp_path, good):
             np.testing.assert_array_equal(value, expected, err_msg=name)
         elif isinstance(expected, aj.kinematics.ArmSpecification):
             assert plain(value) == plain(expected), name
+        elif name == "shared":
+            assert jax.tree.structure(value) == jax.tree.structure(expected)
+            assert all(map(np.array_equal, jax.tree.leaves(value), jax.tree.leaves(expected)))
         elif name != "recording":
             assert value == (str(expected) if name == "reason" else expected), name
 

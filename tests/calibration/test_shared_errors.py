@@ -1,0 +1,203 @@
+"""Errors that poses share are found, and widen the uncertainty; clean calibrations stay as they are."""
+
+import jax
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.calibration.redrawn import trials_of
+from aacmm_jax.calibration.sampling import _RepeatedTask
+from aacmm_jax.calibration.shared_errors import missing_functions, with_shared_errors
+from aacmm_jax.kinematics.corrected_arm import with_further_corrections
+from aacmm_jax.kinematics.prior_scales import default_prior
+from aacmm_jax.summaries.calibration import shared_rows, shared_sentence
+
+NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
+PLACES = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (300, -300, 300), "D": (500, 300, 100)}
+LENGTHS = [("A", "B"), ("C", "D"), ("A", "C"), ("B", "D")]
+POSES, VISIT = 20, 5
+
+
+@pytest.fixture(scope="module")
+def poses():
+    """Arm, its box, a true arm, and poses that hold the sockets exactly."""
+    specification = aj.files.load_specification("cheng2018-simulation")
+    bounds = specification.bounds()
+    true = aj.perturbed_arm(bounds.space, length=0.5, angle=np.deg2rad(0.05), seed=1)
+    capture = aj.simulate(true, PLACES, poses=POSES, seed=1)
+    return specification, bounds, true, {name: np.asarray(q) for name, q in capture.sockets.items()}
+
+
+def captured(poses, seed, *, shift=0.0, visit=VISIT, error=None, marked=False, lengths=4):
+    """With noise, tips that shift at each visit (mm), and readings that are off by a function of them (rad)."""
+    _, _, true, exact = poses
+    rng, sockets = np.random.default_rng(seed), {}
+    names = tuple(f"q_{i + 1}" for i in range(true.joints))
+    for name, q in exact.items():
+        moved = rng.normal(0, 0.005, (POSES, 3))
+        moved += np.repeat(rng.normal(0, shift, (POSES // visit, 3)), visit, axis=0)
+        read = q + np.einsum("nab,nb->na", np.linalg.pinv(np.asarray(true.jacobian(q, names))), moved)
+        read = read - (0.0 if error is None else error(read))
+        sockets[name] = read + rng.normal(0, 2.0 * aj.units.ARCSEC, read.shape)
+    between = {pair: np.linalg.norm(np.subtract(PLACES[pair[0]], PLACES[pair[1]])) for pair in LENGTHS[:lengths]}
+    references = [aj.ReferenceLength(*pair, value + rng.normal(0, 0.002), 0.002) for pair, value in between.items()]
+    visits = {name: np.arange(POSES) // visit for name in sockets} if marked else None
+    return aj.Capture(sockets, references, visits=visits)
+
+
+def calibrated(poses, capture, method="joint", noise=NOISE, **options):
+    specification, bounds, *_ = poses
+    return aj.calibrate(
+        specification.arm, capture, bounds, method=method, noise=noise, check_identifiability=False, **options
+    )
+
+
+def eccentric(q):
+    return 10 * aj.units.ARCSEC * np.stack([0 * q[:, 0], np.cos(q[:, 1]), np.sin(q[:, 2]), *(0 * q[:, 3:].T)], axis=1)
+
+
+def volume(poses):
+    """Lengths over the volume as poses at both ends."""
+    return aj.uncertainty.volume.sample_lengths(poses[2], 60, length=300.0, seed=3)
+
+
+@pytest.mark.parametrize(
+    ("method", "made", "kind", "low", "high"),
+    [
+        ("two-stage", {"shift": 0.02, "marked": True}, "visits", 0.012, 0.03),
+        ("joint", {"shift": 0.02}, "successive poses", 0.012, 0.04),
+        ("joint", {"shift": 0.02, "visit": POSES}, "places", 0.01, 0.05),
+        ("two-stage", {"error": eccentric}, "harmonics=1", 3 * aj.units.ARCSEC, 15 * aj.units.ARCSEC),
+    ],
+)
+def test_errors_are_found_with_their_size_and_cover_lengths(poses, method, made, kind, low, high):
+    inside = {True: [], False: []}
+    ends = volume(poses)
+    # The true arm sees what the readings lack.
+    at = [q + made["error"](q) if "error" in made else q for q in ends]
+    true = np.linalg.norm(np.subtract(*(np.asarray(poses[2].position(q)) for q in at)), axis=1)
+    found = []
+    for seed in range(3):
+        capture = captured(poses, seed, **made)
+        for shared in inside:
+            result = calibrated(poses, capture, method, noise=(NOISE, None)[seed % 2], shared_errors=shared)
+            measured = np.linalg.norm(np.subtract(*(np.asarray(result.arm.position(q)) for q in ends)), axis=1)
+            uncertainty = aj.uncertainty_of(result)
+            inside[shared].append(np.abs(measured - true) < uncertainty.factor(0.95) * uncertainty.length(*ends))
+            if shared:
+                found.append(result.shared)
+            else:
+                assert result.shared is None
+    assert all(each is not None and kind in each.kinds for each in found)
+    sizes = [float(each.sd[each.kinds.index(kind)]) for each in found]
+    assert low < np.median(sizes) < high, sizes
+    # All lengths of one capture err together where places shift.
+    assert np.mean(inside[True]) > (0.6 if kind == "places" else 0.85)
+    assert np.mean(inside[False]) < np.mean(inside[True]) - 0.1
+
+
+def test_clean_calibrations_keep_their_covariance(poses):
+    capture = captured(poses, 6)
+    for method in ("two-stage", "joint"):
+        result = calibrated(poses, capture, method)
+        assert result.shared is None
+        plain = calibrated(poses, capture, method, shared_errors=False)
+        np.testing.assert_array_equal(np.asarray(result.covariance), np.asarray(plain.covariance))
+
+
+def test_functions_that_the_model_lacks_move_other_poses_too(poses):
+    result = calibrated(poses, captured(poses, 0, error=eccentric))
+    uncertainty, q = aj.uncertainty_of(result), volume(poses)[0]
+    whole = uncertainty.complete
+    assert whole.names[: len(uncertainty.names)] == uncertainty.names
+    assert "cos1_5" in whole.names
+    # Parameters alone: the covariance of a tip without the functions is smaller nearly everywhere.
+    alone = np.asarray(uncertainty.covariance_of_functions(uncertainty.derivatives(q)))
+    np.testing.assert_allclose(np.asarray(whole.arm.position(q)), np.asarray(result.arm.position(q)), atol=1e-9)
+    tips = np.trace(np.asarray(uncertainty.tip(q)), axis1=1, axis2=2)
+    assert np.median(tips / np.trace(alone, axis1=1, axis2=2)) > 1.1
+    # What is joined is a covariance: no negative variance.
+    sd = np.sqrt(np.diag(np.asarray(whole.covariance))) + 1e-12
+    assert np.linalg.eigvalsh(np.asarray(whole.covariance) / np.outer(sd, sd)).min() > -1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "made", [{"shift": 0.02, "visit": POSES}, {"shift": 0.02, "marked": True}, {"error": eccentric}]
+)
+def test_monte_carlo_agrees_with_the_covariance(poses, made):
+    capture = captured(poses, 1, **made)
+    result = calibrated(poses, capture, "two-stage")
+    assert result.shared is not None
+    task = _RepeatedTask.of(result, capture, tuple(q[:20] for q in volume(poses)))
+    trials = trials_of(result, capture, result.noise, task.u)
+    values, failed = task.solved(*trials.drawn(500, np.random.default_rng(0), 1.0))
+    assert failed == 0
+    linear = np.asarray(aj.uncertainty_of(result).length(task.start, task.end))
+    assert 0.9 < np.median(values[:, -20:].std(axis=0) / linear) < 1.12
+
+
+def test_a_place_that_shifts_is_part_of_what_readings_and_new_lengths_owe(poses):
+    capture = captured(poses, 2, shift=0.02, visit=POSES)
+    result = calibrated(poses, capture)
+    uncertainty, (start, end) = aj.uncertainty_of(result), volume(poses)
+    tau = float(result.shared.sd_of("places"))
+    assert float(uncertainty.in_one_place) == pytest.approx(tau)
+    plain = aj.uncertainty_of(calibrated(poses, capture, shared_errors=False))
+    extra = (
+        np.asarray(uncertainty.length(start, end, reading=True)) ** 2 - np.asarray(uncertainty.length(start, end)) ** 2
+    )
+    without = np.asarray(plain.length(start, end, reading=True)) ** 2 - np.asarray(plain.length(start, end)) ** 2
+    np.testing.assert_allclose(extra - without, 2 * tau**2, rtol=0.02)
+    new = captured(poses, 12, lengths=2)
+    predicted = aj.calibration.unseen_errors(uncertainty, new).length_u
+    assert np.all(predicted**2 > 1.9 * tau**2)
+
+
+def test_traced_calibrations_have_none(poses):
+    capture = captured(poses, 0)
+    result, found = calibrated(poses, capture, shared_errors=False), []
+
+    def traced(x):
+        found.append(with_shared_errors(result, capture, pytest.fail))
+        return x
+
+    jax.make_jaxpr(traced)(1.0)
+    assert found[0] is result
+
+
+def test_errors_of_places_are_the_same_from_observations(poses):
+    """A prior that says nothing makes the general path solve the same problem."""
+    capture = captured(poses, 2, shift=0.02, visit=POSES)
+    broad = aj.Prior({"all": 1e3})
+    tau = [float(calibrated(poses, capture, prior=prior).shared.sd_of("places")) for prior in (None, broad)]
+    assert tau[0] == pytest.approx(tau[1], rel=0.05)
+    u = [np.sqrt(np.diag(np.asarray(calibrated(poses, capture, prior=prior).covariance))) for prior in (None, broad)]
+    np.testing.assert_allclose(u[0], u[1], rtol=0.1)
+
+
+def test_a_file_keeps_them(poses, tmp_path):
+    capture = captured(poses, 0, error=eccentric, shift=0.02, marked=True)
+    record = aj.calibration.record_of(calibrated(poses, capture), aj.Recording(capture, poses[0]))
+    assert record.shared is not None
+    aj.files.save_calibration(tmp_path / "calibration.h5", record)
+    loaded = aj.files.load_calibration(tmp_path / "calibration.h5")
+    assert loaded.recording.capture.visits == capture.visits
+    for one, other in zip(jax.tree.leaves(record.shared), jax.tree.leaves(loaded.shared), strict=True):
+        np.testing.assert_array_equal(one, other)
+    start, end = volume(poses)
+    np.testing.assert_allclose(
+        np.asarray(aj.uncertainty_of(loaded).length(start, end)),
+        np.asarray(aj.uncertainty_of(record).length(start, end)),
+    )
+    sentence = shared_sentence(shared_rows(loaded.shared))
+    assert "poses of a visit 0.0" in sentence
+    assert "harmonics=1" in sentence
+
+
+def test_default_prior_of_missing_functions_has_every_group(poses):
+    arm = poses[0].arm
+    names = missing_functions(arm)
+    wider = with_further_corrections(arm, names)
+    assert missing_functions(wider) == ()
+    assert set(default_prior(wider).groups) == {"lengths", "angles", "gravity", "gear", "harmonics=1", "harmonics=2-3"}
