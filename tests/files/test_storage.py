@@ -439,7 +439,7 @@ def test_round_trip_of_a_calibration(tmp_path, good):
             assert plain(value) == plain(expected), name
         elif name == "shared":
             assert jax.tree.structure(value) == jax.tree.structure(expected)
-            assert all(map(np.array_equal, jax.tree.leaves(value), jax.tree.leaves(expected)))
+            jax.tree.map(np.testing.assert_array_equal, value, expected)
         elif name != "recording":
             assert value == (str(expected) if name == "reason" else expected), name
 
