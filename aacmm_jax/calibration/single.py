@@ -310,11 +310,13 @@ def _solve_stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
 
 
 def _reduced_chi(measurement: Measurement, tips: Float[AnyArray, "N 3"], fitted: int) -> Float[AnyArray, ""] | None:
-    xp = namespace(measurement, tips, fitted)
     if measurement.weights is None:
         return None
-    degrees_of_freedom = max(3 * sum(size - 1 for size in measurement.sizes) - fitted, 1)
-    return xp.sqrt(xp.sum(measurement.whitened(measurement.centred(tips)) ** 2) / degrees_of_freedom)
+    whitened, spare = (
+        measurement.whitened(measurement.centred(tips)),
+        3 * sum(n - 1 for n in measurement.sizes) - fitted,
+    )
+    return namespace(whitened).sqrt(namespace(whitened).sum(whitened**2) / max(spare, 1))
 
 
 def _make_calibration(

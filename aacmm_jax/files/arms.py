@@ -398,12 +398,9 @@ def _document(specification: ArmSpecification, source: str) -> "TOMLDocument":
 
     document = tomlkit.document()
     arm = single(specification.arm)
-    for key, value in (("name", specification.name), ("source", source)):
-        if value:
-            document[key] = printable(storable(value))
-    document["convention"] = "standard"
-    document["length_unit"] = "mm"
-    document["angle_unit"] = "rad"
+    named = {"name": specification.name, "source": source}
+    document.update({key: printable(storable(text)) for key, text in named.items() if text})
+    document.update({"convention": "standard", "length_unit": "mm", "angle_unit": "rad"})
     document["probe"] = [float(x) for x in np.asarray(arm.probe)]
     facts = {"prismatic": list(arm.prismatic), "thermometer": arm.thermometer}
     document.update({key: fact for key, fact in facts.items() if fact})

@@ -185,7 +185,7 @@ def _read_where(geometry: Geometry, corrections: Corrections, q: Float[Array, "n
     each = jax.tree.map(lambda leaf: leaf[:, None, :], geometry)._replace(corrections=corrections)
 
     def closer(_: Array, reading: Float[Array, "n w N"]) -> Float[Array, "n w N"]:
-        return q - joint_errors(each, joint_motion_of_rows(each, reading[:, :, None]))[:, :, 0]
+        return q - joint_errors(each, joint_motion_of_rows(each, reading[:, :, None]))[0][:, :, 0]
 
     return jax.lax.fori_loop(0, _SUBSTITUTIONS, closer, q)
 

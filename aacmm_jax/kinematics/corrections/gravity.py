@@ -68,8 +68,10 @@ def _pull(term: Term, forward: ForwardPass) -> tuple[float, Float[AnyArray, "...
         return 1.0, forward.tip if term.number == len(forward.origin) else forward.origin[term.number - 1]
     assert term.loads is not None
     centres, each = _centres(forward, term.loads), _KILONEWTON * _STANDARD_GRAVITY * np.array(term.loads.mass)
-    pulls = [each[j] * centres[j] for j in range(term.joint - 1, len(centres))]
-    return float(each[term.joint - 1 :].sum()), sum(pulls[1:], pulls[0])
+    pull = each[term.joint - 1] * centres[term.joint - 1]
+    for j in range(term.joint, len(centres)):
+        pull = pull + each[j] * centres[j]
+    return float(each[term.joint - 1 :].sum()), pull
 
 
 def _centres(forward: ForwardPass, loads: Loads) -> list[Float[AnyArray, "... 3 N"]]:
