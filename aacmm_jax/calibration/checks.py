@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from ..core._compat import inside_trace
+from ..core.arguments import shown
 from ..core.arrays import is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import AnyArray
@@ -82,6 +83,17 @@ def check_identifiable(capture: Capture, bounds: Bounds, prior: Prior | None, st
         raise InputError(" ".join(lost))
     for sentence in sentences:
         warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
+
+
+def check_method(method: str, general: bool) -> None:
+    """Refuse an unknown method, and two stages where observations are ``general``: more than sockets and lengths."""
+    if not isinstance(method, str) or method not in ("two-stage", "joint"):
+        raise InputError(f"method is {shown(method)}; it must be 'two-stage' or 'joint'.")
+    if method == "two-stage" and general:
+        raise InputError(
+            "method='two-stage' is for sockets with reference lengths, without a robust loss or a prior; use "
+            "method='joint'."
+        )
 
 
 def check_noise_model(noise_model: NoiseModel | None, noise: Noise | None, joints: int) -> NoiseModel:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..core._compat import inside_trace
-from ..core.arguments import check_finite, checked_arguments, shown
+from ..core.arguments import check_finite, checked_arguments
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
@@ -27,7 +27,7 @@ from ..uncertainty import propagation, scale_uncertainty
 from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
 from .bounded_fit import Fit, fit
-from .checks import check_enough, check_identifiable, check_noise_model, check_single, check_start
+from .checks import check_enough, check_identifiable, check_method, check_noise_model, check_single, check_start
 from .encoder_noise import with_noise_by_joint
 from .joint_model import with_joint_model
 from .observed import calibrate_observed, identify_observed
@@ -200,13 +200,7 @@ def calibrate(
     by_slides = scale_from_slides(arm, capture, bounds.space, noise)
     general = bool(capture.observations) or robust is not None or prior is not None or by_slides
     method = default_method(arm, general) if method is None else method
-    if not isinstance(method, str) or method not in ("two-stage", "joint"):
-        raise InputError(f"method is {shown(method)}; it must be 'two-stage' or 'joint'.")
-    if method == "two-stage" and general:
-        raise InputError(
-            "method='two-stage' is for sockets with reference lengths, without a robust loss or a prior; use "
-            "method='joint'."
-        )
+    check_method(method, general)
     if not capture.lengths and not by_slides and not any(one.fixes_scale for one in capture.observations):
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, "
