@@ -231,6 +231,18 @@ def _noisy_joint(record: CalibrationRecord, equations: _Equations) -> tuple[Nois
     return equations.tests(every), equations
 
 
+def _noisy_within_observations(equations: _Equations, joint: int) -> bool:
+    """Whether a joint (from 1) is noisy even where its zero may differ from one observation to the next.
+
+    A zero that is off in some of them, as after a slip, moves all of their poses alike: these contradict the others,
+    and that is what has to be said.
+    """
+    own = [np.concatenate([each.own, each.extra[..., [joint - 1]]], axis=2) for each in equations.rows]
+    rows = [each._replace(own=columns) for each, columns in zip(equations.rows, own, strict=True)]
+    found = equations._replace(rows=rows).tests([joint - 1])
+    return found is not None and found.probability < LEVEL
+
+
 def noise_by_joint(record: CalibrationRecord) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
     """The noise of a calibration with that of noisy encoders as the residuals show it; None where there are none.
 
@@ -249,6 +261,8 @@ def noise_by_joint(record: CalibrationRecord) -> tuple[Noise, tuple[NoisyEncoder
     given, joints = record.given_noise is not None, len(equations.unit)
     noisy, probabilities, u = [], [], np.zeros(0)
     found, now = _noisy_joint(record, equations)
+    if found is not None and found.probability < LEVEL and not _noisy_within_observations(now, found.joint):
+        return None
     while found is not None and found.probability < LEVEL and len(noisy) < joints - 1:
         noisy.append(found.joint - 1)
         probabilities.append(found.probability)

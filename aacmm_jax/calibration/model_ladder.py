@@ -28,7 +28,7 @@ from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
 from ..kinematics.prior_scales import default_prior
 from .group_equations import equations_of
 from .joint_model import with_coefficients
-from .log_evidence import log_evidence
+from .model_evidence import log_evidence
 from .record import record_of
 from .results import Calibration
 from .single import calibrate

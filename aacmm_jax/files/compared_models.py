@@ -18,6 +18,7 @@ _MODELS = {
     "rms_outside": ("mm", "RMS error in regions that the model has not seen"),
     "u_outside": ("mm", "standard error of rms_outside, by the scatter of the regions"),
     "ratio": ("1", "mean of (error / predicted standard deviation)^2 outside"),
+    "log_evidence": ("1", "log of the evidence, but for what all models have in common"),
     "difference": ("mm2", "mean square outside less that of the best model"),
     "u_difference": ("mm2", "standard error of the difference"),
     "cpu_seconds": ("s", "CPU time"),

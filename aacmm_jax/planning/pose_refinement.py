@@ -125,7 +125,7 @@ def _slopes_of_errors(arm: Arm, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray
     geometry = to_numpy(arm.geometry)
 
     def errors(readings: np.ndarray) -> np.ndarray:
-        return np.asarray(joint_errors(geometry, joint_motion(geometry, readings)))[:, 0].T
+        return np.asarray(joint_errors(geometry, joint_motion(geometry, readings))[0])[:, 0].T
 
     return np.moveaxis(_by_readings(arm, q, errors), 0, 2)
 

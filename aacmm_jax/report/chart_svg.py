@@ -7,6 +7,7 @@ dots keep their size; text stands at percentages. Colours are those of the page'
 import html
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -71,7 +72,7 @@ def _text(words: object) -> str:
     return html.escape(str(words))
 
 
-def _positions(plot: Plot, x: object, y: object) -> tuple[np.ndarray, np.ndarray]:
+def _positions(plot: Plot, x: object, y: object) -> tuple[Any, Any]:
     return 1000 * plot.x.at(x), 1000 * (1 - plot.y.at(y))
 
 

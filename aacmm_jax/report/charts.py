@@ -47,7 +47,7 @@ class Axis(NamedTuple):
         """Whether names have no room side by side."""
         return self.named and sum(len(words) + 2 for _, words in self.ticks) > 40
 
-    def at(self, values: Any) -> np.ndarray:
+    def at(self, values: Any) -> Any:
         """Positions as fractions of the axis; NaN for what has none on a logarithmic one."""
         values, low, high = np.asarray(values, dtype=float), self.low, self.high
         if self.log:

@@ -540,7 +540,10 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
         (('unit = "um"', 'unit = "um"\ncolumns = [1, 1, 2]'), "1 is given twice"),
         (("reach = 1000", "reech = 1000"), "did you mean 'reach'"),
         (("shoulder = [0, 0, 0]", ""), "reach and shoulder together"),
-        (('name = "{end}"', 'name = "{end}"\ntarget = "ball"'), "target and session are for manifests of poses"),
+        (
+            ('name = "{end}"', 'name = "{end}"\ntarget = "ball"'),
+            "target, session and temperature_C are for",
+        ),
     ],
 )
 def test_wrong_manifests_of_points(tmp_path, change, said):
@@ -651,7 +654,7 @@ def test_an_evaluation_of_points_is_stored_whole(tmp_path):
     assert again.acceptance() == record.acceptance()
     assert (again.limits, again.u_test, again.measured.measured) == (record.limits, record.u_test, "2026-01-31")
     written = aj.report.write_report(tmp_path / "points.h5", tmp_path / "points.html")
-    assert written["verdict"].startswith("Every limit is kept")
+    assert written["verdict"].startswith("Conforms: every limit is kept")
 
 
 def test_bars_at_hand_are_planned_for(cheng):

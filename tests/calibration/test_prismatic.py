@@ -40,9 +40,13 @@ def errors_in_u(result, space: aj.Parameters, true: aj.Arm) -> np.ndarray:
 
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["estimated", "given"])
 def test_the_truth_is_recovered_within_its_uncertainty(problem, noise):
-    """By the default method, which is the joint solve: slides and lengths fix the scale together."""
+    """By the default method, which is the joint solve: slides and lengths fix the scale together.
+
+    Without what tests of the residuals add, which by chance they do in some captures without any fault.
+    """
     _, space, true, capture = problem
-    result = aj.calibrate(space.base, capture, aj.Bounds.around(space.base, space), noise=noise)
+    options = {"replace_noise": False, "shared_errors": False}
+    result = aj.calibrate(space.base, capture, aj.Bounds.around(space.base, space), noise=noise, **options)
     assert result.method == "joint"
     assert result.converged
     errors = errors_in_u(result, space, true)

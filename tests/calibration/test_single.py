@@ -136,16 +136,6 @@ def test_metrics_by_hand():
     np.testing.assert_allclose(figures.centroids, [[1, 2, 0], [7, 7, 7]])
 
 
-def test_a_record_evaluates_each_of_its_arms_once(paper_arm, noisy_capture, bounds):
-    nominal = aj.kinematics.ArmSpecification(paper_arm, "test")
-    result = aj.calibrate(paper_arm, noisy_capture, bounds)
-    record = aj.calibration.record_of(result, aj.Recording(noisy_capture, nominal))
-    first, again = record.evaluations(), record.evaluations()
-    assert all(again[stage] is evaluation for stage, evaluation in first.items())
-    other = record._replace(calibrated=nominal._replace(arm=paper_arm.replace(a_2=70.0))).evaluations()
-    assert float(other["calibrated"].repeatability.rms) > 10 * float(first["calibrated"].repeatability.rms)
-
-
 @pytest.mark.slow  # tests/core/test_numpy_or_jax.py compares whole calibrations
 def test_identify_under_vmap_equals_single_runs(paper_arm, noisy_capture, bounds, space):
     starts = jnp.stack([space.vector() + shift * space.scale for shift in (-2.0, 0.5, 3.0)])

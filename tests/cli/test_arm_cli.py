@@ -104,7 +104,7 @@ def test_what_is_found_corrects_the_manifest(aacmm, tmp_path, few):
     # The arm is known to about a degree, and its mirror image is as good.
     evaluated = json.loads(aacmm("arm", "cheng2018-simulation", "--check", "m.toml", "--json").stdout)
     assert evaluated["fits"]
-    assert corrected.joints == 6
+    assert corrected.columns == 6
 
 
 def test_readings_that_nothing_explains(aacmm, tmp_path, few):

