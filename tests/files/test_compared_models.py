@@ -17,8 +17,8 @@ def row(model, inside, outside, ratio):
     ]
     return {
         "model": model, "parameters": 23, "effective_parameters": 22.5, "rms_inside": inside, "rms_outside": outside,
-        "u_outside": 0.03, "ratio": ratio, "log_evidence": 3.0, "difference": 0.01, "u_difference": 0.02, "converged": model == "dh",
-        "cpu_seconds": 1.5, "regions": regions,
+        "u_outside": 0.03, "ratio": ratio, "log_evidence": 3.0, "difference": 0.01, "u_difference": 0.02,
+        "converged": model == "dh", "cpu_seconds": 1.5, "regions": regions,
     }  # fmt: skip
 
 
