@@ -30,7 +30,7 @@ from ..data.recording import Recording
 from ..kinematics.parameters import ArmSpecification
 from ..uncertainty.group_test import Block
 from ..uncertainty.residual_tests import LEVEL, Residuals, chance_above_zero
-from .group_equations import Rows, equations_in_chunks
+from .group_equations import EXACT, Rows, equations_in_chunks, residual_rms
 from .missing_terms import found_terms
 from .record import CalibrationRecord, record_of
 from .results import Calibration, Identification, NoisyEncoder
@@ -253,7 +253,7 @@ def noise_by_joint(record: CalibrationRecord) -> tuple[Noise, tuple[NoisyEncoder
         record: The calibration.
     """
     rows, relations = equations_in_chunks(record)
-    if not rows:
+    if not rows or residual_rms(rows) < EXACT:
         return None
     equations = _Equations.of(record, rows, relations)
     if equations.left().degrees_of_freedom < _FEWEST:

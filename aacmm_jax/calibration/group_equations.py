@@ -20,6 +20,7 @@ PROBE = ("probe_x", "probe_y", "probe_z")
 LEAST_U = 1e-6  # mm: smallest standard deviation of a length or certified value
 _MOST_POSES = 2000  # that tests of residuals look at: more would only find errors that do not matter
 _CHUNK = 100  # poses of one observation that are kept together
+EXACT = 1e-6  # mm: smaller residuals are rounding errors of a simulation without noise
 
 
 class Rows(NamedTuple):
@@ -101,6 +102,12 @@ def equations_in_chunks(record: CalibrationRecord) -> tuple[list[Rows], list[Blo
             chunks.append(whole._replace(**{name: getattr(whole, name)[of] for name in Rows._fields if name != "name"}))
     step = -(-sum(len(each.poses) for each in chunks) // _MOST_POSES)
     return chunks[:: max(step, 1)], wider(equations.relations, added)
+
+
+def residual_rms(rows: Sequence[Rows]) -> float:
+    """Root mean square of a coordinate of the residuals, mm."""
+    squares = [np.einsum("mcr,mr->mc", each.in_mm, each.residual).ravel() ** 2 for each in rows]
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
 def wider(relations: Sequence[Block], added: int) -> list[Block]:

@@ -28,7 +28,7 @@ from ..uncertainty.residual_tests import (
     pose_form_test,
 )
 from .encoder_noise import NoisyJoint, noisy_joint
-from .group_equations import Rows, equations_in_chunks
+from .group_equations import EXACT, Rows, equations_in_chunks, residual_rms
 from .length_consistency import Lengths, length_test
 from .missing_terms import MOST_TERMS, FoundTerm, found_terms, with_terms
 from .record import CalibrationRecord, record_of
@@ -38,7 +38,6 @@ from .results import Calibration, Identification
 # G.4.2), so that only an arm whose residuals are over twice as large is outside its class.
 CLASS_DEGREES_OF_FREEDOM = 8.0
 _FEWEST = 6  # degrees of freedom below which residuals say nothing
-_EXACT = 1e-6  # mm: smaller residuals are rounding errors of a simulation without noise
 
 
 class Misfit(NamedTuple):
@@ -124,7 +123,7 @@ def _tests(record: CalibrationRecord, usual: ArmNoise | None) -> ModelTests:
     if left.degrees_of_freedom < _FEWEST:
         return ModelTests()
     lengths = length_test(record, rows, relations, left.degrees_of_freedom)
-    if _rms(rows) < _EXACT:
+    if residual_rms(rows) < EXACT:
         return ModelTests(lengths=lengths)
     arm, q = record.calibrated.arm, np.asarray(record.recording.capture.readings)
     terms = found_terms(arm, q, rows, relations)
@@ -147,11 +146,6 @@ def weighted_by_loss(record: CalibrationRecord) -> bool:
     """Whether a robust loss took weight from poses, so that residuals are smaller than the noise."""
     observed = record.observed
     return observed is not None and any(bool(np.any(np.asarray(weights) < 1)) for weights in observed.weights)
-
-
-def _rms(rows: Sequence[Rows]) -> float:
-    squares = [np.sum(np.einsum("mcr,mr->mc", each.in_mm, each.residual) ** 2, axis=1) for each in rows]
-    return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
 def _misfit(record: CalibrationRecord, left: Residuals, usual: ArmNoise | None) -> Misfit | None:

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..uncertainty.group_test import Block
 from ..uncertainty.residual_tests import Residuals
-from .group_equations import LEAST_U, Rows
+from .group_equations import LEAST_U, Rows, residual_rms
 from .length_consistency import lengths_of_sockets
 from .record import CalibrationRecord
 from .sensitivities import Sensitivities
@@ -113,12 +113,6 @@ def _without_scale(left: Residuals, first: int, by_scale: Float[np.ndarray, " l"
     return left.extended(column) if unknown else left
 
 
-def rms_of(rows: list[Rows]) -> float:
-    """Of a coordinate of the residuals, mm."""
-    residuals = [np.einsum("mcr,mr->mc", each.in_mm, each.residual).ravel() for each in rows]
-    return float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
-
-
 def _with_column(blocks: list[Block], of_rows: np.ndarray, of_lengths: np.ndarray) -> list[Block]:
     """With the scale anchor, which the lengths determine, as one more unknown."""
     parts = np.split(np.concatenate([of_rows, of_lengths]), np.cumsum([len(b.residual) for b in blocks])[:-1])
@@ -127,5 +121,5 @@ def _with_column(blocks: list[Block], of_rows: np.ndarray, of_lengths: np.ndarra
 
 def usual_deviations(problem: SharedProblem) -> tuple[float, float]:
     """Standard deviations of an effect of the tip: below which it is nothing, and above which it is improbable."""
-    scatter = rms_of(problem.rows)
+    scatter = residual_rms(problem.rows)
     return scatter / np.sqrt(np.mean([len(each.poses) for each in problem.rows])), _USUAL * scatter

@@ -37,12 +37,12 @@ from ..uncertainty.shared_errors import (
     second_moments,
 )
 from .drawn_errors import functions_of
-from .group_equations import PRIOR, equations_in_chunks
+from .group_equations import EXACT, PRIOR, equations_in_chunks, residual_rms
 from .model_errors import weighted_by_loss
 from .record import record_of
 from .results import Calibration
 from .sensitivities import Sensitivities
-from .shared_equations import SharedProblem, problem_of_poses, rms_of, usual_deviations, with_lengths
+from .shared_equations import SharedProblem, problem_of_poses, usual_deviations, with_lengths
 
 _GATE = 0.1  # probability of a test below which an effect is looked at
 _MODEL = "gravity,gear,harmonics=1-3"  # functions that joints may follow
@@ -52,7 +52,6 @@ _LENGTHS, _PART = (2.0, 5.0, 15.0), 3
 _MOST_PATTERNS = 8  # of successive poses of one socket: slower ones matter, faster ones are like noise
 _NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are alike
 _FEWEST = 6  # degrees of freedom
-_EXACT = 1e-6  # mm: smaller residuals are rounding errors of a simulation without noise
 
 
 def with_shared_errors(
@@ -92,7 +91,7 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
     if not record.converged or weighted_by_loss(record):
         return None
     rows, relations = equations_in_chunks(record)
-    if not rows or rms_of(rows) < _EXACT:
+    if not rows or residual_rms(rows) < EXACT:
         return None
     of_poses = problem_of_poses(record, rows, [block for block in relations if block.fixture == PRIOR], sensitivities)
     if of_poses.left.degrees_of_freedom < _FEWEST:

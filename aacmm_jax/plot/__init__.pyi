@@ -12,8 +12,8 @@ from .calibration import save_calibration_figure as save_calibration_figure
 from .drift import drift_trend as drift_trend
 from .drift import parameter_trend as parameter_trend
 from .drift import save_drift_trend as save_drift_trend
-from .joint_models import compared_models as compared_models
 from .joint_models import joint_function as joint_function
+from .joint_models import model_comparison as model_comparison
 from .patterns import residual_patterns as residual_patterns
 from .study import save_study_figures as save_study_figures
 from .study import study_convergence as study_convergence

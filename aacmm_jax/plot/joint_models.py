@@ -23,7 +23,7 @@ _BEYOND = 0.15  # of its travel, on either side
 _MRAD = 1e-3
 
 
-def compared_models(found: ComparedModels, axes: Any = None) -> Any:
+def model_comparison(found: ComparedModels, axes: Any = None) -> Any:
     """Plot the errors of compared models inside and outside what they were fitted to, mm.
 
     Bars with the standard error of `ComparedModel.u_outside`; the recommended model is marked.

@@ -36,7 +36,7 @@ def records(capture, compared):
 
 
 def test_bars_of_compared_models(compared):
-    axes = aj.plot.compared_models(compared)
+    axes = aj.plot.model_comparison(compared)
     inside, outside = ([bar.get_height() for bar in bars] for bars in axes.containers if len(bars) == 2 and bars[0])
     assert inside == [model.rms_inside for model in compared.models]
     assert outside == [model.rms_outside for model in compared.models]
