@@ -24,10 +24,10 @@ from ..data.noise import Noise
 from ..data.recording import Recording
 from ..kinematics.arm import DOWN, Arm, without_corrections
 from ..kinematics.corrected_arm import with_corrections
-from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
+from ..kinematics.parameters import ArmSpecification, Bounds
 from ..kinematics.prior_scales import default_prior
 from .group_equations import equations_of
-from .joint_model import with_coefficients
+from .joint_model import default_bounds, with_coefficients
 from .model_evidence import log_evidence
 from .record import record_of
 from .results import Calibration
@@ -138,7 +138,7 @@ def compare_models(
         arm: The nominal arm; corrections that it has are replaced by those of each model.
         capture: Sockets, reference lengths and other observations.
         bounds: Box of the free Denavit-Hartenberg parameters, mm and rad; by default around those of
-            `Parameters.free_of`. Coefficients of corrections are free in each model that has them.
+            those that such data determine. Coefficients of corrections are free in each model that has them.
         models: Models from simple to rich, as for `kinematics.with_corrections`; "dh" is the arm alone. The default
             (`default_models`) takes some ten seconds for 500 poses, most of them for "functions" (harmonics=1-31, 62
             coefficients a joint).
@@ -158,7 +158,7 @@ def compare_models(
     if not named or not all(isinstance(model, str) and model.strip() for model in named):
         raise InputError("models names no model; give some, from simple to rich, such as 'dh' and 'dh,gravity'.")
     plain = without_corrections(arm)
-    bounds = Bounds.around(plain, Parameters.free_of(plain)) if bounds is None else bounds
+    bounds = default_bounds(plain, capture) if bounds is None else bounds
     left_out = regions_of(to_numpy(capture), regions, arm.joints)
 
     def compared(model: str) -> ComparedModel:

@@ -171,7 +171,7 @@ def calibrate(
         arm: as for `identify`, like all arguments that are not named here.
         capture: sockets, and at least one reference length, mm; none is needed where the slides of prismatic joints
             determine the scale.
-        bounds: box of the free parameters ``(p,)``, mm and rad; by default around those of `Parameters.free_of`.
+        bounds: box of the free parameters ``(p,)``, mm and rad; by default around those that such data determine.
         model: what the joints do besides their readings, as on the command line: "gravity,harmonics=1" (see
             `kinematics.with_corrections`). Corrections that the arm has are replaced; all coefficients are free.
         method: "two-stage" or "joint"; by default two-stage, but joint where the capture has observations besides
@@ -196,7 +196,7 @@ def calibrate(
     Raises:
         InputError: as `identify` does, and without a reference length.
     """
-    arm, bounds, prior = with_joint_model(arm, bounds, model, prior)
+    arm, bounds, prior = with_joint_model(arm, capture, bounds, model, prior)
     by_slides = scale_from_slides(arm, capture, bounds.space, noise)
     general = bool(capture.observations) or robust is not None or prior is not None or by_slides
     method = default_method(arm, general) if method is None else method

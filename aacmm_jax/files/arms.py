@@ -18,8 +18,8 @@ from ..data.capture import Capture
 from ..kinematics.arm import Arm
 from ..kinematics.axes_to_dh import without_far_frames
 from ..kinematics.independence import nearly_parallel
-from ..kinematics.parameters import ArmSpecification, Parameters, single, with_tool
-from ..uncertainty.target_parameters import independent_of_targets, only_targets
+from ..kinematics.parameters import ArmSpecification, single, with_tool
+from ..uncertainty.target_parameters import determined_parameters
 from .arm_noise import NoiseTable, stated_noise
 from .atomic_write import storable, write_text
 from .corrections import CorrectionsTable, corrections_toml
@@ -353,10 +353,7 @@ def with_parameters(specification: ArmSpecification, capture: Capture | None = N
         capture: What was observed; by default tips in sockets.
     """
     try:
-        if capture is not None and only_targets(capture):
-            space = independent_of_targets(specification.arm, capture)
-        else:
-            space = Parameters.independent(specification.arm)
+        space = determined_parameters(specification.arm, capture)
     except InputError:  # an arm of one or two joints, which has one configuration for each position of the tip
         return specification
     held = tuple(name for name in space.held if not name.startswith("beta_"))

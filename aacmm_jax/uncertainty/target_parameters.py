@@ -18,6 +18,22 @@ def only_targets(capture: Capture) -> bool:
     return not capture.sockets and all(observation.target for observation in capture.observations)
 
 
+def determined_parameters(arm: Arm, capture: Capture | None = None) -> Parameters:
+    """Parameters that are free where nothing is said: `Parameters.independent`, or of targets alone those that these
+    determine.
+
+    Args:
+        arm: The nominal arm, without joint corrections.
+        capture: What was observed; by default tips in sockets.
+
+    Raises:
+        InputError: The arm has one configuration for each position of the tip, as with one or two joints.
+    """
+    if capture is not None and only_targets(capture):
+        return independent_of_targets(arm, capture)
+    return Parameters.independent(arm)
+
+
 def independent_of_targets(arm: Arm, capture: Capture) -> Parameters:
     """`Parameters.independent` for a capture of `only_targets`.
 

@@ -130,10 +130,10 @@ def test_a_model_by_name_is_a_corrected_arm_with_its_prior(paper_arm, space, bou
     assert tight.prior.groups == ("all",)
     plain = aj.calibrate(paper_arm, capture, model="dh", **options)
     assert plain.prior is None
-    assert plain.space.names == aj.Parameters.free_of(paper_arm).names
+    assert plain.space.names == aj.Parameters.independent(paper_arm).names
     for model, message in (("grvity", "did you mean 'gravity'"), (5, "the model is 5; give a text")):
         with pytest.raises(aj.InputError, match=message):
-            unwrap(with_joint_model)(paper_arm, bounds, model, None)
+            unwrap(with_joint_model)(paper_arm, capture, bounds, model, None)
 
 
 def test_placements_are_the_regions_where_there_are_several(paper_arm, space):
