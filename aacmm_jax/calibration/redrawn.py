@@ -69,7 +69,7 @@ def trials_of(result: Calibration, capture: Capture, noise: Noise, u: Float[np.n
         read = noise.of_columns(result.arm.geometry.kinds, result.arm.joints, exact.shape[1])
         readings = exact + read * level * random.normal(size=(count, *exact.shape))
         readings[..., : result.arm.joints] += np.einsum("Nic,tNc->tNi", moves, seats)
-        readings[..., : result.arm.joints] += 0.0 if alike is None else alike.joints
+        readings += 0.0 if alike is None else alike.joints
         lengths = true_lengths + u * random.normal(size=(count, len(u)))
         return batch_of_captures(capture, readings, lengths), coefficients(alike, count)
 

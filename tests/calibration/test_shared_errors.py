@@ -131,7 +131,8 @@ def test_monte_carlo_agrees_with_the_covariance(poses, made):
     assert result.shared is not None
     task = _RepeatedTask.of(result, capture, tuple(q[:20] for q in volume(poses)))
     trials = trials_of(result, capture, result.noise, task.u)
-    values, failed = task.solved(*trials.drawn(500, np.random.default_rng(0), 1.0))
+    captures, coefficients = trials.drawn(500, np.random.default_rng(0), 1.0)
+    values, failed = task.solved(captures, coefficients=coefficients)
     assert failed == 0
     linear = np.asarray(aj.uncertainty_of(result).length(task.start, task.end))
     assert 0.9 < np.median(values[:, -20:].std(axis=0) / linear) < 1.12
