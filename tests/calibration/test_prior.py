@@ -186,9 +186,8 @@ def test_trials_scatter_as_the_posterior_does(paper_arm, true):
     found = calibrate(arm, capture, bounds, prior=prior)
     task = sampling._RepeatedTask.of(found, capture, None)
     trials, random = sampling.trials_of(found, capture, found.noise, task.u), np.random.default_rng(1)
-    values, failed = task.solved(
-        trials.drawn(1200, random, 1.0), task.prior_means(1200, random, np.asarray(found.parameters))
-    )
+    captures, coefficients = trials.drawn(1200, random, 1.0)
+    values, failed = task.solved(captures, task.prior_means(1200, random, np.asarray(found.parameters)), coefficients)
     assert failed == 0
     sampled = task.sampled(found, values, True, failed, 0.95, 1)
     np.testing.assert_allclose(sampled.u, sampled.linear_u, rtol=0.1)
