@@ -3,8 +3,9 @@
 Errors of poses like those that a model was fitted to hardly tell models apart, and a random part of the poses is such.
 Regions exclude each model whose mean square error exceeds that of the best by more than chance explains, region by
 region: what two models have in common (a region that is hard for both) cancels in the difference (Breiman et al. 1984,
-section 3.4.3, with paired differences). Of those left, which predict equally well as far as the regions can tell, the
-simplest is chosen that makes the measurement nearly as probable as the most probable one (`log_evidence`).
+section 3.4.3, with paired differences). A model that is richer than the best has nothing to show for it. Of those left,
+which predict equally well as far as the regions can tell, the simplest is chosen that makes the measurement nearly as
+probable as the most probable one (`log_evidence`).
 """
 
 import time
@@ -94,9 +95,11 @@ class ComparedModels(NamedTuple):
 
     @property
     def as_good(self) -> tuple[ComparedModel, ...]:
-        """Models that the regions cannot tell from the best: by Student's t of the difference, at 5 %."""
+        """The best outside, and simpler ones that the regions cannot tell from it: by Student's t of the difference, at
+        5 %."""
         factor = float(student_quantile(1 - _LEVEL / 2, len(self.models[0].regions) - 1))
-        differences = zip(self.models, self.differences, strict=True)
+        simpler = slice(self.best + 1)
+        differences = zip(self.models[simpler], self.differences[simpler], strict=True)
         return tuple(model for model, (mean, u) in differences if mean <= factor * u)
 
     @property
