@@ -155,7 +155,7 @@ def test_placements_are_the_regions_where_there_are_several(paper_arm, space):
         ([[1.5, 1.6, 13.5], [1.0, 1.0, 13.0], [1.0, 1.0, 13.0]], (50.0, 0.0, 0.0), "b"),
         # Nor one that is richer than the best.
         ([[4.0, 4.1, 4.0], [1.0, 1.0, 1.0], [1.0, 1.1, 1.0]], (0.0, 0.0, 50.0), "b"),
-        # 0.1 on average, with a standard error of 0.06 from three regions: Student's factor is 4.3.
+        # 0.1 on average, with a standard error of 0.06 from three regions: Student's factor is 6.2.
         ([[1.0, 1.1, 13.2], [1.0, 1.0, 13.0], [2.0, 2.0, 14.0]], (0.0, 2.9, 50.0), "a"),
         ([[1.0, 1.1, 13.2], [1.0, 1.0, 13.0], [2.0, 2.0, 14.0]], (0.0, 3.1, 50.0), "b"),
     ],
