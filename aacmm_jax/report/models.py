@@ -43,8 +43,8 @@ def _introduction() -> str:
     return (
         "Each model was calibrated with all poses (inside), and without each region in turn, which it then predicted "
         "(outside). Neighbouring poses err alike, so that only regions that were left out whole show what a model is "
-        "good for elsewhere. The simplest model whose error outside is within one standard error of the best is "
-        "recommended."
+        "good for elsewhere. Of the model that is best outside and simpler ones that the regions cannot tell from it, the "
+        "simplest that makes the measurement about as probable (evidence) is recommended."
     )
 
 
@@ -72,6 +72,7 @@ def _by_model(summary: dict[str, Any]) -> Chart:
 
 
 def _table(models: list[dict[str, Any]]) -> ReportTable:
+    most_probable = max(row["log_evidence"] for row in models)
     rows = [
         [
             text_cell(row["model"]),
@@ -79,6 +80,7 @@ def _table(models: list[dict[str, Any]]) -> ReportTable:
             number_cell(row["effective_parameters"], 1),
             *(number_cell(row[key]) for key in ("rms_inside", "rms_outside", "u_outside")),
             number_cell(row["ratio"], 2),
+            number_cell(row["log_evidence"] - most_probable, 1),
             number_cell(row["cpu_seconds"], 1),
             text_cell("" if row["converged"] else "did not converge", "" if row["converged"] else "unsure"),
         ]
@@ -92,10 +94,15 @@ def _table(models: list[dict[str, Any]]) -> ReportTable:
         "outside [mm]",
         "u of it [mm]",
         "ratio",
+        "evidence",
         "CPU [s]",
         "",
     )
-    return ReportTable("Models; ratio: mean of (error / predicted standard deviation)² outside", columns, rows)
+    caption = (
+        "Models; ratio: mean of (error / predicted standard deviation)² outside; evidence: its logarithm, less that of "
+        "the most probable model"
+    )
+    return ReportTable(caption, columns, rows)
 
 
 def _by_region(summary: dict[str, Any]) -> Chart:
