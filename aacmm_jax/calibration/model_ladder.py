@@ -95,8 +95,10 @@ class ComparedModels(NamedTuple):
 
     @property
     def as_good(self) -> tuple[ComparedModel, ...]:
-        """The best outside, and simpler ones that the regions cannot tell from it: by Student's t of the differences, at
-        5 % for all of them together (Bonferroni), since the best is the one that chance favoured most."""
+        """The best outside, and simpler ones that the regions cannot tell from it.
+
+        By Student's t of the differences, at 5 % for all together (Bonferroni): the best is what chance favoured most.
+        """
         level = _LEVEL / max(len(self.models) - 1, 1)
         factor = float(student_quantile(1 - level / 2, len(self.models[0].regions) - 1))
         simpler = slice(self.best + 1)

@@ -43,7 +43,7 @@ def _introduction() -> str:
     return (
         "Each model was calibrated with all poses (inside), and without each region in turn, which it then predicted "
         "(outside). Neighbouring poses err alike, so that only regions that were left out whole show what a model is "
-        "good for elsewhere. Of the model that is best outside and simpler ones that the regions cannot tell from it, the "
+        "good for elsewhere. Of the model that is best outside, and simpler ones that regions cannot tell from it, the "
         "simplest that makes the measurement about as probable (evidence) is recommended."
     )
 
