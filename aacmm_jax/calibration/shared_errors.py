@@ -62,7 +62,7 @@ def with_shared_errors(
     What is left of an estimated noise is that of single poses. The covariance by the noise of all stays: where chance
     looks like shared errors, intervals do not become narrower.
     """
-    if inside_trace() or not is_concrete(*jax.tree.leaves((result, capture))):
+    if inside_trace() or not is_concrete(*jax.tree.leaves((result, capture))) or result.implausible_residual:
         return result
     with np.errstate(all="ignore"):
         found = _found(to_numpy(result), to_numpy(capture), sensitivities)

@@ -207,10 +207,10 @@ class SharedColumns(NamedTuple):
 @lru_cache(maxsize=32)
 def shared_columns(functions: KnownFunctions | None, indices: tuple[tuple[str, int], ...]) -> SharedColumns:
     """How the columns of some parameters follow from fewer, for an arm with these corrections."""
-    of_functions = np.array([kind == "coefficients" for kind, _ in indices], dtype=bool)
-    wanted = indices
-    if functions is not None:
-        wanted = [("q", int(functions.moved[i])) if kind == "coefficients" else (kind, i) for kind, i in indices]
+    # Thermal expansion moves no joint (-1): its column is its own.
+    moved = [-1 if functions is None or kind != "coefficients" else int(functions.moved[i]) for kind, i in indices]
+    of_functions = np.array(moved, dtype=int) >= 0
+    wanted = [("q", joint) if joint >= 0 else one for joint, one in zip(moved, indices, strict=True)]
     few = {one: place for place, one in enumerate(dict.fromkeys(wanted))}
     own, coefficients = np.flatnonzero(~of_functions), np.flatnonzero(of_functions)
     order = np.argsort(np.concatenate([own, coefficients]))
