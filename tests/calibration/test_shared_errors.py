@@ -1,5 +1,7 @@
 """Errors that poses share are found, and widen the uncertainty; clean calibrations stay as they are."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -94,6 +96,26 @@ def test_errors_are_found_with_their_size_and_cover_lengths(poses, method, made,
     # All lengths of one capture err together where places shift.
     assert np.mean(inside[True]) > (0.6 if kind == "places" else 0.85)
     assert np.mean(inside[False]) < np.mean(inside[True]) - 0.1
+
+
+def test_two_stages_leave_the_noise_of_single_poses_as_one_least_squares_does():
+    # Every length of the Panda is free: a shorter anchor would take all residuals away, with them noise and moments,
+    # where lengths say little of the scale.
+    specification = aj.files.load_specification("panda")
+    bounds = specification.bounds()
+    true = aj.perturbed_arm(bounds.space, length=0.5, angle=np.deg2rad(0.05), seed=1)
+    exact = {name: np.asarray(q) for name, q in aj.simulate(true, PLACES, poses=POSES, seed=1).sockets.items()}
+    made = specification, bounds, true, exact
+    capture = captured(made, 1, shift=0.02, marked=True, error=eccentric)
+    vague = [aj.ReferenceLength(one.start, one.end, one.value, 0.5) for one in capture.lengths]
+    capture = aj.Capture(capture.sockets, vague, visits={name: np.arange(POSES) // VISIT for name in exact})
+    stages, joint = (calibrated(made, capture, method, noise=None) for method in ("two-stage", "joint"))
+    noise = stages.parameter_covariance.noise
+    assert 0.003 < float(np.hypot(noise.seating, 500 * np.mean(np.asarray(noise.encoder)))) < 0.03
+    assert stages.shared.kinds == joint.shared.kinds
+    assert not any("too small" in text for text in aj.warnings_of(stages, capture))
+    assert any("too small" in text for text in aj.warnings_of(dataclasses.replace(stages, shared=None), capture))
+    np.testing.assert_allclose(np.diag(stages.shared.moments), np.diag(joint.shared.moments), rtol=0.5)
 
 
 def test_clean_calibrations_keep_their_covariance(poses):
