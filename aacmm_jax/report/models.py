@@ -43,8 +43,9 @@ def _introduction() -> str:
     return (
         "Each model was calibrated with all poses (inside), and without each region in turn, which it then predicted "
         "(outside). Neighbouring poses err alike, so that only regions that were left out whole show what a model is "
-        "good for elsewhere. The simplest model whose error outside is within one standard error of the best is "
-        "recommended."
+        "good for elsewhere. Recommended is the model with the smallest error outside, or a simpler one that the "
+        "regions cannot tell from it (Student's t of the differences, 5 %): the simplest whose log evidence is within "
+        "3 of the largest among these."
     )
 
 
