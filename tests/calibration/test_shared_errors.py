@@ -10,6 +10,7 @@ import aacmm_jax as aj
 from aacmm_jax.calibration.redrawn import trials_of
 from aacmm_jax.calibration.sampling import _RepeatedTask
 from aacmm_jax.calibration.shared_errors import missing_functions, with_shared_errors
+from aacmm_jax.data.arm_classes import ArmNoise
 from aacmm_jax.kinematics.corrected_arm import with_further_corrections
 from aacmm_jax.kinematics.prior_scales import default_prior
 from aacmm_jax.summaries.calibration import shared_rows, shared_sentence
@@ -201,10 +202,16 @@ def test_errors_of_places_are_the_same_from_observations(poses):
 
 def test_a_file_keeps_them(poses, tmp_path):
     capture = captured(poses, 0, error=eccentric, shift=0.02, marked=True)
-    record = aj.calibration.record_of(calibrated(poses, capture), aj.Recording(capture, poses[0]))
+    usual = ArmNoise("robot", aj.Noise(encoder_arcsec=7.0, seating=0.03), "data sheet")
+    recording = aj.Recording(capture, poses[0], usual=usual)
+    record = aj.calibration.record_of(calibrated(poses, capture), recording)
     assert record.shared is not None
     aj.files.save_calibration(tmp_path / "calibration.h5", record)
     loaded = aj.files.load_calibration(tmp_path / "calibration.h5")
+    # Not that of the calibration, which is in the same file.
+    assert loaded.recording.usual is not None
+    assert float(loaded.recording.usual.noise.seating) == 0.03
+    assert float(np.asarray(loaded.recording.usual.noise.encoder_arcsec)) == pytest.approx(7.0)
     assert loaded.recording.capture.visits == capture.visits
     for one, other in zip(jax.tree.leaves(record.shared), jax.tree.leaves(loaded.shared), strict=True):
         np.testing.assert_array_equal(one, other)
