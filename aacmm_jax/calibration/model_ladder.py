@@ -36,9 +36,7 @@ from .single import calibrate
 from .unseen_regions import Region, UnseenRegion, regions_of, unseen_regions
 
 _LEVEL = 0.05  # of the test by regions
-_EVIDENCE = (
-    3.0  # of a log evidence, up to which the evidence is "not worth more than a bare mention" (Kass and Raftery)
-)
+_EVIDENCE = 3.0  # of a log evidence: 20 times as probable, from which evidence is "strong" (Kass and Raftery)
 DEFAULT_MODELS = ("dh", "gravity", "harmonics=1", "gravity,harmonics=1", "functions", "gravity,functions")
 
 
@@ -143,8 +141,8 @@ def compare_models(
     Args:
         arm: The nominal arm; corrections that it has are replaced by those of each model.
         capture: Sockets, reference lengths and other observations.
-        bounds: Box of the free Denavit-Hartenberg parameters, mm and rad; by default around those of
-            those that such data determine. Coefficients of corrections are free in each model that has them.
+        bounds: Box of the free Denavit-Hartenberg parameters, mm and rad; by default around those
+            that such data determine. Coefficients of corrections are free in each model that has them.
         models: Models from simple to rich, as for `kinematics.with_corrections`; "dh" is the arm alone. The default
             (`default_models`) takes some ten seconds for 500 poses, most of them for "functions" (harmonics=1-31, 62
             coefficients a joint).

@@ -96,7 +96,11 @@ def with_lengths(problem: SharedProblem, relations: list[Block]) -> SharedProble
     residual, shared = whitening @ related.relations.residual, whitening @ related.relations.shared
     blocks.append(related.relations._replace(residual=residual, shared=shared))
     if related.scale is not None:
-        blocks = _with_column(blocks, related.scale[0], whitening @ related.scale[1])
+        # Residuals are in proportion to the arm: where every length is free, a shorter scale anchor, and all else in
+        # proportion, takes them away. That is no error of the anchor, so its column is taken at right angles to them.
+        of_rows, r = related.scale[0], problem.left.values[: len(related.scale[0])]
+        of_rows = of_rows - r * (r @ of_rows) / max(float(r @ r), 1e-300)
+        blocks = _with_column(blocks, of_rows, whitening @ related.scale[1])
     left = _without_scale(Residuals.of(blocks), sum(map(_size, rows)), whitening @ values)
     return problem._replace(left=left, lengths=whitening)
 

@@ -105,7 +105,9 @@ def _usual_of(attributes: Mapping[str, Any]) -> ArmNoise | None:
     """What `_attributes_of_usual` wrote; earlier files have none."""
     if "usual_class" not in attributes:
         return None
-    noise = noise_of_attributes({name.removeprefix("usual_"): value for name, value in attributes.items()})
+    # A calibration has a noise of its own beside it.
+    own = {name.removeprefix("usual_"): value for name, value in attributes.items() if name.startswith("usual_")}
+    noise = noise_of_attributes(own)
     return ArmNoise(attributes["usual_class"], noise, attributes.get("usual_source", ""))
 
 

@@ -11,6 +11,7 @@ from ..calibration.record import REPEATABILITY
 from ..calibration.results import NoisyEncoder
 from ..core.text import shorten
 from ..core.units import ARCSEC
+from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
 
 # What residuals follow, of joint {i}; what causes that; and the model that has such a term.
 _TERMS: dict[str, tuple[str, str, str]] = {
@@ -28,11 +29,13 @@ _FAR_MORE = 100.0  # ratio of noise beyond which the number says nothing
 _MODEL_OPTION = "--model dh,"  # of the command line, which takes further terms into the model
 
 
-def sentences_of_tests(tests: ModelTests, method: str = "") -> list[str]:
-    """What the tests of a calibration found, the most serious first; ``method`` is that of the calibration."""
+def sentences_of_tests(tests: ModelTests, method: str = "", shared: SharedErrors | None = None) -> list[str]:
+    """What the tests of a calibration found, the most serious first; ``method`` is that of the calibration, and
+    ``shared`` what its uncertainty contains of such errors."""
     found = []
+    kinds = set() if shared is None else set(shared.kinds)
     if tests.terms:
-        found.append(_terms(tests.terms))
+        found.append(_terms(tests.terms, bool(kinds - {PLACES, VISITS, SUCCESSIVE})))
     if tests.misfit is not None and tests.misfit.probability < LEVEL:
         found.append(_misfit(tests.misfit))
     if tests.noisy_joint is not None and tests.noisy_joint.probability < LEVEL:
@@ -45,7 +48,12 @@ def sentences_of_tests(tests: ModelTests, method: str = "") -> list[str]:
         found.append(
             f"Residuals of successive poses are alike (correlation {tests.successive.correlation:.2f}, "
             f"{_chance(tests.successive.probability)}): a seat that shifts at each visit, or errors that the model "
-            "lacks. Such poses count as independent, so every u is too small."
+            "lacks. "
+            + (
+                "Every u contains what they share, as far as residuals show it."
+                if kinds & {VISITS, SUCCESSIVE}
+                else "Such poses count as independent, so every u is too small."
+            )
         )
     if tests.noisy_observations:
         named = [f"{one.name} ({math.sqrt(max(one.test.ratio, 0)):.2g} times)" for one in tests.noisy_observations]
@@ -94,7 +102,7 @@ def noisy_encoder_rows(encoders: Sequence[NoisyEncoder], slides: Collection[int]
     return rows
 
 
-def _terms(terms: tuple[FoundTerm, ...]) -> str:
+def _terms(terms: tuple[FoundTerm, ...], in_uncertainty: bool) -> str:
     named = [f"{_TERMS[term.kind][0].format(i=term.joint)} ({_amplitude(term)})" for term in terms]
     kinds = dict.fromkeys(term.kind for term in terms)
     options = list(dict.fromkeys(_TERMS[kind][2] for kind in kinds if _TERMS[kind][2]))
@@ -106,7 +114,11 @@ def _terms(terms: tuple[FoundTerm, ...]) -> str:
         f"Residuals follow {shorten(named, 3)} ({_chance(max(term.probability for term in terms))}), which the model "
         f"lacks: {', '.join(_TERMS[kind][1] for kind in kinds)}{hint}. "
         + (f"As good an explanation: {shorten(as_well, 3)}. " if as_well else "")
-        + "Every u is too small."
+        + (
+            "Every u contains such errors, as far as residuals show them."
+            if in_uncertainty
+            else "Every u is too small."
+        )
     )
 
 

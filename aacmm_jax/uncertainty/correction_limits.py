@@ -92,8 +92,8 @@ def _cause(arm: Arm, q: Float[np.ndarray, "N n"], term: Term, names: tuple[str, 
         return "zero"
     offset = ("d" if term.joint in arm.prismatic else "theta") + f"_{term.joint}"
     gear = f"{GearRatio().words[0]}_{term.joint}"
-    constant, straight = [np.ones(len(q))], [np.ones(len(q)), q[:, term.joint - 1]]
     reading = q[:, term.joint - 1]
+    constant, straight = [np.ones(len(q))], [np.ones(len(q)), reading]
     harmonics = [wave(reading) for word, wave in (("cos", np.cos), ("sin", np.sin)) if f"{word}1_{term.joint}" in names]
     lines = [here] if term.name != gear else harmonics
     if offset in names and _left(here, constant) < _NEARLY * size:

@@ -1,5 +1,7 @@
 """Errors that poses share are found, and widen the uncertainty; clean calibrations stay as they are."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import aacmm_jax as aj
 from aacmm_jax.calibration.redrawn import trials_of
 from aacmm_jax.calibration.sampling import _RepeatedTask
 from aacmm_jax.calibration.shared_errors import missing_functions, with_shared_errors
+from aacmm_jax.data.arm_classes import ArmNoise
 from aacmm_jax.kinematics.corrected_arm import with_further_corrections
 from aacmm_jax.kinematics.prior_scales import default_prior
 from aacmm_jax.summaries.calibration import shared_rows, shared_sentence
@@ -96,6 +99,26 @@ def test_errors_are_found_with_their_size_and_cover_lengths(poses, method, made,
     assert np.mean(inside[False]) < np.mean(inside[True]) - 0.1
 
 
+def test_two_stages_leave_the_noise_of_single_poses_as_one_least_squares_does():
+    # Every length of the Panda is free: a shorter anchor would take all residuals away, with them noise and moments,
+    # where lengths say little of the scale.
+    specification = aj.files.load_specification("panda")
+    bounds = specification.bounds()
+    true = aj.perturbed_arm(bounds.space, length=0.5, angle=np.deg2rad(0.05), seed=1)
+    exact = {name: np.asarray(q) for name, q in aj.simulate(true, PLACES, poses=POSES, seed=1).sockets.items()}
+    made = specification, bounds, true, exact
+    capture = captured(made, 1, shift=0.02, marked=True, error=eccentric)
+    vague = [aj.ReferenceLength(one.start, one.end, one.value, 0.5) for one in capture.lengths]
+    capture = aj.Capture(capture.sockets, vague, visits={name: np.arange(POSES) // VISIT for name in exact})
+    stages, joint = (calibrated(made, capture, method, noise=None) for method in ("two-stage", "joint"))
+    noise = stages.parameter_covariance.noise
+    assert 0.003 < float(np.hypot(noise.seating, 500 * np.mean(np.asarray(noise.encoder)))) < 0.03
+    assert stages.shared.kinds == joint.shared.kinds
+    assert not any("too small" in text for text in aj.warnings_of(stages, capture))
+    assert any("too small" in text for text in aj.warnings_of(dataclasses.replace(stages, shared=None), capture))
+    np.testing.assert_allclose(np.diag(stages.shared.moments), np.diag(joint.shared.moments), rtol=0.5)
+
+
 def test_clean_calibrations_keep_their_covariance(poses):
     capture = captured(poses, 6)
     for method in ("two-stage", "joint"):
@@ -179,10 +202,16 @@ def test_errors_of_places_are_the_same_from_observations(poses):
 
 def test_a_file_keeps_them(poses, tmp_path):
     capture = captured(poses, 0, error=eccentric, shift=0.02, marked=True)
-    record = aj.calibration.record_of(calibrated(poses, capture), aj.Recording(capture, poses[0]))
+    usual = ArmNoise("robot", aj.Noise(encoder_arcsec=7.0, seating=0.03), "data sheet")
+    recording = aj.Recording(capture, poses[0], usual=usual)
+    record = aj.calibration.record_of(calibrated(poses, capture), recording)
     assert record.shared is not None
     aj.files.save_calibration(tmp_path / "calibration.h5", record)
     loaded = aj.files.load_calibration(tmp_path / "calibration.h5")
+    # Not that of the calibration, which is in the same file.
+    assert loaded.recording.usual is not None
+    assert float(loaded.recording.usual.noise.seating) == 0.03
+    assert float(np.asarray(loaded.recording.usual.noise.encoder_arcsec)) == pytest.approx(7.0)
     assert loaded.recording.capture.visits == capture.visits
     for one, other in zip(jax.tree.leaves(record.shared), jax.tree.leaves(loaded.shared), strict=True):
         np.testing.assert_array_equal(one, other)

@@ -123,6 +123,12 @@ def test_moment_of_gravity():
     np.testing.assert_allclose(found, -0.4 * np.cos(np.radians(30)), rtol=1e-12)
 
 
+def test_no_poses_have_no_tips():
+    # As the sockets of a capture that a tracker measured, in its report.
+    arm = with_corrections(aj.load_arm("ur10"), "gravity,gear,harmonics=1")
+    assert arm.position(np.zeros((0, 6))).shape == (0, 3)
+
+
 def test_functions_of_the_readings():
     arm = aj.Arm(alpha=[0.3, 0.2, 0.1], a=[100.0, 200.0, 50.0], d=[10.0, 20.0, 30.0])
     q = readings(arm)

@@ -59,7 +59,8 @@ class Gravity(AbstractCorrection):
         weight = np.array(weights).reshape(-1, *(1,) * forward.tip.ndim)
         lever = xp.stack(points) - weight * forward.origin_before[joints]
         moments = xp.moveaxis(_METRE * cross(forward.z_before[joints], lever), -2, 1)
-        return moments.reshape(-1, *moments.shape[2:])[..., None, :]
+        count = moments.shape[0] * moments.shape[1]  # a -1 is undetermined where there are no poses
+        return moments.reshape(count, *moments.shape[2:])[..., None, :]
 
 
 def _pull(term: Term, forward: ForwardPass) -> tuple[float, Float[AnyArray, "... 3 N"]]:
