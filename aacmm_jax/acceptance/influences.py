@@ -10,6 +10,7 @@ from ..core.text import number
 
 REFERENCE_TEMPERATURE = 20.0  # C (ISO 1)
 _LARGEST_COEFFICIENT, _TEMPERATURES = 1e-3, (-100.0, 200.0)  # 1/K; C: what no test is beyond
+_SMALLEST_GIVEN = 1e-3  # 1e-6/K: less than any body expands by
 _EXPANSION = re.compile(r"\s*(?P<of>artefact|arm)\s*=(?P<numbers>[^=]*)")
 
 
@@ -77,6 +78,8 @@ def read_expansions(texts: Sequence[str]) -> dict[str, Expansion]:
                 f"--expansion '{text}' is not artefact=C,u,T,u or arm=C,u,T,u with C in 1e-6/K and T in C; for example "
                 "artefact=11.5,1,20.8,0.2."
             )
+        if 0 < abs(values[0]) < _SMALLEST_GIVEN:
+            raise InputError(f"--expansion '{text}' gives the coefficient in 1/K; give it in 1e-6/K, 11.5 for steel.")
         if match["of"] in found:
             raise InputError(f"--expansion gives the {match['of']} two expansions; give it one.")
         found[match["of"]] = checked_expansion(Expansion(1e-6 * values[0], 1e-6 * values[1], *values[2:]), match["of"])
@@ -87,7 +90,10 @@ def checked_expansion(body: Expansion, of: str) -> Expansion:
     """The same expansion, or `InputError` where no body has it."""
     low, high = _TEMPERATURES
     if not (abs(body.coefficient) <= _LARGEST_COEFFICIENT and 0 <= body.u_coefficient <= _LARGEST_COEFFICIENT):
-        raise InputError(f"the {of} expands by {body.coefficient:g} per K; give a coefficient such as 11.5e-6.")
+        raise InputError(
+            f"the {of} expands by {body.coefficient:g} per K with u = {body.u_coefficient:g}; give a coefficient such "
+            "as 11.5e-6 and a standard uncertainty of zero or more."
+        )
     if not (low <= body.temperature <= high and 0 <= body.u_temperature <= high):
         raise InputError(
             f"the {of} has a temperature of {body.temperature:g} C with u = {body.u_temperature:g}; give both in C."

@@ -55,7 +55,7 @@ def with_coefficients(bounds: Bounds, arm: Arm) -> Bounds:
     kept = [i for i, name in enumerate(bounds.space.names) if name not in correction_names(bounds.space.base)]
     added = tuple(name for name in correction_names(arm) if not name.startswith("gravity_"))
     names = (*(bounds.space.names[i] for i in kept), *added)
-    base = based_on(bounds.space, arm).base
+    base = based_on(Parameters(bounds.space.base, names[: len(kept)]), arm).base
     endless = np.full(len(added), np.inf)
     sides = np.asarray(bounds.lower)[kept], np.asarray(bounds.upper)[kept]
     return Bounds(Parameters(base, names), np.concatenate([sides[0], -endless]), np.concatenate([sides[1], endless]))

@@ -116,6 +116,7 @@ def correct(
 
 def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) -> np.ndarray:
     """The readings, with the temperature of an arm that expands."""
+    from ..data.reference_length import check_temperatures
     from ..files.temperatures import with_temperature
     from ..kinematics.arm import correction_names
     from ..kinematics.corrections.expansion import Expansion
@@ -128,7 +129,10 @@ def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) 
         raise InputError(
             "the arm was calibrated with its thermal expansion; give --temperature, or a column temperature_C."
         )
-    return with_temperature(commanded.q, commanded.temperature, temperature, str(commanded.table.path))
+    q = with_temperature(commanded.q, commanded.temperature, temperature, str(commanded.table.path))
+    where = "--temperature" if commanded.temperature is None else str(commanded.table.path)
+    check_temperatures(where, q[:, calibrated.joints :])
+    return q
 
 
 def _numbers(option: str, text: str, form: str) -> tuple[float, ...]:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError
+from ..core.text import shorten
 from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
@@ -36,10 +37,29 @@ def evaluated(
         )
         found = evaluation_of(record, recording, **of_test, calibration_warnings=_warnings_of(read[0], record))
         summary = with_spinner("Evaluating", lambda: evaluation_summary(found))
+        if not summary["acceptance"]:
+            _refuse_options_of_tests(of_test, measuring_range)
         if output is not None:
             save_evaluation(output, found, summary)
             summary["written"] = str(output)
     return summary
+
+
+def _refuse_options_of_tests(of_test: dict[str, Any], measuring_range: float | None) -> None:
+    """Raise `InputError` where options are given that only acceptance tests have, and none was made."""
+    influences = of_test["influences"]
+    options = {
+        "--rule": of_test["rule"] is not None,
+        "--test-u-mm": of_test["u_test"] > 0 or influences.u_relative > 0,
+        "--expansion": influences.artefact is not None or influences.arm is not None,
+        "--range-mm": measuring_range is not None,
+    }
+    given = [option for option, there in options.items() if there]
+    if given:
+        raise InputError(
+            f"{shorten(given)} is for acceptance tests, of which this capture allows none or none is asked for; name "
+            "them with --acceptance, or leave the option out."
+        )
 
 
 def _warnings_of(file: InputFile, record: Any) -> list[str]:

@@ -214,6 +214,8 @@ def plan(
             raise InputError(
                 "--acceptance has its own sockets and bars; leave out --socket, --sockets, --length and --region."
             )
+        if model is not None:
+            raise InputError("--model is of calibrations; with --acceptance, leave it out.")
         own = (cone_deg, normal, cell, collisions, link_radius_mm, unconstrained)
         if any(own) or retract_mm is not None or tool_axis != "z":
             raise InputError(

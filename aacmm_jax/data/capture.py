@@ -19,12 +19,11 @@ from ..kinematics.arm import Arm
 from .copies import NOTHING_REPEATED, Repeated, check_different, observation_without_copies, without_copies
 from .observations.observation import AbstractObservation, checked_name, checked_readings
 from .observations.socket import Socket
-from .reference_length import ReferenceLength
+from .reference_length import ReferenceLength, check_temperatures
 from .visits import checked_visits, visits_of
 
 # Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
 _MOST_RADIANS = 8 * np.pi
-_TEMPERATURES = (-50.0, 100.0)  # C; room temperatures in kelvins are outside
 
 
 class Capture(eqx.Module):
@@ -91,7 +90,8 @@ class Capture(eqx.Module):
         for where, block in of_all.items():
             if block.shape[-1] != width:
                 raise InputError(
-                    f"{where} has {block.shape[-1]} columns, but {first} has {width}; give one column a joint."
+                    f"{where} has {block.shape[-1]} columns, but {first} has {width}; give one column a joint, "
+                    "and the temperature after them to all or to none."
                 )
         different = {name: without_copies(block) for name, block in blocks.items()}
         counts = {name: block.shape[0] for name, block in blocks.items()}
@@ -366,16 +366,6 @@ def _form(observations: tuple[AbstractObservation, ...]) -> tuple[Any, ...]:
     return structure, tuple(leaf.shape for leaf in leaves)
 
 
-def _check_temperatures(where: str, temperatures: Float[np.ndarray, "..."]) -> None:
-    low, high = _TEMPERATURES
-    wrong = temperatures[(temperatures < low) | (temperatures > high)]
-    if wrong.size:
-        raise InputError(
-            f"{where} has a temperature of {wrong[0]:g} C, which is not between {low:g} and {high:g}; give degrees "
-            "Celsius in the last column."
-        )
-
-
 def check_readings(capture: Capture, arm: Arm) -> None:
     """Raise `InputError` where known readings of an arm's revolute joints look like degrees."""
     angular = np.array([i not in arm.prismatic for i in range(1, arm.joints + 1)])
@@ -383,7 +373,7 @@ def check_readings(capture: Capture, arm: Arm) -> None:
     for where, readings in [*of_sockets, *((f"observation '{one.name}'", one.q) for one in capture.observations)]:
         if not is_concrete(readings) or readings.shape[-1] not in (arm.joints, arm.columns):
             continue
-        _check_temperatures(where, np.asarray(readings)[..., arm.joints :])
+        check_temperatures(where, np.asarray(readings)[..., arm.joints :])
         size = np.where(angular, np.abs(np.asarray(readings)[..., : arm.joints]), 0.0).reshape(-1, arm.joints)
         if size.max() > _MOST_RADIANS:
             row, column = np.argwhere(size == size.max())[0] + 1

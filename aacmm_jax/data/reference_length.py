@@ -10,6 +10,20 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray
 from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
 
+_TEMPERATURES = (-50.0, 100.0)  # C; room temperatures in kelvins are outside
+_LARGEST_EXPANSION = 1e-3  # 1/K: plastics expand by up to 2e-4
+
+
+def check_temperatures(where: str, temperatures: Float[np.ndarray, "..."]) -> None:
+    """Raise `InputError` where temperatures are not in degrees Celsius; ``where`` names what has them."""
+    low, high = _TEMPERATURES
+    wrong = temperatures[~((temperatures >= low) & (temperatures <= high))]
+    if wrong.size:
+        raise InputError(
+            f"{where} has a temperature of {wrong.flat[0]:g} C, which is not between {low:g} and {high:g}; give "
+            "degrees Celsius."
+        )
+
 
 class ReferenceLength(eqx.Module):
     """A physical artefact: the certified distance between two sockets.
@@ -74,8 +88,17 @@ class ReferenceLength(eqx.Module):
             u_temperature: Standard uncertainty of ``temperature``, K.
 
         Raises:
-            InputError: As of a `ReferenceLength`.
+            InputError: As of a `ReferenceLength`; or the temperature is not in C, or the expansion not in 1/K.
         """
+        where = f"reference length '{start}' to '{end}'"
+        check_temperatures(where, np.asarray(temperature, dtype=float))
+        if not (abs(expansion) <= _LARGEST_EXPANSION and 0 <= u_expansion <= _LARGEST_EXPANSION):
+            raise InputError(
+                f"{where} has an expansion of {expansion:g} /K with u = {u_expansion:g} /K, and no artefact expands by "
+                f"more than {_LARGEST_EXPANSION:g} /K; give 1/K, 11.5e-6 for steel."
+            )
+        if not 0 <= u_temperature < np.inf:
+            raise InputError(f"{where} has u_temperature = {u_temperature:g} K; give zero or a positive number.")
         warmer = temperature - REFERENCE_TEMPERATURE
         parts = (u, value * warmer * u_expansion, value * expansion * u_temperature)
         return cls(start, end, value * (1 + expansion * warmer), float(np.linalg.norm(parts)))

@@ -20,6 +20,7 @@ from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture, ReferenceLength
 from .noise import Noise
 from .observations.observation import MOST_POSES, AbstractObservation, AbstractSimulated
+from .reference_length import check_temperatures
 
 
 @checked_arguments
@@ -129,6 +130,7 @@ class _Temperatures:
         self._range = np.asarray(as_floats(REFERENCE_TEMPERATURE if given is None else given, "temperature"))
         if self._range.shape not in ((), (2,)) or np.any(np.diff(np.atleast_1d(self._range)) < 0):
             raise InputError("temperature must be one number, or the lowest and the highest; C.")
+        check_temperatures("the simulation", self._range)
         self._columns, self._random = int(arm.thermometer), np.random.default_rng(seed)
 
     def configurations(

@@ -24,10 +24,10 @@ def checked_visits(visits: Mapping[str, Numbers] | None, blocks: Mapping[str, An
     Raises:
         InputError: A socket is unknown, or its visits are not one whole number a pose.
     """
+    if visits is not None and not isinstance(visits, Mapping):
+        raise InputError("the visits must be a dictionary: {'A': [1, 1, 2, 2]}, one number for each pose of a socket.")
     if not visits:
         return None
-    if not isinstance(visits, Mapping):
-        raise InputError("the visits must be a dictionary: {'A': [1, 1, 2, 2]}, one number for each pose of a socket.")
     found, known = [], 0
     for name in visits:
         if name not in blocks:
@@ -37,7 +37,8 @@ def checked_visits(visits: Mapping[str, Numbers] | None, blocks: Mapping[str, An
             rows = np.full(block.shape[0], UNKNOWN)
         else:
             given = np.asarray(visits[name])
-            if given.shape != block.shape[:1] or not np.all(np.isfinite(given)) or np.any(given != np.round(given)):
+            numbers = given.shape == block.shape[:1] and given.dtype.kind in "iuf"
+            if not numbers or not np.all(np.isfinite(given)) or np.any(given != np.round(given)):
                 raise InputError(
                     f"the visits of socket '{name}' must be {block.shape[0]} whole numbers, one for each of its poses."
                 )

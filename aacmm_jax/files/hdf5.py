@@ -332,9 +332,9 @@ def undamaged(path: str | os.PathLike) -> Iterator[None]:
 
 
 def _check_kind(path: str | os.PathLike, attributes: Mapping[str, Any], kinds: Sequence[str]) -> None:
-    wanted = " or ".join(kinds)
+    wanted = _with_article(" or ".join(kinds))
     if attributes.get("format") != FORMAT:
-        raise InputError(f"{path} is HDF5, but was not written by aacmm; name a {wanted} file.")
+        raise InputError(f"{path} is HDF5, but was not written by aacmm; name {wanted} file.")
     for name in ("kind",) if kinds == (BLOCK,) else ("created", "command", "package_version", "kind"):
         if not isinstance(attributes.get(name), str):
             raise InputError(f"{path} lacks the attribute '{name}'; it is damaged or was edited; make it again.")
@@ -347,8 +347,11 @@ def _check_kind(path: str | os.PathLike, attributes: Mapping[str, Any], kinds: S
         )
     check_sense(path, {"the time of writing is no date": not _is_time(attributes.get("created"))})
     if attributes["kind"] not in kinds:
-        article = "an" if attributes["kind"][:1] in "aeiou" else "a"
-        raise InputError(f"{path} holds {article} {attributes['kind']}; name a {wanted} file.")
+        raise InputError(f"{path} holds {_with_article(attributes['kind'])}; name {wanted} file.")
+
+
+def _with_article(name: str) -> str:
+    return f"{'an' if name[:1] in 'aeiou' else 'a'} {name}"
 
 
 def _is_time(text: str | None) -> bool:

@@ -34,7 +34,7 @@ from .manifest_observations import FIELDS, TABLES, Source, observations
 from .manifest_sessions import in_sessions, session_name
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
-from .temperatures import numbers_and_temperature, with_temperature
+from .temperatures import numbers_and_temperature, with_or_without_temperature, with_temperature
 from .toml import Strict, each_once, read_toml
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -65,6 +65,8 @@ class _Socket(_Files):
             raise ValueError("a socket needs either file or files.")
         if self.files is not None and self.name is None:
             raise ValueError("a socket of several files needs a name.")
+        if self.visits is not None and self.target:
+            raise ValueError("visits are of the arm's own probe; leave out visits of a socket with a target.")
         return self
 
 
@@ -266,7 +268,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         named = {*sessions.values(), *(session for session, _ in observations)} - {""}
         if named:
             remounted = (model.sessions or _Sessions()).probe == "remounted"
-            capture = in_sessions(sessions, sockets, lengths, observations, remounted)
+            capture = in_sessions(sessions, sockets, lengths, observations, remounted, visits)
         elif model.sessions is not None:
             raise InputError("[sessions] is for tables with a session, but there is none; leave it out.")
         else:
@@ -317,7 +319,7 @@ def recorded(
     folder: Path, model: _Recorded, read: Callable[[Path, float | None], np.ndarray]
 ) -> tuple[dict[str, np.ndarray], list[ReferenceLength], tuple[ProbedSphere, ...], dict[str, np.ndarray]]:
     """The sockets, lengths and spheres that a manifest names, each file read by ``read``; and the visits to sockets."""
-    sockets: dict[str, np.ndarray] = {}
+    read, sockets = with_or_without_temperature(read), dict[str, np.ndarray]()
     visits: dict[str, np.ndarray] = {}
     fields: list[dict[str, str]] = []
     for entry in model.socket:

@@ -30,6 +30,7 @@ def in_sessions(
     lengths: Sequence[ReferenceLength],
     observations: Sequence[tuple[str, AbstractObservation]],
     remounted: bool,
+    visits: Mapping[str, np.ndarray],
 ) -> Capture:
     """One capture of all sessions, each but the first with a probe of its own where that was ``remounted``.
 
@@ -41,8 +42,12 @@ def in_sessions(
     if without:
         raise InputError(f"{shorten(without)} has no session, but other tables have; give each one.")
     parts: dict[str, tuple[dict[str, np.ndarray], list[ReferenceLength], list[AbstractObservation]]] = {}
+    known: dict[str, dict[str, np.ndarray]] = {}
     for name, session in named.items():
-        parts.setdefault(session, ({}, [], []))[0][name.removeprefix(f"{session}/")] = sockets[name]
+        own_name = name.removeprefix(f"{session}/")
+        parts.setdefault(session, ({}, [], []))[0][own_name] = sockets[name]
+        if name in visits:
+            known.setdefault(session, {})[own_name] = visits[name]
     for session, observation in observations:
         own = observation
         if isinstance(observation, Socket):
@@ -57,4 +62,6 @@ def in_sessions(
             )
         start, end = (name.removeprefix(f"{both[0]}/") for name in (length.start, length.end))
         parts[both[0]][1].append(ReferenceLength(start, end, length.value, length.u))
-    return join_sessions({session: Capture(*part) for session, part in parts.items()}, own_probe=remounted)
+    return join_sessions(
+        {session: Capture(*part, visits=known.get(session)) for session, part in parts.items()}, own_probe=remounted
+    )

@@ -41,7 +41,7 @@ def residual_patterns(record: CalibrationRecord) -> Any:
     drawn = [
         *(
             (q[:, i] / (1.0 if i + 1 in slides else DEG), found.along_joint[:, i], f"joint {i + 1}", i + 1 in slides)
-            for i in range(q.shape[1])
+            for i in range(record.calibrated.arm.joints)
         ),
         *(
             (order, found.vector[:, i], f"along {name}, in the order of the poses", None)

@@ -35,7 +35,7 @@ def _by_joint(record: CalibrationRecord, found: SignedResiduals) -> Chart:
     q = np.asarray(record.recording.capture.readings)[found.poses]
     slides = record.calibrated.arm.prismatic
     plots = []
-    for joint in range(q.shape[1]):
+    for joint in range(record.calibrated.arm.joints):
         slide = joint + 1 in slides
         x, title = (q[:, joint], "mm") if slide else (q[:, joint] / DEG, "deg")
         plots.append(_plot(x, found.along_joint[:, joint], f"reading of joint {joint + 1} [{title}]", ""))

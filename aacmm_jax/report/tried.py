@@ -71,7 +71,7 @@ def _joints(record: CalibrationRecord, readings: np.ndarray) -> Chart:
     slides = [joint + 1 in arm.prismatic for joint in range(arm.joints)]
     units = np.where(slides, 1.0, DEG)
     limits = np.asarray(joint_limits(arm, None)) / units[:, None]
-    shown = readings / units
+    shown = readings[:, : arm.joints] / units
     chosen = np.linspace(0, len(shown) - 1, min(len(shown), _TIPS)).round().astype(int)
     used = np.array([_share(shown[:, i], limits[i], slides[i]) for i in range(arm.joints)])
     low, high = shown.min(axis=0), shown.max(axis=0)

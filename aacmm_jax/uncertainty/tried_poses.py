@@ -38,7 +38,8 @@ def tried_poses(arm: Arm, calibrated: Numbers, q: Numbers) -> TriedPoses:
 
     Args:
         arm: The arm.
-        calibrated: Readings that it was calibrated with, ``(N, n)``, rad (slides: mm).
+        calibrated: Readings that it was calibrated with, ``(N, n)``, rad (slides: mm). A temperature after
+            them is left out.
         q: Readings of other poses, ``(v, n)``.
 
     Returns:
@@ -47,7 +48,7 @@ def tried_poses(arm: Arm, calibrated: Numbers, q: Numbers) -> TriedPoses:
     Raises:
         InputError: Fewer than two poses were calibrated with.
     """
-    known, other = np.asarray(calibrated, dtype=float), np.asarray(q, dtype=float)
+    known, other = (np.asarray(each, dtype=float)[:, : arm.joints] for each in (calibrated, q))
     if len(known) < 2:
         raise InputError(
             f"{len(known)} pose has no distance from another; give at least two that were calibrated with."

@@ -54,11 +54,35 @@ def test_temperatures(tmp_path, motion):
     np.testing.assert_allclose([found.value, found.u], [500.01725, np.hypot(0.001, np.hypot(0.0015, 0.002875))])
     for text, sentence in (
         (SMALL + "temperature_C = 295.6\n", "temperature of 295.6 C, which is not between"),
-        (SMALL + "temperature_C = 22\n" + SOCKET.replace("a.csv", "b.csv"), "has 6 columns, but"),
+        (
+            SMALL + "temperature_C = 22\n" + SOCKET.replace("a.csv", "b.csv"),
+            "b.csv has no temperatures, but .*a.csv has",
+        ),
         (SMALL.replace("a.csv", "warm.csv") + "temperature_C = 22\n", "is stated besides; give one of them"),
+        (HEAD + ANGLES + '[[socket]]\nname = "A"\nfiles = ["b.csv", "warm.csv"]\n', "b.csv has no temperatures, but"),
+        (HEAD + ANGLES + "columns = [1, 2, 3, 4, 5, 6]\n" + SOCKET.replace("a.csv", "warm.csv"), "column 3 is"),
+        (
+            HEAD + ANGLES + sockets + length.replace("23", "296") + artefact,
+            "temperature of 296 C, which is not between",
+        ),
+        (HEAD + ANGLES + sockets + length + "expansion = 11.5", "expansion of 11.5 /K"),
+        (HEAD + ANGLES + sockets + length + "expansion = 1e-5\nu_expansion = 1", "with u = 1 /K"),
     ):
         with pytest.raises(aj.InputError, match=sentence):
             read(tmp_path, text)
+
+
+def test_visits_of_sessions_and_targets(tmp_path, motion):
+    """Each file is a visit, in sessions too; of a socket with another tip than the probe they are refused."""
+    record(tmp_path / "b.csv", motion + 0.1)
+    record(tmp_path / "c.csv", motion + 0.2)
+    socket = '[[socket]]\nname = "{}"\nfiles = ["a.csv", "b.csv"]\nvisits = "files"\n'
+    other = '[[socket]]\nfile = "c.csv"\n'
+    assert read(tmp_path, HEAD + ANGLES + socket.format("A")).visits == (0, 0, 0, 0, 1, 1, 1, 1)
+    text = HEAD + ANGLES + socket.format("day/A") + 'session = "day"\n' + other + 'session = "day"\n'
+    assert read(tmp_path, text).visits == (0, 0, 0, 0, 1, 1, 1, 1, -1, -1, -1, -1)
+    with pytest.raises(aj.InputError, match="leave out visits of a socket with a target"):
+        read(tmp_path, HEAD + ANGLES + socket.format("A") + 'target = "ball"\n' + other)
 
 
 @pytest.mark.parametrize(

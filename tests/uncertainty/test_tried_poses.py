@@ -32,6 +32,16 @@ def test_slides_count_in_metres_and_do_not_go_round():
     assert found.distance[0] == pytest.approx(2 * np.pi / np.sqrt(arm.joints))
 
 
+def test_temperatures_are_no_distance(paper_arm):
+    arm = paper_arm.replace(thermometer=True)
+    known = np.zeros((11, 7))
+    known[:, 0], known[:, 6] = np.linspace(0, 1, 11), 20 + np.arange(11)
+    for other in (np.zeros((1, 6)), np.zeros((1, 7))):
+        found = tried_poses(arm, known, other)
+        assert found.spacing == pytest.approx(0.1 / np.sqrt(6))
+        assert found.distance[0] == 0
+
+
 def test_one_pose_has_no_distance(paper_arm):
     assert_refused(lambda: tried_poses(paper_arm, np.zeros((1, 6)), np.zeros((1, 6))), "has no distance from another")
 
