@@ -190,10 +190,14 @@ def warm_capture(low: float, high: float) -> tuple[aj.Capture, aj.Bounds]:
     return capture, aj.Bounds.around(nominal, aj.Parameters.free_of(nominal))
 
 
-@pytest.mark.parametrize("method", ["joint", "two-stage"])
-def test_expansion_is_found(method):
+@pytest.mark.parametrize(
+    "options",
+    [{"method": "joint"}, {"method": "two-stage"}, {"prior": aj.Prior({"expansion": 1e-3})}],
+    ids=["joint", "two-stage", "least squares of everything"],
+)
+def test_expansion_is_found(options):
     capture, bounds = warm_capture(15, 25)
-    result = aj.calibrate(bounds.space.base, capture, bounds, method=method)
+    result = aj.calibrate(bounds.space.base, capture, bounds, **options)
     i = bounds.space.index("expansion")
     u = np.sqrt(result.covariance[i, i])
     assert u < 5e-7
