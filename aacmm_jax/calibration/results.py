@@ -18,7 +18,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import Repeatability
 from ..model.scale import Scale
-from ..solver.reason import Reason, numbers_of
+from ..solver.reason import Reason
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance
 from ..uncertainty.shared_errors import SharedErrors
 from .checks import PLAUSIBLE_SCALE, largest_plausible_residual
@@ -352,9 +352,10 @@ class ManyCalibrations(AbstractManyResults):
 
 def converged(result: Reason) -> Bool[AnyArray, "*batch"]:
     """Whether a reason means that a minimum was reached."""
-    number = numbers_of(result)
-    good = np.array(_GOOD, dtype=number.dtype)
-    return np.asarray(np.isin(np.asarray(number), good)) if is_concrete(number) else jnp.isin(number, good)
+    number = member_numbers(result)
+    if is_concrete(number):
+        return np.asarray(np.isin(np.asarray(number), _GOOD))
+    return jnp.isin(number, np.array(_GOOD, dtype=number.dtype))
 
 
 def active_names(space: Parameters, active: Numbers) -> dict[str, str]:
