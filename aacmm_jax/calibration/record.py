@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from ..core._compat import member_numbers
 from ..core.arguments import checked_arguments
 from ..core.numpy_or_jax import to_jax
 from ..core.text import shorten
@@ -14,7 +15,7 @@ from ..data.noise import Noise
 from ..data.recording import Recording
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import ArmSpecification, Parameters
-from ..solver.reason import SCALE, Reason, numbers_of
+from ..solver.reason import SCALE, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.shared_errors import SharedErrors
 from .checks import largest_plausible_residual, plausible
@@ -220,7 +221,7 @@ def _reason(calibration: Calibration | Identification, stage1: Identification) -
     result = calibration.result if bool(stage1.converged) else stage1.result
     sides = [f"{name} ({side})" for name, side in calibration.active_names().items()]
     sentence = Reason[result]
-    return f"{sentence.rstrip('.')}: {shorten(sides)}." if int(numbers_of(result)) == SCALE and sides else sentence
+    return f"{sentence.rstrip('.')}: {shorten(sides)}." if int(member_numbers(result)) == SCALE and sides else sentence
 
 
 @checked_arguments
