@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arguments import check_finite, checked_arguments, shown, with_options
+from ..core.arguments import check_finite, checked_arguments, with_options
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
 from ..data.capture import Capture
@@ -24,7 +24,7 @@ from ..model.measurement import check_joints
 from ..model.robust import LossName
 from ..solver.reason import reasons
 from .batch_kernel import Problems, Shape, solve_chunk
-from .checks import check_enough
+from .checks import check_enough, check_method
 from .chunks import cut_into_chunks, default_workers, devices_of, round_up, run_chunks
 from .observed_batch import solve_observed
 from .results import ManyCalibrations, ManyIdentifications
@@ -135,13 +135,7 @@ def calibrate_many(
     by_slides = scale_from_slides(arm, capture, space, given.noise)
     general = bool(capture.observations) or any((given.robust, given.prior, given.covariance, by_slides))
     method = default_method(arm, general) if method is None else method
-    if not isinstance(method, str) or method not in ("two-stage", "joint"):
-        raise InputError(f"method is {shown(method)}; it must be 'two-stage' or 'joint'.")
-    if method == "two-stage" and general:
-        raise InputError(
-            "method='two-stage' is for sockets and reference lengths, without a robust loss, a prior and covariances; "
-            "use method='joint'."
-        )
+    check_method(method, general)
     if not capture.lengths and not by_slides and not any(one.fixes_scale for one in capture.observations):
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many."

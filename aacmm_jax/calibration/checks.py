@@ -91,8 +91,8 @@ def check_method(method: str, general: bool) -> None:
         raise InputError(f"method is {shown(method)}; it must be 'two-stage' or 'joint'.")
     if method == "two-stage" and general:
         raise InputError(
-            "method='two-stage' is for sockets with reference lengths, without a robust loss or a prior; use "
-            "method='joint'."
+            "method='two-stage' is for sockets with reference lengths, without a robust loss, a prior and covariances "
+            "of batches; use method='joint'."
         )
 
 

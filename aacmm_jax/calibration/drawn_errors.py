@@ -54,15 +54,22 @@ def functions_of(
     return values, np.array([term.joint - 1 for term in terms])
 
 
+def places_of(capture: Capture) -> Float[np.ndarray, "M p"]:
+    """1 for the poses of each socket or observation that a reference length starts or ends at, a column each."""
+    sizes = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
+    names = [*capture.names, *(observation.name for observation in capture.observations)]
+    ends = {end for length in capture.lengths for end in (length.start, length.end)}
+    used = [i for i, name in enumerate(names) if name in ends]
+    return (np.repeat(np.arange(len(sizes)), sizes)[:, None] == used).astype(float)
+
+
 def _roots(shared: SharedErrors, capture: Capture, sizes: list[int]) -> list[Float[np.ndarray, "M c"]]:
     """Square roots of the covariances of a tip coordinate over the poses."""
     total, found = sum(sizes), []
-    names = [*capture.names, *(observation.name for observation in capture.observations)]
     owner = np.repeat(np.arange(len(sizes)), sizes)
-    ends = {end for length in capture.lengths for end in (length.start, length.end)}
     for kind, sd in zip(shared.kinds, np.asarray(shared.sd), strict=True):
         if kind == PLACES:
-            found.append(sd * (owner[:, None] == [i for i, name in enumerate(names) if name in ends]))
+            found.append(sd * places_of(capture))
         elif kind == VISITS and capture.visits is not None:
             visits = np.full(total, -1)
             visits[: len(capture.visits)] = capture.visits

@@ -36,7 +36,7 @@ from ..uncertainty.shared_errors import (
     one_variance,
     second_moments,
 )
-from .drawn_errors import functions_of
+from .drawn_errors import functions_of, places_of
 from .group_equations import EXACT, PRIOR, equations_in_chunks, residual_rms
 from .model_errors import weighted_by_loss
 from .record import record_of
@@ -297,15 +297,10 @@ def missing_functions(arm: Arm) -> tuple[str, ...]:
 def _places(problem: SharedProblem, effects: Effects) -> _Tips:
     """Errors that all poses of a socket share, which only lengths show."""
     capture = problem.record.recording.capture
-    sizes = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
-    owner = np.repeat(np.arange(len(sizes)), sizes)
-    names = [*capture.names, *(observation.name for observation in capture.observations)]
-    ends = {end for length in capture.lengths for end in (length.start, length.end)}
-    used = [i for i, name in enumerate(names) if name in ends]
     nothing = _Tips(PLACES, 1.0, [])
     if len(capture.lengths) < 2:
         return nothing
-    patterns = (owner[:, None] == used).astype(float)
+    patterns = places_of(capture)
     columns = problem.moved(patterns)
     information, r = effects.product(columns, columns), effects.left.values[:, None]
     values, vectors = np.linalg.eigh(information)

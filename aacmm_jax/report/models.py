@@ -99,8 +99,8 @@ def _table(models: list[dict[str, Any]]) -> ReportTable:
         "",
     )
     caption = (
-        "Models; ratio: mean of (error / predicted standard deviation)² outside; evidence: its logarithm, less that of "
-        "the most probable model"
+        "Models; ratio: mean of (error / predicted standard deviation)² outside; evidence: its logarithm, less that "
+        "of the most probable model"
     )
     return ReportTable(caption, columns, rows)
 

@@ -103,7 +103,7 @@ def _mean_band(x: np.ndarray, y: np.ndarray) -> list[charts.Marks]:
     twice = np.array([2 * y[part].std(ddof=1) / math.sqrt(len(part)) for part in parts])
     return [
         charts.Marks(
-            "mean of neighbours, ± 2 standard errors", middle, mean, "band", "main", low=mean - twice, high=mean + twice
+            "mean of neighbours, ± 2 of its u", middle, mean, "band", "main", low=mean - twice, high=mean + twice
         ),
         charts.Marks("", middle, mean, "line", "main"),
     ]

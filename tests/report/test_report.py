@@ -503,7 +503,8 @@ def test_numbers_are_shown(value, decimals, signed, expected):
 
 
 def test_missing_numbers_are_told_from_infinite_ones():
-    assert [elements.number_cell(value).text for value in (None, math.nan, math.inf)] == ["–", "–", "not determined"]
+    cells = [elements.number_cell(value).text for value in (None, math.nan, math.inf)]
+    assert cells == ["–", "–", "not determined"]
 
 
 def test_a_logarithmic_axis_marks_what_is_there():
