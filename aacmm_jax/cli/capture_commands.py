@@ -165,6 +165,8 @@ def simulate(
                     seed=seed,
                 ),
             )
+            if temperature_c is not None:
+                nominal = load_specification(arm, base=base, tip=tip, capture=capture)
             recording = Recording(capture, nominal, true, seed)
         summary = capture_summary(recording)
         save_capture(output, recording, summary)

@@ -106,6 +106,11 @@ def correct(
             found = readings_at_poses(calibrated, q, in_first_frame(record, commanded.poses), nominal.limits)
         given = {"unit": commanded.unit, "of_readings": commanded.poses is None}
         summary = correction_summary(nominal, calibrated, q, found, **given)
+        if commanded.temperature is not None and q.shape[1] == calibrated.joints:
+            summary["warnings"].append(
+                "the arm was calibrated without thermal expansion, so that column temperature_C changes nothing; "
+                "calibrate with --model expansion for corrections by temperature."
+            )
         write_text(output, corrected_csv(commanded, np.asarray(found.q), np.asarray(found.reached)))
         summary["written"] = str(output)
     warn_of_unusable(calibration, record)

@@ -137,9 +137,12 @@ def plan(
         ),
     ] = None,
     farthest: Annotated[
-        float,
-        typer.Option(metavar="PART", help="Largest distance of what is placed from the shoulder, part of the reach."),
-    ] = 0.95,
+        float | None,
+        typer.Option(
+            metavar="PART",
+            help="Largest distance of what is placed from the shoulder, part of the reach. Default 0.95.",
+        ),
+    ] = None,
     kit: Annotated[
         Path | None,
         typer.Option(
@@ -210,9 +213,10 @@ def plan(
     if region and socket:
         raise InputError("--region is for sockets that are to be positioned; leave it out with --socket.")
     if acceptance is not None:
-        if socket or sockets is not None or length or region:
+        if socket or sockets is not None or length or region or farthest is not None:
             raise InputError(
-                "--acceptance has its own sockets and bars; leave out --socket, --sockets, --length and --region."
+                "--acceptance has its own sockets and bars; leave out --socket, --sockets, --length, --region and "
+                "--farthest."
             )
         if model is not None:
             raise InputError("--model is of calibrations; with --acceptance, leave it out.")
@@ -245,7 +249,7 @@ def plan(
     shared: dict[str, Any] = {
         "poses": poses,
         "region": dict(axes) if axes else None,
-        "farthest": farthest,
+        "farthest": 0.95 if farthest is None else farthest,
         "space": specification.space(),
         "criterion": criterion,
         "margin": margin_deg * DEG,

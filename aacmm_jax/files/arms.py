@@ -167,7 +167,12 @@ def load_arm(
 
 
 def load_specification(
-    source: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
+    source: str | os.PathLike,
+    *,
+    base: str | None = None,
+    tip: str | None = None,
+    probe: Numbers | None = None,
+    capture: Capture | None = None,
 ) -> ArmSpecification:
     """The arm of a file with its name, its proposed identification and, of a URDF, what an export needs.
 
@@ -179,12 +184,14 @@ def load_specification(
         base: As of `load_arm`.
         tip: As of `load_arm`.
         probe: As of `load_arm`.
+        capture: What was observed, where it is known: of targets alone, or at several temperatures, it determines other
+            parameters.
 
     Raises:
         InputError: There is neither, or the file is not an arm's.
     """
     found, proposed = read_arm(source, base=base, tip=tip, probe=probe)
-    return found if proposed else with_parameters(found)
+    return found if proposed else with_parameters(found, capture)
 
 
 def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str | None = None) -> ArmNoise:

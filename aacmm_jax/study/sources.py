@@ -52,20 +52,23 @@ def make_study(
     Raises:
         InputError: For an unknown table, key or value, naming it.
     """
-    nominal = arm if isinstance(arm, ArmSpecification) else ArmSpecification(arm) if isinstance(arm, Arm) else None
-    nominal = load_specification(arm) if nominal is None else nominal  # pyright: ignore[reportArgumentType]
     for key in tables:
         if key not in _TABLES:
             raise InputError(f"a study has no table '{key}'{nearest(key, _TABLES)}")
-    recording = None
-    if isinstance(capture, Capture):
-        recording, capture = Recording(capture, nominal), {"file": "(in memory)"}
-    elif not isinstance(capture, Mapping):
+    if not isinstance(capture, Capture | Mapping):
         raise InputError(
             f"capture is a {type(capture).__name__}; give a table (positions_mm, sockets, file or kit), or a Capture."
         )
-    elif capture.get("file") is not None:
+    recording, observed = None, capture if isinstance(capture, Capture) else None
+    if isinstance(capture, Mapping) and capture.get("file") is not None:
         recording = load_capture(capture["file"])
+        observed = recording.capture
+    if isinstance(arm, Arm):
+        nominal = ArmSpecification(arm)
+    else:
+        nominal = arm if isinstance(arm, ArmSpecification) else load_specification(arm, capture=observed)
+    if isinstance(capture, Capture):
+        recording, capture = Recording(capture, nominal), {"file": "(in memory)"}
     elif capture.get("kit") is not None:
         recording = _simulated(capture["kit"], nominal, seed)
     specification = checked(name=storable(name), arm=nominal.name, trials=trials, seed=seed, capture=capture, **tables)
@@ -120,7 +123,8 @@ def _study_of_file(path: Path) -> Study:
             recording = load_capture(path.parent / specification.capture.file)
         if recording is not None and not specification.arm:
             return Study(specification, recording.nominal, recording)
-        nominal = load_specification(arm_beside(path.parent, specification.arm))
+        observed = None if recording is None else recording.capture
+        nominal = load_specification(arm_beside(path.parent, specification.arm), capture=observed)
         if specification.capture.kit is not None:
             recording = _simulated(path.parent / specification.capture.kit, nominal, specification.seed)
         return Study(specification, nominal, recording)

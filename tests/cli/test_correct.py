@@ -46,9 +46,10 @@ def write(path, header: list[str], rows) -> None:
 
 def test_readings_in_the_columns_and_unit_of_the_table(arms):
     folder, nominal, calibrated = arms
-    header = ["name", *(f"q_{i}_deg" for i in range(1, 7)), "speed"]
-    write(folder / "in.csv", header, [[f"p{i}", *(q / DEG), 7] for i, q in enumerate(Q)])
+    header = ["name", *(f"q_{i}_deg" for i in range(1, 7)), "speed", "temperature_C"]
+    write(folder / "in.csv", header, [[f"p{i}", *(q / DEG), 7, 23] for i, q in enumerate(Q)])
     found = json.loads(run(arms, "in.csv", "-o", "out.csv", "--json").stdout)
+    assert any("column temperature_C changes nothing" in text for text in found["warnings"])
     rows = table(folder / "out.csv")
     assert list(rows[0]) == header
     assert [row["name"] for row in rows] == [f"p{i}" for i in range(6)]

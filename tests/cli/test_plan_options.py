@@ -79,6 +79,11 @@ def test_refused(aacmm, arguments, text):
     assert text in aacmm(*PLAN, *arguments, expect=2).stderr
 
 
+def test_an_acceptance_test_has_its_own_places(aacmm):
+    refused = aacmm("plan", "panda", "-o", "plan.csv", "--acceptance", "iso", "--farthest", "0.95", expect=2)
+    assert "--acceptance has its own sockets and bars" in refused.stderr
+
+
 def test_an_acceptance_test_has_no_cones(aacmm):
     refused = aacmm("plan", "panda", "-o", "plan.csv", "--acceptance", "iso", "--collisions", expect=2)
     assert "obstacles and approach points are of calibrations" in refused.stderr

@@ -8,6 +8,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.files.arms import arm_toml, load_specification, save_arm
 from aacmm_jax.files.controllers import python_program
+from aacmm_jax.files.joint_models import with_model
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.kinematics.arm import correction_names
 from tests.prismatic_arms import SCARA
@@ -75,6 +76,23 @@ def test_a_model_in_an_arm_file(tmp_path):
         file.write_text(f"{plain}\n[corrections]\n{text}\n")
         with pytest.raises(aj.InputError, match=sentence):
             aj.load_arm(file)
+
+
+def test_expansion_of_an_arm_file_is_free_at_several_temperatures(tmp_path):
+    """Of a manifest, also with the same model on the command line, and of a study."""
+    (tmp_path / "arm.toml").write_text(
+        arm_toml(corrected().replace(coefficients=None, gravity=None, corrections=None))
+        + '\n[corrections]\nmodel = "expansion"\n'
+    )
+    manifest = tmp_path / "capture.toml"
+    manifest.write_text('arm = "arm.toml"\n[angles]\nunit = "rad"\n[[socket]]\nname = "A"\nfile = "A.csv"\n')
+    q = np.random.default_rng(0).uniform(-1, 1, (8, 3))
+    header, rows = "q1,q2,q3,temperature_C", np.column_stack([q, np.linspace(15.0, 25.0, len(q))])
+    np.savetxt(tmp_path / "A.csv", rows, delimiter=",", header=header, comments="")
+    recording = aj.files.read_manifest(manifest)
+    study = aj.study.make_study(arm=tmp_path / "arm.toml", trials=1, capture=recording.capture)
+    for specification in (recording.nominal, with_model(recording.nominal, "expansion"), study.nominal):
+        assert "expansion" in specification.space().names
 
 
 def test_formats_without_a_place_for_corrections_refuse_them():

@@ -5,7 +5,8 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.uncertainty.target_parameters import independent_of_targets, only_targets
+from aacmm_jax.kinematics.corrected_arm import with_corrections
+from aacmm_jax.uncertainty.target_parameters import determined_parameters, independent_of_targets, only_targets
 
 BOX = [[400, -400, 200], [800, 400, 800]]
 FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
@@ -41,3 +42,13 @@ def test_a_tip_of_the_arms_own_is_no_target():
     assert not only_targets(aj.simulate(arm, sockets, poses=5, seed=0))
     points = kinds.SimulatedPoints("T", BOX, 5, FRAME, u=0.01)
     assert not only_targets(aj.simulate(arm, {}, observations=[points], poses=1, seed=0))
+
+
+def test_expansion_is_free_where_temperatures_vary():
+    arm = aj.Arm(alpha=[1.5, 0.1, 0.4], a=[50.0, 300.0, 40.0], d=[20.0, 0.0, 250.0], limits=[(-2, 2)] * 3)
+    arm = with_corrections(arm, "expansion")
+    q = np.random.default_rng(0).uniform(-1, 1, (8, 3))
+    for temperatures, free in ((np.linspace(19.8, 20.9, 8), True), (np.linspace(23.0, 23.5, 8), False)):
+        space = determined_parameters(arm, aj.Capture({"A": np.column_stack([q, temperatures])}))
+        assert ("expansion" in space.names) == free
+        assert "a_2" in space.names
