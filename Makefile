@@ -101,7 +101,7 @@ benchmarks/peers/%/.venv/.done: benchmarks/peers/%/requirements.txt
 	$(PYTHON) -m venv .venv
 
 .venv/.run: pyproject.toml requirements/tested.txt | .venv/bin/python
-	$(call install,.venv,--constraint requirements/tested.txt --editable .)
+	$(call install,.venv,--constraint requirements/tested.txt --editable '.[plot,report]')
 	touch $@
 
 .venv/.test: pyproject.toml requirements/tested.txt | .venv/bin/python

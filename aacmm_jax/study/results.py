@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import InputError
+from ..core.extras import require
 from ..files.hdf5 import undamaged
 from ..files.outputs import as_path
 from . import store
@@ -34,10 +35,9 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
     Raises:
         InputError: Where the file is missing, damaged or no study, or xarray is not installed.
     """
-    try:
-        import xarray
-    except ImportError as error:
-        raise InputError("open_study needs xarray; install it with: pip install xarray h5netcdf.") from error
+    require("data", "open_study")
+    import xarray
+
     opened = Results.of(path)
     study = opened.study
     if opened.stored.parts is not None:
