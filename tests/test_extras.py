@@ -46,7 +46,7 @@ def test_the_extras_are_those_of_the_project():
 )
 def test_a_missing_extra_is_one_sentence_in_python(module, extra, use, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
-    message = rf"^[^.]* needs {module}; install it with: pip install 'aacmm_jax\[{extra}\]'\.$"
+    message = rf'^[^.]* needs {module}; install it with: pip install "aacmm_jax\[{extra}\]"$'
     with pytest.raises(aj.InputError, match=message):
         use()
     with pytest.raises(ImportError, match=message):
@@ -64,7 +64,7 @@ def test_a_missing_extra_is_one_sentence_on_the_command_line(module, extra, argu
     monkeypatch.chdir(tmp_path)
     done = run_without(module, *arguments)
     assert (done.returncode, done.stdout) == (2, "")
-    assert re.fullmatch(rf"Error: .* needs {module}; install it with: .*'aacmm_jax\[{extra}\]'\.\n", done.stderr)
+    assert re.fullmatch(rf'Error: .* needs {module}; install it with: .*"aacmm_jax\[{extra}\]"\n', done.stderr)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -76,5 +76,5 @@ def test_the_demonstration_does_the_rest(tmp_path):
     assert summary["calibrated"]["check_rms_mm"] < 0.02
     assert {path.name for path in tmp_path.iterdir()} == {*summary["files"]}
     assert "calibration.h5" in summary["files"]
-    left_out = {name: re.search(r"'aacmm_jax\[(\w+)\]'", text)[1] for name, text in summary["left_out"].items()}
+    left_out = {name: re.search(r'"aacmm_jax\[(\w+)\]"', text)[1] for name, text in summary["left_out"].items()}
     assert left_out == {"calibration.png": "plot", "report.html": "report"}

@@ -13,7 +13,7 @@ class MissingExtra(InputError, ImportError):
 
 
 def require(extra: str, use: str) -> None:
-    """Raise `MissingExtra` where an extra is not installed.
+    """Raise `MissingExtra` where an extra is not installed. Double quotes are right in every shell, cmd.exe included.
 
     Args:
         extra: Its name in pyproject.toml.
@@ -21,4 +21,4 @@ def require(extra: str, use: str) -> None:
     """
     package = _PACKAGES[extra]
     if importlib.util.find_spec(package) is None:
-        raise MissingExtra(f"{use} needs {package}; install it with: pip install 'aacmm_jax[{extra}]'.")
+        raise MissingExtra(f'{use} needs {package}; install it with: pip install "aacmm_jax[{extra}]"')

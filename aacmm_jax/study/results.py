@@ -75,13 +75,15 @@ def _allow_files(count: int, path: Path) -> None:
         return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = count + 200
-    if soft != resource.RLIM_INFINITY and soft < needed:
-        if hard != resource.RLIM_INFINITY and hard < needed:
-            raise InputError(
-                f"{path} consists of {count} blocks, more files than this process may open ({hard}); let the study "
-                "end, or raise the limit."
-            )
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return
+    try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+    except (ValueError, OSError) as error:  # over the hard limit, or over that of the system (macOS)
+        raise InputError(
+            f"{path} consists of {count} blocks, more files than this process may open; let the study end, or raise "
+            "the limit (ulimit -n)."
+        ) from error
 
 
 class Results(NamedTuple):
