@@ -7,6 +7,8 @@
 # make check        lint, types and import contracts
 # make test-newest  a selection of the tests with the newest versions that pyproject.toml allows, installed from scratch
 # make test-lowest  the same with the lowest
+# make package      the source distribution and the wheel, installed and used in another folder: the core, and everything
+# make package-matrix  the same with each extra, on the oldest Python allowed and the newest one found
 # make audit        known vulnerabilities of the environment; skipped where their service cannot be reached
 # make bench        identifications a second, against every contender that is installed
 # make reproduce    Cheng et al. 2018, recomputed and checked against benchmarks/cheng2018/REPRODUCTION.md (1.5 minutes
@@ -29,8 +31,8 @@ SELECTION := tests/test_package.py tests/kinematics tests/solver tests/calibrati
 	tests/files/test_storage.py tests/test_real_captures.py
 PANDA := aacmm-demo/panda
 
-.PHONY: demo test test-slow test-exhaustive test-newest install-newest run-newest test-lowest check audit bench peers \
-	docs reproduce clean
+.PHONY: demo test test-slow test-exhaustive test-newest install-newest run-newest test-lowest check package \
+	package-matrix audit bench peers docs reproduce clean
 
 demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
@@ -78,6 +80,12 @@ check: .venv/.dev
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports --no-cache
 
+package:
+	$(PYTHON) .ci/try_package
+
+package-matrix:
+	$(PYTHON) .ci/try_package --matrix
+
 # Known vulnerabilities of what the tests run on. Their service is asked over the network; without one, this is skipped.
 audit: .venv/.dev
 	@timeout 300 $(BIN)/python -m pip_audit --progress-spinner off --skip-editable --timeout 15 > .venv/audit.txt 2>&1; \
@@ -103,7 +111,7 @@ benchmarks/peers/%/.venv/.done: benchmarks/peers/%/requirements.txt
 	$(PYTHON) -m venv .venv
 
 .venv/.run: pyproject.toml requirements/tested.txt | .venv/bin/python
-	$(call install,.venv,--constraint requirements/tested.txt --editable .)
+	$(call install,.venv,--constraint requirements/tested.txt --editable '.[plot,report]')
 	touch $@
 
 .venv/.test: pyproject.toml requirements/tested.txt | .venv/bin/python

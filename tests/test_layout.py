@@ -183,16 +183,17 @@ def test_private_attributes_are_found():
 
 # Dependencies
 
+EXTRAS = PROJECT["project"]["optional-dependencies"]
+DEPENDENCIES = PROJECT["project"]["dependencies"] + EXTRAS["plot"] + EXTRAS["report"]
+
 
 def test_the_lowest_versions_are_the_lower_caps():
     pinned = dict(
         line.split("==") for line in (ROOT / "requirements/lowest.txt").read_text().splitlines() if "==" in line
     )
     pinned.pop("jaxlib")  # comes with jax, in the same version
-    caps = dict(
-        re.fullmatch(r"([\w-]+)>=([\d.]+),<[\d.]+", each).groups() for each in PROJECT["project"]["dependencies"]
-    )
-    assert pinned == caps
+    capped = (re.fullmatch(r"([\w-]+)>=([\d.]+),<[\d.]+", each) for each in DEPENDENCIES)
+    assert pinned == dict(found.groups() for found in capped)
 
 
 def test_every_import_of_another_package_is_declared():
@@ -200,7 +201,7 @@ def test_every_import_of_another_package_is_declared():
         "PIL",  # comes with matplotlib
         "xarray",  # the extra data
         "distributed",  # the extra dask
-        *(each.split(">=")[0] for each in PROJECT["project"]["dependencies"]),
+        *(each.split(">=")[0] for each in DEPENDENCIES),
     }
     imported = set()
     for path in MODULES:

@@ -354,6 +354,8 @@ def demo(summary: dict[str, Any]) -> None:
         "every length off by this one factor; stage 2 divides it out."
     )
     console.print(f"Files in {escape(summary['folder'])}: {', '.join(escape(name) for name in summary['files'])}")
+    for reason in summary["left_out"].values():
+        console.print(f"Not made: {escape(reason)}")
 
 
 def print_stages(

@@ -10,6 +10,7 @@ from ..calibration.evaluation import evaluate
 from ..calibration.record import CalibrationRecord, record_of
 from ..calibration.single import calibrate
 from ..core.errors import InputError
+from ..core.extras import MissingExtra, require
 from ..core.text import shorten
 from ..data.capture import Capture
 from ..data.recording import Recording
@@ -24,31 +25,42 @@ from ..summaries.calibration import calibration_summary, capture_summary
 
 _DEVIATION_MM, _DEVIATION_DEG = 1.0, 0.1
 _ENCODER_ARCSEC, _SEATING_MM, _LENGTH_U_MM = 2.0, 0.005, 0.002
-_FILES = (
-    "capture.h5",
-    "calibration.h5",
-    "nominal.toml",
-    "true.toml",
-    "calibrated.toml",
-    "calibration.png",
-    "report.html",
-)
+_DATA = ("capture.h5", "calibration.h5", "nominal.toml", "true.toml", "calibrated.toml")
+_FIGURE, _REPORT = "calibration.png", "report.html"
+_EXTRAS = {_FIGURE: "plot", _REPORT: "report"}  # what these files need
+_FILES = (*_DATA, *_EXTRAS)
 _TRUE = ", true"  # what the name of the true arm ends in
 _CHECKS, _CHECK_MM = 30, 300.0
 _START, _END = (400.0, 200.0, 300.0), (700.0, 500.0, 500.0)
 
 
 def run(folder: Path, seed: int) -> dict[str, Any]:
-    """Simulate, calibrate, compare, and leave capture, calibration, arms, a figure and a report in ``folder``."""
+    """Simulate, calibrate, compare, and leave capture, calibration, arms, a figure and a report in ``folder``; without
+    the extra that figure or report need, the summary says so, and the rest is made."""
     from ..report import write_report
 
     nominal = load_specification("cheng2018-simulation")
     _prepare(folder, nominal.name + _TRUE)
-    *made, report = (folder / name for name in _FILES)
-    with together(*made):
-        summary = _made(folder, nominal, seed)
-    write_report(folder / "calibration.h5", report)  # of a file that has to be there
-    return summary
+    left_out = _left_out()
+    for name in left_out:
+        (folder / name).unlink(missing_ok=True)  # of an earlier demonstration
+    made = [name for name in _FILES if name not in left_out]
+    with together(*(folder / name for name in made if name != _REPORT)):
+        summary = _made(folder, nominal, seed, figure=_FIGURE in made)
+    if _REPORT in made:
+        write_report(folder / "calibration.h5", folder / _REPORT)  # of a file that has to be there
+    return summary | {"folder": str(folder), "files": made, "left_out": left_out}
+
+
+def _left_out() -> dict[str, str]:
+    """The files whose extra is not installed, and what is said of each."""
+    found = {}
+    for name, extra in _EXTRAS.items():
+        try:
+            require(extra, name)
+        except MissingExtra as error:
+            found[name] = str(error)
+    return found
 
 
 def _prepare(folder: Path, true_name: str) -> None:
@@ -73,7 +85,7 @@ def _prepare(folder: Path, true_name: str) -> None:
         )
 
 
-def _made(folder: Path, nominal: ArmSpecification, seed: int) -> dict[str, Any]:
+def _made(folder: Path, nominal: ArmSpecification, seed: int, *, figure: bool) -> dict[str, Any]:
     bounds = nominal.bounds()
     true = nominal._replace(
         arm=perturbed_arm(bounds.space, length=_DEVIATION_MM, angle=math.radians(_DEVIATION_DEG), seed=seed),
@@ -97,11 +109,11 @@ def _made(folder: Path, nominal: ArmSpecification, seed: int) -> dict[str, Any]:
     save_arm(nominal.arm, folder / "nominal.toml", name=nominal.name)
     save_arm(true.arm, folder / "true.toml", name=true.name)
     save_arm(record.calibrated.arm, folder / "calibrated.toml", name=record.calibrated.name)
-    summary = _summary(record, whole, _checks(record, seed))
-    from ..plot import save_calibration_figure
+    if figure:
+        from ..plot import save_calibration_figure
 
-    save_calibration_figure(record, folder / "calibration.png")
-    return summary | {"folder": str(folder), "files": list(_FILES)}
+        save_calibration_figure(record, folder / _FIGURE)
+    return _summary(record, whole, _checks(record, seed))
 
 
 def _checks(record: CalibrationRecord, seed: int) -> dict[str, float]:

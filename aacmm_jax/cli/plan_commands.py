@@ -339,9 +339,13 @@ def _written(output: Path, poses: str, manifest: Path | None, manifest_text: Cal
 
 
 def _arm_for(manifest: Path, arm: str) -> str:
-    """An arm as a manifest names it: a shipped name, or the path of a file relative to the manifest."""
-    file = Path(arm)
-    return Path(os.path.relpath(file, manifest.parent)).as_posix() if os.path.isfile(file) else arm
+    """An arm as a manifest names it: a shipped name, or the path of a file, relative to the manifest if it can be."""
+    if not os.path.isfile(arm):
+        return arm
+    try:
+        return Path(os.path.relpath(arm, manifest.parent)).as_posix()
+    except ValueError:  # on another drive
+        return Path(arm).absolute().as_posix()
 
 
 def _range(option: str, text: str) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 """The vertices of mesh files, STL and OBJ, without their faces: enough for a shape that contains the mesh."""
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,8 @@ def mesh_path(file: str, folder: Path) -> Path | None:
         tried = [place for parent in (whole, *whole.parents) for place in (parent / package / rest,)]
         tried += [parent / rest for parent in (whole, *whole.parents) if parent.name == package]
     else:
-        tried = [folder / file.removeprefix("file://")]
+        # In a URL, a slash stands before the letter of a drive: file:///C:/arm.stl.
+        tried = [folder / re.sub(r"^/(?=[A-Za-z]:)", "", file.removeprefix("file://"))]
     return next((path for path in tried if path.is_file()), None)
 
 

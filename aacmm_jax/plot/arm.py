@@ -11,7 +11,7 @@ from ..core.errors import InputError
 from ..kinematics.arm import Arm, joint_limits, without_corrections
 from ..kinematics.axes_to_dh import dh_frames, geometry_of
 from ..kinematics.workspace import arm_reach, skeleton
-from .style import ACCENT, DARK, LIGHT, label_axes, save_figure
+from .style import ACCENT, DARK, LIGHT, axes_or_new, label_axes, new_figure, save_figure
 
 _TIPS = 4000  # of the picture of the reach
 
@@ -86,10 +86,7 @@ def arm_workspace(arm: Arm, axes: Any = None) -> Any:
     Returns:
         The axes.
     """
-    if axes is None:
-        from matplotlib.figure import Figure
-
-        axes = Figure(figsize=(4.6, 5.4), layout="constrained").subplots()
+    axes = axes_or_new(axes, (4.6, 5.4))
     limits = np.asarray(joint_limits(arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_TIPS, arm.joints))
     tips, reach = np.asarray(arm.position(q)), arm_reach(arm)
@@ -115,9 +112,7 @@ def save_arm_figure(arm: Arm, path: Path, *, title: str = "", base: Float[np.nda
     Raises:
         InputError: The format is none of these, or the file cannot be written.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.4, 5.4), layout="constrained")
+    figure = new_figure((10.4, 5.4))
     parts: Any = figure.subfigures(1, 2, width_ratios=(6, 4.4))
     left, right = parts
     arm_at_zero(arm, left.add_subplot(projection="3d"), base=base).set_title("at zero readings", fontsize=10)
@@ -129,9 +124,7 @@ def save_arm_figure(arm: Arm, path: Path, *, title: str = "", base: Float[np.nda
 def _axes_in_space(axes: Any) -> Any:
     """The given axes, or new ones, in three dimensions."""
     if axes is None:
-        from matplotlib.figure import Figure
-
-        return Figure(figsize=(6, 5.4), layout="constrained").add_subplot(projection="3d")
+        return new_figure((6, 5.4)).add_subplot(projection="3d")
     if getattr(axes, "name", "") != "3d":
         raise InputError("an arm is drawn in space; give axes made with projection='3d'.")
     return axes

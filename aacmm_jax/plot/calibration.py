@@ -11,7 +11,17 @@ from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_o
 from ..core.errors import InputError
 from ..core.units import DEG
 from ..kinematics.arm import is_length, parameter_unit
-from .style import ACCENT, DARK, LIGHT, axes_or_new, label_axes, label_parameters, logarithmic, save_figure
+from .style import (
+    ACCENT,
+    DARK,
+    LIGHT,
+    axes_or_new,
+    label_axes,
+    label_parameters,
+    logarithmic,
+    new_figure,
+    save_figure,
+)
 
 _STAGES: Mapping[str, Mapping[str, Any]] = {
     "nominal": {"label": "nominal", "color": LIGHT, "marker": "o"},
@@ -266,8 +276,6 @@ def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
     Raises:
         InputError: For another format, or if the file cannot be written.
     """
-    from matplotlib.figure import Figure
-
     found = observation_residuals(record)
     draw: list[Callable[..., Any]] = [pose_distances]
     if found:
@@ -278,7 +286,7 @@ def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
         draw.append(length_parameter_errors)
     columns = len(draw) if len(draw) <= _MOST_IN_A_ROW else 2
     rows = -(-len(draw) // columns)
-    figure = Figure(figsize=(5.5 * columns, 3.9 * rows), layout="constrained")
+    figure = new_figure((5.5 * columns, 3.9 * rows))
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for function, axes in zip(draw, panels, strict=False):
         function(record, axes)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..drift.results import Drift, Trend, in_words
-from .style import ACCENT, COLORS, DARK, LINES, MARKERS, check_format, save_figure
+from .style import ACCENT, COLORS, DARK, LINES, MARKERS, check_format, new_figure, save_figure
 
 _LIGHT = "0.72"
 _NAMED = len(MARKERS)  # lines that remain distinct, each with its name
@@ -41,9 +41,7 @@ def drift_trend(trend: Trend, axes: Any = None) -> Any:
         Both axes.
     """
     if axes is None:
-        from matplotlib.figure import Figure
-
-        axes = Figure(figsize=(8.2, 6.8), layout="constrained").subplots(2, 1, height_ratios=(1.9, 1))
+        axes = new_figure((8.2, 6.8)).subplots(2, 1, height_ratios=(1.9, 1))
     if len(trend.drifts) == 1:
         parameter_drift(trend.drifts[0], axes[0])
         length_drift(trend.drifts[0], axes[1])

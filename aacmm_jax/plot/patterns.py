@@ -8,7 +8,7 @@ from ..calibration.pose_residuals import signed_residuals
 from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..core.units import DEG
-from .style import ACCENT, DARK, LIGHT
+from .style import ACCENT, DARK, LIGHT, new_figure
 
 _COLUMNS = 4
 _BINS = 8  # of which the mean is drawn
@@ -31,8 +31,6 @@ def residual_patterns(record: CalibrationRecord) -> Any:
     Raises:
         InputError: If no pose has a residual with a direction.
     """
-    from matplotlib.figure import Figure
-
     found = signed_residuals(record)
     if found is None:
         raise InputError("no pose has a residual with a direction, as no socket has several poses; record more poses.")
@@ -49,7 +47,7 @@ def residual_patterns(record: CalibrationRecord) -> Any:
         ),
     ]
     rows = -(-(len(drawn) + 1) // _COLUMNS)
-    figure = Figure(figsize=(3.1 * _COLUMNS, 2.5 * rows), layout="constrained")
+    figure = new_figure((3.1 * _COLUMNS, 2.5 * rows))
     panels = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
     values = np.concatenate([y[np.isfinite(y)] for _, y, *_ in drawn])
     limit = 1.1 * float(np.quantile(np.abs(values), 0.995)) or 1.0

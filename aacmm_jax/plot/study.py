@@ -18,7 +18,7 @@ from ..study.statistics import (
     metric_title,
     shown_unit,
 )
-from .style import ACCENT, COLORS, DARK, LINES, MARKERS, axes_or_new, label_axes, logarithmic, save_figure
+from .style import ACCENT, COLORS, DARK, LINES, MARKERS, axes_or_new, label_axes, logarithmic, new_figure, save_figure
 
 _WIDTHS = ("bounds.length_mm", "bounds.angle_deg")
 _WIDE = 10  # characters of a level: longer ones do not fit beside each other
@@ -262,10 +262,8 @@ def study_convergence(results: Results) -> Any:
 
 
 def _panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Any, Any]:
-    """A figure outside matplotlib's global state, and its axes as an array."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
+    """A new figure, and its axes as an array."""
+    figure = new_figure(size)
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 

@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError
+from ..core.extras import require
 from ..files.atomic_write import write_atomically
 
 _FORMATS = ("png", "svg", "pdf")
+_USE = "a figure"
 DARK, ACCENT, LIGHT = "#1b3a6b", "#d95f02", "0.65"
 # Lines that remain distinct, in grey too.
 LINES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (2, 1)), (0, (4, 1, 1, 1)))
@@ -15,13 +17,17 @@ MARKERS = "os^Dv<>p"
 COLORS = ("#1b3a6b", "#d95f02", "#111111", "#1b7a5a", "#7a3b8f", "#555555", "#a33b3b", "#3a6fb0")
 
 
-def axes_or_new(axes: Any, size: tuple[float, float] = (6.4, 4.2)) -> Any:
-    """The given axes, or those of a new figure outside matplotlib's global state, its size in inches."""
-    if axes is not None:
-        return axes
+def new_figure(size: tuple[float, float]) -> Any:
+    """A figure outside matplotlib's global state, its size in inches; `MissingExtra` without matplotlib."""
+    require("plot", _USE)
     from matplotlib.figure import Figure
 
-    return Figure(figsize=size, layout="constrained").subplots()
+    return Figure(figsize=size, layout="constrained")
+
+
+def axes_or_new(axes: Any, size: tuple[float, float] = (6.4, 4.2)) -> Any:
+    """The given axes, or those of a new figure, its size in inches."""
+    return new_figure(size).subplots() if axes is None else axes
 
 
 def label_axes(axes: Any, x: str, y: str) -> None:
@@ -51,10 +57,11 @@ def label_parameters(axes: Any, names: list[str]) -> None:
 
 
 def check_format(path: Path) -> str:
-    """The format of a figure by its file name; `InputError` for any but PNG, SVG and PDF."""
+    """The format of a figure by its file name; `InputError` for any but PNG, SVG and PDF, or without matplotlib."""
     suffix = path.suffix.lower().removeprefix(".")
     if suffix not in _FORMATS:
         raise InputError(f"{path} is no figure that can be drawn; end its name in .png, .svg or .pdf.")
+    require("plot", _USE)
     return suffix
 
 

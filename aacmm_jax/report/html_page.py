@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..acceptance.record import SIMULATED
+from ..core.extras import require
 from ..files.administrative_data import AdministrativeData, check_conformity
 from ..files.atomic_write import write_text
 from ..files.hdf5 import read_summary, read_tables
@@ -35,9 +36,10 @@ def write_report(
         Title, verdict, warnings and size of the report.
 
     Raises:
-        InputError: If the source cannot be read or the target not written, or the administrative data state a
-            conformity that the source contradicts.
+        InputError: If the source cannot be read or the target not written, the administrative data state a conformity
+            that the source contradicts, or Jinja is not installed.
     """
+    require("report", "a report")
     with together(target):
         return _written(Path(source), Path(target), administrative_data)
 

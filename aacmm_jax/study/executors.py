@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from ..core.errors import InputError
+from ..core.extras import require
 from .local_processes import LocalProcesses
 
 _RETRIES = 3  # of a block whose worker died
@@ -41,10 +42,9 @@ def dask_executor(address: str, workers: int | None = None) -> Iterator[tuple[Ex
         return
     if workers is not None:
         raise InputError("a running Dask cluster has its own workers; leave --workers out.")
-    try:
-        import distributed
-    except ImportError as error:
-        raise InputError("--dask needs Dask; install it with: pip install 'dask[distributed]'.") from error
+    require("dask", "a study on a Dask cluster")
+    import distributed
+
     from .dask_plugin import CompilationCache
 
     with _client(distributed, address) as client:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import InputError
+from ..core.extras import require
 from ..files.hdf5 import undamaged
 from ..files.outputs import as_path
 from . import store
@@ -34,10 +35,9 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
     Raises:
         InputError: Where the file is missing, damaged or no study, or xarray is not installed.
     """
-    try:
-        import xarray
-    except ImportError as error:
-        raise InputError("open_study needs xarray; install it with: pip install xarray h5netcdf.") from error
+    require("data", "open_study")
+    import xarray
+
     opened = Results.of(path)
     study = opened.study
     if opened.stored.parts is not None:
@@ -75,13 +75,15 @@ def _allow_files(count: int, path: Path) -> None:
         return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = count + 200
-    if soft != resource.RLIM_INFINITY and soft < needed:
-        if hard != resource.RLIM_INFINITY and hard < needed:
-            raise InputError(
-                f"{path} consists of {count} blocks, more files than this process may open ({hard}); let the study "
-                "end, or raise the limit."
-            )
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return
+    try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+    except (ValueError, OSError) as error:  # over the hard limit, or over that of the system (macOS)
+        raise InputError(
+            f"{path} consists of {count} blocks, more files than this process may open; let the study end, or raise "
+            "the limit (ulimit -n)."
+        ) from error
 
 
 class Results(NamedTuple):

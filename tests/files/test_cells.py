@@ -11,6 +11,7 @@ from hypothesis.extra import numpy as arrays
 import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.files import load_cell
+from aacmm_jax.files.mesh_vertices import mesh_path
 from aacmm_jax.files.urdf_shapes import bounding_capsule
 from aacmm_jax.kinematics import Box, HalfSpace, Post, clearances
 from aacmm_jax.kinematics.body import capsule_ends, frames_at
@@ -195,3 +196,11 @@ def test_refused_meshes(tmp_path, content):
     (tmp_path / "two" / "meshes" / "text.stl").write_bytes(content)
     with pytest.raises(aj.InputError, match=r"text\.stl has"):
         load_cell(path)
+
+
+def test_a_mesh_on_a_drive_is_found(tmp_path):
+    """Windows writes a path with a drive as file:///C:/...; here C: is a folder."""
+    (tmp_path / "C:").mkdir()
+    (tmp_path / "C:" / "link.stl").write_bytes(b"")
+    assert mesh_path("file:///C:/link.stl", tmp_path) == tmp_path / "C:" / "link.stl"
+    assert mesh_path(f"file://{tmp_path}/C:/link.stl", tmp_path) == tmp_path / "C:" / "link.stl"
