@@ -8,7 +8,7 @@ from rich.markup import escape
 from ..core.text import pluralise
 from ..core.units import DEG
 from ..summaries.tables import decimals_for
-from .calibration_display import print_lengths, print_stages
+from .calibration_display import print_stages
 from .display import (
     formatted,
     new_console,
@@ -19,6 +19,7 @@ from .display import (
     print_warnings,
     print_written,
 )
+from .parameter_display import print_lengths
 
 _STYLES = {"conforms": "green", "fails": "red", "undecided": "yellow", None: "default"}
 

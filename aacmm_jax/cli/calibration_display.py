@@ -15,6 +15,7 @@ from ..summaries.tables import (
     expanded_words,
     observed_words,
     quantity_words,
+    seat_in_words,
     two_digits,
     volume_rows,
 )
@@ -27,6 +28,7 @@ from .display import (
     print_warnings,
     print_written,
 )
+from .parameter_display import print_lengths, print_parameters, print_prior
 
 _MOST_PARTS = 12  # rows of a table
 _TRUTH = (
@@ -144,13 +146,11 @@ def calibration(summary: dict[str, Any]) -> None:
         print_stages(console, title, summary, stages, fitted=summary["fixed_by_one_length"])
     if "truth" in summary:
         _truth(console, summary["truth"])
-    _parameters(console, summary["parameters"])
+    print_parameters(console, summary["parameters"])
     if summary["held"]:
         console.print(f"Fixed at their nominal values: {', '.join(summary['held'])}.")
     if summary.get("prior"):
-        from ..summaries.calibration import prior_sentence
-
-        console.print("Prior (standard deviation of each group): " + ". ".join(map(prior_sentence, summary["prior"])))
+        print_prior(console, summary["prior"])
     if summary["lengths"]:
         print_lengths(console, summary["lengths"], fitted=summary["fixed_by_one_length"])
     _uncertainty(console, summary)
@@ -192,8 +192,8 @@ def _observed(console: Console, summary: dict[str, Any]) -> None:
         parts = [row for row in summary["geometry"] if not row["part"].startswith("position of ")]
         for row in parts[:_MOST_PARTS]:
             for one in row["quantities"]:
-                words = (row["part"], one["quantity"], quantity_words(one), expanded_words(one, factor))
-                table.add_row(*map(escape, words))
+                words = (quantity_words(one, coverage=factor), expanded_words(one, factor))
+                table.add_row(*map(escape, (row["part"], one["quantity"], *words)))
         if parts:
             print_table(console, table)
         hidden = len(summary["geometry"]) - len(parts[:_MOST_PARTS])
@@ -306,8 +306,7 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
         from ..summaries.calibration import tried_sentence
 
         console.print(tried_sentence(found["tried"]))
-    seat = "seat" if summary["sockets_used"] else "tip, each coordinate,"
-    noise = f"{encoders_in_words(found)}, {seat} {1e3 * found['seating_mm']:.3g} um"
+    noise = f"{encoders_in_words(found)}, {seat_in_words(summary)} {1e3 * found['seating_mm']:.3g} um"
     joints = ", ".join(str(row["joint"]) for row in found.get("noisy_encoders", ()))
     replaced = f", but for joint {joints}" if joints else ""
     source = {
@@ -319,8 +318,9 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
     pairs = [f"{row['one']} with {row['other']} ({row['r']:+.3f})" for row in found["correlated"][:6]]
     console.print(source + (f" Strongly correlated: {', '.join(pairs)}." if pairs else ""), soft_wrap=False)
     indices = found["indices"]
+    rest = " (the priors determine the rest)" if summary.get("prior") and found["rank"] < found["parameters"] else ""
     console.print(
-        f"Observability: rank {found['rank']} of {found['parameters']}, "
+        f"Observability: rank {found['rank']} of {found['parameters']}{rest}, "
         f"condition {found['condition'] or math.inf:.3g}, "
         + ", ".join(f"{name} = {value:.3g}" for name, value in indices.items())
     )
@@ -378,41 +378,4 @@ def _truth(console: Console, truth: dict[str, Any]) -> None:
     table = new_table("\nAgainst the true arm of the simulation", "", "nominal", "stage 1", "calibrated")
     for key, text, factor in _TRUTH:
         table.add_row(escape(text), *(formatted(factor * truth[stage][key]) for stage in stages))
-    print_table(console, table)
-
-
-def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
-    """Every free parameter in its own unit, to two digits of its standard uncertainty."""
-    table = new_table(
-        "\nFree parameters, with standard uncertainty u",
-        *("parameter", "unit", "nominal", "calibrated", "change", "u", "bound"),
-    )
-    for row in rows:
-        factor, unit = people_read(row["unit"])
-        nominal, value = factor * row["nominal"], factor * row["calibrated"]
-        u = None if row["u"] is None else factor * row["u"]
-        decimals = 9 if u == 0 else decimals_for(u)
-        numbers = (
-            f"{nominal:z.4f}",
-            f"{value:z.{decimals}f}",
-            f"{value - nominal:+z.{decimals}f}",
-            "-" if u is None else f"{u:.{decimals}f}",
-        )
-        table.add_row(row["parameter"], unit, *numbers, row["bound"] or "")
-    print_table(console, table)
-
-
-def print_lengths(console: Console, rows: list[dict[str, Any]], *, fitted: bool = False) -> None:
-    """Reference lengths; ``fitted``: a single one fixed the scale, so that its error is zero by construction."""
-    table = new_table("\nReference lengths", "between", "value [mm]", "measured [mm]", "error [mm]", "u of error [mm]")
-    for row in rows:
-        decimals = decimals_for(row["error_u_mm"])
-        error = "fixed the scale" if fitted else formatted(row["error_mm"], decimals)
-        table.add_row(
-            escape(f"{row['from']} - {row['to']}"),
-            formatted(row["value_mm"]),
-            formatted(row["measured_mm"], decimals),
-            error,
-            formatted(row["error_u_mm"], decimals),
-        )
     print_table(console, table)

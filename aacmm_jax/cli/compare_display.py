@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..core.units import people_read, people_read_change
+from ..summaries.harmonics import listed_apart
 from .display import (
     formatted,
     new_console,
@@ -45,7 +46,8 @@ def _parameters(console: Console, summary: dict[str, Any]) -> None:
         f"\nParameters: change with its expanded uncertainty U ({100 * summary['level']:g} %)",
         "parameter", "unit", "old", "new", "unit", "change", "U", "",
     )  # fmt: skip
-    for row in summary["parameters"]:
+    names = _listed([summary["parameters"]])
+    for row in (row for row in summary["parameters"] if row["parameter"] in names):
         (factor, unit), (fine, small_unit) = people_read(row["unit"]), people_read_change(row["unit"])
         expanded = row["expanded"]
         decimals = _decimals(None if expanded is None else factor * expanded, 5)
@@ -60,6 +62,15 @@ def _parameters(console: Console, summary: dict[str, Any]) -> None:
             row["without"] or ("[bold]* beyond U[/bold]" if row["moved"] else ""),
         )
     print_table(console, table)
+    if len(names) < len(summary["parameters"]):
+        left_out = len(summary["parameters"]) - len(names)
+        console.print(f"Not listed: {left_out} coefficients of harmonics that did not move beyond U; --json, --csv.")
+
+
+def _listed(tables: list[list[dict[str, Any]]]) -> set[str]:
+    """Names of the parameters to print: of hundreds of harmonics, those that moved."""
+    moved = {row["parameter"] for rows in tables for row in rows if row["moved"]}
+    return moved | {row["parameter"] for row in listed_apart(tables[0])[0]}
 
 
 def _lengths(console: Console, summary: dict[str, Any]) -> None:
@@ -99,7 +110,10 @@ def _changes(console: Console, rows: list[dict[str, Any]]) -> None:
     title = "\nChange from the first calibration (*: beyond its uncertainty)"
     title += f", the last {_COLUMNS}; --csv and --json have all" if left_out else ""
     table = new_table(title, "parameter", "unit", *(str(number) for number, _ in shown))
+    names = _listed([row["parameters"] for _, row in shown])
     for i, first in enumerate(shown[0][1]["parameters"]):
+        if first["parameter"] not in names:
+            continue
         fine, small_unit = people_read_change(first["unit"])
         cells = []
         for _, row in shown:

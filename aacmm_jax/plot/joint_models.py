@@ -5,21 +5,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from ..calibration.joint_functions import function_of_joint
 from ..calibration.model_ladder import ComparedModels
 from ..calibration.pose_residuals import observation_residuals
-from ..calibration.record import CalibrationRecord, uncertainty_of
+from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.units import DEG
-from ..kinematics.arm import Arm, joint_limits
-from ..kinematics.corrected_arm import function_values
-from ..kinematics.corrections.gear_ratio import GearRatio
-from ..kinematics.corrections.harmonics import Harmonics
+from ..kinematics.arm import Arm
 from .style import ACCENT, DARK, LIGHT, axes_or_new, label_axes
 
-_POINTS = 400  # of a curve
 _IN_A_BIN, _MOST_BINS = 8, 80  # poses, and bins of a joint's travel
-_BEYOND = 0.15  # of its travel, on either side
 _MRAD = 1e-3
 
 
@@ -86,10 +82,10 @@ def joint_function(
     lever = np.concatenate([one.lever[joint - 1] for one in residuals])
     slides = joint in arm.prismatic
     unit, reading = (1.0, 1.0) if slides else (_MRAD, DEG)
-    curve = _curve(record, arm, joint, q)
+    curve = function_of_joint(record, joint, q)
     if curve is not None:
-        at, value, expanded, own = curve
-        asked = asked + own
+        at, value, expanded = curve.reading, curve.value, curve.expanded
+        asked = asked + curve.at_poses
         low, high = q[:, joint - 1].min(), q[:, joint - 1].max()
         axes.fill_between(
             at / reading, (value - expanded) / unit, (value + expanded) / unit, color=color, alpha=0.2, linewidth=0
@@ -104,34 +100,6 @@ def joint_function(
     axes.axhline(0, color="0.4", linewidth=0.8)
     label_axes(axes, f"q_{joint} [{'mm' if slides else 'deg'}]", f"joint {joint} [{'mm' if slides else 'mrad'}]")
     return axes
-
-
-def _curve(record: CalibrationRecord, arm: Arm, joint: int, q: Float[np.ndarray, "M n"]) -> tuple[Any, ...] | None:
-    """Readings, the function there, its expanded uncertainty, and the function at the poses; None without one."""
-    if arm.corrections is None:
-        return None
-    each = arm.corrections.functions.each
-    chosen = [i for i, one in enumerate(each) if one.joint == joint and isinstance(one.kind, Harmonics | GearRatio)]
-    if not chosen:
-        return None
-    terms, coefficients = [each[i] for i in chosen], np.asarray(arm.coefficients)[chosen]
-    travel = q[:, joint - 1]
-    low, high = joint_limits(arm, None)[joint - 1] if arm.limits is not None or not arm.prismatic else (-np.inf, np.inf)
-    beyond = _BEYOND * np.ptp(travel)
-    at = np.linspace(max(travel.min() - beyond, low), min(travel.max() + beyond, high), _POINTS)
-    rows = np.zeros((_POINTS, q.shape[1]))
-    rows[:, joint - 1] = at
-    gravity = np.asarray(arm.gravity)
-    at_poses = function_values(arm.corrections.nominal, terms, q, gravity)
-    mean = at_poses.mean(axis=1, keepdims=True)
-    functions = function_values(arm.corrections.nominal, terms, rows, gravity) - mean
-    names = [one.name for one in terms]
-    free = [i for i, name in enumerate(names) if name in record.names]
-    index = [record.names.index(names[i]) for i in free]
-    covariance = record.covariance[np.ix_(index, index)]
-    u = np.sqrt(np.maximum(np.einsum("kp,kl,lp->p", functions[free], covariance, functions[free]), 0.0))
-    factor = uncertainty_of(record).factor()
-    return at, coefficients @ functions, factor * u, coefficients @ (at_poses - mean)
 
 
 def _binned(

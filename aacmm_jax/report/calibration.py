@@ -15,11 +15,9 @@ from ..summaries.observations import capture_words
 from ..summaries.tables import decimals_for, two_digits
 from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
-from . import charts
 from .arm_view import view_of_arm
 from .elements import (
     ArmView,
-    Chart,
     Report,
     ReportTable,
     Section,
@@ -38,6 +36,7 @@ from .observations import (
     residuals_section,
     stages_chart,
 )
+from .parameters import parameters_section
 from .patterns import patterns_sections
 from .residuals import length_rows, metrics_table, pose_distances, residual_chart, socket_table, validation_tables
 from .tried import tried_sections
@@ -70,7 +69,7 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
         _data(record, summary),
         _nominal_and_calibrated(record, summary, evaluations),
         _scale(record, summary, evaluations, factor),
-        _parameters(summary, factor),
+        parameters_section(record, summary, factor),
         *_residuals(record, summary, evaluations["calibrated"]),
         *patterns_sections(record),
         Section("arm", "The arm in its poses", [_view(record, evaluations["calibrated"])]),
@@ -280,65 +279,6 @@ def _scale(
     drawn["calibrated"] = errors["calibrated"]
     block = table if single else length_chart(summary["lengths"], drawn, factor, table)
     return Section("scale", "Scale and reference lengths", [introduction, block])
-
-
-def _parameters(summary: dict[str, Any], factor: float) -> Section:
-    rows = []
-    for row in summary["parameters"]:
-        scale, unit = people_read(row["unit"])
-        expanded = None if row["u"] is None else factor * scale * row["u"]
-        decimals = decimals_for(expanded)
-        state = "" if expanded else "only with others"
-        if row["bound"]:
-            state = f"on the {row['bound']} bound" + (" of stage 1; U is that of k" if expanded else "")
-        rows.append([
-            text_cell(row["parameter"]),
-            text_cell(unit),
-            number_cell(scale * row["calibrated"], decimals),
-            number_cell(expanded, decimals),
-            number_cell(scale * (row["calibrated"] - row["nominal"]), decimals, signed=True),
-            number_cell(scale * row["nominal"], 4),
-            text_cell(state, "unsure" if state else ""),
-        ])  # fmt: skip
-    columns = ("parameter", "unit", "calibrated", "U (95 %)", "change", "nominal", "")
-    introduction = (
-        f"U is the expanded uncertainty, coverage factor {factor:.2f}. A parameter on a bound, or one that the data "
-        "determine only together with others, has none of its own."
-    )
-    by_unit = {unit: [row for row in summary["parameters"] if row["unit"] == unit] for unit in ("mm", "rad")}
-    changes = [_change_chart(unit, chosen, factor) for unit, chosen in by_unit.items() if chosen]
-    return Section("parameters", "Parameters", [introduction, *changes, ReportTable("Parameters", columns, rows)])
-
-
-def _change_chart(unit: str, parameters: list[dict[str, Any]], factor: float) -> Chart:
-    scale, label = people_read(unit)
-    kind = "length" if unit == "mm" else "angle"
-    names = [row["parameter"] for row in parameters]
-    x, change = np.arange(len(names)), scale * np.array([row["calibrated"] - row["nominal"] for row in parameters])
-    expanded = np.array([np.nan if row["u"] is None else factor * scale * row["u"] for row in parameters])
-    known = np.isfinite(expanded)
-    decimals = [decimals_for(bar) if there else 4 for bar, there in zip(expanded.tolist(), known, strict=True)]
-    hover = np.array([
-        f"{name}: {format_number(value, digits, signed=True)} {label}"
-        + (f", U {format_number(bar, digits)} {label}" if there else ", no uncertainty of its own")
-        for name, value, bar, digits, there in zip(
-            names, change.tolist(), expanded.tolist(), decimals, known.tolist(), strict=True
-        )
-    ])  # fmt: skip
-    low, high = (change - expanded)[known], (change + expanded)[known]
-    marks = [charts.Marks("with U (95 %)", x[known], change[known], "dot", "main", hover[known].tolist(), low, high)]
-    # What has no uncertainty of its own has an arbitrary value: within the range of the others it has a cross.
-    axis = charts.linear(f"change [{label}]", *((change[known], low, high) if np.any(known) else (change,)), [0.0])
-    if not np.all(known):
-        at = np.clip(change[~known], axis.low, axis.high)
-        says = "without U of its own: known only together with others, or on a bound"
-        marks.append(charts.Marks(says, x[~known], at, "cross", "accent", hover[~known].tolist()))
-    outside = int(np.sum((change < axis.low) | (change > axis.high)))
-    plot = charts.Plot(charts.names("", names), axis, tuple(marks), horizontal=[0.0], height=260)
-    description = "Calibrated minus nominal; bars are U, and smaller than the mark where none is visible."
-    if outside:
-        description += f" At the edge: {outside} without U, whose values (in the table) lie outside."
-    return Chart(f"change-{unit}", f"Change of {kind} parameters", description, (plot,))
 
 
 def _residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Evaluation) -> list[Section]:

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 from .charts import Plot
 
-_MOST_STACKED = 16  # rows
-_NARROW, _CHARACTER, _GAP = 370.0, 7.2, 10.0  # pixels: a telephone's page, a character, between columns
+_MOST_STACKED = 42  # cells: more would be a list without end
+_NARROW, _CHARACTER, _GAP = 370.0, 7.6, 8.0  # pixels: a telephone's page, a character, between columns
 _LONGEST = 14  # characters: longer texts are wrapped
 _ZERO = 1e-9  # mm: smaller numbers are rounding errors
 
@@ -36,7 +36,7 @@ class ReportTable(NamedTuple):
     @property
     def stacked(self) -> bool:
         """Whether a narrow screen shows each row as a list: a table of few rows that has no room on a telephone."""
-        if len(self.rows) > _MOST_STACKED:
+        if len(self.rows) * len(self.columns) > _MOST_STACKED:
             return False
         texts = [[column, *(row[i].text for row in self.rows)] for i, column in enumerate(self.columns)]
         words = [max((len(word) for text in column for word in text.split()), default=0) for column in texts]
@@ -93,11 +93,14 @@ def text_cell(value: object, mark: str = "") -> Cell:
     return Cell(str(value), None, mark)
 
 
-def number_cell(value: float | None, decimals: int = 4, *, signed: bool = False, mark: str = "") -> Cell:
-    """A cell with a number; a dash for None and NaN."""
+def number_cell(
+    value: float | None, decimals: int = 4, *, signed: bool = False, mark: str = "", rounded: bool = False
+) -> Cell:
+    """A cell with a number; a dash for None and NaN. ``rounded``: to these decimals of its U, even to 0."""
     if value is None or not math.isfinite(value):
         return Cell("–" if value is None or math.isnan(value) else "not determined", None, mark)
-    return Cell(format_number(value, decimals, signed=signed), float(value), mark)
+    shown = round(value, decimals) if rounded else value
+    return Cell(format_number(shown, decimals, signed=signed), float(value), mark)
 
 
 def format_number(value: float, decimals: int = 4, *, signed: bool = False) -> str:

@@ -251,7 +251,8 @@ def _metrics_chart(tests: list[AcceptanceTest]) -> Chart:
         divisors = [max(metric.worst.limit or 0.0, least) for metric in metrics]
         title = "Metrics against their limits"
         description = (
-            "The value of each metric, divided by its limit, with U: it conforms if the whole bar lies below 1."
+            "The value of each metric, divided by its limit, with U. The decisions are in the tables: they follow the "
+            "rule stated above, whose guard band may be less than U."
         )
     else:
         y, lines, divisors = "|value| [mm]", [], [1.0] * len(metrics)

@@ -80,8 +80,8 @@ def removed_tables(record: CalibrationRecord) -> list[ReportTable]:
     return [ReportTable("Left out, because it contradicts the rest", (*columns, *changed), rows)]
 
 
-def _words(quantity: dict[str, Any]) -> str:
-    return quantity_words(quantity, u=False).replace("-", "−")
+def _words(quantity: dict[str, Any], coverage: float | None = None) -> str:
+    return quantity_words(quantity, u=False, coverage=coverage).replace("-", "−")
 
 
 def agreement_tables(summary: dict[str, Any]) -> list[ReportTable]:
@@ -201,7 +201,7 @@ def _weights_table(summary: dict[str, Any]) -> ReportTable:
 
 def geometry_section(summary: dict[str, Any]) -> Section:
     """Every part of the unknown geometry as found, beside what is certified of it."""
-    rows = []
+    rows, factor = [], summary["uncertainty"]["coverage_factor_95"]
     for part in summary["geometry"]:
         # What is certified has its numbers in the order of the quantities.
         errors = None if part["certified"] is None else np.abs(np.subtract(part["values"], part["certified"]))
@@ -210,8 +210,7 @@ def geometry_section(summary: dict[str, Any]) -> Section:
             if errors is not None:
                 count = len(quantity["values"])
                 difference, errors = float(errors[:count].max()), errors[count:]
-            expanded = expanded_words(quantity, summary["uncertainty"]["coverage_factor_95"])
-            cells = (part["part"], quantity["quantity"], _words(quantity), expanded)
+            cells = (part["part"], quantity["quantity"], _words(quantity, factor), expanded_words(quantity, factor))
             rows.append([*map(text_cell, cells), text_cell("") if difference is None else number_cell(difference)])
     introduction = (
         "The geometry that was unknown, as found with the parameters: positions and frames in the base frame, "

@@ -76,8 +76,8 @@
       for (const other of row.children) other.removeAttribute("aria-sort");
       heading.setAttribute("aria-sort", down ? "descending" : "ascending");
       const key = (line) => {
-        const cell = line.children[column];
-        return cell.dataset.value === undefined ? null : Number(cell.dataset.value);
+        const number = parseFloat(line.children[column].textContent.replaceAll("−", "-"));
+        return heading.classList.contains("number") && !Number.isNaN(number) ? number : null;
       };
       const body = table.tBodies[0], lines = [...body.rows];
       lines.sort((one, other) => {

@@ -8,7 +8,8 @@ import numpy as np
 from ..calibration.record import CalibrationRecord
 from ..core.units import people_read
 from ..kinematics.arm import parameter_unit
-from ..summaries.tables import decimals_for, encoders_in_words, volume_rows
+from ..summaries.harmonics import listed_apart
+from ..summaries.tables import decimals_for, encoders_in_words, seat_in_words, volume_rows
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
@@ -43,7 +44,7 @@ def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], facto
     return Section(
         "volume",
         "Uncertainty over the working volume",
-        [introduction, table, chart, _noise_sentence(summary["uncertainty"])],
+        [introduction, table, chart, _noise_sentence(summary)],
     )
 
 
@@ -86,9 +87,10 @@ def _volume_chart(volume: VolumetricUncertainty, factor: float, length: str) -> 
     )
 
 
-def _noise_sentence(found: dict[str, Any]) -> str:
+def _noise_sentence(summary: dict[str, Any]) -> str:
+    found = summary["uncertainty"]
     seating = 1e3 * found["seating_mm"]
-    noise = f"{encoders_in_words(found)}, seat {seating:.3g} µm"
+    noise = f"{encoders_in_words(found)}, {seat_in_words(summary)} {seating:.3g} µm"
     basis = "All uncertainties are based on"
     joints = ", ".join(str(row["joint"]) for row in found.get("noisy_encoders", ()))
     replaced = f", but for joint {joints}, whose noise was estimated" if joints else ""
@@ -126,7 +128,13 @@ def correlations_section(record: CalibrationRecord, uncertainty: Uncertainty) ->
 def observability_section(observability: Observability) -> Section:
     """What the data determine, and how strongly."""
     count, singular = len(observability.names), observability.singular
-    sentences = observability.sentences() or [f"These data determine all {count} parameters."]
+    determined = f"These data determine all {count} parameters."
+    if observability.rank < count:
+        determined = (
+            f"These data determine {observability.rank} directions of the {count} parameters; with their priors, all "
+            "are determined."
+        )
+    sentences = observability.sentences() or [determined]
     rows = [
         ("rank", f"{observability.rank} of {count}", "number of directions that are determined"),
         ("condition", f"{observability.condition:.3g}", "of what is determined, columns scaled"),
@@ -153,8 +161,12 @@ def bounds_section(record: CalibrationRecord, summary: dict[str, Any]) -> Sectio
     """Which bounds are active, and the position of each parameter within its bounds."""
     vector = record.vectors()["calibrated"]
     active, stage1 = summary["active"], summary["active_stage1"]
+    on_bound = sorted({*active, *stage1})
+    listed, harmonics = listed_apart(summary["parameters"])
+    shown = [*(row["parameter"] for row in listed), *(r["parameter"] for r in harmonics if r["parameter"] in on_bound)]
     rows, positions = [], []
-    for i, name in enumerate(record.names):
+    for name in shown:
+        i = record.names.index(name)
         scale, unit = people_read(parameter_unit(record.recording.nominal.arm, name))
         width = record.upper[i] - record.lower[i]
         bounded = np.isfinite(width) and width > 0
@@ -163,25 +175,27 @@ def bounds_section(record: CalibrationRecord, summary: dict[str, Any]) -> Sectio
         state = f"on the {side} bound" + ("" if name in active else " in stage 1") if side else ""
         values = (number_cell(scale * x) for x in (record.lower[i], vector[i], record.upper[i]))
         rows.append([text_cell(name), text_cell(unit), *values, text_cell(state, "unsure" if side else "")])
-    on_bound = sorted({*active, *stage1})
     introduction = f"On a bound: {', '.join(on_bound)}." if on_bound else "No bound is active."
     if record.method == "two-stage":
         introduction += " Bounds are those of stage 1; the scale fix comes after it."
-    at, on = np.asarray(positions), np.array([name in on_bound for name in record.names])
+    at, on = np.asarray(positions), np.array([name in on_bound for name in shown])
     x = np.arange(len(at))
-    hover = [f"{name}: {position:+.2f}" for name, position in zip(record.names, positions, strict=True)]
+    hover = [f"{name}: {position:+.2f}" for name, position in zip(shown, positions, strict=True)]
     marks = [charts.Marks("within", x[~on], at[~on], hover=[hover[i] for i in x[~on]])]
     if np.any(on):
         # Stage 1 may have been on a bound that the calibrated value has left.
         edge = np.clip(at[on], -1, 1)
         marks.append(charts.Marks("on a bound", x[on], edge, "diamond", "accent", [hover[i] for i in x[on]]))
     ticks = ((-1.0, "lower"), (0.0, "middle"), (1.0, "upper"))
-    axes = charts.names("", record.names), charts.Axis("position within bounds", -1.15, 1.15, ticks)
+    axes = charts.names("", shown), charts.Axis("position within bounds", -1.15, 1.15, ticks)
     plot = charts.Plot(*axes, tuple(marks), horizontal=[-1.0, 1.0], height=220)
+    description = "Diamonds are on a bound." if np.any(on) else "None is on a bound."
+    if len(shown) < len(record.names):
+        description += f" Not drawn: {len(record.names) - len(shown)} coefficients of harmonics within theirs."
     chart = Chart(
         "bounds",
         "Position of every parameter within its bounds",
-        "Diamonds are on a bound." if np.any(on) else "None is on a bound.",
+        description,
         (plot,),
         ReportTable("Bounds", ("parameter", "unit", "lower", "calibrated", "upper", ""), rows),
     )

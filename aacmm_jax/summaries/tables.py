@@ -28,12 +28,15 @@ def observed_words(sockets: int, others: int, lengths: int | None = None) -> str
     return ", ".join(words)
 
 
-def quantity_words(row: Mapping[str, Any], u: bool = True) -> str:
+def quantity_words(row: Mapping[str, Any], u: bool = True, coverage: float | None = None) -> str:
     """A quantity of an observation as a person reads it, angles in deg; with its standard uncertainty where one is
-    known and ``u`` is true."""
+    known and ``u`` is true. With a coverage factor, what was found is rounded to its expanded uncertainty."""
     factor, unit = (180 / math.pi, "deg") if row["unit"] == "rad" else (1.0, row["unit"])
-    decimals = 6 if unit == "1" else 4
-    values = ", ".join(f"{round(factor * value, decimals) + 0.0:.{decimals}f}" for value in row["values"])  # no -0
+    default = 6 if unit == "1" else 4
+    found = [None] * len(row["values"]) if coverage is None else row["u_found"]
+    decimals = [decimals_for(None if own is None else (coverage or 0.0) * factor * own, default) for own in found]
+    pairs = zip(row["values"], decimals, strict=True)
+    values = ", ".join(f"{factor * value:z.{digits}f}" for value, digits in pairs)
     words = f"({values})" if len(row["values"]) > 1 else values
     words += "" if unit == "1" else f" {unit}"
     if not u or row["u"] is None:
@@ -47,7 +50,7 @@ def expanded_words(row: Mapping[str, Any], factor: float) -> str:
     if any(u is None for u in row["u_found"]):
         return "not determined"
     expanded = [factor * scale * u for u in row["u_found"]]
-    words = ", ".join(f"{value:.2g}" if value < 100 else f"{value:.0f}" for value in expanded)
+    words = ", ".join(two_digits(value) if value > 0 else "0" for value in expanded)
     return (f"({words})" if len(row["u_found"]) > 1 else words) + unit
 
 
@@ -84,3 +87,8 @@ def encoders_in_words(found: Mapping[str, Any]) -> str:
 
     words, linear = f"encoders {listed(found['encoder_arcsec'], 1.0)} arcsec", found["linear_encoder_mm"]
     return words if linear is None else f"{words}, linear encoders {listed(linear, 1e3)} um"
+
+
+def seat_in_words(summary: Mapping[str, Any]) -> str:
+    """What the noise is of that does not come from the joints: of the seat in a socket, or of the tip itself."""
+    return "seat" if summary["sockets_used"] else "tip, each coordinate,"

@@ -38,8 +38,8 @@ def calibration_verdict(summary: Mapping[str, Any]) -> Verdict:
     held_out = summary["cross_validation"]
     agrees = held_out is not None and held_out["rms_mm"] is not None
     checked = "held-out data agree with it" if agrees else "no held-out data confirm it"
-    prefix = "The simulated arm is fit" if "truth" in summary else "Fit"
-    return Verdict("good", f"{prefix} for use: {stated}; {checked}.")
+    prefix = "Calibrated, in simulation" if "truth" in summary else "Calibrated"
+    return Verdict("good" if agrees else "neutral", f"{prefix}: {stated}; {checked}.")
 
 
 def _sentence(doubts: list[str], consequence: str = "") -> str:
@@ -111,7 +111,10 @@ def evaluation_verdict(summary: Mapping[str, Any], own_warnings: int = 0) -> Ver
         return Verdict("unsure", f"Undecided: the measurement is too uncertain for {shorten(names)}.")
     if decision == "conforms":
         incomplete = any(test["missing"] for test in summary["acceptance"] if test["decision"])
-        says = "Conforms: every limit is kept" + ("; a procedure was not complete." if incomplete else ".")
+        without = dict.fromkeys(metric["name"] for metric in metrics if metric["decision"] is None)
+        says = "Conforms: every limit given is kept" + (f" ({shorten(list(dict.fromkeys(names)))})" if names else "")
+        says += f"; no limit was given for {shorten(list(without))}" if without else ""
+        says += "; a procedure was not complete." if incomplete else "."
         return Verdict("unsure" if incomplete or own_warnings else "good", says)
     return _without_limits(summary)
 

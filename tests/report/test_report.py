@@ -731,7 +731,7 @@ def test_tables_sort_by_click_and_by_keyboard(shown):
     opened = shown("calibration", 1600)
     table = opened.locator("table", has=opened.locator("caption", has_text=re.compile("^Parameters$")))
     column = lambda: [  # noqa: E731
-        float(cell.get_attribute("data-value")) for cell in table.locator("tbody tr td:nth-child(3)").all()
+        float(cell.inner_text().replace("−", "-")) for cell in table.locator("tbody tr td:nth-child(3)").all()
     ]
     heading = table.locator("th button", has_text="calibrated")
     heading.click()

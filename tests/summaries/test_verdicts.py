@@ -25,9 +25,9 @@ UNKNOWN = {"volume": VOLUME | {"u_length_reading_largest_mm": None}, "coverage_f
             "good",
             "U (95 %) of a measured length of 300 mm, 0.020 mm (at worst 0.10 mm); held-out data agree with it.",
         ),
-        ({"truth": {}}, "good", "The simulated arm is fit for use"),
-        ({"cross_validation": None}, "good", "no held-out data confirm it"),
-        ({"model_tests": TESTS}, "good", "Fit for use"),
+        ({"truth": {}}, "good", "Calibrated, in simulation: U (95 %)"),
+        ({"cross_validation": None}, "neutral", "no held-out data confirm it"),
+        ({"model_tests": TESTS}, "good", "Calibrated: U (95 %)"),
         ({"converged": False}, "bad", "Not to be used. stopped"),
         ({"residual_plausible": False}, "bad", "data and arm do not belong together"),
         ({"scale_plausible": False}, "bad", "a scale that it cannot have"),
@@ -59,7 +59,8 @@ def held_out(probability, predicted=0.1):
 @pytest.mark.parametrize(
     ("summary", "own", "mark", "says"),
     [
-        (evaluated("conforms"), 0, "good", "Conforms: every limit is kept."),
+        (evaluated("conforms"), 0, "good", "Conforms: every limit given is kept (E_0)."),
+        (evaluated("conforms", None), 0, "good", "kept (E_0); no limit was given for E_1."),
         (evaluated("conforms"), 1, "unsure", "Conforms"),
         (evaluated("conforms", missing=["more bars"]), 0, "unsure", "a procedure was not complete"),
         (evaluated("conforms", "fails", "undecided"), 0, "bad", "Fails: E_1 is over its limit."),
