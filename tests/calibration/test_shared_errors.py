@@ -17,7 +17,7 @@ from aacmm_jax.kinematics.corrected_arm import with_further_corrections
 from aacmm_jax.kinematics.prior_scales import default_prior
 from aacmm_jax.summaries.calibration import shared_rows, shared_sentence
 from aacmm_jax.uncertainty.group_test import Block
-from aacmm_jax.uncertainty.residual_tests import Residuals
+from aacmm_jax.uncertainty.residual_tests import LEVEL, Residuals
 from aacmm_jax.uncertainty.shared_errors import Effects, one_variance
 
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
@@ -175,6 +175,18 @@ def test_monte_carlo_agrees_with_the_covariance(poses, made):
     assert failed == 0
     linear = np.asarray(aj.uncertainty_of(result).length(task.start, task.end))
     assert 0.9 < np.median(values[:, -20:].std(axis=0) / linear) < 1.12
+
+
+def test_lengths_that_found_errors_explain_are_not_said_to_disagree(poses):
+    made = {"visits": {"shift": 0.02, "visit": POSES}, "gear": {"error": lambda q: 1e-4 * q * (np.arange(6) == 1)}}
+    for what, kind in {"visits": "places", "gear": "gear"}.items():
+        capture = captured(poses, 2, **made[what])
+        result = calibrated(poses, capture, "two-stage")
+        assert kind in result.shared.kinds
+        tests = [aj.calibration.model_tests(one, capture) for one in (result, dataclasses.replace(result, shared=None))]
+        assert tests[0].lengths.probability > 0.05 > LEVEL > tests[1].lengths.probability, what
+    observed = calibrated(poses, capture, prior=aj.Prior({"all": 1e3}))  # by the general path
+    assert aj.calibration.model_tests(observed, capture).lengths.probability > 0.05
 
 
 def test_a_place_that_shifts_is_part_of_what_readings_and_new_lengths_owe(poses):
