@@ -1,4 +1,4 @@
-"""Errors that poses share, drawn anew for Monte Carlo trials: of the tip of every pose, and of what joints do."""
+"""Errors that poses share: drawn anew for Monte Carlo trials, and what they do to lengths between sockets."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, by_joint
 from ..kinematics.corrected_arm import function_values, with_further_corrections
 from ..kinematics.corrections.kinds import term_of
 from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
@@ -28,9 +28,8 @@ def draw_shared(
     if shared is None:
         return None
     q = np.asarray(capture.readings)
-    sizes = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
     tips = np.zeros((count, len(q), 3))
-    for root in _roots(shared, capture, sizes):
+    for root in _roots(shared, capture):
         tips += np.einsum("Mc,tcd->tMd", root, random.normal(size=(count, root.shape[1], 3)))
     values, joints = functions_of(shared.names, arm, q)
     spread = _root(np.asarray(shared.moments))
@@ -56,17 +55,56 @@ def functions_of(
 
 def places_of(capture: Capture) -> Float[np.ndarray, "M p"]:
     """1 for the poses of each socket or observation that a reference length starts or ends at, a column each."""
-    sizes = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
-    names = [*capture.names, *(observation.name for observation in capture.observations)]
     ends = {end for length in capture.lengths for end in (length.start, length.end)}
-    used = [i for i, name in enumerate(names) if name in ends]
-    return (np.repeat(np.arange(len(sizes)), sizes)[:, None] == used).astype(float)
+    used = [i for i, name in enumerate(_names(capture)) if name in ends]
+    return (_owner(capture)[:, None] == used).astype(float)
 
 
-def _roots(shared: SharedErrors, capture: Capture, sizes: list[int]) -> list[Float[np.ndarray, "M c"]]:
+def covariance_of_lengths(
+    shared: SharedErrors, arm: Arm, names: tuple[str, ...], capture: Capture
+) -> Float[np.ndarray, "l l"]:
+    """Covariance of the distances between ends of the reference lengths, as an arm measures them, by errors that poses
+    share, mm^2. Errors of the tip move the mean of an end; how parameters follow these is left out, as it is small.
+
+    Args:
+        shared: The errors.
+        arm: The calibrated arm.
+        names: Its parameters that were free.
+        capture: What it was calibrated from.
+    """
+    q, owner, of = np.asarray(capture.readings), _owner(capture), _names(capture)
+    means = {name: (owner == of.index(name)) / np.sum(owner == of.index(name)) for name in of}
+    between = np.array([means[length.end] - means[length.start] for length in capture.lengths])
+    directions = between @ np.asarray(arm.position(q))
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    found = np.zeros((len(between), len(between)))
+    for root in _roots(shared, capture):
+        moved = between @ root
+        found = found + (directions @ directions.T) * (moved @ moved.T)
+    if shared.names:
+        values, joints = functions_of(shared.names, arm, q)
+        angles = tuple(f"{kind}_{i}" for i, kind in enumerate(by_joint(arm, "theta", "d"), start=1))
+        tips = np.asarray(arm.jacobian(q, angles))[:, :, joints] * values[:, None]
+        tips = tips + np.asarray(arm.jacobian(q, names)) @ np.asarray(shared.follow)
+        columns = np.einsum("lc,lN,Nck->lk", directions, between, tips)
+        found = found + columns @ np.asarray(shared.moments) @ columns.T
+    return found
+
+
+def _names(capture: Capture) -> list[str]:
+    return [*capture.names, *(observation.name for observation in capture.observations)]
+
+
+def _owner(capture: Capture) -> np.ndarray:
+    """Number of the socket or observation of each pose."""
+    sizes = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
+    return np.repeat(np.arange(len(sizes)), sizes)
+
+
+def _roots(shared: SharedErrors, capture: Capture) -> list[Float[np.ndarray, "M c"]]:
     """Square roots of the covariances of a tip coordinate over the poses."""
-    total, found = sum(sizes), []
-    owner = np.repeat(np.arange(len(sizes)), sizes)
+    found, owner = [], _owner(capture)
+    total = len(owner)
     for kind, sd in zip(shared.kinds, np.asarray(shared.sd), strict=True):
         if kind == PLACES:
             found.append(sd * places_of(capture))
@@ -75,7 +113,7 @@ def _roots(shared: SharedErrors, capture: Capture, sizes: list[int]) -> list[Flo
             visits[: len(capture.visits)] = capture.visits
             found.append(sd * (visits[:, None] == [number for number in np.unique(visits) if number >= 0]))
         elif kind == SUCCESSIVE:
-            for i, size in enumerate(sizes):
+            for i, size in enumerate(np.bincount(owner)):
                 order, own = np.arange(size), np.zeros((total, size))
                 kernel = np.exp(-np.abs(order[:, None] - order) / float(shared.correlation_length))
                 own[owner == i] = sd * np.linalg.cholesky(kernel)

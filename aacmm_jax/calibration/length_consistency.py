@@ -14,6 +14,7 @@ from ..model.observed import Observed
 from ..model.residuals import measured_lengths
 from ..uncertainty.group_test import Block
 from ..uncertainty.residual_tests import consistency
+from .drawn_errors import covariance_of_lengths
 from .group_equations import LEAST_U, PRIOR, Rows, scale_anchor_of
 from .record import CalibrationRecord
 
@@ -38,6 +39,9 @@ def length_test(
 ) -> Lengths | None:
     """Lengths and certified values against the arm as the poses alone determine it, but for its scale.
 
+    Errors that poses share, where the calibration has found them, are part of what is expected, unless a single length
+    is what all others contradict.
+
     Args:
         record: The calibration.
         rows: Its equations of poses.
@@ -50,8 +54,22 @@ def length_test(
     related = lengths_of_sockets(record, rows) if record.observed is None else _of_observations(record, rows, relations)
     if related is None:
         return None
+    plain = _tested(record, related, related.covariance, spare)
+    if plain is None or plain.odd or record.shared is None or not record.recording.capture.lengths:
+        return plain
+    arm = to_numpy(record.calibrated.arm)
+    by_shared = covariance_of_lengths(record.shared, arm, record.names, record.recording.capture)
+    number = len(by_shared)  # they come before certified values
+    by_shared = by_shared / (related.units[:number, None] * related.units[:number])
+    others = len(related.names) - number
+    return _tested(record, related, related.covariance + np.pad(by_shared, (0, others)), spare)
+
+
+def _tested(
+    record: CalibrationRecord, related: "Related", covariance: Float[np.ndarray, "l l"], spare: int
+) -> Lengths | None:
     names, units = related.names, related.units
-    found = consistency(related.poses, related.relations, related.covariance, related.scale)
+    found = consistency(related.poses, related.relations, covariance, related.scale)
     if found.degrees_of_freedom < 1:
         return None
 

@@ -14,7 +14,9 @@ from .record import CalibrationRecord
 from .sensitivities import Sensitivities
 
 _EXPLAINED = 1e-3  # part of a column that the model leaves, below which it counts as the model's own
-_USUAL = 3.0  # standard deviation of an effect of the tip above which it is improbable, of that of the residuals
+# Standard deviation of an effect of the tip above which it is improbable, of that of the residuals. Two to four lengths
+# say so little that this decides how wide intervals are: at 3 they covered 89 to 91 % (`benchmarks/NOTES.md`).
+_USUAL = 9.0
 
 
 class SharedProblem(NamedTuple):

@@ -177,15 +177,10 @@ def load_specification(
     """The arm of a file with its name, its proposed identification and, of a URDF, what an export needs.
 
     A file without an ``[identification]`` table gets the parameters that thorough data would determine well, of
-    `Parameters.independent`, and the default bounds.
+    `Parameters.independent`, and the default bounds. The other arguments are those of `load_arm`.
 
     Args:
-        source: As of `load_arm`.
-        base: As of `load_arm`.
-        tip: As of `load_arm`.
-        probe: As of `load_arm`.
-        capture: What was observed, where it is known: of targets alone, or at several temperatures, it determines other
-            parameters.
+        capture: What was observed, where it is known.
 
     Raises:
         InputError: There is neither, or the file is not an arm's.

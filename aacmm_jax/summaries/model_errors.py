@@ -7,7 +7,6 @@ from typing import Any
 from ..calibration.length_consistency import Lengths
 from ..calibration.missing_terms import FoundTerm
 from ..calibration.model_errors import LEVEL, Misfit, ModelTests
-from ..calibration.record import REPEATABILITY
 from ..calibration.results import NoisyEncoder
 from ..core.text import shorten
 from ..core.units import ARCSEC
@@ -62,7 +61,8 @@ def sentences_of_tests(tests: ModelTests, method: str = "", shared: SharedErrors
             f"{shorten(named)}; check these observations, or their u."
         )
     if tests.lengths is not None and tests.lengths.probability < LEVEL:
-        found.append(_lengths(tests.lengths, method))
+        # Errors of places take the part of what u(k) had for lengths that disagree.
+        found.append(_lengths(tests.lengths, "" if PLACES in kinds else method, bool(kinds)))
     return found
 
 
@@ -147,12 +147,13 @@ def _misfit(misfit: Misfit) -> str:
     )
 
 
-def _lengths(lengths: Lengths, method: str) -> str:
+def _lengths(lengths: Lengths, method: str, shared: bool) -> str:
     odd = f"; without {lengths.odd} ({lengths.difference:+.3g} mm) the others agree" if lengths.odd else ""
-    enlarged = "" if method in ("joint", REPEATABILITY) else " u(k) allows for it."
+    enlarged = " u(k) allows for it." if method == "two-stage" else ""
+    predicted = "u, the poses and the errors that these share" if shared and not odd else "u and the poses"
     return (
         f"Reference lengths that disagree with the arm: the {lengths.number} err {lengths.birge_ratio:.2g} times as "
-        f"much as their u and the poses predict (Birge ratio, {_chance(lengths.probability)}){odd}.{enlarged} "
+        f"much as their {predicted} predict (Birge ratio, {_chance(lengths.probability)}){odd}.{enlarged} "
         "Look for a wrong length, or for errors outside the D-H model."
     )
 

@@ -9,11 +9,16 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.calibration.redrawn import trials_of
 from aacmm_jax.calibration.sampling import _RepeatedTask
+from aacmm_jax.calibration.shared_equations import _USUAL
 from aacmm_jax.calibration.shared_errors import missing_functions, with_shared_errors
+from aacmm_jax.core.distributions import student_quantile
 from aacmm_jax.data.arm_classes import ArmNoise
 from aacmm_jax.kinematics.corrected_arm import with_further_corrections
 from aacmm_jax.kinematics.prior_scales import default_prior
 from aacmm_jax.summaries.calibration import shared_rows, shared_sentence
+from aacmm_jax.uncertainty.group_test import Block
+from aacmm_jax.uncertainty.residual_tests import LEVEL, Residuals
+from aacmm_jax.uncertainty.shared_errors import Effects, one_variance
 
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
 PLACES = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (300, -300, 300), "D": (500, 300, 100)}
@@ -144,6 +149,17 @@ def test_functions_that_the_model_lacks_move_other_poses_too(poses):
     assert np.linalg.eigvalsh(np.asarray(whole.covariance) / np.outer(sd, sd)).min() > -1e-6
 
 
+@pytest.mark.parametrize(("lengths", "size"), [(3, 2.0), (3, 4.0), (5, 2.0), (5, 4.0)])
+def test_intervals_by_few_lengths_are_as_wide_as_students(lengths, size):
+    """With the mean of the variance, since its own uncertainty is part of it."""
+    rows = np.concatenate([np.ones(200), np.full(lengths, np.hypot(1.0, size))])
+    none = np.zeros((len(rows), 0))
+    effects = Effects.none(Residuals.of([Block("", None, rows, none, none)]), given=True)
+    variance = one_variance(effects, np.eye(len(rows))[:, 200:], 1 / np.sqrt(POSES), _USUAL).variance
+    student = student_quantile(0.975, lengths)
+    assert 0.88 < 1.96 * np.sqrt(variance) / size / student < 1.05
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "made", [{"shift": 0.02, "visit": POSES}, {"shift": 0.02, "marked": True}, {"error": eccentric}]
@@ -159,6 +175,18 @@ def test_monte_carlo_agrees_with_the_covariance(poses, made):
     assert failed == 0
     linear = np.asarray(aj.uncertainty_of(result).length(task.start, task.end))
     assert 0.9 < np.median(values[:, -20:].std(axis=0) / linear) < 1.12
+
+
+def test_lengths_that_found_errors_explain_are_not_said_to_disagree(poses):
+    made = {"visits": {"shift": 0.02, "visit": POSES}, "gear": {"error": lambda q: 1e-4 * q * (np.arange(6) == 1)}}
+    for what, kind in {"visits": "places", "gear": "gear"}.items():
+        capture = captured(poses, 2, **made[what])
+        result = calibrated(poses, capture, "two-stage")
+        assert kind in result.shared.kinds
+        tests = [aj.calibration.model_tests(one, capture) for one in (result, dataclasses.replace(result, shared=None))]
+        assert tests[0].lengths.probability > 0.05 > LEVEL > tests[1].lengths.probability, what
+    observed = calibrated(poses, capture, prior=aj.Prior({"all": 1e3}))  # by the general path
+    assert aj.calibration.model_tests(observed, capture).lengths.probability > 0.05
 
 
 def test_a_place_that_shifts_is_part_of_what_readings_and_new_lengths_owe(poses):
