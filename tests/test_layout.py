@@ -4,6 +4,7 @@ import ast
 import importlib
 import inspect
 import re
+import runpy
 import sys
 import tomllib
 from functools import cache
@@ -75,6 +76,11 @@ def test_the_folders_are_those_of_the_layers():
 def test_import_contracts_are_kept(capsys):
     status = lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True, no_logo=True)
     assert status == 0, capsys.readouterr().out
+
+
+def test_the_picture_of_the_layout_is_current():
+    drawn = runpy.run_path(str(ROOT / "docs" / "layout_picture.py"))["picture"]()
+    assert drawn == (ROOT / "docs" / "layout.svg").read_text(), "make it anew: python docs/layout_picture.py"
 
 
 @pytest.mark.parametrize("path", MODULES, ids=dotted)
