@@ -2,6 +2,8 @@
 # make test         set up and run the tests (budget: 3 minutes on two cores)
 # make test-slow    the tests that take long, or need optimised programs; the other half of what CI runs
 # make test-exhaustive  before a release: coverage by many trials, every robot, every notebook, all variants
+# make docs         the documentation, into docs/_build/html (runs the notebooks that changed; make docs NOTEBOOKS=stored
+#                   shows their stored outputs instead)
 # make check        lint, types and import contracts
 # make test-newest  a selection of the tests with the newest versions that pyproject.toml allows, installed from scratch
 # make test-lowest  the same with the lowest
@@ -28,7 +30,7 @@ SELECTION := tests/test_package.py tests/kinematics tests/solver tests/calibrati
 PANDA := aacmm-demo/panda
 
 .PHONY: demo test test-slow test-exhaustive test-newest install-newest run-newest test-lowest check audit bench peers \
-	reproduce clean
+	docs reproduce clean
 
 demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
@@ -112,5 +114,9 @@ benchmarks/peers/%/.venv/.done: benchmarks/peers/%/requirements.txt
 	$(call install,.venv,--constraint requirements/tested.txt --editable '.[dev]')
 	touch $@ .venv/.test .venv/.run
 
+.venv/.docs: pyproject.toml requirements/tested.txt | .venv/bin/python
+	$(call install,.venv,--constraint requirements/tested.txt --editable '.[docs]')
+	touch $@ .venv/.run
+
 clean:
-	rm -rf .venv .venv-newest .venv-lowest aacmm-demo
+	rm -rf .venv .venv-newest .venv-lowest aacmm-demo docs/_build docs/notebooks docs/reference/api

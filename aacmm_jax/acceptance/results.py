@@ -13,6 +13,7 @@ from ..kinematics.workspace import Reach
 from .decision import COVERAGE_FACTOR, DECISIONS, Decision, Rule, worst
 from .standards import EDITIONS, SYMBOLS
 
+# Metrics by name: what each of them is.
 METRICS = {
     "Deltam": "largest half range of a coordinate in a socket",
     "Length": "largest deviation of a length",

@@ -1,0 +1,84 @@
+"""The pages of the reference that are generated: one for each namespace; and the notebooks, linked where Sphinx looks.
+
+They are written to docs/reference/api when a build begins, and git ignores them.
+"""
+
+import importlib
+import inspect
+from pathlib import Path
+
+from class_fields import without_substitutions
+from public_names import PACKAGE, PublicName, namespaces, public_names
+
+DOCS = Path(__file__).resolve().parents[1]
+
+
+def _link(name: str) -> str:
+    return f":py:obj:`~{name}`"
+
+
+def _underlined(title: str, line: str) -> list[str]:
+    return [title, line * len(title), ""]
+
+
+def _entry(item: PublicName) -> list[str]:
+    """One name with its docstring; a value that is a dictionary with its contents."""
+    lines = [f".. {item.directive}:: {item.name}"]
+    if item.directive == "autoclass":
+        lines += ["   :members:", "   :inherited-members: tuple, Module, BaseModel, str, int, Enumeration, Enum"]
+    lines.append("")
+    if isinstance(item.value, dict):
+        lines += [f"   {line}" for line in item.docstring.splitlines()] + [""]
+        lines += [f"   * ``{key}``: {text}" for key, text in item.value.items()] + [""]
+    if item.also:
+        lines += ["Also: " + ", ".join(f"``{other}``" for other in item.also) + ".", ""]
+    return [*lines, f"*Written in* ``{item.source.relative_to(PACKAGE.parent)}``.", ""]
+
+
+def _summary(item: PublicName) -> str:
+    return without_substitutions(item.docstring.partition("\n\n")[0].replace("\n", " "))
+
+
+def page(namespace: str, names: list[PublicName]) -> str:
+    """The reference of one namespace as reStructuredText."""
+    module = importlib.import_module(namespace)
+    own = [item for item in names if item.namespace == namespace]
+    others = [item for item in names if any(name.rpartition(".")[0] == namespace for name in item.also)]
+    title = namespace.replace("aacmm_jax", "aj", 1)
+    lines = [*_underlined(title, "="), inspect.getdoc(module) or "", ""]
+    if own:
+        lines += ["| " + f"{_link(item.name)}: {_summary(item)}" for item in own] + [""]
+    if others:
+        lines += ["Here too: " + ", ".join(_link(item.name) for item in others) + ".", ""]
+    for item in own:
+        lines += [*_underlined(item.short, "-"), *_entry(item)]
+    return "\n".join(lines) + "\n"
+
+
+def write_if_changed(path: Path, text: str) -> None:
+    """An unchanged page keeps its time, so that Sphinx does not read it again."""
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+
+def write_pages(app) -> None:
+    """Write the page of every namespace."""
+    names = public_names()
+    for namespace in namespaces():
+        name = namespace.partition(".")[2] or "aj"
+        write_if_changed(DOCS / "reference" / "api" / f"{name}.rst", page(namespace, names))
+
+
+def link_notebooks(app) -> None:
+    """Sphinx reads what is below docs/; the notebooks run in their own folder, which a link keeps."""
+    link = DOCS / "notebooks"
+    if not link.exists():
+        link.symlink_to(Path("..") / "notebooks", target_is_directory=True)
+
+
+def setup(app) -> dict[str, object]:
+    """Called by Sphinx."""
+    app.connect("builder-inited", link_notebooks)
+    app.connect("builder-inited", write_pages)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,26 @@
+"""Formulas as MathML, which every browser shows by itself: no script, and nothing loaded over a network."""
+
+from docutils import nodes
+from latex2mathml.converter import convert
+from sphinx.util.docutils import SphinxTranslator
+
+
+def _inline(translator: SphinxTranslator, node) -> None:
+    translator.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def _block(translator: SphinxTranslator, node) -> None:
+    translator.body.append(translator.starttag(node, "div", CLASS="math"))
+    if node["number"]:
+        translator.body.append(f'<span class="eqno">({node["number"]})')
+        translator.add_permalink_ref(node, "Link to this equation")
+        translator.body.append("</span>")
+    translator.body.append(convert(node.astext(), display="block") + "</div>\n")
+    raise nodes.SkipNode
+
+
+def setup(app) -> dict[str, object]:
+    """Called by Sphinx."""
+    app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
