@@ -44,6 +44,8 @@ PARTS = (
     "Every u is too small",
     "... mm RMS, ... times",
     "... (... times)",
+    "... (... mm, ... times)",
+    "... (... of ... poses)",
     "... (... %)",
     "... pose ... (",
     "... ... mm RMS, ... times",
