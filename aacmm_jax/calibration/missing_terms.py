@@ -24,6 +24,9 @@ from .group_equations import Rows, wider
 
 MOST_TERMS = 6  # that are looked for one after the other
 _AS_WELL = 6.0  # difference of the information criterion (Akaike 1974) below which another term explains as much
+# Part of the residuals. A step of a joint, 1 mrad, turns the residuals themselves by 1e-3 of their size, and so does
+# the frame of a station that imitates it: in what is left of its column after the frame, linear equations are wrong.
+_SECOND_ORDER = 3e-3
 
 Kind = Literal[
     "zero",
@@ -139,9 +142,9 @@ def found_terms(
     candidates, others_rows = missing_terms(arm, q), sum(len(block.residual) for block in relations)
     columns = [np.pad(each, ((0, others_rows), (0, 0))) for each in columns_of(candidates, rows, arm.joints)]
     chosen: list[tuple[int, ScoreTest, float, list[int]]] = []
-    explained = left
+    explained, least = left, _SECOND_ORDER * float(np.sqrt(left.cost))
     for _ in range(MOST_TERMS):
-        tests = score_tests(explained, columns)
+        tests = score_tests(explained, columns, least)
         number = sum(test.degrees_of_freedom[0] > 0 for test in tests)
         significant = [i for i, test in enumerate(tests) if test.probability * number < LEVEL]
         if not significant:
@@ -154,7 +157,7 @@ def found_terms(
         explained = explained.extended(columns[best])
     if not chosen:
         return ()
-    (together,) = score_tests(left, [np.concatenate([columns[i] for i, *_ in chosen], axis=1)])
+    (together,) = score_tests(left, [np.concatenate([columns[i] for i, *_ in chosen], axis=1)], least)
     coefficients = np.split(together.coefficients, np.cumsum([columns[i].shape[1] for i, *_ in chosen])[:-1])
     return tuple(
         FoundTerm(

@@ -150,12 +150,13 @@ class ScoreTest(NamedTuple):
     coefficients: Float[np.ndarray, " c"]
 
 
-def score_tests(left: Residuals, candidates: Sequence[Float[np.ndarray, "R _"]]) -> list[ScoreTest]:
+def score_tests(left: Residuals, candidates: Sequence[Float[np.ndarray, "R _"]], least: float = 0.0) -> list[ScoreTest]:
     """Each candidate against the model, whatever the level of the noise is.
 
     Args:
         left: The residuals.
         candidates: The columns of each candidate.
+        least: Size of what the model leaves of a column, below which it counts as the model's own.
 
     Returns:
         One for each candidate; probability 1 for those that the model explains itself.
@@ -166,6 +167,7 @@ def score_tests(left: Residuals, candidates: Sequence[Float[np.ndarray, "R _"]])
     lengths = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(lengths > 0, lengths, 1.0)
     projected = left.unexplained(columns)
+    projected = np.where(lengths * np.linalg.norm(projected, axis=0) > least, projected, 0.0)
     gram, score = projected.T @ projected, projected.T @ left.values
     ends, found = np.cumsum([each.shape[1] for each in candidates]), []
     for end, each in zip(ends, candidates, strict=True):

@@ -60,6 +60,22 @@ def test_score_tests_are_f_tests_of_the_larger_model(problem, rng):
     assert score_tests(left, []) == []
 
 
+def test_a_column_of_which_the_model_leaves_too_little_is_its_own(problem, rng):
+    """As the zero of a joint, which the frame of a station imitates but for the size of the residuals; also one that is
+    tiny itself."""
+    blocks, columns = problem
+    left = Residuals.of(blocks)
+    nearly = 10 * columns[:, :1] + 0.01 * left.values[:, None]
+    other = rng.normal(size=(sum(SIZES), 1))
+    tiny = np.concatenate([1e-17 * rng.normal(size=(sum(SIZES), 1)), other], axis=1)
+    least = 0.02 * float(np.sqrt(left.cost))
+    found, without = score_tests(left, [nearly, tiny], least), score_tests(left, [nearly, tiny])
+    assert [test.degrees_of_freedom[0] for test in found] == [0, 1]
+    assert [test.degrees_of_freedom[0] for test in without] == [1, 2]
+    assert found[0].probability == 1.0 > 1e-10 > without[0].probability
+    assert found[1].ratio == pytest.approx(score_tests(left, [other])[0].ratio)
+
+
 @pytest.mark.parametrize("relative", [True, False])
 @pytest.mark.parametrize("kernel", [None, "neighbours"])
 def test_quadratic_forms_have_the_distribution_of_their_draws(problem, rng, relative, kernel):
