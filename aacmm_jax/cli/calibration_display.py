@@ -27,6 +27,7 @@ from .display import (
     print_warnings,
     print_written,
 )
+from .parameter_display import print_parameters
 
 _MOST_PARTS = 12  # rows of a table
 _TRUTH = (
@@ -144,7 +145,7 @@ def calibration(summary: dict[str, Any]) -> None:
         print_stages(console, title, summary, stages, fitted=summary["fixed_by_one_length"])
     if "truth" in summary:
         _truth(console, summary["truth"])
-    _parameters(console, summary["parameters"])
+    print_parameters(console, summary["parameters"])
     if summary["held"]:
         console.print(f"Fixed at their nominal values: {', '.join(summary['held'])}.")
     if summary.get("prior"):
@@ -376,27 +377,6 @@ def _truth(console: Console, truth: dict[str, Any]) -> None:
     table = new_table("\nAgainst the true arm of the simulation", "", "nominal", "stage 1", "calibrated")
     for key, text, factor in _TRUTH:
         table.add_row(escape(text), *(formatted(factor * truth[stage][key]) for stage in stages))
-    print_table(console, table)
-
-
-def _parameters(console: Console, rows: list[dict[str, Any]]) -> None:
-    """Every free parameter in its own unit, to two digits of its standard uncertainty."""
-    table = new_table(
-        "\nFree parameters, with standard uncertainty u",
-        *("parameter", "unit", "nominal", "calibrated", "change", "u", "bound"),
-    )
-    for row in rows:
-        factor, unit = people_read(row["unit"])
-        nominal, value = factor * row["nominal"], factor * row["calibrated"]
-        u = None if row["u"] is None else factor * row["u"]
-        decimals = 9 if u == 0 else decimals_for(u)
-        numbers = (
-            f"{nominal:z.4f}",
-            f"{value:z.{decimals}f}",
-            f"{value - nominal:+z.{decimals}f}",
-            "-" if u is None else f"{u:.{decimals}f}",
-        )
-        table.add_row(row["parameter"], unit, *numbers, row["bound"] or "")
     print_table(console, table)
 
 

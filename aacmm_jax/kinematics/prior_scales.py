@@ -21,6 +21,14 @@ _BY_LINK = 1e-3  # rad/m: 1 mrad for links with levers of 1 m
 _COMPLIANCE = 1e-2  # rad/(kN m): 1 mrad for 100 N m
 _EXPANSION = 2e-5  # 1/K: steel has 1.15e-5, aluminium 2.3e-5
 _SLIDE = 0.05  # mm, of the harmonics of a prismatic joint
+_OCTAVES = tuple((2**k, min(2 ** (k + 1) - 1, HIGHEST)) for k in range(HIGHEST.bit_length()))
+_HARMONICS = tuple(f"{Harmonics.model}={low}" + (f"-{high}" if high > low else "") for low, high in _OCTAVES)
+_GROUPS = (Gravity.model, GearRatio.model, Coupling.model, Expansion.model, *_HARMONICS)
+
+
+def coefficient_group(name: str) -> str | None:
+    """The group of `default_prior` that holds a coefficient of a joint correction; None for other parameters."""
+    return next((group for group in _GROUPS if is_of_group(group, name)), None)
 
 
 @checked_arguments
@@ -38,10 +46,9 @@ def default_prior(arm: Arm) -> Prior:
         The prior of the groups that the arm has.
     """
     with_masses = any(name.startswith("compliance_") for name in correction_names(arm))
-    octaves = [(2**k, min(2 ** (k + 1) - 1, HIGHEST)) for k in range(HIGHEST.bit_length())]
     kinds = {Gravity.model: _COMPLIANCE if with_masses else _BY_LINK, GearRatio.model: _RATIO, Coupling.model: _RATIO}
     kinds[Expansion.model] = _EXPANSION
-    kinds |= {f"{Harmonics.model}={low}" + (f"-{high}" if high > low else ""): _HARMONIC for low, high in octaves}
+    kinds |= dict.fromkeys(_HARMONICS, _HARMONIC)
     # Coefficients of a slide are in mm, so that they cannot share a scale with those of joints that turn.
     slides = {f"{word}*_{joint}": _SLIDE for joint in arm.prismatic for word in ("cos", "sin", "compliance", "coupled")}
     names = correction_names(arm)

@@ -16,6 +16,7 @@ from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
 from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
 from ..kinematics.parameters import ArmSpecification, Parameters
+from ..kinematics.prior_scales import coefficient_group
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
 from ..uncertainty.tried_poses import tried_poses
@@ -60,6 +61,34 @@ def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
         if specification.urdf is None
         else {"base": specification.urdf.base, "tip": specification.urdf.tip},
     }
+
+
+def coefficient_groups(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Coefficients of joint corrections among ``parameters`` of a summary, by the groups of `default_prior`: how many,
+    their root mean square, and the largest with its u, name and joint; in the unit of the coefficients."""
+    members: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        group = coefficient_group(row["parameter"])
+        if group is not None:
+            members.setdefault((group, row["unit"]), []).append(row)
+    found = []
+    for (group, unit), own in members.items():
+        worst = max(own, key=lambda row: abs(row["calibrated"]))
+        _, _, joint = worst["parameter"].partition("_")
+        found.append(
+            {
+                "group": group,
+                "unit": unit,
+                "parameters": len(own),
+                "names": [row["parameter"] for row in own],
+                "rms": float(np.sqrt(np.mean([row["calibrated"] ** 2 for row in own]))),
+                "largest": worst["calibrated"],
+                "u": worst["u"],
+                "of": worst["parameter"],
+                "joint": int(joint) if joint else None,
+            }
+        )
+    return found
 
 
 def parameters_csv(record: CalibrationRecord) -> str:

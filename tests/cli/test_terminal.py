@@ -15,6 +15,7 @@ import aacmm_jax as aj
 from aacmm_jax.cli import _FAMILIES, acceptance_display, calibration_display
 from aacmm_jax.cli.app import app, examples, length_option
 from aacmm_jax.cli.display import formatted, new_console, new_table, print_table
+from aacmm_jax.cli.parameter_display import print_parameters
 from aacmm_jax.summaries.calibration import calibration_summary
 from aacmm_jax.summaries.tables import observed_words
 from tests.refusals import assert_refused
@@ -287,3 +288,33 @@ def test_a_length_between_any_two_names(text, expected):
 @pytest.mark.parametrize("text", ["A", "", "A,B,u", "A,B,1,2", ",B"])
 def test_what_is_no_length(text):
     assert_refused(lambda: length_option(text), f"--length '{text}' is not of the form")
+
+
+def test_hundreds_of_coefficients_are_printed_by_groups(capsys):
+    names = {
+        "d_3": "mm",
+        **{f"{word}{h}_{i}": "rad" for h in range(1, 8) for i in range(1, 7) for word in ("cos", "sin")},
+    }
+    rows = [
+        {"parameter": name, "unit": unit, "nominal": 0.0, "calibrated": 1e-5, "u": 2e-6, "bound": None}
+        for name, unit in names.items()
+    ]
+    next(row for row in rows if row["parameter"] == "sin3_4")["calibrated"] = -5e-5
+    print_parameters(new_console(), rows)
+    lines = capsys.readouterr().out.splitlines()
+    (octave,) = [line for line in lines if "harmonics=2-3" in line]
+    assert octave.replace("│", " ").split() == [
+        "harmonics=2-3",
+        "arcsec",
+        "24",
+        "2.92",
+        "-10.3",
+        "0.413",
+        "sin3_4",
+        "4",
+    ]
+    assert any("84 coefficients of joint corrections by group" in line for line in lines)
+    assert any("d_3" in line for line in lines)
+    assert sum("cos" in line for line in lines) == 2  # the largest of the other octaves
+    print_parameters(new_console(), rows[:40])
+    assert "cos1_2" in capsys.readouterr().out
