@@ -129,6 +129,11 @@ def checked_limits(limits: Mapping[str, Limit | float]) -> dict[str, Limit]:
     """Limits by the name of a metric, numbers made into `Limit`; `InputError` for an unknown metric or a bad limit."""
     found = {}
     for name, limit in limits.items():
+        if name == "E_Bi":
+            raise InputError(
+                "E_Bi is not offered: it needs lengths probed from opposite directions at their ends, which no kind of "
+                "observation records as such; E_Uni is tested."
+            )
         if name not in METRICS:
             raise InputError(f"there is no metric '{name}'{nearest(name, list(METRICS))}")
         fixed, divisor = limit if isinstance(limit, Limit) else (limit, math.inf)

@@ -11,7 +11,7 @@ from .style import DARK, axes_or_new, label_axes
 def acceptance_metrics(tests: Sequence[AcceptanceTest], axes: Any = None) -> Any:
     """Plot the worst value of every metric that has a limit, divided by the limit, with its expanded uncertainty.
 
-    Where a decision takes the uncertainty into account, a metric conforms whose bar lies below 1.
+    The decision under each name follows its rule, whose guard band may be less than the bar.
 
     Args:
         tests: Acceptance tests of one arm (`acceptance.run`).

@@ -14,6 +14,8 @@ from ..kinematics.workspace import arm_reach, skeleton
 from .style import ACCENT, DARK, LIGHT, axes_or_new, label_axes, new_figure, save_figure
 
 _TIPS = 4000  # of the picture of the reach
+_ZOOM = 0.88  # so that labels in space stay within the figure
+_NUMBERS = 5  # along the longest axis in space
 
 
 def arm_poses(arm: Arm, q: Numbers, axes: Any = None) -> Any:
@@ -38,8 +40,7 @@ def arm_poses(arm: Arm, q: Numbers, axes: Any = None) -> Any:
         axes.plot(*line.T, **(others if index else first))
     tips = np.asarray(arm.position(configurations))
     axes.plot(*tips.T, linestyle="none", marker="+", color=ACCENT, markersize=8)
-    axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]")
-    axes.set_aspect("equal")
+    _label_space(axes)
     return axes
 
 
@@ -71,8 +72,8 @@ def arm_at_zero(arm: Arm, axes: Any = None, *, base: Float[np.ndarray, "4 4"] | 
     low, high = line.min(axis=0), line.max(axis=0)
     half = 0.6 * np.maximum(high - low, 0.6 * np.ptp(line, axis=0).max())[:, None] * [-1, 1]
     ends = ((low + high) / 2)[:, None] + half
-    axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", xlim=ends[0], ylim=ends[1], zlim=ends[2])
-    axes.set_aspect("equal")
+    axes.set(xlim=ends[0], ylim=ends[1], zlim=ends[2])
+    _label_space(axes)
     return axes
 
 
@@ -119,6 +120,17 @@ def save_arm_figure(arm: Arm, path: Path, *, title: str = "", base: Float[np.nda
     arm_workspace(arm, right.subplots()).set_title(f"reach {arm_reach(arm).radius:.0f} mm", fontsize=10)
     figure.suptitle(title)
     save_figure(figure, Path(path))
+
+
+def _label_space(axes: Any) -> None:
+    """Equal scales, labels, and as many numbers along each axis as its length has room for."""
+    axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]")
+    axes.set_aspect("equal")
+    each = (axes.xaxis, axes.yaxis, axes.zaxis)
+    lengths = [abs(np.subtract(*axis.get_view_interval())) for axis in each]
+    axes.set_box_aspect(lengths, zoom=_ZOOM)
+    for axis, length in zip(each, lengths, strict=True):
+        axis.get_major_locator().set_params(nbins=max(2, round(_NUMBERS * length / max(lengths))))
 
 
 def _axes_in_space(axes: Any) -> Any:

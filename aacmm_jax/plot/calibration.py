@@ -11,6 +11,7 @@ from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_o
 from ..core.errors import InputError
 from ..core.units import DEG
 from ..kinematics.arm import is_length, parameter_unit
+from ..summaries.harmonics import listed_apart
 from .style import (
     ACCENT,
     DARK,
@@ -177,6 +178,8 @@ def _stages(record: CalibrationRecord) -> Mapping[str, Mapping[str, Any]]:
 def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any = None) -> Any:
     """Plot the change of each parameter from its nominal value, with its expanded uncertainty (95 %).
 
+    Hundreds of coefficients of harmonics are left out: `joint_function` draws them as the function that they are.
+
     Args:
         record: The calibration.
         kind: ``"length"`` for the length parameters, mm; ``"angle"`` for the angle parameters, deg.
@@ -192,7 +195,9 @@ def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any
         raise InputError(f"kind is '{kind}'; it must be length or angle.")
     axes = axes_or_new(axes)
     uncertainty, vectors, wanted = uncertainty_of(record), record.vectors(), "mm" if kind == "length" else "rad"
-    chosen = [i for i, name in enumerate(record.names) if parameter_unit(record.recording.nominal.arm, name) == wanted]
+    rows = [{"parameter": name, "unit": parameter_unit(record.recording.nominal.arm, name)} for name in record.names]
+    listed = {row["parameter"] for row in listed_apart(rows)[0] if row["unit"] == wanted}
+    chosen = [i for i, name in enumerate(record.names) if name in listed]
     scale = 1.0 if kind == "length" else 1 / DEG
     change = scale * (vectors["calibrated"] - vectors["nominal"])[chosen]
     expanded = scale * uncertainty.factor() * np.asarray(uncertainty.u)[chosen]

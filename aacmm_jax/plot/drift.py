@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..drift.results import Drift, Trend, in_words
+from ..summaries.harmonics import listed_apart
 from .style import ACCENT, COLORS, DARK, LINES, MARKERS, check_format, new_figure, save_figure
 
 _LIGHT = "0.72"
@@ -115,8 +116,14 @@ def length_trend(trend: Trend, axes: Any, positions: np.ndarray | None = None) -
 
 
 def parameter_drift(drift: Drift, axes: Any) -> Any:
-    """Changes between two calibrations over their expanded uncertainty; those beyond it are filled and named."""
-    chosen = [i for i, reason in enumerate(drift.reasons) if not reason]
+    """Changes between two calibrations over their expanded uncertainty; those beyond it are filled and named.
+
+    Of hundreds of coefficients of harmonics, those beyond it are drawn.
+    """
+    listed = {row["parameter"] for row in listed_apart([{"parameter": name} for name in drift.names])[0]}
+    chosen = [
+        i for i, name in enumerate(drift.names) if not drift.reasons[i] and (name in listed or bool(drift.moved[i]))
+    ]
     ratio, moved = _ratio(drift.change, drift.expanded)[chosen], drift.moved[chosen]
     positions = np.arange(len(chosen))
     _band(axes, np.nanmax(np.abs(ratio), initial=1.0))
@@ -133,7 +140,7 @@ def parameter_drift(drift: Drift, axes: Any) -> Any:
     style = {"rotation": 60, "ha": "right", "rotation_mode": "anchor", "fontsize": 8}
     axes.set_xticks(positions, [drift.names[i] for i in chosen], **style)
     axes.set_xlim(-0.8, max(len(chosen), 1) - 0.2)
-    axes.margins(y=0.3 if crowded else 0.15)
+    axes.margins(y=0.5 if crowded else 0.15)  # room for what is written above and below
     _title_changes(
         axes,
         f"New less old calibration: {int(moved.sum())} of {len(chosen)} parameters beyond the band, "

@@ -8,6 +8,7 @@ from ..calibration.pose_residuals import signed_residuals
 from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..core.units import DEG
+from ..kinematics.arm import by_joint
 from .style import ACCENT, DARK, LIGHT, new_figure
 
 _COLUMNS = 4
@@ -34,15 +35,15 @@ def residual_patterns(record: CalibrationRecord) -> Any:
     found = signed_residuals(record)
     if found is None:
         raise InputError("no pose has a residual with a direction, as no socket has several poses; record more poses.")
-    q, slides = np.asarray(record.recording.capture.readings)[found.poses], record.calibrated.arm.prismatic
+    q = np.asarray(record.recording.capture.readings)[found.poses]
     order = np.arange(1, len(found.poses) + 1)
     drawn = [
         *(
-            (q[:, i] / (1.0 if i + 1 in slides else DEG), found.along_joint[:, i], f"joint {i + 1}", i + 1 in slides)
-            for i in range(record.calibrated.arm.joints)
+            (q[:, i] / unit, found.along_joint[:, i], f"joint {i + 1}", f"reading [{name}]")
+            for i, (unit, name) in enumerate(by_joint(record.calibrated.arm, (DEG, "deg"), (1.0, "mm")))
         ),
         *(
-            (order, found.vector[:, i], f"along {name}, in the order of the poses", None)
+            (order, found.vector[:, i], f"along {name}, in the order of the poses", "pose")
             for i, name in enumerate("xyz")
         ),
     ]

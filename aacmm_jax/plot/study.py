@@ -167,16 +167,16 @@ def study_errors(results: Results, factor: str) -> Any:
                 panel.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
                 panel.plot(x, middle, color=color, marker=marker, label=label)
         panel.set_xscale("log")
-        panel.set_yscale("log")
         panel.set_xticks(x, [f"{value:g}" for value in x])
         panel.minorticks_off()
+        logarithmic(panel)
         _finish(panel, factor_title(factor), _title(kind) if panel is axes[0, 0] else "", fill(words, 60))
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", frameon=False, ncols=2)
     return figure
 
 
 def study_scale(results: Results, factor: str) -> Any:
-    """Plot the scale that stage 1 leaves (found / true) against a shift of the bounds' centre.
+    """Plot the error of the scale that stage 1 leaves (found / true - 1) against a shift of the bounds' centre.
 
     Args:
         results: The study.
@@ -190,13 +190,13 @@ def study_scale(results: Results, factor: str) -> Any:
     panel = axes[0, 0]
     for i, (words, cells) in enumerate(runs.items()):
         x = [float(results.study.factors[factor][_index(results, cell)[factor]]) for cell in cells]
-        low, middle, high = _percentiles(results, "scale", cells)
+        low, middle, high = (1e6 * (part - 1) for part in _percentiles(results, "scale", cells))
         if len(runs) <= 4:
             panel.fill_between(x, low, high, color=COLORS[i], alpha=0.12, linewidth=0)
         style = {"color": COLORS[i], "linestyle": LINES[i], "marker": MARKERS[i], "label": words or None}
         panel.plot(x, middle, **style)
-    panel.axhline(1.0, color="0.4", linewidth=0.9, linestyle="--")
-    _finish(panel, factor_title(factor), "scale of stage 1, found / true")
+    panel.axhline(0.0, color="0.4", linewidth=0.9, linestyle="--")
+    _finish(panel, factor_title(factor), "error of the scale of stage 1 [parts in a million]")
     if len(runs) > 1:
         figure.legend(loc="outside upper center", frameon=False, fontsize=8)
     return figure
@@ -211,7 +211,13 @@ def study_correlation(results: Results, cell: int) -> Any:
 
     Returns:
         The figure.
+
+    Raises:
+        InputError: If the study has no such cell.
     """
+    count = len(results.study.cells)
+    if not 1 <= cell <= count:
+        raise InputError(f"cell is {cell}; the study has cells 1 to {count}.")
     names = results.study.space.names
     figure, axes = _panels(1, 1, (6.8, 5.8))
     panel = axes[0, 0]

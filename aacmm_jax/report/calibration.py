@@ -118,8 +118,8 @@ def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
         change = f"{format_number(row['rms_before_mm'])} → {format_number(row['rms_after_mm'])}\u00a0mm"
         facts.append((f"RMS residual, {row['kind']}, nominal → calibrated", change))
     volume = summary["uncertainty"]["volume"]
-    length = f"U of a {volume['length_mm']:g} mm length"
-    largest, median = volume["u_length_largest_mm"], volume["u_length_median_mm"]
+    length = f"U of a {volume['length_mm']:g} mm length with the noise of its readings"
+    largest, median = volume["u_length_reading_largest_mm"], volume["u_length_reading_median_mm"]
     if median is not None and largest is not None:
         typical, worst = (f"{two_digits(factor * u)}\u00a0mm" for u in (median, largest))
         facts.append((f"{length} (95 %)", f"median {typical}, largest {worst}"))

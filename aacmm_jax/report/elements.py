@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from .charts import Plot
 
-_MOST_STACKED = 42  # cells: more would be a list without end
+_MOST_STACKED = 30  # cells: more would be a list without end
 _NARROW, _CHARACTER, _GAP = 370.0, 7.6, 8.0  # pixels: a telephone's page, a character, between columns
 _LONGEST = 14  # characters: longer texts are wrapped
 _ZERO = 1e-9  # mm: smaller numbers are rounding errors
@@ -35,7 +35,7 @@ class ReportTable(NamedTuple):
 
     @property
     def stacked(self) -> bool:
-        """Whether a narrow screen shows each row as a list: a table of few rows that has no room on a telephone."""
+        """Whether a narrow screen shows each row as a list: a table of few cells that has no room on a telephone."""
         if len(self.rows) * len(self.columns) > _MOST_STACKED:
             return False
         texts = [[column, *(row[i].text for row in self.rows)] for i, column in enumerate(self.columns)]

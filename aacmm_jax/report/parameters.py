@@ -13,7 +13,7 @@ from ..summaries.tables import decimals_for
 from . import charts
 from .elements import Chart, ReportTable, Section, format_number, number_cell, text_cell
 
-_POINTS = 121  # of a curve
+_POINTS = 301  # of a curve
 _COLUMNS = ("parameter", "unit", "calibrated", "U (95 %)", "change", "nominal", "")
 
 

@@ -16,7 +16,6 @@ from ..uncertainty.volume import VolumetricUncertainty
 from . import charts
 from .elements import Cell, Chart, ReportTable, Section, format_number, number_cell, text_cell
 
-_MOST_CORRELATED = 45  # parameters in a chart
 _INDICES = {
     "O1": "geometric mean of the singular values (Menq, Borm)",
     "O2": "smallest over largest (Driels, Pathre)",
@@ -114,8 +113,7 @@ def correlations_section(record: CalibrationRecord, uncertainty: Uncertainty) ->
         "parameters are determined better in combination than one by one."
     )
     table = ReportTable("Pairs correlated by 0.5 or more", ("parameter", "with", "correlation"), pairs)
-    names, strength = list(record.names), np.abs(np.asarray(uncertainty.correlation) - np.eye(len(record.names)))
-    chosen = np.sort(np.argsort(-strength.max(axis=1), kind="stable")[:_MOST_CORRELATED])
+    names, chosen = list(record.names), uncertainty.most_correlated()
     if len(chosen) < len(names):
         description += f" Of {len(names)} parameters, the {len(chosen)} that are correlated most are drawn."
     plot = charts.correlations([names[i] for i in chosen], np.asarray(uncertainty.correlation)[np.ix_(chosen, chosen)])

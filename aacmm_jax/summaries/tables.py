@@ -6,6 +6,8 @@ from typing import Any
 
 from ..core.text import pluralise
 
+_MOST_DECIMALS = 6  # of a quantity that was found
+
 # Repeatability and errors of lengths, by their keys in a summary.
 METRICS = (
     ("de_mm", "DE, mean distance of poses from their socket's centroid"),
@@ -34,7 +36,8 @@ def quantity_words(row: Mapping[str, Any], u: bool = True, coverage: float | Non
     factor, unit = (180 / math.pi, "deg") if row["unit"] == "rad" else (1.0, row["unit"])
     default = 6 if unit == "1" else 4
     found = [None] * len(row["values"]) if coverage is None else row["u_found"]
-    decimals = [decimals_for(None if own is None else (coverage or 0.0) * factor * own, default) for own in found]
+    expanded = [None if own is None else (coverage or 0.0) * factor * own for own in found]
+    decimals = [min(decimals_for(u, default), _MOST_DECIMALS) for u in expanded]
     pairs = zip(row["values"], decimals, strict=True)
     values = ", ".join(f"{factor * value:z.{digits}f}" for value, digits in pairs)
     words = f"({values})" if len(row["values"]) > 1 else values

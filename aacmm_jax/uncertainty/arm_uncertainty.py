@@ -86,6 +86,11 @@ class Uncertainty(eqx.Module):
         safe = xp.where(u > 0, u, 1.0)
         return self.covariance / (safe[:, None] * safe[None, :])
 
+    def most_correlated(self, count: int = 45) -> np.ndarray:
+        """Indices of the parameters that are correlated most with another, in their order; all of few."""
+        strength = np.abs(np.asarray(self.correlation) - np.eye(len(self.names))).max(axis=1, initial=0.0)
+        return np.sort(np.argsort(-strength, kind="stable")[:count])
+
     def correlated(self, least: float = 0.9) -> list[tuple[str, str, float]]:
         """Pairs of parameters with at least this correlation, the strongest first: (name, name, correlation)."""
         if not 0 <= least <= 1:

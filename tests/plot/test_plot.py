@@ -120,6 +120,8 @@ def test_patterns_in_the_residuals(record):
 
     panels = aj.plot.residual_patterns(record).axes
     assert len(panels) == 6 + 3 + 1
+    labels = [panel.get_xlabel() for panel in panels]
+    assert labels == 6 * ["reading [deg]"] + 3 * ["pose"] + ["residual [standard deviations]"]
     found = signed_residuals(record)
     drawn = panels[2].lines[1].get_xydata()
     np.testing.assert_allclose(drawn[:, 0], np.asarray(record.recording.capture.readings)[:, 2] / aj.units.DEG)
