@@ -1,4 +1,7 @@
-"""Strictness for all tests: shapes checked at run time, no silent promotion of rank or dtype; and common fixtures."""
+"""Strictness for all tests: shapes checked at run time, no silent promotion of rank or dtype; and common fixtures.
+
+`make test-slow` leaves the checks of types, which take a tenth of the time, to the others (AACMM_TYPES=0).
+"""
 
 import contextlib
 import functools
@@ -15,11 +18,16 @@ import numpy as np
 import pytest
 
 from . import run_time_types
+from .example_counts import example_count
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-run_time_types.install()
-hypothesis.settings.register_profile("tests", deadline=None)  # a busy machine is no failure
+gc.set_threshold(100_000, 20, 50)  # walks through all that JAX and pytest keep took 8 % of the CPU
+if os.environ.get("AACMM_TYPES", "1") == "1":
+    run_time_types.install()
+hypothesis.settings.register_profile(
+    "tests", deadline=None, max_examples=example_count(30)
+)  # a busy machine is no failure
 hypothesis.settings.load_profile("tests")
 import aacmm_jax as aj  # noqa: E402 - the hook checks every module imported after it
 from aacmm_jax.cli import main  # noqa: E402
@@ -209,13 +217,9 @@ LONGEST = (
 
 
 def pytest_collection_finish():
-    """Collect garbage less often: walks through all that JAX keeps took 8 % of the CPU.
-
-    What is imported stays to the end, so that the collector leaves it out.
-    """
+    """What is imported stays to the end, so that the collector leaves it out."""
     gc.collect()
     gc.freeze()
-    gc.set_threshold(100_000, 20, 50)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 @pytest.mark.parametrize(
     ("attacks", "count"),
     [
-        pytest.param(("flips", "texts", "calls"), 24, marks=pytest.mark.slow),
+        pytest.param(("flips", "texts", "calls"), 6, marks=pytest.mark.slow),
         pytest.param(("writes",), 36, marks=pytest.mark.exhaustive),
         pytest.param(("users",), 0, marks=pytest.mark.exhaustive),
         pytest.param(("flips", "texts", "calls"), 60, marks=pytest.mark.exhaustive),

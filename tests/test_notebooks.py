@@ -13,7 +13,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 # A small version of what the long ones show is in the other tests. Those compute more than they compile.
-LONG = ("01", "03", "04", "05")
+LONG = ("01", "03", "04", "05", "06", "07")
 MARKS = {True: (pytest.mark.exhaustive, pytest.mark.optimised), False: pytest.mark.slow}
 
 

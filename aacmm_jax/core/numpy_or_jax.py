@@ -103,12 +103,13 @@ def scan(body: Callable, start: Any, inputs: Any = None, length: int | None = No
     """`jax.lax.scan` in either library: ``carry, output = body(carry, row)`` over the rows of ``inputs``."""
     if namespace(start, inputs) is jnp:
         return jax.lax.scan(body, start, inputs, length=length)
-    rows, structure = jax.tree.flatten(inputs)
-    carry, outputs = start, []
-    for i in range(len(rows[0]) if length is None else length):
-        carry, output = body(carry, jax.tree.unflatten(structure, [row[i] for row in rows]))
-        outputs.append(output)
-    return carry, jax.tree.map(lambda *leaves: np.stack(leaves), *outputs)
+    leaves, structure = jax.tree.flatten(inputs)
+    carry, outputs, form = start, [], structure
+    for row in zip(*leaves, strict=True) if leaves else [()] * (length or 0):
+        carry, output = body(carry, structure.unflatten(row))
+        values, form = jax.tree.flatten(output)
+        outputs.append(values)
+    return carry, form.unflatten([np.array(values) for values in zip(*outputs, strict=True)])
 
 
 def while_loop(condition: Callable, body: Callable, start: Any) -> Any:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from ..core.arguments import items_of, shown
 from ..core.arrays import Numbers, as_array, as_floats, in_chunks
 from ..core.errors import InputError, nearest
-from ..core.numpy_or_jax import AnyArray, namespace, to_jax, to_numpy
+from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.text import pluralise
 from .chain import Corrections, Geometry, JointKinds, tip_pose
 from .jacobian import tip_jacobian, tip_position
@@ -380,6 +380,7 @@ def parameter_unit(arm: Arm, name: str) -> str:
     return "1" if kind == "gravity" else "mm" if kind in LENGTHS else "rad"
 
 
+@numpy_if_known
 def with_values(
     geometry: Geometry, vector: Float[AnyArray, "... p"], indices: tuple[tuple[str, int], ...]
 ) -> dict[str, Float[AnyArray, "... n"]]:

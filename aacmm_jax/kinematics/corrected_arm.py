@@ -96,20 +96,20 @@ def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"
     limits = joint_limits(arm, None)
     limits = np.concatenate([limits, [_TEMPERATURES]])
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_CONFIGURATIONS, arm.joints + 1))
-    values, taken = function_values(arm.geometry, terms, q, gravity), []
+    values, taken = function_values(arm.geometry, terms, q, gravity), set()
     for joint in range(arm.joints + 1):  # 0: functions that scale all lengths
         basis = np.full((_CONFIGURATIONS, 1), _CONFIGURATIONS**-0.5)
-        for term, column in zip(terms, values, strict=True):
-            if term.joint != joint:
+        for number, column in enumerate(values):
+            if terms[number].joint != joint:
                 continue
             rest = column
             for _ in range(2):  # twice is enough for orthogonality to rounding
                 rest = rest - basis @ (basis.T @ rest)
             size = np.linalg.norm(rest)
             if size > _INDEPENDENT * max(np.linalg.norm(column), 1e-6):
-                taken.append(term)
+                taken.add(number)
                 basis = np.hstack([basis, rest[:, None] / size])
-    return tuple(term for term in terms if term in taken)
+    return tuple(terms[number] for number in sorted(taken))
 
 
 def function_values(

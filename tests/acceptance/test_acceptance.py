@@ -33,7 +33,7 @@ def cheng():
     return aj.files.load_specification("cheng2018-simulation")
 
 
-@pytest.fixture(scope="module", params=["asme", "iso"])
+@pytest.fixture(scope="module", params=["iso", pytest.param("asme", marks=pytest.mark.slow)])
 def procedure(request, cheng):
     """A planned test of the nominal arm."""
     return plan_procedure(cheng.arm, request.param, above=ABOVE, margin=MARGIN)

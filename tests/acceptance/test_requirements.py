@@ -17,6 +17,7 @@ from aacmm_jax.acceptance.procedure import plan_procedure, simulate_procedure
 from aacmm_jax.acceptance.requirements import CONFIDENCES
 from aacmm_jax.acceptance.results import Measured
 from aacmm_jax.kinematics.workspace import arm_reach
+from tests.example_counts import example_count
 
 ISO = ("probing size and form", "articulated location", "length error")
 ASME = ("effective diameter", "single-point articulation", "volumetric")
@@ -286,7 +287,7 @@ def test_the_table_of_requirements_is_that_of_the_documentation():
     assert requirements_table() in page.read_text()
 
 
-@settings(deadline=None, max_examples=10)
+@settings(deadline=None, max_examples=example_count(5))
 @given(st.integers(0, 10**6), st.sampled_from([25, 9, 5]), st.floats(0.0, 0.08))
 def test_touches_by_hand_in_any_orientation_are_recognised(seed, count, off):
     """The recommended pattern, turned at random and touched some degrees away from it."""

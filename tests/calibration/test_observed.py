@@ -291,20 +291,15 @@ def test_what_cannot_be_determined_is_refused(paper_arm, bounds, observation, me
         aj.calibrate(paper_arm, aj.Capture({}, [], observations[: 1 if "equations" in message else 2]), bounds)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("kind", "field"),
     [
         ("points", "points"),
-        *(
-            pytest.param(*case, marks=pytest.mark.exhaustive)
-            for case in (
-                ("spheres", "diameter"),
-                ("planes", "distance"),
-                ("bars", "coordinates"),
-                ("distances", "values"),
-            )
-        ),
+        ("spheres", "diameter"),
+        ("planes", "distance"),
+        ("bars", "coordinates"),
+        ("distances", "values"),
     ],
 )
 def test_derivatives_of_a_calibration(paper_arm, true, bounds, kind, field):

@@ -94,6 +94,7 @@ def test_chance():
     assert math.isnan(chance(1.0, math.inf, 5, 10))
 
 
+@pytest.mark.slow
 def test_honest_data_are_as_improbable_as_chance_makes_them(paper_arm):
     """Arms drawn as the covariance says, and a capture of each: sockets of few poses share the errors of parameters."""
     noise = aj.Noise(encoder_arcsec=1, seating=0.005)

@@ -135,6 +135,7 @@ def test_bad_input_is_exit_code_2_and_one_sentence(aacmm, tmp_path, arguments, m
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_debug_shows_the_traceback(aacmm_process):
     assert "Traceback" in aacmm_process("calibrate", "none.h5", "-o", "x.h5", "--debug", expect=1).stderr
 
@@ -160,7 +161,10 @@ def test_a_process_of_its_own(aacmm_process, cache, tmp_path, monkeypatch):
     [
         ("show panda", "| true", "utf-8", 141, ""),
         pytest.param("show panda --json", "| true", "utf-8", 141, "", marks=pytest.mark.slow),
-        ("show panda", "> /dev/full", "utf-8", 1, "Error: standard output cannot be written: no space left"),
+        pytest.param(
+            *("show panda", "> /dev/full", "utf-8", 1, "Error: standard output cannot be written: no space left"),
+            marks=pytest.mark.slow,
+        ),
         pytest.param("show named.toml", "> out.txt", "ascii", 0, "", marks=pytest.mark.slow),
     ],
 )

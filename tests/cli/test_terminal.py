@@ -17,6 +17,7 @@ from aacmm_jax.cli.app import app, examples, length_option
 from aacmm_jax.cli.display import formatted, new_console, new_table, print_table
 from aacmm_jax.summaries.calibration import calibration_summary
 from aacmm_jax.summaries.tables import observed_words
+from tests.example_counts import example_count
 from tests.refusals import assert_refused
 
 for family in _FAMILIES:
@@ -64,7 +65,7 @@ texts = st.lists(cells, min_size=1, max_size=6).map(" ".join)
 
 
 @given(st.integers(30, 200), st.integers(1, 2), st.data())
-@settings(max_examples=60)
+@settings(max_examples=example_count(20))
 def test_nothing_in_a_table_is_cut(columns, keys, data):
     """Each word of each cell is printed whole, in lines that are not wider than the console."""
     count = data.draw(st.integers(keys + 1, 8))

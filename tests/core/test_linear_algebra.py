@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 
 from aacmm_jax.core import linear_algebra
+from tests.example_counts import example_count
 
 pytestmark = pytest.mark.optimised
 EPSILON = np.finfo(float).eps
@@ -34,7 +35,7 @@ def symmetric(values, seed):
     return (matrix + matrix.T) / 2
 
 
-@settings(max_examples=150)
+@settings(max_examples=example_count(50))
 @given(spectra(), st.booleans())
 def test_eigenvalues_and_eigenvectors(spectrum, singular):
     values, seed = spectrum
@@ -50,7 +51,7 @@ def test_eigenvalues_and_eigenvectors(spectrum, singular):
     np.testing.assert_allclose((vectors * found) @ vectors.T, matrix, rtol=0, atol=3 * size)
 
 
-@settings(max_examples=100)
+@settings(max_examples=example_count(40))
 @given(st.sampled_from(SIZES), st.integers(0, 2**32 - 1), st.floats(0, 60))
 def test_singular_values_keep_their_relative_accuracy_whatever_the_scale_of_columns(size, seed, decades):
     """Columns of very different size have singular values just as different; each keeps its leading digits."""
@@ -76,7 +77,7 @@ def test_singular_matrices():
 
 
 @pytest.mark.slow
-@settings(max_examples=150)
+@settings(max_examples=example_count(50))
 @given(spectra(smallest=-12), st.floats(-10, 10))
 def test_inverse_solution_and_whitening(spectrum, decades):
     """Errors relative to the condition number that is left after scaling the diagonal to 1, which Cholesky does not

@@ -337,7 +337,7 @@ def test_the_scale_left_open_is_no_drift(old, new):
     assert "leave them open" in " ".join(found.findings())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_chance_alone_flags_one_parameter_in_twenty(calibrated):
     """60 pairs of captures of one arm: 5 % of parameters and lengths move, and the joint test's p is uniform."""
     found = [compare(calibrated[2 * i], calibrated[2 * i + 1], points=40) for i in range(PAIRS)]
@@ -351,6 +351,7 @@ def test_chance_alone_flags_one_parameter_in_twenty(calibrated):
     assert 0.7 < ratio < 1.3
 
 
+@pytest.mark.slow
 def test_true_changes_are_found(calibrated, paper_arm, space):
     """theta_4 and a_2 changed, 12 times: only they are flagged and named, and lengths change as the true ones do."""
     other = moved_arm(space, MOVED)
@@ -540,6 +541,7 @@ def test_command(run, files, calibrated):
     assert "Warning: a.h5 was made before c.h5" in " ".join(again.stdout.split())
 
 
+@pytest.mark.slow
 def test_command_on_three_calibrations(run, files):
     done = run("c.h5", "a.h5", "b.h5", "--figure", "trend.svg", "--csv", "table.csv", "--json")
     assert done.exit_code == 0

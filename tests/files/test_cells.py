@@ -15,6 +15,7 @@ from aacmm_jax.files.mesh_vertices import mesh_path
 from aacmm_jax.files.urdf_shapes import bounding_capsule
 from aacmm_jax.kinematics import Box, HalfSpace, Post, clearances
 from aacmm_jax.kinematics.body import capsule_ends, frames_at
+from tests.example_counts import example_count
 
 CELL = """\
 clearance = 4.0
@@ -135,7 +136,7 @@ def test_shapes_of_a_urdf_are_held_by_capsules(tmp_path, name):
     assert np.all(np.isfinite(clearances(load_cell(path).cell, arm, q)))
 
 
-@settings(max_examples=50)
+@settings(max_examples=example_count(15))
 @given(arrays.arrays(float, (12, 3), elements=st.integers(-50, 50).map(float)))
 def test_a_bounding_capsule_holds_its_points(points):
     start, end, radius = bounding_capsule(points)

@@ -10,6 +10,7 @@ import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.files.hdf5 import DIGESTS_SINCE
 from aacmm_jax.files.observation_kinds import kinds as known_kinds
+from tests.example_counts import example_count
 
 JOINTS = 3
 ARM = aj.kinematics.ArmSpecification(aj.Arm(alpha=[1.5, 0.4, -1.0], a=[10, 400, 300], d=[300, 20, 10]), "small")
@@ -76,7 +77,7 @@ def same(one, other):
 
 @pytest.mark.parametrize("kind", known_kinds())
 @given(seed=st.integers(0, 10**6), some=st.booleans())
-@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=example_count(3), suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_file_gives_back_what_was_saved(tmp_path, kind, seed, some):
     draw = np.random.default_rng(seed)
     one = make(kind, draw, some)

@@ -22,6 +22,7 @@ from aacmm_jax.core.text import printable
 from aacmm_jax.files.arms import specification_toml
 from aacmm_jax.files.hdf5 import write_tables
 from aacmm_jax.kinematics.independence import nearly_parallel
+from tests.example_counts import example_count
 from tests.refusals import assert_refused
 
 FULL = OSError(28, "No space left on device")
@@ -188,8 +189,9 @@ def test_unwritable_place(tmp_path, good, what, place, reason):
 @pytest.mark.parametrize(
     ("error", "existing"),
     [
-        *((error, True) for error in (FULL, RuntimeError("HDF5"), KeyboardInterrupt())),
+        *((error, True) for error in (FULL, KeyboardInterrupt())),
         (FULL, False),
+        pytest.param(RuntimeError("HDF5"), True, marks=pytest.mark.slow),
         *(pytest.param(error, False, marks=pytest.mark.slow) for error in (RuntimeError("HDF5"), KeyboardInterrupt())),
     ],
     ids=lambda value: {True: "over a file", False: "new file"}[value] if isinstance(value, bool) else repr(value),
@@ -391,7 +393,7 @@ def plain(value):
     return None if value is None else np.asarray(value).tobytes()
 
 
-quickly = settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow])
+quickly = settings(max_examples=example_count(8), suppress_health_check=[HealthCheck.too_slow])
 
 
 @given(st.data())

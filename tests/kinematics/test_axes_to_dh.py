@@ -19,6 +19,7 @@ from aacmm_jax.kinematics.axes_to_dh import (
     tip_frame,
 )
 from aacmm_jax.kinematics.chain import JointKinds
+from tests.example_counts import example_count
 
 # A right angle, as the makers round it, and nearly none: where D-H, Hayati's form or Euler angles are singular.
 ANGLES = st.one_of(
@@ -76,7 +77,7 @@ def assert_same(poses, expected):
     np.testing.assert_allclose(poses[:3, :3], expected[:3, :3], rtol=0, atol=1e-12)
 
 
-@settings(max_examples=60)
+@settings(max_examples=example_count(20))
 @given(
     chain=st.lists(st.tuples(TRANSFORMS, DIRECTIONS, st.booleans()), min_size=1, max_size=8),
     last=TRANSFORMS,
@@ -181,7 +182,7 @@ def test_far_frames_come_back_and_keep_the_probe():
 
 
 @given(st.tuples(ANGLES, ANGLES, ANGLES))
-@settings(max_examples=100)
+@settings(max_examples=example_count(30))
 def test_roll_pitch_yaw_reproduce_the_rotation(angles):
     matrix = roll_pitch_yaw_matrix(np.array(angles))
     again = roll_pitch_yaw_matrix(roll_pitch_yaw(matrix))

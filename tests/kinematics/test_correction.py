@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
+from tests.example_counts import example_count
 
 from ..refusals import assert_refused
 
@@ -32,7 +33,7 @@ def within_limits(arm: aj.Arm, seed: int, count: int, part: float = 0.8) -> np.n
 
 
 @pytest.mark.parametrize("name", ARMS)
-@settings(max_examples=10)
+@settings(max_examples=example_count(3))
 @given(seed=st.integers(0, 2**31))
 def test_the_calibrated_arm_has_the_pose_that_the_controller_means(name, seed):
     nominal = ARMS[name]

@@ -163,7 +163,12 @@ def test_units(paper_arm, few):
     found = check_readings(paper_arm, q / DEG, positions=positions)
     assert found.best.angle == pytest.approx(DEG)
     assert found.best.changes == 1
-    found = check_readings(paper_arm, q * DEG, positions=positions / 1000)
+
+
+@pytest.mark.slow
+def test_units_of_readings_and_positions(paper_arm, few):
+    q = np.random.default_rng(2).uniform(-1.5, 1.5, (12, 6))
+    found = check_readings(paper_arm, q * DEG, positions=np.asarray(paper_arm.position(q)) / 1000)
     assert found.best.angle == pytest.approx(1 / DEG)
     assert (found.best.length, found.best.changes) == (1000.0, 2)
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 import aacmm_jax as aj
 from aacmm_jax.planning import pose_order
 from aacmm_jax.planning.pose_order import joint_weights, short_order, travel
+from tests.example_counts import example_count
 
 WEIGHTS = np.array([1.0, 0.5, 0.1])
 
@@ -23,7 +24,7 @@ def contiguous(groups) -> bool:
     return len([key for key, _ in itertools.groupby(groups)]) == len(set(groups.tolist()))
 
 
-@settings(max_examples=60)
+@settings(max_examples=example_count(20))
 @given(st.integers(0, 10**6), st.integers(1, 14), st.integers(1, 4))
 def test_an_order_is_a_permutation_group_after_group_and_never_longer(seed, count, groups):
     q, owner = problem(seed, count, groups)

@@ -89,7 +89,7 @@ def test_weighted_solve_is_the_dense_generalised_least_squares(paper_arm, space,
 
 @pytest.mark.parametrize(
     ("method", "noise"),
-    [pytest.param("two-stage", None, id="even"), pytest.param("joint", UNEVEN, id="weighted")],
+    [pytest.param("two-stage", None, id="even"), pytest.param("joint", UNEVEN, id="weighted", marks=pytest.mark.slow)],
 )
 def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space, bounds, method, noise):
     """What the propagation says of readings and lengths is what central differences of whole calibrations say."""
@@ -161,13 +161,14 @@ def test_many_weighted_calibrations_equal_single_ones(paper_arm, bounds, capture
 @pytest.mark.parametrize(
     ("trials", "noise", "noise_model", "least", "most"),
     [
-        (50, None, "estimated", 0.82, 1.0),
+        (12, None, "estimated", 0.55, 1.0),
+        pytest.param(50, None, "estimated", 0.82, 1.0, marks=pytest.mark.slow),
         pytest.param(400, None, "estimated", 0.91, 1.0, marks=pytest.mark.exhaustive),
         pytest.param(400, NOISE, "given", 0.91, 1.0, marks=pytest.mark.exhaustive),
         pytest.param(400, None, "common", 0.0, 0.91, marks=pytest.mark.exhaustive),
         pytest.param(400, None, "robust", 0.92, 1.0, marks=pytest.mark.exhaustive),
     ],
-    ids=["few-estimated", "estimated", "given", "common", "robust"],
+    ids=["handful-estimated", "few-estimated", "estimated", "given", "common", "robust"],
 )
 def test_coverage(paper_arm, space, bounds, trials, noise, noise_model, least, most):
     """Simulated calibrations: 95 % intervals of noise given, or estimated from the residuals, hold the truth; a

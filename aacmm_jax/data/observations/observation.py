@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from ...core.arguments import real_number, shown, truth_value, whole_number
 from ...core.arrays import Numbers, as_array, as_floats, is_concrete
 from ...core.errors import InputError
-from ...core.numpy_or_jax import AnyArray, namespace
+from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 
 MOST_POSES = 100_000  # to simulate, as in a study
 
@@ -160,7 +160,7 @@ class AbstractObservation(eqx.Module):
         changed = copy.copy(self)
         for field in self.by_pose:
             values = getattr(self, field)
-            chosen = tuple(values[i] for i in poses) if isinstance(values, tuple) else values[np.asarray(poses)]
+            chosen = tuple(values[i] for i in poses) if isinstance(values, tuple) else _taken(values, np.asarray(poses))
             object.__setattr__(changed, field, chosen)
         return changed
 
@@ -294,9 +294,7 @@ def checked_covariances(where: str, u: Numbers | None, covariance: Numbers | Non
             raise InputError(f"u of {where} has shape {array.shape}; give one number, three, or ({poses}, 3).")
         if is_concrete(array) and np.any(np.asarray(array) < 0):
             raise InputError(f"u of {where} is negative; a standard uncertainty must be zero or positive.")
-        xp = namespace(array)
-        array = xp.broadcast_to(array if array.ndim else array[None], (poses, 3))
-        return array[:, :, None] ** 2 * np.eye(3)[None]
+        return _squares_on_the_diagonal(array, poses)
     array = as_floats(covariance, f"covariance of {where}")
     if array.shape not in ((3, 3), (poses, 3, 3)):
         raise InputError(f"covariance of {where} has shape {array.shape}; give (3, 3) or ({poses}, 3, 3).")
@@ -307,6 +305,19 @@ def checked_covariances(where: str, u: Numbers | None, covariance: Numbers | Non
         if not symmetric or np.linalg.eigvalsh(known).min() < -1e-12 * max(np.abs(known).max(), 1e-300):
             raise InputError(f"covariance of {where} is not symmetric and positive; give variances in mm^2.")
     return array
+
+
+@numpy_if_known
+def _squares_on_the_diagonal(array: Float[AnyArray, "..."], poses: int) -> Float[AnyArray, "m 3 3"]:
+    """Of one number, of three, or of three a pose."""
+    array = namespace(array).broadcast_to(array if array.ndim else array[None], (poses, 3))
+    return array[:, :, None] ** 2 * np.eye(3)[None]
+
+
+@numpy_if_known
+def _taken(values: AnyArray, rows: Int[np.ndarray, " k"]) -> AnyArray:
+    """The rows of an array."""
+    return values[rows]
 
 
 def each_pose(matrix: Float[AnyArray, "r c"], poses: int) -> Float[AnyArray, "r c m"]:

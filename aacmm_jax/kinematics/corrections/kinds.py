@@ -1,6 +1,7 @@
 """All kinds of joint corrections, and the names of their coefficients."""
 
 import re
+from functools import lru_cache
 
 from ...core.errors import InputError, nearest
 from .coupling import Coupling
@@ -15,8 +16,10 @@ KINDS: tuple[AbstractCorrection, ...] = (Harmonics(), GearRatio(), Gravity(), Co
 # to be found in seconds from 500 poses, and orders to 63 were hardly better (`benchmarks/NOTES.md`).
 _SHORT_FORMS = {"functions": "harmonics=1-31"}
 COEFFICIENT = re.compile(r"([a-z]+)([1-9][0-9]*)?(?:_([1-9][0-9]*))?")
+_KEPT = 4096  # results: every calibration asks for the same ones, and the method of an Equinox module takes 0.1 ms
 
 
+@lru_cache(_KEPT)
 def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
     """The term that a coefficient belongs to, or None where this is no coefficient's name.
 
@@ -35,6 +38,7 @@ def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
     return term
 
 
+@lru_cache(_KEPT)
 def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term, ...]:
     """The terms of a model: kinds with their options, separated by commas, such as "dh,gravity,harmonics=1".
 
