@@ -6,6 +6,7 @@ over the seeds. The page which_data.md includes the table; tests/docs/test_which
 """
 
 import json
+import textwrap
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -20,7 +21,7 @@ from aacmm_jax.uncertainty.target_parameters import determined_parameters
 from aacmm_jax.uncertainty.volume import default_length
 
 DOCS = Path(__file__).resolve().parent
-RESULTS, TABLE = DOCS / "which_data.json", DOCS / "which_data_table.md"
+RESULTS, TABLE = DOCS / "which_data.json", DOCS / "which_data_table.txt"
 COUNTS, SEEDS = (30, 60, 120), (1, 2, 3)
 VOLUME = 200  # lengths all over it
 TARGET = (0.03, -0.02, 0.05)  # in sizes: a tracker's target in the last frame
@@ -212,17 +213,17 @@ def predictions(keys: Iterable[str] = ("measuring", "robot", "hobby"), data: Ite
 
 def table(rows: list[dict]) -> str:
     """The rows as Markdown, a table for each arm."""
-    parts = ["<!-- Written by docs/which_data.py; do not edit. -->"]
+    parts = ["<!-- Written by docs/which_data.py; do not edit. -->\n"]
     for key, case in cases().items():
         every = len(aj.Parameters.independent(case.arm).names)
         length = default_length(case.arm)
-        parts.append(
-            f"### {case.title}\n\n"
+        says = (
             f"{case.arm.joints} joints, {_noise(case)}; artefacts u = {1000 * case.u_artefact:g} um, tracker u = "
             f"{1000 * case.u_tracker:g} um a coordinate{_tolerance(case)}. Sockets and a length determine {every} "
             f"parameters at best. U (95 %) of a length of {length:.0f} mm, mm: median over the volume, largest in "
-            "brackets.\n"
+            "brackets."
         )
+        parts.append(f"### {case.title}\n\n{textwrap.fill(says, 120)}\n")
         lines = [f"| what you have | parameters | scale | {' | '.join(f'{poses} poses' for poses in COUNTS)} |"]
         lines.append("|---|---|---|" + "---|" * len(COUNTS))
         for row in (row for row in rows if row["arm"] == key):
