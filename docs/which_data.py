@@ -177,13 +177,7 @@ def predicted(case: Case, data: str, poses: int, seed: int) -> dict[str, float |
     if not (capture.lengths or capture.observations):
         return found  # whose scale is unknown
     noise = case.noise if all(one.target == "" for one in capture.observations) else case.unseated
-    options: dict[str, Any] = {
-        "method": "joint",
-        "noise": noise,
-        "replace_noise": False,
-        "shared_errors": False,
-        "prior": case.prior,
-    }
+    options: dict[str, Any] = {"replace_noise": False, "shared_errors": False, "prior": case.prior}
     bounds = aj.Bounds.around(case.arm, space)
     result = aj.calibrate(case.arm, capture, bounds, method="joint", noise=noise, **options)
     uncertainty = aj.uncertainty_of(result)

@@ -16,7 +16,8 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
     found = importlib.util.spec_from_file_location("which_data", DOCS / "which_data.py")
-    assert found is not None and found.loader is not None
+    assert found is not None
+    assert found.loader is not None
     module = importlib.util.module_from_spec(found)
     found.loader.exec_module(module)
     return module
@@ -39,11 +40,8 @@ def test_the_table_is_of_the_stored_results(script: ModuleType) -> None:
     ],
 )
 def test_stored_results_are_those_computed_now(script: ModuleType, arm: str, data: str) -> None:
-    (stored,) = (
-        row
-        for row in json.loads(script.RESULTS.read_text(encoding="utf-8"))
-        if (row["arm"], row["data"]) == (arm, data)
-    )
+    rows = json.loads(script.RESULTS.read_text(encoding="utf-8"))
+    (stored,) = (row for row in rows if (row["arm"], row["data"]) == (arm, data))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", aj.IdentifiabilityWarning)
         found = [script.predicted(script.cases()[arm], data, 30, seed) for seed in script.SEEDS]
