@@ -98,38 +98,43 @@ def uncertainty() -> None:
     """U of lengths over the volume for several numbers of poses."""
     arm, _, bounds = _paper()
     axes = _axes()
-    for poses, shade in ((15, 0.35), (30, 0.55), (60, 0.75), (120, 1.0)):
+    for poses, style in ((15, ":"), (30, "-."), (60, "--"), (120, "-")):
         capture = _capture(arm, 3, {"A": poses // 2, "B": poses - poses // 2})
         result = aj.calibrate(arm, capture, bounds, method="joint", noise=NOISE, shared_errors=False)
         found = aj.uncertainty_of(result)
         U = 1000 * found.factor(0.95) * np.sort(np.asarray(aj.volumetric_uncertainty(found, points=400).u_length))
-        axes.plot(U, np.linspace(0, 100, len(U)), color=BLUE, alpha=shade, linewidth=2, label=f"{poses} poses")
-    axes.set(xlabel="U (95 %) of a length of 300 mm [um]", ylabel="lengths below it [%]", xlim=(0, 100))
+        axes.plot(U, np.linspace(0, 100, len(U)), color=BLUE, linestyle=style, linewidth=2, label=f"{poses} poses")
+    axes.set(xlabel="U (95 %) of a length of 300 mm [um]", ylabel="lengths below it [%]", xlim=(0, 80))
     axes.legend(loc="lower right")
     _save(axes, "uncertainty")
 
 
 def random_splits() -> None:
-    """RMS errors of the UR10's poses drawn at random, and of its other series, by model."""
+    """RMS errors of the UR10's poses drawn at random, and of its other series, by model: means of three draws."""
     recording = aj.files.read_manifest(EXAMPLES / "ipa_ur10" / "positions.toml")
     (points,) = recording.capture.observations
-    order = np.random.default_rng(0).permutation(len(points.q))
-    taken, others = (aj.Capture({}, [], [points.select(rows)]) for rows in (order[:500], order[500:]))
     series_a = aj.files.read_manifest(EXAMPLES / "ipa_ur10" / "series_a.toml").capture
     nominal, bounds = recording.nominal.arm, recording.nominal.bounds()
-    rows = []
-    for model in MODELS:
-        result = aj.calibrate(nominal, taken, bounds, model=model)
-        fitted = aj.evaluate(result.arm, taken).observed.geometry
-        inside = float(aj.evaluate(result.arm, others, geometry=fitted).observed.rms[0])
-        rows.append((model, inside, float(aj.evaluate(result.arm, series_a).observed.rms[0])))
-        print(*rows[-1])
+    errors = np.zeros((len(MODELS), 2, 3))
+    for seed in range(3):
+        order = np.random.default_rng(seed).permutation(len(points.q))
+        taken, others = (aj.Capture({}, [], [points.select(rows)]) for rows in (order[:500], order[500:]))
+        for i, model in enumerate(MODELS):
+            result = aj.calibrate(nominal, taken, bounds, model=model)
+            fitted = aj.evaluate(result.arm, taken).observed.geometry
+            errors[i, 0, seed] = float(aj.evaluate(result.arm, others, geometry=fitted).observed.rms[0])
+            errors[i, 1, seed] = float(aj.evaluate(result.arm, series_a).observed.rms[0])
+    print(*zip(MODELS, errors.round(3).tolist(), strict=True), sep="\n")
     before = float(aj.evaluate(nominal, series_a).observed.rms[0])
-    axes, places = _axes(3.4), np.arange(len(rows))
-    axes.bar(places - 0.2, [row[1] for row in rows], 0.38, color=BLUE, label="other poses of C, drawn at random")
-    axes.bar(places + 0.2, [row[2] for row in rows], 0.38, color=ORANGE, label="series A")
+    axes, places = _axes(3.4), np.arange(len(MODELS))
+    for part, (offset, colour, label) in enumerate(
+        ((-0.2, BLUE, "other poses of C, drawn at random"), (0.2, ORANGE, "series A"))
+    ):
+        mean = errors[:, part].mean(axis=1)
+        reached = np.stack([mean - errors[:, part].min(axis=1), errors[:, part].max(axis=1) - mean])
+        axes.bar(places + offset, mean, 0.38, color=colour, label=label, yerr=reached, ecolor=GREY, capsize=3)
     axes.axhline(before, color=GREY, linestyle="--", linewidth=1)
-    axes.set_xticks(places, [row[0].replace(",", ",\n") for row in rows])
+    axes.set_xticks(places, [model.replace(",", ",\n") for model in MODELS])
     axes.set(ylabel="RMS error [mm]", ylim=(0, 1.35))
     axes.legend(loc="upper center", ncols=2)
     _save(axes, "random_splits")

@@ -6,6 +6,8 @@ over the seeds. The page which_data.md includes the table; tests/docs/test_which
 """
 
 import json
+import math
+import textwrap
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -20,7 +22,7 @@ from aacmm_jax.uncertainty.target_parameters import determined_parameters
 from aacmm_jax.uncertainty.volume import default_length
 
 DOCS = Path(__file__).resolve().parent
-RESULTS, TABLE = DOCS / "which_data.json", DOCS / "which_data_table.md"
+RESULTS, TABLE = DOCS / "which_data.json", DOCS / "which_data_table.txt"
 COUNTS, SEEDS = (30, 60, 120), (1, 2, 3)
 VOLUME = 200  # lengths all over it
 TARGET = (0.03, -0.02, 0.05)  # in sizes: a tracker's target in the last frame
@@ -176,13 +178,7 @@ def predicted(case: Case, data: str, poses: int, seed: int) -> dict[str, float |
     if not (capture.lengths or capture.observations):
         return found  # whose scale is unknown
     noise = case.noise if all(one.target == "" for one in capture.observations) else case.unseated
-    options: dict[str, Any] = {
-        "method": "joint",
-        "noise": noise,
-        "replace_noise": False,
-        "shared_errors": False,
-        "prior": case.prior,
-    }
+    options: dict[str, Any] = {"replace_noise": False, "shared_errors": False, "prior": case.prior}
     bounds = aj.Bounds.around(case.arm, space)
     result = aj.calibrate(case.arm, capture, bounds, method="joint", noise=noise, **options)
     uncertainty = aj.uncertainty_of(result)
@@ -212,17 +208,17 @@ def predictions(keys: Iterable[str] = ("measuring", "robot", "hobby"), data: Ite
 
 def table(rows: list[dict]) -> str:
     """The rows as Markdown, a table for each arm."""
-    parts = ["<!-- Written by docs/which_data.py; do not edit. -->"]
+    parts = ["<!-- Written by docs/which_data.py; do not edit. -->\n"]
     for key, case in cases().items():
         every = len(aj.Parameters.independent(case.arm).names)
         length = default_length(case.arm)
-        parts.append(
-            f"### {case.title}\n\n"
+        says = (
             f"{case.arm.joints} joints, {_noise(case)}; artefacts u = {1000 * case.u_artefact:g} um, tracker u = "
             f"{1000 * case.u_tracker:g} um a coordinate{_tolerance(case)}. Sockets and a length determine {every} "
             f"parameters at best. U (95 %) of a length of {length:.0f} mm, mm: median over the volume, largest in "
-            "brackets.\n"
+            "brackets."
         )
+        parts.append(f"### {case.title}\n\n{textwrap.fill(says, 120)}\n")
         lines = [f"| what you have | parameters | scale | {' | '.join(f'{poses} poses' for poses in COUNTS)} |"]
         lines.append("|---|---|---|" + "---|" * len(COUNTS))
         for row in (row for row in rows if row["arm"] == key):
@@ -245,11 +241,12 @@ def _noise(case: Case) -> str:
 def _cell(median: float | None, largest: float | None) -> str:
     if median is None or largest is None:
         return "-"
-    return "not determined" if not median < 10 else f"{_two(median)} ({_two(largest)})"
+    return "not determined" if not median < 10 else f"{_two(median)}\N{NO-BREAK SPACE}({_two(largest)})"
 
 
 def _two(value: float) -> str:
-    return f"{value:.2g}" if value < 10 else f"{value:.0f}"
+    digits = max(0, 1 - math.floor(math.log10(value)))
+    return f"{value:.{digits}f}"
 
 
 def main() -> None:
