@@ -1,0 +1,151 @@
+"""Draws the figures of the explanations as SVG that can be read on light and dark pages: python docs/figures.py."""
+
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import aacmm_jax as aj
+
+DOCS = Path(__file__).resolve().parent
+EXAMPLES = DOCS.parent / "examples"
+GREY, BLUE, ORANGE = "#808080", "#3f88c5", "#e07a3f"  # each has a contrast of 3 and more on white and on Furo's dark
+NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
+SOCKETS = {"A": (400, 200, 300), "B": (700, 500, 500)}
+MODELS = ("dh", "gravity", "harmonics=1", "gravity,harmonics=1", "functions", "gravity,functions")
+STYLE = {
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+    "text.color": GREY,
+    "axes.labelcolor": GREY,
+    "axes.edgecolor": GREY,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "font.size": 11,
+    "svg.hashsalt": "aacmm_jax",
+}
+
+
+def _axes(height: float = 3.0) -> Axes:
+    return Figure(figsize=(7.2, height), layout="constrained").subplots()
+
+
+def _save(axes: Axes, name: str) -> None:
+    assert isinstance(axes.figure, Figure)
+    axes.figure.savefig(DOCS / "explanation" / f"{name}.svg", metadata={"Date": None})
+
+
+def _capture(true: aj.Arm, seed: int, poses: dict[str, int]) -> aj.Capture:
+    return aj.simulate(true, SOCKETS, poses=poses, lengths=[("A", "B", 0.002)], noise=NOISE, seed=seed)
+
+
+def _paper() -> tuple[aj.Arm, aj.Parameters, aj.Bounds]:
+    arm = aj.load_arm("cheng2018-simulation")
+    space = aj.Parameters.free_of(arm)
+    return arm, space, aj.Bounds.around(arm, space, length=10.0, angle=0.0175)
+
+
+def scale() -> None:
+    """k after stage 1 of forty captures, with all lengths free and with a scale anchor."""
+    arm, space, bounds = _paper()
+    found: dict[str | None, list[float]] = {None: [], "longest": []}
+    for seed in range(40):
+        true = aj.perturbed_arm(space, length=1.0, angle=np.radians(0.1), seed=seed)
+        capture = _capture(true, seed, {"A": 70, "B": 10})
+        for hold, values in found.items():
+            values.append(float(aj.identify(arm, capture, bounds, hold=hold).scale.value))
+    axes = _axes(2.6)
+    for height, (hold, colour) in enumerate((("longest", BLUE), (None, ORANGE))):
+        jitter = np.random.default_rng(0).uniform(-0.22, 0.22, 40)
+        axes.plot(found[hold], height + jitter, "o", color=colour, markersize=5, alpha=0.8)
+    axes.axvline(1.0, color=GREY, linewidth=1)
+    axes.set_yticks((0, 1), ("scale anchor d_3", "all lengths free"))
+    axes.set(xlabel="k after stage 1 (1 is right)", ylim=(-0.5, 1.5))
+    _save(axes, "scale")
+    print({hold: (np.mean(values), np.min(values), np.max(values)) for hold, values in found.items()})
+
+
+def method() -> None:
+    """Distances of the tips from their socket's centroid, by the nominal and the calibrated arm."""
+    arm, space, bounds = _paper()
+    true = aj.perturbed_arm(space, length=1.0, angle=np.radians(0.1), seed=1)
+    capture = _capture(true, 1, {"A": 70, "B": 10})
+    result = aj.calibrate(arm, capture, bounds)
+    axes = _axes()
+    for label, each, colour, marker in (("nominal arm", arm, ORANGE, "o"), ("calibrated arm", result.arm, BLUE, "s")):
+        tips = np.asarray(each.position(np.asarray(capture.sockets["A"])))
+        distance = np.linalg.norm(tips - tips.mean(axis=0), axis=1)
+        axes.plot(
+            np.arange(1, 71),
+            distance,
+            marker,
+            color=colour,
+            markersize=4,
+            label=f"{label}: DE {distance.mean():.3g} mm",
+        )
+    axes.set(xlabel="pose in socket A", ylabel="distance from centroid [mm]", yscale="log")
+    axes.legend(loc="center right")
+    _save(axes, "method")
+
+
+def uncertainty() -> None:
+    """U of lengths over the volume for several numbers of poses."""
+    arm, _, bounds = _paper()
+    axes = _axes()
+    for poses, style in ((15, ":"), (30, "-."), (60, "--"), (120, "-")):
+        capture = _capture(arm, 3, {"A": poses // 2, "B": poses - poses // 2})
+        result = aj.calibrate(arm, capture, bounds, method="joint", noise=NOISE, shared_errors=False)
+        found = aj.uncertainty_of(result)
+        U = 1000 * found.factor(0.95) * np.sort(np.asarray(aj.volumetric_uncertainty(found, points=400).u_length))
+        axes.plot(U, np.linspace(0, 100, len(U)), color=BLUE, linestyle=style, linewidth=2, label=f"{poses} poses")
+    axes.set(xlabel="U (95 %) of a length of 300 mm [um]", ylabel="lengths below it [%]", xlim=(0, 80))
+    axes.legend(loc="lower right")
+    _save(axes, "uncertainty")
+
+
+def random_splits() -> None:
+    """RMS errors of the UR10's poses drawn at random, and of its other series, by model: means of three draws."""
+    recording = aj.files.read_manifest(EXAMPLES / "ipa_ur10" / "positions.toml")
+    (points,) = recording.capture.observations
+    series_a = aj.files.read_manifest(EXAMPLES / "ipa_ur10" / "series_a.toml").capture
+    nominal, bounds = recording.nominal.arm, recording.nominal.bounds()
+    errors = np.zeros((len(MODELS), 2, 3))
+    for seed in range(3):
+        order = np.random.default_rng(seed).permutation(len(points.q))
+        taken, others = (aj.Capture({}, [], [points.select(rows)]) for rows in (order[:500], order[500:]))
+        for i, model in enumerate(MODELS):
+            result = aj.calibrate(nominal, taken, bounds, model=model)
+            fitted = aj.evaluate(result.arm, taken).observed.geometry
+            errors[i, 0, seed] = float(aj.evaluate(result.arm, others, geometry=fitted).observed.rms[0])
+            errors[i, 1, seed] = float(aj.evaluate(result.arm, series_a).observed.rms[0])
+    print(*zip(MODELS, errors.round(3).tolist(), strict=True), sep="\n")
+    before = float(aj.evaluate(nominal, series_a).observed.rms[0])
+    axes, places = _axes(3.4), np.arange(len(MODELS))
+    for part, (offset, colour, label) in enumerate(
+        ((-0.2, BLUE, "other poses of C, drawn at random"), (0.2, ORANGE, "series A"))
+    ):
+        mean = errors[:, part].mean(axis=1)
+        reached = np.stack([mean - errors[:, part].min(axis=1), errors[:, part].max(axis=1) - mean])
+        axes.bar(places + offset, mean, 0.38, color=colour, label=label, yerr=reached, ecolor=GREY, capsize=3)
+    axes.axhline(before, color=GREY, linestyle="--", linewidth=1)
+    axes.set_xticks(places, [model.replace(",", ",\n") for model in MODELS])
+    axes.set(ylabel="RMS error [mm]", ylim=(0, 1.35))
+    axes.legend(loc="upper center", ncols=2)
+    _save(axes, "random_splits")
+
+
+def main() -> None:
+    """Draw them all."""
+    with matplotlib.rc_context(STYLE):
+        for draw in (method, scale, uncertainty, random_splits):
+            draw()
+
+
+if __name__ == "__main__":
+    main()

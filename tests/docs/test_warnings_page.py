@@ -1,0 +1,124 @@
+"""The page docs/warnings.md has an entry for each warning in the code, and none for others."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "aacmm_jax"
+PAGE = (ROOT / "docs" / "warnings.md").read_text(encoding="utf-8")
+# Where warnings are worded: of a module all functions, or those that are named.
+SOURCES: dict[str, tuple[str, ...]] = {
+    "summaries/warnings.py": (),
+    "summaries/model_errors.py": ("sentences_of_tests", "sentence_of_noisy_encoders", "_terms", "_misfit", "_lengths"),
+    "summaries/contradictions.py": ("_sentence", "_removal", "_remounted"),
+    "summaries/likely_cause.py": ("likely_cause",),
+    "summaries/validation.py": ("contradicted_prediction", "surprise", "no_better"),
+    "summaries/arm_survey.py": ("arm_survey", "_warnings"),
+    "summaries/compared_models.py": ("_warnings",),
+    "summaries/correction.py": ("correction_summary",),
+    "cli/compare_commands.py": ("_compared",),
+    "drift/comparison.py": ("_warnings", "_common_poses", "_other_arm"),
+    "data/copies.py": ("sentences",),
+    "uncertainty/identifiability.py": ("sentences",),
+    "uncertainty/correction_limits.py": ("by_more_sockets",),
+    "calibration/scale_anchor.py": ("warn_of_a_known_scale",),
+    "acceptance/record.py": ("evaluation_of", "unstated_uncertainty_warning", "SIMULATED"),
+    "acceptance/procedure_items.py": ("socket_in_zone",),
+    "report/study.py": ("_warnings",),
+    "solver/reason.py": ("Reason",),
+    "core/compilation_cache.py": ("set_up",),
+}
+# Parts of sentences, by their beginning, and what is no warning.
+PARTS = (
+    "Converged",
+    "It has not ended",
+    "Every u contains",
+    "Such poses count",
+    "The arm or its probe has changed since",
+    "With the probe's place",
+    "As good an explanation",
+    "Every u is too small",
+    "... mm RMS, ... times",
+    "... (... times)",
+    "... (... mm, ... times)",
+    "... (... of ... poses)",
+    "... (... %)",
+    "... pose ... (",
+    "... ... mm RMS, ... times",
+    "... combinations of",
+    "... more combinations",
+    "... by ... mm",
+    "... mm",
+    "... is not a plausible scale",
+    "k = ... is not a plausible scale",
+    "No Reason",
+)
+
+
+def _text(node: ast.AST) -> str:
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    if isinstance(node, ast.JoinedStr):
+        return "".join(part.value if isinstance(part, ast.Constant) else "..." for part in node.values)
+    return ""
+
+
+def _sentences(node: ast.AST) -> Iterator[str]:
+    """The strings of a function that begin a sentence: not its docstring, nor what is added to another string."""
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        yield from _sentences(node.left)
+        return
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+        return
+    text = _text(node)
+    if text:
+        if re.match(r"[A-Z]|\.\.\.|k = |the ", text) and text.count(" ") > 2:
+            yield text
+        return
+    for child in ast.iter_child_nodes(node):
+        yield from _sentences(child)
+
+
+def _name(node: ast.AST) -> str:
+    if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+        return node.name
+    return ast.unparse(node.targets[0]) if isinstance(node, ast.Assign) else ""
+
+
+def _warnings() -> list[str]:
+    found = []
+    for name, functions in SOURCES.items():
+        tree = ast.parse((PACKAGE / name).read_text(encoding="utf-8"))
+        named = {_name(node): node for node in ast.walk(tree) if _name(node)}
+        gone = sorted(set(functions) - set(named))
+        assert not gone, f"{name} has no {gone}; name what took its place."
+        everything = [node for node in named.values() if isinstance(node, ast.FunctionDef)]
+        for node in [named[function] for function in functions] or everything:
+            found += [text for child in ast.iter_child_nodes(node) for text in _sentences(child)]
+    return [text for text in dict.fromkeys(found) if not text.startswith(PARTS)]
+
+
+def _entries() -> dict[str, re.Pattern[str]]:
+    titles = re.findall(r"^### `(.+)`$", PAGE, flags=re.MULTILINE)
+    assert len(set(titles)) == len(titles), "an entry stands twice"
+    return {title: re.compile(".+?".join(map(re.escape, title.split("…")))) for title in titles}
+
+
+@pytest.mark.parametrize("warning", _warnings())
+def test_each_warning_has_an_entry(warning: str) -> None:
+    assert any(entry.match(warning) for entry in _entries().values()), f"docs/warnings.md lacks: {warning}"
+
+
+def test_each_entry_is_of_a_warning() -> None:
+    warnings = _warnings()
+    unused = [title for title, entry in _entries().items() if not any(entry.match(text) for text in warnings)]
+    assert not unused, f"docs/warnings.md has entries that no warning begins with: {unused}"
+
+
+def test_each_entry_says_something() -> None:
+    parts = re.split(r"^### `.+`$", PAGE, flags=re.MULTILINE)[1:]
+    assert all(len(part.split()) >= 5 for part in parts)
