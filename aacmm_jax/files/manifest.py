@@ -221,6 +221,16 @@ def read_manifest(path: str | os.PathLike) -> Recording:
 
     Raises:
         InputError: names the file, the place in it and what to do.
+
+    Example:
+        >>> columns = "q1,q2,q3,q4,q5,q6"
+        >>> np.savetxt("cone.csv", np.degrees(capture.sockets["A"]), delimiter=",", header=columns, comments="")
+        >>> _ = open("capture.toml", "w").write('''arm = "cheng2018-simulation"
+        ... angles = { unit = "deg" }
+        ... socket = [{ name = "A", file = "cone.csv" }]
+        ... ''')
+        >>> print(aj.files.read_manifest("capture.toml").capture.sizes)
+        (40,)
     """
     path = as_path(path)
     model = read_toml(manifest := InputFile(path), _Manifest)

@@ -33,6 +33,17 @@ def read_points(path: str | os.PathLike) -> Measured:
 
     Raises:
         InputError: names the file, the place in it and what to do.
+
+    Example:
+        >>> np.savetxt("near.csv", true.position(capture.sockets["A"]), delimiter=",")
+        >>> _ = open("points.toml", "w").write('''[points]
+        ... unit = "mm"
+        ... [[socket]]
+        ... name = "near"
+        ... file = "near.csv"
+        ... ''')
+        >>> print(aj.files.read_points("points.toml").sockets["near"].shape)
+        (40, 3)
     """
     path = as_path(path)
     model = read_toml(manifest := InputFile(path), PointsManifest)

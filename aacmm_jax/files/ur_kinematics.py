@@ -77,6 +77,13 @@ def ur_kinematics_yaml(arm: Arm) -> str:
 
     Raises:
         InputError: The arm does not have six joints.
+
+    Example:
+        >>> for line in aj.files.ur_kinematics_yaml(aj.load_arm("ur10e")).splitlines()[-3:]:
+        ...     print(line)
+            pitch: 0.0
+            yaw: 0.0
+          hash: aacmm_jax_calibration
     """
     if single(arm).joints != len(_JOINTS):
         raise InputError(f"kinematics.yaml is of six joints, but the arm has {arm.joints}; choose another --format.")

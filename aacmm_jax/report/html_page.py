@@ -38,6 +38,12 @@ def write_report(
     Raises:
         InputError: If the source cannot be read or the target not written, the administrative data state a conformity
             that the source contradicts, or Jinja is not installed.
+
+    Example:
+        >>> aj.files.save_calibration("calibration.h5", record)
+        >>> written = aj.report.write_report("calibration.h5", "report.html")
+        >>> print(written["title"])
+        Calibration of Cheng 2018, simulated arm
     """
     require("report", "a report")
     with together(target):

@@ -52,6 +52,12 @@ def draw_trials(study: Study, cell: int, trials: Numbers) -> tuple[DrawnTrials, 
 
     Raises:
         InputError: The study has no such cell.
+
+    Example:
+        >>> drawn, captures = aj.study.draw_trials(study, 0, [0, 1])
+        >>> many = aj.identify_many(arm, captures, drawn.lower, drawn.upper, drawn.start)
+        >>> print(many.de.shape)
+        (2,)
     """
     if not 0 <= cell < len(study.settings):
         raise InputError(f"cell is {cell}, but the study has {len(study.settings)} cells; count them from 0.")
