@@ -67,7 +67,7 @@ def test_a_wrong_shape_is_caught_in_a_module_that_is_imported_late():
     assert (done.returncode, done.stdout) == (0, "caught\n"), done.stderr
 
 
-@pytest.mark.parametrize("link", ["docs/scaling.md", "docs/demo.png"])
+@pytest.mark.parametrize("link", ["docs/start.md", "docs/demo.png"])
 def test_the_description_on_an_index_has_no_relative_links(link):
     """It is the README, whose links to files and images become paths in the source distribution."""
     readme = (ROOT / "README.md").read_text()

@@ -13,7 +13,7 @@ from ..core.text import shorten
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, parameter_names, value_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..solver.reason import SCALE, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
@@ -141,9 +141,13 @@ class CalibrationRecord(NamedTuple):
         """Free parameters of the nominal arm, after stage 1, and calibrated; and of the true arm of a simulation."""
         space = Parameters(self.recording.nominal.arm, self.names)
         arms = {"nominal": self.recording.nominal.arm, "stage1": self.stage1.arm, "calibrated": self.calibrated.arm}
+        found = {stage: np.asarray(space.vector(arm)) for stage, arm in arms.items()}
         if self.recording.true is not None:
-            arms["true"] = self.recording.true.arm
-        return {stage: np.asarray(space.vector(arm)) for stage, arm in arms.items()}
+            true, nominal = self.recording.true.arm, found["nominal"]
+            found["true"] = np.array(
+                [_true_value(true, name, value) for name, value in zip(self.names, nominal, strict=True)]
+            )
+        return found
 
     def evaluations(self) -> dict[str, Evaluation]:
         """The three arms on the capture that was identified from."""
@@ -152,6 +156,14 @@ class CalibrationRecord(NamedTuple):
         alike = len(one) == len(other) and all(map(np.array_equal, one, other))
         stage1 = calibrated if alike else evaluate(self.stage1.arm, capture)
         return {"nominal": evaluate(self.recording.nominal.arm, capture), "stage1": stage1, "calibrated": calibrated}
+
+
+def _true_value(true: Arm, name: str, nominal: float) -> float:
+    """A parameter of the true arm, whose corrections need not be those that are identified: what it lacks is 0, but for
+    the direction of gravity, which no arm is without."""
+    if name in parameter_names(true):
+        return float(value_of(true, name))
+    return nominal if name.startswith("gravity_") else 0.0
 
 
 @checked_arguments

@@ -115,6 +115,8 @@ def _left_out(arm: Arm, model: str | None) -> list[str]:
         return []
     loads, known = loads_of(arm), correction_names(arm)
     gone = [term for term in terms_of(model, arm.joints, loads) if term.name not in known]
+    if not gone:
+        return []
     limits = joint_limits(arm, None)
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (50, arm.joints))
     values = function_values(arm.corrections.nominal, gone, q, np.asarray(arm.gravity))

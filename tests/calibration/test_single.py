@@ -334,3 +334,15 @@ def test_what_data_cannot_tell_apart_is_marked(paper_arm, noisy_capture):
             ).determined
         )
     )
+
+
+def test_the_true_arm_may_have_other_corrections(observed_record, paper_arm):
+    """Or none: a parameter that it lacks is 0, and not that of another coefficient in its place."""
+    nominal = aj.kinematics.with_corrections(paper_arm, "gear,gravity")
+    true = aj.kinematics.with_corrections(paper_arm, "harmonics=1").replace(cos1_1=0.1, d_1=7.0)
+    arms = {name: observed_record.calibrated._replace(arm=nominal) for name in ("stage1", "calibrated")}
+    recording = observed_record.recording._replace(
+        nominal=arms["stage1"], true=observed_record.calibrated._replace(arm=true)
+    )
+    record = observed_record._replace(recording=recording, names=("d_1", "gear_1", "gravity_z"), **arms)
+    np.testing.assert_array_equal(record.vectors()["true"], [7.0, 0.0, -1.0])

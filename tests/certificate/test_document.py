@@ -13,7 +13,7 @@ from scipy import stats
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.record import Removed
-from aacmm_jax.certificate import dcc_xml, parse_dcc, xml_elements
+from aacmm_jax.certificate import dcc_xml, measurement_results, parse_dcc, xml_elements
 from aacmm_jax.files.administrative_data import (
     AdministrativeData,
     CalibratedItem,
@@ -24,6 +24,8 @@ from aacmm_jax.files.administrative_data import (
     Reference,
     read_administrative_data,
 )
+from aacmm_jax.kinematics.corrections import kinds
+from aacmm_jax.kinematics.corrections.kind import Loads
 from aacmm_jax.summaries.warnings import of_calibration
 from tests.certificate import dcc_model
 from tests.refusals import assert_refused
@@ -787,3 +789,10 @@ def test_a_certificate_whose_number_was_edited_is_refused(record):
     numbers = (f"<si:value>{number}</si:value>" for number in ("1_0", "\u0663", "NaN", "INF", "1e300", "9" * 5001))
     for edited in (k.replace(".", ","), "", *numbers):
         assert_refused(lambda edited=edited: parse_dcc(text.replace(k, edited)), "'As left / Scale / k'", "no number")
+
+
+@pytest.mark.parametrize("kind", kinds.KINDS, ids=lambda kind: kind.model)
+def test_every_unit_of_a_correction_has_its_name_in_d_si(kind):
+    loads = Loads((1.0,) * 3, ((0.0, 0.0, 0.0),) * 3)
+    units = {term.unit for with_masses in (None, loads) for term in kind.terms(3, "", with_masses)}
+    assert units | {unit.replace("rad", "mm") for unit in units} <= measurement_results._UNITS.keys()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.kinematics import reading_check, reading_search
+from aacmm_jax.kinematics import reading_check, reading_search, with_corrections
 from aacmm_jax.planning import first_capture
 from aacmm_jax.summaries import arm_survey
 
@@ -132,6 +132,11 @@ def test_readings_that_nothing_explains(aacmm, tmp_path, few):
 )
 def test_refusals(aacmm, arguments, part):
     assert part in aacmm("arm", *arguments, expect=2).stderr
+
+
+def test_a_model_of_which_nothing_is_left_out():
+    """All coefficients of gear are independent of each other, so that there is nothing to explain."""
+    assert arm_survey._left_out(with_corrections(aj.load_arm("panda"), "gear"), "gear") == []
 
 
 def test_a_capture_of_another_number_of_joints(aacmm, mukca):
