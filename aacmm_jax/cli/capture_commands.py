@@ -121,8 +121,8 @@ def simulate(
 
     with together(output):
         nominal = load_specification(arm, base=base, tip=tip)
-        links = {"base": base, "tip": tip} if true_arm and true_arm.lower().endswith(".urdf") else {}
-        true = load_specification(true_arm, **links) if true_arm else nominal
+        ends = (base, tip) if true_arm and true_arm.lower().endswith(".urdf") else (None, None)
+        true = load_specification(true_arm, base=ends[0], tip=ends[1]) if true_arm else nominal
         if true.arm.joints != nominal.arm.joints:
             raise InputError(
                 f"the true arm {true_arm} has {true.arm.joints} joints, but {arm} has {nominal.arm.joints}; "

@@ -63,7 +63,7 @@ def to_jax(tree: Tree) -> Tree:
     return jax.tree.unflatten(structure, leaves)
 
 
-def compiled(function: Function | None = None, *, jit: Callable = jax.jit) -> Any:
+def compiled(function: Callable | None = None, *, jit: Callable = jax.jit) -> Any:
     """Decorator: ``jit`` for arrays of JAX; called as it is, without warnings of NaN and 1 / 0, for NumPy's."""
 
     def decorate(function: Callable) -> Callable:
