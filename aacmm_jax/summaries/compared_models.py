@@ -64,7 +64,7 @@ def _warnings(found: ComparedModels) -> list[str]:
     sentences = [f"{model.model} did not converge." for model in found.models if not model.result.converged]
     if chosen.ratio > _EXCESS:
         sentences.append(
-            f"With {chosen.model}, errors outside are {math.sqrt(chosen.ratio):.1f} times what its uncertainty "
-            "predicts: it lacks an effect that none of these models has, or poses all over the joints' travel."
+            f"With {chosen.model}, errors outside are {math.sqrt(chosen.ratio):.1f} times what its noise and prior "
+            "predict: it lacks an effect that none of these models has, or poses all over the joints' travel."
         )
     return sentences
