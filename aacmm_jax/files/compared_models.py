@@ -108,9 +108,7 @@ def _check(path: str | os.PathLike, found: Mapping[str, Any]) -> None:
     names = [row["model"] for row in models]
     numbers = [row[key] for row in models for key in _MODELS]
     numbers += [one[key] for row in models for one in row["regions"] for key in ("rms", "ratio")]
-    positive = [
-        row[key] for row in models for key in ("parameters", "effective_parameters", "rms_inside", "rms_outside")
-    ]
+    positive = [row[key] for row in models for key in _NEEDED[:4]]
     positive += [one["rms"] or 0.0 for row in models for one in row["regions"]]
     check_sense(
         path,
