@@ -1,11 +1,13 @@
 """The cost of a report, and whether a browser shows it: ``python benchmarks/reports.py``.
 
-Writes the reports of the demonstration, of the real Panda in examples/mukca, of an acceptance test and of a study;
-times the command in fresh processes (the second of two counts: programs are compiled by then); opens each report in
-Chromium at 400 and 1600 px; and keeps the measurements in results/. It prints the folder of screenshots and PDFs.
+Writes the reports of the demonstration, of the real Panda in examples/mukca and of data that it has not seen, of an
+acceptance test, a study, compared models, and of the UR10 in examples/ipa_ur10 with 16 and 397 parameters; times the
+command in fresh processes; opens each report in Chromium at 400, 1000 and 1600 px, light and dark; and keeps the
+measurements in results/. It prints the folder of screenshots and PDFs.
 """
 
 import datetime
+import itertools
 import json
 import shutil
 import subprocess
@@ -16,6 +18,10 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 PANDA = HERE.parent / "examples/mukca/capture.toml"
+TRACKER = HERE.parent / "examples/ipa_ur10/positions.toml"
+# Decisions, and what else is marked, outside of what is seen without scrolling; not in tables that are folded.
+OUTSIDE = """[...document.querySelectorAll("td[class*=mark-], .verdict")].filter((one) =>
+    one.getClientRects().length && one.getBoundingClientRect().right > innerWidth + 1).length"""
 STUDY = """
 arm = "cheng2018-simulation"
 trials = 200
@@ -48,11 +54,22 @@ def files(folder: Path) -> dict[str, str]:
     run(folder, "study", "study.toml", "-o", "study.h5")
     run(folder, "import", str(PANDA), "-o", "real-capture.h5")
     run(folder, "calibrate", "real-capture.h5", "-o", "real.h5", "--without", "mid_*/*")
+    run(folder, "evaluate", "real.h5", "real-capture.h5", "-o", "held-out.h5")
+    run(folder, "import", str(PANDA.with_name("panda_3.toml")), "-o", "other-capture.h5")
+    run(folder, "compare-models", "other-capture.h5", "-o", "models.h5")
+    run(folder, "import", str(TRACKER), "-o", "tracker-capture.h5")
+    some = ("--only-poses", "500", "--seed", "0")
+    run(folder, "calibrate", "tracker-capture.h5", "-o", "tracker.h5", *some)
+    run(folder, "calibrate", "tracker-capture.h5", "-o", "many.h5", *some, "--model", "dh,gravity,harmonics=1-31")
     return {
         "demo": "demo/calibration.h5",
         "acceptance test": "acceptance.h5",
         "study": "study.h5",
         "real capture": "real.h5",
+        "evaluation": "held-out.h5",
+        "model comparison": "models.h5",
+        "tracker": "tracker.h5",
+        "397 parameters": "many.h5",
     }
 
 
@@ -70,8 +87,9 @@ def shown(page: Path, shots: Path) -> dict:
             "--disable-sync",
         ]
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=quiet)
-        for width in (400, 1600):
-            opened = browser.new_context(viewport={"width": width, "height": 900}, offline=True).new_page()
+        for width, colours in itertools.product((400, 1000, 1600), ("light", "dark")):
+            context = browser.new_context(viewport={"width": width, "height": 900}, offline=True, color_scheme=colours)
+            opened = context.new_page()
             said, asked = [], []
             opened.on("console", lambda message, said=said: said.append(message.text))
             opened.on("pageerror", lambda error, said=said: said.append(str(error)))
@@ -82,16 +100,18 @@ def shown(page: Path, shots: Path) -> dict:
             drawn = opened.locator("[data-drawn=yes]").count()
             network = [url for url in asked if not url.startswith(("data:", "blob:", "file:"))]
             over = opened.evaluate("document.documentElement.scrollWidth") - width
-            found[width] = {
+            found[f"{width} {colours}"] = {
                 "figures": figures,
                 "drawn": drawn,
                 "console": said,
                 "network": network,
                 "wider than the screen": max(over, 0),
+                "marks outside": opened.evaluate(OUTSIDE),
             }
-            opened.screenshot(path=shots / f"{page.stem}-{width}.png", full_page=True)
-            if width == 1600:
+            opened.screenshot(path=shots / f"{page.stem}-{width}-{colours}.png", full_page=True)
+            if width == 1600 and colours == "light":
                 opened.pdf(path=shots / f"{page.stem}.pdf", format="A4", print_background=True)
+            context.close()
         browser.close()
     return found
 
@@ -101,7 +121,7 @@ def main() -> None:
     results = {}
     for name, file in files(folder).items():
         page = folder / f"{name.replace(' ', '-')}.html"
-        seconds = [run(folder, "report", file, "-o", page.name) for _ in range(3)]
+        seconds = [run(folder, "report", file, "-o", page.name) for _ in range(2)]
         results[name] = {"seconds": [round(x, 2) for x in seconds], "MB": round(page.stat().st_size / 1e6, 2)}
         results[name] |= {"browser": shown(page, folder)} if shutil.which("chromium") else {}
         print(name, results[name])

@@ -18,7 +18,7 @@ from ..data.sphere import checked_sphere
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach
 from . import asme_b89_4_22, iso_10360_12, jjf_1408
-from .decision import LEAST_DIVISOR, MOST, Limit, Rule, checked_rule, decide
+from .decision import LEAST_DIVISOR, MOST, Limit, Rule, checked_rule, decide, without_test
 from .influences import Influences, checked_influences
 from .postures import postures_of
 from .requirements import StandardTest
@@ -148,13 +148,8 @@ def checked_limits(limits: Mapping[str, Limit | float]) -> dict[str, Limit]:
     """Limits by the name of a metric, numbers made into `Limit`; `InputError` for an unknown metric or a bad limit."""
     found = {}
     for name, limit in limits.items():
-        if name == "E_Bi":
-            raise InputError(
-                "E_Bi is not offered: it needs lengths probed from opposite directions at their ends, which no kind of "
-                "observation records as such; E_Uni is tested."
-            )
         if name not in METRICS:
-            raise InputError(f"there is no metric '{name}'{nearest(name, list(METRICS))}")
+            raise InputError(f"there is no metric '{name}'{without_test(name, list(METRICS))}")
         fixed, divisor = limit if isinstance(limit, Limit) else (limit, math.inf)
         if not divisor >= LEAST_DIVISOR:
             raise InputError(

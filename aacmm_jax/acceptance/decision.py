@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Literal, NamedTuple, get_args
 
 from ..core.errors import InputError, nearest
@@ -118,6 +118,13 @@ def worst(decisions: list[Decision]) -> Decision | None:
     return next((decision for decision in DECISIONS if decision in decisions), None)
 
 
+def without_test(name: str, known: Collection[str]) -> str:
+    """The end of a message on a metric that no test has: why it has none, or which names there are."""
+    if name.strip().lower() == "e_bi":
+        return "; lengths probed from opposite directions cannot be recorded, and E_Uni is what is tested."
+    return nearest(name, known, len(known))
+
+
 def read_limits(texts: list[str], known: Mapping[str, str]) -> dict[str, Limit]:
     """Limits by the name of a metric, from texts ``NAME=A`` or ``NAME=A+L/K`` in mm; ``known`` has the names."""
     found: dict[str, Limit] = {}
@@ -130,7 +137,7 @@ def read_limits(texts: list[str], known: Mapping[str, str]) -> dict[str, Limit]:
                 f"--mpe '{text}' is not of the form NAME=A or NAME=A+L/K, in mm; for example E_Uni=0.025+L/40000."
             )
         if name.strip().lower() not in names:
-            raise InputError(f"--mpe '{text}' names the unknown metric '{name}'{nearest(name, known, len(known))}")
+            raise InputError(f"--mpe '{text}' names the unknown metric '{name}'{without_test(name, known)}")
         name = names[name.strip().lower()]
         if name in found:
             raise InputError(f"--mpe gives {name} two limits; give it one.")

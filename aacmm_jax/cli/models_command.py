@@ -130,7 +130,7 @@ def display(summary: dict[str, Any]) -> None:
             str(row["parameters"]),
             f"{row['effective_parameters']:.1f}",
             *numbers,
-            f"{row['ratio']:.2f}",
+            formatted(row["ratio"], 2),
             f"{row['log_evidence'] - most_probable:.1f}",
             f"{row['cpu_seconds']:.1f}",
         )

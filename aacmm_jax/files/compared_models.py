@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .hdf5 import Table, columns, need, numbering, read_tables, undamaged, write_tables
+from .hdf5 import Table, check_sense, columns, need, numbering, read_tables, undamaged, write_tables
 
 KIND = "model comparison"
 # Columns of the table of models: unit and meaning.
@@ -23,6 +23,8 @@ _MODELS = {
     "u_difference": ("mm2", "standard error of the difference"),
     "cpu_seconds": ("s", "CPU time"),
 }
+_NEEDED = ("parameters", "effective_parameters", "rms_inside", "rms_outside", "log_evidence", "cpu_seconds")
+_LARGEST = 1e12
 _TEXTS = ("arm", "best", "recommended")
 _LISTS = ("findings", "warnings", "regions")
 
@@ -112,7 +114,30 @@ def load_compared_models(path: str | os.PathLike) -> dict[str, Any]:
             }
             for i, name in enumerate(models["model"])
         ]
+        _check(path, found)
         return found
+
+
+def _check(path: str | os.PathLike, found: Mapping[str, Any]) -> None:
+    """Raise `InputError` where values make no sense."""
+    models = found["models"]
+    names = [row["model"] for row in models]
+    numbers = [row[key] for row in models for key in _MODELS]
+    numbers += [one[key] for row in models for one in row["regions"] for key in ("rms", "ratio")]
+    positive = [row[key] for row in models for key in _NEEDED[:4]]
+    positive += [one["rms"] or 0.0 for row in models for one in row["regions"]]
+    check_sense(
+        path,
+        {
+            "it holds no models": not models,
+            "a model is named twice": len(set(names)) != len(names),
+            "the recommended model is none of its models": not {found["best"], found["recommended"]} <= set(names),
+            "a model lacks a region": any([one["region"] for one in r["regions"]] != found["regions"] for r in models),
+            "a model lacks a number": any(row[key] is None for row in models for key in _NEEDED),
+            "a number is larger than any can be": any(abs(one) > _LARGEST for one in numbers if one is not None),
+            "a number is negative that cannot be": any(one is not None and one < 0 for one in positive),
+        },
+    )
 
 
 def _number(value: float | None) -> float:

@@ -24,8 +24,6 @@ def check_shown(path: str | os.PathLike, kind: str, summary: Mapping[str, Any]) 
         if stored.attributes.get("of") == "points":
             check_points(path, stored)
             return
-        if kind == "model comparison":  # which hold no capture
-            return
         check_recording(path, stored)
         if kind == "evaluation":
             check_evaluation(path, stored)

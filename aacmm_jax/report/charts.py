@@ -13,6 +13,7 @@ import numpy as np
 Symbol = Literal["dot", "square", "diamond", "cross", "line", "dashed", "band", "bars", "boxes"]
 Tone = Literal["main", "accent", "soft", "ink"]
 SHADES = 6  # of a sequential colour scale, from little to much
+_WITHIN = 0.98  # of the values have shades that divide their range evenly
 _MOST_NAMES = 45  # along an axis; more would overlap
 
 
@@ -112,10 +113,12 @@ def names(title: str, labels: Sequence[str]) -> Axis:
 
 
 def shades(values: Any) -> tuple[np.ndarray, tuple[float, ...]]:
-    """The shade of each value, and the limits between them: round numbers that divide the values' range."""
+    """The shade of each value, and the limits between them, which divide the range of most values evenly: few that are
+    much larger would leave the other shades unused, and share the last one."""
     values = np.asarray(values, dtype=float)
     low, high = _range((values,))
-    limits = np.linspace(low, high, SHADES + 1)
+    most = float(np.quantile(values[np.isfinite(values)], _WITHIN)) if np.any(np.isfinite(values)) else high
+    limits = np.append(np.linspace(low, most, SHADES + 1)[:-1], high)
     shade = np.clip(np.digitize(np.nan_to_num(values, nan=low), limits[1:-1]), 0, SHADES - 1)
     return shade, tuple(float(limit) for limit in limits)
 

@@ -22,7 +22,7 @@ def models_report(summary: dict[str, Any]) -> Report:
     facts = [
         ("Recommended model", chosen["model"]),
         ("Its RMS error in unseen regions", outside),
-        ("(error / predicted standard deviation)², mean outside", format_number(chosen["ratio"], 2)),
+        ("(error / predicted standard deviation)², mean outside", number_cell(chosen["ratio"], 2).text),
     ]
     return Report(
         title=f"Models of the joints compared, {summary['arm'] or 'an arm'}",

@@ -1,7 +1,7 @@
 """Results of a study, read from its file: labelled for users (`open_study`), and cell by cell for tables and plots."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ..core.errors import InputError
 from ..core.extras import require
-from ..files.hdf5 import undamaged
+from ..files.hdf5 import check_sense, undamaged
 from ..files.outputs import as_path
 from . import store
 from .blocks import VARIABLES, Layout, fill_of
@@ -18,6 +18,8 @@ from .definition import POOL_PARTS, Study
 
 if TYPE_CHECKING:
     import xarray
+
+_LARGEST = 1e20  # mm, rad, or a factor
 
 
 def open_study(path: str | os.PathLike) -> "xarray.Dataset":
@@ -91,6 +93,16 @@ def _allow_files(count: int, path: Path) -> None:
         ) from error
 
 
+def _check_sizes(path: Path, rows: Mapping[str, np.ndarray]) -> None:
+    """Raise `InputError` for results beyond every size, whose squares overflow; a trial that failed may have NaN or an
+    infinite number."""
+    floats = (values for values in rows.values() if values.dtype.kind == "f")
+    check_sense(
+        path,
+        {"a result is larger than any can be": any(np.any(np.isfinite(x) & (np.abs(x) > _LARGEST)) for x in floats)},
+    )
+
+
 class Results(NamedTuple):
     """Results of a study, read cell by cell from its file; ``Results.of(path)`` opens it, also while the study runs.
 
@@ -144,6 +156,7 @@ class Results(NamedTuple):
         found = {name: np.full(self.study.trials, fill_of(name), VARIABLES[name].dtype) for name in names}
         with undamaged(self.path):
             for part, rows in store.rows_of(self.path, self.stored, names, cell):
+                _check_sizes(self.path, rows)
                 for name in names:
                     found[name][part] = rows[name]
         return found
@@ -152,6 +165,7 @@ class Results(NamedTuple):
         """Of converged trials, some at a time: parameter errors (estimate minus truth), active bounds, groups."""
         with undamaged(self.path):
             for part, rows in store.rows_of(self.path, self.stored, ["converged", "estimate", "true", "active"], cell):
+                _check_sizes(self.path, rows)
                 good = rows["converged"] == 1
                 group = np.arange(part.start, part.stop) % POOL_PARTS
                 yield (rows["estimate"] - rows["true"])[good], rows["active"][good], group[good]

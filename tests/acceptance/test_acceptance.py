@@ -244,7 +244,7 @@ def test_limits_that_cannot_be_are_refused(texts, said):
         (lambda: run(Measured({"A": np.full((2, 3), 1e200)})), "beyond"),
         (lambda: run(Measured({"A": np.eye(3)}, (aj.ReferenceLength("A", "B", 1.0),))), "unknown socket 'B'"),
         (lambda: unwrap(checked_limits)({"Deltam": "x"}), "limit of Deltam"),
-        (lambda: unwrap(checked_limits)({"E_Bi": 0.05}), "E_Bi is not offered"),
+        (lambda: unwrap(checked_limits)({"E_Bi": 0.05}), "opposite directions cannot be recorded"),
         (lambda: run(Measured({"A": np.eye(3)}), {"Delta": 1.0}), "did you mean 'Deltam'"),
         (lambda: run(Measured({"A": np.eye(3)}), {"Deltam": Limit(1, -1000)}), "divisor"),
         (lambda: run(Measured({"A": np.eye(3)}), u_test=-1), "standard uncertainty of the test"),

@@ -40,6 +40,24 @@ def test_what_was_saved_is_read(file):
     assert_refused(lambda: aj.files.load_capture(file), "holds a model comparison")
 
 
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"recommended": "functions"}, "recommended model is none"),
+        ({"models": [row("dh", 0.3, 0.33, 1.1)] * 2}, "named twice"),
+        ({"models": [SUMMARY["models"][0], row("gravity", 0.2, 1e300, 1.2)]}, "larger than any can be"),
+        ({"models": [SUMMARY["models"][0], row("gravity", -0.2, 0.3, 1.2)]}, "negative"),
+        ({"models": [SUMMARY["models"][0], row("gravity", None, 0.3, 1.2)]}, "lacks a number"),
+        ({"regions": ["left"]}, "lacks a region"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(tmp_path, changed, says):
+    """Edited by somebody who made the digests anew."""
+    save_compared_models(tmp_path / "models.h5", SUMMARY | changed)
+    assert_refused(lambda: load_compared_models(tmp_path / "models.h5"), says)
+    assert_refused(lambda: write_report(tmp_path / "models.h5", tmp_path / "report.html"), says)
+
+
 def test_it_is_shown_and_reported(file, aacmm, tmp_path):
     assert json.loads(aacmm("show", "models.h5", "--json").stdout) == SUMMARY
     assert "Recommended: dh" in aacmm("show", "models.h5").stdout

@@ -10,6 +10,7 @@ import aacmm_jax as aj
 from aacmm_jax.study import store
 from aacmm_jax.study.blocks import Layout
 from aacmm_jax.study.statistics import concise, distribution, level_title, statistic
+from tests.refusals import assert_refused
 
 from .small_study import CHUNK, NOISE, REFERENCE, made
 
@@ -29,6 +30,24 @@ def path(tmp_path_factory):
     path = tmp_path_factory.mktemp("results") / "study.h5"
     aj.study.run_study(study, path, chunk=CHUNK)
     return path
+
+
+def test_results_larger_than_any_can_be_are_refused(path, tmp_path, monkeypatch):
+    """As from a file that was edited, with its digests made anew."""
+    results = aj.study.Results.of(path)
+    rows_of = store.rows_of
+
+    def edited(*arguments):
+        for part, rows in rows_of(*arguments):
+            yield part, {key: np.full_like(x, 1e300) if x.dtype.kind == "f" else x for key, x in rows.items()}
+
+    monkeypatch.setattr(store, "rows_of", edited)
+    assert_refused(lambda: results.column("scale", 0), "larger than any can be")
+    assert_refused(lambda: list(results.errors(0)), "larger than any can be")
+
+
+def test_a_cell_that_a_study_has_not_is_refused(path):
+    assert_refused(lambda: aj.plot.study_correlation(aj.study.Results.of(path), 0), "cells 1 to 4")
 
 
 def test_percentiles_are_numpys():
