@@ -242,8 +242,8 @@ def test_many_are_as_one(paper_arm, space, bounds, true):
         np.testing.assert_allclose(many.prior.sd[i], one.prior.sd, rtol=1e-5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("active", [pytest.param(False, marks=pytest.mark.exhaustive), True])
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("active", [False, True])
 def test_derivatives_are_exact(paper_arm, space, active):
     """By readings, bounds, the length, the prior's mean and scale: of parameters, learned scales and effective numbers;
     against differences of calibrations in NumPy. With two bounds active too."""
