@@ -150,7 +150,7 @@ def test_learned_scales(paper_arm, space, bounds):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"prior": MAKER, "method": "two-stage"}, "a robust loss or a prior"),
+        ({"prior": MAKER, "method": "two-stage"}, "a robust loss, a prior"),
         ({"prior": aj.Prior({"length": 0.3})}, "did you mean 'lengths'"),
         ({"prior": aj.Prior({"d_3": 0.3}, mean={"d_3": 0.4})}, "outside its bounds"),
     ],
