@@ -167,7 +167,7 @@ def _few_memory_maps():
 # Modules in decreasing order of their run time: a long one started last would keep a single worker busy at the end.
 LONGEST = (
     *("test_notebooks", "files/test_example_robots", "test_readme", "test_hostile"),  # of the slow tests
-    "study/test_results",  # and with it all of studies
+    "study",  # the whole folder
     "cli/test_cli",
     "solver/test_solver",
     "report/test_report",
@@ -238,6 +238,10 @@ def pytest_xdist_make_scheduler(config, log):
 
 def pytest_collection_modifyitems(items):
     """Sort the modules by run time (needs ``--no-loadscope-reorder``); the order within a module is kept."""
-    here = Path(__file__).parent
-    rank = {name: number for number, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: rank.get(item.path.relative_to(here).with_suffix("").as_posix(), len(rank)))
+    here, rank = Path(__file__).parent, {name: number for number, name in enumerate(LONGEST)}
+
+    def of(item):
+        module = item.path.relative_to(here).with_suffix("")
+        return rank.get(module.as_posix(), rank.get(module.parent.as_posix(), len(rank)))
+
+    items.sort(key=of)
