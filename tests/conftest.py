@@ -167,52 +167,49 @@ def _few_memory_maps():
 # Modules in decreasing order of their run time: a long one started last would keep a single worker busy at the end.
 LONGEST = (
     *("test_notebooks", "files/test_example_robots", "test_readme", "test_hostile"),  # of the slow tests
-    "study/test_results",  # and with it all of studies
+    "study",  # the whole folder
     "cli/test_cli",
-    "report/test_report",
-    "cli/test_observations_cli",
     "solver/test_solver",
+    "report/test_report",
     "calibration/test_prior",
     "calibration/test_single",
-    "drift/test_drift",
     "calibration/test_observed",
-    "core/test_numpy_or_jax",
-    "calibration/test_observed_batch",
-    "calibration/test_redrawn",
+    *("core/test_numpy_or_jax", "core/test_linear_algebra", "core/test_deadlock"),
+    *("calibration/test_observed_batch", "calibration/test_redrawn", "calibration/test_sampling", "planning/test_kit"),
     "kinematics/test_reading_check",
+    "calibration/test_second_stage",
+    "certificate/test_document",
+    "kinematics/test_corrections",
     "files/test_storage",
     "uncertainty/test_uncertainty",
-    "acceptance/test_acceptance",
-    "calibration/test_second_stage",
-    "calibration/test_batch",
-    "calibration/test_observed_cross_validation",
-    "planning/test_kit",
-    "cli/test_arm_cli",
-    "kinematics/test_chain",
-    "core/test_linear_algebra",
-    "planning/test_constraints",
     "data/test_observations",
-    "kinematics/test_corrections",
-    "test_package",
-    "cli/test_models_cli",
+    "drift/test_drift",
+    "calibration/test_shared_errors",
+    "acceptance/test_acceptance",
+    "cli/test_observations_cli",
+    "cli/test_arm_cli",
+    "calibration/test_observed_cross_validation",
+    "acceptance/test_requirements",
+    "kinematics/test_chain",
+    "calibration/test_batch",
     "summaries/test_likely_cause",
+    "planning/test_constraints",
     "uncertainty/test_observed_identifiability",
-    "certificate/test_document",
-    "files/test_observation_files",
-    "cli/test_outputs",
-    "calibration/test_sampling",
-    "plot/test_plot",
-    "files/test_content_digest",
-    "test_inputs",
     "calibration/test_prismatic",
-    "calibration/test_model_ladder",
+    "test_package",
     "planning/test_planning",
-    "core/test_compilation_cache",
-    "core/test_deadlock",
-    "calibration/test_observed_evaluation",
-    "uncertainty/test_identifiability",
+    "calibration/test_contradictions",
+    "calibration/test_encoder_noise",
+    "calibration/test_model_ladder",
     "test_real_captures",
-    "test_paper",
+    "plot/test_plot",
+    "test_layout",
+    "calibration/test_model_errors",
+    "summaries/test_contradictions",
+    "test_inputs",
+    "files/test_content_digest",
+    "cli/test_outputs",
+    "cli/test_models_cli",
 )
 
 
@@ -241,6 +238,10 @@ def pytest_xdist_make_scheduler(config, log):
 
 def pytest_collection_modifyitems(items):
     """Sort the modules by run time (needs ``--no-loadscope-reorder``); the order within a module is kept."""
-    here = Path(__file__).parent
-    rank = {name: number for number, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: rank.get(item.path.relative_to(here).with_suffix("").as_posix(), len(rank)))
+    here, rank = Path(__file__).parent, {name: number for number, name in enumerate(LONGEST)}
+
+    def of(item):
+        module = item.path.relative_to(here).with_suffix("")
+        return rank.get(module.as_posix(), rank.get(module.parent.as_posix(), len(rank)))
+
+    items.sort(key=of)

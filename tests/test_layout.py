@@ -40,9 +40,15 @@ def dotted(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    """The syntax tree of a file."""
+    return ast.parse(path.read_text())
+
+
 def public_names(stub: Path) -> list[str]:
     """What a stub exports: every import in it, each under its own name."""
-    imports = [node for node in ast.parse(stub.read_text()).body if isinstance(node, ast.ImportFrom)]
+    imports = [node for node in parsed(stub).body if isinstance(node, ast.ImportFrom)]
     assert imports
     return [alias.asname or alias.name for node in imports for alias in node.names]
 
@@ -129,7 +135,7 @@ def own_private_names() -> set[str]:
     """Private names that the package itself defines: functions, classes, attributes, fields."""
     found = set(NAMED_TUPLE)
     for path in MODULES:
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.FunctionDef | ast.ClassDef):
                 found.add(node.name)
             elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
@@ -165,7 +171,7 @@ def private_attributes(tree: ast.AST, own: set[str]) -> list[str]:
 
 @pytest.mark.parametrize("path", [path for path in MODULES if path.name != "_compat.py"], ids=dotted)
 def test_foreign_private_names_are_in_compat_only(path):
-    tree = ast.parse(path.read_text())
+    tree = parsed(path)
     assert unstable_imports(tree) == []
     assert private_attributes(tree, own_private_names()) == []
 
@@ -211,7 +217,7 @@ def test_every_import_of_another_package_is_declared():
     }
     imported = set()
     for path in MODULES:
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.Import):
                 imported |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.level == 0:

@@ -40,7 +40,10 @@ def left_out(case: Case) -> list[str]:
 # The default cross-validation takes half a minute.
 @pytest.mark.parametrize(
     ("name", "cross_validate"),
-    [*((name, False) for name in CASES), pytest.param("panda_6", True, marks=pytest.mark.slow)],
+    [
+        *((name, False) for name in ("panda_2_clean", "panda_6")),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("kuka_14", False), ("panda_6", True))),
+    ],
 )
 def test_unseen_placements(aacmm, mukca, name, cross_validate):
     case = CASES[name]

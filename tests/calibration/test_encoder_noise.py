@@ -46,12 +46,17 @@ def calibrated(arm, capture, **options):
 @pytest.mark.parametrize(
     ("method", "given", "joint", "tracker"),
     [
-        ("two-stage", True, 3, False),
         ("two-stage", False, 2, False),
-        ("joint", True, 2, False),
-        ("joint", False, 3, False),
         ("joint", True, 2, True),
-        ("joint", False, 2, True),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                ("two-stage", True, 3, False),
+                ("joint", True, 2, False),
+                ("joint", False, 3, False),
+                ("joint", False, 2, True),
+            )
+        ),
     ],
 )
 def test_its_noise_is_estimated_and_weights_the_poses(paper_arm, captured, method, given, joint, tracker):

@@ -150,7 +150,7 @@ def test_learned_scales(paper_arm, space, bounds):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"prior": MAKER, "method": "two-stage"}, "a robust loss or a prior"),
+        ({"prior": MAKER, "method": "two-stage"}, "a robust loss, a prior"),
         ({"prior": aj.Prior({"length": 0.3})}, "did you mean 'lengths'"),
         ({"prior": aj.Prior({"d_3": 0.3}, mean={"d_3": 0.4})}, "outside its bounds"),
     ],
@@ -242,8 +242,8 @@ def test_many_are_as_one(paper_arm, space, bounds, true):
         np.testing.assert_allclose(many.prior.sd[i], one.prior.sd, rtol=1e-5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("active", [pytest.param(False, marks=pytest.mark.exhaustive), True])
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("active", [False, True])
 def test_derivatives_are_exact(paper_arm, space, active):
     """By readings, bounds, the length, the prior's mean and scale: of parameters, learned scales and effective numbers;
     against differences of calibrations in NumPy. With two bounds active too."""

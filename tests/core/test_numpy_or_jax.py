@@ -40,7 +40,7 @@ CALLS = {
 @pytest.mark.parametrize(
     ("call", "width"),
     [
-        pytest.param("two-stage", 10.0, marks=pytest.mark.slow),
+        pytest.param("two-stage", 10.0, marks=pytest.mark.exhaustive),
         pytest.param("two-stage", 0.2, marks=pytest.mark.exhaustive),  # on bounds
         pytest.param("joint, noise", 0.2, marks=pytest.mark.slow),
         pytest.param("joint, noise", 10.0, marks=pytest.mark.exhaustive),

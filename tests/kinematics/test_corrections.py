@@ -51,7 +51,12 @@ def readings(arm: aj.Arm) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "name", ["warm elbow", *(pytest.param(name, marks=pytest.mark.slow) for name in ("elbow", "scara", "warm scara"))]
+    "name",
+    [
+        "warm elbow",
+        pytest.param("warm scara", marks=pytest.mark.slow),
+        *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("elbow", "scara")),
+    ],
 )
 def test_derivatives_are_exact(name, request):
     arm = request.getfixturevalue(name.removeprefix("warm "))
@@ -263,7 +268,7 @@ def test_batches_of_corrected_arms(paper_arm):
     np.testing.assert_allclose(jax.vmap(lambda arm: arm.position(q))(batch), expected, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_expansion_is_found_by_a_batch():
     capture, bounds = warm_capture(15, 25)
     one = aj.calibrate(bounds.space.base, capture, bounds, method="joint")

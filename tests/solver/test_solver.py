@@ -193,7 +193,13 @@ def test_derivative_follows_an_active_bound(mode):
     np.testing.assert_allclose(mode(optimum)(jnp.array(5.0), jnp.array(10.0)), [0, 0], atol=1e-10)
 
 
-@pytest.mark.parametrize("unit", [pytest.param(unit, marks=pytest.mark.slow) for unit in (1e8, 1.0, 1e-8)])
+@pytest.mark.parametrize(
+    "unit",
+    [
+        pytest.param(1e8, marks=pytest.mark.slow),
+        *(pytest.param(unit, marks=pytest.mark.exhaustive) for unit in (1.0, 1e-8)),
+    ],
+)
 def test_derivative_does_not_depend_on_units(unit):
     """The same problem with one unknown in another unit: y_1 = u on its bound, y_0 = unit / (1 + u) at the minimum."""
 

@@ -143,7 +143,7 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["two-stage", "joint"])
+@pytest.mark.parametrize("method", [pytest.param("two-stage", marks=pytest.mark.exhaustive), "joint"])
 def test_many_weighted_calibrations_equal_single_ones(paper_arm, bounds, capture, method):
     shifts = 1e-6 * np.random.default_rng(0).normal(size=(3, *capture.q.shape))
     readings = np.asarray(capture.q) + shifts
