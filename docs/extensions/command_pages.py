@@ -3,6 +3,7 @@
 import inspect
 from importlib import import_module
 from pathlib import Path
+from typing import get_args
 
 import typer
 from api_pages import write_if_changed
@@ -45,15 +46,28 @@ def _escaped(text: str) -> str:
     return text.replace("|", r"\|").replace("*", r"\*").replace("_", r"\_").replace("<", r"\<").replace("[", r"\[")
 
 
+def _choices(parameter) -> str:
+    """The values that an option takes, or the word for one."""
+    annotation = parameter.type_descriptor.annotation
+    parts = [part for inner in (annotation, *get_args(annotation)) for part in get_args(inner)]
+    words = [part for part in parts if isinstance(part, str)]
+    words = words or [part for part in get_args(annotation) if isinstance(part, str)]
+    return "|".join(dict.fromkeys(words)) or "VALUE"
+
+
 def _parameter(parameter) -> str:
     """One argument or option: its names, the word for its value, its default, and what it does."""
     if parameter.param_type_name == "argument":
-        names, value = f"`{parameter.make_metavar(typer.Context(typer.main.get_command(program)))}`", ""
+        names, value = f"`{parameter.metavar or parameter.name.upper()}`", ""
     else:
         names = ", ".join(f"`{name}`" for name in [*parameter.opts, *parameter.secondary_opts])
-        value = "" if parameter.is_flag else f" `{parameter.metavar or parameter.type.name.upper()}`"
+        value = "" if parameter.is_flag else f" `{parameter.metavar or _choices(parameter)}`"
     required = "; required" if parameter.required else ""
-    shown = parameter.default is not None and not parameter.is_flag and parameter.default not in ((), [], "")
+    shown = (
+        parameter.default is not None
+        and not getattr(parameter, "is_flag", False)
+        and parameter.default not in ((), [], "")
+    )
     default = f" Default: `{parameter.default}`." if shown and not callable(parameter.default) else ""
     return f"{names}{value}{required}\n: {_escaped(parameter.help or '')}{default}\n"
 
@@ -63,6 +77,7 @@ def page() -> str:
     parts = [OPENING]
     for name, command in _commands().items():
         parts.append(f"## aacmm {name}\n\n{_help(command.help or '')}\n")
+        parts.append(f"{_help(command.epilog or '')}\n")
         parameters = [one for one in command.params if one.name != "help" and not getattr(one, "hidden", False)]
         parts.append("\n".join(map(_parameter, parameters)))
     return "\n".join(parts)
