@@ -89,9 +89,18 @@ def test_the_picture_of_the_layout_is_current():
     assert drawn == (ROOT / "docs" / "layout.svg").read_text(), "make it anew: python docs/layout_picture.py"
 
 
+def lines_of_docstrings(tree: ast.AST) -> int:
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    found = [node.body[0] for node in ast.walk(tree) if isinstance(node, kinds) and ast.get_docstring(node)]
+    return sum(node.end_lineno - node.lineno + 1 for node in found)
+
+
 @pytest.mark.parametrize("path", MODULES, ids=dotted)
 def test_a_module_is_at_most_420_lines(path):
-    assert len(path.read_text().splitlines()) <= 420
+    """The arguments and examples in docstrings are read one function at a time; they count towards 520 only."""
+    text = path.read_text()
+    assert len(text.splitlines()) <= 520
+    assert len(text.splitlines()) - lines_of_docstrings(ast.parse(text)) <= 420
 
 
 # Public names

@@ -132,7 +132,7 @@ def calibrate_many(
         method: "two-stage" or "joint", as in `calibrate`; with ``covariance`` it is joint.
 
     Returns:
-        Parameters, scale, metrics and reasons, problem by problem.
+        Parameters, scale, metrics and reasons, problem by problem; mm and rad.
 
     Raises:
         InputError: As `identify_many`, and where nothing fixes the scale.

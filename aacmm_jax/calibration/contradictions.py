@@ -194,6 +194,9 @@ def session_metrics(record: CalibrationRecord) -> dict[str, tuple[int, float, fl
     (one Gauss-Newton step away), mm; nothing without sessions. A socket's single pose, whose distance is 0, does not
     count.
 
+    Args:
+        record: A calibration of captures that `join_sessions` joined.
+
     Example:
         >>> monday = aj.simulate(true, {"A": (400, 200, 300)}, poses=20, noise=noise, seed=1)
         >>> friday = aj.simulate(true, {"A": (500, 200, 300)}, poses=20, noise=noise, seed=2)

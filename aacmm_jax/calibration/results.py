@@ -382,6 +382,9 @@ class ManyCalibrations(AbstractManyResults):
 def converged(result: Reason) -> Bool[AnyArray, "*batch"]:
     """Whether a reason means that a minimum was reached.
 
+    Args:
+        result: The reason, or one for each problem of a batch.
+
     Example:
         >>> print(bool(aj.calibration.converged(result.result)))
         True

@@ -168,7 +168,8 @@ def read_administrative_data(path: str | os.PathLike) -> AdministrativeData:
         InputError: names the file, the key in it and what to do.
 
     Example:
-        >>> _ = open("laboratory.toml", "w").write('laboratory = { name = "Metrology", city = "Braunschweig" }')
+        >>> from pathlib import Path
+        >>> _ = Path("laboratory.toml").write_text('laboratory = { name = "Metrology", city = "Braunschweig" }')
         >>> print(aj.files.read_administrative_data("laboratory.toml").laboratory.city)
         Braunschweig
     """

@@ -190,6 +190,10 @@ def load_specification(
     `Parameters.independent`, and the default bounds. The other arguments are those of `load_arm`.
 
     Args:
+        source: As of `load_arm`.
+        base: As of `load_arm`.
+        tip: As of `load_arm`.
+        probe: As of `load_arm`, mm.
         capture: What was observed, where it is known.
 
     Raises:
@@ -211,7 +215,15 @@ def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str |
 
     A file without the table is that of a measuring arm, or of a robot where it is a URDF, names one, or is a
     ``kinematics.yaml`` (`data.arm_classes`). Plans assume this noise; a calibration estimates it from the data, and
-    compares it with that of a table. The arguments are those of `load_arm`.
+    compares it with that of a table.
+
+    Args:
+        source: As of `load_arm`.
+        base: As of `load_arm`.
+        tip: As of `load_arm`.
+
+    Returns:
+        Class of the arm, its noise (rad and mm, as `Noise` has it), and where the numbers come from.
 
     Raises:
         InputError: There is no such arm, or the numbers are none of this arm.
@@ -231,6 +243,14 @@ def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str |
 
 def usual_noise(source: str | os.PathLike, *, base: str | None = None, tip: str | None = None) -> ArmNoise | None:
     """The noise of the ``[noise]`` table of an arm's file; None where it has none.
+
+    Args:
+        source: As of `load_arm`.
+        base: As of `load_arm`.
+        tip: As of `load_arm`.
+
+    Returns:
+        Class of the arm, its noise (rad and mm, as `Noise` has it), and where the numbers come from.
 
     Example:
         >>> print(aj.files.usual_noise("robot.urdf"))
@@ -391,6 +411,12 @@ def with_parameters(specification: ArmSpecification, capture: Capture | None = N
 
 def save_arm(arm: Arm, path: str | os.PathLike, *, name: str = "", source: str = "") -> None:
     """Write an arm as TOML: standard convention, mm and rad, digits enough to read back the same numbers.
+
+    Args:
+        arm: One arm.
+        path: The file to write, whole or not at all.
+        name: What people call it.
+        source: Where its numbers come from, a sentence.
 
     Example:
         >>> aj.files.save_arm(result.arm, "calibrated.toml", name="calibrated arm")

@@ -87,7 +87,8 @@ def load_cell(
         InputError: Naming the file and the place in it.
 
     Example:
-        >>> _ = open("cell.toml", "w").write('''clearance = 20.0
+        >>> from pathlib import Path
+        >>> _ = Path("cell.toml").write_text('''clearance = 20.0
         ... [[half_space]]
         ... name = "table"
         ... normal = [0, 0, 1]

@@ -145,6 +145,9 @@ def zero_offsets(nominal: Arm, calibrated: Arm, q: Float[np.ndarray, "N n"]) -> 
 def zero_offsets_csv(found: ZeroOffsets) -> str:
     """Zero offsets as CSV, with the error that remains in comments.
 
+    Args:
+        found: The offsets, from `zero_offsets`; rad, or mm of prismatic joints.
+
     Example:
         >>> found = aj.files.zero_offsets(arm, result.arm, np.array(capture.q))
         >>> print(aj.files.zero_offsets_csv(found).splitlines()[0])

@@ -90,7 +90,8 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
         InputError: Naming the file and the place in it.
 
     Example:
-        >>> _ = open("kit.toml", "w").write('''[[socket]]
+        >>> from pathlib import Path
+        >>> _ = Path("kit.toml").write_text('''[[socket]]
         ... name = "cone"
         ... point = [400, 200, 300]
         ... poses = 5

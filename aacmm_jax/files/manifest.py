@@ -223,9 +223,10 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         InputError: names the file, the place in it and what to do.
 
     Example:
+        >>> from pathlib import Path
         >>> columns = "q1,q2,q3,q4,q5,q6"
         >>> np.savetxt("cone.csv", np.degrees(capture.sockets["A"]), delimiter=",", header=columns, comments="")
-        >>> _ = open("capture.toml", "w").write('''arm = "cheng2018-simulation"
+        >>> _ = Path("capture.toml").write_text('''arm = "cheng2018-simulation"
         ... angles = { unit = "deg" }
         ... socket = [{ name = "A", file = "cone.csv" }]
         ... ''')

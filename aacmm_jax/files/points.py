@@ -35,8 +35,9 @@ def read_points(path: str | os.PathLike) -> Measured:
         InputError: names the file, the place in it and what to do.
 
     Example:
+        >>> from pathlib import Path
         >>> np.savetxt("near.csv", true.position(capture.sockets["A"]), delimiter=",")
-        >>> _ = open("points.toml", "w").write('''[points]
+        >>> _ = Path("points.toml").write_text('''[points]
         ... unit = "mm"
         ... [[socket]]
         ... name = "near"

@@ -75,6 +75,9 @@ def ur_kinematics_yaml(arm: Arm) -> str:
     Frames on nearly parallel axes are where the axis crosses the plane of the frame before; the base, the readings and
     the tip stay. The tip in the tool flange's frame, which the file has no place for, is stated as a comment.
 
+    Args:
+        arm: One arm; mm and rad become m and rad in the file.
+
     Raises:
         InputError: The arm does not have six joints.
 

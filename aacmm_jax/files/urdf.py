@@ -166,6 +166,12 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
 def link_masses(chain: UrdfChain) -> LinkMasses:
     """Mass and centre of mass of what each joint carries up to the next one, side branches included at reading 0.
 
+    Args:
+        chain: The chain, from `urdf_chain`.
+
+    Returns:
+        Masses ``(n,)``, kg, and centres of mass ``(n, 3)`` in each link's D-H frame, mm.
+
     Example:
         >>> chain = aj.files.urdf_chain(aj.files.load_specification("robot.urdf").urdf)
         >>> print(aj.files.link_masses(chain).mass, "kg")

@@ -300,6 +300,9 @@ def parameter_names(arm: Arm) -> tuple[str, ...]:
     """All parameter names of an arm: alpha, a, d, theta, (beta,) by joint from 1, then probe_x, probe_y, probe_z, and
     those of its corrections.
 
+    Args:
+        arm: One arm, or a batch of them.
+
     Example:
         >>> print(aj.kinematics.parameter_names(arm)[:7])
         ('alpha_1', 'alpha_2', 'alpha_3', 'alpha_4', 'alpha_5', 'alpha_6', 'a_1')

@@ -135,6 +135,11 @@ def clearances(cell: Cell, arm: Arm, q: Float[AnyArray, "N n"]) -> Float[AnyArra
     Exact where nothing touches; negative where something does, though not by how much. Infinite where nothing is
     checked.
 
+    Args:
+        cell: The arm's body, and the obstacles.
+        arm: The arm.
+        q: Joint readings ``(N, n)``, rad, or mm of prismatic joints.
+
     Example:
         >>> table = aj.kinematics.HalfSpace("table", normal=(0, 0, 1), point=(0, 0, -1000))
         >>> cell = aj.kinematics.Cell(aj.kinematics.body_along_links(arm, 40.0), obstacles=(table,))

@@ -34,7 +34,7 @@ class Explanation(NamedTuple):
     were given.
 
     Example:
-        >>> readings = capture.q[:20] * np.array([1, 1, -1, 1, 1, 1])
+        >>> readings = capture.q[:20] * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
         >>> found = aj.kinematics.check_readings(arm, readings, positions=true.position(capture.q[:20]))
         >>> print(found.best.signs, f"{found.best.rms:.1f} mm instead of {found.given.rms:.0f} mm")
         (1, 1, -1, 1, 1, 1) 2.2 mm instead of 431 mm

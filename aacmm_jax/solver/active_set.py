@@ -26,11 +26,12 @@ class QuadraticModel(NamedTuple):
     J.
 
     Example:
-        >>> def normal(y, target):
-        ...     return aj.solver.QuadraticModel(0.5 * ((y - target) ** 2).sum(), y - target, np.eye(2))
+        >>> import jax.numpy as jnp
         >>> def residual(y, target):
         ...     return y - target
-        >>> print(aj.least_squares(residual, np.zeros(2), np.array([1.0, 3.0]), upper=2.0, normal=normal).value)
+        >>> def normal(y, target):
+        ...     return aj.solver.QuadraticModel(0.5 * ((y - target) ** 2).sum(), y - target, jnp.eye(2))
+        >>> print(aj.least_squares(residual, jnp.zeros(2), jnp.array([1.0, 3.0]), upper=2.0, normal=normal).value)
         [1. 2.]
     """
 

@@ -28,10 +28,10 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     Use it through `least_squares`, which also brings the adjoint that takes the bounds into account.
 
     Example:
+        >>> import jax.numpy as jnp
         >>> loose = aj.solver.BoundedLevenbergMarquardt(rtol=1e-6, gtol=1e-6)
-        >>> def residual(y, target):
-        ...     return y - target
-        >>> print(aj.least_squares(residual, np.zeros(2), np.array([1.0, 3.0]), upper=2.0, solver=loose).value)
+        >>> target = jnp.array([1.0, 3.0])
+        >>> print(aj.least_squares(lambda y, target: y - target, jnp.zeros(2), target, upper=2.0, solver=loose).value)
         [1. 2.]
     """
 
@@ -130,9 +130,8 @@ def least_squares(
             the solve fails. Under jit that is a failure of JAX's, of several lines.
 
     Example:
-        >>> def residual(y, target):
-        ...     return y - target
-        >>> solution = aj.least_squares(residual, np.array([0.0, 0.0]), np.array([1.0, 3.0]), upper=2.0)
+        >>> import jax.numpy as jnp
+        >>> solution = aj.least_squares(lambda y, target: y - target, jnp.zeros(2), jnp.array([1.0, 3.0]), upper=2.0)
         >>> print(solution.value)
         [1. 2.]
     """

@@ -48,7 +48,8 @@ def draw_trials(study: Study, cell: int, trials: Numbers) -> tuple[DrawnTrials, 
         trials: Numbers of the trials ``(t,)``, from 0.
 
     Returns:
-        Readings, true parameters, bounds and starts, and the captures as a batch that `identify_many` takes.
+        Readings, true parameters, bounds and starts, mm and rad, and the captures as a batch that `identify_many`
+        takes.
 
     Raises:
         InputError: The study has no such cell.

@@ -51,12 +51,6 @@ class Cylinder(AbstractObservation):
     Outside (a pin, a plug gauge) that distance is (diameter + stylus) / 2, inside (a ring gauge, a bore)
     (diameter - stylus) / 2.
 
-    >>> import numpy as np
-    >>> q = np.linspace(0.0, 1.0, 48).reshape(8, 6)
-    >>> ring = Cylinder("ring", q, diameter=50.0, u=0.001, stylus=6.0, inside=True)
-    >>> float(ring.radius), list(ring.unknowns)
-    (22.0, ['axis of ring', 'radius of ring'])
-
     Args:
         name: Name of the cylinder.
         q: Joint readings ``(m, n)``, rad.
