@@ -1,6 +1,7 @@
 """Draws the figures of the explanations as SVG that can be read on light and dark pages: python docs/figures.py."""
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -15,7 +16,7 @@ GREY, BLUE, ORANGE = "#808080", "#3f88c5", "#e07a3f"  # each has a contrast of 3
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
 SOCKETS = {"A": (400, 200, 300), "B": (700, 500, 500)}
 MODELS = ("dh", "gravity", "harmonics=1", "gravity,harmonics=1", "functions", "gravity,functions")
-STYLE = {
+STYLE: dict[Any, Any] = {
     "figure.facecolor": "none",
     "axes.facecolor": "none",
     "savefig.facecolor": "none",
@@ -51,6 +52,13 @@ def _paper() -> tuple[aj.Arm, aj.Parameters, aj.Bounds]:
     return arm, space, aj.Bounds.around(arm, space, length=10.0, angle=0.0175)
 
 
+def _seen(arm: aj.Arm, capture: aj.Capture, geometry: Any = None) -> Any:
+    """How an arm agrees with what was observed, in the geometry given, or in that which fits it best."""
+    observed = aj.evaluate(arm, capture, geometry=geometry).observed
+    assert observed is not None
+    return observed
+
+
 def scale() -> None:
     """k after stage 1 of forty captures, with all lengths free and with a scale anchor."""
     arm, space, bounds = _paper()
@@ -59,7 +67,9 @@ def scale() -> None:
         true = aj.perturbed_arm(space, length=1.0, angle=np.radians(0.1), seed=seed)
         capture = _capture(true, seed, {"A": 70, "B": 10})
         for hold, values in found.items():
-            values.append(float(aj.identify(arm, capture, bounds, hold=hold).scale.value))
+            scale_found = aj.identify(arm, capture, bounds, hold=hold).scale
+            assert scale_found is not None
+            values.append(float(scale_found.value))
     axes = _axes(2.6)
     for height, (hold, colour) in enumerate((("longest", BLUE), (None, ORANGE))):
         jitter = np.random.default_rng(0).uniform(-0.22, 0.22, 40)
@@ -121,11 +131,10 @@ def random_splits() -> None:
         taken, others = (aj.Capture({}, [], [points.select(rows)]) for rows in (order[:500], order[500:]))
         for i, model in enumerate(MODELS):
             result = aj.calibrate(nominal, taken, bounds, model=model)
-            fitted = aj.evaluate(result.arm, taken).observed.geometry
-            errors[i, 0, seed] = float(aj.evaluate(result.arm, others, geometry=fitted).observed.rms[0])
-            errors[i, 1, seed] = float(aj.evaluate(result.arm, series_a).observed.rms[0])
+            fitted = _seen(result.arm, taken).geometry
+            errors[i, :, seed] = _seen(result.arm, others, fitted).rms[0], _seen(result.arm, series_a).rms[0]
     print(*zip(MODELS, errors.round(3).tolist(), strict=True), sep="\n")
-    before = float(aj.evaluate(nominal, series_a).observed.rms[0])
+    before = float(_seen(nominal, series_a).rms[0])
     axes, places = _axes(3.4), np.arange(len(MODELS))
     for part, (offset, colour, label) in enumerate(
         ((-0.2, BLUE, "other poses of C, drawn at random"), (0.2, ORANGE, "series A"))

@@ -200,8 +200,8 @@ def predictions(keys: Iterable[str] = ("measuring", "robot", "hobby"), data: Ite
                 found = [predicted(case, name, poses, seed) for seed in SEEDS]
                 row["parameters"] = max(row["parameters"], *(one["parameters"] for one in found))
                 for what in ("median", "largest"):
-                    values = [one[what] for one in found]
-                    row[what][str(poses)] = None if None in values else round(float(np.median(values)), 4)
+                    values = [value for one in found if (value := one[what]) is not None]
+                    row[what][str(poses)] = round(float(np.median(values)), 4) if values else None
             rows.append(row)
     return rows
 

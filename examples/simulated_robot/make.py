@@ -34,6 +34,7 @@ def _track(true: aj.Arm, path: Path, poses: int, seed: int) -> None:
     points = aj.data.observations.SimulatedPoints("tracker", BOX, poses, STATION, TRACKER_MM, "ball", TARGET)
     capture = aj.simulate(true, {}, observations=[points], encoder_arcsec=ENCODER_ARCSEC, seed=seed)
     (seen,) = capture.observations
+    assert isinstance(seen, aj.data.observations.MeasuredPoints)
     table = np.hstack([np.degrees(seen.q), np.asarray(seen.points)])
     header = ",".join([*(f"J{joint} [deg]" for joint in range(1, 7)), "x [mm]", "y [mm]", "z [mm]"])
     np.savetxt(path, table, fmt=["%.5f"] * 6 + ["%.4f"] * 3, delimiter=",", header=header, comments="")
