@@ -6,6 +6,7 @@ over the seeds. The page which_data.md includes the table; tests/docs/test_which
 """
 
 import json
+import math
 import textwrap
 import warnings
 from collections.abc import Callable, Iterable
@@ -240,11 +241,12 @@ def _noise(case: Case) -> str:
 def _cell(median: float | None, largest: float | None) -> str:
     if median is None or largest is None:
         return "-"
-    return "not determined" if not median < 10 else f"{_two(median)} ({_two(largest)})"
+    return "not determined" if not median < 10 else f"{_two(median)}\N{NO-BREAK SPACE}({_two(largest)})"
 
 
 def _two(value: float) -> str:
-    return f"{value:.2g}" if value < 10 else f"{value:.0f}"
+    digits = max(0, 1 - math.floor(math.log10(value)))
+    return f"{value:.{digits}f}"
 
 
 def main() -> None:
