@@ -77,8 +77,8 @@ test-lowest:
 	$(OPTIMISED) .venv-lowest/bin/python $(PYTEST) -W ignore::DeprecationWarning $(SELECTION)
 
 check: .venv/.dev
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
+	$(BIN)/ruff check . .ci/try_package
+	$(BIN)/ruff format --check . .ci/try_package
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports --no-cache
 

@@ -84,6 +84,7 @@ def test_import_contracts_are_kept(capsys):
     assert status == 0, capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_picture_of_the_layout_is_current():
     drawn = runpy.run_path(str(ROOT / "docs" / "layout_picture.py"))["picture"]()
     assert drawn == (ROOT / "docs" / "layout.svg").read_text(), "make it anew: python docs/layout_picture.py"
