@@ -95,6 +95,11 @@ audit: .venv/.dev
 	then echo "audit skipped: the service of known vulnerabilities cannot be reached"; \
 	else cat .venv/audit.txt; exit $$code; fi
 
+# NOTEBOOKS=stored reaches docs/conf.py as an environment variable.
+docs: .venv/.docs
+	$(BIN)/python -m sphinx -W --keep-going -q -b html -j auto docs docs/_build/html
+	@echo "Open docs/_build/html/index.html"
+
 bench: .venv/.test
 	$(BIN)/python benchmarks/throughput.py
 
@@ -122,12 +127,13 @@ benchmarks/peers/%/.venv/.done: benchmarks/peers/%/requirements.txt
 
 .venv/.dev: pyproject.toml requirements/tested.txt | .venv/bin/python
 	$(call install,.venv,--constraint requirements/tested.txt --editable '.[dev]')
-	touch $@ .venv/.test .venv/.run
+	touch $@ .venv/.test .venv/.docs .venv/.run
 
 .venv/.docs: pyproject.toml requirements/tested.txt | .venv/bin/python
 	$(call install,.venv,--constraint requirements/tested.txt --editable '.[docs]')
 	touch $@ .venv/.run
 
 clean:
-	rm -rf .venv .venv-newest .venv-lowest aacmm-demo docs/_build docs/notebooks docs/reference/api docs/reference/command_line.md
+	rm -rf .venv .venv-newest .venv-lowest aacmm-demo docs/_build docs/notebooks docs/reference/api
+	rm -f docs/reference/command_line.md
 	git clean -qfX docs/reference/files
