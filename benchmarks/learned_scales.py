@@ -4,7 +4,7 @@
 0.5 mrad), records a few poses of each (2 arcsec, 5 um), calibrates them with both scales learned, and writes
 ``results/learned-scales-DATE.json``: the part of the 21 parameters within their 95 % intervals and the mean of
 (error / u)^2, with the noise given and estimated. Then the time of a batch of 64 calibrations of 80 poses, jointly,
-with learned scales and without a prior, compiled. Six minutes of CPU time with 200 trials.
+with learned scales and without a prior, compiled. Ten minutes of CPU time with 200 trials.
 """
 
 import argparse
