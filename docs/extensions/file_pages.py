@@ -71,6 +71,8 @@ def _kind(annotation: object) -> str:
     if re.match(r"(typing\.Annotated\[)?dict\[", text):
         return "table of " + " or ".join(word for word in named if word != "text") if len(named) > 1 else "table"
     several = "list: " if re.match(r"(typing\.(Annotated|Optional)\[)*list\[", text) else ""
+    if several and len(named) == 1 and not named[0].startswith("`"):
+        return "tables" if named == ["table"] else f"list of {named[0]}s"
     return several + (" or ".join(named) or "date")
 
 
@@ -105,14 +107,15 @@ def tables(model: type[BaseModel]) -> dict[str, tuple[type[BaseModel], bool]]:
 
 
 def _table_of_keys(model: type[BaseModel]) -> list[str]:
-    lines = ["| key | value | default | |", "|---|---|---|---|"]
+    lines = ["| key | value | |", "|---|---|---|"]
     for name, field in model.model_fields.items():
         key = field.alias or name
-        default = "required" if field.is_required() else ""
+        default = "; required" if field.is_required() else ""
         if not field.is_required() and isinstance(field.default, str | int | float) and field.default not in ("", 0):
-            default = f"`{str(field.default).lower() if isinstance(field.default, bool) else field.default}`"
+            stated = str(field.default).lower() if isinstance(field.default, bool) else field.default
+            default = f"; default `{stated}`"
         text = description(model, key, name).replace("|", r"\|")
-        lines.append(f"| `{key}` | {_kind(field.annotation)} | {default} | {text} |")
+        lines.append(f"| `{key}` | {_kind(field.annotation)}{default} | {text} |")
     return lines
 
 

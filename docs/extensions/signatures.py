@@ -46,7 +46,7 @@ def _constructor(cls: type) -> str:
 def as_written(app, what: str, name: str, value: object, options: object, signature: str, returns: str):
     """The signature of a function, a method, or a class with a constructor of its own."""
     if what == "class":
-        return _constructor(value), None
+        return None if issubclass(value, BaseException) else (_constructor(value), None)
     node = _definition(getattr(value, "__func__", value))
     if node is None:
         return None
