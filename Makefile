@@ -97,7 +97,7 @@ audit: .venv/.dev
 
 # NOTEBOOKS=stored reaches docs/conf.py as an environment variable.
 docs: .venv/.docs
-	$(BIN)/python -m sphinx -W --keep-going -q -b html -j auto docs docs/_build/html
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo "Open docs/_build/html/index.html"
 
 bench: .venv/.test
