@@ -19,9 +19,9 @@ _TERMS: dict[str, tuple[str, str, str]] = {
     "second harmonic": ("cos 2 q_{i}", "a tilted or oval encoder", "harmonics"),
     "gear ratio": ("q_{i} (gear ratio)", "a wrong gear ratio", "gear"),
     "gravity": ("gravity about joint {i}", "a joint or link that bends under its load", "gravity"),
-    "drifting zero": ("the order of the poses in joint {i}", "a zero that drifts", ""),
-    "drifting base": ("the order of the poses in the tip", "a base or socket that moves", ""),
-    "growing arm": ("the order of the poses in the arm's size", "an arm that warms or cools", ""),
+    "drifting zero": ("a drift of joint {i} from pose to pose", "a zero that drifts", ""),
+    "drifting base": ("a drift of the tip from pose to pose", "a base or socket that moves", ""),
+    "growing arm": ("a growth of the arm from pose to pose", "an arm that warms or cools", ""),
     "thermal expansion": ("temperature", "an arm that expands", "expansion"),
 }
 _FAR_MORE = 100.0  # ratio of noise beyond which the number says nothing
