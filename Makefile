@@ -119,4 +119,5 @@ benchmarks/peers/%/.venv/.done: benchmarks/peers/%/requirements.txt
 	touch $@ .venv/.run
 
 clean:
-	rm -rf .venv .venv-newest .venv-lowest aacmm-demo docs/_build docs/notebooks docs/reference/api
+	rm -rf .venv .venv-newest .venv-lowest aacmm-demo docs/_build docs/notebooks docs/reference/api docs/reference/command_line.md
+	git clean -qfX docs/reference/files

@@ -29,6 +29,9 @@ extensions = [
     "mathml",
     "class_fields",
     "api_pages",
+    "signatures",
+    "command_pages",
+    "file_pages",
 ]
 exclude_patterns = ["_build", "notebooks/README.md"]
 nitpicky = True
@@ -38,6 +41,8 @@ html_math_renderer = "mathml"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_copy_source = False
+html_show_search_summary = False  # would be fetched, which a page on a disk may not do
+toc_object_entries = False
 
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 myst_heading_anchors = 4

@@ -41,6 +41,11 @@ def measured_by(arm: Arm, recording: Recording) -> Measured:
 
     Returns:
         Points of sockets and spheres in mm, the lengths, and the arm's reach.
+
+    Example:
+        >>> measured = aj.acceptance.measured_by(result.arm, recording)
+        >>> print(measured.sockets["A"].shape, f"{measured.reach.radius:.0f} mm")
+        (40, 3) 1360 mm
     """
     capture, touched = recording.capture, [group for sphere in recording.spheres for group in sphere.groups]
     readings = [np.asarray(q) for q in (*capture.sockets.values(), *touched)]
@@ -89,6 +94,15 @@ def run(
     Raises:
         InputError: The points are not points in mm; a limit names no metric or one that these points do not give; or a
             limit grows with a length for a metric that is not of a length.
+
+    Example:
+        >>> measured = aj.acceptance.measured_by(result.arm, aj.Recording(two_bars, nominal))
+        >>> for test in aj.acceptance.run(measured, limits={"SPAT": 0.1}):
+        ...     print(test.called, [(metric.name, metric.decision) for metric in test.metrics])
+        after JJF 1408-2013 [('Deltam', None), ('Length', None), ('Length_Range', None), ('Length_2RMS', None)]
+        after ASME B89.4.22-2004 [('SPAT', 'conforms'), ('SPAT_2s', None)]
+        after ASME B89.4.22-2004 [('Volumetric', None), ('Volumetric_Range', None), ('Volumetric_2RMS', None)]
+        after ISO 10360-12:2016 [('E_Uni', None)]
     """
     measured = _checked(measured)
     u_test = _number(u_test, "the standard uncertainty of the test")
@@ -115,7 +129,12 @@ def run(
 
 
 def requirements_table() -> str:
-    """The requirements of every test as Markdown: whether they are checked, their source, and how certain that is."""
+    """The requirements of every test as Markdown: whether they are checked, their source, and how certain that is.
+
+    Example:
+        >>> print(aj.acceptance.requirements_table().splitlines()[0])
+        ## JJF 1408-2013
+    """
     return table_of(TESTS)
 
 

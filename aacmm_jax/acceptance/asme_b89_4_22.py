@@ -66,6 +66,11 @@ def spat(points: Numbers) -> tuple[float, float]:
 
     Raises:
         InputError: There are fewer than two points.
+
+    Example:
+        >>> largest, two_s = aj.acceptance.spat([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [0.01, 0.0, 0.03]])
+        >>> print(f"{largest:.4f} mm, {two_s:.4f} mm")
+        0.0200 mm, 0.0400 mm
     """
     given = points_of(points, "points of a socket")
     if len(given) < 2:

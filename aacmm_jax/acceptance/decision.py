@@ -13,6 +13,9 @@ DECISIONS: tuple[Decision, ...] = get_args(Decision)  # the worst first
 Rule = Literal["iso-2017", "iso-2013", "simple"]
 # Decision rules by name. Guard bands of ISO 14253-1 are stated from secondary sources; the ratio of 4 to 1 is one of
 # the "N:1 decision rules" that ASME B89.7.3.1-2001 defines in its section 2, which is public in extracts.
+#
+# >>> print(aj.acceptance.RULES["iso-2013"])
+# ISO 14253-1:2013, guard band U
 RULES: dict[Rule, str] = {
     "iso-2017": "ISO 14253-1:2017, conformity proven with a probability of 95 %",
     "iso-2013": "ISO 14253-1:2013, guard band U",
@@ -27,7 +30,13 @@ _LIMIT = re.compile(r"\s*(?P<fixed>[^+/LlKk]+?)\s*(?:\+\s*[Ll]\s*/\s*(?P<divisor
 
 
 class Limit(NamedTuple):
-    """A maximum permissible error (MPE) in mm: ``fixed``, or ``fixed + L / divisor`` for a length L in mm."""
+    """A maximum permissible error (MPE) in mm: ``fixed``, or ``fixed + L / divisor`` for a length L in mm.
+
+    Example:
+        >>> mpe = aj.acceptance.Limit(0.015, divisor=40_000)
+        >>> print(f"{mpe.at(500.0):.4f} mm")
+        0.0275 mm
+    """
 
     fixed: float
     divisor: float = math.inf
@@ -59,6 +68,12 @@ def decide(error: float, limit: float, expanded: float = 0.0, rule: Rule = "iso-
 
     Raises:
         InputError: An argument is not a number, the limit or U is negative or infinite, or the rule is unknown.
+
+    Example:
+        >>> print(aj.acceptance.decide(0.040, limit=0.050, expanded=0.010))
+        conforms
+        >>> print(aj.acceptance.decide(0.048, limit=0.050, expanded=0.010))
+        undecided
     """
     try:
         error, limit, expanded = float(error), float(limit), float(expanded)

@@ -15,7 +15,13 @@ _EXPANSION = re.compile(r"\s*(?P<of>artefact|arm)\s*=(?P<numbers>[^=]*)")
 
 
 class Expansion(NamedTuple):
-    """Thermal expansion of a body in a test: coefficient in 1/K, temperature in C, and their standard uncertainties."""
+    """Thermal expansion of a body in a test: coefficient in 1/K, temperature in C, and their standard uncertainties.
+
+    Example:
+        >>> steel = aj.acceptance.Expansion(11.5e-6, u_coefficient=1e-6, temperature=20.8, u_temperature=0.2)
+        >>> print(f"{steel.relative * 1e6:.1f} um/m, u = {steel.u * 1e6:.1f} um/m")
+        9.2 um/m, u = 2.4 um/m
+    """
 
     coefficient: float
     u_coefficient: float = 0.0
@@ -40,7 +46,15 @@ class Expansion(NamedTuple):
 
 
 class Influences(NamedTuple):
-    """The tester's contributions to the uncertainty of test values, besides the certificates of the artefacts."""
+    """The tester's contributions to the uncertainty of test values, besides the certificates of the artefacts.
+
+    Example:
+        >>> tester = aj.acceptance.Influences(u=0.002, u_relative=2e-6)
+        >>> measured = aj.acceptance.Measured({"cone": true.position(capture.sockets["A"])})
+        >>> tests = aj.acceptance.run(measured, limits={"SPAT": 0.1}, influences=tester)
+        >>> print(tests[0].metrics[0].worst.expanded)
+        0.004
+    """
 
     u: float = 0.0  # standard uncertainty of every value: seat and fixture, mm
     u_relative: float = 0.0  # standard uncertainty in proportion to a length

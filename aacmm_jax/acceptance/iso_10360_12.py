@@ -61,6 +61,12 @@ def form_error(points: Numbers) -> float:
 
     Raises:
         InputError: The points do not determine a sphere.
+
+    Example:
+        >>> directions = np.concatenate([np.eye(3), -np.eye(3)])
+        >>> points = (12.5 + 0.01 * np.array([1, 0, 0, 1, 0, 0]))[:, None] * directions
+        >>> print(f"{aj.acceptance.form_error(points):.4f} mm")
+        0.0100 mm
     """
     return fit_sphere(points).form
 
@@ -78,6 +84,12 @@ def articulated_location(groups: Sequence[Numbers]) -> float:
 
     Raises:
         InputError: The points of a group do not determine a sphere.
+
+    Example:
+        >>> directions = np.concatenate([np.eye(3), -np.eye(3)])
+        >>> centres = ([0.0, 0.0, 0.0], [0.02, 0.0, 0.0])
+        >>> print(round(aj.acceptance.articulated_location([12.5 * directions + centre for centre in centres]), 6))
+        0.02
     """
     return 2 * enclosing_sphere([fit_sphere(group).centre for group in groups])[1]
 

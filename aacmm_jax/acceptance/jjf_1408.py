@@ -28,6 +28,10 @@ def half_range(points: Numbers) -> float:
 
     Raises:
         InputError: ``points`` has another shape, or no rows.
+
+    Example:
+        >>> print(aj.acceptance.half_range([[0.0, 0.0, 0.0], [0.02, 0.01, 0.0], [0.01, 0.0, 0.03]]))
+        0.015
     """
     return float(np.ptp(points_of(points, "points of a socket"), axis=0).max() / 2)
 

@@ -82,6 +82,10 @@ def two_rms(deviations: Numbers) -> float:
 
     Raises:
         InputError: There are no deviations.
+
+    Example:
+        >>> print(f"{aj.acceptance.two_rms([0.01, -0.02, 0.005]):.4f} mm")
+        0.0265 mm
     """
     given = np.asarray(as_floats(deviations, "deviations"))
     if not given.size:

@@ -30,7 +30,13 @@ _STANDARDS = {"asme": asme_b89_4_22, "iso": iso_10360_12}
 
 
 class Procedure(NamedTuple):
-    """A planned acceptance test; mm and rad."""
+    """A planned acceptance test; mm and rad.
+
+    Example:
+        >>> procedure = aj.acceptance.plan_procedure(arm, "asme")
+        >>> print(procedure.poses, len(procedure.lengths), procedure.left_out)
+        97 20 ()
+    """
 
     arm: Arm
     standard: Planned
@@ -82,6 +88,11 @@ def plan_procedure(
 
     Raises:
         InputError: The arm cannot take such a test, or an argument is out of range.
+
+    Example:
+        >>> procedure = aj.acceptance.plan_procedure(arm, "asme", measuring_range=2000.0)
+        >>> print(procedure.poses, "poses,", len(procedure.lengths), "bars")
+        97 poses, 20 bars
     """
     if standard not in PLANNED:
         raise InputError(f"acceptance is '{standard}'; it must be {' or '.join(PLANNED)}.")
@@ -145,6 +156,13 @@ def simulate_procedure(
 
     Raises:
         InputError: Noise is negative, or the true arm does not reach an artefact.
+
+    Example:
+        >>> procedure = aj.acceptance.plan_procedure(arm, "asme", measuring_range=2000.0)
+        >>> built = nominal._replace(arm=true)
+        >>> recorded = aj.acceptance.simulate_procedure(procedure, nominal, built, encoder_arcsec=2.0)
+        >>> print(len(recorded.capture.q), len(recorded.spheres))
+        70 1
     """
     noise = {"encoder_arcsec": encoder_arcsec, "seating": seating, "u_length": u_length, "u_diameter": u_diameter}
     for what, value in noise.items():

@@ -38,7 +38,17 @@ SIMULATED = "The readings are simulated: no real arm was measured."
 
 
 class EvaluationRecord(NamedTuple):
-    """A calibrated arm and the capture it is evaluated on; the metrics follow from these."""
+    """A calibrated arm and the capture it is evaluated on; the metrics follow from these.
+
+    Example:
+        >>> evaluation = aj.acceptance.evaluation_of(record, aj.Recording(two_bars, nominal), standards=["asme"])
+        >>> print(evaluation.calibrated.name)
+        Cheng 2018, simulated arm, calibrated
+        >>> for which, tests in evaluation.acceptance().items():
+        ...     print(which, [test.title for test in tests])
+        nominal ['single-point articulation', 'volumetric']
+        calibrated ['single-point articulation', 'volumetric']
+    """
 
     recording: Recording  # the capture, with the nominal arm of the calibration
     calibrated: ArmSpecification
@@ -101,7 +111,14 @@ class EvaluationRecord(NamedTuple):
 
 
 class PointsRecord(NamedTuple):
-    """Recorded points and the limits they are judged by; the metrics follow from these."""
+    """Recorded points and the limits they are judged by; the metrics follow from these.
+
+    Example:
+        >>> measured = aj.acceptance.Measured({"cone": result.arm.position(capture.sockets["A"])})
+        >>> judged = aj.acceptance.PointsRecord(measured, limits={"SPAT": 0.05}, rule="simple")
+        >>> print([(metric.name, metric.decision) for test in judged.acceptance() for metric in test.metrics])
+        [('Deltam', None), ('SPAT', 'conforms'), ('SPAT_2s', None)]
+    """
 
     measured: Measured
     limits: Mapping[str, Limit | float] = MappingProxyType({})
@@ -159,6 +176,13 @@ def evaluation_of(
     Raises:
         InputError: A limit is impossible, there is nothing to measure its metric on, or the observations do not
             determine their own unknown geometry.
+
+    Example:
+        >>> limits = {"Length": 0.1}
+        >>> evaluation = aj.acceptance.evaluation_of(record, aj.Recording(two_bars, nominal), limits=limits)
+        >>> for test in evaluation.acceptance()["calibrated"]:
+        ...     print(test.title, test.decision)
+        single point and length, as in Cheng et al. 2018 conforms
     """
     known = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
     recording = recording._replace(capture=_divided(record.calibrated.arm, recording.capture, known))

@@ -14,6 +14,9 @@ from .decision import COVERAGE_FACTOR, DECISIONS, Decision, Rule, worst
 from .standards import EDITIONS, SYMBOLS
 
 # Metrics by name: what each of them is.
+#
+# >>> print(aj.acceptance.METRICS["SPAT"])
+# largest distance from the mean point
 METRICS = {
     "Deltam": "largest half range of a coordinate in a socket",
     "Length": "largest deviation of a length",
@@ -49,7 +52,14 @@ def metric_value(where: str, value: float, *u: float) -> MetricValue:
 
 
 class Metric(NamedTuple):
-    """One metric of a test; its name is a key of `METRICS`."""
+    """One metric of a test; its name is a key of `METRICS`.
+
+    Example:
+        >>> measured = aj.acceptance.Measured({"cone": result.arm.position(capture.sockets["A"])})
+        >>> metric = aj.acceptance.run(measured)[0].metrics[0]
+        >>> print(metric.name, f"{metric.value:.4f} mm", metric.decision)
+        Deltam 0.0153 mm None
+    """
 
     name: str
     values: tuple[MetricValue, ...]
@@ -82,7 +92,13 @@ class Metric(NamedTuple):
 
 
 class AcceptanceTest(NamedTuple):
-    """What one test found, and what its full procedure would also have needed (nothing if it is complete)."""
+    """What one test found, and what its full procedure would also have needed (nothing if it is complete).
+
+    Example:
+        >>> tests = aj.acceptance.run(aj.acceptance.measured_by(result.arm, aj.Recording(two_bars, nominal)))
+        >>> print([test.called for test in tests])
+        ['after JJF 1408-2013', 'after ASME B89.4.22-2004', 'after ASME B89.4.22-2004', 'after ISO 10360-12:2016']
+    """
 
     standard: str  # a key of `acceptance.standards.EDITIONS`
     title: str
@@ -115,7 +131,13 @@ class Postures(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What acceptance tests are run on: points in mm, as an arm measures them or as they were recorded."""
+    """What acceptance tests are run on: points in mm, as an arm measures them or as they were recorded.
+
+    Example:
+        >>> measured = aj.acceptance.Measured({"cone": result.arm.position(capture.sockets["A"])})
+        >>> print([test.title for test in aj.acceptance.run(measured)])
+        ['single point and length, as in Cheng et al. 2018', 'single-point articulation']
+    """
 
     sockets: Mapping[str, Float[np.ndarray, "m 3"]]
     lengths: tuple[ReferenceLength, ...] = ()

@@ -41,6 +41,12 @@ def fit_sphere(points: Numbers) -> FittedSphere:
 
     Raises:
         InputError: There are fewer than four points, or they lie in one plane.
+
+    Example:
+        >>> directions = np.concatenate([np.eye(3), -np.eye(3)])
+        >>> sphere = aj.acceptance.fit_sphere([100.0, 0.0, 0.0] + 12.5 * directions)
+        >>> print(sphere.centre.round(6), round(sphere.radius, 6))
+        [100.   0.   0.] 12.5
     """
     from scipy import optimize
 
@@ -84,6 +90,11 @@ def enclosing_sphere(points: Numbers) -> tuple[Float[np.ndarray, " 3"], float]:
 
     Raises:
         InputError: ``points`` has another shape, or no rows.
+
+    Example:
+        >>> centre, radius = aj.acceptance.enclosing_sphere([[0, 0, 0], [2, 0, 0], [1, 0.5, 0]])
+        >>> print(centre, radius)
+        [1. 0. 0.] 1.0
     """
     import miniball
 
@@ -118,6 +129,11 @@ def size_error(points: Numbers, diameter: float, stylus: float = 0.0) -> float:
 
     Raises:
         InputError: The points do not determine a sphere.
+
+    Example:
+        >>> directions = np.concatenate([np.eye(3), -np.eye(3)])
+        >>> print(f"{aj.acceptance.size_error(15.51 * directions, 25.0, stylus=6.0):.4f} mm")
+        0.0200 mm
     """
     return 2 * fit_sphere(points).radius - stylus - diameter
 

@@ -16,6 +16,9 @@ STANDARDS: dict[Standard, str] = {"jjf": JJF_1408, "asme": ASME_B89_4_22, "iso":
 OF_SPHERES = {"effective-diameter": "asme", "probing": "iso", "articulation": "iso"}
 # Symbols of ISO 10360-12:2016 by metric, as a maker's public explanation of its data sheets prints them (Kreon, at
 # digitalscan3d.com/iso-10360-12-standard-for-measuring-arms and oberon3d.com, of 2020); not compared with the text.
+#
+# >>> print(aj.acceptance.SYMBOLS["E_Uni"])
+# E_Uni:0:Tact.AArm
 SYMBOLS = {
     "P_Size": "P_Size.Sph.1x25::Tact.AArm",
     "P_Form": "P_Form.Sph.1x25::Tact.AArm",

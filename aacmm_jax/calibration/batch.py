@@ -92,6 +92,12 @@ def identify_many(
 
     Raises:
         InputError: For shapes that do not fit, a lower bound above its upper one, and too few poses.
+
+    Example:
+        >>> boxes = [aj.Bounds.around(arm, space, length=half, angle=0.0175) for half in (2.0, 5.0, 10.0)]
+        >>> many = aj.identify_many(arm, capture, [box.lower for box in boxes], [box.upper for box in boxes])
+        >>> print(many.de.round(4), many.converged)
+        [0.0124 0.0124 0.0124] [ True  True  True]
     """
     given = BatchOptions(**options)
     if capture.observations or given.robust is not None or given.prior is not None:
@@ -125,10 +131,16 @@ def calibrate_many(
         method: "two-stage" or "joint", as in `calibrate`; with ``covariance`` it is joint.
 
     Returns:
-        Parameters, scale, metrics and reasons, problem by problem.
+        Parameters, scale, metrics and reasons, problem by problem; mm and rad.
 
     Raises:
         InputError: As `identify_many`, and where nothing fixes the scale.
+
+    Example:
+        >>> drawn = [aj.simulate(true, four, poses=10, lengths=bars, noise=noise, seed=seed) for seed in (1, 2)]
+        >>> many = aj.calibrate_many(arm, aj.stack_captures(drawn), bounds)
+        >>> print(many.k.round(5), many.converged)
+        [0.99924 0.99922] [ True  True]
     """
     given = BatchOptions(**options)
     _, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)

@@ -97,6 +97,10 @@ def contradictions_of(record: CalibrationRecord) -> list[Contradiction]:
 
     Returns:
         One for each group to take out, one after the other.
+
+    Example:
+        >>> print(aj.calibration.contradictions_of(record))
+        []
     """
     equations = equations_of(record)
     best: tuple[float, str, list[list[GroupTest]]] = (0.0, "", [])
@@ -188,7 +192,22 @@ def _cause(equations: Equations, members: Sequence[str]) -> Cause | None:
 def session_metrics(record: CalibrationRecord) -> dict[str, tuple[int, float, float]]:
     """Sessions -> number of poses, their RMS distance from the geometry, and that which the session would have alone
     (one Gauss-Newton step away), mm; nothing without sessions. A socket's single pose, whose distance is 0, does not
-    count."""
+    count.
+
+    Args:
+        record: A calibration of captures that `join_sessions` joined.
+
+    Example:
+        >>> monday = aj.simulate(true, {"A": (400, 200, 300)}, poses=20, noise=noise, seed=1)
+        >>> friday = aj.simulate(true, {"A": (500, 200, 300)}, poses=20, noise=noise, seed=2)
+        >>> both = aj.join_sessions({"monday": monday, "friday": friday})
+        >>> stage1 = aj.identify(arm, both, bounds)
+        >>> of_both = aj.calibration.record_of(stage1, aj.Recording(both, nominal))
+        >>> for session, (poses, rms, alone) in aj.calibration.session_metrics(of_both).items():
+        ...     print(session, poses, f"{rms:.3f} mm")
+        monday 20 0.011 mm
+        friday 20 0.010 mm
+    """
     capture = record.recording.capture
     if not capture.sessions:
         return {}
@@ -215,6 +234,11 @@ def remove_contradicting(
 
     Returns:
         The calibration of what remains. ``removed`` says what was taken out, why, and what that changed.
+
+    Example:
+        >>> kept = aj.calibration.remove_contradicting(record, lambda other: aj.calibrate(arm, other, bounds))
+        >>> print(kept.removed)
+        ()
     """
     most = sum(len(set(labels.values())) for labels in groupings(record.recording.capture).values()) // 2
     for _ in range(most):

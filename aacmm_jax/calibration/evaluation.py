@@ -24,7 +24,15 @@ from .observed_evaluation import ObservedEvaluation, checked_geometry, evaluate_
 
 
 class Evaluation(eqx.Module):
-    """Metrics of one arm on one capture, mm; of a batch of arms with its axes first."""
+    """Metrics of one arm on one capture, mm; of a batch of arms with its axes first.
+
+    Example:
+        >>> found = aj.evaluate(result.arm, two_bars)
+        >>> print(found.error.round(3), "mm")
+        [-0.003 -0.001] mm
+        >>> print(found.distances.shape)
+        (60,)
+    """
 
     repeatability: Repeatability
     measured: Float[AnyArray, "*batch l"]  # reference lengths as the arm measures them
@@ -56,6 +64,13 @@ def evaluate(
     Raises:
         InputError: capture and arm differ in their number of joints, the capture is a batch, or the geometry is none of
             this capture.
+
+    Example:
+        >>> new = aj.simulate(true, {"C": (300, -400, 400)}, poses=20, noise=noise, seed=9)
+        >>> for name, one in {"nominal": arm, "calibrated": result.arm}.items():
+        ...     print(f"{name}: DE {aj.evaluate(one, new).repeatability.de:.3f} mm")
+        nominal: DE 1.910 mm
+        calibrated: DE 0.012 mm
     """
     check_columns(arm, capture.columns)
     if capture.q.ndim > 2:

@@ -57,7 +57,15 @@ class LeftOut(NamedTuple):
 
 
 class CrossValidation(NamedTuple):
-    """Every group of sockets left out once. The metrics pool the groups that the others can predict."""
+    """Every group of sockets left out once. The metrics pool the groups that the others can predict.
+
+    Example:
+        >>> left_out = aj.cross_validate(arm, two_bars, bounds)
+        >>> for group in left_out.groups:
+        ...     print(group.sockets, f"{group.rms:.3f} mm, predicted {group.rms_predicted:.3f} mm")
+        ('A', 'B') 0.015 mm, predicted 0.018 mm
+        ('C', 'D') 0.017 mm, predicted 0.014 mm
+    """
 
     groups: tuple[LeftOut, ...]
 

@@ -103,6 +103,11 @@ def model_tests(
 
     Returns:
         The tests; those that found something have a probability below `LEVEL`.
+
+    Example:
+        >>> tests = aj.calibration.model_tests(result, capture)
+        >>> print(tests.warns, len(tests.terms))
+        False 0
     """
     if isinstance(result, CalibrationRecord):
         record = result

@@ -75,7 +75,13 @@ class ComparedModel(NamedTuple):
 
 
 class ComparedModels(NamedTuple):
-    """Models from simple to rich, and which of them to use."""
+    """Models from simple to rich, and which of them to use.
+
+    Example:
+        >>> compared = aj.compare_models(arm, two_bars, bounds, models=["dh", "harmonics=1"])
+        >>> print(compared.best, compared.recommended.model)
+        0 dh
+    """
 
     models: tuple[ComparedModel, ...]
 
@@ -157,6 +163,15 @@ def compare_models(
 
     Raises:
         InputError: A model is unknown, fewer than two regions can be left out, or as `calibrate` does.
+
+    Example:
+        >>> compared = aj.compare_models(arm, two_bars, bounds, models=["dh", "harmonics=1"])
+        >>> for model in compared.models:
+        ...     print(f"{model.model}: {model.rms_inside:.4f} mm inside, {model.rms_outside:.4f} mm outside")
+        dh: 0.0125 mm inside, 0.0307 mm outside
+        harmonics=1: 0.0124 mm inside, 0.0310 mm outside
+        >>> print("recommended:", compared.recommended.model)
+        recommended: dh
     """
     named = default_models(arm, capture) if models is None else items_of(models, "models")
     if not named or not all(isinstance(model, str) and model.strip() for model in named):

@@ -135,6 +135,11 @@ def unseen_errors(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
 
     Returns:
         Errors of every socket, observation and reference length, found and predicted.
+
+    Example:
+        >>> unseen = aj.calibration.unseen_errors(aj.uncertainty_of(result), two_bars)
+        >>> print(unseen.length_error.round(3), unseen.length_u.round(3))
+        [-0.003 -0.001] [0.005 0.008]
     """
     uncertainty, capture = to_numpy((uncertainty.complete, capture))
     return _of_observations(uncertainty, capture) if capture.observations else _of_sockets(uncertainty, capture)

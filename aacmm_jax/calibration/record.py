@@ -58,7 +58,14 @@ class Removed(NamedTuple):
 
 
 class CalibrationRecord(NamedTuple):
-    """Everything a calibration file holds. Arrays are NumPy's, in mm and rad, in the order of ``names``."""
+    """Everything a calibration file holds. Arrays are NumPy's, in mm and rad, in the order of ``names``.
+
+    Example:
+        >>> print(record.method, record.hold, f"k = {record.k:.5f}")
+        two-stage d_3 k = 0.99923
+        >>> print(record.names[:3], record.covariance.shape)
+        ('alpha_1', 'alpha_2', 'alpha_3') (21, 21)
+    """
 
     recording: Recording  # what it was identified from, and the nominal arm
     stage1: ArmSpecification
@@ -165,6 +172,11 @@ def record_of(
 
     Returns:
         What a calibration file holds, as NumPy arrays.
+
+    Example:
+        >>> made = aj.calibration.record_of(result, recording)
+        >>> print(made.converged, made.reason)
+        True Converged: the projected gradient is zero to the tolerance.
     """
     nominal = recording.nominal
     single = isinstance(calibration, Identification)
@@ -233,6 +245,11 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
 
     Returns:
         Standard uncertainties of parameters, tips and lengths, mm and rad.
+
+    Example:
+        >>> uncertainty = aj.uncertainty_of(result)
+        >>> print(np.sqrt(np.diag(uncertainty.tip(q))).round(3), "mm")
+        [0.007 0.006 0.009] mm
     """
     if isinstance(result, CalibrationRecord):
         return Uncertainty(

@@ -297,6 +297,12 @@ def batch_of_captures(capture: Capture, q: Numbers, values: Numbers, u: Numbers 
 
     Returns:
         The captures; nothing is checked.
+
+    Example:
+        >>> draws = np.random.default_rng(0).normal(0.0, 1e-5, (100, *capture.q.shape))
+        >>> batch = aj.calibration.batch_of_captures(capture, capture.q + draws, np.full((100, 1), 469.04))
+        >>> print(batch.q.shape, batch.lengths[0].value.shape)
+        (100, 50, 6) (100,)
     """
     lengths = range(len(capture.lengths))
     if u is None:

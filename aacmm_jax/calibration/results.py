@@ -192,6 +192,13 @@ class Identification(AbstractSingleResult):
     """Result of stage 1. A PyTree: under ``eqx.filter_vmap`` every array has the batch axis first.
 
     ``parameters``, ``active`` and ``covariance`` are in the order of ``space.names``; mm and rad.
+
+    Example:
+        >>> stage1 = aj.identify(arm, capture, bounds)
+        >>> print(f"nominal {stage1.before.de:.3f} mm, identified {stage1.de:.4f} mm")
+        nominal 1.880 mm, identified 0.0124 mm
+        >>> print(dict(zip(stage1.space.names[9:12], stage1.parameters[9:12].round(3).tolist())))
+        {'a_5': 0.159, 'd_2': 0.137, 'd_3': 750.0}
     """
 
     arm: Arm
@@ -230,7 +237,18 @@ class Identification(AbstractSingleResult):
 
 
 class Calibration(AbstractSingleResult):
-    """Result of both stages, or of the joint solve. ``covariance`` is in the order of ``space.names``; mm and rad."""
+    """Result of both stages, or of the joint solve. ``covariance`` is in the order of ``space.names``; mm and rad.
+
+    Example:
+        >>> print(bool(result.converged), result.active.any())
+        True False
+        >>> u = np.sqrt(np.diag(result.covariance))
+        >>> for name in ("a_5", "d_3"):
+        ...     at = result.space.names.index(name)
+        ...     print(f"{name} = {result.parameters[at]:.3f} mm, u = {u[at]:.3f} mm")
+        a_5 = 0.160 mm, u = 0.001 mm
+        d_3 = 750.579 mm, u = 0.010 mm
+    """
 
     arm: Arm
     parameters: Float[AnyArray, " p"]
@@ -300,6 +318,11 @@ class ManyIdentifications(AbstractManyResults):
 
     Fields have the names of an `Identification`'s. What costs more than the solve is left out: covariance, u of the
     scale and metrics by socket come from ``jax.vmap`` of `identify` or, for one capture, of `evaluate` with ``arm``.
+
+    Example:
+        >>> many = aj.identify_many(arm, capture, [bounds.lower] * 3, [bounds.upper] * 3)
+        >>> print(many.parameters.shape, many.active.any())
+        (3, 21) False
     """
 
     parameters: Float[np.ndarray, "b p"]
@@ -325,6 +348,12 @@ class ManyCalibrations(AbstractManyResults):
     """Results of both stages, or of the joint solve, problem by problem, as NumPy arrays; mm and rad.
 
     Fields have the names of a `Calibration`'s; what is left out comes from ``jax.vmap`` of `calibrate`.
+
+    Example:
+        >>> drawn = [aj.simulate(true, four, poses=10, lengths=bars, noise=noise, seed=seed) for seed in (1, 2)]
+        >>> many = aj.calibrate_many(arm, aj.stack_captures(drawn), bounds)
+        >>> print(many.parameters.shape, many.de.shape, many.k.shape)
+        (2, 21) (2,) (2,)
     """
 
     parameters: Float[np.ndarray, "b p"]
@@ -351,7 +380,15 @@ class ManyCalibrations(AbstractManyResults):
 
 
 def converged(result: Reason) -> Bool[AnyArray, "*batch"]:
-    """Whether a reason means that a minimum was reached."""
+    """Whether a reason means that a minimum was reached.
+
+    Args:
+        result: The reason, or one for each problem of a batch.
+
+    Example:
+        >>> print(bool(aj.calibration.converged(result.result)))
+        True
+    """
     number = member_numbers(result)
     if is_concrete(number):
         return np.asarray(np.isin(np.asarray(number), _GOOD))

@@ -32,6 +32,12 @@ class Sampled(NamedTuple):
     """A calibration's outputs over many trials, as NumPy arrays: mm and rad, k, and mm for the lengths.
 
     ``quantities`` are the parameters' names, ``k`` and ``length 1`` ... . Failed solves are left out of ``values``.
+
+    Example:
+        >>> sampled = aj.monte_carlo(result, capture, most=10000)
+        >>> at = sampled.quantities.index("k")
+        >>> print(sampled.trials, f"{sampled.low[at]:.5f} to {sampled.high[at]:.5f}")
+        10000 0.99920 to 0.99925
     """
 
     quantities: tuple[str, ...]
@@ -125,6 +131,12 @@ def monte_carlo(
     Raises:
         InputError: a number is out of range, the calibration had a robust loss (a bootstrap keeps bad poses), or hardly
             any trial converges.
+
+    Example:
+        >>> sampled = aj.monte_carlo(result, capture, most=10000)
+        >>> at = sampled.quantities.index("d_3")
+        >>> print(f"d_3: u = {sampled.u[at]:.3f} mm; by the linear propagation {sampled.linear_u[at]:.3f} mm")
+        d_3: u = 0.010 mm; by the linear propagation 0.010 mm
     """
     if digits not in (1, 2):
         raise InputError(f"digits is {digits}; give 1 or 2 significant digits of the uncertainty.")
@@ -203,6 +215,12 @@ def bootstrap(
     Raises:
         InputError: too few trials, poses that cannot be drawn one in the place of another, another loss than the
             calibration's, or hardly any of them converges.
+
+    Example:
+        >>> sampled = aj.bootstrap(result, capture, trials=100)
+        >>> at = sampled.quantities.index("probe_z")
+        >>> print(sampled.trials, f"trials: probe_z from {sampled.low[at]:.3f} to {sampled.high[at]:.3f} mm")
+        100 trials: probe_z from 102.497 to 102.503 mm
     """
     if trials < 100:
         raise InputError(f"{trials} trials show no distribution; ask for at least 100.")

@@ -91,6 +91,11 @@ def identify(
 
     Raises:
         InputError: too few poses, a start outside the box, names that do not fit, or a batch (see `identify_many`).
+
+    Example:
+        >>> stage1 = aj.identify(arm, capture, bounds)
+        >>> print(f"scale anchor {stage1.hold}, DE {stage1.de:.4f} mm")
+        scale anchor d_3, DE 0.0124 mm
     """
     if capture.observations or robust is not None or prior is not None:
         check_single(arm, capture, bounds, "identify_many")
@@ -195,6 +200,14 @@ def calibrate(
 
     Raises:
         InputError: as `identify` does, and without a reference length.
+
+    Example:
+        >>> calibrated = aj.calibrate(arm, capture, bounds)
+        >>> print(f"DE {calibrated.de:.4f} mm, Deltam {calibrated.deltam:.4f} mm, k = {calibrated.scale.value:.5f}")
+        DE 0.0124 mm, Deltam 0.0153 mm, k = 0.99923
+        >>> error = calibrated.arm.position(q) - true.position(q)
+        >>> print(f"{np.abs(arm.position(q) - true.position(q)).max():.2f} mm become {np.abs(error).max():.4f} mm")
+        1.80 mm become 0.0032 mm
     """
     arm, bounds, prior = with_joint_model(arm, capture, bounds, model, prior)
     by_slides = scale_from_slides(arm, capture, bounds.space, noise)

@@ -60,6 +60,12 @@ def dcc_xml(
         InputError: If the calibration did not converge, its scale is impossible or the nominal arm's, a name has
             characters that XML does not allow, the dates are out of order, the evaluation is of another arm, or a
             conformity is stated that no result supports.
+
+    Example:
+        >>> data = aj.files.AdministrativeData(laboratory={"name": "Metrology Laboratory"})
+        >>> text = aj.certificate.dcc_xml(record, data, created="2026-01-31T12:00:00Z")
+        >>> print(text[:38], "Metrology Laboratory" in text)
+        <?xml version="1.0" encoding="UTF-8"?> True
     """
     if not record.converged:
         reason = record.reason.partition(";")[0].rstrip(".")

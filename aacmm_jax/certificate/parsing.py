@@ -13,7 +13,14 @@ _LARGEST = 1e100  # no quantity is as large in any unit
 
 
 class CertifiedValue(NamedTuple):
-    """A value of a certificate."""
+    """A value of a certificate.
+
+    Example:
+        >>> text = aj.certificate.dcc_xml(record, aj.files.AdministrativeData(), created="2026-01-31T12:00:00Z")
+        >>> found = aj.certificate.parse_dcc(text)["As found", "Repeatability", "DE"]
+        >>> print(found.value, found.expanded)
+        1.8803 None
+    """
 
     value: float
     unit: str  # in D-SI syntax
@@ -32,6 +39,12 @@ def parse_dcc(text: str) -> dict[tuple[str, ...], CertifiedValue]:
 
     Raises:
         InputError: If the text is no XML, no DCC, or has a document type, whose entities could name other files.
+
+    Example:
+        >>> text = aj.certificate.dcc_xml(record, aj.files.AdministrativeData(), created="2026-01-31T12:00:00Z")
+        >>> a_3 = aj.certificate.parse_dcc(text)["As left", "Denavit-Hartenberg parameters", "a_3"]
+        >>> print(a_3.value, "mm, U =", a_3.expanded, "mm")
+        -0.3224 mm, U = 0.0039 mm
     """
     try:
         root = ElementTree.fromstring(text, ElementTree.XMLParser(target=_NoDocumentType()))

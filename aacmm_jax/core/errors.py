@@ -8,6 +8,13 @@ class InputError(ValueError):
     """Something given to the toolkit is wrong: the message says what, where, and what to do.
 
     Commands turn it into exit code 2 and one sentence; in Python it is an ordinary ``ValueError``.
+
+    Example:
+        >>> try:
+        ...     aj.load_arm("pandda")
+        ... except aj.InputError as error:
+        ...     print(error)
+        'pandda' is neither a file nor an arm that ships with the package; did you mean 'panda'?
     """
 
 
@@ -15,6 +22,17 @@ class IdentifiabilityWarning(UserWarning):
     """The data determine less than they seem to: some free parameters or the scale not at all, or copies count once.
 
     The message names the parameters, sockets or lengths.
+
+    Example:
+        >>> import warnings
+        >>> everything = aj.Parameters.free_of(arm, held=())
+        >>> with warnings.catch_warnings(record=True) as caught:
+        ...     warnings.simplefilter("always")
+        ...     _ = aj.calibrate(arm, capture, aj.Bounds.around(arm, everything))
+        >>> print(caught[0].category.__name__)
+        IdentifiabilityWarning
+        >>> print(str(caught[0].message)[:100])
+        No measurement of this kind can separate: d_1 (changes nothing that is measured); theta_6 and probe_
     """
 
 

@@ -31,7 +31,13 @@ class ArmClass(NamedTuple):
 
 
 class ArmNoise(NamedTuple):
-    """What is usual for an arm: its class and its noise, and where the numbers come from."""
+    """What is usual for an arm: its class and its noise, and where the numbers come from.
+
+    Example:
+        >>> usual = aj.files.load_noise("panda")
+        >>> print(usual.arm_class, f"{usual.noise.encoder_arcsec:.1f} arcsec, {usual.noise.seating} mm")
+        robot 9.0 arcsec, 0.005 mm
+    """
 
     arm_class: str
     noise: Noise

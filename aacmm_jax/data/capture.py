@@ -52,6 +52,12 @@ class Capture(eqx.Module):
         InputError: For names that are empty, longer than a line or given twice, readings that are not finite,
             sockets or observations of different joint counts or with the same poses, and lengths that
             join unknown sockets.
+
+    Example:
+        >>> poses = {"A": [q, q + 0.1, q + 0.2], "B": [q - 0.1]}
+        >>> small = aj.Capture(poses, lengths=[aj.ReferenceLength("A", "B", value=500.012, u=0.002)])
+        >>> print(small.names, small.sizes, small.q.shape)
+        ('A', 'B') (3, 1) (4, 6)
     """
 
     q: Float[AnyArray, "N n"]
@@ -296,6 +302,13 @@ def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) ->
 
     Raises:
         InputError: A capture is a batch, or one has targets in more than one session.
+
+    Example:
+        >>> monday = aj.simulate(true, {"A": (400, 200, 300)}, poses=5, seed=1)
+        >>> friday = aj.simulate(true, {"A": (500, 200, 300)}, poses=5, seed=2)
+        >>> both = aj.join_sessions({"monday": monday, "friday": friday})
+        >>> print(both.names, [observation.name for observation in both.observations])
+        ('monday/A',) ['friday/A']
     """
     if not isinstance(captures, Mapping) or not captures:
         raise InputError("the sessions are no dictionary; give the captures by name: {'Monday': capture, ...}.")
@@ -335,6 +348,11 @@ def stack_captures(captures: Iterable[Capture]) -> Capture:
 
     Raises:
         InputError: Where there is none, one is a batch, or they differ in shape.
+
+    Example:
+        >>> drawn = [aj.simulate(true, sockets, poses=10, noise=noise, seed=seed) for seed in (1, 2, 3)]
+        >>> print(aj.stack_captures(drawn).q.shape)
+        (3, 20, 6)
     """
     captures = items_of(captures, "captures")
     for capture in captures:

@@ -26,6 +26,11 @@ class Noise(eqx.Module):
 
     Raises:
         InputError: For values that are negative, not finite or of another shape.
+
+    Example:
+        >>> by_joint = aj.Noise(encoder_arcsec=[2, 2, 2, 5, 5, 10], seating=0.005)
+        >>> print(by_joint.encoder_arcsec, (by_joint.encoder * 1e6).round(1), "urad")
+        [ 2.  2.  2.  5.  5. 10.] [ 9.7  9.7  9.7 24.2 24.2 48.5] urad
     """
 
     encoder: Float[AnyArray, "..."]  # rad

@@ -22,6 +22,11 @@ class Recording(NamedTuple):
         acceptance: Standards whose acceptance procedure the poses were taken for: "jjf", "asme", "iso".
         measuring_range: Diameter of the measuring volume as the arm's maker states it, mm; None where not stated.
         usual: Noise that the arm's file states, with which an estimated one is compared; None where it states none.
+
+    Example:
+        >>> recorded = aj.Recording(capture, nominal, measured="2026-01-31")
+        >>> print(recorded.nominal.name, recorded.capture.sizes)
+        Cheng 2018, simulated arm (40, 10)
     """
 
     capture: Capture

@@ -36,6 +36,11 @@ class ReferenceLength(eqx.Module):
 
     Raises:
         InputError: Where both ends are one socket, ``value`` is not positive or ``u`` is negative.
+
+    Example:
+        >>> bar = aj.ReferenceLength("A", "B", value=500.012, u=0.002)
+        >>> print(aj.Capture({"A": [q, q + 0.1], "B": [q + 0.2]}, lengths=[bar]).lengths[0].u)
+        0.002
     """
 
     start: str = eqx.field(static=True)

@@ -69,6 +69,14 @@ def simulate(
 
     Raises:
         InputError: For a point out of reach, negative noise, and noise given in both forms.
+
+    Example:
+        >>> ideal = aj.simulate(true, {"A": (400, 200, 300), "B": (700, 500, 500)}, poses=2, lengths=[("A", "B")])
+        >>> print(true.position(ideal.sockets["A"]).round(6))
+        [[400. 200. 300.]
+         [400. 200. 300.]]
+        >>> print(f"{ideal.lengths[0].value:.4f} mm")
+        469.0416 mm
     """
     noise = _noise(noise, encoder_arcsec, seating, resolution_arcsec, linear_resolution)
     resolution = _Resolution(resolution_arcsec * ARCSEC, linear_resolution)

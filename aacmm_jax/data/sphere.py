@@ -26,6 +26,12 @@ class ProbedSphere(NamedTuple):
         stylus: Diameter of the probe's ball, mm; 0 where the points are on the sphere itself.
         form: Calibrated form error of the sphere, mm.
         u_form: Standard uncertainty (k = 1) of the form error, mm.
+
+    Example:
+        >>> nine = np.array(aj.simulate(true, {"A": (400, 200, 300)}, poses=9, seed=1).sockets["A"])
+        >>> sphere = aj.data.ProbedSphere("sphere", "effective-diameter", (nine,), diameter=25.0, u=0.0005)
+        >>> print(len(sphere.groups), sphere.groups[0].shape)
+        1 (9, 6)
     """
 
     name: str

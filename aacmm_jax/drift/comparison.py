@@ -50,6 +50,13 @@ def compare(
     Raises:
         InputError: The arms have different numbers of joints, ``level`` is out of range, or the lengths do not fit into
             the volume.
+
+    Example:
+        >>> changed = aj.drift.compare(record, record_in_june, points=20)
+        >>> print([name for name, moved in zip(changed.names, changed.moved) if moved])
+        ['probe_z']
+        >>> print(changed.sentences()[0][:60])
+        Probe remounted: a change of the probe alone (probe_x by -0.
     """
     _check([old, new], level, labels)
     return _compared(old, new, _names([old, new]), level, _lengths(old, points, length, seed), labels)
@@ -84,6 +91,11 @@ def trend(
 
     Raises:
         InputError: As for `compare`; or there are fewer than two calibrations, or a date is not one.
+
+    Example:
+        >>> trend = aj.drift.trend([record, record_in_june], ["2026-01-31", "2026-06-30"], points=20)
+        >>> print(trend.names[-1], trend.change[1, -1].round(3), "mm; U", trend.expanded[1, -1].round(3), "mm")
+        probe_z 0.1 mm; U 0.005 mm
     """
     if len(records) < 2:
         raise InputError("a trend needs at least two calibrations; give more.")

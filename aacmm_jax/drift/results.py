@@ -13,7 +13,16 @@ from .statistics import JointTest, LengthChange
 
 
 class Drift(NamedTuple):
-    """Two calibrations compared, as NumPy arrays in the order of ``names``: mm, rad, or a coefficient's own unit."""
+    """Two calibrations compared, as NumPy arrays in the order of ``names``: mm, rad, or a coefficient's own unit.
+
+    Example:
+        >>> changed = aj.drift.compare(record, record_in_june, points=20)
+        >>> print([name for name, moved in zip(changed.names, changed.moved) if moved])
+        ['probe_z']
+        >>> at = changed.names.index("probe_z")
+        >>> print(f"probe_z by {changed.change[at]:.3f} mm, U = {changed.expanded[at]:.3f} mm")
+        probe_z by 0.100 mm, U = 0.005 mm
+    """
 
     names: tuple[str, ...]  # free in either
     units: tuple[str, ...]
@@ -63,7 +72,13 @@ class Drift(NamedTuple):
 
 
 class Trend(NamedTuple):
-    """Any number of calibrations of one arm, in the order of their dates, each compared with the first."""
+    """Any number of calibrations of one arm, in the order of their dates, each compared with the first.
+
+    Example:
+        >>> trend = aj.drift.trend([record_in_june, record], ["2026-06-30", "2026-01-31"], points=20)
+        >>> print(trend.order, [f"{date:%B}" for date in trend.dates])
+        (1, 0) ['January', 'June']
+    """
 
     dates: tuple[datetime.datetime, ...]
     order: tuple[int, ...]  # index of each among the calibrations given

@@ -132,7 +132,13 @@ class Conformity(Strict):
 
 
 class AdministrativeData(Strict):
-    """The administrative data of a certificate. All are optional; the certificate says what is not stated."""
+    """The administrative data of a certificate. All are optional; the certificate says what is not stated.
+
+    Example:
+        >>> data = aj.files.AdministrativeData(item={"name": "Measuring arm", "serial_number": "7125-0042"})
+        >>> print(data.laboratory.name, "/", data.item.serial_number)
+        not stated / 7125-0042
+    """
 
     laboratory: Laboratory = Laboratory()
     customer: Contact = Contact()
@@ -160,6 +166,12 @@ def read_administrative_data(path: str | os.PathLike) -> AdministrativeData:
 
     Raises:
         InputError: names the file, the key in it and what to do.
+
+    Example:
+        >>> from pathlib import Path
+        >>> _ = Path("laboratory.toml").write_text('laboratory = { name = "Metrology", city = "Braunschweig" }')
+        >>> print(aj.files.read_administrative_data("laboratory.toml").laboratory.city)
+        Braunschweig
     """
     return read_toml(path, AdministrativeData)
 

@@ -135,7 +135,12 @@ class _ArmModel(Strict):
 
 
 def shipped_arms() -> tuple[str, ...]:
-    """Names of the arms that come with the package."""
+    """Names of the arms that come with the package.
+
+    Example:
+        >>> print(aj.files.shipped_arms()[:5])
+        ('cheng2018-ra7125', 'cheng2018-simulation', 'fr3', 'gen3', 'gen3-lite')
+    """
     folder = resources.files("aacmm_jax.files") / "shipped_arms"
     return tuple(sorted(item.name.removesuffix(".toml") for item in folder.iterdir() if item.name.endswith(".toml")))
 
@@ -162,6 +167,11 @@ def load_arm(
 
     Raises:
         InputError: There is neither, or the file is not an arm's.
+
+    Example:
+        >>> panda = aj.load_arm("panda")
+        >>> print(panda.joints, panda.a)
+        7 [  0.    0.   82.5 -82.5   0.   88.    0. ]
     """
     return read_arm(source, base=base, tip=tip, probe=probe)[0].arm
 
@@ -178,10 +188,17 @@ def load_specification(
         source: As of `load_arm`.
         base: As of `load_arm`.
         tip: As of `load_arm`.
-        probe: As of `load_arm`.
+        probe: As of `load_arm`, mm.
 
     Raises:
         InputError: There is neither, or the file is not an arm's.
+
+    Example:
+        >>> robot = aj.files.load_specification("robot.urdf")
+        >>> print(robot.name, robot.arm.joints, robot.arm.limits[0])
+        robot 3 (-3.0, 3.0)
+        >>> print(robot.space().names)
+        ('alpha_1', 'alpha_2', 'a_1', 'a_2', 'theta_2', 'theta_3', 'beta_2', 'probe_x', 'probe_y')
     """
     found, proposed = read_arm(source, base=base, tip=tip, probe=probe)
     return found if proposed else with_parameters(found)
@@ -192,10 +209,23 @@ def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str |
 
     A file without the table is that of a measuring arm, or of a robot where it is a URDF, names one, or is a
     ``kinematics.yaml`` (`data.arm_classes`). Plans assume this noise; a calibration estimates it from the data, and
-    compares it with that of a table. The arguments are those of `load_arm`.
+    compares it with that of a table.
+
+    Args:
+        source: As of `load_arm`.
+        base: As of `load_arm`.
+        tip: As of `load_arm`.
+
+    Returns:
+        Class of the arm, its noise (rad and mm, as `Noise` has it), and where the numbers come from.
 
     Raises:
         InputError: There is no such arm, or the numbers are none of this arm.
+
+    Example:
+        >>> usual = aj.files.load_noise("panda")
+        >>> print(f"{usual.noise.encoder_arcsec:.1f} arcsec: {usual.source}")
+        9.0 arcsec: Franka Emika data sheet: pose repeatability +-0.1 mm by ISO 9283
     """
     arm, model = load_arm(source, base=base, tip=tip), _model_of(source)
     try:
@@ -206,7 +236,20 @@ def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str |
 
 
 def usual_noise(source: str | os.PathLike, *, base: str | None = None, tip: str | None = None) -> ArmNoise | None:
-    """The noise of the ``[noise]`` table of an arm's file; None where it has none."""
+    """The noise of the ``[noise]`` table of an arm's file; None where it has none.
+
+    Args:
+        source: As of `load_arm`.
+        base: As of `load_arm`.
+        tip: As of `load_arm`.
+
+    Returns:
+        Class of the arm, its noise (rad and mm, as `Noise` has it), and where the numbers come from.
+
+    Example:
+        >>> print(aj.files.usual_noise("robot.urdf"))
+        None
+    """
     model = _model_of(source)
     return None if model is None or model.noise is None else load_noise(source, base=base, tip=tip)
 
@@ -361,7 +404,19 @@ def with_parameters(specification: ArmSpecification, capture: Capture | None = N
 
 
 def save_arm(arm: Arm, path: str | os.PathLike, *, name: str = "", source: str = "") -> None:
-    """Write an arm as TOML: standard convention, mm and rad, digits enough to read back the same numbers."""
+    """Write an arm as TOML: standard convention, mm and rad, digits enough to read back the same numbers.
+
+    Args:
+        arm: One arm.
+        path: The file to write, whole or not at all.
+        name: What people call it.
+        source: Where its numbers come from, a sentence.
+
+    Example:
+        >>> aj.files.save_arm(result.arm, "calibrated.toml", name="calibrated arm")
+        >>> print(np.array_equal(aj.load_arm("calibrated.toml").a, result.arm.a))
+        True
+    """
     write_text(path, arm_toml(arm, name=name, source=source))
 
 

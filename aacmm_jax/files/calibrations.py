@@ -63,6 +63,11 @@ def save_calibration(
 
     Raises:
         InputError: the file cannot be written, or a name holds a character that no file can hold.
+
+    Example:
+        >>> aj.files.save_calibration("calibration.h5", record)
+        >>> print(aj.files.load_calibration("calibration.h5").names == record.names)
+        True
     """
     tables = recording_tables(record.recording)
     tables["stage1_arm"] = arm_table(record.stage1)
@@ -115,6 +120,12 @@ def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
 
     Raises:
         InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+
+    Example:
+        >>> aj.files.save_calibration("calibration.h5", record)
+        >>> loaded = aj.files.load_calibration("calibration.h5")
+        >>> print(loaded.calibrated.arm.position(q).round(3))
+        [  36.875  104.896 -111.419]
     """
     stored = read_tables(path, ("calibration",))
     need(path, stored.tables, "stage1_arm", "calibrated_arm", "parameters")

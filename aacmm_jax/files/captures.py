@@ -55,6 +55,11 @@ def save_capture(path: str | os.PathLike, recording: Recording, summary: Mapping
 
     Raises:
         InputError: the file cannot be written, or a name holds a character that no file can hold.
+
+    Example:
+        >>> aj.files.save_capture("capture.h5", recording)
+        >>> print(np.array_equal(aj.files.load_capture("capture.h5").capture.q, capture.q))
+        True
     """
     write_tables(path, "capture", recording_tables(recording), recording_attributes(recording), summary=summary)
 
@@ -70,6 +75,11 @@ def load_capture(path: str | os.PathLike) -> Recording:
 
     Raises:
         InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+
+    Example:
+        >>> aj.files.save_capture("capture.h5", recording)
+        >>> print(aj.files.load_capture("capture.h5").capture.sizes)
+        (40, 10)
     """
     stored = read_tables(path, ("capture", "calibration"))
     with undamaged(path):

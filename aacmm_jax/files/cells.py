@@ -85,6 +85,18 @@ def load_cell(
 
     Raises:
         InputError: Naming the file and the place in it.
+
+    Example:
+        >>> from pathlib import Path
+        >>> _ = Path("cell.toml").write_text('''clearance = 20.0
+        ... [[half_space]]
+        ... name = "table"
+        ... normal = [0, 0, 1]
+        ... point = [0, 0, 0]
+        ... ''')
+        >>> cell = aj.files.load_cell("robot.urdf", "cell.toml").cell
+        >>> print(cell.body.names, [obstacle.name for obstacle in cell.obstacles], cell.clearance)
+        ('shoulder', 'upper_arm', 'forearm') ['table'] 20.0
     """
     content = _CellFile() if file is None else read_toml(file, _CellFile)
     try:

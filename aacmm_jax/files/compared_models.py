@@ -40,6 +40,14 @@ def save_compared_models(
 
     Raises:
         InputError: The file cannot be written, or a name holds a character that no file can hold.
+
+    Example:
+        >>> from aacmm_jax.summaries.compared_models import compared_models_summary
+        >>> compared = aj.compare_models(arm, two_bars, bounds, models=["dh", "harmonics=1"])
+        >>> summary = compared_models_summary(compared, nominal.name) | {"poses": 60}
+        >>> aj.files.save_compared_models("models.h5", summary)
+        >>> print(aj.files.load_compared_models("models.h5")["arm"])
+        Cheng 2018, simulated arm
     """
     models = summary["models"]
     named: dict[str, Any] = {"model": ([row["model"] for row in models], "", "model of the joints")}
@@ -71,6 +79,14 @@ def load_compared_models(path: str | os.PathLike) -> dict[str, Any]:
 
     Raises:
         InputError: The file does not exist, is damaged, is not of this kind, or was written by a newer version.
+
+    Example:
+        >>> from aacmm_jax.summaries.compared_models import compared_models_summary
+        >>> compared = aj.compare_models(arm, two_bars, bounds, models=["dh", "harmonics=1"])
+        >>> summary = compared_models_summary(compared, nominal.name) | {"poses": 60}
+        >>> aj.files.save_compared_models("models.h5", summary)
+        >>> print(aj.files.load_compared_models("models.h5")["recommended"])
+        dh
     """
     stored = read_tables(path, (KIND,))
     need(path, stored.tables, "models", "by_region")

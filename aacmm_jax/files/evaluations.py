@@ -59,6 +59,12 @@ def save_evaluation(
 
     Raises:
         InputError: the file cannot be written, or a name holds a character that no file can hold.
+
+    Example:
+        >>> evaluation = aj.acceptance.evaluation_of(record, aj.Recording(two_bars, nominal))
+        >>> aj.files.save_evaluation("evaluation.h5", evaluation)
+        >>> print(aj.files.load_evaluation("evaluation.h5").recording.capture.names)
+        ('A', 'B', 'C', 'D')
     """
     tables = recording_tables(record.recording)
     tables["calibrated_arm"] = arm_table(record.calibrated)
@@ -175,6 +181,12 @@ def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
 
     Raises:
         InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+
+    Example:
+        >>> evaluation = aj.acceptance.evaluation_of(record, aj.Recording(two_bars, nominal))
+        >>> aj.files.save_evaluation("evaluation.h5", evaluation)
+        >>> print(aj.files.load_evaluation("evaluation.h5").calibrated.name)
+        Cheng 2018, simulated arm, calibrated
     """
     stored = read_tables(path, ("evaluation",))
     need(path, stored.tables, "calibrated_arm", "used", "limits")
@@ -238,6 +250,12 @@ def save_points(path: str | os.PathLike, record: PointsRecord, summary: Mapping[
 
     Raises:
         InputError: the file cannot be written, or a name holds a character that no file can hold.
+
+    Example:
+        >>> measured = aj.acceptance.Measured({"cone": true.position(capture.sockets["A"])})
+        >>> aj.files.save_points("points.h5", aj.acceptance.PointsRecord(measured, limits={"SPAT": 0.05}))
+        >>> print(aj.files.load_points("points.h5").limits)
+        {'SPAT': Limit(fixed=0.05, divisor=inf)}
     """
     measured = record.measured
     owner = [name for name, points in measured.sockets.items() for _ in points]
@@ -280,6 +298,12 @@ def load_points(path: str | os.PathLike) -> PointsRecord:
 
     Raises:
         InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+
+    Example:
+        >>> points = {"cone": true.position(capture.sockets["A"])}
+        >>> aj.files.save_points("points.h5", aj.acceptance.PointsRecord(aj.acceptance.Measured(points)))
+        >>> print(aj.files.load_points("points.h5").measured.sockets["cone"].shape)
+        (40, 3)
     """
     stored = read_tables(path, ("evaluation",))
     need(path, stored.tables, "points", "reference", "limits")

@@ -88,6 +88,17 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
 
     Raises:
         InputError: Naming the file and the place in it.
+
+    Example:
+        >>> from pathlib import Path
+        >>> _ = Path("kit.toml").write_text('''[[socket]]
+        ... name = "cone"
+        ... point = [400, 200, 300]
+        ... poses = 5
+        ... places = 3
+        ... ''')
+        >>> print([(item.simulated.name, item.places) for item in aj.files.read_kit("kit.toml")])
+        [('cone', 3)]
     """
     content = read_toml(path, _Kit)
     items: list[KitItem] = []

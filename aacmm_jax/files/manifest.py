@@ -221,6 +221,17 @@ def read_manifest(path: str | os.PathLike) -> Recording:
 
     Raises:
         InputError: names the file, the place in it and what to do.
+
+    Example:
+        >>> from pathlib import Path
+        >>> columns = "q1,q2,q3,q4,q5,q6"
+        >>> np.savetxt("cone.csv", np.degrees(capture.sockets["A"]), delimiter=",", header=columns, comments="")
+        >>> _ = Path("capture.toml").write_text('''arm = "cheng2018-simulation"
+        ... angles = { unit = "deg" }
+        ... socket = [{ name = "A", file = "cone.csv" }]
+        ... ''')
+        >>> print(aj.files.read_manifest("capture.toml").capture.sizes)
+        (40,)
     """
     path = as_path(path)
     model = read_toml(manifest := InputFile(path), _Manifest)

@@ -39,6 +39,13 @@ def save_plan(path: str | os.PathLike, plan: Plan | KitPlan, *, angles: Angles =
 
     Raises:
         InputError: the file cannot be written.
+
+    Example:
+        >>> from pathlib import Path
+        >>> planned = aj.planning.plan(arm, sockets=four, poses=12, lengths=bars, candidates=60)
+        >>> aj.files.save_plan("plan.csv", planned)
+        >>> print(Path("plan.csv").read_text().split(",")[:6])
+        ['pose', 'socket', 'x_mm', 'y_mm', 'z_mm', 'q_1_deg']
     """
     write_text(path, plan_csv(plan, angles) if isinstance(plan, Plan) else kit_csv(plan, angles))
 

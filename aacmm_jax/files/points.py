@@ -33,6 +33,18 @@ def read_points(path: str | os.PathLike) -> Measured:
 
     Raises:
         InputError: names the file, the place in it and what to do.
+
+    Example:
+        >>> from pathlib import Path
+        >>> np.savetxt("near.csv", true.position(capture.sockets["A"]), delimiter=",")
+        >>> _ = Path("points.toml").write_text('''[points]
+        ... unit = "mm"
+        ... [[socket]]
+        ... name = "near"
+        ... file = "near.csv"
+        ... ''')
+        >>> print(aj.files.read_points("points.toml").sockets["near"].shape)
+        (40, 3)
     """
     path = as_path(path)
     model = read_toml(manifest := InputFile(path), PointsManifest)

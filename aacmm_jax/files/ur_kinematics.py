@@ -75,8 +75,18 @@ def ur_kinematics_yaml(arm: Arm) -> str:
     Frames on nearly parallel axes are where the axis crosses the plane of the frame before; the base, the readings and
     the tip stay. The tip in the tool flange's frame, which the file has no place for, is stated as a comment.
 
+    Args:
+        arm: One arm; mm and rad become m and rad in the file.
+
     Raises:
         InputError: The arm does not have six joints.
+
+    Example:
+        >>> for line in aj.files.ur_kinematics_yaml(aj.load_arm("ur10e")).splitlines()[-3:]:
+        ...     print(line)
+            pitch: 0.0
+            yaw: 0.0
+          hash: aacmm_jax_calibration
     """
     if single(arm).joints != len(_JOINTS):
         raise InputError(f"kinematics.yaml is of six joints, but the arm has {arm.joints}; choose another --format.")

@@ -121,6 +121,13 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
 
     Raises:
         InputError: There is no chain, or a joint in it is of a kind that an arm does not have.
+
+    Example:
+        >>> chain = aj.files.urdf_chain(aj.files.load_specification("robot.urdf").urdf)
+        >>> print([joint.name for joint in chain.joints])
+        ['turn', 'lift', 'bend']
+        >>> print((chain.base @ chain.arm.pose([0.0, 0.0, 0.0]))[:3, 3].round(3), "mm")
+        [750.   0. 300.] mm
     """
     robot = parse_urdf(source.text)
     joints, before, waiting = [], [], np.eye(4)
@@ -157,7 +164,19 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
 
 
 def link_masses(chain: UrdfChain) -> LinkMasses:
-    """Mass and centre of mass of what each joint carries up to the next one, side branches included at reading 0."""
+    """Mass and centre of mass of what each joint carries up to the next one, side branches included at reading 0.
+
+    Args:
+        chain: The chain, from `urdf_chain`.
+
+    Returns:
+        Masses ``(n,)``, kg, and centres of mass ``(n, 3)`` in each link's D-H frame, mm.
+
+    Example:
+        >>> chain = aj.files.urdf_chain(aj.files.load_specification("robot.urdf").urdf)
+        >>> print(aj.files.link_masses(chain).mass, "kg")
+        [4.  3.  1.5] kg
+    """
     frames, frame = dh_frames(geometry_of(chain.arm), chain.base)[1:], np.eye(4)
     mass, centre = np.zeros(len(chain.joints)), np.zeros((len(chain.joints), 3))
     stops = {joint.name for joint in chain.joints}
@@ -195,6 +214,12 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
 
     Raises:
         InputError: The nominal arm is not from a URDF, or the arms do not fit together.
+
+    Example:
+        >>> robot = aj.files.load_specification("robot.urdf")
+        >>> exported = aj.files.urdf_of(robot.arm.replace(a_2=401.0), robot)
+        >>> print(exported.changed, exported.tip)
+        ('bend',) flange
     """
     if nominal.urdf is None:
         raise InputError("the nominal arm was not read from a URDF, so there is none to write; choose --format toml.")
@@ -238,6 +263,13 @@ def save_urdf(arm: Arm, path: str | os.PathLike, *, nominal: ArmSpecification) -
 
     Raises:
         InputError: The nominal arm is not from a URDF, or the file cannot be written.
+
+    Example:
+        >>> robot = aj.files.load_specification("robot.urdf")
+        >>> calibrated = robot.arm.replace(a_2=401.0)
+        >>> exported = aj.files.save_urdf(calibrated, "calibrated.urdf", nominal=robot)
+        >>> print(aj.load_arm("calibrated.urdf").a, exported.tip)
+        [ 50. 401. 300.] flange
     """
     exported = urdf_of(arm, nominal)
     write_text(path, exported.text)

@@ -55,6 +55,13 @@ def urdf_body(specification: ArmSpecification, folder: Path, radius: float) -> U
 
     Raises:
         InputError: The arm is not from a URDF, or a shape cannot be read.
+
+    Example:
+        >>> from pathlib import Path
+        >>> robot = aj.files.load_specification("robot.urdf")
+        >>> found = aj.files.urdf_body(robot, Path("."), 40.0)
+        >>> print(found.body.names, found.body.radius.round(1), "mm")
+        ('shoulder', 'upper_arm', 'forearm') [60.  56.6 42.4] mm
     """
     if specification.urdf is None:
         raise InputError("this arm was not read from a URDF, so it has no collision shapes; give radii of its links.")

@@ -53,6 +53,13 @@ class Arm(eqx.Module):
 
     Raises:
         InputError: Shapes do not fit together, a value is not finite, or there is no joint of such a number.
+
+    Example:
+        >>> two_joints = aj.Arm(alpha=[0.0, 0.0], a=[300.0, 200.0], d=[0.0, 0.0], probe=(0.0, 0.0, 50.0))
+        >>> print(two_joints.position([0.0, np.pi / 2]))
+        [300. 200.  50.]
+        >>> print(two_joints.pose(np.zeros((100, 2))).shape)
+        (100, 4, 4)
     """
 
     alpha: Float[AnyArray, "... n"]  # link twist, rad
@@ -291,7 +298,15 @@ def is_single(arm: Arm) -> bool:
 
 def parameter_names(arm: Arm) -> tuple[str, ...]:
     """All parameter names of an arm: alpha, a, d, theta, (beta,) by joint from 1, then probe_x, probe_y, probe_z, and
-    those of its corrections."""
+    those of its corrections.
+
+    Args:
+        arm: One arm, or a batch of them.
+
+    Example:
+        >>> print(aj.kinematics.parameter_names(arm)[:7])
+        ('alpha_1', 'alpha_2', 'alpha_3', 'alpha_4', 'alpha_5', 'alpha_6', 'a_1')
+    """
     kinds = ("alpha", "a", "d", "theta") + (() if arm.beta is None else ("beta",))
     by_joint = [f"{kind}_{i}" for kind in kinds for i in range(1, arm.joints + 1)]
     return (*by_joint, *(f"probe_{axis}" for axis in _AXES), *correction_names(arm))

@@ -101,6 +101,12 @@ def without_far_frames(arm: Arm) -> Arm:
 
     Args:
         arm: One arm.
+
+    Example:
+        >>> far = aj.load_arm("robot.urdf").replace(alpha=[-1.570796, 1e-5, 0.0], d=[300.0, 40000.0, -40000.0])
+        >>> near = aj.kinematics.without_far_frames(far)
+        >>> print(near.d.round(1), near.beta)
+        [300.   0.   0.] [ 0.000000e+00 -9.999995e-09  0.000000e+00]
     """
     geometry = geometry_of(arm)
     frames = dh_frames(geometry, np.eye(4))

@@ -23,6 +23,11 @@ class Body(NamedTuple):
     """Capsules and the pairs of them that may not touch; lengths in mm.
 
     Frame 0 is the base, frame i the one after joint i.
+
+    Example:
+        >>> body = aj.kinematics.body_along_links(arm, 40.0)
+        >>> print(body.names[:3], body.radius[:3])
+        ('offset d_1', 'link a_2', 'offset d_3') [40. 40. 40.]
     """
 
     names: tuple[str, ...]
@@ -87,6 +92,11 @@ def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: flo
 
     Raises:
         InputError: A radius is not positive, or not one for each joint.
+
+    Example:
+        >>> body = aj.kinematics.body_along_links(arm, 40.0, tool_radius=5.0)
+        >>> print(len(body.names), body.radius.max(), "mm")
+        7 40.0 mm
     """
     arm = to_numpy(arm)
     radii = np.asarray(radius, dtype=float)

@@ -23,6 +23,11 @@ class HalfSpace(NamedTuple):
     """Everything behind a plane: a table, a wall, a floor.
 
     ``normal`` points to where the arm is, from the plane through ``point`` (mm); both in the base frame.
+
+    Example:
+        >>> wall = aj.kinematics.HalfSpace("wall", normal=(1, 0, 0), point=(-500, 0, 0))
+        >>> print(wall.name)
+        wall
     """
 
     name: str
@@ -31,7 +36,13 @@ class HalfSpace(NamedTuple):
 
 
 class Box(NamedTuple):
-    """A solid box: its centre and whole edges, mm, and its rotation vector (rad), in the base frame."""
+    """A solid box: its centre and whole edges, mm, and its rotation vector (rad), in the base frame.
+
+    Example:
+        >>> cabinet = aj.kinematics.Box("cabinet", centre=(800, 0, 300), size=(200, 400, 600))
+        >>> print(cabinet.name, cabinet.rotation)
+        cabinet (0.0, 0.0, 0.0)
+    """
 
     name: str
     centre: tuple[float, float, float]
@@ -40,7 +51,13 @@ class Box(NamedTuple):
 
 
 class Post(NamedTuple):
-    """A capsule: all within ``radius`` (mm) of the segment between two points of the base frame."""
+    """A capsule: all within ``radius`` (mm) of the segment between two points of the base frame.
+
+    Example:
+        >>> pillar = aj.kinematics.Post("pillar", start=(500, 500, 0), end=(500, 500, 2000), radius=80.0)
+        >>> print(pillar.radius, "mm")
+        80.0 mm
+    """
 
     name: str
     start: tuple[float, float, float]
@@ -52,7 +69,14 @@ Obstacle = HalfSpace | Box | Post
 
 
 class Cell(NamedTuple):
-    """What an arm may not touch: obstacles and itself."""
+    """What an arm may not touch: obstacles and itself.
+
+    Example:
+        >>> table = aj.kinematics.HalfSpace("table", normal=(0, 0, 1), point=(0, 0, -200))
+        >>> cell = aj.kinematics.Cell(aj.kinematics.body_along_links(arm, 40.0), obstacles=(table,), clearance=20.0)
+        >>> print(len(cell.obstacles), cell.clearance)
+        1 20.0
+    """
 
     body: Body
     obstacles: tuple[Obstacle, ...] = ()
@@ -110,6 +134,17 @@ def clearances(cell: Cell, arm: Arm, q: Float[AnyArray, "N n"]) -> Float[AnyArra
 
     Exact where nothing touches; negative where something does, though not by how much. Infinite where nothing is
     checked.
+
+    Args:
+        cell: The arm's body, and the obstacles.
+        arm: The arm.
+        q: Joint readings ``(N, n)``, rad, or mm of prismatic joints.
+
+    Example:
+        >>> table = aj.kinematics.HalfSpace("table", normal=(0, 0, 1), point=(0, 0, -1000))
+        >>> cell = aj.kinematics.Cell(aj.kinematics.body_along_links(arm, 40.0), obstacles=(table,))
+        >>> print(aj.kinematics.clearances(cell, arm, q[None]).round(1), "mm")
+        [25.6] mm
     """
     xp, left_out = namespace(arm, q), set(cell.unchecked)
     start, end = capsule_ends(cell.body, frames_at(arm, q))

@@ -26,6 +26,11 @@ class Cone(NamedTuple):
     """Directions from which a tool may come to a socket: within ``half_angle`` (rad) of its ``normal``.
 
     The normal points out of the socket, in the base frame.
+
+    Example:
+        >>> upwards = aj.kinematics.Cone(half_angle=np.radians(45), normal=(0, 0, 1))
+        >>> print(f"{upwards.half_angle:.3f} rad")
+        0.785 rad
     """
 
     half_angle: float = math.pi

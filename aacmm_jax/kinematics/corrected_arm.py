@@ -43,6 +43,11 @@ def with_corrections(
 
     Raises:
         InputError: Something in the model is unknown, or numbers do not fit the arm.
+
+    Example:
+        >>> eccentric = aj.kinematics.with_corrections(arm, "harmonics=1")
+        >>> print(len(eccentric.coefficients), aj.kinematics.parameter_names(eccentric)[-2:])
+        12 ('cos1_6', 'sin1_6')
     """
     if not is_single(arm):
         raise InputError("corrections are for one arm, but this is a batch; take one of it first.")

@@ -54,6 +54,13 @@ def corrected_readings(
 
     Raises:
         InputError: The arms have other numbers of joints, or one of them is a batch.
+
+    Example:
+        >>> ur10e = aj.load_arm("ur10e")
+        >>> as_built = ur10e.replace(theta_2=ur10e.theta[1] + 0.001)
+        >>> found = aj.kinematics.corrected_readings(ur10e, as_built, q)
+        >>> print((found.q - q).round(4), "rad", bool(found.reached))
+        [-0.    -0.001 -0.     0.    -0.     0.   ] rad True
     """
     if nominal.joints != calibrated.joints:
         raise InputError(f"the arms have {nominal.joints} and {calibrated.joints} joints; give arms with as many.")
@@ -81,6 +88,13 @@ def readings_at_poses(
 
     Raises:
         InputError: The arm is a batch, the limits are no pairs, or the shapes differ.
+
+    Example:
+        >>> ur10e = aj.load_arm("ur10e")
+        >>> pose = ur10e.pose(q)
+        >>> found = aj.kinematics.readings_at_poses(ur10e, q + 0.05, pose)
+        >>> print(bool(found.reached), np.abs(found.q - q).max() < 1e-9)
+        True True
     """
     if not is_single(arm):
         raise InputError("poses are reached by one arm, but this is a batch; use jax.vmap, or take one of it.")

@@ -45,6 +45,15 @@ class Parameters(eqx.Module):
 
     Raises:
         InputError: A name is there twice.
+
+    Example:
+        >>> some = aj.Parameters.free_of(arm, held=("d_1", "a_2"))
+        >>> print(len(some.names), some.names[:3])
+        25 ('alpha_1', 'alpha_2', 'alpha_3')
+        >>> print(some.vector(true)[:3].round(4))
+        [-1.5715 -1.5711 -1.5706]
+        >>> print(some.arm(some.vector(true)).position(q).round(3))
+        [  36.437  104.848 -111.66 ]
     """
 
     base: Arm
@@ -238,6 +247,12 @@ class Bounds(eqx.Module):
 
     Raises:
         InputError: A lower bound is above its upper one, or shapes do not fit.
+
+    Example:
+        >>> box = aj.Bounds.around(arm, space, length=5.0, angle=0.01, override={"probe_z": 60.0})
+        >>> half = (box.upper - box.lower) / 2
+        >>> print(space.names[0], half[0].round(3), "rad;", space.names[-1], half[-1].round(3), "mm")
+        alpha_1 0.01 rad; probe_z 60.0 mm
     """
 
     space: Parameters
@@ -319,6 +334,11 @@ def perturbed_arm(space: Parameters, *, length: float, angle: float, seed: int =
 
     Raises:
         InputError: A largest error is negative or not finite.
+
+    Example:
+        >>> as_built = aj.perturbed_arm(space, length=1.0, angle=0.001, seed=1)
+        >>> print((as_built.a - arm.a).round(2))
+        [ 0.51  0.06 -0.56 -0.04 -0.82  0.  ]
     """
     for what, value in (("length", length), ("angle", angle)):
         if not (math.isfinite(value) and value >= 0):
@@ -355,6 +375,11 @@ class ArmSpecification(NamedTuple):
         free: Names that are free in addition, such as Hayati's ``beta_2``.
         urdf: The URDF that the arm was read from; None for others.
         prior: Prior of the parameters; None where the file states none.
+
+    Example:
+        >>> mine = aj.kinematics.ArmSpecification(arm, "my arm", length=5.0, override={"probe_z": 60.0})
+        >>> print(mine.name, len(mine.space().names), mine.bounds().upper[-1] - arm.probe[2])
+        my arm 21 60.0
     """
 
     arm: Arm

@@ -36,6 +36,12 @@ def default_prior(arm: Arm) -> Prior:
 
     Returns:
         The prior of the groups that the arm has.
+
+    Example:
+        >>> bending = aj.kinematics.with_corrections(aj.load_arm("ur10e"), "gravity,harmonics=1")
+        >>> prior = aj.kinematics.default_prior(bending)
+        >>> print(prior.groups)
+        ('lengths', 'angles', 'gravity', 'harmonics=1')
     """
     with_masses = any(name.startswith("compliance_") for name in correction_names(arm))
     octaves = [(2**k, min(2 ** (k + 1) - 1, HIGHEST)) for k in range(HIGHEST.bit_length())]

@@ -49,6 +49,12 @@ class Prior(eqx.Module):
 
     Raises:
         InputError: no group is given, or a standard deviation or mean is no such number.
+
+    Example:
+        >>> tolerances = aj.Prior({"lengths": 0.5, "angles": 0.001, "d_3": 0.1})
+        >>> joint = aj.calibrate(arm, capture, bounds, method="joint", prior=tolerances)
+        >>> print(joint.stage1.prior_metrics.groups)
+        ('lengths', 'angles', 'd_3')
     """
 
     groups: tuple[str, ...] = eqx.field(static=True)

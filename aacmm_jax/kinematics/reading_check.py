@@ -38,7 +38,13 @@ _ALIKE = 1e-6  # of the arm's size
 
 
 class ReadingCheck(NamedTuple):
-    """What `check_readings` found."""
+    """What `check_readings` found.
+
+    Example:
+        >>> found = aj.kinematics.check_readings(arm, capture.q[:20], positions=true.position(capture.q[:20]))
+        >>> print(found.fits, found.explained, found.poses)
+        True True 20
+    """
 
     given: Explanation  # nothing changed
     best: Explanation  # the simplest of the best; ``given`` where the readings fit as they are
@@ -87,6 +93,12 @@ def check_readings(
 
     Raises:
         InputError: Shapes do not fit, or there are too few poses to say anything.
+
+    Example:
+        >>> in_another_order = capture.q[:20, [1, 0, 2, 3, 4, 5]]
+        >>> found = aj.kinematics.check_readings(arm, in_another_order, positions=true.position(capture.q[:20]))
+        >>> print(found.fits, found.best.order)
+        False (1, 0, 2, 3, 4, 5)
     """
     arm = to_numpy(arm)
     evidence = _evidence(arm, q, sockets, positions, rotations, own_frame)

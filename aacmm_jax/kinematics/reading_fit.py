@@ -32,6 +32,12 @@ class Explanation(NamedTuple):
 
     Reading i of the arm is ``signs[i] * (angle * q[:, order[i]]) + offsets[i]``; points are ``length`` times those that
     were given.
+
+    Example:
+        >>> readings = capture.q[:20] * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
+        >>> found = aj.kinematics.check_readings(arm, readings, positions=true.position(capture.q[:20]))
+        >>> print(found.best.signs, f"{found.best.rms:.1f} mm instead of {found.given.rms:.0f} mm")
+        (1, 1, -1, 1, 1, 1) 2.2 mm instead of 431 mm
     """
 
     order: tuple[int, ...]  # the recorded column of each joint, from 0

@@ -28,7 +28,19 @@ class Reach(NamedTuple):
 
 
 def arm_reach(arm: Arm) -> Reach:
-    """Largest distance of the tip from the shoulder within the joint limits."""
+    """Largest distance of the tip from the shoulder within the joint limits.
+
+    Args:
+        arm: One arm.
+
+    Returns:
+        The shoulder in the base frame ``(3,)``, and the distance, mm.
+
+    Example:
+        >>> reach = aj.kinematics.arm_reach(arm)
+        >>> print(f"{reach.radius:.0f} mm")
+        1359 mm
+    """
     shoulder = _shoulder(arm)
     return Reach(shoulder, _extreme_distance(arm, shoulder, farthest=True))
 
@@ -42,6 +54,13 @@ def closest_approach(arm: Arm) -> float:
     """Smallest distance of the tip from the shoulder within the joint limits, mm; the arm's own body may be in the way.
 
     Found from many random starts, so that a smaller one is unlikely, but not excluded.
+
+    Args:
+        arm: One arm.
+
+    Example:
+        >>> print(f"{aj.kinematics.closest_approach(arm):.0f} mm")
+        146 mm
     """
     return _extreme_distance(arm, _shoulder(arm), farthest=False)
 

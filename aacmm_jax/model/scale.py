@@ -24,7 +24,13 @@ Partners = tuple[tuple[str, ...], tuple[tuple[float, ...], ...]]
 
 
 class Scale(eqx.Module):
-    """k = measured / nominal with its standard uncertainty, and the lengths it was found from (mm)."""
+    """k = measured / nominal with its standard uncertainty, and the lengths it was found from (mm).
+
+    Example:
+        >>> k = result.scale
+        >>> print(f"{k.measured[0]:.3f} mm / {k.nominal[0]:.3f} mm = {k.value:.6f}, u = {k.u:.1e}")
+        468.676 mm / 469.038 mm = 0.999229, u = 7.8e-06
+    """
 
     value: Float[AnyArray, ""]
     u: Float[AnyArray, ""]  # conditional on active bounds: takes parameters on a bound as exact
@@ -100,6 +106,11 @@ def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> Scal
 
     Raises:
         InputError: the capture has no reference length.
+
+    Example:
+        >>> stage2 = aj.fix_scale(aj.identify(arm, capture, bounds).arm, capture)
+        >>> print(f"k = {stage2.scale.value:.6f}, u(k) = {stage2.scale.u:.1e}")
+        k = 0.999229, u(k) = 7.2e-06
     """
     if not capture.lengths:
         raise InputError(
@@ -163,6 +174,11 @@ def scale_from_lengths(measured: Numbers, nominal: Numbers, u: float = 0.0) -> S
 
     Raises:
         InputError: a length is not positive and finite, or the shapes do not fit.
+
+    Example:
+        >>> k = aj.scale_from_lengths(measured=[200.758, 200.761, 200.757], nominal=201.513, u=0.002)
+        >>> print(f"k = {k.value:.6f}, u(k) = {k.u:.1e}")
+        k = 0.996257, u(k) = 1.2e-05
     """
     measured, nominal = jnp.atleast_1d(as_array(measured, "measured")), as_array(nominal, "nominal")
     if nominal.shape not in ((), measured.shape):

@@ -71,7 +71,13 @@ Progress = Callable[[str, float], None]
 
 
 class Plan(NamedTuple):
-    """Poses to take, in their order. Arrays are of NumPy: q in rad, positions in mm."""
+    """Poses to take, in their order. Arrays are of NumPy: q in rad, positions in mm.
+
+    Example:
+        >>> planned = aj.planning.plan(arm, sockets=four, poses=12, lengths=bars, candidates=60)
+        >>> print(planned.q.shape, planned.owner[:4], [*planned.sockets])
+        (12, 6) [0 0 1 1] ['A', 'B', 'C', 'D']
+    """
 
     arm: Arm
     names: tuple[str, ...]  # free parameters
@@ -166,6 +172,13 @@ def plan(
 
     Raises:
         InputError: A socket cannot be reached, no poses determine the parameters, or an argument is out of range.
+
+    Example:
+        >>> planned = aj.planning.plan(arm, sockets=four, poses=12, lengths=bars, candidates=60)
+        >>> print(f"u of {planned.check_length:.0f} mm: {planned.predicted.largest:.3f} mm")
+        u of 300 mm: 0.039 mm
+        >>> print(f"with random poses {planned.random.largest:.3f} mm")
+        with random poses 0.103 mm
     """
     report = progress or (lambda stage, fraction: None)
     if not is_single(arm):

@@ -44,7 +44,15 @@ _ROUNDS, _NEIGHBOURS = 2, 12  # of the search about the chosen poses, and its ca
 
 
 class KitPlan(NamedTuple):
-    """Poses to take with a kit of artefacts and instruments. Arrays are of NumPy: q in rad, positions in mm."""
+    """Poses to take with a kit of artefacts and instruments. Arrays are of NumPy: q in rad, positions in mm.
+
+    Example:
+        >>> box = [[200, -300, 100], [600, 300, 500]]
+        >>> tracker = aj.data.observations.SimulatedPoints("tracker", box, 30, u=0.02)
+        >>> planned = aj.planning.plan_kit(arm, [tracker], poses=30, candidates=100)
+        >>> print(planned.poses, [one.name for one in planned.observations])
+        30 ['tracker']
+    """
 
     arm: Arm
     names: tuple[str, ...]  # free parameters
@@ -130,6 +138,16 @@ def plan_kit(
 
     Raises:
         InputError: Something cannot be reached, the poses are too few, or nothing determines the parameters.
+
+    Example:
+        >>> ends = {"1": (0, 0, 0), "2": (300, 0, 0)}
+        >>> bar = aj.data.observations.SimulatedArtefact("ball bar", ends, 2, (0, 0, 0.7, 300, -200, 300), u=0.001)
+        >>> tracker = aj.data.observations.SimulatedPoints("tracker", [[200, -300, 100], [600, 300, 500]], 30, u=0.02)
+        >>> planned = aj.planning.plan_kit(arm, [bar, tracker], poses=30, candidates=100)
+        >>> print([(one.name, len(one.q)) for one in planned.observations])
+        [('ball bar', 27), ('tracker', 3)]
+        >>> print(f"u of {planned.check_length:.0f} mm: at most {planned.predicted.largest:.3f} mm")
+        u of 300 mm: at most 0.038 mm
     """
     report = progress or (lambda stage, fraction: None)
     if not is_single(arm):

@@ -31,7 +31,15 @@ CandidatesOf = Callable[[DesignProblem, Sequence[AbstractObservation]], Candidat
 
 
 class KitItem(NamedTuple):
-    """An artefact or an instrument, and what may be chosen about it."""
+    """An artefact or an instrument, and what may be chosen about it.
+
+    Example:
+        >>> ends = {"1": (0, 0, 0), "2": (300, 0, 0)}
+        >>> bar = aj.data.observations.SimulatedArtefact("ball bar", ends, 2, u=0.001)
+        >>> item = aj.planning.KitItem(bar, places=3, turned="vertical")
+        >>> print(item.simulated.name, item.places)
+        ball bar 3
+    """
 
     simulated: AbstractSimulated
     places: int = 1  # how many placements to choose; 0 leaves it where it is

@@ -18,7 +18,13 @@ _ROUNDS = 25  # of ordering and checking
 
 
 class Motion(NamedTuple):
-    """How the arm takes the poses of a plan, in their order. Arrays are of NumPy."""
+    """How the arm takes the poses of a plan, in their order. Arrays are of NumPy.
+
+    Example:
+        >>> planned = aj.planning.plan(arm, sockets=four, poses=12, lengths=bars, candidates=60)
+        >>> print(f"{planned.motion.travel:.0f} rad instead of {planned.motion.unordered:.0f} rad")
+        50 rad instead of 77 rad
+    """
 
     approach: Float[np.ndarray, "N n"] | None  # configurations above the sockets, rad; None without approach points
     tilt: Float[np.ndarray, " N"]  # between the tool and the normal of its socket, rad

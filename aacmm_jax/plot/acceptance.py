@@ -22,6 +22,12 @@ def acceptance_metrics(tests: Sequence[AcceptanceTest], axes: Any = None) -> Any
 
     Raises:
         InputError: If no metric has a limit.
+
+    Example:
+        >>> measured = aj.acceptance.measured_by(result.arm, aj.Recording(two_bars, nominal))
+        >>> tests = aj.acceptance.run(measured, limits={"SPAT": 0.1, "Length": 0.05})
+        >>> axes = aj.plot.acceptance_metrics(tests)
+        >>> axes.figure.savefig("acceptance.svg")
     """
     metrics = [metric for test in tests for metric in test.metrics if metric.worst.limit]
     if not metrics:

@@ -29,6 +29,10 @@ def arm_poses(arm: Arm, q: Numbers, axes: Any = None) -> Any:
 
     Raises:
         InputError: If the axes are not three-dimensional, or ``q`` does not fit the arm.
+
+    Example:
+        >>> axes = aj.plot.arm_poses(result.arm, capture.q[:5])
+        >>> axes.figure.savefig("poses.svg")
     """
     axes = _axes_in_space(axes)
     configurations = np.atleast_2d(np.asarray(arm._checked(q)))
@@ -56,6 +60,9 @@ def arm_at_zero(arm: Arm, axes: Any = None, *, base: Float[np.ndarray, "4 4"] | 
 
     Raises:
         InputError: If the axes are not three-dimensional.
+
+    Example:
+        >>> aj.plot.arm_at_zero(result.arm).figure.savefig("arm.svg")
     """
     axes = _axes_in_space(axes)
     base = np.eye(4) if base is None else base
@@ -85,6 +92,11 @@ def arm_workspace(arm: Arm, axes: Any = None) -> Any:
 
     Returns:
         The axes.
+
+    Example:
+        >>> axes = aj.plot.arm_workspace(arm)
+        >>> print(axes.get_ylabel())
+        height [mm]
     """
     if axes is None:
         from matplotlib.figure import Figure
@@ -114,6 +126,10 @@ def save_arm_figure(arm: Arm, path: Path, *, title: str = "", base: Float[np.nda
 
     Raises:
         InputError: The format is none of these, or the file cannot be written.
+
+    Example:
+        >>> from pathlib import Path
+        >>> aj.plot.save_arm_figure(arm, Path("arm.svg"), title="The nominal arm")
     """
     from matplotlib.figure import Figure
 

@@ -41,6 +41,11 @@ def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
 
     Returns:
         The axes.
+
+    Example:
+        >>> axes = aj.plot.pose_distances(record)
+        >>> print(axes.get_ylabel())
+        distance from the socket's centroid [mm]
     """
     axes = axes_or_new(axes)
     capture, evaluations = record.recording.capture, record.evaluations()
@@ -77,6 +82,12 @@ def residuals_by_kind(record: CalibrationRecord, unit: str = "mm", axes: Any = N
 
     Raises:
         InputError: If the calibration has no such residuals.
+
+    Example:
+        >>> robust = aj.calibrate(arm, capture, bounds, robust="huber")
+        >>> axes = aj.plot.residuals_by_kind(aj.calibration.record_of(robust, recording, robust="huber"))
+        >>> print(axes.get_ylabel())
+        distance from the geometry [mm]
     """
     if unit not in _UNITS:
         raise InputError(f"unit is '{unit}'; it must be mm, standard deviations or deg.")
@@ -141,6 +152,13 @@ def length_parameter_errors(record: CalibrationRecord, axes: Any = None) -> Any:
 
     Raises:
         InputError: If the calibration is not of a simulation.
+
+    Example:
+        >>> simulated = recording._replace(true=nominal._replace(arm=true))
+        >>> of_simulation = aj.calibration.record_of(result, simulated)
+        >>> axes = aj.plot.length_parameter_errors(of_simulation)
+        >>> print(axes.get_ylabel())
+        error against the true arm [mm]
     """
     if record.recording.true is None:
         raise InputError("the calibration is not of a simulation, so no true arm is known to draw errors against.")
@@ -177,6 +195,11 @@ def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any
 
     Raises:
         InputError: If ``kind`` is neither.
+
+    Example:
+        >>> axes = aj.plot.parameter_changes(record, "angle")
+        >>> print(axes.get_ylabel())
+        calibrated - nominal [deg]
     """
     if kind not in ("length", "angle"):
         raise InputError(f"kind is '{kind}'; it must be length or angle.")
@@ -216,6 +239,11 @@ def reference_length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
 
     Raises:
         InputError: If the calibration has no reference lengths.
+
+    Example:
+        >>> axes = aj.plot.reference_length_errors(record)
+        >>> print(axes.get_ylabel())
+        measured - value [mm]
     """
     lengths = record.recording.capture.lengths
     if not lengths:
@@ -265,6 +293,10 @@ def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
 
     Raises:
         InputError: For another format, or if the file cannot be written.
+
+    Example:
+        >>> from pathlib import Path
+        >>> aj.plot.save_calibration_figure(record, Path("calibration.svg"))
     """
     from matplotlib.figure import Figure
 

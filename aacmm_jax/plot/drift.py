@@ -23,6 +23,11 @@ def save_drift_trend(trend: Trend, path: Path) -> None:
 
     Raises:
         InputError: For another format, or if the file cannot be written.
+
+    Example:
+        >>> from pathlib import Path
+        >>> trend = aj.drift.trend([record, record_in_june], ["2026-01-31", "2026-06-30"], points=20)
+        >>> aj.plot.save_drift_trend(trend, Path("drift.svg"))
     """
     check_format(path)
     save_figure(drift_trend(trend)[0].figure, path)
@@ -39,6 +44,11 @@ def drift_trend(trend: Trend, axes: Any = None) -> Any:
 
     Returns:
         Both axes.
+
+    Example:
+        >>> trend = aj.drift.trend([record, record_in_june], ["2026-01-31", "2026-06-30"], points=20)
+        >>> changes, lengths = aj.plot.drift_trend(trend)
+        >>> changes.figure.savefig("drift.svg")
     """
     if axes is None:
         from matplotlib.figure import Figure
@@ -66,6 +76,14 @@ def parameter_trend(trend: Trend, axes: Any, positions: np.ndarray | None = None
 
     Returns:
         The axes.
+
+    Example:
+        >>> import matplotlib.pyplot as plt
+        >>> dates = ["2026-01-31", "2026-06-30", "2026-12-31"]
+        >>> trend = aj.drift.trend([record, record_in_june, record], dates, points=20)
+        >>> axes = aj.plot.parameter_trend(trend, plt.subplots()[1])
+        >>> print(axes.get_ylabel())
+        change / expanded uncertainty
     """
     positions = np.arange(len(trend.dates)) if positions is None else positions
     ratio = _ratio(trend.change, trend.expanded)

@@ -34,6 +34,12 @@ def model_comparison(found: ComparedModels, axes: Any = None) -> Any:
 
     Returns:
         The axes.
+
+    Example:
+        >>> compared = aj.compare_models(arm, two_bars, bounds, models=["dh", "harmonics=1"])
+        >>> axes = aj.plot.model_comparison(compared)
+        >>> print(len(axes.patches), "bars")
+        4 bars
     """
     axes = axes_or_new(axes)
     x, width = np.arange(len(found.models)), 0.38
@@ -73,6 +79,13 @@ def joint_function(
 
     Raises:
         InputError: If the arm has no such joint, or no residuals of observations are known.
+
+    Example:
+        >>> robust = aj.calibrate(arm, two_bars, bounds, robust="huber")
+        >>> by_pose = aj.calibration.record_of(robust, aj.Recording(two_bars, nominal), robust="huber")
+        >>> axes = aj.plot.joint_function(by_pose, 2)
+        >>> print(axes.get_xlabel())
+        q_2 [deg]
     """
     arm: Arm = to_numpy(record.calibrated.arm)
     if not 1 <= joint <= arm.joints:

@@ -30,6 +30,10 @@ def residual_patterns(record: CalibrationRecord) -> Any:
 
     Raises:
         InputError: If no pose has a residual with a direction.
+
+    Example:
+        >>> figure = aj.plot.residual_patterns(record)
+        >>> figure.savefig("residuals.svg")
     """
     from matplotlib.figure import Figure
 

@@ -39,6 +39,11 @@ def study_metric(results: Results, metric: str = "length_error", axes: Any = Non
 
     Raises:
         InputError: If there is no such metric.
+
+    Example:
+        >>> axes = aj.plot.study_metric(results, "de_stage1")
+        >>> print(axes.get_xlabel(), axes.get_ylabel())
+        half-width of lengths [mm] DE before the scale fix [mm]
     """
     if metric not in METRICS:
         raise InputError(f"a study has no metric '{metric}'; choose one of {', '.join(METRICS)}.")
@@ -78,6 +83,12 @@ def save_study_figures(results: Results, folder: Path) -> list[Path]:
 
     Raises:
         InputError: If the folder or a file cannot be written.
+
+    Example:
+        >>> from pathlib import Path
+        >>> written = aj.plot.save_study_figures(results, Path("figures"))
+        >>> print(written[0].name)
+        convergence.png
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -121,6 +132,9 @@ def study_distributions(
 
     Returns:
         The figure.
+
+    Example:
+        >>> aj.plot.study_distributions(results, "bounds.length_mm").savefig("distributions.svg")
     """
     names = [name for name in (_available(results, metric) for metric in metrics) if name]
     figure, axes = _panels(1, len(names), (4.3 * len(names), 3.8))
@@ -152,6 +166,9 @@ def study_errors(results: Results, factor: str) -> Any:
 
     Returns:
         The figure, with medians and bands from the 5th to the 95th percentile.
+
+    Example:
+        >>> aj.plot.study_errors(results, "bounds.length_mm").savefig("errors.svg")
     """
     kind = "length_error" if "length" in factor else "angle_error"
     runs = _runs(results, factor, most=4)
@@ -184,6 +201,9 @@ def study_scale(results: Results, factor: str) -> Any:
 
     Returns:
         The figure, with medians and bands from the 5th to the 95th percentile.
+
+    Example:
+        >>> aj.plot.study_scale(results, "bounds.length_shift_mm").savefig("scale.svg")
     """
     runs = _runs(results, factor, most=len(MARKERS))
     figure, axes = _panels(1, 1, (6.4, 4.2 + 0.16 * len(runs)))
@@ -211,6 +231,9 @@ def study_correlation(results: Results, cell: int) -> Any:
 
     Returns:
         The figure.
+
+    Example:
+        >>> aj.plot.study_correlation(results, cell=1).savefig("correlation.svg")
     """
     names = results.study.space.names
     figure, axes = _panels(1, 1, (6.8, 5.8))
@@ -233,6 +256,9 @@ def study_convergence(results: Results) -> Any:
 
     Returns:
         The figure.
+
+    Example:
+        >>> aj.plot.study_convergence(results).savefig("convergence.svg")
     """
     factors = sorted(results.study.factors, key=lambda name: -len(results.study.factors[name]))[:2]
     levels = [_levels(results, name) for name in factors] + [["all"]] * (2 - len(factors))

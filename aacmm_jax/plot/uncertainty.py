@@ -26,6 +26,12 @@ def volumetric_uncertainty_map(volume: VolumetricUncertainty, factor: float = 2.
 
     Raises:
         InputError: If no length has a finite uncertainty.
+
+    Example:
+        >>> volume = aj.volumetric_uncertainty(aj.uncertainty_of(result), points=20)
+        >>> axes = aj.plot.volumetric_uncertainty_map(volume)
+        >>> print(axes.get_xlabel())
+        distance from the first axis [mm]
     """
     axes = axes_or_new(axes)
     expanded = factor * volume.u_length
@@ -51,6 +57,11 @@ def correlation_matrix(uncertainty: Uncertainty, axes: Any = None) -> Any:
 
     Returns:
         The axes.
+
+    Example:
+        >>> axes = aj.plot.correlation_matrix(aj.uncertainty_of(result))
+        >>> print(len(axes.get_xticklabels()), "parameters")
+        21 parameters
     """
     axes = axes_or_new(axes, (6.8, 5.8))
     table, names = np.asarray(uncertainty.correlation), uncertainty.names
@@ -74,6 +85,11 @@ def singular_values(observed: Observability, axes: Any = None) -> Any:
 
     Returns:
         The axes.
+
+    Example:
+        >>> axes = aj.plot.singular_values(aj.observability(arm, capture, space))
+        >>> print(axes.get_ylabel())
+        singular value
     """
     axes = axes_or_new(axes)
     values = np.maximum(observed.singular, 1e-12 * observed.singular.max())

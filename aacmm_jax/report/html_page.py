@@ -37,6 +37,12 @@ def write_report(
     Raises:
         InputError: If the source cannot be read or the target not written, or the administrative data state a
             conformity that the source contradicts.
+
+    Example:
+        >>> aj.files.save_calibration("calibration.h5", record)
+        >>> written = aj.report.write_report("calibration.h5", "report.html")
+        >>> print(written["title"])
+        Calibration of Cheng 2018, simulated arm
     """
     with together(target):
         return _written(Path(source), Path(target), administrative_data)

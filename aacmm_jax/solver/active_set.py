@@ -23,7 +23,17 @@ _MAX_RAISES = 200  # of the damping, for one step
 
 class QuadraticModel(NamedTuple):
     """The quadratic model of the cost at one point: all that a step needs from one evaluation of f and its Jacobian
-    J."""
+    J.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> def residual(y, target):
+        ...     return y - target
+        >>> def normal(y, target):
+        ...     return aj.solver.QuadraticModel(0.5 * ((y - target) ** 2).sum(), y - target, jnp.eye(2))
+        >>> print(aj.least_squares(residual, jnp.zeros(2), jnp.array([1.0, 3.0]), upper=2.0, normal=normal).value)
+        [1. 2.]
+    """
 
     cost: Float[AnyArray, "*slots"]  # |f|^2 / 2
     gradient: Float[AnyArray, "*slots p"]  # J^T f

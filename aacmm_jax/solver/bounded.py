@@ -26,6 +26,13 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     the solution holds ``reason``, ``num_accepted_steps``, ``cost``, ``gradient`` and ``optimality``.
 
     Use it through `least_squares`, which also brings the adjoint that takes the bounds into account.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> loose = aj.solver.BoundedLevenbergMarquardt(rtol=1e-6, gtol=1e-6)
+        >>> target = jnp.array([1.0, 3.0])
+        >>> print(aj.least_squares(lambda y, target: y - target, jnp.zeros(2), target, upper=2.0, solver=loose).value)
+        [1. 2.]
     """
 
     # As in `Rules`.
@@ -121,6 +128,12 @@ def least_squares(
     Raises:
         InputError: Where a lower bound is above its upper one, or bounds do not fit the start; with ``throw``, where
             the solve fails. Under jit that is a failure of JAX's, of several lines.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> solution = aj.least_squares(lambda y, target: y - target, jnp.zeros(2), jnp.array([1.0, 3.0]), upper=2.0)
+        >>> print(solution.value)
+        [1. 2.]
     """
     check_x64()
     y0 = jax.tree.map(lambda leaf: jnp.asarray(as_array(leaf, "the start")), y0)

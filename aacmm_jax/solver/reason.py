@@ -9,7 +9,14 @@ from ..core.numpy_or_jax import AnyArray
 
 
 class Reason(eqx.Enumeration):
-    """Why a solve ended."""
+    """Why a solve ended.
+
+    Example:
+        >>> print(result.result == aj.Reason.gradient)
+        True
+        >>> print(aj.Reason[result.result])
+        Converged: the projected gradient is zero to the tolerance.
+    """
 
     running = "It has not ended."
     gradient = "Converged: the projected gradient is zero to the tolerance."

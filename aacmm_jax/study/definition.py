@@ -67,6 +67,10 @@ class Study:
 
     Raises:
         InputError: Whatever can be known to be wrong before work starts, but for fixtures out of reach.
+
+    Example:
+        >>> print(len(study.cells), "cells of", study.trials, "trials:", study.factors)
+        4 cells of 20 trials: {'bounds.length_mm': [5.0, 10.0], 'bounds.length_shift_mm': [0.0, 3.0]}
     """
 
     def __init__(self, specification: Specification, nominal: ArmSpecification, recording: Recording | None = None):

@@ -6,7 +6,13 @@ from jaxtyping import Float
 
 
 class DrawnTrials(NamedTuple):
-    """Trials, as `identify_many` takes them; mm and rad. q is NaN where the true arm did not reach its points."""
+    """Trials, as `identify_many` takes them; mm and rad. q is NaN where the true arm did not reach its points.
+
+    Example:
+        >>> drawn, captures = aj.study.draw_trials(study, 0, [0, 1, 2])
+        >>> print(drawn.q.shape, drawn.true.shape)
+        (3, 30, 6) (3, 21)
+    """
 
     q: Float[Any, "t N n"]
     true: Float[Any, "t p"]

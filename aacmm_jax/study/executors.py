@@ -30,6 +30,11 @@ def dask_executor(address: str, workers: int | None = None) -> Iterator[tuple[Ex
 
     Raises:
         InputError: Where Dask is not installed, no scheduler answers, or the cluster has no workers.
+
+    Example:
+        >>> with aj.study.dask_executor("local", workers=2) as (executor, workers):
+        ...     print(workers)
+        2
     """
     if address == "local":
         count = workers or _cores()

@@ -33,6 +33,11 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
 
     Raises:
         InputError: Where the file is missing, damaged or no study, or xarray is not installed.
+
+    Example:
+        >>> data = aj.study.open_study("study.h5")
+        >>> print(data.de_stage1.mean("trial").values.round(4), "mm")
+        [0.009  0.0098 0.0091 0.0091] mm
     """
     try:
         import xarray
@@ -85,7 +90,12 @@ def _allow_files(count: int, path: Path) -> None:
 
 
 class Results(NamedTuple):
-    """Results of a study, read cell by cell from its file; ``Results.of(path)`` opens it, also while the study runs."""
+    """Results of a study, read cell by cell from its file; ``Results.of(path)`` opens it, also while the study runs.
+
+    Example:
+        >>> print(results.finished, results.study.factors)
+        True {'bounds.length_mm': [5.0, 10.0], 'bounds.length_shift_mm': [0.0, 3.0]}
+    """
 
     path: Path
     stored: store.StoredStudy

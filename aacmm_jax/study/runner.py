@@ -91,6 +91,11 @@ def run_study(
     Raises:
         InputError: For a file of another study, a file that another process is writing, and a full disk; finished
             blocks are kept.
+
+    Example:
+        >>> outcome = aj.study.run_study(study, "study.h5")
+        >>> print(outcome.total, outcome.finished)
+        80 True
     """
     path = Path(os.path.realpath(as_path(path)))
     for what, number in (("workers", workers), ("chunk", chunk)):

@@ -51,6 +51,17 @@ def make_study(
 
     Raises:
         InputError: For an unknown table, key or value, naming it.
+
+    Example:
+        >>> made = aj.study.make_study(
+        ...     arm=arm,
+        ...     trials=1000,
+        ...     capture={"positions_mm": [[400, 200, 300]], "poses": [20, 70]},
+        ...     noise={"encoder_arcsec": [1, 2, 5]},
+        ...     identification={"method": "stage1"},
+        ... )
+        >>> print(len(made.cells), made.factors)
+        6 {'capture.poses': [20.0, 70.0], 'noise.encoder_arcsec': [1.0, 2.0, 5.0]}
     """
     nominal = arm if isinstance(arm, ArmSpecification) else ArmSpecification(arm) if isinstance(arm, Arm) else None
     nominal = load_specification(arm) if nominal is None else nominal  # pyright: ignore[reportArgumentType]
@@ -77,6 +88,10 @@ def shipped_studies() -> tuple[str, ...]:
 
     Returns:
         Their names, in alphabetical order, for `read_study`.
+
+    Example:
+        >>> print(aj.study.shipped_studies())
+        ('bound-sensitivity', 'joint-models', 'noise', 'pose-count', 'reference-length')
     """
     return tuple(
         sorted(item.name.removesuffix(".toml") for item in _shipped().iterdir() if item.name.endswith(".toml"))
@@ -95,6 +110,11 @@ def read_study(source: str | os.PathLike) -> Study:
 
     Raises:
         InputError: Naming the file, the key in it, and what to do.
+
+    Example:
+        >>> shipped = aj.study.read_study("bound-sensitivity")
+        >>> print(len(shipped.cells), shipped.trials)
+        20 1000
     """
     if isinstance(source, str) and source in shipped_studies():
         with resources.as_file(_shipped() / f"{source}.toml") as path:

@@ -99,6 +99,11 @@ def study_summary(results: Results, only: int | None = None) -> dict[str, Any]:
 
     Returns:
         The study's name, arm, seed, size and factors, and under "results" the `cell_summary` of each cell.
+
+    Example:
+        >>> summary = aj.study.study_summary(results)
+        >>> print(summary["trials"], summary["finished"], len(summary["results"]))
+        20 True 4
     """
     study = results.study
     cells = [cell_summary(results, cell) for cell in range(len(study.cells)) if only is None or cell == only - 1]
@@ -127,6 +132,11 @@ def cell_summary(results: Results, cell: int) -> dict[str, Any]:
         Fractions of trials that converged, had the truth within their bounds, or ended on a bound; under "figures"
         mean, standard deviation ("spread") and percentiles of each metric of `METRICS` over the converged trials, mm
         and rad; under "parameters" the bias and standard deviation of each parameter.
+
+    Example:
+        >>> summary = aj.study.cell_summary(results, 0)
+        >>> print(summary["converged"]["value"], summary["figures"].keys() >= {"de", "deltam"})
+        1.0 True
     """
     columns = results.columns(cell)
     ran = columns["converged"] >= 0
@@ -261,6 +271,10 @@ def concise(value: float | None, se: float | None) -> str:
 
     Returns:
         The text.
+
+    Example:
+        >>> print(aj.study.concise(0.010683, 0.000031), aj.study.concise(0.010683, None))
+        0.01068(3) 0.01068
     """
     if value is None or math.isnan(value):
         return "-"

@@ -95,7 +95,11 @@ def _prepared(study: Study, setting: Setting, device: Any) -> tuple[_Static, _Sh
 
 
 def clear_pools() -> None:
-    """Free the pools of configurations, which are kept for more trials of the same study."""
+    """Free the pools of configurations, which are kept for more trials of the same study.
+
+    Example:
+        >>> aj.study.clear_pools()
+    """
     forget_pools()
     _prepared.cache_clear()
 

@@ -48,10 +48,17 @@ def draw_trials(study: Study, cell: int, trials: Numbers) -> tuple[DrawnTrials, 
         trials: Numbers of the trials ``(t,)``, from 0.
 
     Returns:
-        Readings, true parameters, bounds and starts, and the captures as a batch that `identify_many` takes.
+        Readings, true parameters, bounds and starts, mm and rad, and the captures as a batch that `identify_many`
+        takes.
 
     Raises:
         InputError: The study has no such cell.
+
+    Example:
+        >>> drawn, captures = aj.study.draw_trials(study, 0, [0, 1])
+        >>> many = aj.identify_many(arm, captures, drawn.lower, drawn.upper, drawn.start)
+        >>> print(many.de.shape)
+        (2,)
     """
     if not 0 <= cell < len(study.settings):
         raise InputError(f"cell is {cell}, but the study has {len(study.settings)} cells; count them from 0.")

@@ -86,6 +86,11 @@ def warnings_of(
 
     Returns:
         The sentences; none where nothing is to be said.
+
+    Example:
+        >>> for sentence in aj.warnings_of(result, capture):
+        ...     print(sentence)
+        One reference length fixes the scale, so its own error is no check; keep another for checking.
     """
     record = record_of(result, Recording(capture, ArmSpecification(result.space.base)))
     return of_calibration(record, tests=model_tests(record, class_noise=class_noise))

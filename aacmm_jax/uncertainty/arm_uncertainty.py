@@ -24,6 +24,15 @@ class Uncertainty(eqx.Module):
     readings that the model was found to lack count in both: they move every pose. What depends on a direction that the
     data do not determine is infinitely uncertain. Fixed parameters count as exact, and so does the base frame (``d_1``
     and ``theta_1`` only define it).
+
+    Example:
+        >>> uncertainty = aj.uncertainty_of(result)
+        >>> u = dict(zip(uncertainty.names, uncertainty.u))
+        >>> print(f"u(a_3) = {u['a_3']:.4f} mm")
+        u(a_3) = 0.0020 mm
+        >>> start, end = capture.sockets["A"][0], capture.sockets["B"][0]
+        >>> print(f"u of the length between two poses: {uncertainty.length(start, end):.4f} mm")
+        u of the length between two poses: 0.0067 mm
     """
 
     arm: Arm

@@ -35,6 +35,11 @@ class Observability(NamedTuple):
 
     Derivatives are in natural steps (1 mm, 1 mrad) and, where the noise is given, in its standard deviations; else in
     mm. ``null`` ``(p, nullity)`` are directions that change nothing that was recorded.
+
+    Example:
+        >>> found = aj.observability(arm, capture, space)
+        >>> print(found.rank, len(found.undetermined), f"{found.condition:.0f}")
+        21 0 18
     """
 
     names: tuple[str, ...]
@@ -141,6 +146,14 @@ def observability(
 
     Raises:
         InputError: Capture and arm do not fit.
+
+    Example:
+        >>> one_socket = aj.simulate(arm, {"A": (400, 200, 300)}, poses=30)
+        >>> found = aj.observability(arm, one_socket, space)
+        >>> print(found.rank, "of", len(found.names))
+        20 of 21
+        >>> print(found.sentences()[0])
+        Not determined by these data: all lengths together: the scale. A reference length would determine them.
     """
     if space is None:
         space = Parameters.free_of(arm) if bounds is None else bounds.space

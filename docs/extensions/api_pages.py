@@ -5,6 +5,7 @@ They are written to docs/reference/api when a build begins, and git ignores them
 
 import importlib
 import inspect
+import shutil
 from pathlib import Path
 
 from class_fields import without_substitutions
@@ -71,10 +72,13 @@ def write_pages(app) -> None:
 
 
 def link_notebooks(app) -> None:
-    """Sphinx reads what is below docs/; the notebooks run in their own folder, which a link keeps."""
+    """Sphinx reads what is below docs/: a link, or a copy on a system that does not let this user make links."""
     link = DOCS / "notebooks"
     if not link.exists():
-        link.symlink_to(Path("..") / "notebooks", target_is_directory=True)
+        try:
+            link.symlink_to(Path("..") / "notebooks", target_is_directory=True)
+        except OSError:
+            shutil.copytree(DOCS.parent / "notebooks", link)
 
 
 def setup(app) -> dict[str, object]:

@@ -7,6 +7,7 @@ import io
 import re
 import textwrap
 import tokenize
+from functools import cache
 
 
 def _comments(source: str) -> dict[int, str]:
@@ -15,9 +16,13 @@ def _comments(source: str) -> dict[int, str]:
     return {token.start[0]: token.string.lstrip("#: ").strip() for token in tokens if token.type == tokenize.COMMENT}
 
 
+@cache
 def _fields_of(cls: type) -> dict[str, tuple[str, str]]:
-    """Fields that one class itself states: annotation and comment."""
-    source = textwrap.dedent(inspect.getsource(cls))
+    """Fields that one class itself states: annotation and comment; none of a class that is made at run time."""
+    try:
+        source = textwrap.dedent(inspect.getsource(cls))
+    except OSError:
+        return {}
     comments = _comments(source)
     (tree,) = ast.parse(source).body
     assert isinstance(tree, ast.ClassDef)

@@ -55,6 +55,13 @@ class Artefact(AbstractObservation):
 
     Raises:
         InputError: A point with poses has no coordinates, or shapes do not fit.
+
+    Example:
+        >>> holes = {"1": (0, 0, 0), "2": (300, 0, 0), "3": (300, 300, 0)}
+        >>> poses = dict(zip(holes, capture.q[:12].reshape(3, 4, 6)))
+        >>> plate = aj.data.observations.Artefact("plate", holes, poses, u=0.002)
+        >>> print(plate.q.shape, [*plate.unknowns])
+        (12, 6) ['placement plate', 'coordinates of plate']
     """
 
     kind: ClassVar[str] = "artefact"
@@ -226,6 +233,13 @@ class SimulatedArtefact(AbstractSimulated):
         artefact: Name of the artefact, by default that of the observation.
         placement: Name of the placement, likewise.
         index: Name of the index of a platform.
+
+    Example:
+        >>> bar = {"near": (0, 0, 0), "far": (300, 0, 0)}
+        >>> frame = (0, 0, 0.7, 300, -200, 300)
+        >>> placed = aj.data.observations.SimulatedArtefact("bar", bar, 5, frame, u=0.0005)
+        >>> print(aj.simulate(true, {}, observations=[placed]).observations[0].q.shape)
+        (10, 6)
     """
 
     table: ClassVar[str] = "artefact"

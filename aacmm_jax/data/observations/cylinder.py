@@ -51,12 +51,6 @@ class Cylinder(AbstractObservation):
     Outside (a pin, a plug gauge) that distance is (diameter + stylus) / 2, inside (a ring gauge, a bore)
     (diameter - stylus) / 2.
 
-    >>> import numpy as np
-    >>> q = np.linspace(0.0, 1.0, 48).reshape(8, 6)
-    >>> ring = Cylinder("ring", q, diameter=50.0, u=0.001, stylus=6.0, inside=True)
-    >>> float(ring.radius), list(ring.unknowns)
-    (22.0, ['axis of ring', 'radius of ring'])
-
     Args:
         name: Name of the cylinder.
         q: Joint readings ``(m, n)``, rad.
@@ -70,6 +64,12 @@ class Cylinder(AbstractObservation):
 
     Raises:
         InputError: Shapes do not fit, a value is negative, or the ball is larger than the bore.
+
+    Example:
+        >>> kinds = aj.data.observations
+        >>> ring = kinds.Cylinder("ring", capture.q[:8], diameter=50.0, u=0.001, stylus=6.0, inside=True)
+        >>> print(ring.radius, [*ring.unknowns])
+        22.0 ['axis of ring', 'radius of ring']
     """
 
     kind: ClassVar[str] = "cylinder"
@@ -361,6 +361,12 @@ class SimulatedCylinder(AbstractSimulated):
         u: Standard uncertainty of the certified diameter, mm.
         stylus: Diameter of the tip's ball, mm.
         inside: Whether the ball is inside.
+
+    Example:
+        >>> ends = [[400, 200, 300], [400, 200, 320]]
+        >>> ring = aj.data.observations.SimulatedCylinder("ring", ends, 50.0, 12, inside=True)
+        >>> print(aj.simulate(true, {}, observations=[ring]).observations[0].q.shape)
+        (12, 6)
     """
 
     table: ClassVar[str] = "touched_cylinder"

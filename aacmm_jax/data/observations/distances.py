@@ -45,6 +45,11 @@ class Distances(AbstractObservation):
 
     Raises:
         InputError: Shapes do not fit, or a distance is not positive.
+
+    Example:
+        >>> bar = aj.data.observations.Distances("telescoping bar", capture.q[:3], [310.2, 352.7, 401.9], u=0.001)
+        >>> print([*bar.unknowns])
+        ['pivot of telescoping bar']
     """
 
     kind: ClassVar[str] = "distances"
@@ -153,6 +158,12 @@ class SimulatedDistances(AbstractSimulated):
         poses: Number of distances.
         pivot: The pivot in the base frame ``(3,)``, mm.
         u: Standard uncertainty of each distance, mm.
+
+    Example:
+        >>> box = [[200, -300, 100], [600, 300, 500]]
+        >>> wire = aj.data.observations.SimulatedDistances("draw wire", box, 20, (1000, 0, 0), u=0.01)
+        >>> print(aj.simulate(true, {}, observations=[wire]).observations[0].values.shape)
+        (20,)
     """
 
     table: ClassVar[str] = "distances"

@@ -82,6 +82,12 @@ class MeasuredPoints(AbstractMeasured):
 
     Raises:
         InputError: Shapes do not fit, a value is not finite, or a covariance is not positive.
+
+    Example:
+        >>> seen = true.position(capture.q) + np.array([1000.0, 2000.0, -300.0])
+        >>> tracker = aj.data.observations.MeasuredPoints("tracker", capture.q, seen, u=0.02)
+        >>> print(tracker.points.shape, [*tracker.unknowns])
+        (50, 3) ['frame of tracker']
     """
 
     kind: ClassVar[str] = "points"
@@ -162,6 +168,13 @@ class SimulatedPoints(AbstractSimulated):
         u: Standard uncertainty of each coordinate, mm.
         target: Name of the target; by default the arm's probe.
         place: The target's true place in the last frame ``(3,)``, mm.
+
+    Example:
+        >>> box = [[200, -300, 100], [600, 300, 500]]
+        >>> tracker = aj.data.observations.SimulatedPoints("tracker", box, 50, (0, 0, 1.0, 2000, 0, 0), u=0.02)
+        >>> seen = aj.simulate(true, {}, observations=[tracker]).observations[0]
+        >>> print(seen.points.shape, [*seen.unknowns])
+        (50, 3) ['frame of tracker']
     """
 
     table: ClassVar[str] = "points"

@@ -48,6 +48,14 @@ class MeasuredTransforms(AbstractMeasured):
 
     Raises:
         InputError: Shapes do not fit, a matrix is no rotation, or a covariance is not positive.
+
+    Example:
+        >>> seen = true.pose(capture.q)
+        >>> probe = aj.data.observations.MeasuredTransforms(
+        ...     "6-D probe", capture.q, seen[:, :3, 3], seen[:, :3, :3], u=0.02, u_angle=1e-4
+        ... )
+        >>> print([*probe.unknowns])
+        ['frame of 6-D probe', 'orientation of 6-D probe']
     """
 
     kind: ClassVar[str] = "transforms"
@@ -182,6 +190,12 @@ class SimulatedTransforms(AbstractSimulated):
         frame: The instrument's frame in the base frame: rotation vector (rad) and origin (mm), ``(6,)``.
         u: Standard uncertainty of each coordinate, mm.
         u_angle: Standard uncertainty about each axis, rad.
+
+    Example:
+        >>> box = [[200, -300, 100], [600, 300, 500]]
+        >>> probe = aj.data.observations.SimulatedTransforms("6-D probe", box, 20, u=0.01, u_angle=2e-4)
+        >>> print(aj.simulate(aj.load_arm("ur10e"), {}, observations=[probe]).observations[0].rotations.shape)
+        (20, 3, 3)
     """
 
     table: ClassVar[str] = "transforms"

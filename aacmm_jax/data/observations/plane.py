@@ -47,6 +47,11 @@ class Plane(AbstractObservation):
 
     Raises:
         InputError: Readings are not finite, or ``form`` is negative.
+
+    Example:
+        >>> table = aj.data.observations.Plane("table", capture.q[:12], form=0.002)
+        >>> print([*table.unknowns])
+        ['plane table']
     """
 
     kind: ClassVar[str] = "plane"
@@ -110,6 +115,11 @@ class ParallelPlanes(AbstractObservation):
 
     Raises:
         InputError: The planes have different numbers of joints, or a value is negative.
+
+    Example:
+        >>> block = aj.data.observations.ParallelPlanes("block", capture.q[:6], capture.q[6:12], 100.0, u=0.0003)
+        >>> print(block.q.shape, [*block.unknowns])
+        (12, 6) ['plane block', 'distance of block']
     """
 
     kind: ClassVar[str] = "parallel planes"
@@ -301,6 +311,13 @@ class SimulatedPlanes(AbstractSimulated):
         poses: Number of touches of each plane.
         distance: True distance to the second plane, along the cross product of the sides; None for one plane.
         u: Standard uncertainty of the certified distance, mm.
+
+    Example:
+        >>> faces = aj.data.observations.SimulatedPlanes(
+        ...     "block", (300, -200, 150), [[80, 0, 0], [0, 80, 0]], 8, distance=100.0, u=0.001
+        ... )
+        >>> print(aj.simulate(true, {}, observations=[faces]).observations[0].q.shape)
+        (16, 6)
     """
 
     table: ClassVar[str] = "planes"

@@ -40,6 +40,11 @@ class Socket(AbstractObservation):
 
     Raises:
         InputError: Readings are not finite, or not ``(m, n)``.
+
+    Example:
+        >>> hole = aj.data.observations.Socket("hole", capture.sockets["A"])
+        >>> print(hole.q.shape, [*hole.unknowns])
+        (40, 6) ['position of hole']
     """
 
     kind: ClassVar[str] = "socket"
@@ -95,6 +100,13 @@ class SimulatedSocket(AbstractSimulated):
         poses: Number of poses.
         target: Name of the tip, and ``place``, its true place in the last frame ``(3,)``, mm; by default the arm's own
             probe.
+
+    Example:
+        >>> sockets_kind = aj.data.observations.SimulatedSocket
+        >>> cone = sockets_kind("cone", (400, 200, 300), 10, target="tool", place=(20, 0, 80))
+        >>> seated = aj.simulate(true, {}, observations=[cone]).observations[0]
+        >>> print(seated.q.shape, [*seated.unknowns])
+        (10, 6) ['position of cone']
     """
 
     table: ClassVar[str] = "socket"

@@ -51,6 +51,11 @@ class Sphere(AbstractObservation):
 
     Raises:
         InputError: Shapes do not fit, or a diameter or uncertainty is negative.
+
+    Example:
+        >>> ball = aj.data.observations.Sphere("ball", capture.q[:12], diameter=25.0, u=0.0005, stylus=6.0)
+        >>> print(ball.radius, [*ball.unknowns])
+        15.5 ['centre of ball', 'radius of ball']
     """
 
     kind: ClassVar[str] = "sphere"
@@ -201,6 +206,12 @@ class SimulatedSphere(AbstractSimulated):
         certified: Whether the diameter is certified.
         u: Standard uncertainty of the certified diameter, mm.
         stylus: Diameter of the tip's ball, mm.
+
+    Example:
+        >>> ball = aj.data.observations.SimulatedSphere("ball", (300, 0, 300), 50.0, 25, u=0.001, stylus=6.0)
+        >>> touched = aj.simulate(true, {}, observations=[ball]).observations[0]
+        >>> print(touched.q.shape, f"{touched.radius:.2f} mm")
+        (25, 6) 28.00 mm
     """
 
     table: ClassVar[str] = "touched_sphere"

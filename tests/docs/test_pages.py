@@ -1,0 +1,89 @@
+"""Every snippet of every page runs, from the top of the page to its end; docs/conf.py says which blocks are run."""
+
+import contextlib
+import os
+import re
+import shlex
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib.pyplot as plt
+import pytest
+
+from ..conftest import command_line
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+GENERATED = {"_build", "notebooks", "api"}
+PAGES = sorted(
+    path.relative_to(DOCS).as_posix()
+    for path in DOCS.rglob("*.md")
+    if not GENERATED & {*path.relative_to(DOCS).parts} and path.name not in ("command_line.md", "hdf5.md")
+)
+BLOCK = re.compile(
+    r"^(?:<!-- file: (?P<file>\S+) -->\n+)?"
+    r"(?P<fence>`{3,}|:{3,})(?P<language>[\w{}-]*)[^\n]*\n(?P<text>.*?)^(?P=fence) *$",
+    flags=re.MULTILINE | re.DOTALL,
+)
+# Pages with nothing to run are read here; of the others, each costs a calibration or more.
+EXHAUSTIVE: set[str] = set()
+
+
+class Snippet(NamedTuple):
+    """One block of a page."""
+
+    language: str
+    text: str
+    file: str | None
+
+
+def snippets(page: str) -> list[Snippet]:
+    """The blocks of a page that are run or written."""
+    found = [
+        Snippet(match["language"], match["text"], match["file"])
+        for match in BLOCK.finditer((DOCS / page).read_text("utf-8"))
+    ]
+    return [each for each in found if each.language in ("python", "console") or each.file]
+
+
+def commands(text: str) -> list[list[str]]:
+    """The ``aacmm`` commands of a console block; a line that ends with a backslash goes on."""
+    lines = text.replace("\\\n", " ").splitlines()
+    return [shlex.split(line[2:], comments=True) for line in lines if line.startswith("$ aacmm")]
+
+
+def marks(page: str) -> list[pytest.MarkDecorator]:
+    if page in EXHAUSTIVE:
+        return [pytest.mark.exhaustive]
+    return [pytest.mark.slow] if snippets(page) else []
+
+
+@pytest.mark.parametrize("page", [pytest.param(page, marks=marks(page)) for page in PAGES])
+def test_snippets_run(page, tmp_path, monkeypatch):
+    (tmp_path / "examples").symlink_to(ROOT / "examples", target_is_directory=True)
+    for extra in (DOCS / page).parent.glob("*.urdf"):
+        (tmp_path / extra.name).write_bytes(extra.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(os.environ, "MPLBACKEND", "agg")
+    namespace: dict[str, object] = {"__name__": page}
+    for number, (language, text, file) in enumerate(snippets(page), start=1):
+        if file is not None:
+            assert not Path(file).is_absolute()
+            assert ".." not in Path(file).parts
+            Path(file).parent.mkdir(parents=True, exist_ok=True)
+            Path(file).write_text(text, encoding="utf-8")
+        elif language == "python":
+            with contextlib.redirect_stdout(None):
+                exec(compile(text, f"{page}, block {number}", "exec"), namespace)
+        else:
+            for command in commands(text):
+                command_line(tmp_path, *command[1:])
+    plt.close("all")
+
+
+def test_blocks_are_found():
+    text = "<!-- file: a.toml -->\n```toml\nx = 1\n```\n\n```text\nno\n```\n"
+    text += "```console\n$ aacmm show \\\n  a.h5  # b\nprinted\n```\n"
+    found = [(match["language"], match["file"], match["text"]) for match in BLOCK.finditer(text)]
+    assert [each[:2] for each in found] == [("toml", "a.toml"), ("text", None), ("console", None)]
+    assert commands(found[2][2]) == [["aacmm", "show", "a.h5"]]
