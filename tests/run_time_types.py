@@ -6,8 +6,8 @@ types of an earlier one: checked anew in each test, they were a fifth of the sui
 and what is traced have types of their own, so each of them is checked. Preparing a function to be checked costs 4 ms,
 so it is prepared when it is first called. A function in another one would be prepared each time the outer one runs, so
 it is checked in the first runs only. Small functions are called a million times, almost always with types that are
-known after a few hundred; even to look for new ones was then 4 % of the suite's CPU, so that after many calls a
-function is left as it is.
+known after a few hundred; to look for new ones even then made a calibration a third slower (now by a fifth), so that
+after many calls a function is left as it is.
 """
 
 import collections
