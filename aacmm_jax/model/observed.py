@@ -14,6 +14,7 @@ from jaxtyping import Float
 from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import AnyArray, added_to, namespace, to_numpy
 from ..data.capture import Capture, check_one_capture, check_readings
+from ..data.observations.measured_points import AbstractMeasured
 from ..data.observations.observation import POINT, AbstractObservation, Rows, Tips, offset_of
 from ..data.observations.platform import platform_frames
 from ..data.observations.socket import Socket, position_of
@@ -70,6 +71,17 @@ class Observed(eqx.Module):
         observations = self.observations if observations is None else observations
         changed = (observations, q, joint_motion(arm.geometry, q))
         return eqx.tree_at(lambda o: (o.observations, o.q, o.motion), self, changed)
+
+    def measured_without_errors(
+        self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]
+    ) -> "Observed":
+        """The same, had every instrument measured exactly the tips of this arm in this geometry."""
+        forward, parts = self.forward(space, vector, geometry), self.split(geometry)
+        observations = tuple(
+            one.without_errors(_tips(forward, rows), parts) if isinstance(one, AbstractMeasured) else one
+            for one, rows in zip(self.observations, self.slices, strict=True)
+        )
+        return eqx.tree_at(lambda o: o.observations, self, observations)
 
     @property
     def blocks(self) -> dict[str, tuple[str, ...]]:

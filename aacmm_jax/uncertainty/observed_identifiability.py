@@ -1,7 +1,9 @@
 """What observations of all kinds determine: their derivatives by the parameters, with the unknown geometry eliminated.
 
-A rank must not follow from errors of an arm that is not yet calibrated, so the configurations are first moved, a few
-milliradians at most, to where the tips agree with the geometry that fits this arm best.
+A rank must not follow from errors of an arm that is not yet calibrated, so what an instrument measured is first
+replaced by what it would measure of this arm, in the geometry that fits best; the configurations of other observations
+are moved, a few milliradians at most, to where the tips agree with that geometry. (An arm of few joints cannot be moved
+to agree with a measured transform.)
 """
 
 from typing import NamedTuple
@@ -46,7 +48,7 @@ class Agreeing(NamedTuple):
 
     @classmethod
     def of(cls, observed: Observed, space: Parameters) -> "Agreeing":
-        """Fit the geometry, and move the configurations."""
+        """Fit the geometry, and make measured values and configurations agree with it."""
         p = len(space.names)
         z = np.concatenate([np.asarray(space.vector()), np.zeros(len(observed.steps))])
         z[p:] = np.asarray(observed.start(space, z[:p]))
@@ -58,6 +60,7 @@ class Agreeing(NamedTuple):
             z[p:] += step
             if np.max(np.abs(step), initial=0.0) < 1e-8:
                 break
+        observed = observed.measured_without_errors(space, z[:p], z[p:])
         for _ in range(_ROUNDS):
             linear, errors = _linear(observed, space, z)
             if max(np.abs(part.rows.values).max() for part in linear) < _AGREES:

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.core.rotations import rotation_matrix
 from aacmm_jax.data import observations as kinds
+from aacmm_jax.uncertainty.target_parameters import independent_of_targets
 
 NOISE = aj.Noise(encoder_arcsec=2, seating=0.005)
 SLOW = pytest.mark.slow
@@ -88,6 +90,22 @@ def test_a_target_takes_the_place_of_the_probe(paper_arm):
         "theta_6, orientation of T6 and offset of T6 trade off",
         "probe_z (changes nothing that is measured)",
     }
+
+
+def test_transforms_that_an_arm_of_five_joints_cannot_take():
+    """An arm that is not yet calibrated reaches none of them exactly, and still all that is free is determined."""
+    arm, random = to_numpy(aj.load_arm("so100")), np.random.default_rng(0)
+    limits = np.asarray(arm.limits)
+    q = random.uniform(limits[:, 0], limits[:, 1], (40, 5))
+    true = aj.perturbed_arm(aj.Parameters.free_of(arm), length=1.0, angle=np.deg2rad(0.1), seed=1)
+    seen = np.asarray(to_numpy(true).pose(q))
+    probe = kinds.MeasuredTransforms("T6", q, seen[:, :3, 3], seen[:, :3, :3], u=0.02, u_angle=1e-4)
+    capture = aj.Capture({}, observations=[probe])
+    space = independent_of_targets(arm, capture)
+    both = aj.Parameters(space.base, (*space.names, "a_5"))  # that only moves the target in the last frame
+    found = aj.observability(arm, capture, both)
+    assert found.rank == len(space.names) == 14
+    assert found.undetermined == ("a_5 and offset of T6 trade off",)
 
 
 def test_one_bar_on_a_platform_that_turns_half_a_revolution(paper_arm):

@@ -21,6 +21,11 @@ def placed(
     return turned + frame[3:, None], xp.concatenate([xp.stack(by_rotation), identity])
 
 
+def seen_from(frame: Float[AnyArray, " 6"], points: Float[AnyArray, "m 3"]) -> Float[AnyArray, "m 3"]:
+    """Points of the frame around a frame, as coordinates in that frame, mm; undoes `placed`."""
+    return (points - frame[3:]) @ rotation_matrix(frame[:3])
+
+
 def turned_z(direction: Float[AnyArray, " 3"]) -> Float[AnyArray, " 2"]:
     """The first two components of the rotation vector, whose third is 0, that turns z to a unit vector upwards."""
     xp = namespace(direction)

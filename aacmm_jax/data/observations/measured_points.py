@@ -1,5 +1,6 @@
 """Points of the tip as an instrument saw them: a laser tracker, a coordinate measuring machine, a camera."""
 
+import abc
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -11,7 +12,7 @@ from ...core.arrays import Numbers
 from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import fitted_frame, rotation_matrix
-from .frames import frame_and_offset, placed
+from .frames import frame_and_offset, placed, seen_from
 from .observation import (
     FRAME,
     READINGS,
@@ -62,6 +63,10 @@ class AbstractMeasured(AbstractObservation):
     @property
     def fixes_scale(self) -> bool:
         return True
+
+    @abc.abstractmethod
+    def without_errors(self, tips: Tips, unknowns: Unknowns) -> "AbstractMeasured":
+        """The same observation, had the instrument measured exactly these tips."""
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         check_spread(f"observation '{self.name}'", np.asarray(self.points).T)
@@ -143,6 +148,9 @@ class MeasuredPoints(AbstractMeasured):
             measured=rotation @ self.covariance @ rotation.T,
         )
 
+    def without_errors(self, tips: Tips, unknowns: Unknowns) -> "MeasuredPoints":
+        return eqx.tree_at(lambda o: o.points, self, seen_from(unknowns[self.frame], tips.position.T))
+
 
 def check_spread(where: str, points: Float[np.ndarray, "3 m"]) -> None:
     """Raise `InputError` for points on a line, which leave a rotation about it open."""
@@ -200,6 +208,5 @@ class SimulatedPoints(AbstractSimulated):
     def recorded(
         self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
     ) -> MeasuredPoints:
-        rotation = rotation_matrix(self.frame[:3])
-        points = (transforms[:, :3, 3] - self.frame[3:]) @ rotation + self.u * random.normal(size=(len(q), 3))
+        points = seen_from(self.frame, transforms[:, :3, 3]) + self.u * random.normal(size=(len(q), 3))
         return MeasuredPoints(self.name, q, points, u=self.u, target=self.target)

@@ -11,7 +11,7 @@ from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, rotation_derivative, rotation_matrix, rotation_vector
-from .frames import frame_and_offset, placed
+from .frames import frame_and_offset, placed, seen_from
 from .measured_points import MEASURED, AbstractMeasured
 from .observation import (
     FRAME,
@@ -151,6 +151,13 @@ class MeasuredTransforms(AbstractMeasured):
             by_rotation=xp.concatenate([none, left]),
         )
 
+    def without_errors(self, tips: Tips, unknowns: Unknowns) -> "MeasuredTransforms":
+        xp, frame = namespace(tips, unknowns), unknowns[self.frame]
+        station, target = rotation_matrix(frame[:3]), rotation_matrix(unknowns[self.orientation])
+        axes = xp.moveaxis(xp.stack(tips.axes, axis=1), -1, 0)  # (m, 3, 3)
+        exact = (seen_from(frame, tips.position.T), station.T @ axes @ target)
+        return eqx.tree_at(lambda o: (o.points, o.rotations), self, exact)
+
 
 def _logarithm(
     matrix: Float[AnyArray, "3 3 m"],
@@ -218,7 +225,7 @@ class SimulatedTransforms(AbstractSimulated):
         self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
     ) -> MeasuredTransforms:
         station, target = rotation_matrix(self.frame[:3]), rotation_matrix(self.offset_and_orientation[3:])
-        points = (transforms[:, :3, 3] - self.frame[3:]) @ station + self.u * random.normal(size=(len(q), 3))
+        points = seen_from(self.frame, transforms[:, :3, 3]) + self.u * random.normal(size=(len(q), 3))
         errors = self.u_angle * random.normal(size=(len(q), 3))
         rotations = np.stack(
             [
