@@ -23,7 +23,8 @@ from ..uncertainty.identifiability import observability
 PLAUSIBLE_SCALE = (0.5, 2.0)
 # Repeatability of an arm or robot relative to the sum of its links: the paper's arm reaches 1e-5 (0.026 mm on 2.5 m).
 _RELATIVE_REPEATABILITY = 1e-5
-_IMPLAUSIBLE = 100.0  # residuals larger than that by this factor come from wrong data, not from an arm
+# Residuals larger by these factors come from wrong data, not from an arm: than that, and than its noise predicts.
+_OVER_REPEATABILITY, _OVER_NOISE = 100.0, 10.0
 
 
 def check_single(arm: Arm, capture: Capture, bounds: Bounds, many: str) -> None:
@@ -116,13 +117,12 @@ def plausible(k: float) -> bool:
     return PLAUSIBLE_SCALE[0] <= k <= PLAUSIBLE_SCALE[1]
 
 
-def largest_plausible_residual(arm: Arm, noise: Noise | None = None) -> float:
+def largest_plausible_residual(arm: Arm, *noises: Noise | None) -> float:
     """RMS distance from the sockets' centroids, mm, above which data and arm do not belong together.
 
-    A hundred times the usual repeatability of an arm of this size, or what the given noise predicts at its full reach.
+    A hundred times the repeatability of a good arm of this size, or, where that is more, ten times what one of the
+    noises predicts at full reach: that which was given, and that which is usual for the class of the arm.
     """
     size = total_link_length(arm)
-    scatter = _RELATIVE_REPEATABILITY * size
-    if noise is not None:
-        scatter = max(scatter, math.sqrt(3) * math.hypot(*at_tip(noise, arm, size)))
-    return _IMPLAUSIBLE * scatter
+    predicted = [math.sqrt(3) * math.hypot(*at_tip(noise, arm, size)) for noise in noises if noise is not None]
+    return max([_OVER_REPEATABILITY * _RELATIVE_REPEATABILITY * size, *(_OVER_NOISE * each for each in predicted)])

@@ -125,8 +125,14 @@ class CalibrationRecord(NamedTuple):
         return bool(np.abs(left[0]) <= LARGEST_LOG_K * float(self.recording.capture.lengths[0].value))
 
     @property
+    def largest_plausible_residual(self) -> float:
+        """RMS distance from the geometry, mm, that no arm of this size and class exceeds with its own data."""
+        usual = self.recording.usual
+        return largest_plausible_residual(self.calibrated.arm, self.given_noise, None if usual is None else usual.noise)
+
+    @property
     def implausible_residual(self) -> bool:
-        """Whether the residual is over a hundred times the usual repeatability of such an arm: of other data."""
+        """Whether the residual is larger than that of any such arm, so that data and arm do not belong together."""
         arm, capture = self.calibrated.arm, self.recording.capture
         if self.robust is not None and self.observed is not None:
             rms = float(np.sqrt(3) * self.observed.sigma)  # bad poses do not count
@@ -135,7 +141,7 @@ class CalibrationRecord(NamedTuple):
             rms = float(np.sqrt(np.average(np.asarray(self.observed.rms_after) ** 2, weights=poses)))
         else:
             rms = float(evaluate(arm, capture).repeatability.rms)
-        return rms > largest_plausible_residual(arm, self.given_noise)
+        return rms > self.largest_plausible_residual
 
     def vectors(self) -> dict[str, np.ndarray]:
         """Free parameters of the nominal arm, after stage 1, and calibrated; and of the true arm of a simulation."""

@@ -113,7 +113,7 @@ def simulate(
     from ..data.noise import Noise
     from ..data.recording import Recording
     from ..data.simulation import simulate as run
-    from ..files.arms import load_specification
+    from ..files.arms import load_specification, usual_noise
     from ..files.captures import save_capture
     from ..kinematics.parameters import perturbed_arm
     from ..summaries.calibration import capture_summary
@@ -168,6 +168,7 @@ def simulate(
             if temperature_c is not None:
                 nominal = load_specification(arm, base=base, tip=tip, capture=capture)
             recording = Recording(capture, nominal, true, seed)
+        recording = recording._replace(usual=usual_noise(arm, base=base, tip=tip))
         summary = capture_summary(recording)
         save_capture(output, recording, summary)
     show_summary(summary | {"written": str(output)}, as_json, calibration_display.capture)

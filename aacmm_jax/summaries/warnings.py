@@ -156,19 +156,18 @@ def _implausible(record: CalibrationRecord) -> list[str]:
     """A residual that no arm has: the solve ended at a minimum, but of data that do not belong to this arm."""
     if not record.implausible_residual:
         return []
+    most = f"more than the {record.largest_plausible_residual:.2g} mm that are plausible for this arm"
     if record.observed is not None and record.recording.capture.observations:
         worst = int(np.argmax(record.observed.rms_after))
         name, rms = record.observed.names[worst], record.observed.rms_after[worst]
         return [
-            f"Poses of {name} are {rms:.3g} mm RMS from their geometry, over a hundred times the usual repeatability "
-            "of an arm of this size, so data and arm do not belong together: check columns, units, signs and the arm."
-            + _cause(record)
+            f"Poses of {name} are {rms:.3g} mm RMS from their geometry, {most}, so data and arm do not belong "
+            "together: check columns, units, signs and the arm." + _cause(record)
         ]
     rms = float(record.evaluations()["calibrated"].repeatability.rms)
     return [
-        f"The poses of a socket disagree by {rms:.3g} mm RMS, over a hundred times the usual repeatability of an "
-        "arm of this size, so data and arm do not belong together: check the files, their columns and unit, the "
-        "sockets and the arm." + _cause(record)
+        f"The poses of a socket disagree by {rms:.3g} mm RMS, {most}, so data and arm do not belong together: check "
+        "the files, their columns and unit, the sockets and the arm." + _cause(record)
     ]
 
 

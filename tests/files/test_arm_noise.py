@@ -7,7 +7,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.data.arm_classes import CLASSES, class_noise, noise_of_repeatability
-from aacmm_jax.files import load_noise
+from aacmm_jax.files import load_noise, usual_noise
 
 TABLE = """\
 length_unit = "mm"
@@ -47,6 +47,41 @@ def test_shipped_arms():
         float(noise_of_repeatability(aj.load_arm("panda"), 0.1).encoder_arcsec)
     )
     assert encoder(load_noise("cheng2018-simulation")) == pytest.approx(2.0)
+    for name in aj.files.shipped_arms():
+        expected = {"cheng2018": "measuring arm", "so100": "hobby arm"}.get(name.split("-")[0], "robot")
+        stated = usual_noise(name)
+        assert stated is not None, name
+        assert stated.arm_class == expected, name
+    assert encoder(load_noise("ur5e")) == pytest.approx(
+        float(noise_of_repeatability(aj.load_arm("ur5e"), 0.03).encoder_arcsec)
+    )
+    assert encoder(load_noise("so100")) == pytest.approx(288, rel=0.01)  # a step of a servo with 4096 counts is 316
+
+
+@pytest.mark.filterwarnings("ignore::aacmm_jax.core.errors.IdentifiabilityWarning")
+def test_a_hobby_arm_may_leave_residuals_that_no_measuring_arm_leaves():
+    """Its class says so; exchanged joints leave more than any class does."""
+    arm = aj.load_arm("so100")
+    bounds = aj.Bounds.around(arm, aj.Parameters.free_of(arm, held=("theta_1", "d_1", "d_2", "d_3", "alpha_5", "a_5")))
+    sockets = {"A": (0, -200, 150), "B": (0, -230, 230), "C": (80, -180, 120)}
+    right = aj.simulate(arm, sockets, poses=8, encoder_arcsec=500, seed=1)
+    wrong = aj.Capture({name: np.asarray(q)[:, [0, 1, 3, 2, 4]] for name, q in right.sockets.items()})
+    recording = aj.Recording(right, aj.kinematics.ArmSpecification(arm, "test"))
+    record = aj.calibration.record_of(aj.identify(arm, right, bounds), recording)
+    for capture, usual, implausible in (
+        (right, None, True),
+        (right, load_noise("so100"), False),
+        (wrong, load_noise("so100"), True),
+    ):
+        recorded = record._replace(recording=recording._replace(capture=capture, usual=usual))
+        assert recorded.implausible_residual == implausible
+
+
+def test_a_simulated_capture_keeps_what_is_usual_for_its_arm(aacmm, tmp_path):
+    aacmm("simulate", "so100", "-o", "c.h5", "--socket", "A=0,-200,150", "--poses", 2)
+    usual = aj.files.load_capture(tmp_path / "c.h5").usual
+    assert usual is not None
+    assert usual.arm_class == "hobby arm"
 
 
 @pytest.mark.parametrize(
