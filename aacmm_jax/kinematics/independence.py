@@ -20,7 +20,7 @@ from .arm import (
     neighbouring_arm,
     with_arrays,
 )
-from .inverse_kinematics import SocketPoses, project_to_centroids, project_to_targets
+from .inverse_kinematics import ObservedPoses, SocketPoses, project_to_centroids, project_to_targets
 from .near_degeneracy import trade_offs
 
 _OFF_AXIS = 5.0  # mm
@@ -43,6 +43,39 @@ def equations(
     return columns - means[capture.owner], lengths
 
 
+def rigid_motions(tips: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3 6"]:
+    """How tips move with the whole arm: by 1 mm along each axis, and by 1 mrad about each axis of the base; mm."""
+    rotations = np.cross(np.eye(3)[None, :, :], tips[:, None, :]).transpose(0, 2, 1)
+    return np.concatenate([np.broadcast_to(np.eye(3), (len(tips), 3, 3)), rotations * 1e-3], axis=2)
+
+
+def _determining(
+    arm: Arm, capture: SocketPoses, names: Sequence[str], targets_of: Arm
+) -> tuple[Float[np.ndarray, "N 3 p"], Float[np.ndarray, "l p"]]:
+    """`equations` of the sockets, and the like of other observations."""
+    poses, lengths = np.zeros((0, 3, len(names))), np.zeros((0, len(names)))
+    if capture.sizes:
+        poses, lengths = equations(arm, capture, names, project_to_centroids(arm, capture, targets_of))
+    return np.concatenate([poses, *(_of_positions(arm, one, names) for one in capture.observations)]), lengths
+
+
+def _of_positions(arm: Arm, observed: ObservedPoses, names: Sequence[str]) -> Float[np.ndarray, "m 3 p"]:
+    """Derivatives of tips that were measured in an unknown frame, less what that frame, an unknown place of a target
+    and, where nothing fixes it, the scale imitate."""
+    q = np.asarray(observed.q)
+    tips = np.asarray(arm.position(q))
+    unknown = [rigid_motions(tips)]
+    if not observed.fixes_scale:
+        unknown.append(tips[:, :, None] * 1e-3)
+    if observed.target:
+        unknown.append(jacobian_at(arm, q, ("probe_x", "probe_y", "probe_z")))
+    columns = jacobian_at(arm, q, names)
+    rows = columns.reshape(-1, len(names))
+    basis, sizes, _ = np.linalg.svd(np.concatenate(unknown, axis=2).reshape(len(rows), -1), full_matrices=False)
+    basis = basis[:, sizes > 1e-10 * sizes[0]]
+    return (rows - basis @ (basis.T @ rows)).reshape(columns.shape)
+
+
 def _socket_means(values: Float[np.ndarray, "N ..."], capture: SocketPoses) -> Float[np.ndarray, "s ..."]:
     starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
     sums = np.add.reduceat(values, starts, axis=0)
@@ -59,8 +92,9 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
 
     Parameters are taken one after the other, and fixed where those taken before can imitate them: nonzero lengths
     first, then angles, lengths that are nominally zero, the probe and the last link; the longest link comes last of
-    all, so that it is fixed where neither a reference length nor a prismatic joint fixes the scale. Before it come the
-    coefficients of corrections, since a harmonic may imitate a zero offset, but not replace it. Where neighbouring
+    all, so that it is fixed where neither a reference length, another observation nor a prismatic joint fixes the
+    scale. Before it come the coefficients of corrections, since a harmonic may imitate a zero offset, but not replace
+    it. Observations besides sockets count as positions of the tip in an unknown frame. Where neighbouring
     axes are nearly parallel, ``d_i`` is fixed and ``beta_i`` is free. Of a prismatic joint i, ``a_i`` and ``d_(i+1)``
     are fixed rather than others, and ``theta_i`` next to a parallel axis: three angles and ``theta`` of the joint
     before it, or after it, are all that the orientation of the next axis has. At last the first parameter of every
@@ -77,8 +111,7 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
             # Without the exact alignments of the nominal arm. Fixed parameters keep their nominal values, which may
             # make others redundant, so the choice is repeated.
             neighbour = neighbouring_arm(arm, taken or tuple(order))
-            moved = project_to_centroids(neighbour, capture, targets_of=arm)
-            poses, lengths = equations(neighbour, capture, order, moved)
+            poses, lengths = _determining(neighbour, capture, order, targets_of=arm)
             rows = np.concatenate([poses.reshape(-1, len(order)), lengths])
             before, taken = taken, _independent(neighbour, order, rows)
             if taken == before or not taken:
@@ -106,6 +139,7 @@ class PosesInSockets:
 
     q: Float[np.ndarray, "N n"]
     sizes: tuple[int, ...]
+    observations: tuple[ObservedPoses, ...] = ()
 
     @property
     def columns(self) -> int:

@@ -32,8 +32,28 @@ _EXACT = 1e-7  # mm: one more step closes a gap of this size to rounding
 
 
 @runtime_checkable
+class ObservedPoses(Protocol):
+    """The part of an observation that kinematics needs."""
+
+    @property
+    def q(self) -> Float[AnyArray, "m n"]:
+        """Joint readings, rad, or mm of prismatic joints."""
+        ...
+
+    @property
+    def target(self) -> str:
+        """Name of a tip at an unknown place in the last frame; empty for the arm's own probe."""
+        ...
+
+    @property
+    def fixes_scale(self) -> bool:
+        """Whether the observation determines the scale of the arm."""
+        ...
+
+
+@runtime_checkable
 class SocketPoses(Protocol):
-    """The part of a capture that kinematics needs: poses, socket after socket, and the ends of reference lengths."""
+    """The part of a capture that kinematics needs: poses, socket after socket, lengths, and the rest."""
 
     @property
     def q(self) -> Float[AnyArray, "N n"]:
@@ -53,6 +73,11 @@ class SocketPoses(Protocol):
     @property
     def owner(self) -> Int[np.ndarray, " N"]:
         """Index of the socket that each pose belongs to."""
+        ...
+
+    @property
+    def observations(self) -> tuple[ObservedPoses, ...]:
+        """What else was observed."""
         ...
 
     def ends(self) -> Int[np.ndarray, "l 2"]:

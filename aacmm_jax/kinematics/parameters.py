@@ -116,12 +116,14 @@ class Parameters(eqx.Module):
 
         Fixed too is one parameter of every near-degenerate combination (`near_degeneracy`). For the paper's arm with
         a reference length these are its 21; without one, the longest link is fixed too. Where neighbouring axes are
-        nearly parallel, d of the first is fixed and Hayati's beta is free instead.
+        nearly parallel, d of the first is fixed and Hayati's beta is free instead. Observations besides sockets count
+        as positions of the tip in an unknown frame, which is the most that spheres, planes and distances may say;
+        `observability` knows what each kind determines.
 
         Args:
             arm: The nominal arm.
-            capture: The poses and reference lengths; by default poses over the whole workspace with one reference
-                length.
+            capture: The poses, reference lengths and other observations; by default poses over the whole workspace with
+                one reference length.
 
         Raises:
             InputError: The capture has another number of joints, or determines nothing.

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..kinematics.arm import Arm, jacobian_at
+from ..kinematics.independence import rigid_motions
 from ..kinematics.near_degeneracy import reduced_echelon
 from ..kinematics.parameters import Parameters
 
@@ -61,7 +62,6 @@ def structural(null: Float[np.ndarray, "p nullity"], arm: Arm, space: Parameters
         q = np.concatenate([q, random.uniform(10.0, 30.0, (count, 1))], axis=1)
     movements = (jacobian_at(arm, q, space.names) * np.asarray(space.scale) @ null).reshape(3 * count, -1)
     tips = np.asarray(arm.position(q))
-    rotations = np.cross(np.eye(3)[None, :, :], tips[:, None, :]).transpose(0, 2, 1)
-    rigid = np.concatenate([np.broadcast_to(np.eye(3), (count, 3, 3)), rotations * 1e-3], axis=2).reshape(3 * count, 6)
+    rigid = rigid_motions(tips).reshape(3 * count, 6)
     remaining = movements - rigid @ np.linalg.lstsq(rigid, movements, rcond=None)[0]
     return np.linalg.norm(remaining, axis=0) < 1e-6 * np.sqrt(3 * count)

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.data import observations as kinds
 
+BOX = [[200, -300, 100], [600, 300, 500]]
 ENDS = [((400, 200, 300), (600, 200, 300)), ((300, 400, 500), (300, 600, 500))]
 
 
@@ -126,6 +128,30 @@ def test_independent_parameters_are_the_papers(paper_arm, single, paper_capture,
     default = set(aj.Parameters.free_of(paper_arm).names)
     assert set(chosen.names) == (default if lengths else default - {"d_3"})
     assert aj.observability(paper_arm, capture, chosen).rank == len(chosen.names)
+
+
+@pytest.mark.parametrize(
+    ("sockets", "certified", "target", "fixed"),
+    [
+        ({}, True, "", set()),
+        ({}, False, "", {"d_3"}),  # the scale
+        ({"A": (400, 200, 300)}, True, "", set()),
+        ({}, True, "ball", {"theta_6", "d_6", "probe_z"}),  # its place is unknown
+    ],
+    ids=["points", "no scale", "points and a socket", "of a target"],
+)
+def test_independent_parameters_of_other_observations(paper_arm, sockets, certified, target, fixed):
+    """Positions in a frame of their own, with sockets or without, determine what sockets with a length do."""
+    if certified:
+        place = (0, 60, 100) if target else None
+        things = [kinds.SimulatedPoints("T", BOX, 40, (0.1, 0.2, 0.3, 900, 0, 0), u=0.01, target=target, place=place)]
+    else:
+        things = [kinds.SimulatedSphere("ball", (350, 100, 300), 100.0, 40, certified=False)]
+    capture = aj.simulate(paper_arm, sockets, poses=8, observations=things, seed=2)
+    chosen = aj.Parameters.independent(paper_arm, capture)
+    assert set(chosen.names) == set(aj.Parameters.free_of(paper_arm).names) - fixed
+    if certified:
+        assert aj.observability(paper_arm, capture, chosen).rank == len(chosen.names)
 
 
 def test_independent_parameters_of_a_straight_wrist():
