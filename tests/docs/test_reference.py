@@ -37,7 +37,6 @@ LONG = {
     "aj.bootstrap",
     "aj.calibrate_many",
     "aj.calibration.ComparedModels",
-    "aj.calibration.Sampled",
     "aj.compare_models",
     "aj.files.load_calibration",
     "aj.files.load_compared_models",
@@ -49,7 +48,6 @@ LONG = {
     "aj.kinematics.clearances",
     "aj.kinematics.solve_to_targets",
     "aj.model.repeatability",
-    "aj.monte_carlo",
     "aj.planning.KitPlan",
     "aj.planning.Motion",
     "aj.planning.Plan",
@@ -65,6 +63,8 @@ LONG = {
     "aj.uncertainty.Uncertainty",
     "aj.volumetric_uncertainty",
 }
+# More than 10 s: the fewest trials that they allow are 10,000.
+EXHAUSTIVE = {"aj.calibration.Sampled", "aj.monte_carlo"}
 
 
 def examples_of(name: str) -> list[doctest.Example]:
@@ -95,9 +95,13 @@ def study_namespace(namespace, tmp_path_factory) -> tuple[dict[str, object], Pat
     return found, folder / "study.h5"
 
 
-@pytest.mark.parametrize("name", [
-    pytest.param(name, marks=[pytest.mark.slow] if name in LONG or needs_a_study(name) else []) for name in NAMES
-])  # fmt: skip
+def marks(name: str) -> list[pytest.MarkDecorator]:
+    if name in EXHAUSTIVE:
+        return [pytest.mark.exhaustive]
+    return [pytest.mark.slow] if name in LONG or needs_a_study(name) else []
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in NAMES])
 def test_example_runs(name, namespace, request, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copy(DOCS / "reference" / "robot.urdf", tmp_path)
@@ -114,6 +118,10 @@ def test_example_runs(name, namespace, request, tmp_path, monkeypatch):
         found = doctest.DocTestRunner(optionflags=OPTIONS, verbose=False).run(test, out=report.append)
     plt.close("all")
     assert not found.failed, "".join(report)
+
+
+def test_names_that_take_long_exist():
+    assert NAMES.keys() >= LONG | EXHAUSTIVE
 
 
 def arguments_of(value) -> set[str]:
