@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..uncertainty.group_test import Block
 from ..uncertainty.residual_tests import Residuals
-from .group_equations import LEAST_U, Rows, residual_rms
+from .group_equations import LEAST_U, PRIOR, Rows, residual_rms
 from .length_consistency import lengths_of_sockets
 from .record import CalibrationRecord
 from .sensitivities import Sensitivities
@@ -80,6 +80,18 @@ def problem_of_poses(
     return SharedProblem(record, rows, left, sensitivities(), None)
 
 
+def scale_of_lengths(record: CalibrationRecord, relations: list[Block]) -> Block:
+    """That the lengths together say how large the arm is.
+
+    Residuals of sockets are in proportion to the arm: where all lengths are free, a smaller arm would take them away.
+    """
+    lengths = record.recording.capture.lengths
+    weights = np.array([float(length.value) / max(float(length.u), LEAST_U) for length in lengths])
+    block = next(block for block in relations if block.fixture != PRIOR)
+    shared = weights @ block.shared[: len(weights)] / np.linalg.norm(weights)
+    return Block(PRIOR, None, np.zeros(1), shared[None], np.zeros((1, 0)))
+
+
 def with_lengths(problem: SharedProblem, relations: list[Block]) -> SharedProblem:
     """The same with what lengths and certified values say, of all but the scale.
 
@@ -87,6 +99,8 @@ def with_lengths(problem: SharedProblem, relations: list[Block]) -> SharedProble
     """
     record, rows = problem.record, problem.rows
     blocks = [*(each.block("") for each in rows), *relations]
+    if record.observed is not None and record.recording.capture.lengths:
+        blocks.append(scale_of_lengths(record, relations))
     values = np.array([float(length.value) for length in record.recording.capture.lengths])
     if record.observed is not None:
         u = np.maximum([float(length.u) for length in record.recording.capture.lengths], LEAST_U)

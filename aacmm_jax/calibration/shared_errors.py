@@ -42,7 +42,7 @@ from .model_errors import weighted_by_loss
 from .record import record_of
 from .results import Calibration
 from .sensitivities import Sensitivities
-from .shared_equations import SharedProblem, problem_of_poses, usual_deviations, with_lengths
+from .shared_equations import SharedProblem, problem_of_poses, scale_of_lengths, usual_deviations, with_lengths
 
 _GATE = 0.1  # probability of a test below which an effect is looked at
 _MODEL = "gravity,gear,harmonics=1-3"  # functions that joints may follow
@@ -50,6 +50,9 @@ _MODEL = "gravity,gear,harmonics=1-3"  # functions that joints may follow
 # alike in all, which poses do not show.
 _LENGTHS, _PART = (2.0, 5.0, 15.0), 3
 _MOST_PATTERNS = 8  # of successive poses of one socket: slower ones matter, faster ones are like noise
+# Part of the residuals of poses that errors of places explain by the size of the arm alone: residuals of sockets are in
+# proportion to it. So much is no error of places, of which poses say nothing.
+_MOST_OF_POSES = 0.5
 _NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are alike
 _FEWEST = 6  # degrees of freedom
 
@@ -93,7 +96,10 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
     rows, relations = equations_in_chunks(record)
     if not rows or residual_rms(rows) < EXACT:
         return None
-    of_poses = problem_of_poses(record, rows, [block for block in relations if block.fixture == PRIOR], sensitivities)
+    known = [block for block in relations if block.fixture == PRIOR]
+    if record.observed is not None and capture.lengths:
+        known.append(scale_of_lengths(record, relations))
+    of_poses = problem_of_poses(record, rows, known, sensitivities)
     if of_poses.left.degrees_of_freedom < _FEWEST:
         return None
     problem = with_lengths(of_poses, relations)
@@ -306,6 +312,10 @@ def _places(problem: SharedProblem, effects: Effects) -> _Tips:
     values, vectors = np.linalg.eigh(information)
     known = values > NULL * max(values.max(initial=0.0), 1e-300)
     if not known.any():
+        return nothing
+    by_poses = np.where(np.arange(len(r))[:, None] < sum(each.residual.size for each in problem.rows), r, 0.0)
+    explained = np.sum((vectors[:, known].T @ effects.product(columns, by_poses)[:, 0]) ** 2 / values[known])
+    if explained > _MOST_OF_POSES * float(effects.product(by_poses, by_poses)[0, 0]):
         return nothing
     square = float(np.sum((vectors[:, known].T @ effects.product(columns, r)[:, 0]) ** 2 / values[known]))
     number, spare = int(known.sum()), effects.left.degrees_of_freedom - int(known.sum())
