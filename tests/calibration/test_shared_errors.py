@@ -1,6 +1,7 @@
 """Errors that poses share are found, and widen the uncertainty; clean calibrations stay as they are."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -259,3 +260,18 @@ def test_default_prior_of_missing_functions_has_every_group(poses):
     wider = with_further_corrections(arm, names)
     assert missing_functions(wider) == ()
     assert set(default_prior(wider).groups) == {"lengths", "angles", "gravity", "gear", "harmonics=1", "harmonics=2-3"}
+
+
+@pytest.mark.slow
+def test_sessions_with_tips_of_their_own_keep_their_noise():
+    """Where all lengths are free, a smaller arm takes residuals of sockets away, which are in proportion to it."""
+    examples = Path(__file__).resolve().parents[2] / "examples" / "mukca"
+    sessions = {name: aj.files.read_manifest(examples / f"{name}.toml") for name in ("panda_3", "panda_3_bis")}
+    both = aj.join_sessions({name: each.capture for name, each in sessions.items()})
+    nominal = sessions["panda_3"].nominal
+    result = aj.calibrate(nominal.arm, both, nominal.bounds())
+    record = aj.calibration.record_of(result, aj.Recording(both, nominal))
+    for _, rms, alone in aj.calibration.session_metrics(record).values():
+        assert 0.8 * rms < alone <= rms
+    assert {"successive poses"} <= set(result.shared.kinds)
+    assert 0.3 < aj.uncertainty_of(result).length(both.q[:20], both.q[-20:]).max() * 2 < 10

@@ -518,7 +518,7 @@ def test_a_fixed_length_says_so(record):
     square = {name: np.delete(np.delete(getattr(record, name), i, 0), i, 1) for name in ("covariance", "open")}
     names = tuple(name for name in record.names if name != "probe_z")
     text = dcc_xml(
-        record._replace(names=names, held=(*record.held, "probe_z"), **fewer, **square),
+        record._replace(names=names, held=(*record.held, "probe_z"), shared=None, **fewer, **square),
         AdministrativeData(),
         created=CREATED,
     )

@@ -24,6 +24,7 @@ def pools_built_once():
             built[key] = build(study, *fixture)
         return built[key]
 
+    built_once.cache_clear = build.cache_clear
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(configuration_pool, "_fixture_table", built_once)
         yield build
