@@ -153,8 +153,8 @@
       container.dataset.tilt = view.tilt.toFixed(3);
       container.dataset.drawn = "yes";
     }
-    // Names beside their marks, from the top down, each in the first free place around its mark; where there is none, the
-    // mark has no name but is drawn.
+    // Names beside their marks, from the top down, each in the first free place around its mark;
+    // where there is none, the mark has no name but is drawn.
     function label(projected, width, height) {
       const taken = projected.map(([, x, y]) => [x - 7, y - 7, x + 7, y + 7]), line = 16;
       const free = (box) => box[0] >= 2 && box[1] >= 2 && box[2] <= width - 2 && box[3] <= height - 2 &&
