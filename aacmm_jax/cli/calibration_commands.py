@@ -131,7 +131,8 @@ def calibrate(
         typer.Option(
             help="Calibrate once without each placement, station or other group of what was observed, or each region "
             "of joint space where all is one group, and test the result there. "
-            "Default: yes, for a recorded capture with several placements of the reference length."
+            "Default: yes, for a recorded capture with several placements of the reference length, where neither "
+            "--model, --prior nor --robust is given."
         ),
     ] = None,
     leave_out: Annotated[

@@ -10,6 +10,8 @@ from ..calibration.left_out import LEVEL
 from ..core.text import shorten
 from .tables import two_digits
 
+_LARGER = 1.25  # times what is predicted: less is as good as predicted
+
 
 class Verdict(NamedTuple):
     """A mark and a sentence."""
@@ -135,4 +137,6 @@ def _without_limits(summary: Mapping[str, Any]) -> Verdict:
         rms += f", and lengths err by {ratio:.2g} times what is predicted"
     if any(chance < LEVEL / len(chances) for chance in chances):
         return Verdict("unsure", f"The calibration does not hold here: {rms}.")
+    if max(found / expected if expected else 0.0, ratio or 0.0) > _LARGER:
+        return Verdict("unsure", f"Errors on unseen data are larger than predicted, but may be so by chance: {rms}.")
     return Verdict("neutral", f"The calibration holds on unseen data: {rms}. No limit was given.")
