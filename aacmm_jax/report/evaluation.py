@@ -191,18 +191,19 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
 
 def _test_table(test: dict[str, Any], before: bool, limited: bool) -> ReportTable:
     """One acceptance test; ``before``: with columns of the arm as found; ``limited``: with limits and decisions."""
-    columns = ["metric", *(["decision as left" if before else "decision"] if limited else [])]
-    columns += ["as left" if before else "value", "U", *(["MPE"] if limited else [])]
-    columns += ["as found", *(["decision as found"] if limited else [])] if before else []
+    # Decisions first: on a telephone, what stands behind them is off the screen.
+    decisions = ["decision as left", "decision as found"] if before else ["decision"]
+    columns = ["metric", *(decisions if limited else []), "as left" if before else "value", "U"]
+    columns += [*(["MPE"] if limited else []), *(["as found"] if before else [])]
     rows = []
     for metric in test["figures"]:
         row, decimals = [text_cell(metric["symbol"])], decimals_for(metric["expanded_mm"])
-        row += [_decision(metric["decision"], metric["failing"], len(metric["parts"]))] if limited else []
+        if limited:
+            row.append(_decision(metric["decision"], metric["failing"], len(metric["parts"])))
+            row += [_decision(metric["as_found_decision"])] if before else []
         row += [number_cell(metric["value_mm"], decimals), _expanded(metric["expanded_mm"])]
         row += [number_cell(metric["limit_mm"])] if limited else []
-        if before:
-            row.append(number_cell(metric["as_found_mm"], decimals))
-            row += [_decision(metric["as_found_decision"])] if limited else []
+        row += [number_cell(metric["as_found_mm"], decimals)] if before else []
         rows.append([*row, text_cell(metric["where"]), text_cell(METRICS[metric["name"]])])
     caption = f"{test['called']}: {test['title']} [mm]"
     return ReportTable(caption, (*columns, "worst at", "what it is"), rows)
