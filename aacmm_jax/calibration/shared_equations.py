@@ -99,8 +99,6 @@ def with_lengths(problem: SharedProblem, relations: list[Block]) -> SharedProble
     """
     record, rows = problem.record, problem.rows
     blocks = [*(each.block("") for each in rows), *relations]
-    if record.observed is not None and record.recording.capture.lengths:
-        blocks.append(scale_of_lengths(record, relations))
     values = np.array([float(length.value) for length in record.recording.capture.lengths])
     if record.observed is not None:
         u = np.maximum([float(length.u) for length in record.recording.capture.lengths], LEAST_U)

@@ -50,8 +50,8 @@ _MODEL = "gravity,gear,harmonics=1-3"  # functions that joints may follow
 # alike in all, which poses do not show.
 _LENGTHS, _PART = (2.0, 5.0, 15.0), 3
 _MOST_PATTERNS = 8  # of successive poses of one socket: slower ones matter, faster ones are like noise
-# Part of the residuals of poses that errors of places explain by the size of the arm alone: residuals of sockets are in
-# proportion to it. So much is no error of places, of which poses say nothing.
+# Part of the residuals of poses above which the size of the arm explains them, to which residuals of sockets are in
+# proportion: parameters, or errors of places, of which poses say nothing.
 _MOST_OF_POSES = 0.5
 _NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are alike
 _FEWEST = 6  # degrees of freedom
@@ -97,9 +97,11 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
     if not rows or residual_rms(rows) < EXACT:
         return None
     known = [block for block in relations if block.fixture == PRIOR]
-    if record.observed is not None and capture.lengths:
-        known.append(scale_of_lengths(record, relations))
     of_poses = problem_of_poses(record, rows, known, sensitivities)
+    whole = sum(float(np.sum(each.residual**2)) for each in rows)
+    if record.observed is not None and capture.lengths and of_poses.left.cost < _MOST_OF_POSES * whole:
+        relations = [*relations, scale_of_lengths(record, relations)]
+        of_poses = problem_of_poses(record, rows, [*known, relations[-1]], sensitivities)
     if of_poses.left.degrees_of_freedom < _FEWEST:
         return None
     problem = with_lengths(of_poses, relations)
