@@ -275,3 +275,13 @@ def test_sessions_with_tips_of_their_own_keep_their_noise():
         assert 0.8 * rms < alone <= rms
     assert {"successive poses"} <= set(result.shared.kinds)
     assert 0.3 < aj.uncertainty_of(result).length(both.q[:20], both.q[-20:]).max() * 2 < 10
+
+
+@pytest.mark.slow
+def test_lengths_of_a_real_arm_are_predicted_as_large_as_they_err():
+    """Three placements of 50 mm, each left out: errors 0.066 mm, predicted 0.096."""
+    examples = Path(__file__).resolve().parents[2] / "examples" / "mukca"
+    recording = aj.files.read_manifest(examples / "panda_3_bis.toml")
+    arm, bounds = recording.nominal.arm, recording.nominal.bounds()
+    found = aj.cross_validate(arm, recording.capture, bounds, method="joint", prior=default_prior(arm))
+    assert 0.6 * found.length_rms < found.length_u < 2.5 * found.length_rms
