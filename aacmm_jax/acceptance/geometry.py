@@ -126,8 +126,8 @@ class BarPositions(NamedTuple):
         kept: list[int] = []
         for i, (middle, direction) in enumerate(zip(self.middles, self.directions, strict=True)):
             along = np.abs(self.directions[kept] @ direction) > math.cos(_SAME_DIRECTION)
-            beside = np.linalg.norm(self.middles[kept] - middle, axis=1) < near
-            if not np.any(along & beside):
+            close = np.linalg.norm(self.middles[kept] - middle, axis=1) < near
+            if not np.any(along & close):
                 kept.append(i)
         return BarPositions(
             self.length, self.middles[kept], self.directions[kept], tuple(self.readings[i] for i in kept)
