@@ -1,6 +1,6 @@
 """The uncertainty of lengths against the number of poses: planned ones, and random ones in the same sockets.
 
-`python benchmarks/planned_poses.py` (two minutes of CPU) writes results/planned_poses.json and docs/planned_poses.png.
+`python benchmarks/planned_poses.py` (two minutes of CPU) writes results/planned_poses.json, which docs/figures.py draws.
 The arm is the simulated one of Cheng et al. 2018, with 2 arcsec and 5 um of noise, in four sockets with two reference
 lengths (u = 2 um) where a plan of 25 poses places them; lengths of 300 mm over the volume. Random poses are uniform in
 the joints and moved to the sockets; the median of sets of them is given.
@@ -40,32 +40,10 @@ def curves(sockets: int, seed: int) -> dict:
     return rows
 
 
-def figure(found: dict, path: Path) -> None:
-    import matplotlib.pyplot as plt
-
-    drawn, axes = plt.subplots(1, len(found), figsize=(5.5 * len(found), 3.6), squeeze=False, layout="constrained")
-    for ax, (title, rows) in zip(axes[0], found.items(), strict=True):
-        for name, colour in (("random", "#d95f02"), ("planned", "#1b3a6b")):
-            for what, line in (("largest", "-"), ("median", "--")):
-                mean = np.exp(np.mean([np.log(row[f"{name}, {what}"]) for row in rows], axis=0))
-                ax.plot(POSES, mean, line, color=colour, marker="o", markersize=3, label=f"{name}, {what}")
-        ax.set(title=title, xlabel="poses", xscale="log", yscale="log")
-        ticks = list(POSES)
-        ax.set_xticks(ticks, map(str, ticks), minor=False)
-        ax.set_xticks([], minor=True)
-        ax.set_yticks([4, 6, 8, 10, 15, 20, 30, 50], ["4", "6", "8", "10", "15", "20", "30", "50"], minor=False)
-        ax.set_yticks([], minor=True)
-        ax.grid(alpha=0.3)
-    axes[0][0].set_ylabel("standard uncertainty of 300 mm [um]")
-    axes[0][-1].legend(frameon=False)
-    drawn.savefig(path, dpi=110)
-
-
 def main() -> None:
     kinds = {"four sockets, two lengths": 4}
     found = {title: [curves(sockets, seed) for seed in SEEDS] for title, sockets in kinds.items()}
     (HERE / "results" / "planned_poses.json").write_text(json.dumps(found, indent=1) + "\n")
-    figure(found, HERE.parent / "docs" / "planned_poses.png")
     for title, rows in found.items():
         for key in rows[0]:
             means = np.exp(np.mean([np.log(row[key]) for row in rows], axis=0))

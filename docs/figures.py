@@ -1,5 +1,11 @@
-"""Draws the figures of the explanations as SVG that can be read on light and dark pages: python docs/figures.py."""
+"""Draws the figures of the pages as SVG, whose text is dark on light pages and light on dark ones.
 
+``python docs/figures.py [NAME ...]``; by default all of them.
+"""
+
+import io
+import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +19,12 @@ import aacmm_jax as aj
 DOCS = Path(__file__).resolve().parent
 EXAMPLES = DOCS.parent / "examples"
 GREY, BLUE, ORANGE = "#808080", "#3f88c5", "#e07a3f"  # each has a contrast of 3 and more on white and on Furo's dark
+# What is drawn in grey, text above all, takes the colour that is read best on the page.
+COLOURS = """<style>
+:root { --text: #4a4d54 }
+@media (prefers-color-scheme: dark) { :root { --text: #c9cbd0 } }
+</style>
+"""
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
 SOCKETS = {"A": (400, 200, 300), "B": (700, 500, 500)}
 MODELS = ("dh", "gravity", "harmonics=1", "gravity,harmonics=1", "functions", "gravity,functions")
@@ -39,7 +51,10 @@ def _axes(height: float = 3.0) -> Axes:
 
 def _save(axes: Axes, name: str) -> None:
     assert isinstance(axes.figure, Figure)
-    axes.figure.savefig(DOCS / "explanation" / f"{name}.svg", metadata={"Date": None})
+    drawn = io.StringIO()
+    axes.figure.savefig(drawn, format="svg", metadata={"Date": None})
+    text = drawn.getvalue().replace(GREY, "var(--text)").replace(" <defs>", COLOURS + " <defs>", 1)
+    (DOCS / f"{name}.svg").write_text(text, encoding="utf-8")
 
 
 def _capture(true: aj.Arm, seed: int, poses: dict[str, int]) -> aj.Capture:
@@ -77,7 +92,7 @@ def scale() -> None:
     axes.axvline(1.0, color=GREY, linewidth=1)
     axes.set_yticks((0, 1), ("scale anchor d_3", "all lengths free"))
     axes.set(xlabel="k after stage 1 (1 is right)", ylim=(-0.5, 1.5))
-    _save(axes, "scale")
+    _save(axes, "explanation/scale")
     print({hold: (np.mean(values), np.min(values), np.max(values)) for hold, values in found.items()})
 
 
@@ -101,7 +116,7 @@ def method() -> None:
         )
     axes.set(xlabel="pose in socket A", ylabel="distance from centroid [mm]", yscale="log")
     axes.legend(loc="center right")
-    _save(axes, "method")
+    _save(axes, "explanation/method")
 
 
 def uncertainty() -> None:
@@ -116,7 +131,7 @@ def uncertainty() -> None:
         axes.plot(U, np.linspace(0, 100, len(U)), color=BLUE, linestyle=style, linewidth=2, label=f"{poses} poses")
     axes.set(xlabel="U (95 %) of a length of 300 mm [um]", ylabel="lengths below it [%]", xlim=(0, 80))
     axes.legend(loc="lower right")
-    _save(axes, "uncertainty")
+    _save(axes, "explanation/uncertainty")
 
 
 def random_splits() -> None:
@@ -146,14 +161,35 @@ def random_splits() -> None:
     axes.set_xticks(places, [model.replace(",", ",\n") for model in MODELS])
     axes.set(ylabel="RMS error [mm]", ylim=(0, 1.35))
     axes.legend(loc="upper center", ncols=2)
-    _save(axes, "random_splits")
+    _save(axes, "explanation/random_splits")
+
+
+def planned_poses() -> None:
+    """What `benchmarks/planned_poses.py` has stored: u of a length against the number of poses."""
+    stored = json.loads((DOCS.parent / "benchmarks" / "results" / "planned_poses.json").read_text(encoding="utf-8"))
+    ((rows,),) = stored.values()
+    axes = _axes(3.6)
+    for name, colour, marker in (("random", ORANGE, "o"), ("planned", BLUE, "s")):
+        for what, line in (("largest", "-"), ("median", "--")):
+            values = rows[f"{name}, {what}"]
+            axes.plot(
+                rows["poses"], values, line, color=colour, marker=marker, markersize=4, label=f"{name} poses, {what}"
+            )
+    axes.set(xlabel="poses", ylabel="u of a length of 300 mm [um]", xscale="log", yscale="log")
+    axes.set_xticks(rows["poses"], [str(poses) for poses in rows["poses"]])
+    ticks = (4, 6, 8, 10, 15, 20, 30)
+    axes.set_yticks(ticks, [str(each) for each in ticks])
+    axes.minorticks_off()
+    axes.legend()
+    _save(axes, "planned_poses")
 
 
 def main() -> None:
-    """Draw them all."""
+    """Draw those that are named."""
+    every = {draw.__name__: draw for draw in (method, scale, uncertainty, random_splits, planned_poses)}
     with matplotlib.rc_context(STYLE):
-        for draw in (method, scale, uncertainty, random_splits):
-            draw()
+        for name in sys.argv[1:] or every:
+            every[name]()
 
 
 if __name__ == "__main__":

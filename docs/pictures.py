@@ -1,4 +1,4 @@
-"""Makes the README's pictures anew: python docs/pictures.py (needs Chromium for the report)."""
+"""Makes the pictures of README and site anew: python docs/pictures.py (needs Chromium for the report)."""
 
 import shutil
 import subprocess
@@ -10,6 +10,8 @@ DOCS = Path(__file__).resolve().parent
 MANIFEST = DOCS.parent / "examples" / "mukca" / "capture.toml"
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 QUIET = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--hide-scrollbars")
+
+SCHEMES = {"report.png": 1, "report-dark.png": 0}  # Chromium's numbers of light and dark
 
 
 def aacmm(folder: Path, *arguments: object) -> None:
@@ -30,11 +32,10 @@ def main() -> None:
         without = ("--without", "mid_left/*", "--without", "mid_right/*")
         aacmm(folder, "calibrate", "capture.h5", "-o", "calibration.h5", *without)
         aacmm(folder, "report", "calibration.h5", "-o", "report.html")
-        picture = f"--screenshot={DOCS / 'report.png'}"
-        page = (folder / "report.html").as_uri()
-        subprocess.run(
-            [chromium, *QUIET, "--window-size=1060,700", picture, page], check=True, capture_output=True, timeout=120
-        )
+        for name, scheme in SCHEMES.items():
+            picture, setting = f"--screenshot={DOCS / name}", f"--blink-settings=preferredColorScheme={scheme}"
+            command = [chromium, *QUIET, "--window-size=1060,700", setting, picture, (folder / "report.html").as_uri()]
+            subprocess.run(command, check=True, capture_output=True, timeout=120)
 
 
 if __name__ == "__main__":

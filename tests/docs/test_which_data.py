@@ -36,6 +36,7 @@ def test_the_table_is_of_the_stored_results(script: ModuleType) -> None:
         ("measuring", "two sockets, one certified length"),
         ("measuring", "three spheres of certified diameter, touched"),
         ("robot", "a tracker, its target anywhere on the flange"),
+        ("robot7", "two sockets, one certified length"),
         ("hobby", "a plate of six certified holes, in one place"),
     ],
 )
