@@ -2,11 +2,20 @@
 
 from docutils import nodes
 from latex2mathml.converter import convert
+from sphinx.util import logging
 from sphinx.util.docutils import SphinxTranslator
 
 
+def _converted(node, display: str) -> str:
+    """The MathML of a formula; a command that the converter does not know, which it leaves as it is, is warned of."""
+    found = convert(node.astext(), display=display)
+    if "\\" in found:
+        logging.getLogger(__name__).warning("a formula has a command that cannot be shown: %s", node.astext())
+    return found
+
+
 def _inline(translator: SphinxTranslator, node) -> None:
-    translator.body.append(convert(node.astext()))
+    translator.body.append(_converted(node, "inline"))
     raise nodes.SkipNode
 
 
@@ -16,7 +25,7 @@ def _block(translator: SphinxTranslator, node) -> None:
         translator.body.append(f'<span class="eqno">({node["number"]})')
         translator.add_permalink_ref(node, "Link to this equation")
         translator.body.append("</span>")
-    translator.body.append(convert(node.astext(), display="block") + "</div>\n")
+    translator.body.append(_converted(node, "block") + "</div>\n")
     raise nodes.SkipNode
 
 
