@@ -177,7 +177,7 @@ def planned_poses() -> None:
             )
     axes.set(xlabel="poses", ylabel="u of a length of 300 mm [um]", xscale="log", yscale="log")
     axes.set_xticks(rows["poses"], [str(poses) for poses in rows["poses"]])
-    ticks = (4, 6, 8, 10, 15, 20, 30)
+    ticks = (4, 6, 8, 10, 15, 20, 30, 50)
     axes.set_yticks(ticks, [str(each) for each in ticks])
     axes.minorticks_off()
     axes.legend()
