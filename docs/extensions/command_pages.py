@@ -1,6 +1,7 @@
 """The reference of the command line: what every command's ``--help`` says, as a page."""
 
 import inspect
+import re
 from importlib import import_module
 from pathlib import Path
 from typing import get_args
@@ -38,12 +39,19 @@ def _help(text: str) -> str:
             title, *lines = paragraph.splitlines()[1:]
             parts.append("\n".join([title, "", "```text", *(line.strip() for line in lines), "```"]))
         else:
-            parts.append(paragraph)
+            parts.append(_options_as_code(paragraph))
     return "\n\n".join(parts)
 
 
+def _options_as_code(text: str) -> str:
+    """Options in code type, in which two hyphens are no dash."""
+    return re.sub(r"(?<![`\w-])--[a-z][a-z-]*[a-z]", r"`\g<0>`", text)
+
+
 def _escaped(text: str) -> str:
-    return text.replace("|", r"\|").replace("*", r"\*").replace("_", r"\_").replace("<", r"\<").replace("[", r"\[")
+    for character in "|*_<[":
+        text = text.replace(character, "\\" + character)
+    return _options_as_code(text)
 
 
 def _choices(parameter) -> str:
