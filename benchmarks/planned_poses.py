@@ -1,6 +1,6 @@
 """The uncertainty of lengths against the number of poses: planned ones, and random ones in the same sockets.
 
-`python benchmarks/planned_poses.py` (two minutes of CPU) writes results/planned_poses.json, which docs/figures.py draws.
+`python benchmarks/planned_poses.py` (two minutes of CPU) writes results/planned_poses.json; docs/figures.py draws it.
 The arm is the simulated one of Cheng et al. 2018, with 2 arcsec and 5 um of noise, in four sockets with two reference
 lengths (u = 2 um) where a plan of 25 poses places them; lengths of 300 mm over the volume. Random poses are uniform in
 the joints and moved to the sockets; the median of sets of them is given.
