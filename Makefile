@@ -27,6 +27,8 @@ install = $(if $(UV),$(UV) pip install --quiet --python $(1)/bin/python $(2) || 
 PYTEST := -m pytest -n auto --max-worker-restart 0 --dist loadscope --no-loadscope-reorder
 # Tests compile without XLA's optimisations (see tests/__init__.py), except where the variable is set, be it empty.
 OPTIMISED := XLA_FLAGS=
+# The others would be collected for nothing, in 7 s of CPU for each worker.
+OPTIMISED_FILES = $(shell grep -rlw --include "test_*.py" mark.optimised tests)
 # Numerics, differentiation, storage and the command line on real captures: what a change of a dependency breaks first.
 SELECTION := tests/test_package.py tests/kinematics --ignore=tests/kinematics/test_reading_check.py tests/solver \
 	tests/calibration/test_single.py tests/files/test_storage.py tests/test_real_captures.py
@@ -49,11 +51,11 @@ test: .venv/.test
 
 test-slow: .venv/.test
 	AACMM_TYPES=0 $(BIN)/python $(PYTEST) -m "slow and not optimised and not exhaustive"
-	AACMM_TYPES=0 $(OPTIMISED) $(BIN)/python $(PYTEST) -m "optimised and not exhaustive"
+	AACMM_TYPES=0 $(OPTIMISED) $(BIN)/python $(PYTEST) -m "optimised and not exhaustive" $(OPTIMISED_FILES)
 
 test-exhaustive: .venv/.test
 	$(BIN)/python $(PYTEST) -m "(exhaustive or slow) and not optimised"
-	$(OPTIMISED) $(BIN)/python $(PYTEST) -m "(exhaustive or slow) and optimised"
+	$(OPTIMISED) $(BIN)/python $(PYTEST) -m "(exhaustive or slow) and optimised" $(OPTIMISED_FILES)
 	AACMM_EXAMPLES=10 $(OPTIMISED) $(BIN)/python $(PYTEST) -m "hypothesis and not slow"
 
 test-newest: install-newest

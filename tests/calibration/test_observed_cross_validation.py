@@ -35,7 +35,7 @@ def true(space):
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=pytest.mark.slow if case in ("kinds", "placements") else ()) for case in CASES]
+    "case", [pytest.param(case, marks=pytest.mark.slow if case != "region" else ()) for case in CASES]
 )
 def test_honest_data_err_as_predicted(paper_arm, true, bounds, case):
     capture = aj.simulate(true, {}, observations=CASES[case], noise=NOISE, seed=3)

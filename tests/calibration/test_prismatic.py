@@ -76,7 +76,7 @@ def test_a_linear_axis_that_stands_still_says_nothing():
         aj.calibrate(space.base, capture, aj.Bounds.around(space.base, space))
 
 
-@pytest.mark.parametrize("name", ["gantry", "linear axis"])
+@pytest.mark.parametrize("name", ["gantry", pytest.param("linear axis", marks=pytest.mark.slow)])
 def test_slides_fix_the_scale_without_a_reference_length(name):
     """All lengths come out in the mm of the slides: a reference length of the capture agrees to its uncertainty."""
     space, true, capture = simulated(name)

@@ -32,7 +32,7 @@ def calibrated(arm, bounds, simulated, sockets=(), lengths=(), **options):
 
 
 @pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=() if kind in ("spheres", "planes") else pytest.mark.slow) for kind in SIMULATED]
+    "kind", [pytest.param(kind, marks=() if kind == "spheres" else pytest.mark.slow) for kind in SIMULATED]
 )
 def test_residuals_scatter_as_the_weights_say(paper_arm, bounds, kind):
     """Whitened residuals of drawn data, by the arm and the geometry about which they are drawn, have variance 1."""

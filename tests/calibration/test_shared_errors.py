@@ -73,9 +73,9 @@ def volume(poses):
 @pytest.mark.parametrize(
     ("method", "made", "kind", "low", "high"),
     [
-        ("two-stage", {"shift": 0.02, "marked": True}, "visits", 0.012, 0.03),
+        pytest.param("two-stage", {"shift": 0.02, "marked": True}, "visits", 0.012, 0.03, marks=pytest.mark.slow),
         ("joint", {"shift": 0.02}, "successive poses", 0.012, 0.04),
-        ("joint", {"shift": 0.02, "visit": POSES}, "places", 0.01, 0.05),
+        pytest.param("joint", {"shift": 0.02, "visit": POSES}, "places", 0.01, 0.05, marks=pytest.mark.slow),
         ("two-stage", {"error": eccentric}, "harmonics=1", 3 * aj.units.ARCSEC, 15 * aj.units.ARCSEC),
     ],
 )

@@ -113,7 +113,7 @@ def test_all_outputs_or_none(aacmm, inputs, monkeypatch, failing):
     else:
         replace = os.replace
         monkeypatch.setattr(os, "replace", lambda a, b: refused() if str(b).endswith(".png") else replace(a, b))
-    for output in ("old.h5", "new.h5"):
+    for output in ("old.h5",) if failing == "figure" else ("old.h5", "new.h5"):
         done = aacmm("calibrate", "c.h5", "-o", output, "--figure", "f.png", expect=2)
         assert "f.png cannot be written: no space left on device" in done.stderr
         assert content(inputs) == before

@@ -198,8 +198,13 @@ def test_unwritable_place(tmp_path, good, what, place, reason):
 )
 @pytest.mark.parametrize(
     ("what", "step"),
-    # An arm's text is built before any file is touched.
-    [(what, step) for what in WRITERS for step in ("build", "write", "replace") if (what, step) != ("arm", "build")],
+    # An arm's text is built before any file is touched. A capture is written as a calibration is, and sooner.
+    [
+        pytest.param(what, step, marks=pytest.mark.slow if what == "calibration" and step != "replace" else ())
+        for what in WRITERS
+        for step in ("build", "write", "replace")
+        if (what, step) != ("arm", "build")
+    ],
 )
 def test_failure_midway_changes_nothing(tmp_path, monkeypatch, good, what, step, error, existing):
     path = tmp_path / "out"

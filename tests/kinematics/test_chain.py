@@ -90,7 +90,11 @@ def test_the_tips_and_columns_of_a_batch_are_those_of_the_loop(beta, prismatic):
 
 @pytest.mark.parametrize(
     ("joints", "prismatic"),
-    [(2, ()), (7, ()), (4, (1, 3)), *(pytest.param(n, (), marks=pytest.mark.exhaustive) for n in (3, 4, 5, 6, 8, 9))],
+    [
+        (4, (1, 3)),
+        *(pytest.param(n, (), marks=pytest.mark.slow) for n in (2, 7)),
+        *(pytest.param(n, (), marks=pytest.mark.exhaustive) for n in (3, 4, 5, 6, 8, 9)),
+    ],
 )
 def test_jacobian_is_jax_own_differentiation(joints, prismatic):
     """Analytic columns; JAX's forward and reverse modes through the custom rule; and the plain chain: all equal."""

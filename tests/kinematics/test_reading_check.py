@@ -104,10 +104,10 @@ def test_number_of_changes(order, signs, offsets, changes):
 @pytest.mark.parametrize(
     ("order", "signs", "offsets"),
     [
-        (PLAIN, (1,) * 7, NONE),
+        pytest.param(PLAIN, (1,) * 7, NONE, marks=pytest.mark.slow),
         pytest.param(PLAIN, (1, 1, -1, 1, 1, 1, 1), NONE, marks=pytest.mark.slow),
         ((0, 1, 2, 3, 5, 4, 6), (1, 1, -1, 1, 1, 1, 1), (0, np.pi / 2, 0, 0, 0, 0, 0)),
-        (PLAIN, (1,) * 7, (0, 0, 0, 37 * DEG, 0, 0, 0)),
+        pytest.param(PLAIN, (1,) * 7, (0, 0, 0, 37 * DEG, 0, 0, 0), marks=pytest.mark.slow),
     ],
 )
 def test_mistakes_in_a_recorded_capture(panda, few, order, signs, offsets):

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.study import configuration_pool
+from aacmm_jax.study import configuration_pool, runner
 
+from . import prepared_blocks
 from .small_study import CHUNK, SPECIFICATION
 
 
@@ -55,3 +56,11 @@ def prepared(home, tmp_path):
         return {"program": program, "env": {name: str(value) for name, value in environment.items()}}
 
     return options
+
+
+@pytest.fixture
+def read_blocks(home, monkeypatch):
+    """Blocks are read from the finished study, where what is tested is how they are kept."""
+    for name, value in {"WHOLE": home / "whole.h5", "SECONDS": 0, "STARTED": home / "started"}.items():
+        monkeypatch.setenv(name, str(value))
+    monkeypatch.setattr(runner, "run_block", prepared_blocks.prepared)

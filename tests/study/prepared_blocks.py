@@ -20,10 +20,9 @@ def prepared(study, block, **_) -> dict[str, np.ndarray]:
         return {name: whole["trials"][name][block.slices] for name in runner.store.VARIABLES}
 
 
-runner.run_block = prepared
-runner.check_reach = lambda study: None
-
 if __name__ == "__main__":
+    runner.run_block = prepared
+    runner.check_reach = lambda study: None
     from aacmm_jax.cli import main
 
     main()

@@ -78,7 +78,7 @@ def until(condition, process: subprocess.Popen) -> None:
     """Wait until something is so, or the process has ended."""
     deadline = time.monotonic() + 600
     while process.poll() is None and time.monotonic() < deadline and not condition():
-        time.sleep(0.002)
+        time.sleep(0.02)  # to look more often would take a second of CPU
 
 
 def until_parts(path: Path, count: int, process: subprocess.Popen) -> None:

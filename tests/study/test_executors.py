@@ -27,7 +27,10 @@ def processes():
         yield executor
 
 
-def test_local_processes_write_the_same_study(home, study, tmp_path, processes):
+@pytest.mark.parametrize("blocks", ["read", pytest.param("computed", marks=pytest.mark.slow)])
+def test_local_processes_write_the_same_study(home, study, tmp_path, processes, blocks):
+    """Also where blocks are read there: to trace their programs in a fresh process takes seconds."""
+    processes.submit(worker_tasks.take_blocks, home / "whole.h5" if blocks == "read" else None).result()
     outcome = aj.study.run_study(study, tmp_path / "s.h5", executor=processes, workers=1, chunk=CHUNK, shards=True)
     assert outcome.ran == 96
     same(home / "whole.h5", tmp_path / "s.h5")
@@ -183,8 +186,10 @@ def test_an_executor_that_forks_is_refused(study, tmp_path):
         aj.study.run_study(study, tmp_path / "t.h5", executor=pool)
 
 
-def test_nobody_answers(aacmm, home):
-    pytest.importorskip("distributed")
+def test_nobody_answers(aacmm, home, monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    client = distributed.Client
+    monkeypatch.setattr(distributed, "Client", lambda **given: client(**given | {"timeout": given["timeout"] / 10}))
     done = aacmm("study", home / "spec.toml", "-o", "s.h5", "--dask", "tcp://127.0.0.1:1", expect=2)
     assert done.stderr.count("\n") == 1
     assert "no Dask scheduler answers at tcp://127.0.0.1:1; start one, or use --dask local" in done.stderr

@@ -15,13 +15,14 @@ from tests.refusals import assert_refused
 from .small_study import CHUNK, NOISE, REFERENCE, made
 
 matplotlib.use("Agg")
+TRIALS = 24
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     study = made(
         name="a study",
-        trials=64,
+        trials=TRIALS,
         seed=5,
         noise=NOISE,
         reference=REFERENCE | {"u_mm": 0.002},
@@ -146,7 +147,7 @@ def test_factors_are_named_in_words(name, level, text):
 def test_summary_says_what_the_arrays_say(path, summary):
     data = aj.study.open_study(path)
     assert summary["factors"] == {"bounds.length_mm": [0.5, 5.0], "bounds.length_shift_mm": [0.0, 1.0]}
-    assert summary["trials_run"] == 4 * 64
+    assert summary["trials_run"] == 4 * TRIALS
     cell = summary["results"][3]
     assert cell["factors"] == {"bounds.length_mm": 5.0, "bounds.length_shift_mm": 1.0}
     picked = data.sel(bounds_length_mm=5.0, bounds_length_shift_mm=1.0).squeeze()
@@ -182,7 +183,7 @@ def test_labelled_data(path):
     data = aj.study.open_study(path)
     assert data.estimate.dims == ("cell", "trial", "parameter")
     grid = data[["k", "length_error"]].unstack("cell")
-    assert grid.sizes == {"trial": 64, "bounds_length_mm": 2, "bounds_length_shift_mm": 2}
+    assert grid.sizes == {"trial": TRIALS, "bounds_length_mm": 2, "bounds_length_shift_mm": 2}
     assert data.length_error.attrs["units"] == "mm"
     assert data.attrs["seed"] == 5
     assert data.attrs["finished"]
@@ -202,7 +203,7 @@ def test_a_study_that_has_just_begun_is_shown(aacmm, study, tmp_path):
 
 def test_the_terminal_shows_all_of_it(path, aacmm):
     done = aacmm("show", path)
-    assert "a study of Cheng 2018, simulated arm: 4 cells of 64 trials, seed 5" in done.stdout
+    assert f"a study of Cheng 2018, simulated arm: 4 cells of {TRIALS} trials, seed 5" in done.stdout
     for heading in ("converged", "on a bound", "Deltam [mm]", "angle error", "95 %"):
         assert heading in done.stdout
     one = aacmm("show", path, "--cell", 2)

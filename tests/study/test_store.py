@@ -90,6 +90,7 @@ def test_stopped_is_resumed(home, study, tmp_path):
     assert aj.study.run_study(study, path).ran == 0
 
 
+@pytest.mark.usefixtures("read_blocks")
 def test_a_second_run_at_the_same_time_is_refused(study, tmp_path):
     refused = []
 
@@ -347,6 +348,7 @@ def test_reading_needs_no_more_files_than_one(home, study, tmp_path):
     assert "more files than this process may open" in done.stderr
 
 
+@pytest.mark.usefixtures("read_blocks")
 def test_a_worker_that_fails_stops_the_study_and_keeps_the_rest(study, tmp_path, monkeypatch):
     real = runner.run_block
 

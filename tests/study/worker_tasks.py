@@ -7,6 +7,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+from aacmm_jax.study import runner, trials
+
+from . import prepared_blocks
+
 
 def die_once(marker: Path) -> str:
     if marker.exists():
@@ -17,6 +21,13 @@ def die_once(marker: Path) -> str:
 
 def die(_: object) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def take_blocks(whole: Path | None) -> None:
+    """Blocks of this process are read from a finished study from now on, or computed."""
+    runner.run_block = prepared_blocks.prepared if whole else trials.run_block
+    if whole:
+        os.environ.update(WHOLE=str(whole), SECONDS="0", STARTED=str(whole.with_name("started")))
 
 
 def misses() -> list[str]:
