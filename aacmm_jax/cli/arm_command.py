@@ -45,8 +45,8 @@ def arm(
         typer.Option(
             metavar="POSES",
             help="Compare readings with the arm: a manifest (TOML), a capture (HDF5), or a table (CSV) with columns "
-            "q_1, q_2, ... and, where the tip was, x, y, z (mm) with or without qw, qx, qy, qz or rx, ry, rz; without "
-            "positions its poses are of one socket, or of those that a column socket names.",
+            "q_1, q_2, ... and, where the tip was, x, y, z (mm, or as the header says) with or without qw, qx, qy, qz "
+            "or rx, ry, rz; without positions its poses are of one socket, or of those that a column socket names.",
         ),
     ] = None,
     unit: Annotated[
@@ -182,7 +182,7 @@ def _survey(
 
 
 def _check(specification: Any, path: Path, unit: str | None, as_json: bool) -> None:
-    from ..files.angles import angles_toml
+    from ..files.angles import angles_toml, positions_unit, units_toml
     from ..summaries.reading_check import reading_check_summary
     from . import arm_display
 
@@ -192,11 +192,14 @@ def _check(specification: Any, path: Path, unit: str | None, as_json: bool) -> N
             raise InputError(f"--unit is for a table, but {path} says the unit of its readings; leave it out.")
         manifest = path if path.suffix.lower() == ".toml" else None
         found = _of_capture(specification, path)
-        taken = None if manifest is not None else "rad"
+        taken, positions = None if manifest is not None else "rad", positions_unit(manifest)
     else:
-        found, taken = _of_table(specification, path, unit)
-    summary = reading_check_summary(found, specification.name, unit=taken)
-    summary["angles"] = angles_toml(found.best, taken, manifest) if found.explained and not found.fits else None
+        found, taken, positions = _of_table(specification, path, unit)
+    best = found.best
+    summary = reading_check_summary(found, specification.name, unit=taken, positions=positions)
+    angles = found.explained and (best.hypothesis.changes or best.angle != 1)
+    summary["angles"] = angles_toml(best, taken, manifest) if angles else None
+    summary["units"] = units_toml(best, positions) if found.explained else None
     show_summary(summary, as_json, arm_display.check)
     if not found.explained:
         raise typer.Exit(1)
@@ -217,7 +220,7 @@ def _of_capture(specification: Any, path: Path) -> Any:
     return with_spinner("Comparing", lambda: check_capture(specification.arm, recording.capture))
 
 
-def _of_table(specification: Any, path: Path, unit: str | None) -> tuple[Any, str]:
+def _of_table(specification: Any, path: Path, unit: str | None) -> tuple[Any, str, str]:
     import numpy as np
 
     from ..files.commanded_poses import read_known_poses
@@ -238,7 +241,7 @@ def _of_table(specification: Any, path: Path, unit: str | None) -> tuple[Any, st
             specification.arm, known.q, sockets=known.sockets, positions=positions, rotations=rotations
         ),
     )
-    return found, known.unit
+    return found, known.unit, known.length_unit
 
 
 def _probe(text: str | None) -> tuple[float, float, float] | None:

@@ -90,6 +90,8 @@ def check(summary: dict[str, Any]) -> None:
     console = new_console()
     colour = "green" if summary["fits"] else "yellow" if summary["explained"] else "red"
     console.print(f"[{colour}]{escape(summary['sentence'])}[/{colour}]")
+    if summary["tip"]:
+        console.print(escape(summary["tip"]))
     if summary["unit"] is not None:
         console.print(f"Readings were taken to be in {summary['unit']}.")
     outside = (summary["found"] or summary["given"])["readings_outside_limits"]
@@ -98,6 +100,9 @@ def check(summary: dict[str, Any]) -> None:
     words = alternatives_sentence(summary["alternatives"], summary["known_positions"])
     if words:
         console.print(escape(words))
+    if summary["units"] is not None:
+        console.print("\nIn the manifest, in the table of the measured positions:")
+        console.print(escape(summary["units"]), end="")
     if summary["angles"] is not None:
         console.print("\nIn the manifest:")
         console.print(escape(summary["angles"]), end="")
