@@ -11,6 +11,7 @@ from ..core.errors import InputError
 from ..core.text import number
 from .app import bad_option
 
+CONTEXT: Any = typer.Context.__base__  # what Typer passes: its own class is a subclass that nothing is of
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 PlanEncoderNoise = Annotated[
@@ -90,6 +91,35 @@ LinkRadius = Annotated[
         "--link-radius-mm", min=0, metavar="MM", help="Radius of capsules along the links, as the arm's body."
     ),
 ]
+
+
+# Options that each way of planning takes besides those of all: of a calibration with sockets, of one with a kit, and
+# of an acceptance test.
+_OF_ALL = {"arm", "output", "manifest", "base", "tip", "seed", "as_json", "angles", "margin_deg", "above_mm"}
+_OF_CALIBRATIONS = {
+    *("poses", "model", "held", "encoder_arcsec", "linear_encoder_mm", "seating_mm", "tool_axis", "retract_mm", "cell"),
+    *("collisions", "link_radius_mm", "unconstrained", "criterion", "region", "candidates", "check_length_mm"),
+    "farthest",
+}
+_OF_SOCKETS = {"sockets", "socket", "length", "length_mm", "u_mm", "cone_deg", "normal"}
+_OF_ACCEPTANCE = {"acceptance", "sphere_mm", "stylus_mm", "bar_mm", "range_mm"}
+
+
+def check_options(context: Any, kit: bool, acceptance: bool) -> None:
+    """Refuse options that the way of planning would ignore."""
+    taken = _OF_ACCEPTANCE if acceptance else _OF_CALIBRATIONS | ({"kit"} if kit else _OF_SOCKETS)
+    sources = {name: context.get_parameter_source(name) for name in context.params if name not in _OF_ALL | taken}
+    ignored = [
+        f"--{name.replace('_', '-')}" for name, source in sources.items() if source and source.name == "COMMANDLINE"
+    ]
+    if not ignored:
+        return
+    listed = " and ".join([", ".join(ignored[:-1]), ignored[-1]] if len(ignored) > 1 else ignored)
+    if acceptance:
+        raise InputError(f"--acceptance has its own poses, sockets and bars and ignores {listed}; leave out {listed}.")
+    if kit:
+        raise InputError(f"--kit names what is used and where it is, and ignores {listed}; leave out {listed}.")
+    raise InputError(f"{listed} {'is' if len(ignored) == 1 else 'are'} for acceptance tests; give --acceptance too.")
 
 
 class PlannedArm(NamedTuple):
