@@ -11,6 +11,7 @@ from ..core.text import number
 from ..files.inputs import InputFile
 from ..files.outputs import together
 from .app import BaseLink, Json, TipLink, app, bad_option, examples, show_summary, with_spinner
+from .plan_options import PlanEncoderNoise, PlanSeatingNoise, assumed_noise
 
 _CAPTURES = (".toml", ".h5")  # others are tables
 
@@ -59,24 +60,8 @@ def arm(
             metavar="FILE.png", help="Picture of the arm at zero readings, and of its reach (.png, .svg, .pdf)."
         ),
     ] = None,
-    encoder_arcsec: Annotated[
-        float | None,
-        typer.Option(
-            "--encoder-arcsec",
-            min=0,
-            metavar="ARCSEC",
-            help="Standard deviation of a joint reading. Default: that of a measuring arm (2) and of a robot (10).",
-        ),
-    ] = None,
-    seating_mm: Annotated[
-        float | None,
-        typer.Option(
-            "--seating-mm",
-            min=0,
-            metavar="MM",
-            help="Standard deviation of the tip in its socket, for each coordinate. Default 0.005.",
-        ),
-    ] = None,
+    encoder_arcsec: PlanEncoderNoise = None,
+    seating_mm: PlanSeatingNoise = None,
     model: Annotated[
         str | None,
         typer.Option(
@@ -130,7 +115,9 @@ def arm(
         from ..files.joint_models import with_model
 
         specification = with_model(specification, model)
-    _survey(specification, figure, encoder_arcsec, seating_mm, model, as_json)
+    with together(figure):
+        usual = assumed_noise(file, {"base": base, "tip": tip}, (encoder_arcsec, seating_mm, None))
+    _survey(specification, figure, usual, model, as_json)
 
 
 def _template(path: Path, joints: int, as_json: bool) -> None:
@@ -150,26 +137,21 @@ def _template(path: Path, joints: int, as_json: bool) -> None:
 def _survey(
     specification: Any,
     figure: Path | None,
-    encoder_arcsec: float | None,
-    seating_mm: float | None,
+    usual: Any,
     model: str | None,
     as_json: bool,
 ) -> None:
-    from ..data.noise import Noise
     from ..summaries.arm_survey import arm_survey
     from . import arm_display
 
-    noise, base = None, None
-    if encoder_arcsec is not None or seating_mm is not None:
-        given = {"encoder_arcsec": encoder_arcsec, "seating": seating_mm}
-        noise = Noise(**({"encoder_arcsec": 2.0, "seating": 0.005} | {k: x for k, x in given.items() if x is not None}))
+    base = None
     if specification.urdf is not None:
         from ..files.urdf import urdf_chain
 
         base = urdf_chain(specification.urdf).base
     with together(figure):
         summary = with_spinner("Looking at the arm", lambda: arm_survey(
-            specification, noise=noise, base=base, model=model
+            specification, usual, base=base, model=model
         ))  # fmt: skip
         if base is not None:
             summary["urdf"]["first_frame_in_base_mm"] = base.tolist()

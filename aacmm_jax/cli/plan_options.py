@@ -131,6 +131,24 @@ class PlannedArm(NamedTuple):
     notes: tuple[str, ...]
 
 
+def assumed_noise(
+    arm: str, links: Mapping[str, str | None], noise: tuple[float | None, float | None, float | None]
+) -> Any:
+    """The noise of an arm that has not been calibrated (`ArmNoise`): what options give (``noise``: arcsec, mm and, of
+    prismatic joints, mm), else what its file states, else that of its class."""
+    from ..data.noise import Noise
+    from ..files.arms import load_noise
+
+    assumed = load_noise(arm, **links)
+    encoder, seating, linear = noise
+    found = Noise(
+        encoder_arcsec=assumed.noise.encoder_arcsec if encoder is None else encoder,
+        seating=assumed.noise.seating if seating is None else seating,
+        linear_encoder=assumed.noise.linear_encoder if linear is None else linear,
+    )
+    return assumed._replace(noise=found, source=assumed.source if encoder is None else "as given")
+
+
 def planned_arm(
     arm: str,
     links: Mapping[str, str | None],
@@ -148,29 +166,21 @@ def planned_arm(
     ``sockets``: names that may be named.
     """
     from ..data.arm_classes import CLASSES
-    from ..data.noise import Noise
-    from ..files.arms import load_noise
     from ..files.cells import load_cell
 
-    assumed = load_noise(arm, **links)
+    assumed = assumed_noise(arm, links, noise)
     default = CLASSES[assumed.arm_class]
-    encoder, seating, linear = noise
-    found = Noise(
-        encoder_arcsec=assumed.noise.encoder_arcsec if encoder is None else encoder,
-        seating=assumed.noise.seating if seating is None else seating,
-        linear_encoder=assumed.noise.linear_encoder if linear is None else linear,
-    )
     file, wanted, radius = cell
     loaded = load_cell(arm, file, **links, radius=radius) if wanted or file is not None or radius is not None else None
     return PlannedArm(
         {
-            "noise": found,
+            "noise": assumed.noise,
             "tool_axis": _tool_axis(tool_axis),
             "cell": None if loaded is None else loaded.cell,
             "retract": default.retract if retract is None else retract,
         },
         _cones(*cones, default.cone, sockets),
-        "as given" if encoder is not None else assumed.source,
+        assumed.source,
         () if loaded is None else loaded.notes,
     )
 

@@ -26,7 +26,7 @@ _MAX_SWEEPS = 30  # of Jacobi rotations; matrices of 40 rows need about 10
 def length_and_direction(
     vectors: Float[AnyArray, "k m"],
 ) -> tuple[Float[AnyArray, " m"], Float[AnyArray, "k m"]]:
-    """Lengths of vectors that are columns, and unit vectors along them, with finite derivatives; both 0 for one of 0."""
+    """Lengths of vectors that are columns, and unit vectors along them, with finite derivatives; of 0, both are 0."""
     xp = namespace(vectors)
     square = xp.sum(vectors**2, axis=0)
     size = xp.sqrt(xp.where(square == 0, 1.0, square))
