@@ -15,7 +15,7 @@ from ..core.units import DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
 from .manifest_observations import reading_unit_of
 from .temperatures import TEMPERATURE
-from .text_table import TextTable
+from .text_table import Column, TextTable
 
 _ANGLES = {"deg": DEG, "rad": 1.0}
 # Names of columns that hold the readings of joints 1, 2, ... from left to right.
@@ -38,44 +38,53 @@ class CommandedPoses(NamedTuple):
 
 
 def read_commanded_poses(
-    path: str | os.PathLike, arm: Arm, *, unit: str | None = None, near: Sequence[float] | None = None
+    path: str | os.PathLike,
+    arm: Arm,
+    *,
+    unit: str | None = None,
+    near: Sequence[float] | None = None,
+    columns: Sequence[Column] | None = None,
+    length_unit: str | None = None,
 ) -> CommandedPoses:
     """Read a table with a row for each commanded pose.
 
     Either joint readings, in columns named q_1, q_2, ... (or q1, joint_1, j1, a1; with a unit, as q_1_deg, if the
-    header states it), or in all columns of a table without such names. Or positions and orientations: x, y, z (mm, or
-    the header's unit) with qw, qx, qy, qz (quaternion) or rx, ry, rz (rotation vector, in ``unit`` unless the header
-    says it), and the readings to begin with in columns as above, or ``near``. A column temperature_C is the arm's.
+    header states it), or in all columns of a table without such names, or in ``columns``. Or positions and
+    orientations: x, y, z (mm, or the header's unit) with qw, qx, qy, qz (quaternion) or rx, ry, rz (rotation vector, in
+    ``unit`` unless the header says it), and the readings to begin with in columns as above, or ``near``. A column
+    temperature_C is the arm's.
 
     Args:
         path: The table (CSV or other text).
         arm: The nominal arm; readings of its prismatic joints are in mm.
         unit: ``"deg"`` or ``"rad"`` of the others; needed where the header does not say it.
         near: Readings to begin with, in ``unit``, where the table has none.
+        columns: Columns of the joint readings, by name, shell pattern or number from 1, where their names say nothing.
+        length_unit: Unit of positions whose header states none; by default mm.
 
     Raises:
         InputError: Columns are missing, or a unit is missing or differs.
     """
     table, joints = TextTable(path), arm.joints
     orientation = _orientation(table)
-    columns = _reading_columns(path, table, joints, alone=orientation is None)
-    stated = reading_unit_of(table, [i + 1 for i in columns], arm) if columns else None
+    picked = _reading_columns(path, table, joints, alone=orientation is None, wanted=columns)
+    stated = reading_unit_of(table, [i + 1 for i in picked], arm) if picked else None
     if stated is not None and (stated not in _ANGLES or unit not in (None, stated)):
         raise InputError(f"{path} states {stated} for joint readings; give them in deg or rad, and leave out --unit.")
     found = stated or unit
     if found is None:
         raise InputError(f"{path} does not say the unit of joint readings; give --unit deg or --unit rad.")
-    if columns and near is not None:
+    if picked and near is not None:
         raise InputError(f"{path} has joint readings in each row; leave out --near.")
-    if not columns and near is None:
+    if not picked and near is None:
         raise InputError(f"{path} has no joint readings to begin with; add columns q_1 to q_{joints}, or give --near.")
     if near is not None and len(near) != joints:
         raise InputError(f"--near has {len(near)} readings, but the arm {joints} joints; give one per joint.")
-    poses = None if orientation is None else _poses(path, table, _ANGLES[found])
-    readings = table.numbers([i + 1 for i in columns]) if near is None else np.tile(near, (table.length, 1))
+    poses = None if orientation is None else _poses(path, table, _ANGLES[found], length_unit)
+    readings = table.numbers([i + 1 for i in picked]) if near is None else np.tile(near, (table.length, 1))
     temperature = table.numbers([TEMPERATURE])[:, 0] if table.has([TEMPERATURE]) else None
     q = np.array(by_joint(arm, _ANGLES[found], 1.0)) * readings
-    return CommandedPoses(q, poses, found, arm, table, columns, temperature)
+    return CommandedPoses(q, poses, found, arm, table, picked, temperature)
 
 
 class KnownPoses(NamedTuple):
@@ -193,28 +202,46 @@ def _position(table: TextTable) -> tuple[list[str], str | None] | None:
     return next((found for names in _POSITIONS if (found := _found(table, names, tuple(LENGTH_UNITS)))), None)
 
 
-def _reading_columns(path: str | os.PathLike, table: TextTable, joints: int, alone: bool) -> tuple[int, ...]:
+def _reading_columns(
+    path: str | os.PathLike,
+    table: TextTable,
+    joints: int,
+    alone: bool,
+    wanted: Sequence[Column] | None = None,
+) -> tuple[int, ...]:
     """Columns of joint readings, counted from 0; ``alone``: there are no poses, so there must be some."""
+    if wanted is not None:
+        found = tuple(table.pick(wanted))
+        if len(found) != joints:
+            raise InputError(
+                f"{path}: {len(found)} columns are picked for the readings of {joints} joints; pick one for each."
+            )
+        return found
     numbers = {pattern: table.pick([pattern]) for pattern in _READINGS if table.has([pattern])}
     for columns in numbers.values():
         if len(columns) == joints:
             return tuple(columns)
     if not alone:
         return ()
-    if not table.header and table.width == joints:
+    if table.width == joints and _position(table) is None:
         return tuple(range(joints))
     raise InputError(
         f"{path} has no columns q_1 to q_{joints} of joint readings, and no positions with orientations (x, y, z with "
-        "qw, qx, qy, qz or rx, ry, rz); name its columns so."
+        "qw, qx, qy, qz or rx, ry, rz); name its columns so, or pick those of the readings (--columns)."
     )
 
 
-def _poses(path: str | os.PathLike, table: TextTable, angle: float) -> Float[np.ndarray, "N 4 4"]:
-    """Positions, mm, and orientations; ``angle``: the unit of a rotation vector that its header does not state."""
+def _poses(
+    path: str | os.PathLike, table: TextTable, angle: float, length: str | None = None
+) -> Float[np.ndarray, "N 4 4"]:
+    """Positions, mm, and orientations; ``angle`` and ``length``: units of a rotation vector and of positions that the
+    header does not state."""
     position, orientation = _position(table), _orientation(table)
     if position is None or orientation is None:
         raise InputError(f"{path} has orientations, but no positions in columns x, y and z; add them.")
-    unit, (names, rotation_unit) = position[1] or "mm", orientation
+    if length is not None and position[1] not in (None, length):
+        raise InputError(f"{path} states positions in {position[1]}; leave out --length-unit.")
+    unit, (names, rotation_unit) = position[1] or length or "mm", orientation
     if unit not in LENGTH_UNITS or rotation_unit not in (None, *_ANGLES):
         raise InputError(
             f"{path} states positions in {unit}; give one of {', '.join(LENGTH_UNITS)}, and angles in deg or rad."
