@@ -216,8 +216,8 @@ def calibrate(
     check_method(method, general)
     if not capture.lengths and not by_slides and not any(one.fixes_scale for one in capture.observations):
         raise InputError(
-            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets (or, "
-            "from Python, identify for stage 1 alone)."
+            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets, or take "
+            "the scale from the nominal arm (--scale nominal; from Python, identify for stage 1 alone)."
         )
     sensitivities = None
     if general:

@@ -212,6 +212,11 @@ def sockets_option(texts: Sequence[str] | None) -> dict[str, tuple[float, ...]]:
     return points
 
 
+def names_option(text: str) -> tuple[str, ...]:
+    """Names that an option lists, separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
 def length_option(text: str) -> tuple:
     """A reference length from ``A,B`` or ``A,B,U``, mm; a name with a comma in it is put in double quotes."""
     start, end, *rest = [*next(csv.reader([text]), []), "", ""]

@@ -11,6 +11,7 @@ from ..core.text import number
 from ..files.inputs import InputFile
 from ..files.outputs import together
 from .app import BaseLink, Json, TipLink, app, bad_option, examples, show_summary, with_spinner
+from .plan_options import PlanEncoderNoise, PlanSeatingNoise, assumed_noise
 
 _CAPTURES = (".toml", ".h5")  # others are tables
 
@@ -45,8 +46,8 @@ def arm(
         typer.Option(
             metavar="POSES",
             help="Compare readings with the arm: a manifest (TOML), a capture (HDF5), or a table (CSV) with columns "
-            "q_1, q_2, ... and, where the tip was, x, y, z (mm) with or without qw, qx, qy, qz or rx, ry, rz; without "
-            "positions its poses are of one socket, or of those that a column socket names.",
+            "q_1, q_2, ... and, where the tip was, x, y, z (mm, or as the header says) with or without qw, qx, qy, qz "
+            "or rx, ry, rz; without positions its poses are of one socket, or of those that a column socket names.",
         ),
     ] = None,
     unit: Annotated[
@@ -59,24 +60,8 @@ def arm(
             metavar="FILE.png", help="Picture of the arm at zero readings, and of its reach (.png, .svg, .pdf)."
         ),
     ] = None,
-    encoder_arcsec: Annotated[
-        float | None,
-        typer.Option(
-            "--encoder-arcsec",
-            min=0,
-            metavar="ARCSEC",
-            help="Standard deviation of a joint reading. Default: that of a measuring arm (2) and of a robot (10).",
-        ),
-    ] = None,
-    seating_mm: Annotated[
-        float | None,
-        typer.Option(
-            "--seating-mm",
-            min=0,
-            metavar="MM",
-            help="Standard deviation of the tip in its socket, for each coordinate. Default 0.005.",
-        ),
-    ] = None,
+    encoder_arcsec: PlanEncoderNoise = None,
+    seating_mm: PlanSeatingNoise = None,
     model: Annotated[
         str | None,
         typer.Option(
@@ -130,7 +115,9 @@ def arm(
         from ..files.joint_models import with_model
 
         specification = with_model(specification, model)
-    _survey(specification, figure, encoder_arcsec, seating_mm, model, as_json)
+    with together(figure):
+        usual = assumed_noise(file, {"base": base, "tip": tip}, (encoder_arcsec, seating_mm, None))
+    _survey(specification, figure, usual, model, as_json)
 
 
 def _template(path: Path, joints: int, as_json: bool) -> None:
@@ -150,26 +137,21 @@ def _template(path: Path, joints: int, as_json: bool) -> None:
 def _survey(
     specification: Any,
     figure: Path | None,
-    encoder_arcsec: float | None,
-    seating_mm: float | None,
+    usual: Any,
     model: str | None,
     as_json: bool,
 ) -> None:
-    from ..data.noise import Noise
     from ..summaries.arm_survey import arm_survey
     from . import arm_display
 
-    noise, base = None, None
-    if encoder_arcsec is not None or seating_mm is not None:
-        given = {"encoder_arcsec": encoder_arcsec, "seating": seating_mm}
-        noise = Noise(**({"encoder_arcsec": 2.0, "seating": 0.005} | {k: x for k, x in given.items() if x is not None}))
+    base = None
     if specification.urdf is not None:
         from ..files.urdf import urdf_chain
 
         base = urdf_chain(specification.urdf).base
     with together(figure):
         summary = with_spinner("Looking at the arm", lambda: arm_survey(
-            specification, noise=noise, base=base, model=model
+            specification, usual, base=base, model=model
         ))  # fmt: skip
         if base is not None:
             summary["urdf"]["first_frame_in_base_mm"] = base.tolist()
@@ -182,7 +164,7 @@ def _survey(
 
 
 def _check(specification: Any, path: Path, unit: str | None, as_json: bool) -> None:
-    from ..files.angles import angles_toml
+    from ..files.angles import angles_toml, positions_unit, units_toml
     from ..summaries.reading_check import reading_check_summary
     from . import arm_display
 
@@ -192,11 +174,14 @@ def _check(specification: Any, path: Path, unit: str | None, as_json: bool) -> N
             raise InputError(f"--unit is for a table, but {path} says the unit of its readings; leave it out.")
         manifest = path if path.suffix.lower() == ".toml" else None
         found = _of_capture(specification, path)
-        taken = None if manifest is not None else "rad"
+        taken, positions = None if manifest is not None else "rad", positions_unit(manifest)
     else:
-        found, taken = _of_table(specification, path, unit)
-    summary = reading_check_summary(found, specification.name, unit=taken)
-    summary["angles"] = angles_toml(found.best, taken, manifest) if found.explained and not found.fits else None
+        found, taken, positions = _of_table(specification, path, unit)
+    best = found.best
+    summary = reading_check_summary(found, specification.name, unit=taken, positions=positions)
+    angles = found.explained and (best.hypothesis.changes or best.angle != 1)
+    summary["angles"] = angles_toml(best, taken, manifest) if angles else None
+    summary["units"] = units_toml(best, positions) if found.explained else None
     show_summary(summary, as_json, arm_display.check)
     if not found.explained:
         raise typer.Exit(1)
@@ -217,7 +202,7 @@ def _of_capture(specification: Any, path: Path) -> Any:
     return with_spinner("Comparing", lambda: check_capture(specification.arm, recording.capture))
 
 
-def _of_table(specification: Any, path: Path, unit: str | None) -> tuple[Any, str]:
+def _of_table(specification: Any, path: Path, unit: str | None) -> tuple[Any, str, str]:
     import numpy as np
 
     from ..files.commanded_poses import read_known_poses
@@ -238,7 +223,7 @@ def _of_table(specification: Any, path: Path, unit: str | None) -> tuple[Any, st
             specification.arm, known.q, sockets=known.sockets, positions=positions, rotations=rotations
         ),
     )
-    return found, known.unit
+    return found, known.unit, known.length_unit
 
 
 def _probe(text: str | None) -> tuple[float, float, float] | None:

@@ -71,13 +71,19 @@ def _needed(console: Console, summary: dict[str, Any]) -> None:
         counts = list(kind["rows"][0]["u_mm"])
         console.print(
             "\n[bold]U of a length that a calibration from random poses adds[/bold] \\[mm, k = 2]: "
-            f"{escape(kind['class'])}, {kind['encoder_arcsec']:.3g} arcsec, {kind['seating_mm']:.3g} mm"
+            f"{escape(kind['class'])}"
         )
         table = new_table("", "data", *(f"{count} poses" for count in counts), "enough")
         for row in kind["rows"]:
             u = [None if x is None else 2 * x for x in row["u_mm"].values()]
             table.add_row(escape(row["data"]), *(formatted(x) for x in u), str(row["enough_poses"] or "-"))
         print_table(console, table)
+        console.print(
+            f"Of encoders of {kind['encoder_arcsec']:.3g} arcsec and a seat of {kind['seating_mm']:.3g} mm "
+            f"({escape(kind['noise_source'])}), reference lengths of u = {kind['u_length_mm']:g} mm, and a tracker of "
+            f"u = {kind['u_tracker_mm']:g} mm in each coordinate. Two sockets and a reference length are as good as a "
+            "ball bar in one place."
+        )
         console.print(
             f"Enough: poses from which on this is less than the noise of the readings themselves, "
             f"{formatted(2 * kind['u_reading_mm'])} mm."
@@ -90,6 +96,8 @@ def check(summary: dict[str, Any]) -> None:
     console = new_console()
     colour = "green" if summary["fits"] else "yellow" if summary["explained"] else "red"
     console.print(f"[{colour}]{escape(summary['sentence'])}[/{colour}]")
+    if summary["tip"]:
+        console.print(escape(summary["tip"]))
     if summary["unit"] is not None:
         console.print(f"Readings were taken to be in {summary['unit']}.")
     outside = (summary["found"] or summary["given"])["readings_outside_limits"]
@@ -98,6 +106,9 @@ def check(summary: dict[str, Any]) -> None:
     words = alternatives_sentence(summary["alternatives"], summary["known_positions"])
     if words:
         console.print(escape(words))
+    if summary["units"] is not None:
+        console.print("\nIn the manifest, in the table of the measured positions:")
+        console.print(escape(summary["units"]), end="")
     if summary["angles"] is not None:
         console.print("\nIn the manifest:")
         console.print(escape(summary["angles"]), end="")

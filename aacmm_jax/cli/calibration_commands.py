@@ -21,6 +21,7 @@ from .app import (
     Without,
     app,
     examples,
+    names_option,
     show_summary,
     with_spinner,
 )
@@ -331,9 +332,11 @@ def _bounds(
     from ..kinematics.arm import is_length
     from ..kinematics.parameters import Bounds, Parameters
 
-    names = _names(held) if held is not None else nominal.held
+    names = names_option(held) if held is not None else nominal.held
     proposed = [name for name in nominal.free if name not in (names or ())]
-    space = Parameters.free_of(nominal.arm, held=names, free=tuple(dict.fromkeys([*proposed, *_names(free or "")])))
+    space = Parameters.free_of(
+        nominal.arm, held=names, free=tuple(dict.fromkeys([*proposed, *names_option(free or "")]))
+    )
     override = {name: width for name, width in nominal.override.items() if name in space.names}
     seen = set()
     for text in single:
@@ -378,10 +381,6 @@ def known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_e
         missing = "--seating-mm" if seating_mm is None else "--encoder-arcsec"
         raise InputError(f"{missing} is missing: give both standard deviations, or neither to have both estimated.")
     return Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm)
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def _several(capture: Any, parameters: int) -> bool:

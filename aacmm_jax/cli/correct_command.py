@@ -11,7 +11,7 @@ from ..core.errors import InputError
 from ..core.text import number, pluralise
 from ..files.inputs import InputFile
 from ..files.outputs import together
-from .app import CalibrationFile, Json, app, bad_option, examples, show_summary, warn_of_unusable
+from .app import CalibrationFile, Json, app, bad_option, examples, names_option, show_summary, warn_of_unusable
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
 _MOST_ROWS = 20  # that are printed
@@ -42,6 +42,18 @@ def correct(
             help="Of joint readings and rotation vectors; needed where the header does not say it (q_1_deg). Readings "
             "of prismatic joints are in mm."
         ),
+    ] = None,
+    columns: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help="Columns of the joint readings where they are not named q_1, q_2, ...: names, a pattern, or numbers "
+            "from 1, separated by commas. Default: all columns of a table with one for each joint.",
+        ),
+    ] = None,
+    length_unit: Annotated[
+        Literal["mm", "m", "um", "inch"] | None,
+        typer.Option(help="Of positions whose header states no unit (x_m). Default mm."),
     ] = None,
     near: Annotated[
         str | None,
@@ -90,6 +102,7 @@ def correct(
     from ..summaries.correction import correction_summary
 
     begin = None if near is None else _numbers("--near", near, "Q1,Q2,... with a reading for each joint")
+    picked = None if columns is None else [int(x) if x.isdecimal() else x for x in names_option(columns)]
     with together(output):
         record = load_calibration(InputFile(calibration))
         nominal, calibrated = to_numpy((record.recording.nominal.arm, record.calibrated.arm))
@@ -98,7 +111,9 @@ def correct(
             if len(tip) != 3:
                 bad_option("--probe", probe, "X,Y,Z in mm")
             nominal, calibrated = nominal.replace(probe=tip), calibrated.replace(probe=tip)
-        commanded = read_commanded_poses(InputFile(poses), nominal, unit=unit, near=begin)
+        commanded = read_commanded_poses(
+            InputFile(poses), nominal, unit=unit, near=begin, columns=picked, length_unit=length_unit
+        )
         q = _at_temperature(commanded, calibrated, temperature)
         if commanded.poses is None:
             found = corrected_readings(nominal, calibrated, q)

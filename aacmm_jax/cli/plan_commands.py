@@ -22,11 +22,13 @@ from .app import (
     app,
     examples,
     length_option,
+    names_option,
     show_summary,
     sockets_option,
     with_spinner,
 )
 from .plan_options import (
+    CONTEXT,
     CellFile,
     Collisions,
     ConeAngles,
@@ -36,6 +38,7 @@ from .plan_options import (
     PlanSeatingNoise,
     RetractDistance,
     ToolAxis,
+    check_options,
     planned_arm,
 )
 
@@ -52,6 +55,7 @@ from .plan_options import (
     )
 )
 def plan(
+    context: CONTEXT,  # pyright: ignore[reportInvalidTypeForm]
     arm: NominalArm,
     output: Annotated[
         Path,
@@ -88,6 +92,14 @@ def plan(
             metavar="MODEL",
             help="What the joints do besides their readings, as for calibrate: the poses determine its coefficients "
             "too.",
+        ),
+    ] = None,
+    held: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help="Parameters that are fixed, as for calibrate, separated by commas; replaces the list in the arm's "
+            "file.",
         ),
     ] = None,
     encoder_arcsec: PlanEncoderNoise = None,
@@ -198,6 +210,11 @@ def plan(
 
     with together(output, manifest):  # refuses outputs that are inputs or cannot be written, before the work
         specification = load_specification(arm, base=base, tip=tip)
+    if held is not None:
+        fixed = names_option(held)
+        specification = specification._replace(
+            held=fixed, free=tuple(name for name in specification.free if name not in fixed)
+        )
     if model is not None:
         from ..files.joint_models import with_model
 
@@ -208,25 +225,10 @@ def plan(
         raise InputError(
             "--length is between sockets of --socket; to have a reference length positioned, use --length-mm."
         )
-    if kit is not None and (socket or sockets is not None or length or acceptance is not None):
-        raise InputError("--kit names what is used; leave out --socket, --sockets, --length and --acceptance.")
+    check_options(context, kit is not None, acceptance is not None)
     if region and socket:
         raise InputError("--region is for sockets that are to be positioned; leave it out with --socket.")
     if acceptance is not None:
-        if socket or sockets is not None or length or region or farthest is not None:
-            raise InputError(
-                "--acceptance has its own sockets and bars; leave out --socket, --sockets, --length, --region and "
-                "--farthest."
-            )
-        if model is not None:
-            raise InputError("--model is of calibrations; with --acceptance, leave it out.")
-        own = (cone_deg, normal, cell, collisions, link_radius_mm, unconstrained)
-        if any(own) or retract_mm is not None or tool_axis != "z":
-            raise InputError(
-                "cones of approach, obstacles and approach points are of calibrations; with --acceptance, leave out "
-                "--cone-deg, --normal, --tool-axis, --retract-mm, --cell, --collisions, --link-radius-mm and "
-                "--unconstrained."
-            )
         options = {
             "above": above_mm,
             "margin": margin_deg * DEG,
@@ -259,8 +261,6 @@ def plan(
         "unconstrained": unconstrained,
         "seed": seed,
     }
-    if kit is not None and (cone_deg or normal):
-        raise InputError("--cone-deg and --normal are of sockets; with --kit, state half_angle_deg and normal in it.")
     names = list(points) or [chr(ord("A") + i) for i in range(4 if sockets is None else min(sockets, 26))]
     with together(output, manifest):
         assumed = planned_arm(

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..core.text import pluralise
-from .display import new_console, new_table, print_table, print_written
+from .display import formatted, new_console, new_table, print_table, print_written
 
 
 @contextmanager
@@ -52,7 +52,7 @@ def plan(summary: dict[str, Any]) -> None:
     for row in summary["lengths"]:
         console.print(
             f"Reference length {escape(row['from'])} - {escape(row['to'])}: {row['value_mm']:.1f} mm, "
-            f"u = {1e3 * row['u_mm']:.3g} um"
+            f"u = {row['u_mm']:.3g} mm"
         )
     _print_predictions(console, summary, "random poses in the same sockets")
     print_written(console, summary)
@@ -94,9 +94,7 @@ def _print_predictions(
     more: list[tuple[str, dict[str, float] | None]] | None = None,
 ) -> None:
     length = f"{summary['check_length_mm']:g} mm"
-    console.print(
-        f"\n[bold]Standard uncertainty that the calibration adds to lengths of {length} over the volume \\[um][/bold]"
-    )
+    console.print(f"\n[bold]U that the calibration adds to lengths of {length} over the volume \\[mm, k = 2][/bold]")
     table = new_table("", "", "median", "largest")
     for key, text in (
         ("predicted", "this plan"),
@@ -107,12 +105,12 @@ def _print_predictions(
     ):
         if summary[key] is None:
             continue
-        table.add_row(text, *(f"{1e3 * summary[key][which]:.1f}" for which in ("median_mm", "largest_mm")))
+        table.add_row(text, *(formatted(2 * summary[key][which]) for which in ("median_mm", "largest_mm")))
     for text, prediction in more or []:
         values = (
             ["not determined", ""]
             if prediction is None
-            else [f"{1e3 * prediction[which]:.1f}" for which in ("median_mm", "largest_mm")]
+            else [formatted(2 * prediction[which]) for which in ("median_mm", "largest_mm")]
         )
         table.add_row(text, *values)
     print_table(console, table)
@@ -128,11 +126,11 @@ def _print_noise(console: Console, summary: dict[str, Any]) -> None:
     slide = summary["linear_encoder_mm"]
     linear, option = ("", "")
     if slide is not None:
-        linear, option = f", linear ones of {1e3 * slide:.3g} um", f"--linear-encoder-mm {slide:.3g} "
+        linear, option = f", linear ones of {slide:.3g} mm", f"--linear-encoder-mm {slide:.3g} "
     model = "" if summary.get("model") is None else f"--model {summary['model']} "
     options = "" if each else f" (--method joint {model}--encoder-arcsec {encoders:.3g} {option}--seating-mm {seat:g})"
     console.print(
-        f"For a joint calibration with encoders of {text} arcsec{linear} and a seat of {1e3 * seat:g} um{options}; "
+        f"For a joint calibration with encoders of {text} arcsec{linear} and a seat of {seat:g} mm{options}; "
         f"{escape(summary['noise_source'])}."
     )
 

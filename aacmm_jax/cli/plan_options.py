@@ -11,6 +11,7 @@ from ..core.errors import InputError
 from ..core.text import number
 from .app import bad_option
 
+CONTEXT: Any = typer.Context.__base__  # what Typer passes: its own class is a subclass that nothing is of
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 PlanEncoderNoise = Annotated[
@@ -92,6 +93,35 @@ LinkRadius = Annotated[
 ]
 
 
+# Options that each way of planning takes besides those of all: of a calibration with sockets, of one with a kit, and
+# of an acceptance test.
+_OF_ALL = {"arm", "output", "manifest", "base", "tip", "seed", "as_json", "angles", "margin_deg", "above_mm"}
+_OF_CALIBRATIONS = {
+    *("poses", "model", "held", "encoder_arcsec", "linear_encoder_mm", "seating_mm", "tool_axis", "retract_mm", "cell"),
+    *("collisions", "link_radius_mm", "unconstrained", "criterion", "region", "candidates", "check_length_mm"),
+    "farthest",
+}
+_OF_SOCKETS = {"sockets", "socket", "length", "length_mm", "u_mm", "cone_deg", "normal"}
+_OF_ACCEPTANCE = {"acceptance", "sphere_mm", "stylus_mm", "bar_mm", "range_mm"}
+
+
+def check_options(context: Any, kit: bool, acceptance: bool) -> None:
+    """Refuse options that the way of planning would ignore."""
+    taken = _OF_ACCEPTANCE if acceptance else _OF_CALIBRATIONS | ({"kit"} if kit else _OF_SOCKETS)
+    sources = {name: context.get_parameter_source(name) for name in context.params if name not in _OF_ALL | taken}
+    ignored = [
+        f"--{name.replace('_', '-')}" for name, source in sources.items() if source and source.name == "COMMANDLINE"
+    ]
+    if not ignored:
+        return
+    listed = " and ".join([", ".join(ignored[:-1]), ignored[-1]] if len(ignored) > 1 else ignored)
+    if acceptance:
+        raise InputError(f"--acceptance has its own poses, sockets and bars and ignores {listed}; leave out {listed}.")
+    if kit:
+        raise InputError(f"--kit names what is used and where it is, and ignores {listed}; leave out {listed}.")
+    raise InputError(f"{listed} {'is' if len(ignored) == 1 else 'are'} for acceptance tests; give --acceptance too.")
+
+
 class PlannedArm(NamedTuple):
     """What plans assume of an arm, by its file and the options."""
 
@@ -99,6 +129,24 @@ class PlannedArm(NamedTuple):
     cone: Any  # of `planning.plan`: a `Cone`, or socket name -> `Cone`
     noise_source: str
     notes: tuple[str, ...]
+
+
+def assumed_noise(
+    arm: str, links: Mapping[str, str | None], noise: tuple[float | None, float | None, float | None]
+) -> Any:
+    """The noise of an arm that has not been calibrated (`ArmNoise`): what options give (``noise``: arcsec, mm and, of
+    prismatic joints, mm), else what its file states, else that of its class."""
+    from ..data.noise import Noise
+    from ..files.arms import load_noise
+
+    assumed = load_noise(arm, **links)
+    encoder, seating, linear = noise
+    found = Noise(
+        encoder_arcsec=assumed.noise.encoder_arcsec if encoder is None else encoder,
+        seating=assumed.noise.seating if seating is None else seating,
+        linear_encoder=assumed.noise.linear_encoder if linear is None else linear,
+    )
+    return assumed._replace(noise=found, source=assumed.source if encoder is None else "as given")
 
 
 def planned_arm(
@@ -118,29 +166,21 @@ def planned_arm(
     ``sockets``: names that may be named.
     """
     from ..data.arm_classes import CLASSES
-    from ..data.noise import Noise
-    from ..files.arms import load_noise
     from ..files.cells import load_cell
 
-    assumed = load_noise(arm, **links)
+    assumed = assumed_noise(arm, links, noise)
     default = CLASSES[assumed.arm_class]
-    encoder, seating, linear = noise
-    found = Noise(
-        encoder_arcsec=assumed.noise.encoder_arcsec if encoder is None else encoder,
-        seating=assumed.noise.seating if seating is None else seating,
-        linear_encoder=assumed.noise.linear_encoder if linear is None else linear,
-    )
     file, wanted, radius = cell
     loaded = load_cell(arm, file, **links, radius=radius) if wanted or file is not None or radius is not None else None
     return PlannedArm(
         {
-            "noise": found,
+            "noise": assumed.noise,
             "tool_axis": _tool_axis(tool_axis),
             "cell": None if loaded is None else loaded.cell,
             "retract": default.retract if retract is None else retract,
         },
         _cones(*cones, default.cone, sockets),
-        "as given" if encoder is not None else assumed.source,
+        assumed.source,
         () if loaded is None else loaded.notes,
     )
 

@@ -23,6 +23,16 @@ _LARGE = 60  # rows from which the inverse of a triangle is worth the import of 
 _MAX_SWEEPS = 30  # of Jacobi rotations; matrices of 40 rows need about 10
 
 
+def length_and_direction(
+    vectors: Float[AnyArray, "k m"],
+) -> tuple[Float[AnyArray, " m"], Float[AnyArray, "k m"]]:
+    """Lengths of vectors that are columns, and unit vectors along them, with finite derivatives; of 0, both are 0."""
+    xp = namespace(vectors)
+    square = xp.sum(vectors**2, axis=0)
+    size = xp.sqrt(xp.where(square == 0, 1.0, square))
+    return xp.where(square == 0, 0.0, size), vectors / size[None]
+
+
 def solve_positive_definite(
     matrix: Float[AnyArray, "*batch p p"], right: Float[AnyArray, "*batch p"]
 ) -> Float[AnyArray, "*batch p"]:

@@ -8,6 +8,12 @@ UM = 1e-3  # mm
 DEG = math.pi / 180  # rad
 ARCMIN = math.pi / (180 * 60)  # rad
 ARCSEC = math.pi / (180 * 3600)  # rad
+LENGTH_UNITS = {"mm": 1.0, "m": M, "um": UM, "inch": INCH}  # as files name them
+
+
+def length_unit(size: float) -> str | None:
+    """The name of a unit of length of this size, mm; None: there is none."""
+    return next((name for name, value in LENGTH_UNITS.items() if math.isclose(size, value)), None)
 
 
 def people_read(unit: str) -> tuple[float, str]:

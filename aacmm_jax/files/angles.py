@@ -1,10 +1,10 @@
-"""The table ``[angles]`` of a manifest, with what a check of the readings found."""
+"""What a check of the readings found, as the lines that a manifest needs: its table ``[angles]``, and ``units``."""
 
 import os
 
 import numpy as np
 
-from ..core.units import ARCSEC, DEG
+from ..core.units import ARCSEC, DEG, LENGTH_UNITS, length_unit
 from ..kinematics.reading_fit import Explanation
 from .inputs import InputFile
 from .manifest import manifest_model
@@ -48,6 +48,27 @@ def angles_toml(found: Explanation, unit: str | None, manifest: str | os.PathLik
     if np.any(new_offsets):
         lines.append(f"offset = {_row(np.round(new_offsets, 9))}")
     return "\n".join(lines) + "\n"
+
+
+def positions_unit(manifest: str | os.PathLike | None) -> str:
+    """The unit in which a manifest takes the positions that an instrument measured, by default mm."""
+    if manifest is None:
+        return "mm"
+    model = read_toml(InputFile(as_path(manifest)), manifest_model())
+    tables = [*getattr(model, "points", ()), *getattr(model, "transforms", ())]
+    stated = next((table.units["points"] for table in tables if "points" in table.units), "mm")
+    return stated if stated in LENGTH_UNITS else "mm"
+
+
+def units_toml(found: Explanation, positions: str) -> str | None:
+    """The line that makes the table of a manifest read positions in the unit that was found; None: none is needed.
+
+    Args:
+        found: The explanation, of the positions as they were read.
+        positions: The unit in which they were read.
+    """
+    unit = length_unit(found.length * LENGTH_UNITS[positions])
+    return None if found.length == 1 or unit is None else f'units = {{ points = "{unit}" }}\n'
 
 
 def _row(values: np.ndarray) -> str:

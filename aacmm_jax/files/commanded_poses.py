@@ -11,17 +11,17 @@ from jaxtyping import Bool, Float
 
 from ..core.errors import InputError
 from ..core.rotations import rotation_matrix
-from ..core.units import DEG, INCH, UM, M
+from ..core.units import DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
 from .manifest_observations import reading_unit_of
 from .temperatures import TEMPERATURE
-from .text_table import TextTable
+from .text_table import Column, TextTable
 
 _ANGLES = {"deg": DEG, "rad": 1.0}
-_LENGTHS = {"mm": 1.0, "m": M, "um": UM, "inch": INCH}
 # Names of columns that hold the readings of joints 1, 2, ... from left to right.
 _READINGS = ("q_[0-9]*", "q[0-9]*", "joint*[0-9]*", "j[0-9]*", "a[0-9]*")
 _QUATERNION, _ROTATION = ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")
+_POSITIONS = (("x", "y", "z"), ("px", "py", "pz"))
 _ROUNDED = 1e-3  # of a quaternion's length: three decimals at least
 
 
@@ -38,44 +38,53 @@ class CommandedPoses(NamedTuple):
 
 
 def read_commanded_poses(
-    path: str | os.PathLike, arm: Arm, *, unit: str | None = None, near: Sequence[float] | None = None
+    path: str | os.PathLike,
+    arm: Arm,
+    *,
+    unit: str | None = None,
+    near: Sequence[float] | None = None,
+    columns: Sequence[Column] | None = None,
+    length_unit: str | None = None,
 ) -> CommandedPoses:
     """Read a table with a row for each commanded pose.
 
     Either joint readings, in columns named q_1, q_2, ... (or q1, joint_1, j1, a1; with a unit, as q_1_deg, if the
-    header states it), or in all columns of a table without such names. Or positions and orientations: x, y, z (mm, or
-    the header's unit) with qw, qx, qy, qz (quaternion) or rx, ry, rz (rotation vector, in ``unit`` unless the header
-    says it), and the readings to begin with in columns as above, or ``near``. A column temperature_C is the arm's.
+    header states it), or in all columns of a table without such names, or in ``columns``. Or positions and
+    orientations: x, y, z (mm, or the header's unit) with qw, qx, qy, qz (quaternion) or rx, ry, rz (rotation vector, in
+    ``unit`` unless the header says it), and the readings to begin with in columns as above, or ``near``. A column
+    temperature_C is the arm's.
 
     Args:
         path: The table (CSV or other text).
         arm: The nominal arm; readings of its prismatic joints are in mm.
         unit: ``"deg"`` or ``"rad"`` of the others; needed where the header does not say it.
         near: Readings to begin with, in ``unit``, where the table has none.
+        columns: Columns of the joint readings, by name, shell pattern or number from 1, where their names say nothing.
+        length_unit: Unit of positions whose header states none; by default mm.
 
     Raises:
         InputError: Columns are missing, or a unit is missing or differs.
     """
     table, joints = TextTable(path), arm.joints
     orientation = _orientation(table)
-    columns = _reading_columns(path, table, joints, alone=orientation is None)
-    stated = reading_unit_of(table, [i + 1 for i in columns], arm) if columns else None
+    picked = _reading_columns(path, table, joints, alone=orientation is None, wanted=columns)
+    stated = reading_unit_of(table, [i + 1 for i in picked], arm) if picked else None
     if stated is not None and (stated not in _ANGLES or unit not in (None, stated)):
         raise InputError(f"{path} states {stated} for joint readings; give them in deg or rad, and leave out --unit.")
     found = stated or unit
     if found is None:
         raise InputError(f"{path} does not say the unit of joint readings; give --unit deg or --unit rad.")
-    if columns and near is not None:
+    if picked and near is not None:
         raise InputError(f"{path} has joint readings in each row; leave out --near.")
-    if not columns and near is None:
+    if not picked and near is None:
         raise InputError(f"{path} has no joint readings to begin with; add columns q_1 to q_{joints}, or give --near.")
     if near is not None and len(near) != joints:
         raise InputError(f"--near has {len(near)} readings, but the arm {joints} joints; give one per joint.")
-    poses = None if orientation is None else _poses(path, table, _ANGLES[found])
-    readings = table.numbers([i + 1 for i in columns]) if near is None else np.tile(near, (table.length, 1))
+    poses = None if orientation is None else _poses(path, table, _ANGLES[found], length_unit)
+    readings = table.numbers([i + 1 for i in picked]) if near is None else np.tile(near, (table.length, 1))
     temperature = table.numbers([TEMPERATURE])[:, 0] if table.has([TEMPERATURE]) else None
     q = np.array(by_joint(arm, _ANGLES[found], 1.0)) * readings
-    return CommandedPoses(q, poses, found, arm, table, columns, temperature)
+    return CommandedPoses(q, poses, found, arm, table, picked, temperature)
 
 
 class KnownPoses(NamedTuple):
@@ -87,14 +96,15 @@ class KnownPoses(NamedTuple):
     positions: Float[np.ndarray, "m 3"] | None  # mm, in the frame that the file uses
     rotations: Float[np.ndarray, "m 3 3"] | None
     sockets: tuple[str, ...] | None  # of each pose, where there are no positions
+    length_unit: str  # of the positions in the file
 
 
 def read_known_poses(path: str | os.PathLike, joints: int, *, unit: str | None = None) -> KnownPoses:
     """Read a table with a row for each recorded pose: joint readings, and where the tip was.
 
-    Readings are in columns named as for `read_commanded_poses`; positions in x, y and z, perhaps with an orientation.
-    Without positions all poses are of one socket, or of those that a column ``socket`` names. A table without header
-    has a column for each joint, and after them perhaps x, y and z.
+    Readings are in columns named as for `read_commanded_poses`; positions in x, y, z or px, py, pz,
+    perhaps with an orientation. Without positions all poses are of one socket, or of those that a column ``socket``
+    names. A table without header has a column for each joint, and after them perhaps x, y and z.
 
     Args:
         path: The table (CSV or other text).
@@ -106,24 +116,25 @@ def read_known_poses(path: str | os.PathLike, joints: int, *, unit: str | None =
     """
     table = TextTable(path)
     point: list[int | str] = ["x", "y", "z"]
-    length: str | None = "mm"
+    length: str = "mm"
     orientation = None
     if not table.header and table.width in (joints, joints + 3):
         columns, has_points = tuple(range(joints)), table.width > joints
         point = [joints + 1, joints + 2, joints + 3]
     else:
         columns = _reading_columns(path, table, joints, alone=True)
-        orientation, position = _orientation(table), _found(table, ("x", "y", "z"), tuple(_LENGTHS))
+        orientation, position = _orientation(table), _position(table)
         has_points = position is not None
-        point, length = ([*position[0]], position[1] or "mm") if position else (point, length)
+        if position is not None:
+            point, length = [*position[0]], position[1] or "mm"
     picked = [i + 1 for i in columns]
     header = table.unit(picked)
     if header is not None and (header not in _ANGLES or unit not in (None, header)):
         raise InputError(f"{path} states {header} for joint readings; give them in deg or rad, and leave out --unit.")
     readings = table.numbers(picked)
     found = header or unit or ("deg" if np.abs(readings).max() > 2 * np.pi else "rad")
-    if length not in _LENGTHS:
-        raise InputError(f"{path} states positions in {length}; give one of {', '.join(_LENGTHS)}.")
+    if length not in LENGTH_UNITS:
+        raise InputError(f"{path} states positions in {length}; give one of {', '.join(LENGTH_UNITS)}.")
     rotations = None
     if orientation is not None:
         rotations = _poses(path, table, _ANGLES[found])[:, :3, :3]
@@ -133,9 +144,10 @@ def read_known_poses(path: str | os.PathLike, joints: int, *, unit: str | None =
         _ANGLES[found] * readings,
         found,
         (header or unit) is not None,
-        _LENGTHS[length] * table.numbers(point) if has_points else None,
+        LENGTH_UNITS[length] * table.numbers(point) if has_points else None,
         rotations,
         None if has_points else sockets,
+        length,
     )
 
 
@@ -185,35 +197,58 @@ def _orientation(table: TextTable) -> tuple[list[str], str | None] | None:
     return _found(table, _QUATERNION, ()) or _found(table, _ROTATION, tuple(_ANGLES))
 
 
-def _reading_columns(path: str | os.PathLike, table: TextTable, joints: int, alone: bool) -> tuple[int, ...]:
+def _position(table: TextTable) -> tuple[list[str], str | None] | None:
+    """The columns of a position, and the unit that the header states."""
+    return next((found for names in _POSITIONS if (found := _found(table, names, tuple(LENGTH_UNITS)))), None)
+
+
+def _reading_columns(
+    path: str | os.PathLike,
+    table: TextTable,
+    joints: int,
+    alone: bool,
+    wanted: Sequence[Column] | None = None,
+) -> tuple[int, ...]:
     """Columns of joint readings, counted from 0; ``alone``: there are no poses, so there must be some."""
+    if wanted is not None:
+        found = tuple(table.pick(wanted))
+        if len(found) != joints:
+            raise InputError(
+                f"{path}: {len(found)} columns are picked for the readings of {joints} joints; pick one for each."
+            )
+        return found
     numbers = {pattern: table.pick([pattern]) for pattern in _READINGS if table.has([pattern])}
     for columns in numbers.values():
         if len(columns) == joints:
             return tuple(columns)
     if not alone:
         return ()
-    if not table.header and table.width == joints:
+    if table.width == joints and _position(table) is None:
         return tuple(range(joints))
     raise InputError(
         f"{path} has no columns q_1 to q_{joints} of joint readings, and no positions with orientations (x, y, z with "
-        "qw, qx, qy, qz or rx, ry, rz); name its columns so."
+        "qw, qx, qy, qz or rx, ry, rz); name its columns so, or pick those of the readings (--columns)."
     )
 
 
-def _poses(path: str | os.PathLike, table: TextTable, angle: float) -> Float[np.ndarray, "N 4 4"]:
-    """Positions, mm, and orientations; ``angle``: the unit of a rotation vector that its header does not state."""
-    position, orientation = _found(table, ("x", "y", "z"), tuple(_LENGTHS)), _orientation(table)
+def _poses(
+    path: str | os.PathLike, table: TextTable, angle: float, length: str | None = None
+) -> Float[np.ndarray, "N 4 4"]:
+    """Positions, mm, and orientations; ``angle`` and ``length``: units of a rotation vector and of positions that the
+    header does not state."""
+    position, orientation = _position(table), _orientation(table)
     if position is None or orientation is None:
         raise InputError(f"{path} has orientations, but no positions in columns x, y and z; add them.")
-    unit, (names, rotation_unit) = position[1] or "mm", orientation
-    if unit not in _LENGTHS or rotation_unit not in (None, *_ANGLES):
+    if length is not None and position[1] not in (None, length):
+        raise InputError(f"{path} states positions in {position[1]}; leave out --length-unit.")
+    unit, (names, rotation_unit) = position[1] or length or "mm", orientation
+    if unit not in LENGTH_UNITS or rotation_unit not in (None, *_ANGLES):
         raise InputError(
-            f"{path} states positions in {unit}; give one of {', '.join(_LENGTHS)}, and angles in deg or rad."
+            f"{path} states positions in {unit}; give one of {', '.join(LENGTH_UNITS)}, and angles in deg or rad."
         )
     numbers = table.numbers(names)
     poses = np.tile(np.eye(4), (len(numbers), 1, 1))
-    poses[:, :3, 3] = _LENGTHS[unit] * table.numbers(position[0])
+    poses[:, :3, 3] = LENGTH_UNITS[unit] * table.numbers(position[0])
     if len(names) == len(_QUATERNION):
         poses[:, :3, :3] = _rotations(path, numbers)
     else:

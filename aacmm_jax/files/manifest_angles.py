@@ -7,9 +7,8 @@ import numpy as np
 from pydantic import AfterValidator, Field, FiniteFloat, PositiveInt, model_validator
 
 from ..core.errors import InputError
-from ..core.units import ARCSEC, DEG
+from ..core.units import ARCSEC, DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
-from .manifest_observations import LENGTHS
 from .toml import Strict, each_once
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -71,6 +70,8 @@ def in_rad(readings: np.ndarray, angles: Angles, arm: Arm) -> np.ndarray:
         if angles.counts_per_turn
         else _UNITS[angles.unit]
     )
-    linear = 1 / a_joint(angles.counts_per_mm, "counts_per_mm") if angles.counts_per_mm else LENGTHS[angles.linear_unit]
+    linear = (
+        1 / a_joint(angles.counts_per_mm, "counts_per_mm") if angles.counts_per_mm else LENGTH_UNITS[angles.linear_unit]
+    )
     units = np.where(by_joint(arm, False, True), linear, unit)
     return a_joint(angles.sign, "sign") * (readings - a_joint(angles.offset, "offset")) * units

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, FiniteFloat, NonNegativeInt, Positiv
 
 from ..core.errors import InputError, nearest
 from ..core.text import shorten
-from ..core.units import ARCSEC, DEG, INCH, UM, M
+from ..core.units import ARCSEC, DEG, LENGTH_UNITS
 from ..data.observations.observation import AbstractObservation, Entry
 from ..data.observations.socket import Socket
 from ..kinematics.arm import Arm
@@ -25,7 +25,6 @@ from .temperatures import TEMPERATURE, with_temperature
 from .text_table import Column, TextTable
 from .toml import Strict, each_once
 
-LENGTHS = {"mm": 1.0, "m": M, "um": UM, "inch": INCH}
 _ANGLES = {"rad": 1.0, "deg": DEG, "arcsec": ARCSEC}
 _NUMBERS_OF_ROTATION = {"vector": 3, "quaternion wxyz": 4, "quaternion xyzw": 4, "matrix": 9}
 _EULER = re.compile("[xyz]{3}|[XYZ]{3}")
@@ -302,7 +301,7 @@ class _Reader:
 
     def _unit(self, entry: Entry, header: str | None = None) -> float:
         """What a number of the table or manifest is multiplied by; ``header``: the unit that the table states."""
-        known = _ANGLES if entry.unit in ("rad", "1") else LENGTHS
+        known = _ANGLES if entry.unit in ("rad", "1") else LENGTH_UNITS
         unit = self._table.units.get(entry.name)
         if unit is not None and header is not None and unit != header:
             raise InputError(

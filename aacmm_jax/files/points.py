@@ -7,15 +7,13 @@ import numpy as np
 
 from ..acceptance.results import Measured
 from ..core.errors import InputError, nearest
-from ..core.units import INCH, UM, M
+from ..core.units import LENGTH_UNITS
 from ..kinematics.workspace import Reach
 from .inputs import InputFile, fingerprint
 from .manifest import PointsManifest, recorded
 from .outputs import as_path
 from .text_table import read_numbers
 from .toml import read_toml
-
-_UNITS = {"mm": 1.0, "m": M, "um": UM, "inch": INCH}
 
 
 def read_points(path: str | os.PathLike) -> Measured:
@@ -59,7 +57,7 @@ def read_points(path: str | os.PathLike) -> Measured:
                     f"{file} has {table.shape[1]} columns; give x, y and z, or pick three with columns = [...] in "
                     "[points]."
                 )
-            return table * _UNITS[model.points.unit]
+            return table * LENGTH_UNITS[model.points.unit]
 
         sockets, lengths, spheres, _ = recorded(path.parent, model, points)
         for length in lengths:

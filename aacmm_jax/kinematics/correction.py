@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from ..core.arrays import Numbers, as_array
 from ..core.errors import InputError
 from ..core.linear_algebra import solve_positive_definite
-from ..core.numpy_or_jax import AnyArray, compiled, namespace, numpy_if_known
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, numpy_if_known, to_numpy
 from ..core.rotations import cross
 from .arm import Arm, checked_limits, is_single
 from .chain import ForwardPass, Geometry, forward_pass, joint_motion, joint_motion_of_rows, length_scale, reading_units
@@ -126,6 +126,26 @@ def readings_at_poses(
     shape = q.shape[:-1]
     found = found.reshape(*shape, arm.joints)
     return ReadingsAtPoses(found, *(x.reshape(shape) for x in (scale * distance, angle, reached)))
+
+
+def least_motion(arm: Arm, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, " N"]:
+    """The smallest movement of an arm whose readings change by 1 rad (1 m of a prismatic joint) in all, mm.
+
+    A rotation of the last frame counts as what it moves at 500 mm, with six joints or more. It is 0 in a singular
+    configuration, where two axes of a wrist align or an arm is stretched: readings of a pose are not unique there, or
+    poses near it have none.
+
+    Args:
+        arm: One arm.
+        q: Readings, rad and mm.
+    """
+    geometry = to_numpy(arm.geometry)
+    forward = forward_pass(geometry, joint_motion(geometry, q))
+    columns = np.asarray(reading_columns(forward))
+    if arm.joints >= FULL_POSE:
+        columns = np.concatenate([columns, _LEVER * np.asarray(reading_rotations(forward))], axis=1)
+    columns = columns * np.asarray(reading_units(geometry))[:, None, None]
+    return np.linalg.svd(columns.transpose(2, 1, 0), compute_uv=False)[:, -1]
 
 
 def _at_20_degrees(poses: Float[AnyArray, "c 4 4"], scale: Float[AnyArray, " c"]) -> Float[AnyArray, "c 4 4"]:

@@ -55,6 +55,9 @@ class ReadingCheck(NamedTuple):
     poses: int
     known_positions: bool  # in the base frame
     tried: int  # hypotheses
+    # Of the nominal arm as the best has it, with the tip where it fits in the last frame, mm; None: it is not free.
+    rms_with_tip: float | None = None
+    free_tip: bool = False  # whether the place of the tip was said to be unknown
 
     @property
     def fits(self) -> bool:
@@ -124,7 +127,9 @@ def check_readings(
     simplest = min(every, key=lambda one: (one.outside > 0, one.changes, one.rms_fitted))
     best = simplest if explained else min(every, key=lambda one: one.rms_fitted)
     others, equal = _others(fit, best, good) if explained else ((), 0)
-    return ReadingCheck(given, best, others, equal, explained, size, len(evidence.q), evidence.in_base, tried)
+    return ReadingCheck(given, best, others, equal, explained, size, len(evidence.q), evidence.in_base, tried)._replace(
+        rms_with_tip=fit.with_tip_found(best) if own_frame else None, free_tip=free_tip
+    )
 
 
 def _bound(rms: float, fit: ReadingFit) -> float:

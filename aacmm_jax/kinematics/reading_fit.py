@@ -73,8 +73,8 @@ class ReadingFit:
         lengths = [is_length(name) for name in names]
         self._deviations = np.where(lengths, _LENGTH * size, _TWIST)
         self._zeros = np.array([name.startswith("theta") for name in names])
-        probe = [name.startswith("probe") for name in names]
-        self._deviations[probe] = size / 2 if free_tip else _PROBE * size
+        self._tip = np.array([name.startswith("probe") for name in names])
+        self._deviations[self._tip] = size / 2 if free_tip else _PROBE * size
         rows = (3 if evidence.rotations is None else 6) * len(self._few.q)
         unknown = 0 if evidence.in_base else 6 if evidence.own_frame else 3 * (1 + int(self._few.owner.max()))
         self._enough = rows - unknown >= 3 * arm.joints
@@ -124,6 +124,20 @@ class ReadingFit:
     def refitted(self, hypothesis: Hypothesis, angle: float, length: float) -> Explanation:
         """The explanation with the zeros that fit best, as few of them changed as are needed."""
         return self.needed_zeros(hypothesis, angle, length, *self.with_free_zeros(hypothesis, angle, length))
+
+    def with_tip_found(self, one: Explanation) -> float:
+        """The residual of the nominal arm with the tip where it fits best in the last frame, mm."""
+        evidence, vector = self.evidence.scaled(one.angle, one.length), self._nominal.copy()
+        readings, tip = one.hypothesis.readings(evidence.q), np.flatnonzero(self._tip)
+        residual, columns = self._residual(evidence, vector, readings)
+        best = _rms(residual, len(readings))
+        for _ in range(_STEPS):
+            vector[tip] -= np.linalg.lstsq(columns[:, tip], residual, rcond=1e-10)[0]
+            residual, columns = self._residual(evidence, vector, readings)
+            before, best = best, min(best, _rms(residual, len(readings)))
+            if best > 0.99 * before:
+                break
+        return best
 
     def _adjusted(
         self, hypothesis: Hypothesis, angle: float, length: float, zero: float

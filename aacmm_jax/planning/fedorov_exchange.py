@@ -130,11 +130,20 @@ def relaxed_value(candidates: Candidates, count: int, objective: Objective, iter
     for iteration in range(iterations + 1):
         covariance = np.linalg.inv(candidates.base + (flat * np.repeat(times, each)[:, None]).T @ flat)
         if iteration < iterations:
-            root = np.linalg.cholesky(objective.gradient(covariance[:p, :p]))
+            root = _root(objective.gradient(covariance[:p, :p]))
             gain = np.sum((flat @ (covariance[:, :p] @ root)).reshape(len(times), -1) ** 2, axis=1)
             times *= gain**_RELAXATION
             times *= count / times.sum()
     return objective.value(covariance[:p, :p])
+
+
+def _root(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+    """A root of a semidefinite matrix; it is singular where lengths do not depend on a parameter."""
+    try:
+        return np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(matrix)
+        return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 def covariance_of(information: Float[np.ndarray, "P P"], parameters: int) -> Float[np.ndarray, "p p"]:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.numpy_or_jax import to_numpy
+from ..core.text import pluralise
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise, tip_covariances
 from ..data.observations.measured_points import MeasuredPoints
@@ -29,7 +30,7 @@ _LENGTHS = 200  # that predictions are of
 _DETERMINED = 10.0  # mm: a length known no better follows from the weak prior alone
 _PLACEMENTS, _STARTS = 5, 40  # of sockets; and configurations in each socket
 _SOCKETS = (2, 4, 6)  # in pairs at the ends of reference lengths
-_U_LENGTH, _U_TRACKER = 0.002, 0.02  # mm
+U_LENGTH, U_TRACKER = 0.002, 0.02  # mm: of reference lengths, and of each coordinate that a tracker measures
 _STILL_AT, _FEW = (0.5, 0.25, 0.75), 40  # of a joint's range; and poses that say nothing
 _POINTS = 240  # poses that a tracker sees
 
@@ -154,7 +155,7 @@ def first_capture(arm: Arm, noise: Noise, arm_class: str = "") -> FirstCapture:
         starts, ends = sample_lengths(arm, _PLACEMENTS * sockets // 2, length=length, seed=2)
         points = np.stack([np.asarray(arm.position(starts)), np.asarray(arm.position(ends))], axis=1)
         placed = [_in_sockets(problem, part.reshape(-1, 3)) for part in np.split(points, _PLACEMENTS)]
-        words = f"{sockets} sockets, {sockets // 2} reference length{'s' if sockets > 2 else ''} of {length:.0f} mm"
+        words = f"{sockets} sockets, {pluralise(sockets // 2, 'reference length')} of {length:.0f} mm"
         rows.append(_expected(words, sockets, placed, functions, u_reading))
     rows.append(_expected("a tracker", 0, [_seen(problem)], functions, u_reading))
     return FirstCapture(arm_class, noise, u_reading, tuple(rows))
@@ -168,21 +169,21 @@ def _thorough(
     q, sizes = np.asarray(poses.q), poses.sizes
     tips, ends = np.asarray(arm.position(q)), np.cumsum(sizes)
     sockets = {f"S{i}": q[end - size : end] for i, (size, end) in enumerate(zip(sizes, ends, strict=True))}
-    length = ReferenceLength("S0", "S1", float(np.linalg.norm(tips[0] - tips[sizes[0]])), _U_LENGTH)
-    return sockets, [length], [MeasuredPoints("tracker", q, tips, u=_U_TRACKER)]
+    length = ReferenceLength("S0", "S1", float(np.linalg.norm(tips[0] - tips[sizes[0]])), U_LENGTH)
+    return sockets, [length], [MeasuredPoints("tracker", q, tips, u=U_TRACKER)]
 
 
 def _in_sockets(problem: DesignProblem, points: Float[np.ndarray, "s 3"]) -> tuple[Candidates, int]:
     """Random poses in sockets, two by two at the ends of reference lengths, and how many there are."""
     pairs = tuple((i, i + 1) for i in range(0, len(points), 2))
     pool = pool_at(problem, points, _STARTS)
-    return candidates_of(problem, FixturePlacement(points, pairs, (_U_LENGTH,) * len(pairs)), pool), len(pool.q)
+    return candidates_of(problem, FixturePlacement(points, pairs, (U_LENGTH,) * len(pairs)), pool), len(pool.q)
 
 
 def _seen(problem: DesignProblem) -> tuple[Candidates, int]:
     """Random poses that a tracker sees from an unknown place."""
     # A tip that is not seated scatters by its readings, and by the tracker.
-    noise = Noise(encoder_arcsec=np.asarray(problem.noise.encoder_arcsec), seating=_U_TRACKER)
+    noise = Noise(encoder_arcsec=np.asarray(problem.noise.encoder_arcsec), seating=U_TRACKER)
     q = problem.region.draw(_POINTS)
     pool = pool_of(problem._replace(noise=to_numpy(noise)), q, np.zeros(len(q), dtype=int))
     tips = np.asarray(problem.arm.position(q))

@@ -192,7 +192,7 @@ def plan_kit(
         noise=noise,
         criterion=criterion,
         check_length=check_length,
-        **_predictions(problem, placed, pool, chosen, functions),
+        **_predictions(problem, placed, pool, chosen, functions, report),
         motions=motions,
         cell=problem.region.cell,
         retract=retract,
@@ -361,9 +361,11 @@ def _predictions(
     pool: list[AbstractObservation],
     chosen: list[AbstractObservation],
     functions: Float[np.ndarray, "v p"],
+    report: Progress,
 ) -> dict[str, Any]:
     """For the plan, for random poses, for imprecise and more poses, and without each part of the kit."""
-    random = problem.region.random
+    random, stage = problem.region.random, "Predicting"
+    report(stage, 0.0)
 
     def predicted(candidates: Candidates, rows: Float[np.ndarray, "m r P"]) -> Prediction:
         return prediction_of(candidates, rows, functions)
@@ -385,14 +387,18 @@ def _predictions(
         of([_loosened(problem, *parts) for parts in zip(placed.kit, placed.items, chosen, strict=True)])
         for _ in range(_LOOSE_SETS)
     ]
+    report(stage, 0.3)
     base = planned.information(planned.rows)
     added = exchange(possible._replace(base=base), MORE, problem.objective, least=0, sweeps=1)
     without = {}
-    for part in dict.fromkeys(placed.parts) if len(set(placed.parts)) > 1 else ():
+    parts = list(dict.fromkeys(placed.parts)) if len(set(placed.parts)) > 1 else []
+    for number, part in enumerate(parts):
+        report(stage, 0.4 + 0.6 * number / len(parts))
         left = [one for one, of_part in zip(chosen, placed.parts, strict=True) if of_part != part]
         seen = observability(problem.arm, Capture({}, (), left), problem.space)
         complete = seen.rank == len(problem.space.names)
         without[part] = of(left) if complete else Prediction(math.inf, math.inf)
+    report(stage, 1.0)
     return {
         "predicted": predicted(planned, planned.rows),
         "random": typical(random_sets),

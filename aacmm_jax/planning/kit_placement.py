@@ -18,6 +18,7 @@ from ..kinematics.workspace import SearchRegion, reached, total_link_length
 from .fedorov_exchange import Candidates, relaxed_value
 from .motion import approaches
 from .placement import DesignProblem, PlacementRegion, inside
+from .unreachable import explained_place
 
 _PLACEMENTS, _DESIGNED, _NEIGHBOURS = 120, 8, 60
 _STARTS, _DESIGN_STARTS = 120, 400  # random configurations for each thing: of the first score, and of the second
@@ -94,11 +95,13 @@ def set_up(
     share: float = 0.0,
     item: KitItem | None = None,
     retract: float = 0.0,
+    explain: bool = True,
 ) -> AbstractObservation:
     """Poses in one thing from random starts, as the observation that they would give without errors of the arm.
 
     ``item`` says from which cone it is approached, and ``retract`` how far its approach points are, mm. Raises
-    `InputError` where a place is reached from fewer than this ``share`` of the starts, or hardly ever.
+    `InputError` where a place is reached from fewer than this ``share`` of the starts, or hardly ever; it says which
+    constraint leaves too few, unless ``explain`` is False.
     """
     own = region_of(region, simulated, item)
     each = len(_repeated(simulated, 1).tips(np.random.default_rng(0)))
@@ -114,13 +117,12 @@ def set_up(
     counts = np.bincount(whole.places[good], minlength=int(whole.places.max()) + 1)
     tried = np.bincount(whole.places)
     if np.any(counts < np.maximum(share * tried, _LEAST_CANDIDATES)):
-        where = ", ".join(f"{round(float(x)):.6g}" for x in tips[whole.places == int(np.argmin(counts / tried))][0])
-        cone = f", its cone of {math.degrees(item.half_angle):.3g} deg" if item is not None and item.has_cone else ""
-        clear = ", or clear of obstacles and of itself" if region.cell is not None else ""
-        raise InputError(
-            f"'{simulated.name}' at ({where}) mm cannot be reached in enough poses within the joint limits and their "
-            f"margin{cone}{clear}; move it, or make its {'cone wider' if cone else 'box smaller'}."
-        )
+        if not explain:
+            raise InputError(f"'{simulated.name}' cannot be reached in enough poses; move it.")
+        point = tips[whole.places == int(np.argmin(counts / tried))][0]
+        enough = max(share, _LEAST_CANDIDATES / float(tried.min()))
+        approach = retract if item is not None and item.has_cone else 0.0
+        raise InputError(explained_place(own, f"'{simulated.name}'", point, enough, approach))
     return whole.select(np.flatnonzero(good))
 
 
@@ -180,7 +182,7 @@ class _Search(NamedTuple):
         if not scored:
             raise InputError(
                 "no placement of the kit was found that can be reached well; give a region nearer to the arm, or "
-                "fewer places."
+                f"fewer places. In the last that was tried, {self._reason(layout)}"
             )
         best, best_pools, best_value = None, None, np.inf
         shortlist = [layout for _, _, layout in sorted(scored)[:_DESIGNED]]
@@ -200,6 +202,15 @@ class _Search(NamedTuple):
         report(stage, 1.0)
         return sorted(scored)[0][2] if best is None else best
 
+    def _reason(self, layout: _Layout) -> str:
+        """Why a placement cannot be reached well."""
+        for simulated, (item, _) in zip(layout.kit, self.things, strict=True):
+            try:
+                set_up(self.problem.region, simulated, _STARTS, _REACHED, item)
+            except InputError as error:
+                return str(error)
+        return "single poses of it are hard to reach."
+
     def _value(self, pools: Sequence[AbstractObservation], iterations: int) -> float:
         candidates = self.candidates_of(self.problem, pools)
         return relaxed_value(candidates, self.poses, self.problem.objective, iterations)
@@ -218,7 +229,8 @@ class _Search(NamedTuple):
                 found.append(known[i])
                 continue
             try:
-                found.append(set_up(self.problem.region, simulated, starts, 0.0 if frame is None else _REACHED, item))
+                share, stands = (0.0, True) if frame is None else (_REACHED, False)
+                found.append(set_up(self.problem.region, simulated, starts, share, item, explain=stands))
             except InputError:
                 if frame is None:
                     raise

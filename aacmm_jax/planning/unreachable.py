@@ -1,4 +1,4 @@
-"""Why a socket cannot be reached in enough poses, as a sentence."""
+"""Why a socket, or a place of what is in a kit, cannot be reached in enough poses, as a sentence."""
 
 import math
 from collections.abc import Sequence
@@ -21,18 +21,26 @@ def explained(
     share: float,
     retract: float,
 ) -> str:
-    """Which constraint leaves too few of the poses in a socket: obstacles, cone, approach point, or the reach.
+    """Which constraint leaves too few of the poses in a socket.
 
     ``share`` is the part of the random starts that would be enough.
     """
-    enough = math.ceil(share * _STARTS)
-    where = ", ".join(f"{round(float(x)):.6g}" for x in points[socket])
-    what = f"socket '{names[socket]}' at ({where}) mm cannot be reached in enough poses"
     cones = None if region.cones is None else region.cones.at(np.array([socket]))
-    own = region._replace(cones=cones)
+    return explained_place(region._replace(cones=cones), f"socket '{names[socket]}'", points[socket], share, retract)
+
+
+def explained_place(own: SearchRegion, name: str, point: Float[np.ndarray, " 3"], share: float, retract: float) -> str:
+    """Which constraint leaves too few poses of the tip in a point: obstacles, cone, approach point, or the reach.
+
+    ``own`` is a region with one cone, that of the point.
+    """
+    enough = math.ceil(share * _STARTS)
+    where = ", ".join(f"{round(float(x)):.6g}" for x in point)
+    what = f"{name} at ({where}) mm cannot be reached in enough poses"
+    cones, region = own.cones, own
 
     def reached(other: SearchRegion) -> Float[np.ndarray, "c n"]:
-        return configurations_at(other, points[socket][None], _STARTS)[0]
+        return configurations_at(other, point[None], _STARTS)[0]
 
     found = reached(own)
     if len(found) >= enough and retract and cones is not None:
@@ -53,7 +61,6 @@ def explained(
     if cones is not None and cones.any and len(reached(own._replace(cell=None, cones=None))) >= enough:
         angle, normal = math.degrees(float(cones.half_angles[0])), ", ".join(f"{x:.3g}" for x in cones.normals[0])
         return (
-            f"{what} within its cone of {angle:.3g} deg about ({normal}); widen the cone, turn its normal, or move the "
-            "socket."
+            f"{what} within its cone of {angle:.3g} deg about ({normal}); widen the cone, turn its normal, or move it."
         )
     return f"{what} within the joint limits and their margin; move it, or give more candidates."

@@ -125,6 +125,7 @@ _REPORTS: dict[str, Callable[[str | os.PathLike, dict[str, Any]], tuple[Report, 
 
 def _origin(source: str | os.PathLike, attributes: dict[str, Any]) -> list[tuple[str, list[str]]]:
     """How the file was made, and how to reproduce it."""
+    seed = attributes.get("seed")
     return [
         ("File", [fingerprint(source)]),
         ("Measured on", [str(attributes.get("measured") or "not stated")]),
@@ -132,7 +133,7 @@ def _origin(source: str | os.PathLike, attributes: dict[str, Any]) -> list[tuple
         ("Command", [str(attributes["command"])]),
         ("aacmm_jax", [str(attributes["package_version"])]),
         ("Versions", [attributes.get("versions") or "not recorded"]),
-        ("Seed", ["none" if attributes.get("seed") is None else str(attributes["seed"])]),
+        *([] if seed is None else [("Seed", [str(seed)])]),
         ("Sources", [str(line) for line in attributes.get("sources") or ["not recorded"]]),
     ]
 

@@ -10,15 +10,22 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import pluralise, shorten
 from ..core.units import ARCSEC
-from ..data.arm_classes import class_noise
-from ..data.noise import Noise
+from ..data.arm_classes import ArmNoise
 from ..kinematics.arm import Arm, correction_names, joint_limits, without_corrections
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, tip_frame
 from ..kinematics.corrected_arm import function_values, loads_of
 from ..kinematics.corrections.kinds import terms_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..kinematics.workspace import arm_reach, closest_approach, total_link_length
-from ..planning.first_capture import Determined, FirstCapture, determined_by, first_capture, still_joints
+from ..planning.first_capture import (
+    U_LENGTH,
+    U_TRACKER,
+    Determined,
+    FirstCapture,
+    determined_by,
+    first_capture,
+    still_joints,
+)
 from ..uncertainty.correction_limits import is_vertical
 from .calibration import arm_summary
 
@@ -31,8 +38,8 @@ _OTHERS = "Left out as constant, or as combinations of other functions of their 
 
 def arm_survey(
     specification: ArmSpecification,
+    usual: ArmNoise,
     *,
-    noise: Noise | None = None,
     base: Transform | None = None,
     model: str | None = None,
 ) -> dict[str, Any]:
@@ -40,7 +47,7 @@ def arm_survey(
 
     Args:
         specification: The arm, with the identification that its file proposes.
-        noise: Of its readings and of the seat; by default that of the usual classes of arms.
+        usual: Class of the arm, and the noise of its readings and of the seat.
         base: The first frame in a robot's base link, mm; frames are in the base link then.
         model: The model that the arm's corrections are of, where one was named.
     """
@@ -73,11 +80,12 @@ def arm_survey(
             "determined": [_row(one) for one in found],
             "still": [{"joint": one.joint, "lost": None if one.lost is None else list(one.lost)} for one in still],
         }
-        classes = ("measuring arm", "robot")
-        noises = {name: class_noise(arm, name) for name in classes} if noise is None else {"given": noise}
-        needed = [first_capture(arm, one, name) for name, one in noises.items()]
+        needed = [first_capture(arm, usual.noise, usual.arm_class)]
         moving = [one.joint for one in still if one.lost is None or one.lost]
-        summary |= {"needed": [_needed(one) for one in needed], "advice": _advice(needed, moving, arm.joints)}
+        summary |= {
+            "needed": [_needed(one, usual.source) for one in needed],
+            "advice": _advice(needed, moving, arm.joints),
+        }
     except InputError as error:
         summary["warnings"].append(f"What a calibration needs cannot be computed for this arm: {error}")
     return summary
@@ -140,9 +148,12 @@ def _row(one: Determined) -> dict[str, Any]:
     }
 
 
-def _needed(one: FirstCapture) -> dict[str, Any]:
+def _needed(one: FirstCapture, source: str) -> dict[str, Any]:
     return {
         "class": one.arm_class,
+        "noise_source": source,
+        "u_length_mm": U_LENGTH,
+        "u_tracker_mm": U_TRACKER,
         "encoder_arcsec": float(np.max(np.asarray(one.noise.encoder))) / ARCSEC,
         "seating_mm": float(one.noise.seating),
         "u_reading_mm": one.u_reading,

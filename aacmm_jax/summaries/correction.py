@@ -3,13 +3,14 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..core.text import pluralise, shorten
 from ..core.units import DEG
 from ..kinematics.arm import Arm, by_joint
-from ..kinematics.correction import FULL_POSE, ReadingsAtPoses
+from ..kinematics.correction import FULL_POSE, ReadingsAtPoses, least_motion
 
+_SINGULAR = 3.0  # mm a rad: 1 mm takes 20 deg of the joints; axes of a wrist are within half a degree of each other
 _LARGE_CHANGE = 5.0  # deg: ten times what link errors of 1 mm and 1 mrad take where no axes align
 
 
@@ -43,6 +44,7 @@ def correction_summary(
         "largest_angle_deg": None,
         "largest_change": None,
         "largest_slide": None,
+        "singular": [],
         "not_reached": [_missed(nominal, found, row) for row in np.flatnonzero(~reached).tolist()],
         "warnings": [],
     }
@@ -53,6 +55,14 @@ def correction_summary(
         )
     if not reached.any():
         return summary
+    summary["singular"] = _singular(nominal, q[:, : nominal.joints] if of_readings else np.asarray(found.q), reached)
+    if summary["singular"]:
+        rows = shorten([str(row) for row in summary["singular"]])
+        summary["warnings"].append(
+            f"In {pluralise(len(summary['singular']), 'row')} (row {rows}) the nominal arm is singular, or nearly so: "
+            "axes align, or it is stretched. Its controller's inverse has no unique answer there, and may take other "
+            "readings for such a pose than these; command readings there, not poses, or keep away from it."
+        )
     summary["largest_distance_mm"] = float(np.asarray(found.distance)[reached].max())
     summary["largest_angle_deg"] = float(np.asarray(found.angle)[reached].max() / DEG)
     if of_readings:
@@ -76,6 +86,12 @@ def correction_summary(
                 "motions; look at them before an arm is sent there."
             )
     return summary
+
+
+def _singular(nominal: Arm, q: Float[np.ndarray, "N n"], reached: Bool[np.ndarray, " N"]) -> list[int]:
+    """Rows, from 1, near a singular configuration."""
+    near = least_motion(nominal, q) < _SINGULAR
+    return (np.flatnonzero(near & reached) + 1).tolist()
 
 
 def _missed(nominal: Arm, found: ReadingsAtPoses, row: int) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.text import shorten
-from ..core.units import DEG, INCH, UM, M
+from ..core.units import DEG, INCH, UM, M, length_unit
 from ..data.capture import Capture
 from ..data.observations.measured_transforms import MeasuredTransforms
 from ..data.observations.observation import AbstractObservation
@@ -44,6 +44,7 @@ class _Tried(NamedTuple):
     cause: str
     q: Float[np.ndarray, "M n"]
     observations: tuple[AbstractObservation, ...] | None = None  # None: as given
+    write: str = ""  # what corrects it in the manifest, as a sentence
 
 
 def likely_cause(arm: Arm, capture: Capture) -> str:
@@ -62,15 +63,16 @@ def likely_cause(arm: Arm, capture: Capture) -> str:
         given, size = misfit.rms(misfit.given), total_link_length(arm)
         if given < _NOMINAL * size:
             return ""
-        rms, cause = np.inf, ""
+        rms, cause, write = np.inf, "", ""
         for tried in misfit.corrections():
             found = misfit.rms(tried)
             if found < 0.98 * rms:  # of equally good corrections, the first
-                rms, cause = found, tried.cause
+                rms, cause, write = found, tried.cause, tried.write
     if not rms < min(given / _BETTER, _SMALL * size):
         return ""
     return (
         f"Likely cause: {cause}. Corrected, the residuals by the nominal arm fall from {given:.3g} to {rms:.3g} mm RMS."
+        + write
     )
 
 
@@ -128,7 +130,8 @@ class _OfObservations(NamedTuple):
                 for i, of in zip(several, corrected, strict=True):
                     changed[i] = dict(of).get(cause, observations[i])
                 names = shorten([observations[i].name for i in several], 3)
-                yield _Tried(f"{cause} ({names})", q, tuple(changed))
+                field = _measured_field(observations[several[0]])
+                yield _Tried(f"{cause} ({names})", q, tuple(changed), _line(cause, field))
 
     def rms(self, tried: _Tried) -> float:
         """RMS distance of the tips from the geometry that fits them, mm; an angle counts as the arm's lever makes it.
@@ -215,6 +218,12 @@ def _measured_field(observation: AbstractObservation) -> str | None:
         if entry.unit == "mm" and measured and getattr(observation, entry.name) is not None:
             return entry.name
     return None
+
+
+def _line(cause: str, field: str | None) -> str:
+    """What to write in the manifest where a unit is the cause."""
+    unit = length_unit(_UNITS.get(cause, 0.0))
+    return f' In its table of the manifest write units = {{ {field} = "{unit}" }}.' if unit in ("m", "inch") else ""
 
 
 def _measured(observation: AbstractObservation) -> Iterator[tuple[str, AbstractObservation]]:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..core.units import DEG, INCH, M
+from ..core.units import DEG, LENGTH_UNITS, length_unit
 from ..data.capture import Capture
 from ..data.observations.measured_points import AbstractMeasured
 from ..kinematics.arm import Arm
@@ -14,7 +14,7 @@ from ..kinematics.reading_check import ReadingCheck, check_readings
 from ..kinematics.reading_fit import Explanation
 
 _LISTED = 5
-_LENGTH_UNITS = {M: "m", 1 / M: "um", INCH: "inches", 1 / INCH: "mm, and were taken for inches"}
+_MUCH = 2.0  # a place of the tip that reduces the residuals by less is not spoken of
 _QUARTERS = 1e-9  # rad
 
 
@@ -46,13 +46,16 @@ def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
     )
 
 
-def reading_check_summary(found: ReadingCheck, arm: str, *, unit: str | None = None) -> dict[str, Any]:
+def reading_check_summary(
+    found: ReadingCheck, arm: str, *, unit: str | None = None, positions: str = "mm"
+) -> dict[str, Any]:
     """Plain values for JSON and display.
 
     Args:
         found: What the comparison found.
         arm: Name of the arm.
         unit: Unit of the readings that was stated, or taken; None where the file says it for itself.
+        positions: Unit that positions were taken to be in.
     """
     best = found.best
     return {
@@ -62,19 +65,21 @@ def reading_check_summary(found: ReadingCheck, arm: str, *, unit: str | None = N
         "unit": unit,
         "fits": found.fits,
         "explained": found.explained,
-        "sentence": _sentence(found),
-        "given": _row(found.given),
-        "found": _row(best) if found.explained else None,
-        "alternatives": [_row(one) for one in found.others],
+        "sentence": _sentence(found, positions),
+        "tip": _tip(found),
+        "given": _row(found.given, positions),
+        "found": _row(best, positions) if found.explained else None,
+        "alternatives": [_row(one, positions) for one in found.others],
         "equivalent": found.equal,
         "known_positions": found.known_positions,
+        "rms_with_tip_mm": found.rms_with_tip,
         "hypotheses": found.tried,
     }
 
 
-def _row(one: Explanation) -> dict[str, Any]:
+def _row(one: Explanation, positions: str) -> dict[str, Any]:
     return {
-        "says": explanation_words(one),
+        "says": explanation_words(one, positions),
         "columns": [column + 1 for column in one.order],
         "signs": list(one.signs),
         "zeros_deg": [offset / DEG for offset in one.offsets],
@@ -87,7 +92,7 @@ def _row(one: Explanation) -> dict[str, Any]:
     }
 
 
-def _sentence(found: ReadingCheck) -> str:
+def _sentence(found: ReadingCheck, positions: str) -> str:
     given, best = found.given, found.best
     if not found.explained:
         return (
@@ -100,15 +105,37 @@ def _sentence(found: ReadingCheck) -> str:
             f"The readings fit as they are: {given.rms:.3g} mm RMS by the nominal arm, {given.rms_fitted:.3g} mm with "
             "parameters as real arms have them."
         )
-    words = explanation_words(best)
+    words = explanation_words(best, positions)
     return (
         f"{words[0].upper()}{words[1:]}. So corrected, the residuals by the nominal arm fall from {given.rms:.3g} to "
         f"{best.rms:.3g} mm RMS ({best.rms_fitted:.3g} mm with parameters as real arms have them)."
     )
 
 
-def explanation_words(one: Explanation) -> str:
-    """What an explanation changes, in one sentence without its end; empty where nothing."""
+def _tip(found: ReadingCheck) -> str:
+    """How much of the residual is due to the place of the tip, which a calibration finds; empty where it is little."""
+    rms = found.best.rms
+    if not found.explained or found.rms_with_tip is None or _MUCH * found.rms_with_tip > rms:
+        return ""
+    known = (
+        "what was seen is taken to be where the arm's probe is. A calibration finds its place"
+        if found.free_tip
+        else "what was seen is not where the arm's probe is. In its table of the manifest write target = "
+        '"reflector", and a calibration finds its place'
+    )
+    return (
+        f"Most of the {rms:.3g} mm is an offset of the tip: {known} in the last frame; with it the nominal arm leaves "
+        f"{found.rms_with_tip:.3g} mm RMS."
+    )
+
+
+def explanation_words(one: Explanation, positions: str = "mm") -> str:
+    """What an explanation changes, in one sentence without its end; empty where nothing.
+
+    Args:
+        one: The explanation.
+        positions: Unit that positions were taken to be in.
+    """
     words = []
     if one.angle != 1:
         words.append(
@@ -117,7 +144,13 @@ def explanation_words(one: Explanation) -> str:
             else "the readings are in radians, and were taken for degrees"
         )
     if one.length != 1:
-        words.append(f"the positions are in {_LENGTH_UNITS[one.length]}")
+        unit = length_unit(one.length * LENGTH_UNITS[positions])
+        factor = f"{one.length:.4g} times as large as they were taken to be"
+        words.append(
+            f"the positions are {factor}"
+            if unit is None
+            else f"the positions are in {unit}, and were taken for {positions}"
+        )
     words += _order(one.order)
     wrong = [f"{column + 1}" for column, sign in sorted(zip(one.order, one.signs, strict=True)) if sign < 0]
     if wrong:

@@ -1,6 +1,7 @@
 """Warnings about a capture or a calibration: one sentence each, the most serious first."""
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from ..calibration.results import Calibration, Identification, active_names
 from ..calibration.scale_anchor import scale_set_by_clause
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
-from ..core.units import INCH, M
+from ..core.units import INCH, UM, M
 from ..data.capture import Capture
 from ..data.noise import Noise, tip_covariances
 from ..data.recording import Recording
@@ -29,6 +30,9 @@ _SUSPICIOUS_SCALE = 0.005  # of a fixed link: beyond it the nominal value or a r
 _TOLERANCE = math.radians(0.01)  # beyond a limit: more than the noise of any encoder
 _APART = 5.0  # RMS of a session among others, over that which it has alone, beyond which they are not of one arm
 _EXACT = 1e-6  # mm: smaller residuals are rounding errors of a simulation without noise
+# mm. An interferometer reaches 0.1 um in a metre; seats, probes and trackers of arms are far from it. Beyond 1 mm a
+# length or point says less than the nominal arm does.
+_SMALLEST_U, _LARGEST_U = 1e-4, 1.0
 _TRY_ALL = "aacmm arm ARM --check MANIFEST tries every order and sign of the columns, and the zeros of the joints."
 # By k, which is a length measured by the nominal arm over its reference value: one in m, read as mm, makes k = 1000.
 _MISTAKEN_UNITS = {
@@ -63,7 +67,37 @@ def of_capture(recording: Recording) -> list[str]:
     exact = [f"{length.start} - {length.end}" for length in recording.capture.lengths if float(length.u) == 0]
     if exact and recording.true is None:
         found.append(f"Taken as exact, because u is 0: {shorten(exact)}; give the standard uncertainty of each length.")
+    return found + ([] if recording.true is not None else _implausible_uncertainties(recording.capture))
+
+
+def _implausible_uncertainties(capture: Capture) -> list[str]:
+    """Of standard uncertainties that nothing which measures arms has: most likely of another unit than mm."""
+    small, large = [], []
+    for where, values in _uncertainties(capture):
+        positive = values[values > 0]
+        if len(positive) and positive.min() < _SMALLEST_U:
+            small.append(f"{where} (u = {positive.min() / UM:.3g} um)")
+        if len(positive) and positive.max() > _LARGEST_U:
+            large.append(f"{where} (u = {positive.max() / UM:,.0f} um)")
+    found = []
+    if small:
+        found.append(f"Less than 0.1 um is hardly ever reached: {shorten(small)}; u is in mm, was it given in m?")
+    if large:
+        found.append(f"More than 1 mm says next to nothing: {shorten(large)}; u is in mm, was it given in um?")
     return found
+
+
+def _uncertainties(capture: Capture) -> Iterator[tuple[str, np.ndarray]]:
+    """What has standard uncertainties of lengths or coordinates, by its table in a manifest, and these, mm."""
+    for length in capture.lengths:
+        yield f"[[length]] {length.start} - {length.end}", np.atleast_1d(np.asarray(length.u, dtype=float))
+    for one in capture.observations:
+        stored = one.stored()
+        values = stored.get("u")
+        if stored.get("covariance") is not None:
+            values = np.sqrt(np.diagonal(np.asarray(stored["covariance"]), axis1=-2, axis2=-1))
+        if values is not None:
+            yield f"[[{one.table}]] {one.name}", np.atleast_1d(np.asarray(values, dtype=float)).ravel()
 
 
 def of_import(recording: Recording) -> list[str]:

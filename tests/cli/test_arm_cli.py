@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.files.commanded_poses import read_known_poses
 from aacmm_jax.kinematics import reading_check, reading_search, with_corrections
 from aacmm_jax.planning import first_capture
 from aacmm_jax.summaries import arm_survey
@@ -32,6 +33,7 @@ def test_a_template_is_written_looked_at_and_not_overwritten(aacmm, tmp_path, mo
     assert "my.toml exists" in aacmm("arm", "--new", "my.toml", expect=2).stderr
     said = aacmm("arm", "my.toml", "--figure", "arm.png")
     assert (tmp_path / "arm.png").read_bytes().startswith(b"\x89PNG")
+    printed = " ".join(said.stdout.split())
     for part in (
         "Reach: ",
         "Redundant",
@@ -39,8 +41,10 @@ def test_a_template_is_written_looked_at_and_not_overwritten(aacmm, tmp_path, mo
         "sockets and a reference length",
         "enough",
         "Record",
+        "Of encoders of 2 arcsec and a seat of 0.005 mm (class measuring arm: ",  # as aacmm plan assumes it
+        "reference lengths of u = 0.002 mm",
     ):
-        assert part in said.stdout, part
+        assert part in printed, part
 
 
 @pytest.mark.slow
@@ -54,6 +58,7 @@ def test_a_urdf_in_its_base_link(aacmm, monkeypatch):
     assert [row["joint"] for row in found["frames"]] == [1, 2, 3, 4, 5, 6, None]
     (needed,) = found["needed"]
     assert (needed["encoder_arcsec"], needed["seating_mm"]) == (pytest.approx(5), 0.005)
+    assert (needed["class"], needed["noise_source"]) == ("robot", "as given")
     assert found["reach_mm"]["nearest"] < found["reach_mm"]["farthest"] < found["reach_mm"]["links"]
     assert set(found["free"]) | set(found["fixed"]) <= set(aj.kinematics.arm.parameter_names(chain.arm)) | {
         f"beta_{i}" for i in range(1, 7)
@@ -74,6 +79,21 @@ def test_a_table_of_known_positions(aacmm, tmp_path, few):
     assert said.startswith("Columns 4 and 5 are exchanged; column 3 runs the other way. So corrected")
     angles = tomllib.loads(said[said.index("[angles]") : said.index("12 poses")])["angles"]
     assert angles == {"unit": "deg", "columns": [1, 2, 3, 5, 4, 6], "sign": [1, 1, -1, 1, 1, 1]}
+
+
+def test_positions_in_metres_are_no_matter_of_the_angles(aacmm, tmp_path, few, monkeypatch):
+    """The line that is missing is printed, not the table [angles], which is right; px_m in a table is read as m."""
+    monkeypatch.setattr(reading_search, "_MOST", 1000)
+    points = np.asarray(aj.load_arm("cheng2018-simulation").position(Q)) / 1000
+    header = [*(f"q_{i}" for i in range(1, 7)), "px_m", "py_m", "pz_m"]
+    write(tmp_path / "p.csv", header, np.hstack([Q, points]))
+    tables = '[[points]]\nfile = "p.csv"\ncolumns = { points = "p*_m" }\n'
+    (tmp_path / "m.toml").write_text(f'arm = "cheng2018-simulation"\nangles = {{ unit = "rad" }}\n{tables}')
+    said = aacmm("arm", "cheng2018-simulation", "--check", "m.toml").stdout
+    assert said.startswith("The positions are in m, and were taken for mm. So corrected")
+    assert 'units = { points = "m" }' in said
+    assert "[angles]" not in said
+    np.testing.assert_allclose(read_known_poses(tmp_path / "p.csv", 6, unit="rad").positions, 1000 * points)
 
 
 def test_poses_of_a_urdf_are_in_its_base_link(aacmm, tmp_path, few):

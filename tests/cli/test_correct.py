@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
 from aacmm_jax.cli.correct_command import in_first_frame
+from aacmm_jax.kinematics.correction import corrected_readings
+from aacmm_jax.summaries.correction import correction_summary
 
 from ..conftest import command_line
 
@@ -109,6 +111,39 @@ def test_what_is_not_reached_is_named_by_row_and_left_empty(arms):
     found = json.loads(run(arms, "far.csv", "-o", "out.csv", "--json", expect=1).stdout)
     assert [row["row"] for row in found["not_reached"]] == [2]
     assert found["not_reached"][0]["distance_mm"] > 100
+
+
+def test_columns_of_other_names_and_positions_in_metres(arms):
+    folder, nominal, _ = arms
+    names = ["base", "shoulder", "elbow", "roll", "pitch", "yaw"]
+    write(folder / "named.csv", ["speed", *names], [[7, *q] for q in Q])
+    assert "--columns" in run(arms, "named.csv", "-o", "no.csv", "--unit", "rad", expect=2).stderr
+    by_name = ("--columns", "base,shoulder,elbow,roll,pitch,yaw")
+    for options in (by_name, ("--columns", "2,3,4,5,6,7")):
+        run(arms, "named.csv", "-o", "out.csv", "--unit", "rad", *options)
+        assert list(table(folder / "out.csv")[0]) == ["speed", *names]
+    write(folder / "all.csv", names, Q)  # a column for each joint needs no names
+    run(arms, "all.csv", "-o", "all-out.csv", "--unit", "rad")
+    corrected = [[row[name] for name in names] for row in table(folder / "out.csv")]
+    assert [[row[name] for name in names] for row in table(folder / "all-out.csv")] == corrected
+    poses = np.asarray(nominal.pose(Q[:2]))
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
+    header = ["x", "y", "z", "qw", "qx", "qy", "qz", *names]
+    write(folder / "m.csv", header, np.hstack([poses[:, :3, 3] / 1000, quaternions, Q[:2]]))
+    run(arms, "m.csv", "-o", "m-out.csv", "--unit", "rad", "--length-unit", "m", *by_name)
+    found = [[float(row[name]) for name in names] for row in table(folder / "m-out.csv")]
+    np.testing.assert_allclose(found, np.array(corrected[:2], dtype=float), atol=1e-6)
+
+
+def test_rows_at_a_singular_wrist_are_named():
+    """Axes 4 and 6 of a UR10e align where joint 5 is at 0"""
+    nominal = aj.load_arm("ur10e")
+    q = np.tile([0.2, -1.0, 1.2, 0.4, 0.0, 0.3], (3, 1))
+    q[:, 4] = 1.2, 0.0, 0.02
+    found = corrected_readings(nominal, nominal.replace(d_6=nominal.d[5] + 0.01), q)
+    summary = correction_summary(nominal, nominal, q, found, unit="rad", of_readings=True)
+    assert summary["singular"] == [2]
+    assert summary["warnings"][0].startswith("In 1 row (row 2) the nominal arm is singular, or nearly so")
 
 
 def test_poses_of_a_urdf_are_in_its_base_link():

@@ -331,10 +331,11 @@ def test_a_plan_with_a_kit(aacmm, tmp_path):
         '[[points]]\nname = "tracker"\nbox = [[200, -300, 100], [600, 300, 500]]\nu = 0.02\n'
     )
     options = ("--kit", "kit.toml", "--poses", 16, "--candidates", 120, "--manifest", "capture.toml")
-    shown = aacmm("plan", "cheng2018-simulation", "-o", "plan.csv", *options).stdout
+    held = ("--held", "theta_1,d_1,a_6,alpha_6,probe_x,probe_y,d_2")
+    shown = aacmm("plan", "cheng2018-simulation", "-o", "plan.csv", *options, *held).stdout
     for part in ("bar", "tracker", "without tracker: ", "16 random poses in the same places"):
         assert part in shown
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 17
     assert '"a" = "bar-a.csv"' in (tmp_path / "capture.toml").read_text()
     refused = aacmm("plan", "cheng2018-simulation", "-o", "p.csv", "--kit", "kit.toml", "--sockets", 3, expect=2)
-    assert "--kit names what is used" in refused.stderr
+    assert "--kit names what is used and where it is, and ignores --sockets" in refused.stderr

@@ -73,7 +73,7 @@ def test_a_robot_by_default(aacmm):
         (("--tool-axis", "w"), "--tool-axis 'w' is not of the form"),
         (("--link-radius-mm", "0"), "radius of the arm's links must be above 0"),
         (("--cell", "none.toml"), "none.toml"),
-        (("--acceptance", "iso", "--cone-deg", "50"), "leave out --socket"),
+        (("--acceptance", "iso", "--cone-deg", "50"), "and --cone-deg; leave out"),
         (("--cone-deg", "A=20", "--normal", "A=0,0,-1"), "socket 'A' at (450, 100, 200) mm cannot be reached"),
     ],
 )
@@ -81,14 +81,24 @@ def test_refused(aacmm, arguments, text):
     assert text in aacmm(*PLAN, *arguments, expect=2).stderr
 
 
-def test_an_acceptance_test_has_its_own_places(aacmm):
-    refused = aacmm("plan", "panda", "-o", "plan.csv", "--acceptance", "iso", "--farthest", "0.95", expect=2)
-    assert "--acceptance has its own sockets and bars" in refused.stderr
-
-
-def test_an_acceptance_test_has_no_cones(aacmm):
-    refused = aacmm("plan", "panda", "-o", "plan.csv", "--acceptance", "iso", "--collisions", expect=2)
-    assert "obstacles and approach points are of calibrations" in refused.stderr
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (("--acceptance", "iso", "--farthest", 0.95), "ignores --farthest; leave out --farthest"),
+        (("--acceptance", "iso", "--collisions"), "ignores --collisions"),
+        # The default, stated, is ignored too.
+        (("--acceptance", "iso", "--poses", 30, "--candidates", 200), "leave out --poses and --candidates"),
+        (("--acceptance", "iso", "--kit", "kit.toml"), "ignores --kit"),
+        (
+            ("--kit", "kit.toml", "--length-mm", 400, "--u-mm", 0.01, "--sockets", 3),
+            "leave out --length-mm, --u-mm and --sockets",
+        ),
+        (("--sphere-mm", 40), "--sphere-mm is for acceptance tests; give --acceptance too"),
+        (("--held", "d_9"), "unknown parameter 'd_9'"),
+    ],
+)
+def test_options_that_would_be_ignored_are_refused(aacmm, options, text):
+    assert text in aacmm("plan", "panda", "-o", "plan.csv", *options, expect=2).stderr
 
 
 def test_a_manifest_names_the_arm_relative_to_itself_where_it_can(tmp_path, monkeypatch):

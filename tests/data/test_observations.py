@@ -112,6 +112,17 @@ SIMULATED = [
 ]
 
 
+@pytest.mark.parametrize(("name", "part"), [("sphere", "centre of s"), ("distances", "pivot of d")])
+def test_a_tip_in_the_centre_is_at_no_distance_in_no_direction(name, part):
+    """A plan with a sphere of radius 0 begins there."""
+    observation = to_numpy(ALL[name])
+    unknowns = unknowns_of(observation) | {part: TIPS.position[:, 0]}
+    with np.errstate(all="raise"):
+        rows = observation.residual(TIPS, unknowns)
+    assert np.isfinite(rows.values).all()
+    np.testing.assert_array_equal(rows.by_tip[0, :, 0], 0)
+
+
 def test_starts_are_exact_for_exact_data(paper_arm):
     """Without noise and by the true arm, the closed forms find the geometry, also of targets at an unknown place."""
     capture = aj.simulate(paper_arm, {}, observations=SIMULATED, seed=3)

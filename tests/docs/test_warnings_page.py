@@ -53,6 +53,7 @@ PARTS = (
     "... more combinations",
     "... by ... mm",
     "... mm",
+    "... (u = ... um)",
     "... is not a plausible scale",
     "k = ... is not a plausible scale",
     "No Reason",

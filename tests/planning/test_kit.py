@@ -190,6 +190,31 @@ def test_refused(paper_arm, space, kit, options, text):
         plan_kit(paper_arm, kit, space=space, candidates=100, check_length=200.0, **options)
 
 
+def bar(**options):
+    simulated = kinds.SimulatedArtefact("bar", {"a": (400, 0, 300), "b": (500, 0, 300)}, 2, u=0.001)
+    return KitItem(simulated, **options)
+
+
+@pytest.mark.parametrize(
+    ("item", "options", "text"),
+    [
+        (bar(places=0, half_angle=1e-5, normal=(1, 0, 0)), {}, "within its cone of 0.000573 deg about (1, 0, 0)"),
+        (
+            bar(places=0, half_angle=0.3, normal=(0, 0, -1)),
+            {"retract": 500.0},  # under the table
+            "by way of its approach point 500 mm along its normal",
+        ),
+        (bar(half_angle=0.001), {"region": {"z": (200, 400)}}, "In the last that was tried, 'bar' at"),
+    ],
+    ids=["cone", "approach", "placed"],
+)
+def test_what_cannot_be_reached_says_why(paper_arm, space, monkeypatch, item, options, text):
+    monkeypatch.setattr(kit_placement, "_PLACEMENTS", 2)
+    with pytest.raises(aj.InputError) as refused:
+        plan_kit(paper_arm, [item], space=space, poses=20, candidates=100, check_length=200.0, **options)
+    assert text in str(refused.value)
+
+
 def test_a_kit_that_leaves_parameters_open(paper_arm):
     """Touches of one sphere say nothing of where the arm stands or of its first offset."""
     with pytest.raises(aj.InputError, match="this kit does not determine the parameters"):

@@ -14,6 +14,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.report import chart_svg, charts, elements, write_report
+from aacmm_jax.report.html_page import _origin
 from aacmm_jax.summaries.tables import decimals_for
 from tests.refusals import assert_refused
 from tests.written_study import write_study
@@ -752,3 +753,10 @@ def test_it_prints_to_pdf(shown, tmp_path, kind):
     content = opened.pdf(path=tmp_path / "report.pdf", format="A4", print_background=True)
     pages = len(re.findall(rb"/Type\s*/Page\b", content))
     assert 2 <= pages <= 25
+
+
+@pytest.mark.parametrize("seed", [None, 0])
+def test_the_origin_names_a_seed_where_there_is_one(tmp_path, seed):
+    (tmp_path / "c.h5").write_bytes(b"")
+    attributes = {"created": "2026-01-01", "command": "aacmm calibrate", "package_version": "1", "seed": seed}
+    assert dict(_origin(tmp_path / "c.h5", attributes)).get("Seed") == (None if seed is None else ["0"])

@@ -119,7 +119,9 @@ def test_observations(paper_arm, captures, names, field, mistake, cause):
 
     capture = captures[names]
     wrong = eqx.tree_at(concerned, capture, [mistake(np.asarray(values)) for values in concerned(capture)])
-    check(likely_cause(paper_arm, wrong), cause)
+    said = likely_cause(paper_arm, wrong)
+    check(said, cause)
+    assert (f'write units = {{ {field} = "m" }}.' in said) == cause.startswith(METRES)
 
 
 @pytest.mark.parametrize("names", sorted({row[0] for row in MISTAKES}))

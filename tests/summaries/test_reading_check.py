@@ -7,6 +7,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
+from aacmm_jax.files.angles import units_toml
 from aacmm_jax.kinematics import reading_check, reading_search
 from aacmm_jax.kinematics.reading_fit import Explanation
 from aacmm_jax.summaries.reading_check import check_capture, explanation_words, reading_check_summary
@@ -67,5 +68,30 @@ def test_a_capture_of_a_tracker_and_what_cannot_be_checked(paper_arm, monkeypatc
     summary = reading_check_summary(found, "paper's")
     assert summary["sentence"].startswith("Column 4 runs the other way. So corrected")
     assert summary["found"]["signs"] == [1, 1, 1, -1, 1, 1]
+    assert summary["tip"] == ""
     with pytest.raises(aj.InputError, match="at least two"):
         check_capture(paper_arm, aj.Capture({"A": q[:1], "B": q[1:2]}))
+
+
+@pytest.mark.parametrize(
+    ("target", "part"), [("reflector", "A calibration finds its place"), ("", 'write target = "reflector"')]
+)
+def test_an_offset_of_the_target_is_named(paper_arm, monkeypatch, target, part):
+    monkeypatch.setattr(reading_search, "_MOST", 2000)
+    monkeypatch.setattr(reading_check, "_REFITTED", 2)
+    q = np.random.default_rng(0).uniform(-1.5, 1.5, (30, 6))
+    seen = paper_arm.replace(probe=np.asarray(paper_arm.probe) + np.array([30.0, -40.0, 46.0]))
+    points = np.asarray(seen.position(q)) + np.array([1000.0, 0, 0])
+    capture = aj.Capture({}, observations=[kinds.MeasuredPoints("one", q, points, target=target)])
+    summary = reading_check_summary(check_capture(paper_arm, capture), "paper's")
+    assert summary["fits"]
+    assert summary["given"]["rms_mm"] > 30
+    assert summary["rms_with_tip_mm"] < 1e-9
+    assert part in summary["tip"]
+
+
+@pytest.mark.parametrize(("taken", "length", "unit"), [("mm", 1000, "m"), ("m", 1e-3, "mm"), ("inch", 1 / 25.4, "mm")])
+def test_the_unit_found_depends_on_the_unit_taken(taken, length, unit):
+    one = Explanation(SIX, (1,) * 6, (0,) * 6, 1.0, length, 1.0, 1.0, 0)
+    assert explanation_words(one, taken) == f"the positions are in {unit}, and were taken for {taken}"
+    assert units_toml(one, taken) == f'units = {{ points = "{unit}" }}\n'

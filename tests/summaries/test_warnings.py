@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.kinematics.parameters import ArmSpecification
 from aacmm_jax.summaries import warnings
 
 
@@ -99,3 +100,27 @@ def test_readings_outside_the_limits():
     swapped = aj.Capture({"A": q[:, [0, 1, 3, 2, 4, 5, 6]], "B": jnp.asarray(q + 0.1)}, lengths)
     found = warnings.of_capture(aj.Recording(swapped, panda))
     assert found[0].startswith("Joint 4: 3 of 6 readings lie outside its limits, -176 to -4 deg")
+
+
+@pytest.mark.parametrize(
+    ("u", "said"),
+    [
+        (0.02, []),
+        (1e-4, []),
+        (1.0, []),
+        (20e-6, ["Less than 0.1 um is hardly ever reached: {} (u = 0.02 um); u is in mm, was it given in m?"]),
+        (20.0, ["More than 1 mm says next to nothing: {} (u = 20,000 um); u is in mm, was it given in um?"]),
+    ],
+)
+def test_uncertainties_in_another_unit_are_named(paper_arm, u, said):
+    q = np.random.default_rng(0).uniform(-1, 1, (8, 6))
+    points = np.asarray(paper_arm.position(q))
+    kinds = aj.data.observations
+    length = aj.Capture({"A": q[:4], "B": q[4:]}, [aj.ReferenceLength("A", "B", 300.0, u)])
+    tracker = aj.Capture({}, observations=[kinds.MeasuredPoints("T", q, points, u=u)])
+    sphere = aj.Capture({}, observations=[kinds.Sphere("S", q, diameter=25.0, u=u)])
+    wheres = ("[[length]] A - B", "[[points]] T", "[[touched_sphere]] S")
+    for where, capture in zip(wheres, (length, tracker, sphere), strict=True):
+        recording = aj.Recording(capture, ArmSpecification(paper_arm))
+        assert warnings.of_capture(recording) == [text.format(where) for text in said]
+        assert warnings.of_capture(recording._replace(true=recording.nominal)) == []

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
-from ...core.linear_algebra import semidefinite_eigen, solve_positive_definite
+from ...core.linear_algebra import length_and_direction, semidefinite_eigen, solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace, scan
 from ...core.rotations import cross, rotation_derivative, rotation_matrix
 from .frames import moved, turned_z
@@ -223,8 +223,7 @@ def distances(
     w = xp.concatenate([axis[:2], xp.zeros_like(axis[:1])])
     turned = rotation_matrix(w)
     between = turned.T[:2] @ tips - axis[2:, None]
-    distance = xp.sqrt(xp.sum(between**2, axis=0))
-    across = between / distance[None]
+    distance, across = length_and_direction(between)
     direction = turned[:, :2] @ across
     # A small rotation v of the axes moves a tip by -v x t in them.
     small = [rotation_derivative(w)[:, i : i + 1] + xp.zeros_like(tips) for i in range(2)]

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ...core.arrays import Numbers, as_floats, is_concrete
 from ...core.errors import InputError
-from ...core.linear_algebra import solve_positive_definite
+from ...core.linear_algebra import length_and_direction, solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace
 from .frames import moved
 from .observation import (
@@ -124,8 +124,8 @@ class Distances(AbstractObservation):
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         xp, m = namespace(tips, unknowns, self.values), self.q.shape[0]
         between = tips.position - unknowns[self.pivot][:, None]
-        distance = xp.sqrt(xp.sum(between**2, axis=0))
-        direction = (between / distance[None])[None]
+        distance, towards = length_and_direction(between)
+        direction = towards[None]
         by_unknowns = {self.pivot: -direction.swapaxes(0, 1)}
         values = self.values
         if self.constant:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
-from ...core.linear_algebra import solve_positive_definite
+from ...core.linear_algebra import length_and_direction, solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace
 from .frames import moved
 from .observation import (
@@ -154,9 +154,9 @@ class Sphere(AbstractObservation):
         if self.point:
             identity = each_pose(xp.asarray(np.eye(3)), m)
             return Rows(between, identity, {self.centre: -identity}, no_covariance(3, m))
-        distance = xp.sqrt(xp.sum(between**2, axis=0))
-        direction = (between / distance[None])[None]
-        radius = unknowns[self.size][0] if self.free else self.radius
+        distance, towards = length_and_direction(between)
+        direction = towards[None]
+        radius: Any = unknowns[self.size][0] if self.free else self.radius
         by_unknowns = {self.centre: -direction.swapaxes(0, 1)}
         if self.free:
             by_unknowns[self.size] = -xp.ones((1, 1, m))
