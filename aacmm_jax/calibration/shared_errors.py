@@ -22,6 +22,7 @@ from ..data.capture import Capture
 from ..data.recording import Recording
 from ..kinematics.arm import Arm, correction_names, natural_steps
 from ..kinematics.corrected_arm import with_corrections, with_further_corrections
+from ..kinematics.corrections.kinds import coefficient_of, shared_model
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.prior_scales import default_prior
 from ..uncertainty.residual_tests import block_diagonal, form_of_poses, form_test, score_tests
@@ -45,7 +46,6 @@ from .sensitivities import Sensitivities
 from .shared_equations import SharedProblem, problem_of_poses, scale_of_lengths, usual_deviations, with_lengths
 
 _GATE = 0.1  # probability of a test below which an effect is looked at
-_MODEL = "gravity,gear,harmonics=1-3"  # functions that joints may follow
 # Poses over which successive errors may be alike. Over a third of the poses of a socket and more they are as good as
 # alike in all, which poses do not show.
 _LENGTHS, _PART = (2.0, 5.0, 15.0), 3
@@ -293,12 +293,14 @@ def missing_functions(arm: Arm) -> tuple[str, ...]:
     if arm.prismatic:
         return ()
     known = correction_names(arm)
-    every = correction_names(with_corrections(arm, _MODEL))
-    bends = any(name.startswith("compliance") for name in known)
+    every = {name: coefficient_of(name) for name in correction_names(with_corrections(arm, shared_model()))}
+    # By known masses a joint bends with one coefficient, and by unknown ones with one for each link.
+    by_gravity = [] if arm.corrections is None else arm.corrections.functions.by_gravity
+    bends = bool(np.any(by_gravity))
     return tuple(
         name
-        for name in every
-        if name not in known and not name.startswith("gravity_") and not (bends and name.startswith("compliance"))
+        for name, one in every.items()
+        if one is not None and name not in known and not (bends and one.kind.rows == 3)
     )
 
 

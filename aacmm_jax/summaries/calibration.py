@@ -15,6 +15,7 @@ from ..data.capture import Capture, ReferenceLength
 from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
 from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
+from ..kinematics.corrections.kinds import coefficient_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
@@ -52,7 +53,12 @@ def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
         "joints": joints,
         "probe_mm": np.asarray(arm.probe).tolist(),
         "corrections": [
-            {"coefficient": name, "unit": parameter_unit(arm, name), "value": float(value_of(arm, name))}
+            {
+                "coefficient": name,
+                "of": "direction of gravity" if (found := coefficient_of(name)) is None else found.kind.description,
+                "unit": parameter_unit(arm, name),
+                "value": float(value_of(arm, name)),
+            }
             for name in correction_names(arm)
         ],
         "held": list(specification.space().held),
