@@ -70,7 +70,7 @@ def print_corrections(console: Console, rows: Sequence[Mapping[str, Any]]) -> No
         print_table(console, table)
     zero: dict[str, list[str]] = {}
     for row in rows:
-        if row["value"] == 0:
+        if row["value"] == 0 and row["of"]:  # not the direction of gravity
             zero.setdefault(row["of"], []).append(row["coefficient"])
     for of, names in zero.items():
         amount = pluralise(len(names), "coefficient")

@@ -55,7 +55,7 @@ def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
         "corrections": [
             {
                 "coefficient": name,
-                "of": "direction of gravity" if (found := coefficient_of(name)) is None else found.kind.description,
+                "of": "" if (found := coefficient_of(name)) is None else found.kind.description,
                 "unit": parameter_unit(arm, name),
                 "value": float(value_of(arm, name)),
             }
