@@ -13,6 +13,7 @@ from ..summaries.tables import (
     decimals_for,
     encoders_in_words,
     expanded_words,
+    lengths_sentence,
     observed_words,
     quantity_words,
     seat_in_words,
@@ -125,6 +126,8 @@ def calibration(summary: dict[str, Any]) -> None:
     console = new_console()
     print_solve(console, summary)
     print_verdict(console, summary)
+    if summary.get("lengths_tested"):
+        console.print(lengths_sentence(summary["lengths_tested"]))
     anchor = f"scale anchor {summary['hold']}" if summary["hold"] else "no scale anchor"
     if summary["scale_k"] is not None:
         u = summary["scale_u"] or 0.0

@@ -24,7 +24,7 @@ from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .model_errors import noisy_encoder_rows, summary_of_tests
 from .observations import capture_observations, observed_summary
 from .validation import cross_validation_summary
-from .verdicts import calibration_verdict
+from .verdicts import calibration_verdict, checked_lengths
 from .warnings import observed, of_calibration, of_import
 
 _CORRELATED = 0.95
@@ -214,7 +214,8 @@ def calibration_summary(
         summary["truth"] = {
             stage: truth_errors(record, vectors, stage) for stage in ("nominal", "stage1", "calibrated")
         }
-    return summary | {"verdict": calibration_verdict(summary)._asdict()}
+    checked = checked_lengths(summary["lengths"], summary["cross_validation"], record.fixed_by_one_length)
+    return summary | {"lengths_tested": checked, "verdict": calibration_verdict(summary)._asdict()}
 
 
 def prior_rows(prior: PriorMetrics) -> list[dict[str, Any]]:
