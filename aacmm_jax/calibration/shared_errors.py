@@ -3,7 +3,8 @@
 Looked for are, each only where a test of the residuals says so with a probability below 10 %: errors of the tip that
 all poses of a visit share (marked in the capture, or successive poses where none are), functions of the readings that
 the model lacks (`uncertainty.shared_errors`), and errors that all poses of a socket share, which only reference lengths
-show. The gate keeps the intervals of a calibration in which nothing is wrong as they are.
+show. The gate keeps the intervals of a calibration in which nothing is wrong as they are. Poses from which a robust
+loss took weight count with the weights of the solution, as if these were given.
 """
 
 from collections.abc import Callable
@@ -39,7 +40,6 @@ from ..uncertainty.shared_errors import (
 )
 from .drawn_errors import functions_of, places_of
 from .group_equations import EXACT, PRIOR, equations_in_chunks, residual_rms
-from .model_errors import weighted_by_loss
 from .record import record_of
 from .results import Calibration
 from .sensitivities import Sensitivities
@@ -91,7 +91,7 @@ class _Found(NamedTuple):
 
 def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Sensitivities]) -> _Found | None:
     record = record_of(result, Recording(capture, ArmSpecification(result.space.base)))
-    if not record.converged or weighted_by_loss(record):
+    if not record.converged:
         return None
     rows, relations = equations_in_chunks(record)
     if not rows or residual_rms(rows) < EXACT:
