@@ -54,8 +54,8 @@ _MOST_PATTERNS = 8  # of successive poses of one socket: slower ones matter, fas
 # proportion: parameters, or errors of places, of which poses say nothing.
 _MOST_OF_POSES = 0.5
 _NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are alike
-# Of the weight that a robust loss left a pose: beyond 13 standard deviations with Huber, 4 with Tukey. Shared errors of a
-# few standard deviations cost weight, too, and are what is looked for.
+# Of the weight of a pose after a robust loss: less remains beyond 13 standard deviations with Huber, 4 with Tukey.
+# Shared errors of a few standard deviations cost weight, too, and are what is looked for.
 _TRUSTED = 0.1
 _FEWEST = 6  # degrees of freedom
 
