@@ -64,7 +64,7 @@ def _register_files() -> None:
             continue
         for value in vars(import_module(f"{__package__}.{module}")).values():
             if isinstance(value, type) and issubclass(value, AbstractCorrection) and value is not AbstractCorrection:
-                register(value())
+                register(value())  # pyright: ignore[reportCallIssue] - a final kind has no fields
 
 
 class Coefficient(NamedTuple):
