@@ -8,8 +8,7 @@ from jaxtyping import Float
 from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import Arm, joint_limits
 from ..kinematics.corrected_arm import function_values
-from ..kinematics.corrections.gear_ratio import GearRatio
-from ..kinematics.corrections.harmonics import Harmonics
+from ..kinematics.corrections.kind import Term
 from .record import CalibrationRecord, uncertainty_of
 
 _POINTS = 400  # of a curve
@@ -17,7 +16,7 @@ _BEYOND = 0.15  # of its travel, on either side
 
 
 class JointFunction(NamedTuple):
-    """Harmonics and gear ratio of one joint, less their mean over the poses; rad, or mm of a prismatic joint."""
+    """Corrections of one joint by its own reading, less their mean over the poses; rad, or mm of a prismatic joint."""
 
     reading: Float[np.ndarray, " points"]  # the travel of the poses and a little beyond, within the joint's limits
     value: Float[np.ndarray, " points"]
@@ -28,7 +27,7 @@ class JointFunction(NamedTuple):
 def function_of_joint(
     record: CalibrationRecord, joint: int, q: Float[np.ndarray, "poses joints"], points: int = _POINTS
 ) -> JointFunction | None:
-    """The harmonics and the gear ratio of a joint, with their uncertainty.
+    """The functions of its own reading that correct a joint (harmonics, gear ratio), with their uncertainty.
 
     The mean over the poses is taken away: a zero offset takes it up.
 
@@ -39,13 +38,15 @@ def function_of_joint(
         points: Number of readings, evenly spaced, at which the function is given.
 
     Returns:
-        The function; None if the joint has neither harmonics nor a gear ratio.
+        The function; None if the joint has no such corrections.
     """
     arm: Arm = to_numpy(record.calibrated.arm)
     if arm.corrections is None:
         return None
     each = arm.corrections.functions.each
-    chosen = [i for i, one in enumerate(each) if one.joint == joint and isinstance(one.kind, Harmonics | GearRatio)]
+    chosen = [
+        i for i, one in enumerate(each) if one.joint == joint and isinstance(one, Term) and one.kind.of_own_reading
+    ]
     if not chosen:
         return None
     terms, coefficients = [each[i] for i in chosen], np.asarray(arm.coefficients)[chosen]

@@ -8,7 +8,7 @@ tip itself.
 """
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +17,7 @@ from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import DOWN, Arm
 from ..kinematics.chain import forward_pass, joint_motion
 from ..kinematics.corrected_arm import function_values
-from ..kinematics.corrections.kinds import terms_of
+from ..kinematics.corrections.kinds import all_sought, model_with, terms_of
 from ..uncertainty.group_test import Block
 from ..uncertainty.residual_tests import LEVEL, Residuals, ScoreTest, score_tests
 from .group_equations import Rows, wider
@@ -28,43 +28,25 @@ _AS_WELL = 6.0  # difference of the information criterion (Akaike 1974) below wh
 # the frame of a station that imitates it: in what is left of its column after the frame, linear equations are wrong.
 _SECOND_ORDER = 3e-3
 
-Kind = Literal[
-    "zero",
-    "first harmonic",
-    "second harmonic",
-    "gear ratio",
-    "gravity",
-    "drifting zero",
-    "drifting base",
-    "growing arm",
-    "thermal expansion",
-]
-# As in `kinematics.corrections`; a kind is looked for with all its functions of a joint at once.
-_FUNCTIONS: dict[Kind, str] = {
-    "gear ratio": "gear",
-    "first harmonic": "harmonics=1",
-    "second harmonic": "harmonics=2",
-    "gravity": "gravity",
-}
-
 
 class MissingTerm(NamedTuple):
     """A term that the model may lack: of one joint, in mrad, or of the tip, in mm."""
 
-    kind: Kind
+    kind: str  # "zero", "drifting zero", "drifting base", "growing arm", or what a kind of correction is sought by
     joint: int | None  # from 1; None: of the tip
     values: Float[np.ndarray, "N _k"] | Float[np.ndarray, "N 3 _k"]  # pose by pose, for coefficients of 1
+    relative: bool = False  # whether its size is that of the coefficient
 
 
 class FoundTerm(NamedTuple):
     """A term that explains residuals, and what explains them as well."""
 
-    kind: Kind
+    kind: str
     joint: int | None
     test: ScoreTest
     probability: float  # Holm's: of all candidates
     amplitude: float  # half the range of what the term adds over the poses, rad or mm; of a gear ratio, relative
-    alternatives: tuple[tuple[Kind, int | None], ...]
+    alternatives: tuple[tuple[str, int | None], ...]
     term: MissingTerm
 
 
@@ -95,36 +77,33 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
     arm = to_numpy(arm)
     order = np.linspace(-1.0, 1.0, len(q))[:, None]
     tip = np.moveaxis(np.asarray(forward_pass(arm.geometry, joint_motion(arm.geometry, q)).tip), -1, 0)
-    functions = _functions(arm, q)
-    found = []
+    found, of_arm = [], []
     for joint in range(1, arm.joints + 1):
-        found += [MissingTerm("zero", joint, np.ones_like(order)), MissingTerm("drifting zero", joint, order)]
+        zeros = MissingTerm("zero", joint, np.ones_like(order), relative=True)
+        found += [zeros, MissingTerm("drifting zero", joint, order)]
+    for name, (kind, sought) in all_sought().items():
+        functions = _functions(arm, q, model_with(kind, sought.option))
+        if kind.of_arm:
+            growth = [one for one in functions[0].T if np.ptp(one) > 0]
+            of_arm += [MissingTerm(name, None, one[:, None, None] * tip[:, :, None] / 1e3) for one in growth]
         # A scale has no revolution to repeat, and carries what it moves.
-        kinds: list[Kind] = [kind for kind in _FUNCTIONS if joint not in arm.prismatic or kind == "gear ratio"]
-        found += [MissingTerm(kind, joint, functions[kind, joint]) for kind in kinds]
+        joints = [joint for joint in functions if joint and (joint not in arm.prismatic or sought.of_slides)]
+        found += [MissingTerm(name, joint, functions[joint], sought.relative) for joint in joints]
     return [
         *found,
         MissingTerm("drifting base", None, order[:, :, None] * np.eye(3)),
         MissingTerm("growing arm", None, order[:, :, None] * tip[:, :, None] / 1e3),  # by 1 mm a m
-        *(
-            MissingTerm("thermal expansion", None, (temperature - 20)[:, None, None] * tip[:, :, None] / 1e3)
-            for temperature in q[:, arm.joints :].T
-            if np.ptp(temperature) > 0
-        ),
+        *of_arm,
     ]
 
 
-def _functions(arm: Arm, q: Float[np.ndarray, "N n"]) -> dict[tuple[Kind, int], Float[np.ndarray, "N _k"]]:
-    """The functions of each kind and joint. Masses are not known, so each link has a coefficient of its own."""
+def _functions(arm: Arm, q: Float[np.ndarray, "N n"], model: str) -> dict[int, Float[np.ndarray, "N _k"]]:
+    """The functions of a model, joint by joint. Masses are not known, so each link has a coefficient of its own."""
     nominal = arm.geometry if arm.corrections is None else arm.corrections.nominal
     gravity = np.asarray(DOWN if arm.gravity is None else arm.gravity)
-    found = {}
-    for kind, model in _FUNCTIONS.items():
-        terms = terms_of(model, arm.joints)
-        values = function_values(nominal, terms, q, gravity)
-        for joint in range(1, arm.joints + 1):
-            found[kind, joint] = values[[term.joint == joint for term in terms]].T
-    return found
+    terms = terms_of(model, arm.joints)
+    values = function_values(nominal, terms, q, gravity)
+    return {joint: values[[term.joint == joint for term in terms]].T for joint in sorted({t.joint for t in terms})}
 
 
 def found_terms(
@@ -192,7 +171,7 @@ def _criterion(left: Residuals, test: ScoreTest) -> float:
 
 
 def _amplitude(term: MissingTerm, coefficients: Float[np.ndarray, " k"]) -> float:
-    if term.kind in ("gear ratio", "zero"):
+    if term.relative:
         return float(abs(coefficients[0])) * 1e-3
     added = term.values @ coefficients
     half = float(np.linalg.norm(np.ptp(added.reshape(len(added), -1), axis=0))) / 2

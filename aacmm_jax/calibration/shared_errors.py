@@ -3,10 +3,11 @@
 Looked for are, each only where a test of the residuals says so with a probability below 10 %: errors of the tip that
 all poses of a visit share (marked in the capture, or successive poses where none are), functions of the readings that
 the model lacks (`uncertainty.shared_errors`), and errors that all poses of a socket share, which only reference lengths
-show. The gate keeps the intervals of a calibration in which nothing is wrong as they are.
+show. The gate keeps the intervals of a calibration in which nothing is wrong as they are. After a robust loss,
+poses count with the weights of the solution, as if these were given, and bad ones, which lost most of it, not at all.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,6 +23,7 @@ from ..data.capture import Capture
 from ..data.recording import Recording
 from ..kinematics.arm import Arm, correction_names, natural_steps
 from ..kinematics.corrected_arm import with_corrections, with_further_corrections
+from ..kinematics.corrections.kinds import coefficient_of, shared_model
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.prior_scales import default_prior
 from ..uncertainty.residual_tests import block_diagonal, form_of_poses, form_test, score_tests
@@ -37,15 +39,13 @@ from ..uncertainty.shared_errors import (
     second_moments,
 )
 from .drawn_errors import functions_of, places_of
-from .group_equations import EXACT, PRIOR, equations_in_chunks, residual_rms
-from .model_errors import weighted_by_loss
-from .record import record_of
+from .group_equations import EXACT, PRIOR, Rows, equations_in_chunks, residual_rms
+from .record import CalibrationRecord, record_of
 from .results import Calibration
 from .sensitivities import Sensitivities
 from .shared_equations import SharedProblem, problem_of_poses, scale_of_lengths, usual_deviations, with_lengths
 
 _GATE = 0.1  # probability of a test below which an effect is looked at
-_MODEL = "gravity,gear,harmonics=1-3"  # functions that joints may follow
 # Poses over which successive errors may be alike. Over a third of the poses of a socket and more they are as good as
 # alike in all, which poses do not show.
 _LENGTHS, _PART = (2.0, 5.0, 15.0), 3
@@ -54,6 +54,9 @@ _MOST_PATTERNS = 8  # of successive poses of one socket: slower ones matter, fas
 # proportion: parameters, or errors of places, of which poses say nothing.
 _MOST_OF_POSES = 0.5
 _NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are alike
+# Of the weight of a pose after a robust loss: less remains beyond 13 standard deviations with Huber, 4 with Tukey.
+# Shared errors of a few standard deviations cost weight, too, and are what is looked for.
+_TRUSTED = 0.1
 _FEWEST = 6  # degrees of freedom
 
 
@@ -91,9 +94,10 @@ class _Found(NamedTuple):
 
 def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Sensitivities]) -> _Found | None:
     record = record_of(result, Recording(capture, ArmSpecification(result.space.base)))
-    if not record.converged or weighted_by_loss(record):
+    if not record.converged:
         return None
     rows, relations = equations_in_chunks(record)
+    rows = _trusted(record, rows)
     if not rows or residual_rms(rows) < EXACT:
         return None
     known = [block for block in relations if block.fixture == PRIOR]
@@ -123,6 +127,17 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
     if not (tips.variance or places.variance or len(functions.sd)):
         return None
     return _summed(problem, (tips, places), functions, places.joined(problem, with_tips), places.joined(problem, every))
+
+
+def _trusted(record: CalibrationRecord, rows: Sequence[Rows]) -> list[Rows]:
+    """Without poses that lost most of their weight to a robust loss: what is left of their errors is no noise."""
+    if record.observed is None:
+        return list(rows)
+    weights, found = np.concatenate([np.asarray(one) for one in record.observed.weights]), []
+    for each in rows:
+        kept = weights[each.poses] > _TRUSTED
+        found.append(each._replace(**{name: getattr(each, name)[kept] for name in Rows._fields if name != "name"}))
+    return [each for each in found if len(each.poses)]
 
 
 def _summed(
@@ -293,12 +308,14 @@ def missing_functions(arm: Arm) -> tuple[str, ...]:
     if arm.prismatic:
         return ()
     known = correction_names(arm)
-    every = correction_names(with_corrections(arm, _MODEL))
-    bends = any(name.startswith("compliance") for name in known)
+    every = {name: coefficient_of(name) for name in correction_names(with_corrections(arm, shared_model()))}
+    # By known masses a joint bends with one coefficient, and by unknown ones with one for each link.
+    by_gravity = [] if arm.corrections is None else arm.corrections.functions.by_gravity
+    bends = bool(np.any(by_gravity))
     return tuple(
         name
-        for name in every
-        if name not in known and not name.startswith("gravity_") and not (bends and name.startswith("compliance"))
+        for name, one in every.items()
+        if one is not None and name not in known and not (bends and one.kind.rows == 3)
     )
 
 

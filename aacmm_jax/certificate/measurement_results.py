@@ -53,12 +53,7 @@ class _Stage(NamedTuple):
     evaluation: Evaluation
 
 
-# Metres and newtons only of compliances.
-_UNITS = {"mm": MILLIMETRE, "rad": RADIAN, "1": ONE}
-_UNITS |= {"rad/m": r"\radian\metre\tothe{-1}", "rad/(kN m)": r"\radian\kilo\newton\tothe{-1}\metre\tothe{-1}"}
-_UNITS |= {"1/K": r"\kelvin\tothe{-1}"}
-_UNITS |= {"mm/m": r"\milli\metre\metre\tothe{-1}"}
-_UNITS |= {"mm/(kN m)": r"\milli\metre\kilo\newton\tothe{-1}\metre\tothe{-1}"}
+_D_SI = {"mm": MILLIMETRE, "rad": RADIAN, "m": r"\metre", "kN": r"\kilo\newton", "K": r"\kelvin"}
 
 
 def add_results(
@@ -294,7 +289,14 @@ def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, 
         add_english(quantity, "name", name)
         if note:
             add_english(quantity, "description", note)
-        add_real(quantity, value, _UNITS[parameter_unit(stage.arm, name)], u, factor)
+        add_real(quantity, value, _in_d_si(parameter_unit(stage.arm, name)), u, factor)
+
+
+def _in_d_si(unit: str) -> str:
+    """A unit such as "rad/(kN m)" in D-SI, with factors below the stroke as negative powers."""
+    above, _, below = unit.partition("/")
+    factors = [] if above == "1" else [_D_SI[above]]
+    return "".join([*factors, *(_D_SI[one] + r"\tothe{-1}" for one in below.strip("()").split())]) or ONE
 
 
 def _add_covariance(results: Element, record: CalibrationRecord) -> None:
@@ -311,7 +313,7 @@ def _add_covariance(results: Element, record: CalibrationRecord) -> None:
     )
     table = add(data, "list")
     add_english(table, "name", "Covariance")
-    units = [_UNITS[parameter_unit(record.calibrated.arm, record.names[i])] for i in own]
+    units = [_in_d_si(parameter_unit(record.calibrated.arm, record.names[i])) for i in own]
     for row, unit in zip(own, units, strict=True):
         products = [f"{unit}{_SQUARED}" if unit == other and unit in _SIMPLE else unit + other for other in units]
         add_row(table, record.names[row], np.asarray(record.covariance)[row, own].tolist(), products)

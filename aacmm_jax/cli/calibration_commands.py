@@ -50,7 +50,10 @@ def calibrate(
     ] = None,
     robust: Annotated[
         Literal["huber", "cauchy", "tukey"] | None,
-        typer.Option(help="Robust loss, which takes weight from bad poses and lists them."),
+        typer.Option(
+            help="Robust loss, which takes weight from bad poses and lists them; encoders that are noisier than others "
+            "are not looked for then."
+        ),
     ] = None,
     model: Annotated[
         str | None,

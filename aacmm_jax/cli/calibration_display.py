@@ -7,12 +7,13 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..core.text import pluralise, shorten
-from ..core.units import DEG, people_read, people_read_change
+from ..core.units import DEG
 from ..summaries.tables import (
     METRICS,
     decimals_for,
     encoders_in_words,
     expanded_words,
+    lengths_sentence,
     observed_words,
     quantity_words,
     seat_in_words,
@@ -28,7 +29,7 @@ from .display import (
     print_warnings,
     print_written,
 )
-from .parameter_display import print_lengths, print_parameters, print_prior
+from .parameter_display import print_corrections, print_lengths, print_parameters, print_prior
 
 _MOST_PARTS = 12  # rows of a table
 _TRUTH = (
@@ -59,14 +60,7 @@ def arm(summary: dict[str, Any]) -> None:
     console.print(
         f"Probe {', '.join(formatted(x) for x in summary['probe_mm'])} mm. Fixed: {', '.join(summary['held'])}."
     )
-    if summary["corrections"]:
-        others = [row for row in summary["corrections"] if row["value"] == 0]
-        title = f"\nJoint corrections ({len(others)} more coefficients are 0)" if others else "\nJoint corrections"
-        table = new_table(title, "coefficient", "value", "unit")
-        for row in (row for row in summary["corrections"] if row["value"] != 0):
-            scale, unit = people_read_change(row["unit"]) if row["unit"] == "rad" else people_read(row["unit"])
-            table.add_row(row["coefficient"], f"{scale * row['value']:.4g}", unit)
-        print_table(console, table)
+    print_corrections(console, summary["corrections"])
     if summary["urdf"] is not None:
         base, frame = summary["urdf"]["base"], summary["urdf"]["first_frame_in_base_mm"]
         where = f"in the frame of {base}"
@@ -132,6 +126,8 @@ def calibration(summary: dict[str, Any]) -> None:
     console = new_console()
     print_solve(console, summary)
     print_verdict(console, summary)
+    if summary.get("lengths_tested"):
+        console.print(lengths_sentence(summary["lengths_tested"]))
     anchor = f"scale anchor {summary['hold']}" if summary["hold"] else "no scale anchor"
     if summary["scale_k"] is not None:
         u = summary["scale_u"] or 0.0

@@ -15,7 +15,7 @@ from ..core.text import shorten
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..data.simulation import simulate
-from ..files.arms import load_specification, save_arm
+from ..files.arms import load_specification, save_arm, usual_noise
 from ..files.calibrations import save_calibration
 from ..files.captures import load_capture, save_capture
 from ..files.inputs import fingerprint
@@ -29,6 +29,7 @@ _DATA = ("capture.h5", "calibration.h5", "nominal.toml", "true.toml", "calibrate
 _FIGURE, _REPORT = "calibration.png", "report.html"
 _EXTRAS = {_FIGURE: "plot", _REPORT: "report"}  # what these files need
 _FILES = (*_DATA, *_EXTRAS)
+_ARM = "cheng2018-simulation"
 _TRUE = ", true"  # what the name of the true arm ends in
 _CHECKS, _CHECK_MM = 30, 300.0
 _START, _END = (400.0, 200.0, 300.0), (700.0, 500.0, 500.0)
@@ -39,7 +40,7 @@ def run(folder: Path, seed: int) -> dict[str, Any]:
     the extra that figure or report need, the summary says so, and the rest is made."""
     from ..report import write_report
 
-    nominal = load_specification("cheng2018-simulation")
+    nominal = load_specification(_ARM)
     _prepare(folder, nominal.name + _TRUE)
     left_out = _left_out()
     for name in left_out:
@@ -100,7 +101,7 @@ def _made(folder: Path, nominal: ArmSpecification, seed: int, *, figure: bool) -
         seating=_SEATING_MM,
         seed=seed,
     )
-    recording = Recording(capture, nominal, true, seed)
+    recording = Recording(capture, nominal, true, seed, usual=usual_noise(_ARM))
     save_capture(folder / "capture.h5", recording, capture_summary(recording))
     recording = recording._replace(sources=(fingerprint(folder / "capture.h5"),))
     record = record_of(calibrate(nominal.arm, capture, bounds), recording)

@@ -10,6 +10,7 @@ from rich.markup import escape
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import reading, together
+from ..summaries.tables import rms_difference
 from .app import (
     Json,
     KnownEncoderNoise,
@@ -118,13 +119,20 @@ def display(summary: dict[str, Any]) -> None:
     for sentence in summary["findings"]:
         console.print(escape(sentence))
     table = new_table(
-        "\nRMS distance from the geometry [mm]; u: standard error by the scatter of the regions; ratio: mean of "
-        "(error / predicted standard deviation)^2 outside; evidence: its logarithm, less the largest",
-        "model", "parameters", "determined", "inside", "outside", "u", "ratio", "evidence", "CPU [s]",
+        "\nRMS distance from the geometry [mm]; to best: outside, less that of the best outside, compared region by "
+        "region; u: standard errors by the scatter of the regions; ratio: mean of (error / predicted standard "
+        "deviation)^2 outside; evidence: its logarithm, less the largest",
+        "model", "parameters", "determined", "inside", "outside", "u", "to best", "u", "ratio", "evidence", "CPU [s]",
     )  # fmt: skip
     most_probable = max(row["log_evidence"] for row in summary["models"])
+    least = next(row["rms_outside"] for row in summary["models"] if row["model"] == summary["best"])
     for row in summary["models"]:
-        numbers = (formatted(row[key]) for key in ("rms_inside", "rms_outside", "u_outside"))
+        known = row["difference"] is not None and row["u_difference"] is not None
+        differences = rms_difference(row, least) if known and row["model"] != summary["best"] else (None, None)
+        numbers = (
+            *(formatted(row[key]) for key in ("rms_inside", "rms_outside", "u_outside")),
+            *("-" if one is None else formatted(one) for one in differences),
+        )
         table.add_row(
             escape(row["model"]),
             str(row["parameters"]),

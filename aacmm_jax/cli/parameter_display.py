@@ -6,7 +6,8 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from ..core.units import people_read
+from ..core.text import pluralise, shorten
+from ..core.units import people_read, people_read_change
 from ..summaries.harmonics import harmonics_by_joint, listed_apart
 from ..summaries.tables import decimals_for
 from .display import formatted, new_table, print_table
@@ -56,6 +57,24 @@ def _harmonics(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
         value = f"{factor * largest['calibrated']:+z.{decimals}f}"
         table.add_row(*cells, largest["parameter"], value, formatted(u, decimals))
     print_table(console, table)
+
+
+def print_corrections(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
+    """The coefficients of an arm's corrections that are known, and what the others are."""
+    known = [row for row in rows if row["value"] != 0]
+    if known:
+        table = new_table("\nJoint corrections", "coefficient", "value", "unit", "")
+        for row in known:
+            scale, unit = people_read_change(row["unit"]) if row["unit"] == "rad" else people_read(row["unit"])
+            table.add_row(row["coefficient"], f"{scale * row['value']:.4g}", unit, row["of"])
+        print_table(console, table)
+    zero: dict[str, list[str]] = {}
+    for row in rows:
+        if row["value"] == 0 and row["of"]:  # not the direction of gravity
+            zero.setdefault(row["of"], []).append(row["coefficient"])
+    for of, names in zero.items():
+        amount = pluralise(len(names), "coefficient")
+        console.print(escape(f"Joint corrections of 0, until they are calibrated: {amount}, {of} ({shorten(names)})."))
 
 
 def print_prior(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -10,7 +10,7 @@ from ..core.errors import InputError
 from ..core.text import number
 from ..core.units import ARCSEC, DEG, UM, M
 from ..kinematics.arm import Arm
-from ..kinematics.priors import Prior, possible_names, unit_of_group
+from ..kinematics.priors import MIXED, Prior, possible_names, unit_of_group
 from .toml import Strict
 
 _UNITS = {
@@ -22,7 +22,7 @@ _UNITS = {
     "1": {"": 1.0},
 }
 _LEARN = "learn"
-_VALUE = re.compile(r"(?:(?P<mean>[^\s]+?)\s*\+-\s*)?(?P<sd>[^\s]+?)\s*(?P<unit>[a-zK/]*)")
+_VALUE = re.compile(r"(?:(?P<mean>[^\s]+?)\s*\+-\s*)?(?P<sd>[^\s]+?)\s*(?P<unit>[a-zKN/() ]*)")
 
 
 class PriorTable(Strict):
@@ -78,7 +78,7 @@ def prior_of_text(text: str, arm: Arm) -> Prior | None:
             continue
         found = _VALUE.fullmatch(value)
         unit = unit_of_group(group, possible_names(arm))
-        factors = _UNITS.get(unit, {})
+        factors = {} if unit == MIXED else _UNITS.get(unit, {unit.removeprefix("1"): 1.0})
         try:
             if found is None or found["unit"] not in factors:
                 raise ValueError(value)

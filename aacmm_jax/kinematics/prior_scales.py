@@ -7,20 +7,11 @@ for each joint fails where a joint moves little, since high orders imitate anyth
 
 from ..core.arguments import checked_arguments
 from .arm import Arm, correction_names
-from .corrections.coupling import Coupling
-from .corrections.expansion import Expansion
-from .corrections.gear_ratio import GearRatio
-from .corrections.gravity import Gravity
-from .corrections.harmonics import HIGHEST, Harmonics
+from .corrections.kind import Term
+from .corrections.kinds import all_kinds
 from .priors import Prior, is_of_group
 
 _LENGTH, _ANGLE = 1.0, 1e-3  # mm, rad
-_HARMONIC = 5e-5  # rad: 10 arcsec
-_RATIO = 2e-4  # of a gear, or part of another joint's reading
-_BY_LINK = 1e-3  # rad/m: 1 mrad for links with levers of 1 m
-_COMPLIANCE = 1e-2  # rad/(kN m): 1 mrad for 100 N m
-_EXPANSION = 2e-5  # 1/K: steel has 1.15e-5, aluminium 2.3e-5
-_SLIDE = 0.05  # mm, of the harmonics of a prismatic joint
 
 
 @checked_arguments
@@ -43,13 +34,14 @@ def default_prior(arm: Arm) -> Prior:
         >>> print(prior.groups)
         ('lengths', 'angles', 'gravity', 'harmonics=1')
     """
-    with_masses = any(name.startswith("compliance_") for name in correction_names(arm))
-    octaves = [(2**k, min(2 ** (k + 1) - 1, HIGHEST)) for k in range(HIGHEST.bit_length())]
-    kinds = {Gravity.model: _COMPLIANCE if with_masses else _BY_LINK, GearRatio.model: _RATIO, Coupling.model: _RATIO}
-    kinds[Expansion.model] = _EXPANSION
-    kinds |= {f"{Harmonics.model}={low}" + (f"-{high}" if high > low else ""): _HARMONIC for low, high in octaves}
-    # Coefficients of a slide are in mm, so that they cannot share a scale with those of joints that turn.
-    slides = {f"{word}*_{joint}": _SLIDE for joint in arm.prismatic for word in ("cos", "sin", "compliance", "coupled")}
+    terms = () if arm.corrections is None else arm.corrections.functions.each
+    kinds: dict[str, float] = {}
+    slides: dict[str, float] = {}
+    for kind in all_kinds():
+        kinds |= kind.usual([term for term in terms if isinstance(term, Term) and term.kind.model == kind.model])
+        if kind.usual_of_slide is not None:
+            # Coefficients of a slide are in mm, so that they cannot share a scale with those of joints that turn.
+            slides |= {f"{word}*_{joint}": kind.usual_of_slide for joint in arm.prismatic for word in kind.words}
     names = correction_names(arm)
     known = {group: sd for group, sd in (kinds | slides).items() if any(is_of_group(group, name) for name in names)}
     return Prior({"lengths": _LENGTH, "angles": _ANGLE} | known, learn=True)

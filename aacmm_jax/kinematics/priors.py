@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
-from functools import cache
 
 import equinox as eqx
 import numpy as np
@@ -15,10 +14,8 @@ from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from .arm import Arm, is_length, natural_steps, parameter_names
 from .corrections.harmonics import Harmonics, orders_of
 from .corrections.kind import Term
-from .corrections.kinds import COEFFICIENT, KINDS
+from .corrections.kinds import all_kinds, coefficient_of, is_kind
 
-_KIND_OF_WORD = {word: kind.model for kind in KINDS for word in kind.words}
-_CORRECTIONS = frozenset(_KIND_OF_WORD.values())
 _BROAD = 10.0  # standard deviation at which the search for a learned one begins, in natural steps
 LEAST_STEPS = 1e-4  # smallest learned standard deviation, in natural steps: 0.1 um, 0.02 arcsec
 
@@ -100,7 +97,7 @@ class Prior(eqx.Module):
     def check(self, arm: Arm) -> None:
         """Raise `InputError` for a group that holds no parameter of an arm."""
         names = possible_names(arm)
-        corrections = [kind.model for kind in KINDS if any(_is_correction(kind.model, name) for name in names)]
+        corrections = [kind.model for kind in all_kinds() if any(_is_correction(kind.model, name) for name in names)]
         for group in (*self.groups, *self.mean):
             if not any(is_of_group(group, name) for name in names):
                 stems = dict.fromkeys(name.rsplit("_", 1)[0] for name in names)
@@ -178,7 +175,7 @@ def is_of_group(group: str, name: str) -> bool:
     """Whether a group holds a parameter."""
     if group in ("lengths", "angles"):
         return is_length(name) == (group == "lengths")
-    if group.partition("=")[0] in _CORRECTIONS:
+    if is_kind(group.partition("=")[0]):
         return _is_correction(group, name)
     return group in ("all", name, name.rsplit("_", 1)[0]) or fnmatchcase(name, group)
 
@@ -186,18 +183,10 @@ def is_of_group(group: str, name: str) -> bool:
 def _is_correction(group: str, name: str) -> bool:
     """Whether a coefficient is of the kind of a group, and of its orders where it names some."""
     kind, _, option = group.partition("=")
-    found = _correction(name)
-    if found is None or found[0] != kind:
+    found = coefficient_of(name)
+    if found is None or found.kind.model != kind:
         return False
-    return not option or (kind == Harmonics.model and found[1] in (orders_of(option) or ()))
-
-
-@cache
-def _correction(name: str) -> tuple[str, int] | None:
-    """Kind of a coefficient, as a model names it, and its number; None for every other parameter."""
-    found = COEFFICIENT.fullmatch(name)
-    kind = None if found is None else _KIND_OF_WORD.get(found[1])
-    return None if found is None or kind is None else (kind, int(found[2] or 0))
+    return not option or (kind == Harmonics.model and found.number in (orders_of(option) or ()))
 
 
 def _owner(groups: tuple[str, ...], name: str) -> int | None:
@@ -207,7 +196,7 @@ def _owner(groups: tuple[str, ...], name: str) -> int | None:
 
 
 def _closeness(group: str, name: str) -> int:
-    if group.partition("=")[0] in _CORRECTIONS:
+    if is_kind(group.partition("=")[0]):
         return 3 if "=" in group else 2
     return {name: 4, "lengths": 1, "angles": 1, "all": 0}.get(group, 3)
 
@@ -231,9 +220,7 @@ def _unit(names: Iterable[str]) -> str:
     return MIXED if len(lengths) == 2 else "mm" if True in lengths else "rad"
 
 
-@cache
 def unit_of_coefficient(name: str) -> str:
     """Unit of a joint correction's coefficient, of a joint that rotates; empty for other parameters."""
-    found = _correction(name)
-    kind = next((kind for kind in KINDS if found is not None and kind.model == found[0]), None)
-    return "" if found is None or kind is None else kind.unit_of(Term(kind, "", found[1], 1))
+    found = coefficient_of(name)
+    return "" if found is None else found.kind.unit_of(Term(*found))

@@ -12,7 +12,7 @@ from ..core.text import pluralise
 from ..core.units import DEG, people_read
 from ..summaries.calibration import calibration_summary, shared_sentence
 from ..summaries.observations import capture_words
-from ..summaries.tables import decimals_for, two_digits
+from ..summaries.tables import decimals_for, lengths_sentence, two_digits
 from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
 from .arm_view import view_of_arm
@@ -125,6 +125,8 @@ def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
         facts.append((f"{length} (95 %)", f"median {typical}, largest {worst}"))
     else:
         facts.append((length, "not determined everywhere"))
+    if summary.get("lengths_tested"):
+        facts.append(("Lengths tested", lengths_sentence(summary["lengths_tested"]).partition(": ")[2]))
     if summary["scale_k"] is not None:
         expanded = factor * (summary["scale_u"] or 0.0)
         decimals = decimals_for(expanded, 7)

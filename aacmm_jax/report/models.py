@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..core.text import pluralise
+from ..summaries.tables import rms_difference
 from . import charts
 from .elements import Chart, Report, ReportTable, Section, format_number, number_cell, text_cell
 
@@ -73,12 +74,14 @@ def _by_model(summary: dict[str, Any]) -> Chart:
 
 def _table(models: list[dict[str, Any]]) -> ReportTable:
     most_probable = max(row["log_evidence"] for row in models)
+    least = min(row["rms_outside"] for row in models)
     rows = [
         [
             text_cell(row["model"]),
             number_cell(row["parameters"], 0),
             number_cell(row["effective_parameters"], 1),
             *(number_cell(row[key]) for key in ("rms_inside", "rms_outside", "u_outside")),
+            *(number_cell(one) for one in _differences(row, least)),
             number_cell(row["ratio"], 2),
             number_cell(row["log_evidence"] - most_probable, 1),
             number_cell(row["cpu_seconds"], 1),
@@ -93,16 +96,23 @@ def _table(models: list[dict[str, Any]]) -> ReportTable:
         "inside [mm]",
         "outside [mm]",
         "u of it [mm]",
+        "to the best outside [mm]",
+        "u of it [mm]",
         "ratio",
         "evidence",
         "CPU [s]",
         "",
     )
     caption = (
-        "Models; ratio: mean of (error / predicted standard deviation)² outside; evidence: its logarithm, less that "
-        "of the most probable model"
+        "Models; to the best outside: compared region by region; ratio: mean of (error / predicted standard "
+        "deviation)² outside; evidence: its logarithm, less that of the most probable model"
     )
     return ReportTable(caption, columns, rows)
+
+
+def _differences(row: dict[str, Any], least: float) -> tuple[float | None, float | None]:
+    known = row["difference"] is not None and row["u_difference"] is not None
+    return rms_difference(row, least) if known and row["rms_outside"] > least else (None, None)
 
 
 def _by_region(summary: dict[str, Any]) -> Chart:

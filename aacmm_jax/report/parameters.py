@@ -8,6 +8,7 @@ import numpy as np
 from ..calibration.joint_functions import function_of_joint
 from ..calibration.record import CalibrationRecord
 from ..core.units import DEG, people_read
+from ..kinematics.corrections.kind import Term
 from ..summaries.harmonics import harmonics_by_joint, listed_apart
 from ..summaries.tables import decimals_for
 from . import charts
@@ -107,9 +108,14 @@ def _functions_chart(record: CalibrationRecord) -> Chart | None:
         plots.append(charts.Plot(*axes, marks, vertical=ends, horizontal=[0.0], height=150))
     if not plots:
         return None
+    corrections = record.calibrated.arm.corrections
+    terms = () if corrections is None else corrections.functions.each
+    kinds = {term.kind.description: term.kind.of_own_reading for term in terms if isinstance(term, Term)}
+    drawn, others = ([each for each, own in kinds.items() if own is of] for of in (True, False))
     description = (
-        "Harmonics and gear ratio of each joint, less their mean, against its reading; gravity and couplings are not "
-        "in it. Dotted lines are the ends of the travel that was measured."
+        f"Corrections of each joint by its own reading ({', '.join(drawn)}), less their mean, against the reading"
+        + (f"; without {', '.join(others)}" if others else "")
+        + ". Dotted lines are the ends of the travel that was measured."
     )
     return Chart("functions", "What the joints do besides their readings", description, tuple(plots))
 

@@ -15,6 +15,7 @@ from ..data.capture import Capture, ReferenceLength
 from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
 from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
+from ..kinematics.corrections.kinds import coefficient_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
@@ -23,7 +24,7 @@ from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .model_errors import noisy_encoder_rows, summary_of_tests
 from .observations import capture_observations, observed_summary
 from .validation import cross_validation_summary
-from .verdicts import calibration_verdict
+from .verdicts import calibration_verdict, checked_lengths
 from .warnings import observed, of_calibration, of_import
 
 _CORRELATED = 0.95
@@ -52,7 +53,12 @@ def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
         "joints": joints,
         "probe_mm": np.asarray(arm.probe).tolist(),
         "corrections": [
-            {"coefficient": name, "unit": parameter_unit(arm, name), "value": float(value_of(arm, name))}
+            {
+                "coefficient": name,
+                "of": "" if (found := coefficient_of(name)) is None else found.kind.description,
+                "unit": parameter_unit(arm, name),
+                "value": float(value_of(arm, name)),
+            }
             for name in correction_names(arm)
         ],
         "held": list(specification.space().held),
@@ -208,7 +214,8 @@ def calibration_summary(
         summary["truth"] = {
             stage: truth_errors(record, vectors, stage) for stage in ("nominal", "stage1", "calibrated")
         }
-    return summary | {"verdict": calibration_verdict(summary)._asdict()}
+    checked = checked_lengths(summary["lengths"], summary["cross_validation"], record.fixed_by_one_length)
+    return summary | {"lengths_tested": checked, "verdict": calibration_verdict(summary)._asdict()}
 
 
 def prior_rows(prior: PriorMetrics) -> list[dict[str, Any]]:

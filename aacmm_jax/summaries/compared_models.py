@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 from ..calibration.model_ladder import ComparedModel, ComparedModels
+from .tables import rms_difference
 
 _EXCESS = 2.0  # of the mean squared normalised error, from which the uncertainty is said to be too small
 
@@ -53,16 +54,18 @@ def _finding(found: ComparedModels) -> str:
     chosen, best = found.recommended, found.models[found.best]
     if chosen is best:
         return f"Recommended: {chosen.model}, which predicts regions that it has not seen best."
+    difference, u = rms_difference(_row(chosen, *found.differences[found.models.index(chosen)]), best.rms_outside)
     return (
         f"Recommended: {chosen.model}. Regions that it has not seen cannot tell it from the best outside "
-        f"({best.model}), and it is the simplest of such models that makes the measurement as probable."
+        f"({best.model}): its error is larger by {difference:.2g} mm, standard error {u:.2g} mm, region by region. It "
+        "is the simplest of such models that makes the measurement as probable."
     )
 
 
 def _warnings(found: ComparedModels) -> list[str]:
     chosen = found.recommended
     sentences = [f"{model.model} did not converge." for model in found.models if not model.result.converged]
-    if chosen.ratio > _EXCESS:
+    if chosen.ratio >= _EXCESS:
         sentences.append(
             f"With {chosen.model}, errors outside are {math.sqrt(chosen.ratio):.1f} times what its noise and prior "
             "predict: it lacks an effect that none of these models has, or poses all over the joints' travel."

@@ -10,31 +10,30 @@ from ..calibration.model_errors import LEVEL, Misfit, ModelTests
 from ..calibration.results import NoisyEncoder
 from ..core.text import shorten
 from ..core.units import ARCSEC
+from ..kinematics.arm import Arm
+from ..kinematics.corrections.kind import Term
+from ..kinematics.corrections.kinds import all_sought, model_of
 from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
 
-# What residuals follow, of joint {i}; what causes that; and the model that has such a term.
-_TERMS: dict[str, tuple[str, str, str]] = {
-    "zero": ("the zero of joint {i}, which is fixed", "a wrong zero", ""),
-    "first harmonic": ("cos q_{i}", "an eccentric encoder or a bending link", "harmonics"),
-    "second harmonic": ("cos 2 q_{i}", "a tilted or oval encoder", "harmonics"),
-    "gear ratio": ("q_{i} (gear ratio)", "a wrong gear ratio", "gear"),
-    "gravity": ("gravity about joint {i}", "a joint or link that bends under its load", "gravity"),
-    "drifting zero": ("a drift of joint {i} from pose to pose", "a zero that drifts", ""),
-    "drifting base": ("a drift of the tip from pose to pose", "a base or socket that moves", ""),
-    "growing arm": ("a growth of the arm from pose to pose", "an arm that warms or cools", ""),
-    "thermal expansion": ("temperature", "an arm that expands", "expansion"),
+# Terms that no kind of joint correction has: what residuals follow, of joint {i}, and what causes that.
+_OTHERS: dict[str, tuple[str, str]] = {
+    "zero": ("the zero of joint {i}, which is fixed", "a wrong zero"),
+    "drifting zero": ("a drift of joint {i} from pose to pose", "a zero that drifts"),
+    "drifting base": ("a drift of the tip from pose to pose", "a base or socket that moves"),
+    "growing arm": ("a growth of the arm from pose to pose", "an arm that warms or cools"),
 }
 _FAR_MORE = 100.0  # ratio of noise beyond which the number says nothing
-_MODEL_OPTION = "--model dh,"  # of the command line, which takes further terms into the model
 
 
-def sentences_of_tests(tests: ModelTests, method: str = "", shared: SharedErrors | None = None) -> list[str]:
-    """What the tests of a calibration found, the most serious first; ``method`` is that of the calibration, and
-    ``shared`` what its uncertainty contains of such errors."""
+def sentences_of_tests(
+    tests: ModelTests, method: str = "", shared: SharedErrors | None = None, arm: Arm | None = None
+) -> list[str]:
+    """What the tests of a calibration found, the most serious first; ``method`` is that of the calibration, ``shared``
+    what its uncertainty contains of such errors, and ``arm`` the calibrated arm, whose corrections its model has."""
     found = []
     kinds = set() if shared is None else set(shared.kinds)
     if tests.terms:
-        found.append(_terms(tests.terms, bool(kinds - {PLACES, VISITS, SUCCESSIVE})))
+        found.append(_terms(tests.terms, bool(kinds - {PLACES, VISITS, SUCCESSIVE}), arm))
     if tests.misfit is not None and tests.misfit.probability < LEVEL:
         found.append(_misfit(tests.misfit))
     if tests.noisy_joint is not None and tests.noisy_joint.probability < LEVEL:
@@ -102,17 +101,36 @@ def noisy_encoder_rows(encoders: Sequence[NoisyEncoder], slides: Collection[int]
     return rows
 
 
-def _terms(terms: tuple[FoundTerm, ...], in_uncertainty: bool) -> str:
-    named = [f"{_TERMS[term.kind][0].format(i=term.joint)} ({_amplitude(term)})" for term in terms]
+def _words(name: str) -> tuple[str, str]:
+    """What residuals follow, of joint {i}, and what causes that."""
+    found = all_sought().get(name)
+    return _OTHERS[name] if found is None else (found[1].follows, found[1].cause)
+
+
+def _wider_model(terms: tuple[FoundTerm, ...], arm: Arm | None) -> str:
+    """The model that the arm has, with the terms that were found besides; empty where no model has them."""
+    each = () if arm is None or arm.corrections is None else arm.corrections.functions.each
+    own = [term for term in each if isinstance(term, Term)]
+    sought, added = all_sought(), []
+    for kind, one in (sought[term.kind] for term in terms if term.kind in sought):
+        # All of its default functions where the model has none yet, as a first harmonic is seldom alone.
+        option = one.option if any(term.kind.model == kind.model for term in own) else ""
+        joints = 1 if arm is None else arm.joints
+        added += kind.terms(max(joints, *(term.joint or 1 for term in terms)), option, None)
+    return model_of([*own, *added]) if added else ""
+
+
+def _terms(terms: tuple[FoundTerm, ...], in_uncertainty: bool, arm: Arm | None) -> str:
+    named = [f"{_words(term.kind)[0].format(i=term.joint)} ({_amplitude(term)})" for term in terms]
     kinds = dict.fromkeys(term.kind for term in terms)
-    options = list(dict.fromkeys(_TERMS[kind][2] for kind in kinds if _TERMS[kind][2]))
-    hint = f"; try {_MODEL_OPTION}{','.join(options)}" if options else ""
+    model = _wider_model(terms, arm)
+    hint = f"; try --model {model}" if model else ""
     found = {(term.kind, term.joint) for term in terms}
     others = dict.fromkeys(other for term in terms for other in term.alternatives if other not in found)
-    as_well = [_TERMS[kind][0].format(i=joint) for kind, joint in others]
+    as_well = [_words(kind)[0].format(i=joint) for kind, joint in others]
     return (
         f"Residuals follow {shorten(named, 3)} ({_chance(max(term.probability for term in terms))}), which the model "
-        f"lacks: {', '.join(_TERMS[kind][1] for kind in kinds)}{hint}. "
+        f"lacks: {', '.join(_words(kind)[1] for kind in kinds)}{hint}. "
         + (f"As good an explanation: {shorten(as_well, 3)}. " if as_well else "")
         + (
             "Every u contains such errors, as far as residuals show them."
@@ -123,7 +141,7 @@ def _terms(terms: tuple[FoundTerm, ...], in_uncertainty: bool) -> str:
 
 
 def _amplitude(term: FoundTerm) -> str:
-    if term.kind == "gear ratio":
+    if term.term.relative and term.kind != "zero":
         return f"{_rounded(100 * term.amplitude)} %"
     return f"{_rounded(term.amplitude)} mm" if term.joint is None else f"{_rounded(term.amplitude / ARCSEC)} arcsec"
 

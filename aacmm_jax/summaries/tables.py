@@ -95,3 +95,25 @@ def encoders_in_words(found: Mapping[str, Any]) -> str:
 def seat_in_words(summary: Mapping[str, Any]) -> str:
     """What the noise is of that does not come from the joints: of the seat in a socket, or of the tip itself."""
     return "seat" if summary["sockets_used"] else "tip, each coordinate,"
+
+
+def rms_difference(row: Mapping[str, Any], best_rms: float) -> tuple[float, float]:
+    """The RMS error outside less that of the best model, and its standard error by the scatter of the differences
+    between regions, mm: a difference of squares is that of the roots times their sum."""
+    total = max(row["rms_outside"] + best_rms, 1e-300)
+    return row["difference"] / total, row["u_difference"] / total
+
+
+def lengths_sentence(found: Mapping[str, Any]) -> str:
+    """What a calibration says of the lengths that it was tried on (`verdicts.checked_lengths`), in words."""
+    low, high = (f"{found[key]:.4g}" for key in ("shortest_mm", "longest_mm"))
+    size = f"{low} mm" if low == high else f"{low} to {high} mm"
+    untested = f"Lengths over {high} mm are untested."
+    if found["rms_mm"] is None:
+        return f"Lengths tested: none, as the only one ({size}) fixed the scale. {untested}"
+    held = f"{found['held_out']} of them" if found["held_out"] else "none"
+    predicted = "" if found["predicted_mm"] is None else f", predicted {two_digits(found['predicted_mm'])} mm"
+    return (
+        f"Lengths tested: {found['lengths']} ({size}), {held} held out; RMS error "
+        f"{two_digits(found['rms_mm'])} mm{predicted}. {untested}"
+    )

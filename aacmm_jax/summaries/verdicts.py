@@ -3,7 +3,8 @@
 Terminal and report begin with it. Its mark is "good", "unsure", "bad", or "neutral" where nothing was decided.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from ..calibration.left_out import LEVEL
@@ -84,6 +85,41 @@ def _model_fails(tests: Mapping[str, Any]) -> bool:
     return bool(tests["missing_terms"] or tests["noisy_observations"]) or any(
         one is not None and one["probability"] is not None and one["probability"] < level for one in single
     )
+
+
+def checked_lengths(
+    lengths: Sequence[Mapping[str, Any]], held_out: Mapping[str, Any] | None, fixed_by_one: bool
+) -> dict[str, Any] | None:
+    """What a calibration says of the lengths that it was tried on, mm; None without reference lengths.
+
+    Args:
+        lengths: Rows of a summary, with errors of the calibrated arm.
+        held_out: The summary of a cross-validation.
+        fixed_by_one: Whether a single length fixed the scale, so that its error is 0 by construction.
+    """
+    if not lengths:
+        return None
+    values = [row["value_mm"] for row in lengths]
+    found = {"lengths": len(lengths), "held_out": 0, "shortest_mm": min(values), "longest_mm": max(values)}
+    found |= {"rms_mm": None, "predicted_mm": None}
+    held = sum(group["lengths"] for group in held_out.get("left_out", [])) if held_out else 0
+    if held_out and held and held_out["length_error_rms_mm"] is not None:
+        return found | {
+            "held_out": min(held, len(lengths)),
+            "rms_mm": held_out["length_error_rms_mm"],
+            "predicted_mm": held_out["length_u_mm"],
+        }
+    if fixed_by_one:
+        return found
+    u = [row["error_u_mm"] for row in lengths]
+    return found | {
+        "rms_mm": _root_mean_square([row["error_mm"] for row in lengths]),
+        "predicted_mm": None if None in u else _root_mean_square(u),
+    }
+
+
+def _root_mean_square(values: Sequence[float]) -> float:
+    return math.sqrt(sum(value**2 for value in values) / len(values))
 
 
 def overall_decision(summary: Mapping[str, Any]) -> str | None:

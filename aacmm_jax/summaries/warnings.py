@@ -147,7 +147,8 @@ def of_calibration(
         found.append(sentence_of_noisy_encoders(record.noisy_encoders, slides, given))
     found += [] if record.validation is None else contradicted_prediction(record.validation)
     if not record.implausible_residual:
-        found += sentences_of_tests(model_tests(record) if tests is None else tests, record.method, record.shared)
+        tests = model_tests(record) if tests is None else tests
+        found += sentences_of_tests(tests, record.method, record.shared, record.calibrated.arm)
     if record.recording.capture.observations:
         found += [*_on_bounds_observed(record), *_scale(record), *of_capture(record.recording)]
         seen = observed(record) if seen is None else seen

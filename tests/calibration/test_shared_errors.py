@@ -285,3 +285,18 @@ def test_lengths_of_a_real_arm_are_predicted_as_large_as_they_err():
     arm, bounds = recording.nominal.arm, recording.nominal.bounds()
     found = aj.cross_validate(arm, recording.capture, bounds, method="joint", prior=default_prior(arm))
     assert 0.6 * found.length_rms < found.length_u < 2.5 * found.length_rms
+
+
+@pytest.mark.parametrize("robust", [pytest.param("tukey"), pytest.param("huber", marks=pytest.mark.slow)])
+def test_a_robust_loss_keeps_them(poses, robust):
+    """A bad pose loses its weight, and the uncertainty of lengths is about that without this pose."""
+    capture = captured(poses, 3, error=eccentric)
+    sockets = {name: np.array(q) for name, q in capture.sockets.items()}
+    sockets["A"][3, 2] += 1e-3
+    plain = calibrated(poses, capture)
+    found = calibrated(poses, aj.Capture(sockets, capture.lengths), robust=robust)
+    assert plain.shared is not None
+    assert found.shared is not None
+    assert "harmonics=1" in found.shared.kinds
+    u = [np.median(np.asarray(aj.uncertainty_of(one).length(*volume(poses)))) for one in (plain, found)]
+    assert 0.6 < u[1] / u[0] < 1.7, u

@@ -791,8 +791,22 @@ def test_a_certificate_whose_number_was_edited_is_refused(record):
         assert_refused(lambda edited=edited: parse_dcc(text.replace(k, edited)), "'As left / Scale / k'", "no number")
 
 
-@pytest.mark.parametrize("kind", kinds.KINDS, ids=lambda kind: kind.model)
+@pytest.mark.parametrize("kind", kinds.all_kinds(), ids=lambda kind: kind.model)
 def test_every_unit_of_a_correction_has_its_name_in_d_si(kind):
     loads = Loads((1.0,) * 3, ((0.0, 0.0, 0.0),) * 3)
     units = {term.unit for with_masses in (None, loads) for term in kind.terms(3, "", with_masses)}
-    assert units | {unit.replace("rad", "mm") for unit in units} <= measurement_results._UNITS.keys()
+    for unit in units | {unit.replace("rad", "mm") for unit in units}:
+        assert measurement_results._in_d_si(unit).startswith("\\")
+
+
+@pytest.mark.parametrize(
+    ("unit", "expected"),
+    [
+        ("1", r"\one"),
+        ("mm", r"\milli\metre"),
+        ("1/K", r"\kelvin\tothe{-1}"),
+        ("rad/(kN m)", r"\radian\kilo\newton\tothe{-1}\metre\tothe{-1}"),
+    ],
+)
+def test_units_in_d_si(unit, expected):
+    assert measurement_results._in_d_si(unit) == expected

@@ -2,8 +2,12 @@
 
 import pytest
 
-from aacmm_jax.summaries.tables import decimals_for, two_digits
-from aacmm_jax.summaries.verdicts import calibration_verdict, evaluation_verdict
+from aacmm_jax.summaries.tables import decimals_for, lengths_sentence, rms_difference, two_digits
+from aacmm_jax.summaries.verdicts import (
+    calibration_verdict,
+    checked_lengths,
+    evaluation_verdict,
+)
 
 VOLUME = {"length_mm": 300.0, "u_length_reading_median_mm": 0.01, "u_length_reading_largest_mm": 0.05}
 SOUND = {
@@ -99,3 +103,40 @@ def test_uncertainties_have_two_digits(u, says):
 
 def test_what_has_no_uncertainty_has_the_usual_decimals():
     assert [decimals_for(u) for u in (None, 0.0, float("inf"))] == [4, 4, 4]
+
+
+ROWS = [
+    {"value_mm": 200.0, "error_mm": 0.03, "error_u_mm": 0.01},
+    {"value_mm": 650.25, "error_mm": -0.04, "error_u_mm": 0.02},
+]
+HELD_OUT = {"left_out": [{"lengths": 1}, {"lengths": 0}], "length_error_rms_mm": 0.05, "length_u_mm": 0.04}
+
+
+@pytest.mark.parametrize(
+    ("lengths", "held_out", "says"),
+    [
+        (
+            ROWS,
+            None,
+            "Lengths tested: 2 (200 to 650.2 mm), none held out; RMS error 0.035 mm, predicted 0.016 mm. Lengths over "
+            "650.2 mm are untested.",
+        ),
+        (ROWS, HELD_OUT, "1 of them held out; RMS error 0.050 mm, predicted 0.040 mm."),
+        (ROWS, HELD_OUT | {"length_error_rms_mm": None}, "none held out; RMS error 0.035 mm"),
+        (ROWS[:1], None, "Lengths tested: none, as the only one (200 mm) fixed the scale. Lengths over 200 mm are"),
+    ],
+)
+def test_checked_lengths(lengths, held_out, says):
+    found = checked_lengths(lengths, held_out, len(lengths) == 1)
+    assert found is not None
+    assert says in lengths_sentence(found)
+
+
+def test_no_lengths_are_tested_without_any():
+    assert checked_lengths([], None, False) is None
+
+
+def test_difference_of_rms_errors():
+    """0.5 mm and 0.3 mm differ by 0.2 mm, as 0.25 and 0.09 mm^2 do by 0.16."""
+    row = {"rms_outside": 0.5, "difference": 0.16, "u_difference": 0.08}
+    assert rms_difference(row, 0.3) == pytest.approx((0.2, 0.1))

@@ -18,8 +18,9 @@ class Coupling(AbstractCorrection):
 
     model: ClassVar[str] = "coupled"
     words: ClassVar[tuple[str, ...]] = ("coupled",)
-    description: ClassVar[str] = "part of another joint's reading"
+    description: ClassVar[str] = "parts of other joints' readings"
     rows: ClassVar[int] = 1
+    usual_of_slide: ClassVar[float | None] = 0.05
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
         if not option:
@@ -29,6 +30,9 @@ class Coupling(AbstractCorrection):
             raise InputError(f"coupled={option} names no joints; coupled=2-3 lets the reading of joint 2 move joint 3.")
         return tuple(Term(self, "coupled", int(pair[1]), int(pair[2])) for pair in pairs if pair)
 
+    def option_of(self, terms: Sequence[Term]) -> str:
+        return "+".join(dict.fromkeys(f"{term.number}-{term.joint}" for term in terms))
+
     def wrong(self, term: Term, joints: int) -> str:
         if not 1 <= term.number <= joints:
             return f"is of the reading of another joint from 1 to {joints}, as coupled2_3 is"
@@ -36,6 +40,9 @@ class Coupling(AbstractCorrection):
 
     def unit_of(self, term: Term) -> str:
         return "1"
+
+    def usual(self, terms: Sequence[Term]) -> dict[str, float]:
+        return {self.model: 2e-4}
 
     def values(
         self, terms: Sequence[Term], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass

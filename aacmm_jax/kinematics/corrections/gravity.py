@@ -14,10 +14,12 @@ from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross
 from ..chain import ForwardPass
-from .kind import AbstractCorrection, Loads, Term
+from .kind import AbstractCorrection, Loads, Sought, Term
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, by definition
 _METRE = 1e-3  # m/mm
+_BY_LINK = 1e-3  # rad/m, usual: 1 mrad for links with levers of 1 m
+_BY_MASS = 1e-2  # rad/(kN m), usual: 1 mrad for 100 N m
 _KILONEWTON = 1e-3  # kN/N: with rad/(kN m), compliances are about as large as errors of angles
 
 
@@ -31,8 +33,13 @@ class Gravity(AbstractCorrection):
 
     model: ClassVar[str] = "gravity"
     words: ClassVar[tuple[str, ...]] = ("compliance",)
-    description: ClassVar[str] = "compliance by the moment of gravity"
+    description: ClassVar[str] = "compliances under the moment of gravity"
     rows: ClassVar[int] = 3
+    sought: ClassVar[tuple[Sought, ...]] = (
+        Sought("gravity", "", "gravity about joint {i}", "a joint or link that bends under its load"),
+    )
+    shared: ClassVar[str | None] = ""
+    usual_of_slide: ClassVar[float | None] = 0.05
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
         if option:
@@ -43,6 +50,9 @@ class Gravity(AbstractCorrection):
             Term(self, "compliance", link, joint) for joint in range(1, joints + 1) for link in range(joint, joints + 1)
         )
 
+    def option_of(self, terms: Sequence[Term]) -> str:
+        return ""
+
     def wrong(self, term: Term, joints: int) -> str:
         if term.number and not term.joint <= term.number <= joints:
             return f"is of a link from {term.joint} to {joints}, as compliance{term.joint}_{term.joint} is"
@@ -50,6 +60,9 @@ class Gravity(AbstractCorrection):
 
     def unit_of(self, term: Term) -> str:
         return "rad/m" if term.number else "rad/(kN m)"
+
+    def usual(self, terms: Sequence[Term]) -> dict[str, float]:
+        return {self.model: _BY_LINK if all(term.number for term in terms) else _BY_MASS}
 
     def values(
         self, terms: Sequence[Term], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass

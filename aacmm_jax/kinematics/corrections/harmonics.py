@@ -14,9 +14,10 @@ from jaxtyping import Float
 from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace
 from ..chain import ForwardPass
-from .kind import AbstractCorrection, Loads, Term
+from .kind import AbstractCorrection, Loads, Sought, Term
 
 HIGHEST = 99
+_USUAL = 5e-5  # rad: 10 arcsec
 
 
 def orders_of(option: str) -> tuple[int, ...] | None:
@@ -35,8 +36,15 @@ class Harmonics(AbstractCorrection):
 
     model: ClassVar[str] = "harmonics"
     words: ClassVar[tuple[str, ...]] = ("cos", "sin")
-    description: ClassVar[str] = "harmonic of an encoder"
+    description: ClassVar[str] = "harmonics of encoders"
     rows: ClassVar[int] = 1
+    of_own_reading: ClassVar[bool] = True
+    sought: ClassVar[tuple[Sought, ...]] = (
+        Sought("first harmonic", "1", "cos q_{i}", "an eccentric encoder or a bending link"),
+        Sought("second harmonic", "2", "cos 2 q_{i}", "a tilted or oval encoder"),
+    )
+    shared: ClassVar[str | None] = "1-3"
+    usual_of_slide: ClassVar[float | None] = 0.05
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
         orders = orders_of(option or "1+2")
@@ -49,11 +57,22 @@ class Harmonics(AbstractCorrection):
             Term(self, word, order, joint) for joint in range(1, joints + 1) for order in orders for word in self.words
         )
 
+    def option_of(self, terms: Sequence[Term]) -> str:
+        orders = sorted({term.number for term in terms})
+        first = [order for order in orders if order - 1 not in orders]
+        last = [order for order in orders if order + 1 not in orders]
+        runs = [(low,) if low == high else (low, high) for low, high in zip(first, last, strict=True)]
+        return "" if orders == [1, 2] else "+".join("-".join(map(str, run)) for run in runs)
+
     def wrong(self, term: Term, joints: int) -> str:
         return "" if 1 <= term.number <= HIGHEST else f"has no order from 1 to {HIGHEST}"
 
     def unit_of(self, term: Term) -> str:
         return "rad"
+
+    def usual(self, terms: Sequence[Term]) -> dict[str, float]:
+        octaves = [(2**k, min(2 ** (k + 1) - 1, HIGHEST)) for k in range(HIGHEST.bit_length())]
+        return {f"{self.model}={low}" + (f"-{high}" if high > low else ""): _USUAL for low, high in octaves}
 
     def values(
         self, terms: Sequence[Term], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass

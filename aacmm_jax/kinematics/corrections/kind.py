@@ -6,12 +6,12 @@ What a joint really does is its reading plus coefficients times known functions 
 
 so the derivative of the tip by a coefficient is the Jacobian column of the joint's theta (of a prismatic joint, of its
 d) times phi. Thermal expansion moves no joint: all lengths grow by 1 + c (T - 20 C). A new kind is one file with one
-class, and its entry in `kinds.KINDS`.
+class in this folder: whatever else the package does with kinds, it asks them.
 """
 
 import abc
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Float
@@ -32,13 +32,39 @@ class Loads(NamedTuple):
     centre: tuple[tuple[float, float, float], ...]
 
 
+class Sought(NamedTuple):
+    """Functions of a kind that residuals are searched for, all those of one joint at once.
+
+    Args:
+        name: What results call it: "first harmonic".
+        option: That of the model with these functions: "1" of ``harmonics=1``.
+        follows: What residuals follow then, of joint {i}: "cos q_{i}".
+        cause: What usually causes it, with its article: "an eccentric encoder".
+        of_slides: Whether prismatic joints have it as well.
+        relative: Whether its size is the coefficient, a ratio, rather than what it adds over the poses.
+    """
+
+    name: str
+    option: str
+    follows: str
+    cause: str
+    of_slides: bool = False
+    relative: bool = False
+
+
 class AbstractCorrection(eqx.Module):
     """A kind of joint correction, without data of its own: hashable, so that it is static in every program."""
 
     model: eqx.AbstractClassVar[str]  # what a model calls it, as in ``--model dh,harmonics=1``
     words: eqx.AbstractClassVar[tuple[str, ...]]  # with which the names of its coefficients begin
-    description: eqx.AbstractClassVar[str]  # of one coefficient
+    description: eqx.AbstractClassVar[str]  # what its coefficients are, in the plural: "errors of gear ratios"
     rows: eqx.AbstractClassVar[int]  # of `values`: 3 for a function of gravity, one for each component of its direction
+    of_arm: ClassVar[bool] = False  # whether it scales all lengths of the arm: its terms are of joint 0
+    of_own_reading: ClassVar[bool] = False  # whether each function is of its joint's reading alone, and can be drawn
+    sought: ClassVar[tuple[Sought, ...]] = ()  # what residuals of a calibration without it are searched for
+    # Option of the model whose functions poses may share errors by; None: none of them.
+    shared: ClassVar[str | None] = None
+    usual_of_slide: ClassVar[float | None] = None  # mm: like `usual`, where a joint is prismatic; None: the same
 
     @abc.abstractmethod
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple["Term", ...]:
@@ -54,12 +80,27 @@ class AbstractCorrection(eqx.Module):
         """
 
     @abc.abstractmethod
+    def option_of(self, terms: Sequence["Term"]) -> str:
+        """The option of the model that has these terms, and as few others as can be: the inverse of `terms`."""
+
+    @abc.abstractmethod
     def wrong(self, term: "Term", joints: int) -> str:
         """What is wrong with a term of this kind for an arm of so many joints, in a few words; empty if nothing is."""
 
     @abc.abstractmethod
     def unit_of(self, term: "Term") -> str:
         """Unit of a term's coefficient: of a revolute joint; in place of rad, mm of a prismatic one."""
+
+    @abc.abstractmethod
+    def usual(self, terms: Sequence["Term"]) -> dict[str, float]:
+        """About how large coefficients usually are: the groups of the default prior with their standard deviations.
+
+        Args:
+            terms: Those of an arm that are of this kind.
+
+        Returns:
+            By name of a group (`Prior`), in the unit of the coefficients.
+        """
 
     @abc.abstractmethod
     def values(

@@ -1,22 +1,111 @@
 """All kinds of joint corrections, and the names of their coefficients."""
 
+import pkgutil
 import re
+from collections.abc import Iterable
 from functools import lru_cache
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple
 
 from ...core.errors import InputError, nearest
-from .coupling import Coupling
-from .expansion import Expansion
-from .gear_ratio import GearRatio
-from .gravity import Gravity
-from .harmonics import Harmonics
-from .kind import AbstractCorrection, Loads, Term
+from .kind import AbstractCorrection, Loads, Sought, Term
 
-KINDS: tuple[AbstractCorrection, ...] = (Harmonics(), GearRatio(), Gravity(), Coupling(), Expansion())
 # Short forms. An error function of each joint, whatever its cause: with a prior, 62 coefficients a joint are few enough
 # to be found in seconds from 500 poses, and orders to 63 were hardly better (`benchmarks/NOTES.md`).
 _SHORT_FORMS = {"functions": "harmonics=1-31"}
-COEFFICIENT = re.compile(r"([a-z]+)([1-9][0-9]*)?(?:_([1-9][0-9]*))?")
+_COEFFICIENT = re.compile(r"([a-z]+)([1-9][0-9]*)?(?:_([1-9][0-9]*))?")
 _KEPT = 4096  # results: every calibration asks for the same ones, and the method of an Equinox module takes 0.1 ms
+_KINDS: dict[str, AbstractCorrection] = {}  # by what a model calls them
+
+
+def all_kinds() -> tuple[AbstractCorrection, ...]:
+    """Every kind that has a file in this folder, in the order of the files' names, and those registered besides."""
+    return tuple(_KINDS.values())
+
+
+def is_kind(name: str) -> bool:
+    """Whether a model calls some kind so."""
+    return name in _KINDS
+
+
+def register(kind: AbstractCorrection) -> None:
+    """Make a kind known that has no file in this folder.
+
+    Raises:
+        InputError: What a model calls it, or a word of its coefficients, is another kind's, or no lowercase letters.
+    """
+    for name in (kind.model, *kind.words):
+        taken = any(name in (other.model, *other.words) for other in all_kinds())
+        if taken or re.fullmatch("[a-z]+", name) is None or name in ("dh", *_SHORT_FORMS):
+            raise InputError(
+                f"'{name}' of {type(kind).__name__} is no name for a kind of joint correction; name it by lowercase "
+                "letters that no other kind has."
+            )
+    _KINDS[kind.model] = kind
+    _forget()
+
+
+def unregister(kind: AbstractCorrection) -> None:
+    """Make a kind unknown again."""
+    del _KINDS[kind.model]
+    _forget()
+
+
+def _forget() -> None:
+    for kept in (coefficient_of, term_of, terms_of):
+        kept.cache_clear()
+
+
+def _register_files() -> None:
+    """Whatever kinds the modules of this folder define."""
+    for module in sorted(each.name for each in pkgutil.iter_modules([str(Path(__file__).parent)])):
+        if module in ("kind", "kinds"):
+            continue
+        for value in vars(import_module(f"{__package__}.{module}")).values():
+            if isinstance(value, type) and issubclass(value, AbstractCorrection) and value is not AbstractCorrection:
+                register(value())  # pyright: ignore[reportCallIssue] - a final kind has no fields
+
+
+class Coefficient(NamedTuple):
+    """What the name of a coefficient says of it."""
+
+    kind: AbstractCorrection
+    word: str
+    number: int
+    joint: int
+
+
+@lru_cache(_KEPT)
+def coefficient_of(name: str) -> Coefficient | None:
+    """What the name of a coefficient says, of whichever arm it is; None for every other parameter."""
+    found = _COEFFICIENT.fullmatch(name)
+    kind = None if found is None else next((kind for kind in all_kinds() if found[1] in kind.words), None)
+    if found is None or kind is None:
+        return None
+    return Coefficient(kind, found[1], int(found[2] or 0), int(found[3] or 0))
+
+
+def all_sought() -> dict[str, tuple[AbstractCorrection, Sought]]:
+    """What residuals are searched for, by name, with its kind."""
+    return {sought.name: (kind, sought) for kind in all_kinds() for sought in kind.sought}
+
+
+def shared_model() -> str:
+    """The model of the functions by which poses may share errors."""
+    return ",".join(model_with(kind, kind.shared) for kind in all_kinds() if kind.shared is not None)
+
+
+def model_of(terms: Iterable[Term]) -> str:
+    """The model that has all these terms: "dh,gear,harmonics=1-3"; "dh" alone for none."""
+    given = tuple(terms)
+    of_kinds = [(kind, [term for term in given if term.kind.model == kind.model]) for kind in all_kinds()]
+    return ",".join(["dh", *(model_with(kind, kind.option_of(own)) for kind, own in of_kinds if own)])
+
+
+def model_with(kind: AbstractCorrection, option: str) -> str:
+    """A model of one kind with an option, or without where it is empty."""
+    return f"{kind.model}={option}" if option else kind.model
 
 
 @lru_cache(_KEPT)
@@ -26,13 +115,11 @@ def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
     Raises:
         InputError: It is one, but not of an arm with so many joints.
     """
-    found = COEFFICIENT.fullmatch(name)
-    kind = None if found is None else next((kind for kind in KINDS if found[1] in kind.words), None)
-    if found is None or kind is None:
+    found = coefficient_of(name)
+    if found is None:
         return None
-    number = int(found[2] or 0)
-    term = Term(kind, found[1], number, int(found[3] or 0), loads if kind.rows == 3 and not number else None)
-    wrong = f"is of a joint from 1 to {joints}" if _is_outside(term, joints) else kind.wrong(term, joints)
+    term = Term(*found, loads if found.kind.rows == 3 and not found.number else None)
+    wrong = f"is of a joint from 1 to {joints}" if _is_outside(term, joints) else found.kind.wrong(term, joints)
     if wrong:
         raise InputError(f"the coefficient '{name}' {wrong}; correct its name.")
     return term
@@ -61,13 +148,13 @@ def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term,
         seen.add(name)
         if name == "dh":
             continue
-        kinds = [kind for kind in KINDS if kind.model == name]
-        if not kinds:
-            known = ["dh", *(kind.model for kind in KINDS), *_SHORT_FORMS]
+        kind = _KINDS.get(name)
+        if kind is None:
+            known = ["dh", *_KINDS, *_SHORT_FORMS]
             raise InputError(f"unknown model '{name}'{nearest(name, known)}")
-        terms = kinds[0].terms(joints, option, loads)
+        terms = kind.terms(joints, option, loads)
         for term in terms:
-            wrong = kinds[0].wrong(term, joints)
+            wrong = kind.wrong(term, joints)
             if wrong or _is_outside(term, joints):
                 raise InputError(f"{part} {wrong or f'names joint {term.joint} of {joints}'}; correct it.")
         found += terms
@@ -75,5 +162,8 @@ def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term,
 
 
 def _is_outside(term: Term, joints: int) -> bool:
-    """Whether an arm has no such joint; 0, no joint, is for thermal expansion alone."""
-    return not (0 if isinstance(term.kind, Expansion) else 1) <= term.joint <= joints
+    """Whether an arm has no such joint; 0, no joint, is for what scales the whole arm."""
+    return not (0 if term.kind.of_arm else 1) <= term.joint <= joints
+
+
+_register_files()

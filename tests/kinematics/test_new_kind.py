@@ -1,0 +1,164 @@
+"""A new kind of joint correction is one file: this one goes the whole way, and the package has never heard of it."""
+
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.calibration.model_errors import model_tests
+from aacmm_jax.calibration.shared_errors import missing_functions
+from aacmm_jax.certificate.measurement_results import _in_d_si
+from aacmm_jax.cli import calibration_display
+from aacmm_jax.files.joint_models import with_model
+from aacmm_jax.files.priors import prior_of_text
+from aacmm_jax.kinematics import default_prior, with_corrections
+from aacmm_jax.kinematics.arm import correction_names
+from aacmm_jax.kinematics.corrections import kinds
+from aacmm_jax.kinematics.corrections.kind import AbstractCorrection, Sought, Term
+from aacmm_jax.report import write_report
+from aacmm_jax.summaries.calibration import arm_summary
+
+BOW = 2e-4  # 1/rad
+
+
+class Bow(AbstractCorrection):
+    """A scale whose error grows with the square of the reading."""
+
+    model: ClassVar[str] = "bow"
+    words: ClassVar[tuple[str, ...]] = ("bow",)
+    description: ClassVar[str] = "bows of scales"
+    rows: ClassVar[int] = 1
+    of_own_reading: ClassVar[bool] = True
+    sought: ClassVar[tuple[Sought, ...]] = (Sought("bow", "", "the square of q_{i}", "a bent scale"),)
+    shared: ClassVar[str | None] = ""
+
+    def terms(self, joints, option, loads):
+        return tuple(Term(self, "bow", 0, joint) for joint in range(1, joints + 1))
+
+    def option_of(self, terms):
+        return ""
+
+    def wrong(self, term, joints):
+        return "has a number, and takes none" if term.number else ""
+
+    def unit_of(self, term):
+        return "1/rad"
+
+    def usual(self, terms):
+        return {"bow": 1e-4}
+
+    def values(self, terms, q, forward):
+        return q[np.array([term.joint - 1 for term in terms])] ** 2
+
+
+@pytest.fixture(scope="module", autouse=True)
+def bow():
+    kind = Bow()
+    kinds.register(kind)
+    yield kind
+    kinds.unregister(kind)
+
+
+@pytest.fixture(scope="module")
+def captured(paper_arm):
+    """Sockets of an arm whose second joint has a bow."""
+    places = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (300, -300, 300)}
+    capture = aj.simulate(
+        with_corrections(paper_arm, ["bow_2"]).replace(bow_2=BOW),
+        *(places,),
+        poses=25,
+        lengths=[("A", "B", 0.002), ("A", "C", 0.002)],
+        encoder_arcsec=2.0,
+        seating=0.005,
+        seed=1,
+    )
+    return capture
+
+
+@pytest.fixture(scope="module")
+def nominal(paper_arm):
+    return aj.kinematics.ArmSpecification(with_corrections(paper_arm, ["bow_2"]), "bent")
+
+
+@pytest.fixture(scope="module")
+def record(captured, nominal):
+    result = aj.calibrate(nominal.arm, captured, nominal.bounds(), method="joint", check_identifiability=False)
+    return aj.calibration.record_of(result, aj.Recording(captured, nominal))
+
+
+def test_a_calibration_finds_it(record):
+    at = record.names.index("bow_2")
+    value, u = record.vectors()["calibrated"][at], np.sqrt(record.covariance[at, at])
+    assert abs(value - BOW) < 4 * u < BOW
+
+
+def test_residuals_without_it_name_it(paper_arm, captured):
+    space = aj.Parameters.free_of(paper_arm)
+    bounds = aj.Bounds.around(paper_arm, space, length=5.0, angle=0.01)
+    result = aj.calibrate(paper_arm, captured, bounds, method="joint", check_identifiability=False)
+    assert ("bow", 2) in {(term.kind, term.joint) for term in model_tests(result, captured).terms}
+    (sentence,) = (text for text in aj.warnings_of(result, captured) if text.startswith("Residuals follow"))
+    assert "a bent scale" in sentence
+    assert "try --model dh,bow" in sentence
+    assert result.shared is not None
+    assert "bow" in result.shared.kinds
+
+
+def test_it_is_among_what_poses_may_share(paper_arm):
+    assert "bow_3" in missing_functions(paper_arm)
+    assert "bow" in default_prior(with_corrections(paper_arm, "bow")).groups
+
+
+def test_it_is_stored_and_reported(record, tmp_path):
+    aj.files.save_calibration(tmp_path / "bent.h5", record)
+    again = aj.files.load_calibration(tmp_path / "bent.h5")
+    assert again.names == record.names
+    assert correction_names(again.calibrated.arm) == ("bow_2",)
+    write_report(tmp_path / "bent.h5", tmp_path / "bent.html")
+    page = (tmp_path / "bent.html").read_text()
+    assert ">bow_2<" in page
+    assert "bows of scales" in page
+
+
+def test_its_prior_is_stated_in_words(nominal):
+    prior = prior_of_text("bow=0.0003/rad", nominal.arm)
+    assert prior is not None
+    assert float(prior.sd["bow"]) == 3e-4
+
+
+def test_certificates_have_its_unit():
+    assert _in_d_si("1/rad") == r"\radian\tothe{-1}"
+
+
+@pytest.mark.slow
+def test_models_with_it_are_compared(paper_arm, captured):
+    compared = aj.compare_models(paper_arm, captured, models=["dh", "bow"])
+    assert compared.recommended.model == "bow"
+
+
+def test_the_arm_is_shown_with_it(capsys):
+    specification = with_model(aj.files.load_specification("cheng2018-simulation"), "dh,bow")
+    calibration_display.arm(arm_summary(specification))
+    assert "6 coefficients, bows of scales (bow_1, bow_2" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.exhaustive
+def test_the_command_line_takes_it(aacmm):
+    assert "bows of scales" in " ".join(aacmm("arm", "cheng2018-simulation", "--model", "dh,bow").stdout.split())
+
+
+@pytest.mark.parametrize(("name", "part"), [("gear", "'gear'"), ("Bow", "'Bow'"), ("dh", "'dh'"), ("cos", "'cos'")])
+def test_names_that_are_taken(name, part):
+    class Other(Bow):
+        model: ClassVar[str] = name
+
+    with pytest.raises(aj.InputError, match=part):
+        kinds.register(Other())
+
+
+@pytest.mark.parametrize(
+    "model", ["dh", "dh,gravity", "dh,gear,harmonics=1-3+8", "dh,harmonics", "dh,coupled=2-3", "dh,expansion,bow"]
+)
+def test_the_model_of_terms(model):
+    assert kinds.model_of(kinds.terms_of(model, 6)) == model
