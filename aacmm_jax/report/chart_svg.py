@@ -61,7 +61,7 @@ def points(plot: Plot) -> list[list]:
 
 def shade_key(limits: Sequence[float], unit: str) -> list[tuple[str, str]]:
     """The key of a sequential scale: each shade with its range."""
-    decimals = max(1 - int(np.floor(np.log10(max(limits[1] - limits[0], 1e-9)))), 0)
+    decimals = max(1 - int(np.floor(np.log10(max(min(np.diff(limits)), 1e-9)))), 0)
     words = [f"{low:.{decimals}f} to {high:.{decimals}f} {unit}".strip() for low, high in pairwise(limits)]
     if np.isinf(limits[-1]):
         words[-1] = f"over {limits[-2]:.{decimals}f} {unit}".strip()

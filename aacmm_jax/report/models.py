@@ -33,7 +33,7 @@ def models_report(summary: dict[str, Any]) -> Report:
         warnings=list(summary["warnings"]),
         facts=facts,
         sections=[
-            Section("models", "Errors inside and outside", [_introduction(), _by_model(summary), _table(models)]),
+            Section("models", "Errors inside and outside", [_introduction(), _by_model(summary), *_table(models)]),
             Section("regions", "Errors by region", [_by_region(summary)]),
         ],
     )
@@ -71,7 +71,7 @@ def _by_model(summary: dict[str, Any]) -> Chart:
     return Chart("models", "Errors by model", description, (charts.Plot(*axes, marks, height=260),))
 
 
-def _table(models: list[dict[str, Any]]) -> ReportTable:
+def _table(models: list[dict[str, Any]]) -> tuple[ReportTable, str]:
     most_probable = max(row["log_evidence"] for row in models)
     rows = [
         [
@@ -98,11 +98,11 @@ def _table(models: list[dict[str, Any]]) -> ReportTable:
         "CPU [s]",
         "",
     )
-    caption = (
-        "Models; ratio: mean of (error / predicted standard deviation)² outside; evidence: its logarithm, less that "
-        "of the most probable model"
+    meaning = (
+        "Determined: parameters that the data determine. u of it: standard error of the error outside. Ratio: mean of "
+        "(error / predicted standard deviation)² outside. Evidence: its logarithm, less that of the most probable model."
     )
-    return ReportTable(caption, columns, rows)
+    return ReportTable("Models", columns, rows), meaning
 
 
 def _by_region(summary: dict[str, Any]) -> Chart:

@@ -31,7 +31,7 @@ def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], facto
     length = f"{volume.length:g} mm length"
     rows = [[text_cell(title), *map(_expanded, values)] for title, values in volume_rows(found, factor)]
     low, high = volume.start.min(axis=0), volume.start.max(axis=0)
-    box = ", ".join(f"{axis} from {a:.0f} to {b:.0f}" for axis, a, b in zip("xyz", low, high, strict=True))
+    box = ", ".join(f"{axis} from {_whole(a)} to {_whole(b)}" for axis, a, b in zip("xyz", low, high, strict=True))
     introduction = (
         f"At {len(volume.start)} positions that random poses within the joint limits reach ({box} mm), "
         f"expanded to 95 % with the factor {factor:.2f}."
@@ -50,6 +50,10 @@ def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], facto
 def _expanded(u: float | None) -> Cell:
     """An expanded uncertainty, to two digits."""
     return number_cell(u, decimals_for(u))
+
+
+def _whole(value: float) -> str:
+    return f"{value:.0f}".replace("-", "−")
 
 
 def _volume_chart(volume: VolumetricUncertainty, factor: float, length: str) -> Chart:

@@ -108,7 +108,9 @@ def _check_sense(path: Path, rows: Mapping[str, np.ndarray]) -> None:
             "a result is larger than any can be": any(
                 np.any(np.isfinite(x) & (np.abs(x) > _LARGEST)) for x in floats.values()
             ),
-            "a trial that converged has an infinite result": any(np.any(np.isinf(x[converged])) for x in floats.values()),
+            "a trial that converged has an infinite result": any(
+                np.any(np.isinf(x[converged])) for x in floats.values()
+            ),
             "a trial that converged has a parameter without a number": any(np.any(np.isnan(x)) for x in parameters),
         },
     )
