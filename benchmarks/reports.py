@@ -23,9 +23,11 @@ TRACKER = HERE.parent / "examples/ipa_ur10/positions.toml"
 OUTSIDE = """[...document.querySelectorAll("td[class*=mark-], .verdict")].filter((one) =>
     one.getClientRects().length && one.getBoundingClientRect().right > innerWidth + 1).length"""
 # Charts whose every plot has a size and marks, which needs no script; and views of the arm that the script has drawn.
-DRAWN = """[...document.querySelectorAll("[data-chart]")].filter((one) => [...one.querySelectorAll(".axes > svg")].every(
-    (svg) => svg.getBoundingClientRect().width > 50 && svg.getBoundingClientRect().height > 50 &&
-    svg.querySelector("path, use, rect"))).length + document.querySelectorAll("[data-drawn=yes]").length"""
+DRAWN = """[...document.querySelectorAll("[data-chart]")].filter((one) =>
+    [...one.querySelectorAll(".axes > svg")].every((svg) => {
+        const size = svg.getBoundingClientRect();
+        return size.width > 50 && size.height > 50 && svg.querySelector("path, use, rect");
+    })).length + document.querySelectorAll("[data-drawn=yes]").length"""
 STUDY = """
 arm = "cheng2018-simulation"
 trials = 200

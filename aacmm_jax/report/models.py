@@ -100,7 +100,8 @@ def _table(models: list[dict[str, Any]]) -> tuple[ReportTable, str]:
     )
     meaning = (
         "Determined: parameters that the data determine. u of it: standard error of the error outside. Ratio: mean of "
-        "(error / predicted standard deviation)² outside. Evidence: its logarithm, less that of the most probable model."
+        "(error / predicted standard deviation)² outside. Evidence: its logarithm, less that of the most probable "
+        "model."
     )
     return ReportTable("Models", columns, rows), meaning
 
