@@ -124,7 +124,7 @@ def shades(values: Any, number: int = SHADES) -> tuple[np.ndarray, tuple[float, 
 
 
 def correlations(parameters: Sequence[str], table: np.ndarray) -> Plot:
-    """Correlations: darker is stronger, with the sign written where it is at least 0.5."""
+    """Correlations by their size, with the sign written where it is at least 0.5."""
     strength, count = np.abs(np.asarray(table, dtype=float)), len(parameters)
     rows, columns = np.nonzero(strength > 0.05)
     shade = np.minimum((strength[rows, columns] * SHADES).astype(int), SHADES - 1)

@@ -75,14 +75,13 @@ def _table(models: list[dict[str, Any]]) -> tuple[ReportTable, str]:
     most_probable = max(row["log_evidence"] for row in models)
     rows = [
         [
-            text_cell(row["model"]),
+            text_cell(*((row["model"],) if row["converged"] else (f"{row['model']}: did not converge", "unsure"))),
             number_cell(row["parameters"], 0),
             number_cell(row["effective_parameters"], 1),
             *(number_cell(row[key]) for key in ("rms_inside", "rms_outside", "u_outside")),
             number_cell(row["ratio"], 2),
             number_cell(row["log_evidence"] - most_probable, 1),
             number_cell(row["cpu_seconds"], 1),
-            text_cell("" if row["converged"] else "did not converge", "" if row["converged"] else "unsure"),
         ]
         for row in models
     ]
@@ -96,7 +95,6 @@ def _table(models: list[dict[str, Any]]) -> tuple[ReportTable, str]:
         "ratio",
         "evidence",
         "CPU [s]",
-        "",
     )
     meaning = (
         "Determined: parameters that the data determine. u of it: standard error of the error outside. Ratio: mean of "

@@ -59,7 +59,7 @@ def _section_view(record: CalibrationRecord, volume: VolumetricUncertainty, foun
     plot = charts.Plot(x, charts.linear("height [mm]", height, tips[:, 2]), marks, height=380)
     description = (
         "Random poses all over the volume by their distance in joint space from the nearest pose of the calibration, "
-        "in multiples of the spacing of its own poses: up to 1 it was tried there; the darker, the less."
+        "in multiples of the spacing of its own poses: up to 1 it was tried there; the larger the mark, the less."
     )
     return Chart("tried", "Where it was tried", description, (plot,), shade_limits=limits)
 

@@ -82,7 +82,7 @@ def _volume_chart(volume: VolumetricUncertainty, factor: float, length: str) -> 
     return Chart(
         "volume",
         f"U of a {length} over the volume",
-        "Larger and darker marks are more uncertain; height against distance from the first axis.",
+        "The larger the mark, the more uncertain; height against distance from the first axis.",
         (plot,),
         ReportTable("All positions", columns, data),
         shade_limits=limits if np.any(known) else (),
@@ -113,7 +113,7 @@ def correlations_section(record: CalibrationRecord, uncertainty: Uncertainty) ->
         for one, other, r in uncertainty.correlated(0.5)
     ]
     description = (
-        "Darker is more strongly correlated; the sign is written where it is at least 0.5. Strongly correlated "
+        "The colour is the size of the correlation; its sign is written from 0.5 on. Strongly correlated "
         "parameters are determined better in combination than one by one."
     )
     table = ReportTable("Pairs correlated by 0.5 or more", ("parameter", "with", "correlation"), pairs)
