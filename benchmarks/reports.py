@@ -22,6 +22,12 @@ TRACKER = HERE.parent / "examples/ipa_ur10/positions.toml"
 # Decisions, and what else is marked, outside of what is seen without scrolling; not in tables that are folded.
 OUTSIDE = """[...document.querySelectorAll("td[class*=mark-], .verdict")].filter((one) =>
     one.getClientRects().length && one.getBoundingClientRect().right > innerWidth + 1).length"""
+# Charts whose every plot has a size and marks, which needs no script; and views of the arm that the script has drawn.
+DRAWN = """[...document.querySelectorAll("[data-chart]")].filter((one) =>
+    [...one.querySelectorAll(".axes > svg")].every((svg) => {
+        const size = svg.getBoundingClientRect();
+        return size.width > 50 && size.height > 50 && svg.querySelector("path, use, rect");
+    })).length + document.querySelectorAll("[data-drawn=yes]").length"""
 STUDY = """
 arm = "cheng2018-simulation"
 trials = 200
@@ -97,7 +103,7 @@ def shown(page: Path, shots: Path) -> dict:
             opened.goto(page.as_uri())
             opened.wait_for_selector("body[data-ready=yes]", timeout=60_000)
             figures = opened.locator("[data-chart], [data-scene]").count()
-            drawn = opened.locator("[data-drawn=yes]").count()
+            drawn = opened.evaluate(DRAWN)
             network = [url for url in asked if not url.startswith(("data:", "blob:", "file:"))]
             over = opened.evaluate("document.documentElement.scrollWidth") - width
             found[f"{width} {colours}"] = {

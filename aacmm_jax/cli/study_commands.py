@@ -194,7 +194,7 @@ def _progress_display() -> Iterator[Any]:
 def _ended(outcome: Any, output: Path) -> None:
     if outcome.finished:
         ran = f"{outcome.ran:,} trials run" if outcome.ran else "nothing was left to run"
-        print(f"Written: {output} ({outcome.total:,} trials, {ran}). See it with: aacmm show {output}")
+        print(f"Written: {output} ({outcome.total:,} trials, {ran}).\nSee it with: aacmm show {output}")
 
 
 def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool) -> None:

@@ -74,7 +74,7 @@ def arm_at_zero(arm: Arm, axes: Any = None, *, base: Float[np.ndarray, "4 4"] | 
     for number, frame in enumerate(dh_frames(geometry_of(without_corrections(arm)), base)[:-1], start=1):
         origin, end = frame[:3, 3], frame[:3, 3] + size * frame[:3, 2]
         axes.quiver(*origin, *(end - origin), color=ACCENT, linewidth=1.2, arrow_length_ratio=0.25)
-        axes.text(*(end + 0.25 * size * frame[:3, 2]), str(number), color=ACCENT, fontsize=9)
+        axes.text(*(end + 0.4 * size * frame[:3, 2]), f"  {number}", color=ACCENT, fontsize=9, va="center")
     # A flat arm in a box of its own size would be a line.
     low, high = line.min(axis=0), line.max(axis=0)
     half = 0.6 * np.maximum(high - low, 0.6 * np.ptp(line, axis=0).max())[:, None] * [-1, 1]
@@ -140,7 +140,8 @@ def save_arm_figure(arm: Arm, path: Path, *, title: str = "", base: Float[np.nda
 
 def _label_space(axes: Any) -> None:
     """Equal scales, labels, and as many numbers along each axis as its length has room for."""
-    axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]")
+    axes.set(xlabel="x [mm]", ylabel="y [mm]")
+    axes.set_zlabel("z [mm]", labelpad=8)
     axes.set_aspect("equal")
     each = (axes.xaxis, axes.yaxis, axes.zaxis)
     lengths = [abs(np.subtract(*axis.get_view_interval())) for axis in each]

@@ -175,14 +175,15 @@ def study_errors(results: Results, factor: str) -> Any:
     figure, axes = _panels(1, len(runs), (5 * len(runs), 3.9), sharey=True)
     for panel, (words, cells) in zip(axes[0], runs.items(), strict=True):
         x = [float(results.study.factors[factor][_index(results, cell)[factor]]) for cell in cells]
-        for name, color, label, marker in (
-            (f"{kind}_stage1", ACCENT, "before the scale fix", "^"),
-            (kind, DARK, "after", "s"),
+        # Angles are the same after the fix: the line before it is wide enough to be seen below the other.
+        for name, color, label, marker, size in (
+            (f"{kind}_stage1", ACCENT, "before the scale fix", "^", 12),
+            (kind, DARK, "after", "s", 5),
         ):
             low, middle, high = _percentiles(results, name, cells)
             if np.any(np.isfinite(middle)):
                 panel.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
-                panel.plot(x, middle, color=color, marker=marker, label=label)
+                panel.plot(x, middle, color=color, marker=marker, label=label, markersize=size, linewidth=size / 3)
         panel.set_xscale("log")
         panel.set_xticks(x, [f"{value:g}" for value in x])
         panel.minorticks_off()

@@ -23,7 +23,6 @@ from .elements import (
     Section,
     format_number,
     number_cell,
-    scientific,
     text_cell,
 )
 from .lengths import length_chart
@@ -243,24 +242,27 @@ def _scale(
     record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation], factor: float
 ) -> Section:
     k, u, single = record.k, record.u_k, record.fixed_by_one_length
-    u_of_k = f"u(k)\u00a0=\u00a0{scientific(u)}"
+    k_shown = f"{k:.{decimals_for(u, 8)}f}"
+    u_of_k = f"u(k)\u00a0=\u00a0{two_digits(u)}"
     if record.method == REPEATABILITY:
         introduction = "The scale is that of the nominal arm: nothing that was measured set it." + (
-            f" By the reference lengths, which took no part, k = {k:.8f}." if math.isfinite(k) else ""
+            f" By the reference lengths, which took no part, k = {k_shown}." if math.isfinite(k) else ""
         )
     elif math.isnan(k):
         introduction = f"Fitted with all else at once, the scale comes from {', '.join(summary['scale_from'])}."
     elif record.method == "joint":
         introduction = (
             "Poses and reference lengths were fitted together. The arm that poses alone give measures the lengths as "
-            f"k = {k:.8f} times their calibrated value, with {u_of_k}."
+            f"k = {k_shown} times their calibrated value, with {u_of_k}."
         )
     else:
+        expanded = 1000 * factor * u
+        decimals = decimals_for(expanded)
         introduction = (
             "Repeatability does not determine the size of an arm; the reference lengths do. The arm of stage 1 "
-            f"measures them as k = {k:.8f} times their calibrated value, with {u_of_k}. The lengths of the arm "
-            f"were divided by k: {format_number(abs(k - 1) * 1000, 4)} mm in a metre, known to "
-            f"± {format_number(1000 * factor * u, 4)} mm in a metre (95 %)."
+            f"measures them as k = {k_shown} times their calibrated value, with {u_of_k}. The lengths of the arm "
+            f"were divided by k: {abs(k - 1) * 1000:.{decimals}f} mm in a metre, known to "
+            f"±\u00a0{expanded:.{decimals}f} mm in a metre (95 %)."
         )
     if not summary["lengths"]:
         return Section("scale", "Scale", [introduction])

@@ -61,7 +61,8 @@ def points(plot: Plot) -> list[list]:
 
 def shade_key(limits: Sequence[float], unit: str) -> list[tuple[str, str]]:
     """The key of a sequential scale: each shade with its range."""
-    decimals = max(1 - int(np.floor(np.log10(max(limits[1] - limits[0], 1e-9)))), 0)
+    step = 1.01 * max(min(np.diff(limits)), 1e-9)  # so that 0.0999 has the decimals of 0.1
+    decimals = max(1 - int(np.floor(np.log10(step))), 0)
     words = [f"{low:.{decimals}f} to {high:.{decimals}f} {unit}".strip() for low, high in pairwise(limits)]
     if np.isinf(limits[-1]):
         words[-1] = f"over {limits[-2]:.{decimals}f} {unit}".strip()

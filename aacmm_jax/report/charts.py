@@ -112,19 +112,19 @@ def names(title: str, labels: Sequence[str]) -> Axis:
     return Axis(title, -0.6, len(labels) - 0.4, ticks, named=True)
 
 
-def shades(values: Any) -> tuple[np.ndarray, tuple[float, ...]]:
+def shades(values: Any, number: int = SHADES) -> tuple[np.ndarray, tuple[float, ...]]:
     """The shade of each value, and the limits between them, which divide the range of most values evenly: few that are
     much larger would leave the other shades unused, and share the last one."""
     values = np.asarray(values, dtype=float)
     low, high = _range((values,))
     most = float(np.quantile(values[np.isfinite(values)], _WITHIN)) if np.any(np.isfinite(values)) else high
-    limits = np.append(np.linspace(low, most, SHADES + 1)[:-1], high)
-    shade = np.clip(np.digitize(np.nan_to_num(values, nan=low), limits[1:-1]), 0, SHADES - 1)
+    limits = np.append(np.linspace(low, most, number + 1)[:-1], high)
+    shade = np.clip(np.digitize(np.nan_to_num(values, nan=low), limits[1:-1]), 0, number - 1)
     return shade, tuple(float(limit) for limit in limits)
 
 
 def correlations(parameters: Sequence[str], table: np.ndarray) -> Plot:
-    """Correlations: darker is stronger, with the sign written where it is at least 0.5."""
+    """Correlations by their size, with the sign written where it is at least 0.5."""
     strength, count = np.abs(np.asarray(table, dtype=float)), len(parameters)
     rows, columns = np.nonzero(strength > 0.05)
     shade = np.minimum((strength[rows, columns] * SHADES).astype(int), SHADES - 1)

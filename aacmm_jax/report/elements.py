@@ -111,8 +111,3 @@ def format_number(value: float, decimals: int = 4, *, signed: bool = False) -> s
     if value != 0 and abs(value) < 0.5 * 10**-decimals:
         return f"{value:{sign}.1e}".replace("-", "−")
     return f"{value:{sign}.{decimals}f}".replace("-", "−")
-
-
-def scientific(value: float) -> str:
-    """A number with two digits in powers of ten, which no line break divides."""
-    return f"{value:.1e}".replace("-", "−")

@@ -34,7 +34,7 @@ def models_report(summary: dict[str, Any]) -> Report:
         warnings=list(summary["warnings"]),
         facts=facts,
         sections=[
-            Section("models", "Errors inside and outside", [_introduction(), _by_model(summary), _table(models)]),
+            Section("models", "Errors inside and outside", [_introduction(), _by_model(summary), *_table(models)]),
             Section("regions", "Errors by region", [_by_region(summary)]),
         ],
     )
@@ -72,12 +72,12 @@ def _by_model(summary: dict[str, Any]) -> Chart:
     return Chart("models", "Errors by model", description, (charts.Plot(*axes, marks, height=260),))
 
 
-def _table(models: list[dict[str, Any]]) -> ReportTable:
+def _table(models: list[dict[str, Any]]) -> tuple[ReportTable, str]:
     most_probable = max(row["log_evidence"] for row in models)
     least = min(row["rms_outside"] for row in models)
     rows = [
         [
-            text_cell(row["model"]),
+            text_cell(*((row["model"],) if row["converged"] else (f"{row['model']}: did not converge", "unsure"))),
             number_cell(row["parameters"], 0),
             number_cell(row["effective_parameters"], 1),
             *(number_cell(row[key]) for key in ("rms_inside", "rms_outside", "u_outside")),
@@ -85,7 +85,6 @@ def _table(models: list[dict[str, Any]]) -> ReportTable:
             number_cell(row["ratio"], 2),
             number_cell(row["log_evidence"] - most_probable, 1),
             number_cell(row["cpu_seconds"], 1),
-            text_cell("" if row["converged"] else "did not converge", "" if row["converged"] else "unsure"),
         ]
         for row in models
     ]
@@ -101,13 +100,13 @@ def _table(models: list[dict[str, Any]]) -> ReportTable:
         "ratio",
         "evidence",
         "CPU [s]",
-        "",
     )
-    caption = (
-        "Models; to the best outside: compared region by region; ratio: mean of (error / predicted standard "
-        "deviation)² outside; evidence: its logarithm, less that of the most probable model"
+    meaning = (
+        "Determined: parameters that the data determine. u of it: standard error of the number before it. To the best: "
+        "difference of the error outside to the best one, compared region by region. Ratio: mean of (error / predicted "
+        "standard deviation)² outside. Evidence: its logarithm, less that of the most probable model."
     )
-    return ReportTable(caption, columns, rows)
+    return ReportTable("Models", columns, rows), meaning
 
 
 def _differences(row: dict[str, Any], least: float) -> tuple[float | None, float | None]:

@@ -56,7 +56,7 @@ def _rows(parameters: Sequence[Mapping[str, Any]], factor: float) -> list[list]:
             number_cell(scale * row["calibrated"], decimals, rounded=rounded),
             number_cell(expanded, decimals),
             number_cell(scale * (row["calibrated"] - row["nominal"]), decimals, signed=True, rounded=rounded),
-            number_cell(scale * row["nominal"], 4),
+            number_cell(scale * row["nominal"], max(decimals, 4)),
             text_cell(state, "unsure" if state else ""),
         ])  # fmt: skip
     return rows

@@ -14,7 +14,6 @@ from ..uncertainty.volume import VolumetricUncertainty
 from . import charts
 from .elements import Chart, ReportTable, Section, number_cell, text_cell
 
-_LIMITS = (1.0, 1.5, 2.0, 2.5, 3.0)  # between the shades: multiples of the spacing of the calibration's poses
 _TIPS = 400  # most tips of the calibration that are drawn
 _FULL_TURN = 360.0
 
@@ -41,7 +40,7 @@ def _u_within(volume: VolumetricUncertainty, found: TriedPoses, factor: float) -
 def _section_view(record: CalibrationRecord, volume: VolumetricUncertainty, found: TriedPoses) -> Chart:
     """Half a section through the volume: random poses by their distance from the nearest calibrated one."""
     ratio = found.distance / max(found.spacing, 1e-12)
-    shade = np.digitize(ratio, _LIMITS, right=True)
+    shade, limits = shades(ratio)
     radius, height = np.hypot(volume.start[:, 0], volume.start[:, 1]), volume.start[:, 2]
     hover = [
         f"({', '.join(f'{x:.0f}' for x in point)}) mm: {distance / DEG:.0f} deg from the nearest pose, {times:.1f} "
@@ -60,9 +59,20 @@ def _section_view(record: CalibrationRecord, volume: VolumetricUncertainty, foun
     plot = charts.Plot(x, charts.linear("height [mm]", height, tips[:, 2]), marks, height=380)
     description = (
         "Random poses all over the volume by their distance in joint space from the nearest pose of the calibration, "
-        "in multiples of the spacing of its own poses: up to 1 it was tried there; the darker, the less."
+        "in multiples of the spacing of its own poses: up to 1 it was tried there; the larger the mark, the less."
     )
-    return Chart("tried", "Where it was tried", description, (plot,), shade_limits=(0.0, *_LIMITS, math.inf))
+    return Chart("tried", "Where it was tried", description, (plot,), shade_limits=limits)
+
+
+def shades(ratio: np.ndarray) -> tuple[np.ndarray, tuple[float, ...]]:
+    """The shade of each multiple of the spacing: the first ends at 1, the others divide what is beyond."""
+    beyond = ratio > 1.0
+    if np.all(beyond) or not np.any(beyond):
+        return charts.shades(ratio)
+    shade, limits = charts.shades(ratio[beyond], charts.SHADES - 1)
+    found = np.zeros(len(ratio), dtype=int)
+    found[beyond] = shade + 1
+    return found, (0.0, 1.0, *limits[1:])
 
 
 def _joints(record: CalibrationRecord, readings: np.ndarray) -> Chart:

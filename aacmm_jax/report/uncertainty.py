@@ -31,7 +31,7 @@ def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], facto
     length = f"{volume.length:g} mm length"
     rows = [[text_cell(title), *map(_expanded, values)] for title, values in volume_rows(found, factor)]
     low, high = volume.start.min(axis=0), volume.start.max(axis=0)
-    box = ", ".join(f"{axis} from {a:.0f} to {b:.0f}" for axis, a, b in zip("xyz", low, high, strict=True))
+    box = ", ".join(f"{axis} from {_whole(a)} to {_whole(b)}" for axis, a, b in zip("xyz", low, high, strict=True))
     introduction = (
         f"At {len(volume.start)} positions that random poses within the joint limits reach ({box} mm), "
         f"expanded to 95 % with the factor {factor:.2f}."
@@ -50,6 +50,10 @@ def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], facto
 def _expanded(u: float | None) -> Cell:
     """An expanded uncertainty, to two digits."""
     return number_cell(u, decimals_for(u))
+
+
+def _whole(value: float) -> str:
+    return f"{value:.0f}".replace("-", "−")
 
 
 def _volume_chart(volume: VolumetricUncertainty, factor: float, length: str) -> Chart:
@@ -78,7 +82,7 @@ def _volume_chart(volume: VolumetricUncertainty, factor: float, length: str) -> 
     return Chart(
         "volume",
         f"U of a {length} over the volume",
-        "Larger and darker marks are more uncertain; height against distance from the first axis.",
+        "The larger the mark, the more uncertain; height against distance from the first axis.",
         (plot,),
         ReportTable("All positions", columns, data),
         shade_limits=limits if np.any(known) else (),
@@ -109,7 +113,7 @@ def correlations_section(record: CalibrationRecord, uncertainty: Uncertainty) ->
         for one, other, r in uncertainty.correlated(0.5)
     ]
     description = (
-        "Darker is more strongly correlated; the sign is written where it is at least 0.5. Strongly correlated "
+        "The colour is the size of the correlation; its sign is written from 0.5 on. Strongly correlated "
         "parameters are determined better in combination than one by one."
     )
     table = ReportTable("Pairs correlated by 0.5 or more", ("parameter", "with", "correlation"), pairs)

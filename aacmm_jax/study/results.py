@@ -93,13 +93,26 @@ def _allow_files(count: int, path: Path) -> None:
         ) from error
 
 
-def _check_sizes(path: Path, rows: Mapping[str, np.ndarray]) -> None:
-    """Raise `InputError` for results beyond every size, whose squares overflow; a trial that failed may have NaN or an
-    infinite number."""
-    floats = (values for values in rows.values() if values.dtype.kind == "f")
+def _check_sense(path: Path, rows: Mapping[str, np.ndarray]) -> None:
+    """Raise `InputError` for results that no trial has; one that failed may have NaN or an infinite number.
+
+    A converged trial may have NaN for what the study does not compute, such as k without reference lengths, but not
+    for its parameters.
+    """
+    converged = rows["converged"] == 1
+    floats = {name: values for name, values in rows.items() if values.dtype.kind == "f"}
+    parameters = [floats[name][converged] for name in ("estimate", "true") if name in floats]
     check_sense(
         path,
-        {"a result is larger than any can be": any(np.any(np.isfinite(x) & (np.abs(x) > _LARGEST)) for x in floats)},
+        {
+            "a result is larger than any can be": any(
+                np.any(np.isfinite(x) & (np.abs(x) > _LARGEST)) for x in floats.values()
+            ),
+            "a trial that converged has an infinite result": any(
+                np.any(np.isinf(x[converged])) for x in floats.values()
+            ),
+            "a trial that converged has a parameter without a number": any(np.any(np.isnan(x)) for x in parameters),
+        },
     )
 
 
@@ -153,10 +166,11 @@ class Results(NamedTuple):
         return found | {"group": np.arange(self.study.trials) % POOL_PARTS}
 
     def _columns(self, names: list[str], cell: int) -> dict[str, np.ndarray]:
-        found = {name: np.full(self.study.trials, fill_of(name), VARIABLES[name].dtype) for name in names}
+        layout = Layout.of(self.study, self.stored.chunk)
+        found = {name: np.full(layout.shape(name)[1:], fill_of(name), VARIABLES[name].dtype) for name in names}
         with undamaged(self.path):
-            for part, rows in store.rows_of(self.path, self.stored, names, cell):
-                _check_sizes(self.path, rows)
+            for part, rows in store.rows_of(self.path, self.stored, [*{*names, "converged"}], cell):
+                _check_sense(self.path, rows)
                 for name in names:
                     found[name][part] = rows[name]
         return found
@@ -165,7 +179,7 @@ class Results(NamedTuple):
         """Of converged trials, some at a time: parameter errors (estimate minus truth), active bounds, groups."""
         with undamaged(self.path):
             for part, rows in store.rows_of(self.path, self.stored, ["converged", "estimate", "true", "active"], cell):
-                _check_sizes(self.path, rows)
+                _check_sense(self.path, rows)
                 good = rows["converged"] == 1
                 group = np.arange(part.start, part.stop) % POOL_PARTS
                 yield (rows["estimate"] - rows["true"])[good], rows["active"][good], group[good]

@@ -255,7 +255,8 @@ def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
 
     def shown(row: Mapping[str, Any]) -> str:
         scale, unit = (1.0, "mm") if row["unit"] == "mm" else people_read_change(row["unit"])
-        return f"{words.get(row['kind'], row['kind'])} {row['sd'] * scale:.3g} {unit}"
+        sd = float(f"{row['sd'] * scale:.3g}")
+        return f"{words.get(row['kind'], row['kind'])} {sd:g} {unit}"
 
     tips = [shown(row) for row in rows if row["kind"] in (PLACES, VISITS, SUCCESSIVE)]
     functions = [shown(row) for row in rows if row["kind"] not in (PLACES, VISITS, SUCCESSIVE)]

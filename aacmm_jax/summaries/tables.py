@@ -94,7 +94,7 @@ def encoders_in_words(found: Mapping[str, Any]) -> str:
 
 def seat_in_words(summary: Mapping[str, Any]) -> str:
     """What the noise is of that does not come from the joints: of the seat in a socket, or of the tip itself."""
-    return "seat" if summary["sockets_used"] else "tip, each coordinate,"
+    return "seat" if summary["sockets_used"] else "each coordinate of the tip"
 
 
 def rms_difference(row: Mapping[str, Any], best_rms: float) -> tuple[float, float]:

@@ -150,7 +150,11 @@ def evaluation_verdict(summary: Mapping[str, Any], own_warnings: int = 0) -> Ver
     if decision == "conforms":
         incomplete = any(test["missing"] for test in summary["acceptance"] if test["decision"])
         without = dict.fromkeys(metric["name"] for metric in metrics if metric["decision"] is None)
-        says = "Conforms: every limit given is kept" + (f" ({shorten(list(dict.fromkeys(names)))})" if names else "")
+        found = {metric["name"]: metric["as_found_decision"] for metric in metrics}
+        says = f"Conforms{' as left' if any(found.values()) else ''}: every limit given is kept"
+        says += f" ({shorten(list(dict.fromkeys(names)))})" if names else ""
+        failed = [name for name, decision in found.items() if decision == "fails"]
+        says += f"; as found, it fails ({shorten(failed)})" if failed else ""
         says += f"; no limit was given for {shorten(list(without))}" if without else ""
         says += "; a procedure was not complete." if incomplete else "."
         return Verdict("unsure" if incomplete or own_warnings else "good", says)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import aacmm_jax as aj
+from aacmm_jax.summaries.compared_models import compared_models_summary
 
 STUDY = """
 arm = "cheng2018-simulation"
@@ -72,6 +73,8 @@ def results() -> Results:
     observed_record = aj.calibration.record_of(found, observed_recording)
     tips = {name: np.asarray(arm.arm.position(q)) for name, q in capture.sockets.items()}
     measured = aj.acceptance.PointsRecord(aj.acceptance.Measured(tips, capture.lengths, ()))
+    models = aj.compare_models(arm.arm, capture, arm.bounds(), models=["dh", "harmonics=1"])
+    compared = compared_models_summary(models, arm.name) | {"poses": sum(map(len, capture.sockets.values()))}
     writers = {
         "capture": lambda path: aj.files.save_capture(path, recording),
         "calibration": lambda path: aj.files.save_calibration(path, record),
@@ -79,6 +82,7 @@ def results() -> Results:
         "calibration from observations": lambda path: aj.files.save_calibration(path, observed_record),
         "evaluation": lambda path: aj.files.save_evaluation(path, evaluation),
         "points": lambda path: aj.files.save_points(path, measured),
+        "compared models": lambda path: aj.files.save_compared_models(path, compared, ["capture.h5"], 1),
     }
     return Results(arm, recording, observed_recording, record, writers)
 
@@ -90,6 +94,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "calibration from observations": aj.files.load_calibration,
     "evaluation": aj.files.load_evaluation,
     "points": aj.files.load_points,
+    "compared models": aj.files.load_compared_models,
 }
 
 

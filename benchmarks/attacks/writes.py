@@ -49,7 +49,7 @@ def targets(folder: Path) -> dict[str, Target]:
 
     def save(kind: str) -> Callable[[Any, Path], Any]:
         what = {"observations": "capture", "calibration from observations": "calibration"}.get(kind, kind)
-        return lambda loaded, path: getattr(aj.files, f"save_{what}")(path, loaded)
+        return lambda loaded, path: getattr(aj.files, f"save_{what.replace(' ', '_')}")(path, loaded)
 
     def in_blocks_at(path: Path) -> None:
         shutil.copy(folder / "parts" / "study.h5", path)

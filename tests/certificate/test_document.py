@@ -503,6 +503,7 @@ def test_priors_and_joint_corrections_are_stated(record):
     found = aj.calibrate(nominal, capture, bounds, prior=prior, check_identifiability=False)
     named = record.recording.nominal._replace(arm=nominal)
     text = dcc_xml(aj.calibration.record_of(found, aj.Recording(capture, named)), AdministrativeData(), created=CREATED)
+    assert dcc_model.faults(text) == []
     stated = " ".join(contents(text, ".//dcc:usedMethod/dcc:description"))
     assert "what was known of the parameters beforehand" in stated
     assert "lengths: given, 0.5 mm; " in stated
@@ -522,6 +523,7 @@ def test_a_fixed_length_says_so(record):
         AdministrativeData(),
         created=CREATED,
     )
+    assert dcc_model.faults(text) == []
     assert "Not identified: fixed at its nominal value" in text
     assert parse_dcc(text)["As left", PARAMETERS, "probe_z"].expanded is None
 
@@ -593,6 +595,7 @@ def test_nothing_is_made_up(record):
 def test_what_was_left_out_is_stated(record):
     removed = Removed("station", "T2", ("T2/day", "T2/night"), 45.6, (6, 60), 1e-9, 0.2, 0.1, "theta_3", 12.0)
     text = dcc_xml(record._replace(removed=(removed,)), AdministrativeData(), created=CREATED)
+    assert dcc_model.faults(text) == []
     (said,) = [one for one in contents(text, "*/dcc:statements") if "T2" in one]
     assert said.startswith(
         "Left out: station T2, which contradicts the rest (F = 45.6 with 6 and 60 degrees of freedom"
@@ -609,7 +612,9 @@ def test_warnings_and_simulations_are_stated(record):
     simulated = record._replace(recording=recording._replace(true=recording.nominal), reduced_chi=3.0, noise=given)
     warnings = of_calibration(simulated)
     assert any("times what the given noise predicts" in sentence for sentence in warnings)
-    said = contents(dcc_xml(simulated, AdministrativeData(), created=CREATED), "*/dcc:statements")
+    text = dcc_xml(simulated, AdministrativeData(), created=CREATED)
+    assert dcc_model.faults(text) == []
+    said = contents(text, "*/dcc:statements")
     assert set(warnings) <= set(said)
     assert "The readings are simulated, so this is no certificate of a real arm." in said
 

@@ -170,3 +170,10 @@ def test_an_arm_is_drawn_in_space(record):
 )
 def test_what_cannot_be_drawn_is_refused(record, call, said):
     assert_refused(lambda: call(record), said)
+
+
+def test_what_the_scale_fix_does_not_change_is_seen_below_what_it_left(made):
+    panel = aj.plot.study_errors(made["study_metric"][0], "noise.encoder_arcsec").axes[0]
+    before, after = panel.lines
+    assert before.get_linewidth() > 2 * after.get_linewidth()
+    assert before.get_markersize() > 2 * after.get_markersize()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.report import chart_svg, charts, elements, write_report
+from aacmm_jax.report import chart_svg, charts, elements, tried, write_report
 from aacmm_jax.report.html_page import _origin
 from aacmm_jax.summaries.tables import decimals_for
 from tests.refusals import assert_refused
@@ -162,7 +162,9 @@ def test_charts_are_in_the_page_as_pictures_with_words(page):
 def test_a_calibration_report_says_what_the_calibration_found(written):
     found = Page(written.pages["calibration"].read_text(encoding="utf-8"))
     record = written.record
-    assert f"{record.k:.8f}" in found.text
+    decimals = decimals_for(record.u_k)
+    assert f"k = {record.k:.{decimals}f} times" in found.text
+    assert f"u(k)\u00a0=\u00a0{record.u_k:.{decimals}f}." in found.text
     for name, value, u in zip(
         record.names, record.vectors()["calibrated"], np.sqrt(np.diag(record.covariance)), strict=True
     ):
@@ -512,6 +514,23 @@ def test_a_logarithmic_axis_marks_what_is_there():
     marks = [mark for mark, _ in charts.logarithmic("", [0.012, 0.3]).ticks]
     assert marks == pytest.approx([0.01, 0.02, 0.05, 0.1, 0.2])
     assert charts.logarithmic("", []).ticks
+
+
+@pytest.mark.parametrize(
+    ("ratio", "expected"),
+    [
+        (np.linspace(0.5, 11.0, 400), (0.0, 1.0)),  # partly tried: the first shade ends at 1
+        (np.linspace(8.0, 14.0, 400), (8.0,)),  # never tried: all shades are of what is there
+        (np.linspace(0.2, 0.9, 400), (0.2,)),
+    ],
+)
+def test_the_map_of_what_was_tried_uses_every_shade(ratio, expected):
+    shade, limits = tried.shades(ratio)
+    assert set(shade.tolist()) == set(range(charts.SHADES))
+    assert limits[: len(expected)] == pytest.approx(expected)
+    assert limits[-1] == pytest.approx(ratio.max())
+    for i in range(charts.SHADES):
+        assert np.all((ratio[shade == i] >= limits[i] - 1e-9) & (ratio[shade == i] <= limits[i + 1] + 1e-9))
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Results of a study: standard errors that are true, tables, plots, labelled data."""
 
 import json
+from functools import partial
 
 import matplotlib
 import numpy as np
@@ -33,18 +34,31 @@ def path(tmp_path_factory):
     return path
 
 
-def test_results_larger_than_any_can_be_are_refused(path, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("value", "names", "says"),
+    [
+        (1e300, ("scale", "estimate"), "larger than any can be"),
+        (np.inf, ("scale", "estimate"), "a trial that converged has an infinite result"),
+        (-np.inf, ("scale", "true"), "a trial that converged has an infinite result"),
+        (np.nan, ("estimate",), "a trial that converged has a parameter without a number"),
+    ],
+)
+def test_results_that_no_trial_has_are_refused(path, monkeypatch, value, names, says):
     """As from a file that was edited, with its digests made anew."""
-    results = aj.study.Results.of(path)
-    rows_of = store.rows_of
+    results, rows_of = aj.study.Results.of(path), store.rows_of
 
-    def edited(*arguments):
+    def edited(*arguments, failed=False):
         for part, rows in rows_of(*arguments):
-            yield part, {key: np.full_like(x, 1e300) if x.dtype.kind == "f" else x for key, x in rows.items()}
+            rows = {key: np.full_like(x, value) if key in names else x for key, x in rows.items()}
+            yield part, rows | ({"converged": np.zeros_like(rows["converged"])} if failed else {})
 
     monkeypatch.setattr(store, "rows_of", edited)
-    assert_refused(lambda: results.column("scale", 0), "larger than any can be")
-    assert_refused(lambda: list(results.errors(0)), "larger than any can be")
+    for name in names:
+        assert_refused(partial(results.column, name, 0), says)
+    assert_refused(lambda: list(results.errors(0)), says)
+    if not np.isfinite(value):  # which a trial that failed may have
+        monkeypatch.setattr(store, "rows_of", lambda *arguments: edited(*arguments, failed=True))
+        assert not np.isfinite(results.column(names[0], 0)).any()
 
 
 def test_a_cell_that_a_study_has_not_is_refused(path):

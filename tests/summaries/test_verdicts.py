@@ -49,8 +49,10 @@ def test_of_a_calibration(changed, mark, says):
     assert says in verdict.says
 
 
-def evaluated(*decisions, missing=(), **more):
-    figures = [{"name": f"E_{i}", "decision": decision} for i, decision in enumerate(decisions)]
+def evaluated(*decisions, missing=(), found=None, **more):
+    figures = [
+        {"name": f"E_{i}", "decision": decision, "as_found_decision": found} for i, decision in enumerate(decisions)
+    ]
     test = {"decision": decisions[0] if decisions else None, "missing": list(missing), "figures": figures}
     return {"acceptance": [test], "failed": [], "kept": [], "held_out": None} | more
 
@@ -65,6 +67,8 @@ def held_out(probability, predicted=0.1):
     [
         (evaluated("conforms"), 0, "good", "Conforms: every limit given is kept (E_0)."),
         (evaluated("conforms", None), 0, "good", "kept (E_0); no limit was given for E_1."),
+        (evaluated("conforms", found="conforms"), 0, "good", "Conforms as left: every limit given is kept (E_0)."),
+        (evaluated("conforms", found="fails"), 0, "good", "kept (E_0); as found, it fails (E_0)."),
         (evaluated("conforms"), 1, "unsure", "Conforms"),
         (evaluated("conforms", missing=["more bars"]), 0, "unsure", "a procedure was not complete"),
         (evaluated("conforms", "fails", "undecided"), 0, "bad", "Fails: E_1 is over its limit."),
