@@ -72,7 +72,7 @@ def test_the_default_has_the_groups_that_the_arm_has(paper_arm):
     assert default_prior(paper_arm).groups == ("lengths", "angles")
     prior = default_prior(with_corrections(paper_arm, "gravity,gear,harmonics=1-5"))
     assert prior.groups == (
-        "lengths", "angles", "gravity", "gear", "harmonics=1", "harmonics=2-3", "harmonics=4-7"
+        "lengths", "angles", "gear", "gravity", "harmonics=1", "harmonics=2-3", "harmonics=4-7"
     )  # fmt: skip
     found = prior.of(("a_2", "theta_2", "cos1_2", "cos3_2"), np.zeros(4))
     assert all(found.learned)
