@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from ..core.arguments import checked_arguments, items_of, shown
 from ..core.arrays import Numbers, is_concrete, joined
 from ..core.errors import InputError, nearest
+from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.text import shorten
 from ..kinematics.arm import Arm
@@ -26,7 +27,7 @@ from .visits import checked_visits, visits_of
 _MOST_RADIANS = 8 * np.pi
 
 
-class Capture(eqx.Module):
+class Capture(Module):
     """Poses grouped by the socket in which the tip rested, reference lengths between sockets, and other observations.
 
     A socket's position is unknown and is eliminated by the centroid of its poses; one pose at an end is enough for a

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from ..core.arguments import items_of, shown
 from ..core.arrays import Numbers, as_array, as_floats, in_chunks
 from ..core.errors import InputError, nearest
+from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.text import pluralise
 from .chain import Corrections, Geometry, JointKinds, tip_pose
@@ -26,7 +27,7 @@ DOWN = (0.0, 0.0, -1.0)
 _LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a compiler
 
 
-class Arm(eqx.Module):
+class Arm(Module):
     """A serial arm with a probe; T = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)] of each joint, revolute by default.
 
     A prismatic joint slides along its axis: T = Rz(theta) Tz(q + d) Tx(a) Rx(alpha) [Ry(beta)], with readings in mm.

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from ..core.arguments import checked_arguments, items_of, real_number
 from ..core.arrays import Numbers, as_array, is_concrete, joined, random_key
 from ..core.errors import InputError
+from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace
 from .arm import (
     Arm,
@@ -34,7 +35,7 @@ from .inverse_kinematics import SocketPoses
 from .priors import Prior
 
 
-class Parameters(eqx.Module):
+class Parameters(Module):
     """The free parameters of an arm, in order, and the arm that supplies the fixed ones.
 
     ``vector(arm)`` reads them into ``(p,)`` (mm and rad mixed); ``arm(vector)`` writes them back.
@@ -239,7 +240,7 @@ def based_on(space: Parameters, arm: Arm) -> Parameters:
     return Parameters(base=arm, names=space.names)
 
 
-class Bounds(eqx.Module):
+class Bounds(Module):
     """Bounds of the free parameters.
 
     Args:

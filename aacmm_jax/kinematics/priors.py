@@ -10,6 +10,7 @@ from jaxtyping import Float
 from ..core.arguments import items_of, shown
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError, nearest
+from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from .arm import Arm, is_length, natural_steps, parameter_names
 from .corrections.harmonics import Harmonics, orders_of
@@ -20,7 +21,7 @@ _BROAD = 10.0  # standard deviation at which the search for a learned one begins
 LEAST_STEPS = 1e-4  # smallest learned standard deviation, in natural steps: 0.1 um, 0.02 arcsec
 
 
-class Prior(eqx.Module):
+class Prior(Module):
     """Gaussian priors of parameters: a mean and a standard deviation, as a maker states a nominal value and tolerance.
 
     A group is "all", "lengths", "angles", a kind of joint correction as a model names it ("gravity", "gear", "coupled",
@@ -139,7 +140,7 @@ class Prior(eqx.Module):
 MIXED = "mm and mrad"
 
 
-class ParameterPrior(eqx.Module):
+class ParameterPrior(Module):
     """The prior of a vector of free parameters."""
 
     mean: Float[AnyArray, " p"]  # mm and rad

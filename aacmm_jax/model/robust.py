@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from ..core.arguments import shown
 from ..core.errors import InputError
+from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace
 
 LossName = Literal["huber", "cauchy", "tukey"]
@@ -35,7 +36,7 @@ def check_loss(robust: object) -> None:
         raise InputError(f"robust is {shown(robust)}; it must be one of {', '.join(LOSSES)}, or None.")
 
 
-class Loss(eqx.Module):
+class Loss(Module):
     """A robust loss by its name."""
 
     name: LossName = eqx.field(static=True)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from ..core.arrays import Numbers, is_concrete
 from ..core.distributions import student_quantile
 from ..core.errors import InputError
+from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm
@@ -16,7 +17,7 @@ from ..kinematics.parameters import Parameters
 from .shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
 
 
-class Uncertainty(eqx.Module):
+class Uncertainty(Module):
     """Standard uncertainties of a calibrated arm, in mm and rad.
 
     They are the calibration's contribution; with ``reading=True`` the noise of the readings is added, as given to the

@@ -14,6 +14,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray
 from .evidence import Groups, PriorModel, learned_log_variances
 from .residual_tests import Residuals
@@ -29,7 +30,7 @@ _LEAST_LOG = 2 * np.log(1e-4)  # smallest log variance of a learned group, in na
 PLACES, VISITS, SUCCESSIVE = "places", "visits", "successive poses"  # kinds that move the tips of poses alike
 
 
-class SharedErrors(eqx.Module):
+class SharedErrors(Module):
     """Errors that poses share and the model of a calibration does not have, as its residuals show them.
 
     Its covariance contains them. Functions of the readings that joints follow besides the model ("gravity",

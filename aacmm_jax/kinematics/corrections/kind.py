@@ -16,6 +16,7 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 from jaxtyping import Float
 
+from ...core.module import Module
 from ...core.numpy_or_jax import AnyArray
 from ..chain import ForwardPass
 
@@ -52,7 +53,7 @@ class Sought(NamedTuple):
     relative: bool = False
 
 
-class AbstractCorrection(eqx.Module):
+class AbstractCorrection(Module):
     """A kind of joint correction, without data of its own: hashable, so that it is static in every program."""
 
     model: eqx.AbstractClassVar[str]  # what a model calls it, as in ``--model dh,harmonics=1``
