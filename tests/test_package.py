@@ -24,11 +24,12 @@ def test_an_unknown_name_is_an_attribute_error():
         aj.lod_arm  # noqa: B018
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "line",
     [
         "from aacmm_jax import *; print(load_arm('panda').joints)",
-        pytest.param("import aacmm_jax; print(aacmm_jax.files.load_arm('panda').joints)", marks=pytest.mark.slow),
+        "import aacmm_jax; print(aacmm_jax.files.load_arm('panda').joints)",
     ],
 )
 def test_late_names_in_a_fresh_process(line):

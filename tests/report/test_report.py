@@ -696,7 +696,8 @@ def test_a_browser_draws_everything_and_asks_for_nothing(shown, written, kind, w
         assert opened.title().startswith("Evaluation of Arm <script>")
 
 
-@pytest.mark.parametrize("kind", ["calibration", pytest.param("evaluation", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["calibration", "evaluation"])
 def test_the_arm_turns_under_mouse_keys_and_buttons(shown, kind):
     opened = shown(kind, 1600)
     scene = opened.locator("[data-scene]")
@@ -747,6 +748,7 @@ def test_the_mark_under_the_pointer_is_said_and_tab_stops_are_few(shown):
     assert opened.evaluate("document.activeElement.textContent") == "unit"
 
 
+@pytest.mark.slow
 def test_tables_sort_by_click_and_by_keyboard(shown):
     opened = shown("calibration", 1600)
     table = opened.locator("table", has=opened.locator("caption", has_text=re.compile("^Parameters$")))

@@ -27,7 +27,8 @@ def processes():
         yield executor
 
 
-@pytest.mark.parametrize("blocks", ["read", pytest.param("computed", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("blocks", ["read", "computed"])
 def test_local_processes_write_the_same_study(home, study, tmp_path, processes, blocks):
     """Also where blocks are read there: to trace their programs in a fresh process takes seconds."""
     processes.submit(worker_tasks.take_blocks, home / "whole.h5" if blocks == "read" else None).result()
@@ -68,6 +69,7 @@ def test_a_process_that_dies_is_replaced(processes, tmp_path, monkeypatch):
         processes.submit(worker_tasks.die, None).result()
 
 
+@pytest.mark.slow
 def test_fresh_workers_find_what_others_have_compiled(tmp_path, monkeypatch):
     settings = CacheSettings(str(tmp_path / "cache"), 0.0)
     monkeypatch.setattr(CacheSettings, "current", lambda: settings)
@@ -115,9 +117,8 @@ def test_dask_workers_find_what_others_have_compiled(home, study, tmp_path):
     assert kept[0] == kept[1]
 
 
-@pytest.mark.parametrize(
-    "where", [(), pytest.param(("--dask", "local"), marks=pytest.mark.slow)], ids=["threads", "processes"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("where", [(), ("--dask", "local")], ids=["threads", "processes"])
 def test_an_interrupt_is_answered_while_programs_compile(home, tmp_path, prepared, where):
     """First blocks that would take an hour, as a compilation that Python cannot interrupt; Ctrl-C reaches all."""
     path = tmp_path / "s.h5"
