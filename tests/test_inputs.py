@@ -510,6 +510,7 @@ aj.calibrate(arm, length(1e7), bounds, method="joint")
 """.strip().splitlines()
 
 
+@pytest.mark.slow
 def test_what_has_another_type():
     """In one process without that checker."""
     program = """

@@ -241,7 +241,7 @@ def tight(paper_arm, width: float, **nominal: float) -> tuple[aj.Arm, aj.Bounds]
 @pytest.mark.parametrize(
     ("d_3", "width"),
     [
-        (745.0, 0.2),
+        pytest.param(745.0, 0.2, marks=pytest.mark.slow),
         *(
             pytest.param(d_3, width, marks=pytest.mark.exhaustive)
             for d_3, width in ((753.0, 0.05), (753.0, 0.2), (753.0, 1.0), (745.0, 0.05), (745.0, 1.0))

@@ -143,7 +143,8 @@ def test_starts_are_exact_for_exact_data(paper_arm):
         assert np.abs(observation.residual(tips, found).values).max() < 1e-3, observation.kind
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_platform_frames_are_exact_for_exact_data(seed):
     """Of two bars, which leave a turn about their line open, on indices up to half a revolution and more apart; a plate
     stands beside the platform and on it, which tells the platform's frame, and errors are added to the residuals."""

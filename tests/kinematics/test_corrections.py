@@ -53,8 +53,7 @@ def readings(arm: aj.Arm) -> np.ndarray:
 @pytest.mark.parametrize(
     "name",
     [
-        "warm elbow",
-        pytest.param("warm scara", marks=pytest.mark.slow),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("warm elbow", "warm scara")),
         *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("elbow", "scara")),
     ],
 )
