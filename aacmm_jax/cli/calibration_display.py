@@ -177,7 +177,7 @@ def _observed(console: Console, summary: dict[str, Any]) -> None:
     if summary["observations"]:
         table = new_table(
             "\nObservations, RMS distance from their geometry",
-            *("observation", "kind", "poses", "nominal [mm]", "calibrated [mm]", "reduced chi"),
+            *("observation", "kind", "poses", "nominal [mm]", "calibrated [mm]", "in s.d."),
         )
         for row in summary["observations"]:
             numbers = (formatted(row["rms_before_mm"]), formatted(row["rms_after_mm"]), f"{row['reduced_chi']:.2f}")

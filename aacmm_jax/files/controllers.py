@@ -198,7 +198,8 @@ def python_program(arm: Arm, *, title: str, base: Transform | None = None) -> st
 
 
 def _row(values: Iterable[float], separator: str = ",") -> str:
-    return separator.join(repr(float(value)) for value in values)
+    # Below 1e-12 of any unit is rounding.
+    return separator.join(repr(float(value) if abs(value) > 1e-12 else 0.0) for value in values)
 
 
 def _placed(transform: Transform, length: float, angle: float, length_unit: str, angle_unit: str) -> str:
