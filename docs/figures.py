@@ -165,19 +165,19 @@ def random_splits() -> None:
 
 
 def planned_poses() -> None:
-    """What `benchmarks/planned_poses.py` has stored: u of a length against the number of poses."""
+    """What `benchmarks/planned_poses.py` has stored: U of a length against the number of poses."""
     stored = json.loads((DOCS.parent / "benchmarks" / "results" / "planned_poses.json").read_text(encoding="utf-8"))
     ((rows,),) = stored.values()
     axes = _axes(3.6)
     for name, colour, marker in (("random", ORANGE, "o"), ("planned", BLUE, "s")):
         for what, line in (("largest", "-"), ("median", "--")):
-            values = rows[f"{name}, {what}"]
+            values = [2e-3 * u for u in rows[f"{name}, {what}"]]  # U in mm, of u in um
             axes.plot(
                 rows["poses"], values, line, color=colour, marker=marker, markersize=4, label=f"{name} poses, {what}"
             )
-    axes.set(xlabel="poses", ylabel="u of a length of 300 mm [um]", xscale="log", yscale="log")
+    axes.set(xlabel="poses", ylabel="U (k = 2) of a length of 300 mm [mm]", xscale="log", yscale="log")
     axes.set_xticks(rows["poses"], [str(poses) for poses in rows["poses"]])
-    ticks = (4, 6, 8, 10, 15, 20, 30, 50)
+    ticks = (0.008, 0.012, 0.02, 0.03, 0.04, 0.06, 0.1)
     axes.set_yticks(ticks, [str(each) for each in ticks])
     axes.minorticks_off()
     axes.legend()

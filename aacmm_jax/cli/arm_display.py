@@ -79,8 +79,8 @@ def _needed(console: Console, summary: dict[str, Any]) -> None:
             table.add_row(escape(row["data"]), *(formatted(x) for x in u), str(row["enough_poses"] or "-"))
         print_table(console, table)
         console.print(
-            f"Of encoders of {kind['encoder_arcsec']:.3g} arcsec and a seat of {kind['seating_mm']:.3g} mm "
-            f"({escape(kind['noise_source'])}), reference lengths of u = {kind['u_length_mm']:g} mm, and a tracker of "
+            f"Medians over the volume, of encoders of {kind['encoder_arcsec']:.3g} arcsec and a seat of "
+            f"{kind['seating_mm']:.3g} mm ({escape(kind['noise_source'])}), reference lengths of u = {kind['u_length_mm']:g} mm, and a tracker of "
             f"u = {kind['u_tracker_mm']:g} mm in each coordinate. Two sockets and a reference length are as good as a "
             "ball bar in one place."
         )

@@ -183,7 +183,9 @@ def _advice(needed: Sequence[FirstCapture], moving: list[int], arm_joints: int) 
     every = "Every joint must move." if len(moving) == arm_joints else ""
     joints = every or f"These joints must move: {shorten([str(joint) for joint in moving], 20)}." * bool(moving)
     trackers = (row.enough for row in needed[0].expected if not row.sockets and row.enough is not None)
-    tracked = "".join(f" With a tracker: {pluralise(2 * enough, 'pose')} all over its workspace." for enough in trackers)
+    tracked = "".join(
+        f" With a tracker: {pluralise(2 * enough, 'pose')} all over its workspace." for enough in trackers
+    )
     return (
         f"Record {2 * poses} poses, as different as possible, in {best.data}. From {pluralise(poses, 'pose')} on the "
         "calibration adds less to a measured length than the readings themselves; the others are its check."

@@ -37,6 +37,8 @@ UNKNOWN = {"volume": VOLUME | {"u_length_reading_largest_mm": None}, "coverage_f
         ({"scale_plausible": False}, "bad", "a scale that it cannot have"),
         ({"cross_validation": {"rms_mm": 0.1, "surprising": True}}, "unsure", "held-out data disagree"),
         ({"model_tests": TESTS | {"lengths": {"probability": 0.001}}}, "unsure", "errors that the model lacks"),
+        ({"model_tests": TESTS | {"misfit": {"probability": 0.001, "ratio": 2.0}}}, "unsure", "the model lacks"),
+        ({"model_tests": TESTS | {"misfit": {"probability": 0.001, "ratio": 0.5}}}, "good", "Calibrated: U (95 %)"),
         ({"model_tests": TESTS | {"missing_terms": [{}]}}, "unsure", "so errors may exceed the stated U"),
         ({"active_stage1": {"a_2": "upper"}}, "unsure", "on a bound: a_2"),
         ({"method": "repeatability"}, "unsure", "nothing that was measured set its scale"),
