@@ -121,6 +121,7 @@ def correct(
             found = readings_at_poses(calibrated, q, in_first_frame(record, commanded.poses), nominal.limits)
         given = {"unit": commanded.unit, "of_readings": commanded.poses is None}
         summary = correction_summary(nominal, calibrated, q, found, **given)
+        summary["probe_mm"] = [np.asarray(arm.probe).tolist() for arm in (nominal, calibrated)]
         if commanded.temperature is not None and q.shape[1] == calibrated.joints:
             summary["warnings"].append(
                 "the arm was calibrated without thermal expansion, so that column temperature_C changes nothing; "
@@ -178,10 +179,22 @@ def in_first_frame(record: Any, poses: np.ndarray) -> np.ndarray:
 def _display(summary: dict[str, Any]) -> None:
     console = new_console()
     print_warnings(console, summary)
+    meant, has = (", ".join(f"{x:.3f}" for x in probe) for probe in summary["probe_mm"])
+    if meant == has:
+        console.print(f"Of a tip at ({has}) mm in the last frame.")
+    else:
+        console.print(
+            f"The controller means the tip at ({meant}) mm in the last frame, the calibrated arm's is at ({has}) mm: "
+            "right for the probe of the calibration. State another tool with --probe X,Y,Z."
+        )
     rows, missed, largest = summary["rows"], summary["not_reached"], summary["largest_change"]
     console.print(f"{rows - len(missed)} of {pluralise(rows, 'pose')} reached with corrected readings.")
     if len(missed) < rows:
-        console.print(f"Largest distance from a pose with them: {formatted(summary['largest_distance_mm'])} mm.")
+        # Of the arithmetic, not of the arm: how far it is really off is what an evaluation with unseen data says.
+        console.print(
+            "Largest distance from a pose with them, if the arm is as calibrated: "
+            f"{formatted(summary['largest_distance_mm'])} mm."
+        )
     if largest is not None:
         console.print(f"Without the correction: {formatted(summary['largest_distance_before_mm'])} mm.")
         console.print(

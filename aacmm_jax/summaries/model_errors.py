@@ -108,7 +108,7 @@ def _words(name: str) -> tuple[str, str]:
 
 
 def _wider_model(terms: tuple[FoundTerm, ...], arm: Arm | None) -> str:
-    """The model that the arm has, with the terms that were found besides; empty where no model has them."""
+    """The model that the arm has, with the terms that were found besides; empty where that is no other model."""
     each = () if arm is None or arm.corrections is None else arm.corrections.functions.each
     own = [term for term in each if isinstance(term, Term)]
     sought, added = all_sought(), []
@@ -117,7 +117,8 @@ def _wider_model(terms: tuple[FoundTerm, ...], arm: Arm | None) -> str:
         option = one.option if any(term.kind.model == kind.model for term in own) else ""
         joints = 1 if arm is None else arm.joints
         added += kind.terms(max(joints, *(term.joint or 1 for term in terms)), option, None)
-    return model_of([*own, *added]) if added else ""
+    wider = model_of([*own, *added]) if added else ""
+    return "" if own and wider == model_of(own) else wider
 
 
 def _terms(terms: tuple[FoundTerm, ...], in_uncertainty: bool, arm: Arm | None) -> str:

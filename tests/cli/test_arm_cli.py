@@ -41,7 +41,7 @@ def test_a_template_is_written_looked_at_and_not_overwritten(aacmm, tmp_path, mo
         "sockets and a reference length",
         "enough",
         "Record",
-        "Of encoders of 2 arcsec and a seat of 0.005 mm (class measuring arm: ",  # as aacmm plan assumes it
+        "of encoders of 2 arcsec and a seat of 0.005 mm (class measuring arm: ",  # as aacmm plan assumes it
         "reference lengths of u = 0.002 mm",
     ):
         assert part in printed, part

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.calibration.missing_terms import FoundTerm
 from aacmm_jax.calibration.redrawn import trials_of
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.kinematics import parameter_names, with_corrections
@@ -13,6 +14,7 @@ from aacmm_jax.kinematics.chain import KnownFunctions, forward_pass, joint_motio
 from aacmm_jax.kinematics.corrected_arm import function_values
 from aacmm_jax.kinematics.corrections.kinds import terms_of
 from aacmm_jax.kinematics.jacobian import rotation_columns
+from aacmm_jax.summaries.model_errors import _wider_model
 
 MODEL = "gravity,harmonics,gear,coupled"
 
@@ -305,3 +307,17 @@ def test_functions_together_are_those_one_by_one():
         (6, np.cos(31 * q[:, 4])),
     ):
         np.testing.assert_allclose(values[together.first_row[term], 0], row, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("model", "found", "advised"),
+    [
+        ("dh", ("gear ratio", "gravity"), "dh,gear,gravity"),
+        ("dh,gear", ("gravity",), "dh,gear,gravity"),
+        ("dh,gear,gravity", ("gear ratio",), ""),
+    ],
+)
+def test_a_model_that_the_arm_has_is_not_advised(model, found, advised):
+    arm = with_corrections(aj.load_arm("panda"), model)
+    terms = tuple(FoundTerm(kind, 2, *[None] * (len(FoundTerm._fields) - 2)) for kind in found)
+    assert set(_wider_model(terms, arm).split(",")) == set(advised.split(","))
