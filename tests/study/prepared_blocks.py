@@ -20,9 +20,11 @@ def prepared(study, block, **_) -> dict[str, np.ndarray]:
         return {name: whole["trials"][name][block.slices] for name in runner.store.VARIABLES}
 
 
-if __name__ == "__main__":
+if __name__ in ("__main__", "__mp_main__"):  # the command's process, and those that it starts
     runner.run_block = prepared
     runner.check_reach = lambda study: None
+
+if __name__ == "__main__":
     from aacmm_jax.cli import main
 
     main()
