@@ -278,6 +278,7 @@ def test_covariance_depends_on_the_solution_and_not_on_the_start(paper_arm, capt
     np.testing.assert_allclose(u[0], u[1], rtol=1e-5, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_bounds_that_allow_no_scale_are_named(paper_arm, capture):
     """a_2 is 2 mm too long and cannot be shortened, so the anchor alone would have to bring k to 1."""
     arm, bounds = tight(paper_arm, 0.05, d_3=745.0, a_2=float(paper_arm.a[1]) + 2.0)

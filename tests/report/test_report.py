@@ -724,6 +724,7 @@ def test_the_arm_turns_under_mouse_keys_and_buttons(shown, kind):
     assert "pose 3" in opened.locator(".controls output").inner_text()
 
 
+@pytest.mark.slow
 def test_the_mark_under_the_pointer_is_said_and_tab_stops_are_few(shown):
     opened = shown("calibration", 1600)
     axes = opened.locator("[data-chart=residuals] .axes")
