@@ -146,6 +146,7 @@ def test_float32_is_refused_at_import(aacmm_process, monkeypatch):
     assert "needs 64-bit floats, but JAX_ENABLE_X64=0" in aacmm_process("show", "panda", expect=1).stderr
 
 
+@pytest.mark.slow
 def test_a_process_of_its_own(aacmm_process, cache, tmp_path, monkeypatch):
     """Exit codes of real processes, and the folder in which compiled programs are kept for the next one."""
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
