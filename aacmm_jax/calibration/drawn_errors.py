@@ -10,7 +10,8 @@ from ..data.capture import Capture
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.corrected_arm import function_values, with_further_corrections
 from ..kinematics.corrections.kinds import term_of
-from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
+from ..uncertainty.shared_errors import SharedErrors
+from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 
 class DrawnErrors(NamedTuple):

@@ -26,7 +26,8 @@ from ..model.observed import Observed, certified_and_lengths, linear_rows
 from ..model.socket_sums import means_over_sockets, sums_over_sockets
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.observed_identifiability import dense_rows
-from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
+from ..uncertainty.shared_errors import SharedErrors
+from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .observed_evaluation import fit_geometry
 
 _NULL = 1e-10  # singular values of the geometry below this, of the largest, are zero

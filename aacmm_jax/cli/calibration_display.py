@@ -151,7 +151,7 @@ def calibration(summary: dict[str, Any]) -> None:
         print_lengths(console, summary["lengths"], fitted=summary["fixed_by_one_length"])
     _uncertainty(console, summary)
     if summary.get("shared_errors"):
-        from ..summaries.calibration import shared_sentence
+        from ..summaries.uncertainty_sentences import shared_sentence
 
         console.print(shared_sentence(summary["shared_errors"]))
     print_written(console, summary)
@@ -299,7 +299,7 @@ def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
         "Propagated from u of the parameters to 400 positions that random poses within the joint limits reach."
     )
     if found.get("tried"):
-        from ..summaries.calibration import tried_sentence
+        from ..summaries.uncertainty_sentences import tried_sentence
 
         console.print(tried_sentence(found["tried"]))
     noise = f"{encoders_in_words(found)}, {seat_in_words(summary)} {1e3 * found['seating_mm']:.3g} um"

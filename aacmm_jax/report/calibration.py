@@ -10,9 +10,10 @@ from ..calibration.pose_residuals import distances_of, observation_residuals
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise
 from ..core.units import DEG, people_read
-from ..summaries.calibration import calibration_summary, shared_sentence
+from ..summaries.calibration import calibration_summary
 from ..summaries.observations import capture_words
 from ..summaries.tables import decimals_for, lengths_sentence, two_digits
+from ..summaries.uncertainty_sentences import shared_sentence
 from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
 from .arm_view import view_of_arm

@@ -7,8 +7,8 @@ import numpy as np
 from ..calibration.record import CalibrationRecord
 from ..core.units import DEG
 from ..kinematics.arm import joint_limits
-from ..summaries.calibration import tried_sentence
 from ..summaries.tables import two_digits
+from ..summaries.uncertainty_sentences import tried_sentence
 from ..uncertainty.tried_poses import TriedPoses, tried_poses
 from ..uncertainty.volume import VolumetricUncertainty
 from . import charts

@@ -1,6 +1,6 @@
 """Arms, captures and calibrations as plain dictionaries with the unit in every key; ``--json`` prints them."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from ..calibration.model_errors import model_tests
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import PriorMetrics, active_names
 from ..core.text import pluralise
-from ..core.units import DEG, people_read, people_read_change
+from ..core.units import people_read
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
@@ -18,7 +18,7 @@ from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_o
 from ..kinematics.corrections.kinds import coefficient_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import Observability
-from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
+from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.tried_poses import tried_poses
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .model_errors import noisy_encoder_rows, summary_of_tests
@@ -249,21 +249,6 @@ def shared_rows(shared: SharedErrors) -> list[dict[str, Any]]:
     return [{"kind": kind, "sd": float(shared.sd[i]), "unit": shared.units[i]} for i, kind in enumerate(shared.kinds)]
 
 
-def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Errors that poses share in words."""
-    words = {PLACES: "poses of a socket", VISITS: "poses of a visit"}
-
-    def shown(row: Mapping[str, Any]) -> str:
-        scale, unit = (1.0, "mm") if row["unit"] == "mm" else people_read_change(row["unit"])
-        sd = float(f"{row['sd'] * scale:.3g}")
-        return f"{words.get(row['kind'], row['kind'])} {sd:g} {unit}"
-
-    tips = [shown(row) for row in rows if row["kind"] in (PLACES, VISITS, SUCCESSIVE)]
-    functions = [shown(row) for row in rows if row["kind"] not in (PLACES, VISITS, SUCCESSIVE)]
-    parts = [*tips, *(["functions that the model lacks: " + ", ".join(functions)] if functions else [])]
-    return f"Errors that poses share, part of the uncertainty (standard deviations): {'; '.join(parts)}."
-
-
 def uncertainty_summary(
     record: CalibrationRecord, observability: Observability, volume: VolumetricUncertainty | None = None
 ) -> dict[str, Any]:
@@ -299,16 +284,6 @@ def _tried(record: CalibrationRecord, volume: VolumetricUncertainty) -> dict[str
         return None
     found = tried_poses(record.calibrated.arm, readings, volume.q)
     return {"poses": len(found.distance), "tried": int(found.tried.sum()), "spacing_rad": found.spacing}
-
-
-def tried_sentence(found: Mapping[str, Any]) -> str:
-    """How much of the volume a calibration has tried, in words."""
-    percentage = 100 * found["tried"] / found["poses"]
-    return (
-        f"Of {found['poses']} random poses within the joint limits, {percentage:.2g} % lie as near to a pose of the "
-        f"calibration as its poses lie to one another ({found['spacing_rad'] / DEG:.2g} deg RMS over the joints). "
-        "Elsewhere the calibration was never tried, and U rests on the model alone."
-    )
 
 
 def active_names_of(record: CalibrationRecord, active: np.ndarray) -> dict[str, str]:

@@ -13,7 +13,8 @@ from ..core.units import ARCSEC
 from ..kinematics.arm import Arm
 from ..kinematics.corrections.kind import Term
 from ..kinematics.corrections.kinds import all_sought, model_of
-from ..uncertainty.shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
+from ..uncertainty.shared_errors import SharedErrors
+from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 # Terms that no kind of joint correction has: what residuals follow, of joint {i}, and what causes that.
 _OTHERS: dict[str, tuple[str, str]] = {

@@ -14,7 +14,8 @@ from ..kinematics.arm import Arm
 from ..kinematics.chain import joint_motion
 from ..kinematics.corrected_arm import with_further_corrections
 from ..kinematics.parameters import Parameters
-from .shared_errors import PLACES, SUCCESSIVE, VISITS, SharedErrors
+from .shared_errors import SharedErrors
+from .shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 
 class Uncertainty(Module):

@@ -18,6 +18,7 @@ from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray
 from .evidence import Groups, PriorModel, learned_log_variances
 from .residual_tests import Residuals
+from .shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 _ROUNDS = 40  # of the variance of independent errors; usually 5
 _TOLERANCE = 1e-6
@@ -25,9 +26,6 @@ NULL = 1e-6  # eigenvalues of an effect's information below this, of the largest
 _GRID = 240  # standard deviations at which the likelihood of one effect is computed
 _LARGEST = 30.0  # standard deviation of an effect, of that of a tip coordinate
 _LEAST_LOG = 2 * np.log(1e-4)  # smallest log variance of a learned group, in natural steps
-
-
-PLACES, VISITS, SUCCESSIVE = "places", "visits", "successive poses"  # kinds that move the tips of poses alike
 
 
 class SharedErrors(Module):

@@ -16,7 +16,8 @@ from aacmm_jax.core.distributions import student_quantile
 from aacmm_jax.data.arm_classes import ArmNoise
 from aacmm_jax.kinematics.corrected_arm import with_further_corrections
 from aacmm_jax.kinematics.prior_scales import default_prior
-from aacmm_jax.summaries.calibration import shared_rows, shared_sentence
+from aacmm_jax.summaries.calibration import shared_rows
+from aacmm_jax.summaries.uncertainty_sentences import shared_sentence
 from aacmm_jax.uncertainty.group_test import Block
 from aacmm_jax.uncertainty.residual_tests import LEVEL, Residuals
 from aacmm_jax.uncertainty.shared_errors import Effects, one_variance

@@ -322,7 +322,7 @@ _NEVER_NEEDED = "optimistix lineax jax.experimental.pallas xarray matplotlib"
         ("--help", f"jax scipy h5py {_PLOTS}"),
         ("--version", f"jax scipy h5py {_PLOTS}"),
         ("calibrate --help", f"jax scipy h5py {_PLOTS}"),
-        ("show p.h5", f"jax scipy {_PLOTS}"),
+        ("show c.h5", f"jax scipy {_PLOTS}"),
         ("calibrate p.h5 -o again.h5", f"{_NEVER_NEEDED} jinja2"),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
