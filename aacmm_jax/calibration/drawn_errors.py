@@ -33,8 +33,8 @@ def draw_shared(
     for root in _roots(shared, capture):
         tips += np.einsum("Mc,tcd->tMd", root, random.normal(size=(count, root.shape[1], 3)))
     values, joints = functions_of(shared.names, arm, q)
-    spread = _root(np.asarray(shared.moments))
-    coefficients = random.normal(size=(count, len(shared.names))) @ spread.T
+    factor = _root(np.asarray(shared.moments))
+    coefficients = random.normal(size=(count, len(shared.names))) @ factor.T
     turned = np.zeros((count, *q.shape))
     for k, joint in enumerate(joints):
         turned[:, :, joint] += coefficients[:, k, None] * values[:, k]

@@ -82,8 +82,7 @@ def _needed(console: Console, summary: dict[str, Any]) -> None:
             f"Medians over the volume, of encoders of {kind['encoder_arcsec']:.3g} arcsec and a seat of "
             f"{kind['seating_mm']:.3g} mm ({escape(kind['noise_source'])}), reference lengths of "
             f"u = {kind['u_length_mm']:g} mm, and a tracker of u = {kind['u_tracker_mm']:g} mm in each coordinate. Two "
-            "sockets and a reference length are as good as a "
-            "ball bar in one place."
+            "sockets and a reference length are as good as a ball bar in one place."
         )
         console.print(
             f"Enough: poses from which on this is less than the noise of the readings themselves, "

@@ -10,7 +10,7 @@ from rich.markup import escape
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import reading, together
-from ..summaries.tables import rms_difference
+from ..summaries.tables import difference_from_best
 from .app import (
     Json,
     KnownEncoderNoise,
@@ -125,13 +125,11 @@ def display(summary: dict[str, Any]) -> None:
         "model", "parameters", "determined", "inside", "outside", "u", "to best", "u", "ratio", "evidence", "CPU [s]",
     )  # fmt: skip
     most_probable = max(row["log_evidence"] for row in summary["models"])
-    least = next(row["rms_outside"] for row in summary["models"] if row["model"] == summary["best"])
+    least = min(row["rms_outside"] for row in summary["models"])
     for row in summary["models"]:
-        known = row["difference"] is not None and row["u_difference"] is not None
-        differences = rms_difference(row, least) if known and row["model"] != summary["best"] else (None, None)
         numbers = (
             *(formatted(row[key]) for key in ("rms_inside", "rms_outside", "u_outside")),
-            *("-" if one is None else formatted(one) for one in differences),
+            *("-" if one is None else formatted(one) for one in difference_from_best(row, least)),
         )
         table.add_row(
             escape(row["model"]),

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..core.text import pluralise
-from ..summaries.tables import rms_difference
+from ..summaries.tables import difference_from_best
 from . import charts
 from .elements import Chart, Report, ReportTable, Section, format_number, number_cell, text_cell
 
@@ -81,7 +81,7 @@ def _table(models: list[dict[str, Any]]) -> tuple[ReportTable, str]:
             number_cell(row["parameters"], 0),
             number_cell(row["effective_parameters"], 1),
             *(number_cell(row[key]) for key in ("rms_inside", "rms_outside", "u_outside")),
-            *(number_cell(one) for one in _differences(row, least)),
+            *(number_cell(one) for one in difference_from_best(row, least)),
             number_cell(row["ratio"], 2),
             number_cell(row["log_evidence"] - most_probable, 1),
             number_cell(row["cpu_seconds"], 1),
@@ -107,11 +107,6 @@ def _table(models: list[dict[str, Any]]) -> tuple[ReportTable, str]:
         "standard deviation)² outside. Evidence: its logarithm, less that of the most probable model."
     )
     return ReportTable("Models", columns, rows), meaning
-
-
-def _differences(row: dict[str, Any], least: float) -> tuple[float | None, float | None]:
-    known = row["difference"] is not None and row["u_difference"] is not None
-    return rms_difference(row, least) if known and row["rms_outside"] > least else (None, None)
 
 
 def _by_region(summary: dict[str, Any]) -> Chart:

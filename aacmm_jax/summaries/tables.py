@@ -104,6 +104,12 @@ def rms_difference(row: Mapping[str, Any], best_rms: float) -> tuple[float, floa
     return row["difference"] / total, row["u_difference"] / total
 
 
+def difference_from_best(row: Mapping[str, Any], best_rms: float) -> tuple[float | None, float | None]:
+    """`rms_difference`, mm; nothing of the best model itself, and where the regions say nothing."""
+    known = row["difference"] is not None and row["u_difference"] is not None
+    return rms_difference(row, best_rms) if known and row["rms_outside"] > best_rms else (None, None)
+
+
 def lengths_sentence(found: Mapping[str, Any]) -> str:
     """What a calibration says of the lengths that it was tried on (`verdicts.checked_lengths`), in words."""
     low, high = (f"{found[key]:.4g}" for key in ("shortest_mm", "longest_mm"))
