@@ -1,6 +1,7 @@
 # make demo         set up and run the demonstration: the paper's simulated arm, and a real Franka Panda
 # make test         set up and run the tests (budget: 3 minutes on two cores)
 # make test-slow    the tests that take long, or need optimised programs; the other half of what CI runs
+# make test-rounding    the examples of all docstrings and a selection of the tests, rounded as by another processor
 # make test-exhaustive  before a release: coverage by many trials, every robot, every notebook, all variants; the slow
 #                   ones again with their types checked, and ten times as many examples of what hypothesis draws
 # make docs         the documentation, into docs/_build/html (runs the notebooks that changed; make docs NOTEBOOKS=stored
@@ -17,9 +18,11 @@
 # make peers        install the contender that needs a Python environment of its own
 # Everything is installed into .venv in this folder (test-newest and test-lowest: .venv-newest, .venv-lowest).
 
-PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
+PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13 python3.14; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
 BIN := .venv/bin
+# Make reads a comma in the arguments of a call as the end of one, so what contains commas has a name.
+USERS := '.[plot,report]'
 # install,FOLDER,ARGUMENTS: by pip; with make UV=uv by uv, in a tenth of the CPU, and by pip where that fails.
 install = $(if $(UV),$(UV) pip install --quiet --python $(1)/bin/python $(2) || )$(1)/bin/python -m pip install --quiet \
 	--disable-pip-version-check $(2)
@@ -33,8 +36,11 @@ OPTIMISED_FILES = $(shell grep -rlw --include "test_*.py" mark.optimised tests)
 SELECTION := tests/test_package.py tests/kinematics --ignore=tests/kinematics/test_reading_check.py tests/solver \
 	tests/calibration/test_single.py tests/files/test_storage.py tests/test_real_captures.py
 PANDA := aacmm-demo/panda
+# As a processor of 2008 rounds: SSE4.2 and the linear algebra of that time (without effect on other architectures).
+OTHER_ROUNDING := OPENBLAS_CORETYPE=Nehalem XLA_FLAGS="--xla_backend_optimization_level=0 \
+	--xla_cpu_use_fusion_emitters=false --xla_cpu_max_isa=SSE4_2"
 
-.PHONY: demo test test-slow test-exhaustive test-newest install-newest run-newest test-lowest check package \
+.PHONY: demo test test-slow test-rounding test-exhaustive test-newest install-newest run-newest test-lowest check package \
 	package-matrix audit bench peers docs reproduce clean
 
 demo: .venv/.run
@@ -52,6 +58,10 @@ test: .venv/.test
 test-slow: .venv/.test
 	AACMM_TYPES=0 $(BIN)/python $(PYTEST) -m "slow and not optimised and not exhaustive"
 	AACMM_TYPES=0 $(OPTIMISED) $(BIN)/python $(PYTEST) -m "optimised and not exhaustive" $(OPTIMISED_FILES)
+
+test-rounding: .venv/.test
+	AACMM_TYPES=0 $(OTHER_ROUNDING) $(BIN)/python $(PYTEST) -m "not exhaustive and not optimised" tests/docs/test_reference.py
+	AACMM_TYPES=0 $(OTHER_ROUNDING) $(BIN)/python $(PYTEST) $(SELECTION) tests/uncertainty tests/cli
 
 test-exhaustive: .venv/.test
 	$(BIN)/python $(PYTEST) -m "(exhaustive or slow) and not optimised"
@@ -79,8 +89,8 @@ test-lowest:
 	$(OPTIMISED) .venv-lowest/bin/python $(PYTEST) -W ignore::DeprecationWarning $(SELECTION)
 
 check: .venv/.dev
-	$(BIN)/ruff check . .ci/try_package
-	$(BIN)/ruff format --check . .ci/try_package
+	$(BIN)/ruff check . .ci/try_package .ci/readme_commands
+	$(BIN)/ruff format --check . .ci/try_package .ci/readme_commands
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports --no-cache
 
@@ -120,7 +130,7 @@ benchmarks/peers/%/.venv/.done: benchmarks/peers/%/requirements.txt
 	$(PYTHON) -m venv .venv
 
 .venv/.run: pyproject.toml requirements/tested.txt | .venv/bin/python
-	$(call install,.venv,--constraint requirements/tested.txt --editable '.[plot,report]')
+	$(call install,.venv,--constraint requirements/tested.txt --editable $(USERS))
 	touch $@
 
 .venv/.test: pyproject.toml requirements/tested.txt | .venv/bin/python

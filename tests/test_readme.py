@@ -1,12 +1,19 @@
 """The README is short, leads somewhere, and its Python and commands print what it says."""
 
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+TARGETS = (
+    " ".join(re.findall(r"^\.PHONY: (.*?[^\\])$", MAKEFILE, flags=re.DOTALL | re.MULTILINE)).replace("\\", "").split()
+)
+# Of the documentation only what the repository holds: building it makes more.
+PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/[!_]*/*.md")]
 COMMANDS = re.findall(r"^aacmm (.*)$", README, flags=re.MULTILINE)
 
 
@@ -23,6 +30,25 @@ def test_links_lead_somewhere(page):
     ]
     assert links
     assert not [link for link in links if not (ROOT / link.partition("#")[0]).is_file()]
+
+
+def test_it_gives_two_commands_that_make_knows():
+    (block,) = re.findall(r"^## Two commands\n.*?```\n(.*?)```", README, flags=re.DOTALL | re.MULTILINE)
+    assert [line.split("#")[0].strip() for line in block.splitlines()] == ["make demo", "make test"]
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_shell_can_read_what_make_runs(target):
+    line = ["make", "--no-print-directory", "--dry-run", "--always-make", target, "NOTEBOOKS=stored"]
+    commands = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert commands
+    subprocess.run(["bash", "-n"], input=commands, text=True, check=True)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_targets_that_pages_name_exist(page):
+    named = re.findall(r"(?:^|`)make ([a-z][a-z-]+)", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert set(named) <= {*TARGETS}
 
 
 @pytest.fixture
@@ -45,9 +71,7 @@ def test_python_prints_what_it_says(capsys):
 @pytest.mark.exhaustive
 @pytest.mark.usefixtures("clone")
 def test_commands_print_what_it_says(aacmm, tmp_path):
-    demo, *commands = COMMANDS
-    assert demo == "demo"
-    printed = [" ".join(aacmm(*re.sub('"', "", command).split()).stdout.split()) for command in commands]
+    printed = [" ".join(aacmm(*re.sub('"', "", command).split()).stdout.split()) for command in COMMANDS]
     said = "held-out poses are 0.245 mm RMS from their geometry, predicted 0.401 mm"
     assert said in printed[2]
     assert said in " ".join(README.split())

@@ -59,8 +59,9 @@ def corrected_readings(
         >>> ur10e = aj.load_arm("ur10e")
         >>> as_built = ur10e.replace(theta_2=ur10e.theta[1] + 0.001)
         >>> found = aj.kinematics.corrected_readings(ur10e, as_built, q)
-        >>> print((found.q - q).round(4), "rad", bool(found.reached))
-        [-0.    -0.001 -0.     0.    -0.     0.   ] rad True
+        >>> change = found.q - q
+        >>> print(f"{change[1]:.4f} rad", bool(found.reached))
+        -0.0010 rad True
     """
     if nominal.joints != calibrated.joints:
         raise InputError(f"the arms have {nominal.joints} and {calibrated.joints} joints; give arms with as many.")

@@ -33,6 +33,7 @@ SHARE_OF_BOUNDS = 0.5  # of a half-width, that a standard uncertainty may reach
 _ZERO = 1e-8  # singular values below this, of the largest, are zero: exact degeneracy, which is named elsewhere
 _PARTNER = 0.05  # of the largest partner of a parameter: smaller ones are not named
 _PARTNERS_NAMED = 3
+_EQUAL = 1e-6  # relative differences below this are rounding
 
 
 class TradeOff(NamedTuple):
@@ -124,18 +125,18 @@ def _trade_off(
 
 
 def reduced_echelon(basis: Float[np.ndarray, "p r"]) -> tuple[Float[np.ndarray, "p r"], list[int]]:
-    """The same space by vectors that are each 0 at the other vectors' leading parameters, and these parameters."""
-    rows, leading = basis.T.copy(), []
-    for i in range(len(rows)):
-        # The parameter that the remaining vectors change most leads; its vector is moved to row i.
-        column = int(np.argmax(np.linalg.norm(rows[i:], axis=0)))
-        row = i + int(np.argmax(np.abs(rows[i:, column])))
-        rows[[i, row]] = rows[[row, i]]
-        rows[i] /= rows[i, column]
-        others = np.arange(len(rows)) != i
-        rows[others] -= np.outer(rows[others, column], rows[i])
-        leading.append(column)
-    return rows.T, leading
+    """The same space by vectors that are each 0 at the other vectors' leading parameters, and these parameters.
+
+    Orthonormal vectors of the same space give the same result, whatever a processor's rounding made of them: the
+    parameter that the remaining space changes most leads, and of equal ones the first.
+    """
+    rest, leading = basis.copy(), []
+    for _ in range(basis.shape[1]):
+        sizes = np.linalg.norm(rest, axis=1)
+        leading.append(int(np.argmax(sizes > (1 - _EQUAL) * sizes.max())))
+        direction = rest[leading[-1]] / sizes[leading[-1]]
+        rest -= np.outer(rest @ direction, direction)
+    return basis @ np.linalg.inv(basis[leading]), leading
 
 
 def _step(name: str) -> str:

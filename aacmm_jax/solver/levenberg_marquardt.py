@@ -99,8 +99,10 @@ def advance(progress: Progress, evaluated: QuadraticModel, box: Box, rules: Rule
     below_rounding = xp.abs(progress.step.predicted) <= 4 * _EPSILON * progress.model.cost
     unclipped = norm((trial - progress.y) / scale) >= 0.5 * progress.step.length
     tiny = small_step | (below_rounding & unclipped & ~accept & finite)
-    # Refusals alone made this step tiny, far from any minimum: the model is wrong (a false derivative, a kink).
-    forced = ~accept & (progress.damping > 1e-3 * largest) & (optimality > 1e-6)
+    # Refusals alone made this step tiny, far from any minimum: the model is wrong (a false derivative, a kink). A step
+    # this small may be accepted all the same: the cost does not resolve it, and which of two equal gradients is the
+    # smaller one is decided by rounding.
+    forced = (progress.damping > 1e-3 * largest) & (optimality > 1e-6)
     reason = xp.where(tiny, xp.where(small_step, STEP, ROUNDING), RUNNING)
     reason = xp.where(tiny & forced, STALLED, reason)
     reason = xp.where(optimality <= rules.gtol, GRADIENT, reason)
