@@ -61,7 +61,7 @@ test-slow: .venv/.test
 
 test-rounding: .venv/.test
 	AACMM_TYPES=0 $(OTHER_ROUNDING) $(BIN)/python $(PYTEST) -m "not exhaustive and not optimised" tests/docs/test_reference.py
-	AACMM_TYPES=0 $(OTHER_ROUNDING) $(BIN)/python $(PYTEST) $(SELECTION) tests/uncertainty tests/cli
+	$(OTHER_ROUNDING) $(BIN)/python $(PYTEST) $(SELECTION) tests/uncertainty tests/cli
 
 test-exhaustive: .venv/.test
 	$(BIN)/python $(PYTEST) -m "(exhaustive or slow) and not optimised"
