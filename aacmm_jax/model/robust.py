@@ -5,12 +5,15 @@ c the tuning constant of `Loss`, the cost of a pose is c^2 / 2 rho(s), and its w
 Sources: Huber 1964; Holland and Welsch 1977 (Cauchy); Beaton and Tukey 1974; Triggs et al. 2000.
 """
 
+from functools import cache
 from typing import Literal, get_args
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Float
 
 from ..core.arguments import shown
+from ..core.distributions import chi_square_quantile, chi_square_tail
 from ..core.errors import InputError
 from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace
@@ -18,16 +21,7 @@ from ..core.numpy_or_jax import AnyArray, namespace
 LossName = Literal["huber", "cauchy", "tukey"]
 LOSSES = get_args(LossName)
 
-# Constants of 95 % efficiency for normal residuals of r rows a pose (tests/model/test_robust.py integrates them).
-TUNING = {
-    "huber": {1: 1.345, 3: 1.628, 6: 1.869},
-    "cauchy": {1: 2.385, 3: 2.666, 6: 2.862},
-    "tukey": {1: 4.685, 3: 5.490, 6: 6.356},
-}
-# Medians of the chi-square distribution: of the square of a pose's whitened residual.
-MEDIANS = {1: 0.454936, 3: 2.365974, 6: 5.348121}
-# Its 95 % point, and what remains of its expectation, of 1 a row, where larger squares count as one at that point.
-BOUNDED_SQUARES = {1: (3.841459, 0.912972), 3: (7.814728, 0.963499), 6: (12.591587, 0.978234)}
+_EFFICIENCY = 0.95  # for normal residuals
 
 
 def check_loss(robust: object) -> None:
@@ -36,32 +30,70 @@ def check_loss(robust: object) -> None:
         raise InputError(f"robust is {shown(robust)}; it must be one of {', '.join(LOSSES)}, or None.")
 
 
+def _rho_and_slope(name: LossName, s: Float[AnyArray, " m"]) -> tuple[Float[AnyArray, " m"], Float[AnyArray, " m"]]:
+    """rho(s) and its derivative."""
+    xp = namespace(s)
+    if name == "huber":
+        inside = s <= 1
+        root = xp.sqrt(xp.where(inside, 1.0, s))
+        return xp.where(inside, s, 2 * root - 1), 1 / root
+    if name == "cauchy":
+        return xp.log1p(s), 1 / (1 + s)
+    inside = xp.minimum(s, 1.0)
+    return inside * (1 - inside + inside**2 / 3), (1 - inside) ** 2
+
+
+@cache
+def tuning_constant(name: LossName, rows: int) -> float:
+    """The constant c of a loss with which it is 95 % efficient for normal residuals of so many rows, to 3 decimals.
+
+    The efficiency of the estimate of a shift is A^2 / B with A = E[w + 2/r w' |x|^2] and B = E[w^2 |x|^2] / r, where w
+    is the weight and |x| has the chi distribution with r degrees of freedom (Hampel et al. 1986, section 4.2). With
+    many rows even a tiny c is more efficient than that; then a quarter of good poses has |x| < c.
+    """
+    root = np.linspace(0.0, np.sqrt(rows) + 8.0, 4_001)
+    density = np.exp((rows - 1) * np.log(np.maximum(root, 1e-300)) - 0.5 * root**2)
+    density[0] /= 2  # as the trapezoidal rule counts it
+    density /= density.sum()
+    low, high = np.sqrt(chi_square_quantile(0.25, rows)), 20.0 + 2 * np.sqrt(rows)
+    while high - low > 1e-6:
+        c = 0.5 * (low + high)
+        weight = _rho_and_slope(name, (root / c) ** 2)[1]
+        # w' |x|^2 as half the derivative by |x|, times |x|.
+        a = np.sum(density * (weight + np.gradient(weight, root) * root / rows))
+        b = np.sum(density * weight**2 * root**2) / rows
+        low, high = (c, high) if a**2 < _EFFICIENCY * b else (low, c)
+    return round(float(high), 3)
+
+
+def median_square(rows: int) -> float:
+    """The median of |x|^2 for normal residuals of so many rows."""
+    return chi_square_quantile(0.5, rows)
+
+
+def bounded_square(rows: int) -> tuple[float, float]:
+    """The 95 % point of |x|^2 for normal residuals, and the mean of a row's square where larger ones count as that.
+
+    The mean is F(b; r + 2) + b (1 - F(b; r)) / r, with the chi-square distribution function F at the point b.
+    """
+    most = chi_square_quantile(0.95, rows)
+    return most, 1 - chi_square_tail(most, rows + 2) + most * chi_square_tail(most, rows) / rows
+
+
 class Loss(Module):
     """A robust loss by its name."""
 
     name: LossName = eqx.field(static=True)
 
-    def _constant(self, rows: int) -> float:
-        return TUNING[self.name][rows]
-
     def cost_and_weight(self, white: Float[AnyArray, "r m"]) -> tuple[Float[AnyArray, " m"], Float[AnyArray, " m"]]:
         """Cost and weight of every pose."""
-        xp, c2 = namespace(white), self._constant(white.shape[0]) ** 2
-        s = xp.sum(white**2, axis=0) / c2
-        if self.name == "huber":
-            inside = s <= 1
-            root = xp.sqrt(xp.where(inside, 1.0, s))
-            rho, weight = xp.where(inside, s, 2 * root - 1), 1 / root
-        elif self.name == "cauchy":
-            rho, weight = xp.log1p(s), 1 / (1 + s)
-        else:
-            inside = xp.minimum(s, 1.0)
-            rho, weight = inside * (1 - inside + inside**2 / 3), (1 - inside) ** 2
+        xp, c2 = namespace(white), tuning_constant(self.name, white.shape[0]) ** 2
+        rho, weight = _rho_and_slope(self.name, xp.sum(white**2, axis=0) / c2)
         return 0.5 * c2 * rho, weight
 
     def transformed(self, white: Float[AnyArray, "r m"]) -> Float[AnyArray, "r m"]:
         """Residuals whose squares are twice the cost."""
-        xp, c2 = namespace(white), self._constant(white.shape[0]) ** 2
+        xp, c2 = namespace(white), tuning_constant(self.name, white.shape[0]) ** 2
         square = xp.sum(white**2, axis=0)
         small = square < 1e-12 * c2
         cost, _ = self.cost_and_weight(white)

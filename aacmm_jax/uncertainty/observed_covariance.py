@@ -17,7 +17,7 @@ from ..data.noise import Noise, noise_of, one_arcsec
 from ..kinematics.chain import ForwardPass, JointKinds
 from ..kinematics.jacobian import reading_columns, reading_rotations
 from ..model.observed import Linear, Observed, Whitening, whitened
-from ..model.robust import BOUNDED_SQUARES, MEDIANS
+from ..model.robust import bounded_square, median_square
 
 _LEAST_SIGMA = 1e-9  # mm
 _ROUNDS, _MEDIAN_ROUNDS, _MOMENT_ROUNDS = 100, 20, 10
@@ -134,7 +134,7 @@ def robust_scatter_of(
         for part, error in zip(*known, strict=True):
             inverse = inverse_positive_definite(part.rows.measured + covariance_of_sigma(error, xp.exp(log_sigma)))
             square = xp.einsum("rm,mrs,sm->m", part.rows.values, inverse, part.rows.values)
-            squares.append(square / MEDIANS[part.rows.values.shape[0]])
+            squares.append(square / median_square(part.rows.values.shape[0]))
         ratio = xp.median(xp.concatenate(squares)) * count / expected
         return xp.maximum(log_sigma + 0.5 * xp.log(ratio + 1e-300), np.log(_LEAST_SIGMA)), xp.zeros(())
 
@@ -236,7 +236,7 @@ def _bounded(part: _Parts, found: Moments) -> tuple[Float[AnyArray, "r r m"], Fl
     covariance = covariance + 0.01 * xp.asarray(np.eye(r))[:, :, None]
     inverse = xp.moveaxis(inverse_positive_definite(xp.moveaxis(covariance, -1, 0)), 0, -1)
     square = xp.einsum("am,abm,bm->m", part.white, inverse, part.white)
-    most, expected = BOUNDED_SQUARES[r]
+    most, expected = bounded_square(r)
     return inverse, xp.minimum(1.0, most / xp.maximum(square, 1e-300)) / expected
 
 

@@ -5,10 +5,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from aacmm_jax.model.robust import BOUNDED_SQUARES, LOSSES, MEDIANS, TUNING, Loss
+from aacmm_jax.model.robust import LOSSES, Loss, bounded_square, median_square, tuning_constant
 
 
-@pytest.mark.parametrize("rows", [1, 3, 6])
+# Holland and Welsch 1977, table 1.
+@pytest.mark.parametrize(("name", "constant"), [("huber", 1.345), ("cauchy", 2.385), ("tukey", 4.685)])
+def test_tuning_constants_of_one_row_are_the_published_ones(name, constant):
+    assert tuning_constant(name, 1) == constant
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 4, 6])
 @pytest.mark.parametrize("name", LOSSES)
 def test_tuning_constants_give_95_percent(name, rows):
     """Efficiency of the estimate of a shift, A^2 / B with A = E[w + 2/r w' |x|^2] and B = E[w^2 |x|^2] / r."""
@@ -23,13 +29,17 @@ def test_tuning_constants_give_95_percent(name, rows):
     a = np.trapezoid((weight + 2 / rows * slope * square) * density, root)
     b = np.trapezoid(weight**2 * square * density, root) / rows
     assert a**2 / b == pytest.approx(0.95, abs=2e-3)
-    assert MEDIANS[rows] == pytest.approx(stats.chi2(rows).median(), abs=1e-5)
-    assert rows in TUNING[name]
 
 
-@pytest.mark.parametrize("rows", [1, 3, 6])
+@pytest.mark.parametrize("name", LOSSES)
+def test_many_rows_keep_a_quarter_of_good_poses(name):
+    assert tuning_constant(name, 40) >= stats.chi(40).ppf(0.25) - 1e-3
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 6, 40])
 def test_bounded_squares_of_normal_residuals(rows):
-    most, expected = BOUNDED_SQUARES[rows]
+    assert median_square(rows) == pytest.approx(stats.chi2(rows).median(), abs=1e-5)
+    most, expected = bounded_square(rows)
     distribution = stats.chi2(rows)
     assert most == pytest.approx(distribution.ppf(0.95), abs=1e-5)
     assert expected == pytest.approx(distribution.expect(lambda x: np.minimum(x, most)) / rows, abs=1e-5)
