@@ -36,6 +36,7 @@ OPTIMISED_FILES = $(shell grep -rlw --include "test_*.py" mark.optimised tests)
 SELECTION := tests/test_package.py tests/kinematics --ignore=tests/kinematics/test_reading_check.py tests/solver \
 	tests/calibration/test_single.py tests/files/test_storage.py tests/test_real_captures.py
 PANDA := aacmm-demo/panda
+SUMMARY := sed '/^Warning/,$$d'
 # As a processor of 2008 rounds: SSE4.2 and the linear algebra of that time (without effect on other architectures).
 OTHER_ROUNDING := OPENBLAS_CORETYPE=Nehalem XLA_FLAGS="--xla_backend_optimization_level=0 \
 	--xla_cpu_use_fusion_emitters=false --xla_cpu_max_isa=SSE4_2"
@@ -47,10 +48,17 @@ demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
 	@echo
 	@echo "A real Franka Panda, calibrated in six placements of a tool with two sockets, evaluated in two others:"
-	$(BIN)/aacmm import examples/mukca/capture.toml -o $(PANDA)-capture.h5 > /dev/null
-	$(BIN)/aacmm calibrate $(PANDA)-capture.h5 -o $(PANDA)-calibration.h5 --without 'mid_left/*' --without 'mid_right/*'
-	$(BIN)/aacmm evaluate $(PANDA)-calibration.h5 $(PANDA)-capture.h5 -o $(PANDA)-evaluation.h5
-	$(BIN)/aacmm report $(PANDA)-calibration.h5 -o $(PANDA)-report.html
+	@echo
+	$(BIN)/aacmm import examples/mukca/capture.toml -o $(PANDA)-capture.h5 > $(PANDA)-capture.txt
+	$(BIN)/aacmm calibrate $(PANDA)-capture.h5 -o $(PANDA)-calibration.h5 \
+		--without 'mid_left/*' --without 'mid_right/*' > $(PANDA)-calibration.txt
+	@$(SUMMARY) $(PANDA)-calibration.txt
+	$(BIN)/aacmm evaluate $(PANDA)-calibration.h5 $(PANDA)-capture.h5 -o $(PANDA)-evaluation.h5 > $(PANDA)-evaluation.txt
+	@$(SUMMARY) $(PANDA)-evaluation.txt
+	$(BIN)/aacmm report $(PANDA)-calibration.h5 -o $(PANDA)-report.html > $(PANDA)-report.txt
+	@echo
+	@echo "All that was printed, with warnings and tables, is in $(PANDA)-calibration.txt and $(PANDA)-evaluation.txt."
+	@echo "Open in a browser: aacmm-demo/report.html (the simulated arm), $(PANDA)-report.html (the Panda)"
 
 test: .venv/.test
 	$(BIN)/python $(PYTEST)
