@@ -32,8 +32,12 @@ def _is_unit(cell: str) -> bool:
 
 
 def with_units(names: list[str], cells: list[str]) -> list[str] | None:
-    """Names with the units of a row of their own in brackets; None where the cells are not units."""
-    if not any(_inside(cell) in _UNITS for cell in cells) or not all(_is_unit(cell) or not cell for cell in cells):
+    """Names with the units of a row of their own in brackets; None where the cells are not units.
+
+    Without names, one must be of lengths or angles, as the names of columns may be letters.
+    """
+    known = _is_unit if any(names) else lambda cell: _inside(cell) in _UNITS
+    if not any(map(known, cells)) or not all(_is_unit(cell) or not cell for cell in cells):
         return None
     return [f"{name} [{_inside(cell)}]" if cell else name for name, cell in zip(names, cells, strict=True)]
 

@@ -160,11 +160,14 @@ def read_manifest(path: str | os.PathLike) -> Recording:
 
     ``[[points]]``, ``[[transforms]]``, ``[[touched_sphere]]``, ``[[touched_cylinder]]``, ``[[plane]]``,
     ``[[parallel_planes]]``, ``[[artefact]]`` and ``[[distances]]`` are observations of these kinds. Their ``file``
-    holds readings and measured values (or ``readings`` is a file of readings with as many rows); ``columns`` picks them
-    by header name, shell pattern or number: ``columns = { q = "q*_rad", points = ["x", "y", "z"] }``. ``units``,
-    ``rotation``, ``coverage_factor``, ``delimiter``, ``decimal`` and ``skip`` say how they are written, ``group`` names
-    a column that divides the table into several observations, and ``preset`` (csv, leica, xyzijk, ipa) fills in what is
-    not stated.
+    holds readings and measured values (or ``readings`` is a file of readings with as many rows).
+
+    In all tables ``columns`` picks by header name, shell pattern or number, ``columns = { q = "q*_rad", points =
+    ["x", "y", "z"] }``, or those of the readings alone, ``columns = ["J1", "J2", "J3"]``. Where nothing is stated, they
+    are those with names of joints in the header, or all. ``units``, ``rotation``, ``coverage_factor``, ``delimiter``,
+    ``decimal`` and ``skip`` say how they are written, ``group`` names a column that divides the table into several
+    sockets or observations, and ``preset`` (csv, leica, xyzijk, ipa) fills in what is not stated. Units in the header
+    must agree with those stated.
 
     ``session = "monday"`` in such tables, with fields in braces if needed, or ``columns = { session = "day" }`` for
     each row, makes sessions of one arm (`data.capture.join_sessions`); names are then ``monday/name``, in lengths too.

@@ -417,11 +417,11 @@ class _Reader:
 
     def check_complete(self, given: set[str]) -> None:
         """Raise `InputError` where something that the kind needs is nowhere."""
-        for entry in self._kind.entries:
-            if entry.required and entry.name not in given:
+        for name, entry in self._entries.items():
+            if entry.required and name not in given:
                 place = (
-                    f"pick its columns with columns = {{ {entry.name} = ... }}"
+                    f"pick its columns with columns = {{ {name} = ... }}"
                     if entry.dimensions[:1] == ("pose",)
                     else "state it"
                 )
-                raise InputError(f"{self._where} has no '{entry.name}' ({entry.says}); {place}.")
+                raise InputError(f"{self._where} has no '{name}' ({entry.says}); {place}.")

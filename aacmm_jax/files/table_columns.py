@@ -100,7 +100,11 @@ def reading_columns(table: TextTable, joints: int, taken: Sequence[int] = (), li
         numbered = [columns for _, columns in _numbered(table) if len(columns) == joints]
         if not numbered or _is_whole(table, numbered[0], joints):
             return free
-    guess = [columns for _, columns in _numbered(table) if _is_whole(table, columns, joints)]
+    guess = [
+        columns
+        for _, columns in _numbered(table)
+        if _is_whole(table, columns, joints) and all(map(table.is_numeric, columns))
+    ]
     numeric = [i for i in free if table.is_numeric(i)][-joints:]
     proposed = guess[0] if guess else numeric if len(numeric) == joints else []
     add = f"add {_line(line, proposed)} if these are the joints in their order"

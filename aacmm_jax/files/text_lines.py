@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from ..core.errors import InputError
 from .inputs import InputFile, largest_file
 
-# A table takes about eight times its size as Python objects, and 128 MiB are a million poses: more is another file.
+# A table of numbers takes twelve times its size as Python objects: 128 MiB, a million poses, take 1.5 GiB. One of
+# digits and ends of lines takes a hundred times its size, so that lines are limited, too.
 TABLE_SHARE = 1 / 8
+_MOST_LINES = 2_000_000
 _LONGEST_LINE = 2**20  # bytes; ten thousand columns have a tenth of it
 _DELIMITERS = (";", "\t", ",")
 _SAMPLED = 50  # lines from which the delimiter is found
@@ -48,8 +50,10 @@ def table_lines(path: str | os.PathLike) -> tuple[list[str], bool]:
 
 
 def _check_lines(file: InputFile, content: bytes) -> None:
-    """Refuse a line that no table has, which would take minutes to divide into cells."""
+    """Refuse lines that no table has, which would take minutes to divide into cells."""
     end = b"\n" if b"\n" in content else b"\r"
+    if content.count(end) > _MOST_LINES:
+        raise InputError(f"{file} has more than the {_MOST_LINES:,} lines that a text table may have; divide it.")
     start = 0
     while len(content) - start > _LONGEST_LINE:
         last = content.rfind(end, start, start + _LONGEST_LINE)
