@@ -153,10 +153,14 @@ class TextTable:
     def _matching(self, column: Column) -> list[int]:
         if isinstance(column, int):
             return [column - 1] if 1 <= column <= self.width else []
-        exact = [i for i, name in enumerate(self._header) if name == column]
-        exact = exact or [i for i, name in enumerate(self._header) if fnmatch.fnmatchcase(name, column)]
-        wanted = plain_name(column)
-        return exact or [i for i, name in enumerate(self._header) if fnmatch.fnmatchcase(plain_name(name), wanted)]
+        wanted, plain = plain_name(column), [plain_name(name) for name in self._header]
+        # As it stands first: q[1] is also a pattern, of q1.
+        for names, text in ((self._header, column), (plain, wanted)):
+            same = [i for i, name in enumerate(names) if name == text]
+            if same:
+                return same
+        exact = [i for i, name in enumerate(self._header) if fnmatch.fnmatchcase(name, column)]
+        return exact or [i for i, name in enumerate(plain) if fnmatch.fnmatchcase(name, wanted)]
 
     def unit(self, picked: Sequence[int]) -> str | None:
         """The unit that the header states for columns, counted from 0, or None. Raises `InputError` for several."""
@@ -177,7 +181,7 @@ class TextTable:
             indices = self._matching(column)
             if not indices:
                 raise InputError(f"{self._path} has {self._missing(column)}")
-            if len(indices) > 1 and isinstance(column, str) and not set("*?[") & set(column):
+            if len(indices) > 1 and isinstance(column, str) and plain_name(column) in map(plain_name, self._header):
                 numbers = shorten([str(i + 1) for i in indices])
                 raise InputError(
                     f"{self._path} names the columns {numbers} all {quoted(column)}; give each name once, or pick them "
