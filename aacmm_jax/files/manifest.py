@@ -29,8 +29,9 @@ from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
 from .arms import arm_beside, read_arm, usual_noise, with_parameters
 from .inputs import InputFile, fingerprint
 from .manifest_angles import Angles, Readings
-from .manifest_observations import FIELDS, TABLES, Picked, SocketTable, Source, Table, name_of, observations, parts
+from .manifest_observations import Source, name_of, observations, parts
 from .manifest_sessions import in_sessions
+from .manifest_tables import FIELDS, TABLES, Picked, SocketTable, Table
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
 from .text_lines import TABLE_SHARE

@@ -13,7 +13,7 @@ from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
-from .manifest_observations import Picked, Wanted, as_list
+from .manifest_tables import Picked, Wanted, as_list
 from .table_columns import reading_columns
 from .temperatures import TEMPERATURE, with_temperature
 from .text_table import TextTable
@@ -174,9 +174,10 @@ class Readings:
         )
         for header, stated, what in pairs:
             if header is not None and header != stated:
+                german = " (the German Grad is deg)" if (header, stated) == ("gon", "deg") else ""
                 raise InputError(
                     f"{text.path}: the header of the {what} says {header}, but the manifest {stated}; correct one of "
-                    "them."
+                    f"them{german}."
                 )
         if linear == "counts" and angles.counts_per_mm is None:
             raise InputError(

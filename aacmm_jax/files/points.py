@@ -12,9 +12,10 @@ from ..core.units import LENGTH_UNITS
 from ..kinematics.workspace import Reach
 from .inputs import InputFile, fingerprint
 from .manifest import PointsManifest, read_recorded
-from .manifest_observations import Source, Wanted, as_list
+from .manifest_observations import Source
+from .manifest_tables import Wanted, as_list
 from .outputs import as_path
-from .table_columns import position_columns
+from .table_columns import LINE, position_columns, proposed_columns
 from .text_lines import TABLE_SHARE
 from .text_table import TextTable
 from .toml import read_toml
@@ -101,10 +102,10 @@ def _points(text: TextTable, wanted: Wanted, model: PointsManifest) -> np.ndarra
         picked = [i for i in range(text.width) if i not in wanted.taken]
         text.check_ascending(picked)
     if len(picked) != 3:
-        numeric = [str(i + 1) for i in range(text.width) if text.is_numeric(i)][:3]
+        line = LINE.format(", ".join(str(i + 1) for i in proposed_columns(text, 3, wanted.taken)) or "...")
         raise InputError(
-            f"{text.path} has {text.shown()}, and {len(picked)} of them are picked; add "
-            f"columns = [{', '.join(numeric)}] with those of x, y and z."
+            f"{text.path} has {text.shown()}, and it is not clear which of them are x, y and z; add {line} with these "
+            "three."
         )
     header = text.unit(picked) if named is None else named[1]
     stated = wanted.unit or model.points.unit or header or wanted.usual_unit

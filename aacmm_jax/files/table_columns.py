@@ -105,13 +105,22 @@ def reading_columns(table: TextTable, joints: int, taken: Sequence[int] = (), li
         for _, columns in _numbered(table)
         if _is_whole(table, columns, joints) and all(map(table.is_numeric, columns))
     ]
-    numeric = [i for i in free if table.is_numeric(i)][-joints:]
-    proposed = guess[0] if guess else numeric if len(numeric) == joints else []
+    proposed = guess[0] if guess else proposed_columns(table, joints, taken)
     add = f"add {_line(line, proposed)} if these are the joints in their order"
-    if not proposed:
+    if table.misnamed:
+        add = "correct the header, or the delimiter where decimal commas are taken for it"
+    elif not proposed:
         add = f"pick one column a joint with {line.format('...')}, or name them q_1 to q_{joints}"
     unclear = "but the arm has" if len(free) < joints else "and it is not clear which of them are those of the"
     raise InputError(f"{table.path} has {table.shown()}, {unclear} {joints} joints; {add}.")
+
+
+def proposed_columns(table: TextTable, count: int, taken: Sequence[int] = ()) -> list[int]:
+    """So many columns of numbers, from 0, without times or indices before them; none where others may be meant."""
+    numeric = [i for i in range(table.width) if i not in taken and table.is_numeric(i)]
+    while len(numeric) > count and table.ascends(numeric[0]):
+        numeric.pop(0)
+    return numeric if len(numeric) == count and not table.misnamed else []
 
 
 def _line(line: str, columns: Sequence[int]) -> str:

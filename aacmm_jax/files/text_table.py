@@ -68,7 +68,7 @@ class TextTable:
             self._lines.append(line_number)
         if not self._rows:
             raise InputError(f"{path} holds no numbers; give one line a pose.")
-        self._check_widths(words)
+        self._check_widths()
         self._leave_out_trailing(words)
         words = [_trimmed(cells, self.width) for cells in words]
         self._title = words[-1] if words else []  # a line of words that does not name the columns
@@ -78,7 +78,7 @@ class TextTable:
         """The cells of a line of names; between blanks, a unit belongs to the name before it."""
         return cells_of(re.sub(r"[ \t]+(?=[\[(])", "", line) if self._delimiter == " " else line, self._delimiter)
 
-    def _check_widths(self, words: list[list[str]]) -> None:
+    def _check_widths(self) -> None:
         if len(set(map(len, self._rows))) == 1:
             return
         width = len(self._rows[0])
@@ -123,6 +123,11 @@ class TextTable:
         return self._header
 
     @property
+    def misnamed(self) -> bool:
+        """Whether a line of several names is above the rows, but not one name for each column."""
+        return not self._header and len(self._title) > 1
+
+    @property
     def width(self) -> int:
         """Number of columns."""
         return len(self._rows[0])
@@ -135,7 +140,8 @@ class TextTable:
     def shown(self) -> str:
         """Its columns as a message shows them: names with their numbers."""
         if not self._header:
-            return f"{self.width} columns without names"
+            others = f", but its header {len(self._title)} names" if self.misnamed else " without names"
+            return f"{self.width} columns{others}"
         names = [f"{i} {quoted(name[:_LONG])}" for i, name in enumerate(self._header, start=1)]
         return f"the columns {shorten(names, _LONG)}"
 
@@ -273,6 +279,14 @@ class TextTable:
     def is_numeric(self, index: int) -> bool:
         """Whether a column begins and ends with a number, also with a decimal comma."""
         return all(is_number(row[index].strip(" \t").replace(",", ".", 1)) for row in (self._rows[0], self._rows[-1]))
+
+    def ascends(self, index: int) -> bool:
+        """Whether every number of a column is larger than the one before it, as those of times and indices are."""
+        try:
+            values = [float(row[index].replace(",", ".")) for row in self._rows]
+        except ValueError:
+            return False
+        return len(values) > 1 and bool(np.all(np.diff(values) > 0))
 
     def texts(self, column: Column) -> np.ndarray:
         """The cells of one column."""

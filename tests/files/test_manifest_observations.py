@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
-from aacmm_jax.files.manifest_observations import TABLES
+from aacmm_jax.files.manifest_tables import TABLES
 from aacmm_jax.files.observation_kinds import kinds as known_kinds
 from tests.refusals import assert_refused
 

@@ -11,7 +11,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.core.units import ANGLE_UNITS
 from aacmm_jax.files.manifest_angles import Angles, Readings
-from aacmm_jax.files.manifest_observations import Wanted
+from aacmm_jax.files.manifest_tables import Wanted
 from aacmm_jax.files.text_table import TextTable
 from tests.refusals import assert_refused, refusal
 
@@ -234,7 +234,7 @@ def test_units_that_contradict_the_manifest(tmp_path, header):
         (["X", "Y", "Z"], None, ["does not say the unit of its points", 'add unit = "mm" to [points]']),
         (["P3", "P2", "P1"], "mm", ["in the order 'P3', 'P2', 'P1'; add columns = [3, 2, 1]"]),
         (["n", "X", "Y", "W"], "mm", ["has no column 'z', but columns x, y"]),
-        (["t", "a", "b", "c"], "mm", ["the columns 1 't', 2 'a'", "add columns = [1, 2, 3]"]),
+        (["t", "a", "b", "c"], "mm", ["the columns 1 't', 2 'a'", "add columns = [2, 3, 4] with these three"]),
         (["Z [mm]", "Y [mm]", "X [mm]", "Hole"], None, None),
     ],
 )
@@ -264,6 +264,11 @@ NUMBERS = "0.12345,1.12345,2.12345,3.12345,4.12345,-2.12345\n"
         (3 * NUMBERS.replace("\n", "e-05\n") + NUMBERS[:-1] + "e-0", ["line 4: the last number", "copy it again"]),
         (3 * NUMBERS.replace("\n", "e-05\n") + NUMBERS[:-1] + "e-", ["'-2.12345e-', has fewer digits"]),
         (3 * NUMBERS + NUMBERS[:30], ["line 4, the last, ends after 4 of 6 columns", "the file is cut there"]),
+        ("J1,J2,J3,J4,J5,J6\n" + 6 * "0,5,1,5" + "\n", ["but its header 6 names", "where decimal commas are"]),
+        (
+            "J1,J2,J3,J4,J5,J6,J7\n0.5," + NUMBERS,
+            ["7 'J7', and it is not clear", "pick one column a joint with columns"],
+        ),
         ("6,5,4,3,2,1\n" + NUMBERS, ["line 1 is 6 to 1", "add skip = 1 and columns = [6, 5, 4, 3, 2, 1]"]),
         ("q1,q2,q3,q4,q5,q7\n" + NUMBERS, ["the columns 1 'q1'", "add columns = [1, 2, 3, 4, 5, 6] if"]),
         ("x,y,z,rx,ry,rz\n" + NUMBERS, ["6 'rz', and it is not clear which of them", "add columns = [1, 2"]),
