@@ -8,6 +8,7 @@ UM = 1e-3  # mm
 DEG = math.pi / 180  # rad
 ARCMIN = math.pi / (180 * 60)  # rad
 ARCSEC = math.pi / (180 * 3600)  # rad
+ANGLE_UNITS = {"rad": 1.0, "deg": DEG, "arcsec": ARCSEC, "gon": math.pi / 200, "mrad": 1e-3}  # as files name them
 LENGTH_UNITS = {"mm": 1.0, "m": M, "um": UM, "inch": INCH}  # as files name them
 
 

@@ -4,14 +4,12 @@ import os
 
 import numpy as np
 
-from ..core.units import ARCSEC, DEG, LENGTH_UNITS, length_unit
+from ..core.units import ANGLE_UNITS, LENGTH_UNITS, length_unit
 from ..kinematics.reading_fit import Explanation
 from .inputs import InputFile
-from .manifest import manifest_model
+from .manifest import columns_of_readings, manifest_model
 from .outputs import as_path
 from .toml import read_toml
-
-_UNITS = {"rad": 1.0, "deg": DEG, "arcsec": ARCSEC}
 
 
 def angles_toml(found: Explanation, unit: str | None, manifest: str | os.PathLike | None = None) -> str:
@@ -24,24 +22,26 @@ def angles_toml(found: Explanation, unit: str | None, manifest: str | os.PathLik
     """
     joints = len(found.order)
     columns, signs, offsets = np.arange(1, joints + 1), np.ones(joints), np.zeros(joints)
-    counts = None
+    counts, listed = None, False
     if manifest is not None:
         stated = read_toml(InputFile(as_path(manifest)), manifest_model()).angles
         if stated is not None:
-            unit, counts = stated.unit, stated.counts_per_turn
-            columns = columns if stated.columns is None else np.array(stated.columns)
+            unit, counts, listed = stated.unit, stated.counts_per_turn, stated.columns is not None
             signs, offsets = (np.broadcast_to(np.asarray(x, float), joints) for x in (stated.sign, stated.offset))
+        columns = np.array(columns_of_readings(manifest))
     order = list(found.order)
     if found.angle != 1:
         unit = "deg" if found.angle < 1 else "rad"
-    size = 2 * np.pi / np.broadcast_to(np.asarray(counts, float), joints)[order] if counts else _UNITS[unit or "rad"]
+    size = (
+        2 * np.pi / np.broadcast_to(np.asarray(counts, float), joints)[order] if counts else ANGLE_UNITS[unit or "rad"]
+    )
     new_signs = np.array(found.signs) * signs[order]
     new_offsets = offsets[order] - new_signs * np.array(found.offsets) / size
     lines = ["[angles]", f'unit = "{unit or "rad"}"']
     if counts is not None:
         each = np.broadcast_to(np.asarray(counts, float), joints)[order]
         lines.append(f"counts_per_turn = {_row(each) if np.ndim(counts) else _number(float(each[0]))}")
-    if not np.array_equal(columns[order], np.arange(1, joints + 1)):
+    if listed or order != sorted(order):
         lines.append(f"columns = {_row(columns[order])}")
     if np.any(new_signs < 0):
         lines.append(f"sign = {_row(new_signs)}")

@@ -13,15 +13,14 @@ from ..core.errors import InputError
 from ..core.rotations import rotation_matrix
 from ..core.units import DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
-from .manifest_observations import reading_unit_of
+from .manifest_angles import header_units
+from .table_columns import columns_of_joints, find_named, position_columns, reading_columns
 from .temperatures import TEMPERATURE
 from .text_table import Column, TextTable
 
 _ANGLES = {"deg": DEG, "rad": 1.0}
-# Names of columns that hold the readings of joints 1, 2, ... from left to right.
-_READINGS = ("q_[0-9]*", "q[0-9]*", "joint*[0-9]*", "j[0-9]*", "a[0-9]*")
 _QUATERNION, _ROTATION = ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")
-_POSITIONS = (("x", "y", "z"), ("px", "py", "pz"))
+_OPTION = "--columns {}"
 _ROUNDED = 1e-3  # of a quaternion's length: three decimals at least
 
 
@@ -68,7 +67,9 @@ def read_commanded_poses(
     table, joints = TextTable(path), arm.joints
     orientation = _orientation(table)
     picked = _reading_columns(path, table, joints, alone=orientation is None, wanted=columns)
-    stated = reading_unit_of(table, [i + 1 for i in picked], arm) if picked else None
+    stated, linear = header_units(table, picked, arm) if picked else (None, None)
+    if linear not in (None, "mm"):
+        raise InputError(f"{path} states {linear} for readings of prismatic joints; convert them to mm.")
     if stated is not None and (stated not in _ANGLES or unit not in (None, stated)):
         raise InputError(f"{path} states {stated} for joint readings; give them in deg or rad, and leave out --unit.")
     found = stated or unit
@@ -81,10 +82,10 @@ def read_commanded_poses(
     if near is not None and len(near) != joints:
         raise InputError(f"--near has {len(near)} readings, but the arm {joints} joints; give one per joint.")
     poses = None if orientation is None else _poses(path, table, _ANGLES[found], length_unit)
-    readings = table.numbers([i + 1 for i in picked]) if near is None else np.tile(near, (table.length, 1))
-    temperature = table.numbers([TEMPERATURE])[:, 0] if table.has([TEMPERATURE]) else None
+    readings = table.numbers(picked) if near is None else np.tile(near, (table.length, 1))
+    temperature = table.numbers(table.pick([TEMPERATURE]))[:, 0] if table.has([TEMPERATURE]) else None
     q = np.array(by_joint(arm, _ANGLES[found], 1.0)) * readings
-    return CommandedPoses(q, poses, found, arm, table, picked, temperature)
+    return CommandedPoses(q, poses, found, arm, table, tuple(picked), temperature)
 
 
 class KnownPoses(NamedTuple):
@@ -115,19 +116,16 @@ def read_known_poses(path: str | os.PathLike, joints: int, *, unit: str | None =
         InputError: Columns are missing, or units differ.
     """
     table = TextTable(path)
-    point: list[int | str] = ["x", "y", "z"]
+    point: list[int] = []
     length: str = "mm"
     orientation = None
     if not table.header and table.width in (joints, joints + 3):
-        columns, has_points = tuple(range(joints)), table.width > joints
-        point = [joints + 1, joints + 2, joints + 3]
+        picked, point = list(range(joints)), list(range(joints, table.width))
     else:
-        columns = _reading_columns(path, table, joints, alone=True)
-        orientation, position = _orientation(table), _position(table)
-        has_points = position is not None
+        picked = _reading_columns(path, table, joints, alone=True)
+        orientation, position = _orientation(table), position_columns(table)
         if position is not None:
-            point, length = [*position[0]], position[1] or "mm"
-    picked = [i + 1 for i in columns]
+            point, length = position[0], position[1] or "mm"
     header = table.unit(picked)
     if header is not None and (header not in _ANGLES or unit not in (None, header)):
         raise InputError(f"{path} states {header} for joint readings; give them in deg or rad, and leave out --unit.")
@@ -144,9 +142,9 @@ def read_known_poses(path: str | os.PathLike, joints: int, *, unit: str | None =
         _ANGLES[found] * readings,
         found,
         (header or unit) is not None,
-        LENGTH_UNITS[length] * table.numbers(point) if has_points else None,
+        LENGTH_UNITS[length] * table.numbers(point) if point else None,
         rotations,
-        None if has_points else sockets,
+        None if point else sockets,
         length,
     )
 
@@ -181,54 +179,25 @@ def corrected_csv(commanded: CommandedPoses, q: Float[np.ndarray, "N n"], reache
     return stream.getvalue()
 
 
-def _found(table: TextTable, names: Sequence[str], units: Sequence[str]) -> tuple[list[str], str | None] | None:
-    """Columns of these names, alone or with a unit after them, and the unit that the header states; None: not there."""
-    if not table.header:
-        return None
-    for unit in ("", *units):
-        wanted = [f"{name}_{unit}" if unit else name for name in names]
-        if table.has(wanted):
-            return wanted, unit or table.unit(wanted)
-    return None
-
-
-def _orientation(table: TextTable) -> tuple[list[str], str | None] | None:
+def _orientation(table: TextTable) -> tuple[list[int], str | None] | None:
     """The columns of a quaternion or a rotation vector, and the unit that the header states."""
-    return _found(table, _QUATERNION, ()) or _found(table, _ROTATION, tuple(_ANGLES))
-
-
-def _position(table: TextTable) -> tuple[list[str], str | None] | None:
-    """The columns of a position, and the unit that the header states."""
-    return next((found for names in _POSITIONS if (found := _found(table, names, tuple(LENGTH_UNITS)))), None)
+    return find_named(table, _QUATERNION) or find_named(table, _ROTATION, tuple(_ANGLES))
 
 
 def _reading_columns(
-    path: str | os.PathLike,
-    table: TextTable,
-    joints: int,
-    alone: bool,
-    wanted: Sequence[Column] | None = None,
-) -> tuple[int, ...]:
+    path: str | os.PathLike, table: TextTable, joints: int, alone: bool, wanted: Sequence[Column] | None = None
+) -> list[int]:
     """Columns of joint readings, counted from 0; ``alone``: there are no poses, so there must be some."""
     if wanted is not None:
-        found = tuple(table.pick(wanted))
+        found = table.pick(wanted)
         if len(found) != joints:
             raise InputError(
                 f"{path}: {len(found)} columns are picked for the readings of {joints} joints; pick one for each."
             )
         return found
-    numbers = {pattern: table.pick([pattern]) for pattern in _READINGS if table.has([pattern])}
-    for columns in numbers.values():
-        if len(columns) == joints:
-            return tuple(columns)
-    if not alone:
-        return ()
-    if table.width == joints and _position(table) is None:
-        return tuple(range(joints))
-    raise InputError(
-        f"{path} has no columns q_1 to q_{joints} of joint readings, and no positions with orientations (x, y, z with "
-        "qw, qx, qy, qz or rx, ry, rz); name its columns so, or pick those of the readings (--columns)."
-    )
+    position = position_columns(table)
+    taken = position[0] if position is not None else []
+    return reading_columns(table, joints, taken, _OPTION) if alone else columns_of_joints(table, joints, taken)[0]
 
 
 def _poses(
@@ -236,20 +205,20 @@ def _poses(
 ) -> Float[np.ndarray, "N 4 4"]:
     """Positions, mm, and orientations; ``angle`` and ``length``: units of a rotation vector and of positions that the
     header does not state."""
-    position, orientation = _position(table), _orientation(table)
+    position, orientation = position_columns(table), _orientation(table)
     if position is None or orientation is None:
         raise InputError(f"{path} has orientations, but no positions in columns x, y and z; add them.")
     if length is not None and position[1] not in (None, length):
         raise InputError(f"{path} states positions in {position[1]}; leave out --length-unit.")
-    unit, (names, rotation_unit) = position[1] or length or "mm", orientation
+    unit, (columns, rotation_unit) = position[1] or length or "mm", orientation
     if unit not in LENGTH_UNITS or rotation_unit not in (None, *_ANGLES):
         raise InputError(
             f"{path} states positions in {unit}; give one of {', '.join(LENGTH_UNITS)}, and angles in deg or rad."
         )
-    numbers = table.numbers(names)
+    numbers = table.numbers(columns)
     poses = np.tile(np.eye(4), (len(numbers), 1, 1))
     poses[:, :3, 3] = LENGTH_UNITS[unit] * table.numbers(position[0])
-    if len(names) == len(_QUATERNION):
+    if len(columns) == len(_QUATERNION):
         poses[:, :3, :3] = _rotations(path, numbers)
     else:
         vectors = (angle if rotation_unit is None else _ANGLES[rotation_unit]) * numbers

@@ -31,14 +31,15 @@ class InputFile(os.PathLike):
 
     Args:
         path: The file; an `InputFile` is taken as it is.
+        share: Part of the limit of `largest_file` that its size may be.
 
     Raises:
         InputError: The file is missing, cannot be read, is no ordinary file, or is larger than the limit.
     """
 
-    def __init__(self, path: str | os.PathLike):
+    def __init__(self, path: str | os.PathLike, share: float = 1.0):
         self._path = as_path(path)
-        with open_input(path) as stream:
+        with open_input(path, share) as stream:
             self.content: bytes = stream.read()
 
     def __fspath__(self) -> str:
@@ -55,7 +56,7 @@ class InputFile(os.PathLike):
 
 
 @contextlib.contextmanager
-def open_input(path: str | os.PathLike, times: int = 1) -> Iterator[Any]:
+def open_input(path: str | os.PathLike, times: float = 1) -> Iterator[Any]:
     """Open an ordinary file for reading, of at most ``times`` the limit of `largest_file`; bytes, never more than that.
 
     Pipes and devices are not opened: reading them may have no end. Raises `InputError`.

@@ -2,9 +2,9 @@
 
 import datetime
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import (
@@ -14,7 +14,6 @@ from pydantic import (
     FiniteFloat,
     NonNegativeFloat,
     PositiveFloat,
-    PositiveInt,
     create_model,
     model_validator,
 )
@@ -29,45 +28,16 @@ from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
 from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
 from .arms import arm_beside, read_arm, usual_noise, with_parameters
 from .inputs import InputFile, fingerprint
-from .manifest_angles import Angles, angles_of, in_rad
-from .manifest_observations import FIELDS, TABLES, Source, observations
-from .manifest_sessions import in_sessions, session_name
+from .manifest_angles import Angles, Readings
+from .manifest_observations import Source, name_of, observations, parts
+from .manifest_sessions import in_sessions
+from .manifest_tables import FIELDS, TABLES, Picked, SocketTable, Table
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
-from .temperatures import numbers_and_temperature, with_or_without_temperature, with_temperature
+from .text_lines import TABLE_SHARE
 from .toml import Strict, each_once, read_toml
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-
-
-class _Files(Strict):
-    """What is recorded in one file, or in several."""
-
-    file: str | None = None
-    files: Annotated[list[str], Field(min_length=1), AfterValidator(each_once)] | None = None
-    temperature_C: FiniteFloat | None = None  # of the arm, where the files have no such column
-
-    @property
-    def paths(self) -> list[str]:
-        return [self.file] if self.file is not None else list(self.files or ())
-
-
-class _Socket(_Files):
-    name: str | None = None
-    target: str = ""  # another tip than the arm's own probe
-    session: str | None = None
-    visits: Literal["files"] | None = None  # each file is one visit to the socket
-    exclude: list[str] = Field(default_factory=list)
-
-    @model_validator(mode="after")
-    def _one(self) -> "_Socket":
-        if (self.file is None) == (self.files is None):
-            raise ValueError("a socket needs either file or files.")
-        if self.files is not None and self.name is None:
-            raise ValueError("a socket of several files needs a name.")
-        if self.visits is not None and self.target:
-            raise ValueError("visits are of the arm's own probe; leave out visits of a socket with a target.")
-        return self
 
 
 class _Length(Strict):
@@ -91,7 +61,7 @@ class _Length(Strict):
         )
 
 
-class _Sphere(_Files):
+class _Sphere(Table):
     name: str
     test: SphereTest
     diameter: PositiveFloat
@@ -100,16 +70,10 @@ class _Sphere(_Files):
     form: NonNegativeFloat = 0.0
     u_form: NonNegativeFloat = 0.0
 
-    @model_validator(mode="after")
-    def _one(self) -> "_Sphere":
-        if (self.file is None) == (self.files is None):
-            raise ValueError("a sphere needs either file or files (one for each repeat, or orientation).")
-        return self
-
 
 class _Points(Strict):
-    unit: Literal["mm", "m", "um", "inch"]
-    columns: Annotated[list[PositiveInt], Field(min_length=3, max_length=3), AfterValidator(each_once)] | None = None
+    unit: Literal["mm", "m", "um", "inch"] | None = None  # by default that of the header
+    columns: Picked | None = None  # of x, y and z
     reach: PositiveFloat | None = None  # mm
     measuring_range: PositiveFloat | None = None  # diameter of the measuring volume as the maker states it, mm
     shoulder: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None  # mm
@@ -131,7 +95,7 @@ class _Recorded(Strict):
     """What manifests of poses and of points have in common."""
 
     date: Annotated[datetime.date, Field(strict=False), BeforeValidator(_day)] | None = None  # when it was recorded
-    socket: list[_Socket] = Field(default_factory=list)
+    socket: list[SocketTable] = Field(default_factory=list)
     length: list[_Length] = Field(default_factory=list)
     sphere: list[_Sphere] = Field(default_factory=list)
 
@@ -197,11 +161,14 @@ def read_manifest(path: str | os.PathLike) -> Recording:
 
     ``[[points]]``, ``[[transforms]]``, ``[[touched_sphere]]``, ``[[touched_cylinder]]``, ``[[plane]]``,
     ``[[parallel_planes]]``, ``[[artefact]]`` and ``[[distances]]`` are observations of these kinds. Their ``file``
-    holds readings and measured values (or ``readings`` is a file of readings with as many rows); ``columns`` picks them
-    by header name, shell pattern or number: ``columns = { q = "q*_rad", points = ["x", "y", "z"] }``. ``units``,
-    ``rotation``, ``coverage_factor``, ``delimiter``, ``decimal`` and ``skip`` say how they are written, ``group`` names
-    a column that divides the table into several observations, and ``preset`` (csv, leica, xyzijk, ipa) fills in what is
-    not stated.
+    holds readings and measured values (or ``readings`` is a file of readings with as many rows).
+
+    In all tables ``columns`` picks by header name, shell pattern or number, ``columns = { q = "q*_rad", points =
+    ["x", "y", "z"] }``, or those of the readings alone, ``columns = ["J1", "J2", "J3"]``. Where nothing is stated, they
+    are those with names of joints in the header, or all. ``units``, ``rotation``, ``coverage_factor``, ``delimiter``,
+    ``decimal`` and ``skip`` say how they are written, ``group`` names a column that divides the table into several
+    sockets or observations, and ``preset`` (csv, leica, xyzijk, ipa) fills in what is not stated. Units in the header
+    must agree with those stated.
 
     ``session = "monday"`` in such tables, with fields in braces if needed, or ``columns = { session = "day" }`` for
     each row, makes sessions of one arm (`data.capture.join_sessions`); names are then ``monday/name``, in lengths too.
@@ -233,124 +200,128 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         >>> print(aj.files.read_manifest("capture.toml").capture.sizes)
         (40,)
     """
-    path = as_path(path)
+    return _read(as_path(path))[0]
+
+
+def columns_of_readings(path: str | os.PathLike) -> list[int]:
+    """The columns of the joint readings, from 1, in the first table that a manifest names. Raises `InputError`."""
+    return _read(as_path(path))[1]
+
+
+def _read(path: Path) -> tuple[Recording, list[int]]:
     model = read_toml(manifest := InputFile(path), _Manifest)
     try:
         arm = arm_beside(path.parent, model.arm)
         nominal, proposed = read_arm(arm, base=model.base, tip=model.tip, probe=model.probe)
-        joints, columns = nominal.arm.joints, model.angles.columns if model.angles else None
-        if columns is not None and len(columns) != joints:
-            raise InputError(
-                f"angles.columns picks {len(columns)} columns, but the arm has {joints} joints; pick one a joint."
-            )
         files = [manifest]
 
         def opened(file: Path) -> InputFile:
-            files.append(read := InputFile(file))
+            files.append(read := InputFile(file, TABLE_SHARE))
             return read
 
-        def angles(file: Path, stated: float | None) -> np.ndarray:
-            read = opened(file)
-            table, temperature = numbers_and_temperature(read, columns)
-            if table.shape[1] != joints:
-                raise InputError(
-                    f"{file} has {table.shape[1]} columns, but the arm has {joints} joints; give one column a joint, "
-                    "or pick them with columns = [...] in [angles]."
-                )
-            return with_temperature(in_rad(table, angles_of(model.angles), nominal.arm), temperature, stated, str(file))
-
-        sockets, lengths, spheres, visits = recorded(path.parent, model, angles)
-
-        def radians(readings: np.ndarray, unit: str | None, preset: str | None, header: str | None) -> np.ndarray:
-            stated = angles_of(model.angles, unit, header or preset)
-            if header is not None and stated.unit != header:
-                raise InputError(
-                    f"the header of the readings says {header}, but the manifest {stated.unit}; correct one of them."
-                )
-            return in_rad(readings, stated, nominal.arm)
-
-        source = Source(path.parent, opened, nominal.arm, columns, radians)
-        sessions = _sessions_of(path.parent, model)
-        of_targets = [(sessions.get(one.name, ""), one) for one in _sockets_of_targets(path.parent, model, sockets)]
-        observations = [*of_targets, *_observations(model, source)]
-        if not sockets and not observations:
+        readings = Readings(nominal.arm, model.angles)
+        source = Source(path.parent, opened, "q", readings)
+        recorded = read_recorded(model, source)
+        # Another tip than the arm's own probe was held in these, so that they are observations.
+        of_targets = [
+            (seated.session, Socket(name, seated.poses, target=seated.target))
+            for name, seated in recorded.sockets.items()
+            if seated.target
+        ]
+        seats = {name: seated for name, seated in recorded.sockets.items() if not seated.target}
+        sockets = {name: seated.poses for name, seated in seats.items()}
+        visits = {name: seated.visits for name, seated in seats.items() if seated.visits is not None}
+        observed = [*of_targets, *_observations(model, source)]
+        if not sockets and not observed:
             raise InputError("there is neither a [[socket]] nor another observation; add one.")
         sources = tuple(dict.fromkeys(fingerprint(file, path.parent) for file in files))
-        named = {*sessions.values(), *(session for session, _ in observations)} - {""}
-        if named:
+        sessions = {name: seated.session for name, seated in seats.items()}
+        if {*sessions.values(), *(session for session, _ in observed)} - {""}:
             remounted = (model.sessions or _Sessions()).probe == "remounted"
-            capture = in_sessions(sessions, sockets, lengths, observations, remounted, visits)
+            capture = in_sessions(sessions, sockets, recorded.lengths, observed, remounted, visits)
         elif model.sessions is not None:
             raise InputError("[sessions] is for tables with a session, but there is none; leave it out.")
         else:
-            others = [observation for _, observation in observations]
-            visits = {name: rows for name, rows in visits.items() if name in sockets}
-            capture = Capture(sockets, lengths, others, visits=visits)
-        if capture.columns == joints + 1:
+            others = [observation for _, observation in observed]
+            capture = Capture(sockets, recorded.lengths, others, visits=visits)
+        if capture.columns == nominal.arm.joints + 1:
             nominal = nominal._replace(arm=nominal.arm.replace(thermometer=True))
         check_readings(capture, nominal.arm)
-        return Recording(
+        recording = Recording(
             capture,
             nominal if proposed else with_parameters(nominal, capture),
-            spheres=spheres,
+            spheres=recorded.spheres,
             sources=sources,
             measured=str(model.date or ""),
             acceptance=(model.acceptance,) if isinstance(model.acceptance, str) else tuple(model.acceptance),
             measuring_range=model.measuring_range,
             usual=usual_noise(arm, base=model.base, tip=model.tip),
         )
+        return recording, readings.columns
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def _sockets_of_targets(folder: Path, model: _Poses, sockets: dict[str, np.ndarray]) -> Iterator[Socket]:
-    """Sockets that another tip than the arm's own probe was held in; they are taken out of ``sockets``."""
-    for entry in model.socket:
-        for name, *_ in _expand(folder, entry) if entry.target else ():
-            yield Socket(name, sockets.pop(name), target=entry.target)
-
-
-def _sessions_of(folder: Path, model: _Poses) -> dict[str, str]:
-    """The session of each socket that has one."""
-    return {
-        name: session_name(entry.session, values, "[[socket]]")
-        for entry in model.socket
-        for name, _, values in (_expand(folder, entry) if entry.session is not None else ())
-    }
-
-
 def _observations(model: _Poses, source: Source) -> Iterator[tuple[str, AbstractObservation]]:
     for kind in TABLES:
-        for entry in getattr(model, kind.table):
+        for entry in () if kind is Socket else getattr(model, kind.table):
             for values in _fields(source.folder, entry, kind.table):
                 yield from observations(source, kind, entry, values)
 
 
-def recorded(
-    folder: Path, model: _Recorded, read: Callable[[Path, float | None], np.ndarray]
-) -> tuple[dict[str, np.ndarray], list[ReferenceLength], tuple[ProbedSphere, ...], dict[str, np.ndarray]]:
-    """The sockets, lengths and spheres that a manifest names, each file read by ``read``; and the visits to sockets."""
-    read, sockets = with_or_without_temperature(read), dict[str, np.ndarray]()
-    visits: dict[str, np.ndarray] = {}
+class Seated(NamedTuple):
+    """The poses of one socket."""
+
+    session: str
+    poses: np.ndarray
+    target: str
+    visits: np.ndarray | None
+
+
+class Recorded(NamedTuple):
+    """The sockets, lengths and spheres that a manifest names."""
+
+    sockets: dict[str, Seated]
+    lengths: list[ReferenceLength]
+    spheres: tuple[ProbedSphere, ...]
+
+
+def read_recorded(model: _Recorded, source: Source) -> Recorded:
+    """Read the tables of sockets and spheres of a manifest. Raises `InputError`."""
+    sockets: dict[str, Seated] = {}
     fields: list[dict[str, str]] = []
     for entry in model.socket:
-        for name, files, values in _expand(folder, entry):
-            check_name(name)
-            if name in sockets:
-                raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
-            parts = [read(file, entry.temperature_C) for file in files]
-            sockets[name] = np.concatenate(parts)
-            if entry.visits is not None:
-                visits[name] = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        for values in _fields(source.folder, entry, "socket"):
             fields.append(values)
+            for name, seated in _seated(source, entry, values):
+                if name in sockets:
+                    raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
+                sockets[name] = seated
     spheres = []
     for entry in model.sphere:
         if any((entry.name, entry.test) == (other.name, other.test) for other in spheres):
             raise InputError(f"sphere '{entry.name}' is defined twice for one test; give its files in one [[sphere]].")
-        groups = tuple(read(folder / file, entry.temperature_C) for file in entry.paths)
+        found = list(parts(source, Socket, entry, {}, f"[[sphere]] '{entry.name}'"))
+        # A group is a repeat, or an orientation: a file, or the rows of one value in the column of groups.
+        groups = [
+            part.rows[source.quantity][part.files == file]
+            for part in found
+            for file in dict.fromkeys(part.files.tolist())
+        ]
         numbers = (entry.diameter, entry.u, entry.stylus, entry.form, entry.u_form)
-        spheres.append(checked_sphere(ProbedSphere(entry.name, entry.test, groups, *numbers)))
-    return sockets, _lengths(model.length, fields, sockets), tuple(spheres), visits
+        spheres.append(checked_sphere(ProbedSphere(entry.name, entry.test, tuple(groups), *numbers)))
+    return Recorded(sockets, _lengths(model.length, fields, sockets), tuple(spheres))
+
+
+def _seated(source: Source, entry: SocketTable, values: Mapping[str, str]) -> Iterator[tuple[str, Seated]]:
+    """The sockets of one entry: one, or one for each session and group."""
+    own = name_of(entry, values)
+    named = "" if entry.name is None and entry.group is not None else own
+    for part in parts(source, Socket, entry, values, f"[[socket]] '{own}'"):
+        name = "/".join(text for text in (part.session, named, part.group) if text)
+        check_name(name)
+        visits = None if entry.visits is None else part.files
+        yield name, Seated(part.session, part.rows[source.quantity], part.rows.get("target", ""), visits)
 
 
 def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
@@ -377,16 +348,8 @@ def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
     yield {}
 
 
-def _expand(folder: Path, entry: _Socket) -> Iterator[tuple[str, list[Path], dict[str, str]]]:
-    """Sockets of one entry: name, files and the values of its fields in braces."""
-    for values in _fields(folder, entry, "socket"):
-        name = Path(entry.paths[0]).stem if entry.name is None else fill(entry.name, values)
-        session = session_name(entry.session, values, "[[socket]]")
-        yield f"{session}/{name}" if session else name, [folder / fill(file, values) for file in entry.paths], values
-
-
 def _lengths(
-    entries: list[_Length], fields: list[dict[str, str]], sockets: Mapping[str, np.ndarray]
+    entries: list[_Length], fields: list[dict[str, str]], sockets: Mapping[str, Seated]
 ) -> list[ReferenceLength]:
     """Reference lengths; one with fields in braces gives every combination that the sockets' files have."""
     lengths = []

@@ -1,152 +1,24 @@
-"""Observations in a manifest: a table a kind, made of what the kind declares, whose columns are those of text files.
+"""Observations in a manifest, read from text tables.
 
-Nothing here depends on a kind: `AbstractObservation.entries` says what each needs.
+Sockets and spheres are read by the same reader, and so are the points of a manifest of points. Nothing here depends on
+a kind: `AbstractObservation.entries` says what each needs.
 """
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import AfterValidator, Field, FiniteFloat, NonNegativeInt, PositiveFloat, create_model
 
 from ..core.errors import InputError, nearest
-from ..core.text import shorten
-from ..core.units import ARCSEC, DEG, LENGTH_UNITS
+from ..core.text import quoted, shorten
+from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.observations.observation import AbstractObservation, Entry
-from ..data.observations.socket import Socket
-from ..kinematics.arm import Arm
 from .inputs import InputFile
 from .manifest_sessions import session_name
-from .observation_kinds import kinds
+from .manifest_tables import NUMBERS_OF_ROTATION, PRESETS, Preset, Wanted, as_list
 from .patterns import check_name, fields_of, fill
-from .temperatures import TEMPERATURE, with_temperature
 from .text_table import Column, TextTable
-from .toml import Strict, each_once
-
-_ANGLES = {"rad": 1.0, "deg": DEG, "arcsec": ARCSEC}
-_NUMBERS_OF_ROTATION = {"vector": 3, "quaternion wxyz": 4, "quaternion xyzw": 4, "matrix": 9}
-_EULER = re.compile("[xyz]{3}|[XYZ]{3}")
-
-
-class Preset(NamedTuple):
-    """Columns, units and conventions of tables that people have; a manifest may change each of them."""
-
-    columns: Mapping[str, Sequence[Sequence[Column]]]  # the first choice that a table has
-    units: Mapping[str, str] = {}  # where neither the manifest nor the table's header states one
-    rotation: str | None = None
-    coverage_factor: float = 1.0
-
-
-PRESETS = {
-    # Readings and positions as `aacmm plan` writes them, or with plainer names.
-    "csv": Preset(
-        {
-            "q": [["q_*_deg"], ["q*_deg"], ["q*_rad"], ["q_[0-9]*"]],
-            "points": [["[xyz]_mm"], ["x", "y", "z"]],
-            "u": [["u_[xyz]_mm"], ["u_x", "u_y", "u_z"]],
-        },
-        {"q": "deg"},
-    ),
-    # 6-D export of a laser tracker: U(95) of the coordinates, scalar part of the quaternion first. Names as in the
-    # exports of ZhangTeng-Hust/ASTL (T-Mac of 2022): "X  [mm]", "U(95) X  [mm]", "Q0 "; others write "U95 X".
-    "leica": Preset(
-        {
-            "points": [["X", "Y", "Z"]],
-            "u": [["U*95* X", "U*95* Y", "U*95* Z"]],
-            "rotations": [["Q0", "Q1", "Q2", "Q3"]],
-        },
-        rotation="quaternion wxyz",
-        coverage_factor=2.0,
-    ),
-    # Point lists with the direction in which a point was probed, which is not needed.
-    "xyzijk": Preset({"points": [["X", "Y", "Z"], [1, 2, 3]]}),
-    # christianlandgraf/ipa-robot-accuracy; R = Rx(rx) Ry(ry) Rz(rz) is the order that agrees with the robot's joints.
-    "ipa": Preset(
-        {"q": [["q?_rad"]], "points": [["[xyz]_mm"]], "u": [["std_[xyz]_mm"]], "rotations": [["r[xyz]_deg"]]},
-        {"q": "rad", "rotations": "deg"},
-        rotation="XYZ",
-    ),
-}
-
-
-def _rotation(text: str) -> str:
-    if text not in _NUMBERS_OF_ROTATION and not _EULER.fullmatch(text):
-        raise ValueError(
-            f"'{text}' is no convention of rotations; give {', '.join(_NUMBERS_OF_ROTATION)}, or three axes such as "
-            "XYZ (moving axes, R = Rx Ry Rz) or xyz (fixed axes, R = Rz Ry Rx)."
-        )
-    return text
-
-
-_Picked = Column | Annotated[list[Column], Field(min_length=1)]
-
-
-class _Table(Strict):
-    """What the tables of all kinds have in common."""
-
-    name: str | None = None
-    file: str | None = None
-    files: Annotated[list[str], Field(min_length=1), AfterValidator(each_once)] | dict[str, str] | None = None
-    exclude: list[str] = Field(default_factory=list)
-    readings: str | None = None  # file of the readings, in the same order
-    preset: Literal["csv", "leica", "xyzijk", "ipa"] | None = None
-    columns: dict[str, _Picked] = Field(default_factory=dict)
-    units: dict[str, str] = Field(default_factory=dict)
-    rotation: Annotated[str, AfterValidator(_rotation)] | None = None
-    coverage_factor: PositiveFloat | None = None  # of the columns of u
-    delimiter: Literal[",", ";", "\t", " "] | None = None
-    decimal: Literal[".", ","] = "."
-    skip: NonNegativeInt = 0
-    group: Column | None = None
-    session: str | None = None  # of all rows; columns.session, of each
-    temperature_C: FiniteFloat | None = None  # of the arm, where the table has no such column
-
-    @property
-    def paths(self) -> list[str]:
-        """Its files, for fields in braces."""
-        if self.file is not None:
-            return [self.file]
-        return list(self.files.values() if isinstance(self.files, dict) else self.files or ())
-
-
-def _model(kind: type[AbstractObservation]) -> type[_Table]:
-    fields: dict[str, Any] = {}
-    for entry in kind.entries:
-        stated = _stated(entry)
-        if stated is not None:
-            fields[entry.name] = (bool, False) if entry.content == "truth" else (stated | None, None)
-    return create_model(f"{kind.__name__}Table", __base__=_Table, **fields)
-
-
-def _stated(entry: Entry) -> Any:
-    """The type of an entry that is stated in the manifest itself, or None for one that is in columns only."""
-    if not entry.dimensions:
-        return {"number": FiniteFloat, "text": str, "truth": bool}[entry.content]
-    if entry.dimensions in (("pose",), ("pose", "axis")) and entry.content == "number" and not entry.required:
-        return FiniteFloat  # the same for all
-    if entry.dimensions[-1:] == ("axis",) and entry.dimensions[0] != "pose":
-        return dict[str, Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]]
-    return None
-
-
-# Sockets have a table of their own.
-TABLES = {kind: _model(kind) for kind in kinds().values() if kind is not Socket}
-FIELDS: dict[str, Any] = {
-    kind.table: (list[table], Field(default_factory=list))  # pyright: ignore[reportInvalidTypeForm]
-    for kind, table in TABLES.items()
-}
-
-
-def reading_unit_of(text: TextTable, wanted: Sequence[Column], arm: Arm) -> str | None:
-    """The unit of angles that the header of readings states, or None; it may state mm for prismatic joints."""
-    columns = text.pick(wanted)
-    slides = [columns[i - 1] + 1 for i in arm.prismatic]
-    linear = text.unit(slides) if slides else None
-    if linear not in (None, "mm"):
-        raise InputError(f"{text.path} states {linear} for readings of prismatic joints; convert them to mm.")
-    return text.unit([i + 1 for i in columns if i + 1 not in slides])
 
 
 class Source(NamedTuple):
@@ -154,38 +26,56 @@ class Source(NamedTuple):
 
     folder: Path
     open: Callable[[Path], InputFile]
-    arm: Arm
-    columns: Sequence[int] | None  # of the readings, by [angles]
-    # Readings in rad and mm, from the unit that the manifest's table states, its preset's, and that of the header.
-    radians: Callable[[np.ndarray, str | None, str | None, str | None], np.ndarray]
+    quantity: str  # what a pose is: q (readings), or points
+    rows: Callable[[TextTable, Wanted], np.ndarray]
+
+
+class Part(NamedTuple):
+    """The poses of a table of a manifest that belong to one session and group, which may be empty."""
+
+    session: str
+    group: str
+    rows: dict[str, Any]  # of entries; the poses are `Source.quantity`
+    files: np.ndarray  # of each pose, the number of its file
 
 
 def observations(
     source: Source, kind: type[AbstractObservation], table: Any, values: Mapping[str, str]
 ) -> Iterator[tuple[str, AbstractObservation]]:
-    """The observations of one table of a manifest, one for each session and group, each with its session, which may be
-    empty; ``values`` are those of its fields in braces."""
-    where = f"[[{kind.table}]]"
-    if (table.file is None) == (table.files is None):
-        raise InputError(f"a table {where} needs either file or files.")
-    first = Path(fill(table.paths[0], values))
-    name = first.stem if table.name is None else fill(table.name, values)
+    """The observations of one table of a manifest, each with its session, which may be empty; ``values`` are those of
+    its fields in braces."""
+    name = name_of(table, values)
+    for part in parts(source, kind, table, values, f"[[{kind.table}]] '{name}'"):
+        yield part.session, kind.rebuilt(f"{name}/{part.group}" if table.group is not None else name, part.rows)
+
+
+def name_of(table: Any, values: Mapping[str, str]) -> str:
+    """The name of a table: as stated, or its first file's."""
+    name = Path(fill(table.paths[0], values)).stem if table.name is None else fill(table.name, values)
     check_name(name)
-    reader = _Reader(source, kind, table, f"{where} '{name}'")
-    session = session_name(table.session, values, where)
+    return name
+
+
+def parts(
+    source: Source, kind: type[AbstractObservation], table: Any, values: Mapping[str, str], where: str
+) -> Iterator[Part]:
+    """The parts of one table of a manifest, one for each session and group; ``where`` names it in messages."""
+    reader = _Reader(source, kind, table, where)
+    session = session_name(getattr(table, "session", None), values, where)
     found = [reader.read(label, fill(file, values), session) for label, file in _files(table)]
     groups = np.concatenate([group for group, _, _ in found])
     sessions = np.concatenate([session for _, session, _ in found])
+    files = np.repeat(np.arange(len(found)), [len(group) for group, _, _ in found])
     by_pose = {key: np.concatenate([rows[key] for *_, rows in found]) for key in found[0][2]}
     stated = reader.stated(values)
     both = sorted(by_pose.keys() & stated.keys())
     if both:
-        raise InputError(f"{where} '{name}': {both[0]} is given and also in columns; give it once.")
+        raise InputError(f"{where}: {both[0]} is given and also in columns; give it once.")
     for session, group in dict.fromkeys(zip(sessions.tolist(), groups.tolist(), strict=True)):
         chosen = (groups == group) & (sessions == session)
         rows = {key: value[chosen] for key, value in by_pose.items()}
         reader.check_complete({*rows, *stated})
-        yield session, kind.rebuilt(f"{name}/{group}" if table.group is not None else name, rows | stated)
+        yield Part(session, group, rows | stated, files[chosen])
 
 
 def _files(table: Any) -> list[tuple[str, str]]:
@@ -201,76 +91,71 @@ class _Reader:
     def __init__(self, source: Source, kind: type[AbstractObservation], table: Any, where: str):
         self._source, self._kind, self._table, self._where = source, kind, table, where
         self._preset = PRESETS[table.preset] if table.preset is not None else Preset({})
-        self._entries = {entry.name: entry for entry in kind.entries}
-        if table.session is not None and "session" in table.columns:
+        # In a manifest of points, a point stands where a pose has its readings.
+        self._entries = {source.quantity if entry.name == "q" else entry.name: entry for entry in kind.entries}
+        columns = table.columns if isinstance(table.columns, dict) else {source.quantity: table.columns}
+        self._columns = {key: as_list(picked) for key, picked in columns.items()}
+        if getattr(table, "session", None) is not None and "session" in columns:
             raise InputError(f"{where}: session is given and also in columns; give it once.")
-        for key in (*table.columns, *table.units):
-            if key not in (*self._entries, *({"session"} & table.columns.keys())):
+        may_have_sessions = source.quantity == "q" and hasattr(table, "session")
+        for key in (*columns, *table.units):
+            if key not in self._entries and not (key == "session" and key in columns and may_have_sessions):
                 raise InputError(f"{where} has no '{key}'{nearest(key, self._entries)}")
         labels = [e for e in kind.entries if e.dimensions == ("pose",) and e.content == "text"]
         self._label = labels[0].name if labels else None
         if isinstance(table.files, dict) and self._label is None:
             raise InputError(f"{where} has files by name, but its poses have none; give files as a list.")
-        if table.readings is not None and len(table.paths) > 1:
+        self._own_file = getattr(table, "readings", None)
+        if self._own_file is not None and len(table.paths) > 1:
             raise InputError(f"{where} has readings in a file of their own, so it needs one file of values.")
 
     def read(self, label: str, file: str, session: str) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
         """The group and the session of each pose of a file, and what its columns hold."""
         table, source = self._table, self._source
-        text = TextTable(
-            source.open(source.folder / file), delimiter=table.delimiter, decimal=table.decimal, skip=table.skip
-        )
-        chosen = {key: [x] if isinstance(x, str | int) else x for key, x in table.columns.items()}
+        text = self._open(file, table.skip)
+        chosen = dict(self._columns)
         for key, choices in self._preset.columns.items():
             # A preset may name more than a kind needs, or than a table has.
             if key not in self._entries or key in chosen or getattr(table, key, None) is not None:
                 continue
-            there = next((wanted for wanted in choices if text.has(wanted) and self._fits(text, key, wanted)), None)
+            there = next((wanted for wanted in choices if text.has(wanted)), None)
             if there is not None:
-                chosen[key] = there
-        found: dict[str, Any] = {}
+                chosen[key] = list(there)
         if label:
             chosen.pop(self._label or "", None)
-        of_session = chosen.pop("session", None)
-        readings = self._readings(text, chosen.pop("q", None))
-        found["q"] = readings
-        for key, wanted in chosen.items():
-            found[key] = self._column(text, self._entries[key], wanted)
+        group = np.full(text.length, "") if table.group is None else text.texts(table.group)
+        if table.group is not None and "" in group:
+            raise InputError(
+                f"{self._where}: {file} row {group.tolist().index('') + 1} has an empty cell in column "
+                f"{quoted(str(table.group))}, which names its group; fill it, or leave out the row."
+            )
+        of_session, main = chosen.pop("session", None), chosen.pop(source.quantity, None)
+        others = [*chosen.values(), of_session or [], [] if table.group is None else [table.group]]
+        readings = text if self._own_file is None else self._open(self._own_file, 0)
+        wanted = Wanted(
+            main,
+            table.units.get(source.quantity),
+            self._preset.units.get(source.quantity),
+            [i for columns in others for i in text.pick(columns)] if readings is text else [],
+            table.temperature_C,
+        )
+        found = {source.quantity: (rows := source.rows(readings, wanted))}
+        for key, columns in chosen.items():
+            found[key] = self._column(text, self._entries[key], columns)
         if label and self._label is not None:
-            found[self._label] = np.full(len(readings), label)
-        sessions = np.full(len(readings), session) if of_session is None else text.texts(of_session[0])
-        for key, rows in (found | {"session": sessions}).items():
-            if len(rows) != len(readings):
+            found[self._label] = np.full(len(rows), label)
+        sessions = np.full(len(rows), session) if of_session is None else text.texts(of_session[0])
+        for key, values in (found | {"session": sessions, "group": group}).items():
+            if len(values) != len(rows):
                 raise InputError(
-                    f"{self._where}: {file} has {len(rows)} rows of '{key}', but there are {len(readings)} readings; "
+                    f"{self._where}: {file} has {len(values)} rows of '{key}', but there are {len(rows)} readings; "
                     "give a row of each for every pose."
                 )
-        group = np.full(len(readings), "") if table.group is None else text.texts(table.group)
         return group, sessions, found
 
-    def _fits(self, text: TextTable, key: str, wanted: Sequence[Column]) -> bool:
-        """Whether columns of a preset can be what is wanted: where slides are in mm, angles alone are not all."""
-        arm = self._source.arm
-        return key != "q" or not arm.prismatic or len(text.pick(wanted)) == arm.joints
-
-    def _readings(self, text: TextTable, wanted: Sequence[Column] | None) -> np.ndarray:
-        source, table = self._source, self._table
-        if table.readings is not None:
-            text = TextTable(source.open(source.folder / table.readings), delimiter=table.delimiter,
-                             decimal=table.decimal)  # fmt: skip
-        if wanted is None:
-            wanted = list(range(1, source.arm.joints + 1)) if source.columns is None else source.columns
-        numbers = text.numbers(wanted)
-        joints = source.arm.joints
-        if numbers.shape[1] != joints:
-            raise InputError(
-                f"{self._where} picks {numbers.shape[1]} columns for the readings, but the arm has {joints} "
-                "joints; give one column a joint."
-            )
-        header = reading_unit_of(text, wanted, source.arm)
-        readings = source.radians(numbers, table.units.get("q"), self._preset.units.get("q"), header)
-        temperature = text.numbers([TEMPERATURE])[:, 0] if text.has([TEMPERATURE]) else None
-        return with_temperature(readings, temperature, table.temperature_C, str(text.path))
+    def _open(self, file: str, skip: int) -> TextTable:
+        table, source = self._table, self._source
+        return TextTable(source.open(source.folder / file), delimiter=table.delimiter, decimal=table.decimal, skip=skip)
 
     def _column(self, text: TextTable, entry: Entry, wanted: Sequence[Column]) -> np.ndarray:
         if entry.dimensions[:1] != ("pose",):
@@ -279,8 +164,8 @@ class _Reader:
             if len(wanted) != 1:
                 raise InputError(f"{self._where}: {entry.name} is in one column; pick one.")
             return text.texts(wanted[0])
-        numbers = text.numbers(wanted)
-        header = text.unit(wanted)
+        picked = text.pick(wanted)
+        numbers, header = text.numbers(picked), text.unit(picked)
         if entry.unit == "1":
             return self._rotations(entry, numbers, header)
         counts = {("pose",): (1,), ("pose", "axis"): (3,), ("pose", "axis", "axis_2"): (9,)}[entry.dimensions]
@@ -301,7 +186,7 @@ class _Reader:
 
     def _unit(self, entry: Entry, header: str | None = None) -> float:
         """What a number of the table or manifest is multiplied by; ``header``: the unit that the table states."""
-        known = _ANGLES if entry.unit in ("rad", "1") else LENGTH_UNITS
+        known = ANGLE_UNITS if entry.unit in ("rad", "1") else LENGTH_UNITS
         unit = self._table.units.get(entry.name)
         if unit is not None and header is not None and unit != header:
             raise InputError(
@@ -326,9 +211,9 @@ class _Reader:
         if convention is None:
             raise InputError(
                 f"{self._where} does not say how its rotations are written; give rotation = "
-                f"{', '.join(_NUMBERS_OF_ROTATION)}, or three axes such as XYZ or xyz."
+                f"{', '.join(NUMBERS_OF_ROTATION)}, or three axes such as XYZ or xyz."
             )
-        self._check_count(entry.name, numbers.shape[1], (_NUMBERS_OF_ROTATION.get(convention, 3),))
+        self._check_count(entry.name, numbers.shape[1], (NUMBERS_OF_ROTATION.get(convention, 3),))
         if convention == "matrix":
             return numbers.reshape(-1, 3, 3)
         if convention.startswith("quaternion"):
@@ -362,11 +247,11 @@ class _Reader:
 
     def check_complete(self, given: set[str]) -> None:
         """Raise `InputError` where something that the kind needs is nowhere."""
-        for entry in self._kind.entries:
-            if entry.required and entry.name not in given:
+        for name, entry in self._entries.items():
+            if entry.required and name not in given:
                 place = (
-                    f"pick its columns with columns = {{ {entry.name} = ... }}"
+                    f"pick its columns with columns = {{ {name} = ... }}"
                     if entry.dimensions[:1] == ("pose",)
                     else "state it"
                 )
-                raise InputError(f"{self._where} has no '{entry.name}' ({entry.says}); {place}.")
+                raise InputError(f"{self._where} has no '{name}' ({entry.says}); {place}.")

@@ -7,21 +7,27 @@ import numpy as np
 
 from ..acceptance.results import Measured
 from ..core.errors import InputError, nearest
+from ..core.text import quoted
 from ..core.units import LENGTH_UNITS
 from ..kinematics.workspace import Reach
 from .inputs import InputFile, fingerprint
-from .manifest import PointsManifest, recorded
+from .manifest import PointsManifest, read_recorded
+from .manifest_observations import Source
+from .manifest_tables import Wanted, as_list
 from .outputs import as_path
-from .text_table import read_numbers
+from .table_columns import LINE, position_columns, proposed_columns
+from .text_lines import TABLE_SHARE
+from .text_table import TextTable
 from .toml import read_toml
 
 
 def read_points(path: str | os.PathLike) -> Measured:
     """Read a manifest of points and every file that it names; paths are relative to the manifest.
 
-    ``[points]`` has ``unit`` (mm, m, um, inch), optionally ``columns``, the ``measuring_range`` that the maker states
-    (a diameter, mm), and, for the zones of ASME B89.4.22, the arm's ``reach`` and ``shoulder`` (x, y, z) in mm.
-    ``[[socket]]``, ``[[length]]`` and ``[[sphere]]`` are those of `read_manifest`, with files of x, y, z.
+    ``[points]`` has ``unit`` (mm, m, um, inch; by default that of the header), optionally ``columns`` of x, y and z,
+    the ``measuring_range`` that the maker states (a diameter, mm), and, for the zones of ASME B89.4.22, the arm's
+    ``reach`` and ``shoulder`` (x, y, z) in mm. ``[[socket]]``, ``[[length]]`` and ``[[sphere]]`` are those of
+    `read_manifest`, with files of x, y, z: columns of these names, or the only three.
 
     Args:
         path: the manifest (TOML).
@@ -49,17 +55,15 @@ def read_points(path: str | os.PathLike) -> Measured:
     try:
         files = [manifest]
 
-        def points(file: Path, _: float | None) -> np.ndarray:
-            files.append(read := InputFile(file))
-            table = read_numbers(read, model.points.columns)
-            if table.shape[1] != 3:
-                raise InputError(
-                    f"{file} has {table.shape[1]} columns; give x, y and z, or pick three with columns = [...] in "
-                    "[points]."
-                )
-            return table * LENGTH_UNITS[model.points.unit]
+        def opened(file: Path) -> InputFile:
+            files.append(read := InputFile(file, TABLE_SHARE))
+            return read
 
-        sockets, lengths, spheres, _ = recorded(path.parent, model, points)
+        def points(text: TextTable, wanted: Wanted) -> np.ndarray:
+            return _points(text, wanted, model)
+
+        seated, lengths, spheres = read_recorded(model, Source(path.parent, opened, "points", points))
+        sockets = {name: one.poses for name, one in seated.items()}
         for length in lengths:
             for end in (length.start, length.end):
                 if end not in sockets:
@@ -82,3 +86,36 @@ def read_points(path: str | os.PathLike) -> Measured:
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def _points(text: TextTable, wanted: Wanted, model: PointsManifest) -> np.ndarray:
+    """The points of a table, mm."""
+    columns = wanted.columns
+    if columns is None and model.points.columns is not None:
+        columns = as_list(model.points.columns)
+    named = position_columns(text) if columns is None else None
+    if columns is not None:
+        picked = text.pick(columns)
+    elif named is not None:
+        picked = named[0]
+    else:
+        picked = [i for i in range(text.width) if i not in wanted.taken]
+        text.check_ascending(picked)
+    if len(picked) != 3:
+        line = LINE.format(", ".join(str(i + 1) for i in proposed_columns(text, 3, wanted.taken)) or "...")
+        raise InputError(
+            f"{text.path} has {text.shown()}, and it is not clear which of them are x, y and z; add {line} with these "
+            "three."
+        )
+    header = text.unit(picked) if named is None else named[1]
+    stated = wanted.unit or model.points.unit or header or wanted.usual_unit
+    if stated is None:
+        raise InputError(f'{text.path} does not say the unit of its points; add unit = "mm" to [points].')
+    if header not in (None, stated):
+        raise InputError(
+            f"{text.path}: the header of the points says {quoted(header)[1:-1]}, but the manifest {stated}; correct "
+            "one of them."
+        )
+    if stated not in LENGTH_UNITS:
+        raise InputError(f"{text.path}: points are in {quoted(stated)}; give one of {', '.join(LENGTH_UNITS)}.")
+    return text.numbers(picked, distinct=True) * LENGTH_UNITS[stated]

@@ -124,7 +124,8 @@ def _written(steps: Sequence[Any], content: Any) -> list[Any]:
     """The part of the path to an error that is in the file: other steps are pydantic's ("a number or a list")."""
     kept = []
     for step in steps:
-        inside = isinstance(content, list | tuple) if isinstance(step, int) else isinstance(content, Mapping)
+        inside = isinstance(content, list | tuple if isinstance(step, int) else Mapping)
+        inside = inside and (isinstance(step, int) or step in content)
         if inside:
             kept.append(step)
             try:

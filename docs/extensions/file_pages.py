@@ -18,7 +18,7 @@ from key_descriptions import DESCRIPTIONS
 from pydantic import BaseModel
 
 import aacmm_jax as aj
-from aacmm_jax.files import administrative_data, arms, cells, kits, manifest, manifest_observations
+from aacmm_jax.files import administrative_data, arms, cells, kits, manifest, manifest_tables
 from aacmm_jax.study import specification
 
 FOLDER = DOCS / "reference" / "files"
@@ -37,7 +37,7 @@ FORMATS: dict[str, tuple[str, str, type[BaseModel]]] = {
     ),
 }
 # Classes whose arguments say what the keys of their tables are.
-_DOCUMENTED = {f"{kind.__name__}Table": kind for kind in manifest_observations.TABLES} | {
+_DOCUMENTED = {f"{kind.__name__}Table": kind for kind in manifest_tables.TABLES} | {
     f"{kind.__name__}Table": kind for kind in kits.simulated_kinds().values()
 }
 

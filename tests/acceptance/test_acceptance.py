@@ -538,7 +538,7 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
         (("diameter = 30.98", "diameter = 0"), "diameter"),
         (('file = "sphere/touch.txt"', ""), "either file or files"),
         (('unit = "um"', 'unit = "um"\ncolumns = [1, 2, 4]'), "column 4"),
-        (('unit = "um"', 'unit = "um"\ncolumns = [1, 1, 2]'), "1 is given twice"),
+        (('unit = "um"', 'unit = "um"\ncolumns = [1, 1, 2]'), "one column is picked twice"),
         (("reach = 1000", "reech = 1000"), "did you mean 'reach'"),
         (("shoulder = [0, 0, 0]", ""), "reach and shoulder together"),
         (

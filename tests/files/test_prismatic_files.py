@@ -9,7 +9,7 @@ from aacmm_jax.files import controllers, plans
 from aacmm_jax.files.captures import load_capture, save_capture
 from aacmm_jax.files.commanded_poses import corrected_csv, read_commanded_poses
 from aacmm_jax.files.manifest import read_manifest
-from aacmm_jax.files.text_table import read_numbers
+from aacmm_jax.files.text_table import TextTable
 from aacmm_jax.kinematics.parameters import ArmSpecification, perturbed_arm
 from aacmm_jax.summaries.calibration import arm_summary, capture_summary
 
@@ -123,7 +123,7 @@ def test_commanded_readings_and_their_correction(tmp_path):
     np.testing.assert_allclose(commanded.q, rows * [np.pi / 180, np.pi / 180, 1, np.pi / 180])
     text = corrected_csv(commanded, np.asarray(commanded.q), np.array([True, True]))
     (tmp_path / "again.csv").write_text(text)
-    np.testing.assert_allclose(read_numbers(tmp_path / "again.csv"), rows, rtol=1e-12)
+    np.testing.assert_allclose(TextTable(tmp_path / "again.csv").numbers(range(rows.shape[1])), rows, rtol=1e-12)
     path.write_text("q_1_deg,q_2_deg,q_3_um,q_4_deg\n10,20,1e5,30\n")
     assert_refused(lambda: read_commanded_poses(path, SCARA), "states um for readings of prismatic joints")
 

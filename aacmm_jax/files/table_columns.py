@@ -1,0 +1,144 @@
+"""Which columns of a text table hold the readings of the joints, or positions, where nobody has stated them."""
+
+import re
+from collections.abc import Sequence
+
+from ..core.errors import InputError
+from ..core.text import quoted
+from ..core.units import LENGTH_UNITS
+from .column_names import bare_name, stem_and_number
+from .temperatures import TEMPERATURE
+from .text_table import TextTable
+
+# Words beside the number in the names of readings: q_1, joint 1, A1, axis_1, actual_q_0, /panda_joint1/position, ...
+_OF_JOINTS = re.compile("q|j|a|ax|axis|axes|achse|joints?|jnt|jpos|gelenk|theta|th|\u03b8|enc|encoder|angle|winkel|rax")
+# Words in the names of other quantities that joints have.
+_OF_OTHERS = re.compile(
+    "qd+|d+q|dtheta|vel|velocity|velocities|speed|acc|acceleration|tau|torques?|effort|moments?|force|currents?|voltage|"
+    "power|temp|temperatures?|error|err|mode|limit|min|max|std|sigma|u|control|output|contact|collision|brake|tcp|pose|"
+    "probe|direction"
+)
+# First words in the names of columns that hold no reading.
+_NO_JOINT = re.compile("[xyzt]|time|timestamp|date|stamp|index|row|point|socket|group|name|nr|no")
+_POSITIONS = (("x", "y", "z"), ("px", "py", "pz"))
+LINE = "columns = [{}]"  # what a manifest states; of commands it is an option
+
+
+def _words(stem: str) -> list[str]:
+    """The words of a name: JointPosition is two."""
+    return re.findall(r"[^\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", stem).casefold())
+
+
+def _numbered(table: TextTable) -> list[tuple[list[str], list[int]]]:
+    """Columns whose names differ in the last number only: the words of the names, and the columns from 0."""
+    found: dict[str, list[int]] = {}
+    words: dict[str, list[str]] = {}
+    for i, name in enumerate(table.header):
+        numbered = stem_and_number(name)
+        if numbered is not None:
+            found.setdefault(numbered[0].casefold(), []).append(i)
+            words.setdefault(numbered[0].casefold(), _words(numbered[0]))
+    return [(words[stem], columns) for stem, columns in found.items()]
+
+
+def _is_whole(table: TextTable, columns: Sequence[int], joints: int) -> bool:
+    """Whether the names of columns count to the number of joints, from 0 or 1."""
+    numbers = sorted(found[1] for i in columns if (found := stem_and_number(table.header[i])) is not None)
+    return numbers in (list(range(joints)), list(range(1, joints + 1)))
+
+
+def columns_of_joints(
+    table: TextTable, joints: int, taken: Sequence[int] = (), line: str = LINE
+) -> tuple[list[int], bool]:
+    """The columns, from 0, whose names are those of the joints, and whether there are any names of joints at all.
+
+    Args:
+        table: The table.
+        joints: Number of joints.
+        taken: Columns that hold something else.
+        line: What states columns, for messages.
+
+    Raises:
+        InputError: Several sets of columns have such names, or their numbers do not ascend.
+    """
+    sets = [
+        columns
+        for words, columns in _numbered(table)
+        if any(map(_OF_JOINTS.fullmatch, words))
+        and not any(map(_OF_OTHERS.fullmatch, words))
+        and not set(columns) & set(taken)
+    ]
+    whole = [columns for columns in sets if _is_whole(table, columns, joints)]
+    if len(whole) > 1:
+        choices = [f"{_line(line, columns)} ({quoted(table.header[columns[0]])}, ...)" for columns in whole]
+        raise InputError(f"{table.path} has several columns of each joint; add {' or '.join(choices[:4])}.")
+    for columns in [columns for columns in sets if len(columns) == joints and not whole]:
+        table.check_ascending(columns, line)  # one of them is there twice
+    if whole:
+        table.check_ascending(whole[0], line)
+        return whole[0], True
+    return [], bool(sets)
+
+
+def reading_columns(table: TextTable, joints: int, taken: Sequence[int] = (), line: str = LINE) -> list[int]:
+    """The columns of the joint readings, from 0: those with names of joints, or all that are not ``taken`` where these
+    are as many as the joints, and nothing in the header contradicts it.
+
+    Raises:
+        InputError: It is not clear which they are; the message has the line to add.
+    """
+    columns, any_names = columns_of_joints(table, joints, taken, line)
+    if columns:
+        return columns
+    temperature = table.pick([TEMPERATURE]) if table.has([TEMPERATURE]) else []
+    free = [i for i in range(table.width) if i not in taken and i not in temperature]
+    foreign = [
+        i for i in free if table.header and any(map(_NO_JOINT.fullmatch, _words(bare_name(table.header[i]))[:1]))
+    ]
+    if len(free) == joints and not foreign and not any_names:
+        table.check_ascending(free, line)
+        numbered = [columns for _, columns in _numbered(table) if len(columns) == joints]
+        if not numbered or _is_whole(table, numbered[0], joints):
+            return free
+    guess = [
+        columns
+        for _, columns in _numbered(table)
+        if _is_whole(table, columns, joints) and all(map(table.is_numeric, columns))
+    ]
+    proposed = guess[0] if guess else proposed_columns(table, joints, taken)
+    add = f"add {_line(line, proposed)} if these are the joints in their order"
+    if table.misnamed:
+        add = "correct the header, or the delimiter where decimal commas are taken for it"
+    elif not proposed:
+        add = f"pick one column a joint with {line.format('...')}, or name them q_1 to q_{joints}"
+    unclear = "but the arm has" if len(free) < joints else "and it is not clear which of them are those of the"
+    raise InputError(f"{table.path} has {table.shown()}, {unclear} {joints} joints; {add}.")
+
+
+def proposed_columns(table: TextTable, count: int, taken: Sequence[int] = ()) -> list[int]:
+    """So many columns of numbers, from 0, without times or indices before them; none where others may be meant."""
+    numeric = [i for i in range(table.width) if i not in taken and table.is_numeric(i)]
+    while len(numeric) > count and table.ascends(numeric[0]):
+        numeric.pop(0)
+    return numeric if len(numeric) == count and not table.misnamed else []
+
+
+def _line(line: str, columns: Sequence[int]) -> str:
+    return line.format(", ".join(str(i + 1) for i in columns))
+
+
+def find_named(
+    table: TextTable, names: Sequence[str], units: Sequence[str] = ()
+) -> tuple[list[int], str | None] | None:
+    """Columns of these names, from 0, alone or with a unit after them, and the unit that the header states."""
+    for unit in ("", *units) if table.header else ():
+        wanted = [f"{name}_{unit}" if unit else name for name in names]
+        if table.has(wanted):
+            picked = table.pick(wanted)
+            return picked, unit or table.unit(picked)
+    return None
+
+
+def position_columns(table: TextTable) -> tuple[list[int], str | None] | None:
+    """The columns of a position, and the unit that the header states."""
+    return next((found for names in _POSITIONS if (found := find_named(table, names, tuple(LENGTH_UNITS)))), None)
