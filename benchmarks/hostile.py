@@ -5,6 +5,7 @@
 
 flips   Single bits of files of every kind and of a study's blocks.
 texts   Mutated manifests, tables, arms, specifications and certificates.
+structure  One name misspelt or repeated: in URDFs, and in half as many TOML files of every kind.
 calls   Hostile arguments of Python functions and of commands.
 kills   A study killed by SIGKILL, resumed, and compared with one that was not, to the bit; threads and processes.
 writes  Files of every kind while they are written: killed, or out of space.
@@ -21,7 +22,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from attacks import calls, flips, kills, texts, users, writes
+from attacks import calls, flips, kills, structure, texts, users, writes
 from attacks.outcomes import FAILURES
 
 # With the usual number of attempts. Writes are first: they fork, which JAX does not survive once it has computed.
@@ -31,6 +32,7 @@ ATTACKS = {
     "kills": (kills.attack, 40),
     "flips": (flips.attack, 10_000),
     "texts": (texts.attack, 10_000),
+    "structure": (structure.attack, 500),
     "calls": (calls.attack, 400),
 }
 
