@@ -232,7 +232,7 @@ REFUSED = {
     "no XML": (("</robot>", ""), {}, ["not valid XML", "correct it there"]),
     "another format": (("<robot", "<model"), {}, ["not valid XML"]),
     "misspelt origin": (
-        ('<origin xyz="0.35', '<orign xyz="0.35'), {}, ["line 50: joint 'joint_4'", "element <orign>", "mean '<origin>'?"]
+        ('<origin xyz="0.35', '<orign xyz="0.35'), {}, ["line 50: joint 'joint_4'", "<orign>; did you mean '<origin>'?"]
     ),
     "Origin": (('<origin xyz="0.35', '<Origin xyz="0.35'), {}, ["<Origin>; did you mean '<origin>'?"]),
     "xzy": (('xyz="0.35', 'xzy="0.35'), {}, ["line 50: <origin> of joint 'joint_4'", "'xzy'; did you mean 'xyz'?"]),
@@ -250,7 +250,7 @@ REFUSED = {
         ('<inertial><origin xyz="0 0 0.2"/><mass value="3"/>', '<mass value="3"/><inertial>'), {}, ["'upper'", "<mass>"]
     ),
     "inside an origin": (
-        ('<origin xyz="0.08 0 0"/>', '<origin xyz="0.08 0 0"><axis xyz="0 0 1"/></origin>'), {}, ["<axis>, but holds none"]
+        ('<origin xyz="0.08 0 0"/>', '<origin xyz="0.08 0 0"><axis xyz="0 0 1"/></origin>'), {}, ["<axis>, but holds"]
     ),
     "text": (('<origin xyz="0.35 0 0.03"', 'origin xyz="0.35" <origin'), {}, ["holds the text 'origin xyz=\"0.35\"'"]),
     "quaternion": (('rpy="0 1.5708 0"', 'quat_xyzw="0 1 0 0"'), {}, ["quat_xyzw", "as rpy"]),
