@@ -98,7 +98,7 @@ def _discard_output() -> None:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    from ..core.text import printable
+    from ..core.text import in_short, printable
 
-    print(f"Error: {printable(message)}", file=sys.stderr)
+    print(f"Error: {printable(in_short(message))}", file=sys.stderr)
     sys.exit(code)

@@ -10,6 +10,8 @@ from collections.abc import Iterable, Sequence
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
 _BEGINS_FORMULA = ("=", "+", "-", "@", "\t")  # in the cell of a spreadsheet
 _LONGEST = 60  # characters of a text that a message quotes
+_LONGEST_NAME, _LONGEST_SENTENCE = 250, 1000
+_LONG_NAME = re.compile(rf"\S{{{_LONGEST_NAME + 1},}}")
 # Marks that are not seen, or change the direction of what follows, so that a text reads otherwise than it is.
 _MARKS = frozenset("\ufeff\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
@@ -44,6 +46,20 @@ def printable(text: str) -> str:
 def quoted(text: str) -> str:
     """The text in quotes as a message shows it: printable, and cut where it is long."""
     return f"'{printable(text if len(text) <= _LONGEST else text[:_LONGEST] + '...')}'"
+
+
+def in_short(sentence: str) -> str:
+    """A sentence that holds names from outside, at a length that people read; what is cut out is in the middle.
+
+    Names without blanks are cut first, so that what the sentence says of them remains.
+    """
+    sentence = _LONG_NAME.sub(lambda found: _middle_out(found[0], _LONGEST_NAME), sentence)
+    return _middle_out(sentence, _LONGEST_SENTENCE)
+
+
+def _middle_out(text: str, most: int) -> str:
+    half = (most - 3) // 2
+    return text if len(text) <= most else f"{text[:half]}...{text[-half:]}"
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:

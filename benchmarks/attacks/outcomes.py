@@ -49,7 +49,7 @@ def limited_time(seconds: float) -> Iterator[None]:
 
 def is_sentence(text: str) -> bool:
     """Whether a message is one line that ends as a sentence does, and no longer than anybody reads."""
-    return text.endswith((".", "?")) and "\n" not in text and len(text) < 2000
+    return text.endswith((".", "?")) and "\n" not in text and len(text) <= 1000
 
 
 def ending(call: Callable[[], Any], seconds: float = 20, said: list[str] | None = None) -> tuple[str | None, Any]:
