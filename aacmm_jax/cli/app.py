@@ -47,7 +47,8 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"max_content_width": 120},
     help="Calibrate articulated-arm coordinate measuring machines and other serial arms.",
-    epilog="Every command has --help, and --debug for the traceback of a failure. Start with: aacmm demo",
+    epilog="Every command has --help, --debug for the traceback of a failure, and --overwrite to replace a file that "
+    "aacmm did not write. Start with: aacmm demo",
 )
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else.")]

@@ -5,7 +5,6 @@ from collections.abc import Iterable
 
 from .text import in_short, quoted
 
-
 _COMPARED = 200  # characters of a word: comparing takes their square
 
 
