@@ -233,8 +233,8 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         >>> print(aj.files.read_manifest("capture.toml").capture.sizes)
         (40,)
     """
-    path = as_path(path)
     model = read_toml(manifest := InputFile(path), _Manifest)
+    path = as_path(path)
     try:
         arm = arm_beside(path.parent, model.arm)
         nominal, proposed = read_arm(arm, base=model.base, tip=model.tip, probe=model.probe)

@@ -52,8 +52,7 @@ def test_a_sentence_keeps_its_ends():
         ("arm.toml", '"{}" = 1'),
         ("arm.toml", 'length_unit = "{}"'),
         ("arm.urdf", '<robot><joint name="{}"/></robot>'),
-        ("arm.urdf", '<robot><link name="a"/><link name="b"/><joint name="j" type="{}"><parent link="a"/><child link="b"/>'
-         "</joint></robot>"),
+        ("arm.urdf", '<robot><joint name="j" type="{}"><parent link="a"/><child link="b"/></joint></robot>'),
         ("kinematics.yaml", "dh_a: {}"),
     ],
 )  # fmt: skip
