@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
 _BEGINS_FORMULA = ("=", "+", "-", "@", "\t")  # in the cell of a spreadsheet
 _LONGEST = 60  # characters of a text that a message quotes
-_LONGEST_NAME, _LONGEST_SENTENCE = 250, 1000
+_LONGEST_NAME, _LONGEST_SENTENCE = 400, 1000
 _LONG_NAME = re.compile(rf"\S{{{_LONGEST_NAME + 1},}}")
 # Marks that are not seen, or change the direction of what follows, so that a text reads otherwise than it is.
 _MARKS = frozenset("\ufeff\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
