@@ -6,6 +6,7 @@
 flips   Single bits of files of every kind and of a study's blocks.
 texts   Mutated manifests, tables, arms, specifications and certificates.
 headers Tables whose header contradicts the manifest in unit or order, or is misspelt.
+structure  One name misspelt or repeated: in URDFs, and in half as many TOML files of every kind.
 calls   Hostile arguments of Python functions and of commands.
 kills   A study killed by SIGKILL, resumed, and compared with one that was not, to the bit; threads and processes.
 writes  Files of every kind while they are written: killed, or out of space.
@@ -22,7 +23,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from attacks import calls, flips, headers, kills, texts, users, writes
+from attacks import calls, flips, headers, kills, structure, texts, users, writes
 from attacks.outcomes import FAILURES
 
 # With the usual number of attempts. Writes are first: they fork, which JAX does not survive once it has computed.
@@ -33,6 +34,7 @@ ATTACKS = {
     "flips": (flips.attack, 10_000),
     "texts": (texts.attack, 10_000),
     "headers": (headers.attack, 500),
+    "structure": (structure.attack, 500),
     "calls": (calls.attack, 400),
 }
 

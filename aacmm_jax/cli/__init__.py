@@ -1,5 +1,6 @@
 """The command line, ``aacmm``."""
 
+import contextlib
 import errno
 import gc
 import io
@@ -26,13 +27,12 @@ _FAMILIES = (
 
 
 def main() -> None:
-    """Run ``aacmm``. ``--debug`` shows tracebacks.
+    """Run ``aacmm``. ``--debug`` shows tracebacks, ``--overwrite`` replaces files of any kind by the outputs.
 
     Exit codes: 0 done, 1 not achieved, 2 bad input, 130 interrupted, 141 standard output closed by its reader.
     """
-    debug = "--debug" in sys.argv
-    if debug:
-        sys.argv.remove("--debug")
+    debug, overwrite = (option in sys.argv for option in ("--debug", "--overwrite"))
+    sys.argv = [word for word in sys.argv if word not in ("--debug", "--overwrite")]
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names that the terminal's encoding does not have
     # Tracing makes hundreds of thousands of objects that live until the process ends. Looking for garbage among them
@@ -44,6 +44,7 @@ def main() -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         from ..core.errors import InputError
+        from ..files.outputs import asking
         from .app import Stopped, app, check_numbers
 
         for family in _FAMILIES:
@@ -56,7 +57,8 @@ def main() -> None:
         _interrupted()
     try:
         check_numbers(sys.argv[1:])
-        app(prog_name="aacmm")
+        with contextlib.nullcontext() if overwrite else asking():
+            app(prog_name="aacmm")
     except SystemExit as done:
         if done.code == INTERRUPTED:
             _interrupted()
@@ -98,7 +100,7 @@ def _discard_output() -> None:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    from ..core.text import printable
+    from ..core.text import in_short, printable
 
-    print(f"Error: {printable(message)}", file=sys.stderr)
+    print(f"Error: {printable(in_short(message))}", file=sys.stderr)
     sys.exit(code)

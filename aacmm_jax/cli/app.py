@@ -1,18 +1,45 @@
 """What all commands share: the application, common arguments and options, checks, and how results are printed."""
 
+import contextlib
 import csv
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, get_args, get_type_hints
 
 import typer
+import typer.core
 
 from ..core.errors import InputError
-from ..core.text import is_control, is_number, number, printable, quoted
+from ..core.text import in_short, is_control, is_number, number, printable, quoted
+
+
+class _Commands(typer.core.TyperGroup):
+    """The commands; what typer says of wrong options is printable and no longer than people read."""
+
+    def make_context(self, *arguments: Any, **options: Any) -> Any:
+        with _said_in_short():
+            return super().make_context(*arguments, **options)
+
+    def invoke(self, ctx: Any) -> Any:
+        with _said_in_short():
+            return super().invoke(ctx)
+
+
+@contextlib.contextmanager
+def _said_in_short() -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        message = getattr(error, "message", "")  # of typer's exceptions; that of several lines is the help
+        if isinstance(message, str) and "\n" not in message:
+            error.message = printable(in_short(message))  # pyright: ignore[reportAttributeAccessIssue]
+        raise
+
 
 app = typer.Typer(
+    cls=_Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -20,7 +47,8 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"max_content_width": 120},
     help="Calibrate articulated-arm coordinate measuring machines and other serial arms.",
-    epilog="Every command has --help, and --debug for the traceback of a failure. Start with: aacmm demo",
+    epilog="Every command has --help, --debug for the traceback of a failure, and --overwrite to replace a file that "
+    "aacmm did not write. Start with: aacmm demo",
 )
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else.")]

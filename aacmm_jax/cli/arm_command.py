@@ -8,12 +8,9 @@ import typer
 
 from ..core.errors import InputError
 from ..core.text import number
-from ..files.inputs import InputFile
 from ..files.outputs import together
 from .app import BaseLink, Json, TipLink, app, bad_option, examples, show_summary, with_spinner
 from .plan_options import PlanEncoderNoise, PlanSeatingNoise, assumed_noise
-
-_CAPTURES = (".toml", ".h5")  # others are tables
 
 
 @app.command(
@@ -107,7 +104,9 @@ def arm(
             raise InputError("--check compares readings alone; leave out --figure, --encoder-arcsec and --seating-mm.")
         if model is not None:
             raise InputError("--check compares readings alone; leave out --model.")
-        _check(specification, check, unit, as_json)
+        from .reading_checks import check_arm
+
+        check_arm(specification, check, unit, as_json)
         return
     if unit is not None:
         raise InputError("--unit is for the table of --check; leave it out.")
@@ -161,69 +160,6 @@ def _survey(
             save_arm_figure(specification.arm, figure, title=specification.name, base=base)
             summary["written"] = str(figure)
     show_summary(summary, as_json, arm_display.survey)
-
-
-def _check(specification: Any, path: Path, unit: str | None, as_json: bool) -> None:
-    from ..files.angles import angles_toml, positions_unit, units_toml
-    from ..summaries.reading_check import reading_check_summary
-    from . import arm_display
-
-    manifest = None
-    if path.suffix.lower() in _CAPTURES:
-        if unit is not None:
-            raise InputError(f"--unit is for a table, but {path} says the unit of its readings; leave it out.")
-        manifest = path if path.suffix.lower() == ".toml" else None
-        found = _of_capture(specification, path)
-        taken, positions = None if manifest is not None else "rad", positions_unit(manifest)
-    else:
-        found, taken, positions = _of_table(specification, path, unit)
-    best = found.best
-    summary = reading_check_summary(found, specification.name, unit=taken, positions=positions)
-    angles = found.explained and (best.hypothesis.changes or best.angle != 1)
-    summary["angles"] = angles_toml(best, taken, manifest) if angles else None
-    summary["units"] = units_toml(best, positions) if found.explained else None
-    show_summary(summary, as_json, arm_display.check)
-    if not found.explained:
-        raise typer.Exit(1)
-
-
-def _of_capture(specification: Any, path: Path) -> Any:
-    from ..files.captures import load_capture
-    from ..files.manifest import read_manifest
-    from ..summaries.reading_check import check_capture
-
-    read = read_manifest if path.suffix.lower() == ".toml" else load_capture
-    recording = read(InputFile(path)) if read is load_capture else read(path)
-    joints = recording.nominal.arm.joints
-    if joints != specification.arm.joints:
-        raise InputError(
-            f"{path} has readings of {joints} joints, but the arm has {specification.arm.joints}; name its arm."
-        )
-    return with_spinner("Comparing", lambda: check_capture(specification.arm, recording.capture))
-
-
-def _of_table(specification: Any, path: Path, unit: str | None) -> tuple[Any, str, str]:
-    import numpy as np
-
-    from ..files.commanded_poses import read_known_poses
-    from ..kinematics.reading_check import check_readings
-
-    joints = specification.arm.joints
-    known = read_known_poses(InputFile(path), joints, unit=unit)
-    positions, rotations = known.positions, known.rotations
-    if positions is not None and specification.urdf is not None:
-        from ..files.urdf import urdf_chain
-
-        frame = np.linalg.inv(urdf_chain(specification.urdf).base)
-        positions = positions @ frame[:3, :3].T + frame[:3, 3]
-        rotations = None if rotations is None else frame[:3, :3] @ rotations
-    found = with_spinner(
-        "Comparing",
-        lambda: check_readings(
-            specification.arm, known.q, sockets=known.sockets, positions=positions, rotations=rotations
-        ),
-    )
-    return found, known.unit, known.length_unit
 
 
 def _probe(text: str | None) -> tuple[float, float, float] | None:

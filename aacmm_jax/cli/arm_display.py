@@ -106,6 +106,10 @@ def check(summary: dict[str, Any]) -> None:
     words = alternatives_sentence(summary["alternatives"], summary["known_positions"])
     if words:
         console.print(escape(words))
+    for row in summary["standing"]:
+        console.print(f"[yellow]{escape(row['says'])}[/yellow]")
+    if summary["reading_sets_sentence"]:
+        console.print(escape(summary["reading_sets_sentence"]))
     if summary["units"] is not None:
         console.print("\nIn the manifest, in the table of the measured positions:")
         console.print(escape(summary["units"]), end="")

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -174,7 +174,9 @@ def simulate(
     show_summary(summary | {"written": str(output)}, as_json, calibration_display.capture)
 
 
-@app.command(name="import", epilog=examples("aacmm import capture.toml -o capture.h5"))
+@app.command(
+    name="import", epilog=examples("aacmm import capture.toml -o capture.h5", "aacmm import capture.toml --check")
+)
 def import_(
     manifest: Annotated[
         Path,
@@ -183,10 +185,22 @@ def import_(
             help="Which files hold which poses and measured values, in which columns and units.",
         ),
     ],
-    output: CaptureOutput,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE.h5", help="Capture to write (HDF5).")
+    ] = None,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check",
+            help="Compare the readings with the arm: order, signs, zeros and units of the columns; joints that stand "
+            "still; commanded against measured readings where the tables have both. Exit code 1 where nothing fits.",
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Read recorded joint readings into a capture."""
+    if output is None and not check:
+        raise InputError("name the capture to write with -o FILE.h5, or look at the readings with --check.")
     from ..files.captures import save_capture
     from ..files.manifest import read_manifest
     from ..summaries.calibration import capture_summary
@@ -195,8 +209,26 @@ def import_(
     with together(output):
         recording = read_manifest(manifest)
         summary = capture_summary(recording)
-        save_capture(output, recording, summary)
-    show_summary(summary | {"written": str(output)}, as_json, calibration_display.capture)
+        if output is not None:
+            save_capture(output, recording, summary)
+    summary |= {} if output is None else {"written": str(output)}
+    if not check:
+        show_summary(summary, as_json, calibration_display.capture)
+        return
+    from .reading_checks import check_recording
+
+    found = summary["check"] = check_recording(recording.nominal, recording, manifest)
+    show_summary(summary, as_json, _checked)
+    if not found["explained"]:
+        raise typer.Exit(1)
+
+
+def _checked(summary: dict[str, Any]) -> None:
+    from . import arm_display, calibration_display
+
+    calibration_display.capture(summary)
+    typer.echo()
+    arm_display.check(summary["check"])
 
 
 def _temperature_option(text: str) -> float | list[float]:

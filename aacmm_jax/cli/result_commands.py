@@ -12,7 +12,7 @@ from ..core.text import printable
 from ..files.atomic_write import write_text
 from ..files.hdf5 import read_summary
 from ..files.inputs import InputFile
-from ..files.outputs import together
+from ..files.outputs import check_kept, together
 from ..files.sense import check_shown
 from .app import (
     BaseLink,
@@ -264,6 +264,8 @@ def export(
         else:
             text, notes = exported(record, specification, written_as, source, convention, units)
         if output is not None:
+            if written_as == "urdf" and (original := record.recording.nominal.urdf) and text != original.text:
+                check_kept(output, original.text)
             write_text(output, text)
     typer.echo(text, nl=False) if output is None else typer.echo(f"Written: {output}")
     for note in notes:

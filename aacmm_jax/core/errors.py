@@ -3,6 +3,10 @@
 import difflib
 from collections.abc import Iterable
 
+from .text import in_short, quoted
+
+_COMPARED = 200  # characters of a word: comparing takes their square
+
 
 class InputError(ValueError):
     """Something given to the toolkit is wrong: the message says what, where, and what to do.
@@ -16,6 +20,9 @@ class InputError(ValueError):
         ...     print(error)
         'pandda' is neither a file nor an arm that ships with the package; did you mean 'panda'?
     """
+
+    def __init__(self, sentence: str = ""):
+        super().__init__(in_short(sentence))
 
 
 class IdentifiabilityWarning(UserWarning):
@@ -39,8 +46,8 @@ class IdentifiabilityWarning(UserWarning):
 def nearest(word: str, known: Iterable[str], most: int = 12) -> str:
     """A hint ``; did you mean 'x'?`` for a misspelt word, or ``most`` of what is known when nothing is near."""
     known = list(known)
-    matches = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    matches = difflib.get_close_matches(word[:_COMPARED], known, n=1, cutoff=0.5)
     if matches:
-        return f"; did you mean '{matches[0]}'?"
-    shown = ", ".join(known[:most]) + (", ..." if len(known) > most else "")
+        return f"; did you mean {quoted(matches[0])}?"
+    shown = ", ".join(quoted(name)[1:-1] for name in known[:most]) + (", ..." if len(known) > most else "")
     return f"; known are {shown}." if known else "."

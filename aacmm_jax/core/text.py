@@ -1,12 +1,17 @@
 """Text from outside: what is a number, and what may be printed; and lists and numbers in sentences."""
 
+import csv
+import io
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 # What Python's ``float`` takes besides is no number to people: 1_0, digits of other scripts, blanks around it.
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
+_BEGINS_FORMULA = ("=", "+", "-", "@", "\t")  # in the cell of a spreadsheet
 _LONGEST = 60  # characters of a text that a message quotes
+_LONGEST_NAME, _LONGEST_SENTENCE = 400, 1000
+_LONG_NAME = re.compile(rf"\S{{{_LONGEST_NAME + 1},}}")
 # Marks that are not seen, or change the direction of what follows, so that a text reads otherwise than it is.
 _MARKS = frozenset("\ufeff\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
@@ -41,6 +46,38 @@ def printable(text: str) -> str:
 def quoted(text: str) -> str:
     """The text in quotes as a message shows it: printable, and cut where it is long."""
     return f"'{printable(text if len(text) <= _LONGEST else text[:_LONGEST] + '...')}'"
+
+
+def in_short(sentence: str) -> str:
+    """A sentence that holds names from outside, at a length that people read; what is cut out is in the middle.
+
+    Names without blanks are cut first, so that what the sentence says of them remains.
+    """
+    sentence = _LONG_NAME.sub(lambda found: _middle_out(found[0], _LONGEST_NAME), sentence)
+    return _middle_out(sentence, _LONGEST_SENTENCE)
+
+
+def _middle_out(text: str, most: int) -> str:
+    half = (most - 3) // 2
+    return text if len(text) <= most else f"{text[:half]}...{text[-half:]}"
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """Rows as CSV; a text that a spreadsheet would calculate (``=1+1.h5``) has an apostrophe before it.
+
+    Spreadsheets take ``= + - @`` and a tab as the beginning of a formula, whoever chose the name of the file or socket
+    in that cell. `TextTable` reads such a cell without the apostrophe.
+    """
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows([_not_calculated(cell) for cell in row] for row in rows)
+    return stream.getvalue()
+
+
+def _not_calculated(cell: object) -> object:
+    if not isinstance(cell, str):
+        return cell
+    cell = printable(cell)  # a carriage return would end the row
+    return f"'{cell}" if cell.startswith(_BEGINS_FORMULA) and not is_number(cell) else cell
 
 
 def shorten(items: Sequence[str], most: int = 5) -> str:

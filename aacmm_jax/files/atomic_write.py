@@ -16,8 +16,8 @@ def write_atomically(path: str | os.PathLike, advice: str = ELSEWHERE, *, leftov
     Inside `together`, the end is that of all outputs. A symbolic link is followed: the file that it points to is
     written. A file that is replaced leaves its permissions to the new one. Whatever goes wrong (Ctrl-C included), the
     temporary file is removed and an existing target stays as it was; ``leftovers``: those of killed processes are
-    removed as well. Raises `InputError` where the path cannot be written, or is a folder, a device, a pipe or
-    read-only.
+    removed as well. Raises `InputError` where the path cannot be written, is a folder, a device, a pipe or read-only,
+    or, in a command, where it is a file that aacmm did not write (`asking`).
     """
     file = OutputFile(path, advice)
     waits = False
@@ -29,6 +29,7 @@ def write_atomically(path: str | os.PathLike, advice: str = ELSEWHERE, *, leftov
             file.create()
             yield file.temporary
             file.finish()
+            file.check_replaced()
             waits = hand_over(file)
             if not waits:
                 put_in_place([file])

@@ -1,7 +1,5 @@
 """Tables of poses, as joint readings or as positions with orientations: commanded, with their corrections, or known."""
 
-import csv
-import io
 import os
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from ..core.errors import InputError
 from ..core.rotations import rotation_matrix
+from ..core.text import csv_text
 from ..core.units import DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
 from .manifest_angles import header_units
@@ -172,11 +171,7 @@ def corrected_csv(commanded: CommandedPoses, q: Float[np.ndarray, "N n"], reache
             columns.append((header[i] if header else f"column_{i + 1}", list(table.texts(i + 1))))
     if not commanded.columns:
         columns += zip(names, cells, strict=True)
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([name for name, _ in columns])
-    writer.writerows(zip(*(column for _, column in columns), strict=True))
-    return stream.getvalue()
+    return csv_text([[name for name, _ in columns], *zip(*(column for _, column in columns), strict=True)])
 
 
 def _orientation(table: TextTable) -> tuple[list[int], str | None] | None:

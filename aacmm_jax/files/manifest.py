@@ -200,16 +200,17 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         >>> print(aj.files.read_manifest("capture.toml").capture.sizes)
         (40,)
     """
-    return _read(as_path(path))[0]
+    return _read(path)[0]
 
 
 def columns_of_readings(path: str | os.PathLike) -> list[int]:
     """The columns of the joint readings, from 1, in the first table that a manifest names. Raises `InputError`."""
-    return _read(as_path(path))[1]
+    return _read(path)[1]
 
 
-def _read(path: Path) -> tuple[Recording, list[int]]:
+def _read(path: str | os.PathLike) -> tuple[Recording, list[int]]:
     model = read_toml(manifest := InputFile(path), _Manifest)
+    path = as_path(path)
     try:
         arm = arm_beside(path.parent, model.arm)
         nominal, proposed = read_arm(arm, base=model.base, tip=model.tip, probe=model.probe)

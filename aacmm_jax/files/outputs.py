@@ -1,5 +1,7 @@
 """The files that a command writes: none of them is a file that it reads, and all of them appear together or not at all.
 
+A command replaces a file only where aacmm wrote it, as it says itself or as its beginning shows (`asking`).
+
 Whatever is written goes to a temporary file in the same folder, which is locked while its writer lives and is renamed
 at the end. So a temporary file that nobody has locked was left by a process that was killed, and is removed.
 """
@@ -96,6 +98,14 @@ class OutputFile:
                     os.chown(self.temporary, replaced.st_uid, replaced.st_gid)
             os.chmod(self.temporary, stat.S_IMODE(replaced.st_mode))
 
+    def check_replaced(self) -> None:
+        """Raise `InputError` where the complete file would replace one that somebody else wrote; of commands only."""
+        if _asking.get() and self.target.exists() and not _is_own(self.target, self.temporary):
+            raise InputError(
+                f"{self.named} exists and is no earlier output of this kind; choose another name, or replace it with "
+                "--overwrite."
+            )
+
     def discard(self) -> None:
         """Remove the temporary files that are left."""
         self._unlock()
@@ -174,6 +184,57 @@ def _remove_unlocked(path: str) -> None:
         os.unlink(path)
     finally:
         os.close(descriptor)
+
+
+_asking: ContextVar[bool] = ContextVar("asking", default=False)
+_MARKS = (b"aacmm", b"atplotlib")  # near the beginning or end of most files that are written here
+_ENDS = 2**14  # bytes
+_FIRST_ELEMENT = re.compile(rb"<[A-Za-z][^>]*>")
+
+
+@contextlib.contextmanager
+def asking() -> Iterator[None]:
+    """What is written in this block replaces no file that aacmm did not write; `InputError` asks for --overwrite."""
+    token = _asking.set(True)
+    try:
+        yield
+    finally:
+        _asking.reset(token)
+
+
+def check_kept(path: str | os.PathLike, original: str) -> None:
+    """Raise `InputError`, in a command, where the file that would be replaced is this text, which the user wrote."""
+    if _asking.get() and os.path.isfile(path) and Path(path).read_bytes() == original.encode():
+        raise InputError(
+            f"{path} is the original that the arm was read from; choose another name, or replace it with --overwrite."
+        )
+
+
+def _is_own(old: Path, new: Path) -> bool:
+    """Whether a file is of the kind of the new one, as far as their beginnings and ends say; or is empty.
+
+    Where the new file says who wrote it, the old one must, too. Tables, TOML, JSON and URDF have no place for that:
+    they must have the same first line, or first element, which has the names of columns, of the arm or of the robot.
+    """
+    if not os.path.getsize(old):
+        return True
+    (first, last), (first_new, last_new) = _ends(old), _ends(new)
+    marks = [mark for mark in _MARKS if mark in first_new + last_new]
+    if marks:
+        return first[:4] == first_new[:4] and any(mark in first + last for mark in marks)
+    return _beginning(first) == _beginning(first_new)
+
+
+def _ends(path: Path) -> tuple[bytes, bytes]:
+    with open(path, "rb") as stream:
+        first = stream.read(_ENDS)
+        stream.seek(max(os.path.getsize(path) - _ENDS, 0))
+        return first, stream.read()
+
+
+def _beginning(text: bytes) -> bytes:
+    element = _FIRST_ELEMENT.search(text) if text.lstrip(b"\xef\xbb\xbf").startswith(b"<") else None
+    return element[0] if element else b"".join(text.split(b"\n", 2)[: 2 if text.startswith(b"{") else 1])
 
 
 class _Outputs:

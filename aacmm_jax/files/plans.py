@@ -1,17 +1,16 @@
 """Plans as files: the poses of a calibration or of an acceptance test as CSV, and the manifest for the readings."""
 
-import csv
-import io
 import json
 import os
 from collections.abc import Iterable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from ..acceptance.procedure import TOUCHED, Procedure
 from ..acceptance.procedure_items import ProcedureItem
 from ..acceptance.standards import PLANNED
+from ..core.text import csv_text
 from ..core.units import DEG
 from ..data.observations.observation import AbstractObservation, Entry
 from ..data.observations.socket import Socket
@@ -218,12 +217,10 @@ def _poses_csv(
 
     With approach configurations, a row for them before and after each pose; not where they are not finite.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     readings = [f"q_{i}_{unit}" for i, unit in enumerate(by_joint(arm, angles, "mm"), start=1)]
     direction = [f"probe_direction_{axis}" for axis in "xyz"]
     moves = [] if approach is None else ["move"]
-    writer.writerow(["pose", *moves, *headings, "x_mm", "y_mm", "z_mm", *readings, *direction])
+    rows: list[list[Any]] = [["pose", *moves, *headings, "x_mm", "y_mm", "z_mm", *readings, *direction]]
     unit, digits = (DEG, 3) if angles == "deg" else (1.0, 6)
     units = np.array(by_joint(arm, unit, 1.0))
 
@@ -240,11 +237,11 @@ def _poses_csv(
     for number, label in enumerate(labels):
         pose = [number + 1, *(["pose"] if moves else []), *label, *found[number]]
         if around is None or approach is None or not np.all(np.isfinite(approach[number])):
-            writer.writerow(pose)
+            rows.append(pose)
             continue
         before, after = ([number + 1, move, *label, *around[number]] for move in ("approach", "retract"))
-        writer.writerows([before, pose, after])
-    return text.getvalue()
+        rows += [before, pose, after]
+    return csv_text(rows)
 
 
 def file_of(procedure: Procedure, item: ProcedureItem) -> str:

@@ -141,7 +141,8 @@ def _explain(error: Any, model: Any, content: Any) -> str:
     steps = error["loc"] if kind == "missing" else _written(error["loc"], content)
     place = ""
     for step in steps:
-        place += f" {step + 1}" if isinstance(step, int) else (f".{step}" if place else str(step))
+        named = quoted(str(step))[1:-1]  # in short
+        place += f" {step + 1}" if isinstance(step, int) else f".{named}" if place else named
     if kind == "extra_forbidden":
         return f"unknown key '{place}'{nearest(str(steps[-1]), _known_keys(model, steps[:-1]))}"
     if kind == "missing":

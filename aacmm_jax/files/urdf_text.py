@@ -8,8 +8,7 @@ files, or grow to any size.
 import re
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any, NamedTuple
-from xml.parsers import expat
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,19 +17,11 @@ from ..core.errors import InputError
 from ..core.rotations import roll_pitch_yaw_matrix
 from ..core.text import is_control, number, quoted
 from ..kinematics.axes_to_dh import Transform
+from .urdf_elements import Element, Place, elements
 
-_MOST_CHARACTERS = 20_000_000  # the largest robots of public collections have a twentieth of it
-_DEEPEST = 64  # levels of elements; a URDF has six
 _LARGEST = 1e6  # m and rad, of positions, angles and directions
 _LARGEST_ANGLE = 6.3  # rad, of roll, pitch and yaw: one revolution
 _METRE = 1000.0  # mm
-
-
-class Place(NamedTuple):
-    """Where a start tag is in the text, as bytes of its UTF-8."""
-
-    start: int
-    end: int
 
 
 class UrdfJoint(NamedTuple):
@@ -73,17 +64,6 @@ class Robot(NamedTuple):
     end: int  # where </robot> begins, as bytes of the text in UTF-8
 
 
-class _Element(NamedTuple):
-    name: str
-    attributes: dict[str, str]
-    line: int
-    place: Place
-    children: list["_Element"]
-
-    def child(self, name: str) -> "_Element | None":
-        return next((child for child in self.children if child.name == name), None)
-
-
 @lru_cache(maxsize=4)  # for the chain, the masses and the export, which each take the text
 def parse_urdf(text: str) -> Robot:
     """The joints and links of a URDF.
@@ -92,11 +72,9 @@ def parse_urdf(text: str) -> Robot:
         text: The whole file.
 
     Raises:
-        InputError: It is no XML or no URDF, a value is no number, or a name is missing or there twice.
+        InputError: It is no XML or no URDF, a value is no number, or a name is unknown, missing or there twice.
     """
-    root, end = _parsed(text)
-    if root.name != "robot":
-        raise InputError(f"its root element is <{root.name[:40]}>, but that of a URDF is <robot>; name a URDF file.")
+    root, end = elements(text)
     joints, links = {}, {}
     for element in root.children:
         if element.name in ("joint", "link"):
@@ -123,7 +101,7 @@ def collision_shapes(text: str) -> dict[str, tuple[UrdfShape, ...]]:
     Raises:
         InputError: A shape has no size, or a number is none.
     """
-    root, _ = _parsed(text)
+    root, _ = elements(text)
     found: dict[str, tuple[UrdfShape, ...]] = {}
     for link in root.children:
         if link.name == "link":
@@ -135,7 +113,7 @@ def collision_shapes(text: str) -> dict[str, tuple[UrdfShape, ...]]:
     return found
 
 
-def _shape(collision: _Element, what: str) -> UrdfShape | None:
+def _shape(collision: Element, what: str) -> UrdfShape | None:
     geometry = collision.child("geometry")
     if geometry is None or not geometry.children:
         return None
@@ -200,62 +178,7 @@ def _with_attributes(tag: str, values: Mapping[str, str]) -> str:
     return tag
 
 
-def _parsed(text: str) -> tuple[_Element, int]:
-    """The root element with its direct children and theirs, and where its end tag begins."""
-    if len(text) > _MOST_CHARACTERS:
-        raise InputError(f"it has {len(text):,} characters, and {_MOST_CHARACTERS:,} are the most; name a URDF file.")
-    content = text.encode()
-    parser = expat.ParserCreate("utf-8")
-    stack: list[_Element] = []
-    found: dict[str, Any] = {}
-
-    def start(name: str, attributes: dict[str, str]) -> None:
-        line = parser.CurrentLineNumber
-        if name.startswith("xacro:"):
-            raise InputError(
-                f"line {line} has <{quoted(name)[1:-1]}>, so it is a xacro file; expand it with "
-                "'xacro FILE.xacro > FILE.urdf' and name that."
-            )
-        if len(stack) > _DEEPEST:
-            raise InputError(f"line {line} nests elements too deeply; no URDF has more than {_DEEPEST} levels.")
-        begin = parser.CurrentByteIndex
-        element = _Element(name, attributes, line, Place(begin, _end_of_tag(content, begin)), [])
-        if stack:
-            stack[-1].children.append(element)
-        else:
-            found["root"] = element
-        stack.append(element)
-
-    def end(_: str) -> None:
-        stack.pop()
-        found["end"] = parser.CurrentByteIndex
-
-    def refuse(name: str, *_: object) -> None:
-        raise InputError(f"it has a document type, {quoted(name)}, as no URDF needs; leave it out.")
-
-    parser.StartElementHandler, parser.EndElementHandler, parser.StartDoctypeDeclHandler = start, end, refuse
-    try:
-        parser.Parse(content, True)
-    except expat.ExpatError as error:
-        raise InputError(f"it is not valid XML: {error}; correct it there.") from error
-    return found["root"], found["end"]
-
-
-def _end_of_tag(content: bytes, start: int) -> int:
-    """Where a start tag ends; a ``>`` in a value does not end it."""
-    quote = 0
-    for position in range(start, len(content)):
-        character = content[position]
-        if quote:
-            quote = 0 if character == quote else quote
-        elif character in b"\"'":
-            quote = character
-        elif character == ord(">"):
-            return position + 1
-    return len(content)  # of text that is no XML, which the parser refuses
-
-
-def _joint(element: _Element, name: str) -> UrdfJoint:
+def _joint(element: Element, name: str) -> UrdfJoint:
     what = f"joint {quoted(name)}"
     ends = []
     for end in ("parent", "child"):
@@ -265,7 +188,10 @@ def _joint(element: _Element, name: str) -> UrdfJoint:
         ends.append(_attribute(child, "link", f"the <{end}> of {what}"))
     kind = _attribute(element, "type", what)
     origin, axis, limit, mimic = (element.child(part) for part in ("origin", "axis", "limit", "mimic"))
-    direction = np.array([1.0, 0.0, 0.0]) if axis is None else _numbers(axis, "xyz", what, (1.0, 0.0, 0.0))
+    direction = np.array([1.0, 0.0, 0.0])  # which the format's specification says
+    if axis is not None:
+        _attribute(axis, "xyz", f"<axis> of {what}")
+        direction = _numbers(axis, "xyz", what, (0.0, 0.0, 0.0))
     size = float(np.linalg.norm(direction))
     unit = _METRE if kind == "prismatic" else 1.0
     limits = None
@@ -286,19 +212,20 @@ def _joint(element: _Element, name: str) -> UrdfJoint:
     )
 
 
-def _link(element: _Element, name: str) -> UrdfLink:
+def _link(element: Element, name: str) -> UrdfLink:
     inertial = element.child("inertial")
     mass = None if inertial is None else inertial.child("mass")
     if inertial is None or mass is None:
         return UrdfLink(name, None, None)
     what = f"link {quoted(name)}"
+    _attribute(mass, "value", f"<mass> of {what}")
     value = _numbers(mass, "value", what, (0.0,))[0]
     if value < 0:
         raise InputError(f"line {mass.line}: the mass of {what} is {value:g} kg; it cannot be negative.")
     return UrdfLink(name, float(value), _origin(inertial.child("origin"), what)[:3, 3])
 
 
-def _origin(element: _Element | None, what: str) -> Transform:
+def _origin(element: Element | None, what: str) -> Transform:
     transform = np.eye(4)
     if element is not None:
         angles = _numbers(element, "rpy", what, (0.0, 0.0, 0.0))
@@ -312,7 +239,7 @@ def _origin(element: _Element | None, what: str) -> Transform:
     return transform
 
 
-def _numbers(element: _Element, name: str, what: str, default: tuple[float, ...]) -> Float[np.ndarray, " k"]:
+def _numbers(element: Element, name: str, what: str, default: tuple[float, ...]) -> Float[np.ndarray, " k"]:
     text = element.attributes.get(name)
     if text is None:
         return np.array(default)
@@ -333,7 +260,7 @@ def _numbers(element: _Element, name: str, what: str, default: tuple[float, ...]
     return values
 
 
-def _attribute(element: _Element, name: str, what: str) -> str:
+def _attribute(element: Element, name: str, what: str) -> str:
     value = element.attributes.get(name, "")
     if not value:
         raise InputError(f"line {element.line}: {what} has no {name}; add it.")

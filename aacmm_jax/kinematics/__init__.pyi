@@ -23,5 +23,7 @@ from .priors import Prior as Prior
 from .reading_check import ReadingCheck as ReadingCheck
 from .reading_check import check_readings as check_readings
 from .reading_fit import Explanation as Explanation
+from .standing_joints import StandingJoint as StandingJoint
+from .standing_joints import standing_joints as standing_joints
 from .workspace import arm_reach as arm_reach
 from .workspace import closest_approach as closest_approach

@@ -1,8 +1,9 @@
 """A largest set of parameters that data determine: a choice of independent columns of derivatives."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -59,10 +60,31 @@ def _determining(
     return np.concatenate([poses, *(_of_positions(arm, one, names) for one in capture.observations)]), lengths
 
 
-def _of_positions(arm: Arm, observed: ObservedPoses, names: Sequence[str]) -> Float[np.ndarray, "m 3 p"]:
+def determined_at(
+    arm: Arm,
+    capture: SocketPoses,
+    order: Sequence[str],
+    change: Callable[[Float[np.ndarray, "m n"]], Float[np.ndarray, "m n"]],
+) -> tuple[str, ...]:
+    """The first of these parameters that are independent at the poses of a capture, once ``change`` has made other
+    readings of them. Tips that do not meet in their socket then are no matter: what imitates what stays the same."""
+
+    def changed(q: Any) -> Float[np.ndarray, "m n"]:
+        return change(np.array(q)[:, : arm.joints])
+
+    rows = [_of_positions(arm, one, order, changed(one.q)).reshape(-1, len(order)) for one in capture.observations]
+    if capture.sizes:
+        poses, lengths = equations(arm, capture, order, changed(capture.q))
+        rows += [poses.reshape(-1, len(order)), lengths]
+    return _independent(arm, list(order), np.concatenate(rows))
+
+
+def _of_positions(
+    arm: Arm, observed: ObservedPoses, names: Sequence[str], q: Float[np.ndarray, "m n"] | None = None
+) -> Float[np.ndarray, "m 3 p"]:
     """Derivatives of tips that were measured in an unknown frame, less what that frame, an unknown place of a target
-    and, where nothing fixes it, the scale imitate."""
-    q = np.asarray(observed.q)
+    and, where nothing fixes it, the scale imitate; at other readings, where they are given."""
+    q = np.asarray(observed.q) if q is None else q
     tips = np.asarray(arm.position(q))
     unknown = [rigid_motions(tips)]
     if not observed.fixes_scale:

@@ -9,7 +9,7 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.model_errors import model_tests
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import PriorMetrics, active_names
-from ..core.text import pluralise
+from ..core.text import csv_text, pluralise
 from ..core.units import people_read
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import linear_encoder_mm
@@ -71,12 +71,12 @@ def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
 def parameters_csv(record: CalibrationRecord) -> str:
     """The free parameters as CSV: name, unit, nominal, calibrated, standard uncertainty."""
     vectors, u = record.vectors(), np.sqrt(np.diag(record.covariance))
-    lines = ["parameter,unit,nominal,calibrated,u"]
+    rows: list[list[Any]] = [["parameter", "unit", "nominal", "calibrated", "u"]]
     for i, name in enumerate(record.names):
         values = (vectors["nominal"][i], vectors["calibrated"][i], u[i])
         unit = parameter_unit(record.recording.nominal.arm, name)
-        lines.append(",".join([name, unit, *(repr(float(value)) for value in values)]))
-    return "\n".join(lines) + "\n"
+        rows.append([name, unit, *(float(value) for value in values)])
+    return csv_text(rows)
 
 
 def capture_summary(recording: Recording) -> dict[str, Any]:

@@ -1,11 +1,10 @@
 """Comparisons of calibrations as plain dictionaries with the unit in every key, and as CSV."""
 
-import csv
-import io
 from typing import Any
 
 import numpy as np
 
+from ..core.text import csv_text
 from ..drift.results import Drift, Trend
 from ..drift.statistics import LengthChange, ProbeTest
 
@@ -101,15 +100,13 @@ def trend_summary(trend: Trend, labels: list[str]) -> list[dict[str, Any]]:
 
 def drift_csv(trend: Trend, labels: list[str]) -> str:
     """Every parameter of every calibration but the first, compared with the first, in its unit; empty if unknown."""
-    text = io.StringIO()
     columns = ("parameter", "unit", "old", "new", "change", "u", "expanded", "moved", "without")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["old_calibration", "new_calibration", "new_created", *columns])
+    rows: list[list[Any]] = [["old_calibration", "new_calibration", "new_created", *columns]]
     for date, position, drift in zip(trend.dates[1:], trend.order[1:], trend.drifts, strict=True):
         for row in _rows(drift):
             cells = ["" if row[name] is None else row[name] for name in columns]
-            writer.writerow([labels[trend.order[0]], labels[position], date.isoformat(), *cells])
-    return text.getvalue()
+            rows.append([labels[trend.order[0]], labels[position], date.isoformat(), *cells])
+    return csv_text(rows)
 
 
 def _rows(drift: Drift) -> list[dict[str, Any]]:

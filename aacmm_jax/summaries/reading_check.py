@@ -6,12 +6,14 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
+from ..core.text import pluralise
 from ..core.units import DEG, LENGTH_UNITS, length_unit
 from ..data.capture import Capture
 from ..data.observations.measured_points import AbstractMeasured
 from ..kinematics.arm import Arm
 from ..kinematics.reading_check import ReadingCheck, check_readings
 from ..kinematics.reading_fit import Explanation
+from ..kinematics.standing_joints import lost_by_standing, standing_joints
 
 _LISTED = 5
 _MUCH = 2.0  # a place of the tip that reduces the residuals by less is not spoken of
@@ -75,6 +77,26 @@ def reading_check_summary(
         "rms_with_tip_mm": found.rms_with_tip,
         "hypotheses": found.tried,
     }
+
+
+def standing_rows(arm: Arm, capture: Capture) -> list[dict[str, Any]]:
+    """Joints that (nearly) stand still over all poses, with what they leave open, in one sentence each.
+
+    Args:
+        arm: One arm, nominal.
+        capture: Poses of it.
+    """
+    rows, found = [], standing_joints(arm, np.asarray(capture.readings))
+    open_by = lost_by_standing(arm, capture, [one.joint for one in found]) if found else []
+    for one, lost in zip(found, open_by, strict=True):
+        unit, size = ("mm", one.range) if one.joint in arm.prismatic else ("deg", one.range / DEG)
+        says = f"Joint {one.joint} stands still ({size:.2g} {unit} over {pluralise(one.poses, 'pose')})"
+        if lost:
+            says += f": {_listed(list(lost))} cannot be identified; move it, or hold them (--held)."
+        else:
+            says += ", which leaves nothing open that such poses could determine."
+        rows.append({"joint": one.joint, f"range_{unit}": size, "poses": one.poses, "lost": list(lost), "says": says})
+    return rows
 
 
 def _row(one: Explanation, positions: str) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import io
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,15 +49,18 @@ def limited_time(seconds: float) -> Iterator[None]:
 
 def is_sentence(text: str) -> bool:
     """Whether a message is one line that ends as a sentence does, and no longer than anybody reads."""
-    return text.endswith((".", "?")) and "\n" not in text and len(text) < 2000
+    return text.endswith((".", "?")) and "\n" not in text and len(text) <= 1000
 
 
-def ending(call: Callable[[], Any], seconds: float = 20) -> tuple[str | None, Any]:
-    """How a call ended: None and its result, or the outcome and the message."""
+def ending(call: Callable[[], Any], seconds: float = 20, said: list[str] | None = None) -> tuple[str | None, Any]:
+    """How a call ended: None and its result, or the outcome and the message; ``said`` gets its warnings."""
     try:
-        with limited_time(seconds), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return None, call()
+        with limited_time(seconds), warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            result = call()
+        if said is not None:
+            said += [str(one.message) for one in caught]
+        return None, result
     except aj.InputError as error:
         return (REFUSED if is_sentence(str(error)) else UNEXPECTED), str(error)
     except Hang:
@@ -68,12 +71,23 @@ def ending(call: Callable[[], Any], seconds: float = 20) -> tuple[str | None, An
         return UNEXPECTED, f"{type(error).__name__}: {error}"
 
 
-def read_again(read: Callable[[], Any], expected: Any, different: str = SILENT) -> tuple[str, str]:
-    """The outcome of reading a changed file, and the message; ``different``: what another result is."""
-    outcome, found = ending(read)
+def read_again(
+    read: Callable[[], Any], expected: Any, different: str = SILENT, names: Iterable[str] = ()
+) -> tuple[str, str]:
+    """The outcome of reading a changed file, and the message.
+
+    ``different`` is what another result is. Where the change is one of ``names`` (of elements, attributes, keys,
+    columns), another result is silent unless a warning says one of them; values are data.
+    """
+    said: list[str] = []
+    outcome, found = ending(read, said=said)
     if outcome is not None:
         return outcome, found
-    return (SAME if exact(found) == expected else different), ""
+    if exact(found) == expected:
+        return SAME, ""
+    names = tuple(names)
+    named = any(name in sentence for name in names for sentence in said)
+    return (OTHER if named else SILENT if names else different), " ".join(said)
 
 
 def exact(value: Any) -> Any:

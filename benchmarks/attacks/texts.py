@@ -1,8 +1,8 @@
 """Text files of every kind are mutated and read again.
 
-An edit (a digit, a name, a line) is another valid text and may give another result. A corruption (digits of another
-script, quotes, control characters, another encoding, ...) never may: the result is the same, or the file is refused in
-one sentence.
+An edit (a digit, a line) is another valid text and may give another result; one that makes a new name (of a key, an
+element, a column) may only where a warning says that name. A corruption (digits of another script, quotes, control
+characters, another encoding, ...) never may: the result is the same, or the file is refused in one sentence.
 """
 
 import random
@@ -334,6 +334,29 @@ CORRUPTIONS: dict[str, Callable[[str, random.Random], str]] = {
 }
 
 
+# Names in the text, of keys, elements, attributes or columns, by the ending of the file.
+NAMES = {
+    ".toml": r"(?m)(?:^|(?<=[{,])) *([A-Za-z_][\w-]*)(?= *=[^=])|^\[+([\w.]+)\]+",
+    ".yaml": r"(?m)^ *([A-Za-z_]\w*):",
+    ".urdf": r"</?([A-Za-z_][\w:]*)|\s([A-Za-z_]\w*)\s*=",
+    ".xml": r"</?([A-Za-z_][\w:]*)|\s([A-Za-z_]\w*)\s*=",
+    ".csv": r"\A[^\n]*",
+}
+
+
+def new_names(file: str, original: str, mutated: str) -> set[str]:
+    """Names of the mutated text that the original does not have."""
+    found = [
+        {
+            cell
+            for one in re.finditer(NAMES[Path(file).suffix], text)
+            for cell in re.split(",|;", one[one.lastindex or 0])
+        }
+        for text in (original, mutated)
+    ]
+    return {name for name in found[1] - found[0] if re.search(r"[^\W\d]", name)}
+
+
 def attack(folder: Path, seed: int, count: int) -> Iterator[Attempt]:
     """So many mutations, each of a file and of a kind drawn at random."""
     choose = random.Random(seed)
@@ -346,7 +369,9 @@ def attack(folder: Path, seed: int, count: int) -> Iterator[Attempt]:
         original = (folder / file).read_text()
         mutated = mutations[mutation](original, choose)
         (folder / file).write_bytes(mutated.encode(errors="surrogateescape"))
-        outcome, message = read_again(readers[file], expected[file], OTHER if kind == "edits" else SILENT)
+        edit = kind == "edits"
+        names = new_names(file, original, mutated) if edit else ()
+        outcome, message = read_again(readers[file], expected[file], OTHER if edit else SILENT, names)
         (folder / file).write_text(original)
         changed = [line for line in mutated.split("\n") if line not in original.split("\n")][:2]
         yield Attempt(kind, outcome, f"{file}, {mutation}: {[line[:90] for line in changed]} {message}")

@@ -18,7 +18,8 @@ OPENING = """# Command line
 
 `aacmm COMMAND --help` says the same on a terminal. Lengths are in mm; angles are in the unit that an option's name
 says. Exit codes: 0 done, 1 not achieved, 2 bad input, 130 interrupted, 141 the reader closed the output. `--debug`
-shows the traceback of an error.
+shows the traceback of an error. Every command replaces its own output when it runs again, but a file that aacmm did not
+write as what it writes now only with `--overwrite`.
 """
 
 

@@ -162,3 +162,24 @@ def test_a_model_of_which_nothing_is_left_out():
 def test_a_capture_of_another_number_of_joints(aacmm, mukca):
     said = aacmm("arm", "cheng2018-simulation", "--check", mukca / "panda_3.toml", expect=2).stderr
     assert "7 joints" in said
+
+
+def test_import_checks_the_readings(aacmm, tmp_path, few, paper_arm, paper_capture):
+    """Joint 5 moves by 0.1 deg; commanded readings differ from measured ones. Nothing is written without -o."""
+    q = np.array(paper_capture.q)[:60]
+    q[:, 4] = 0.4 + np.radians(np.linspace(0, 0.1, len(q)))
+    commanded = q + 1e-6 * np.random.default_rng(0).normal(size=q.shape)
+    table = np.hstack([commanded, q, np.asarray(paper_arm.position(q))])
+    header = [*(f"target_q_{i}" for i in range(6)), *(f"actual_q_{i}" for i in range(6)), "x", "y", "z"]
+    np.savetxt(tmp_path / "t.csv", table, delimiter=",", header=",".join(header), comments="", fmt="%.9f")
+    (tmp_path / "m.toml").write_text(
+        'arm = "cheng2018-simulation"\nangles = { unit = "rad" }\n[[points]]\nfile = "t.csv"\nu = 0.02\n'
+        'columns = { q = "actual_q_*", points = ["x", "y", "z"] }\n'
+    )
+    before = sorted(tmp_path.iterdir())
+    shown = " ".join(aacmm("import", "m.toml", "--check").stdout.split())
+    assert sorted(tmp_path.iterdir()) == before
+    assert "The readings fit as they are" in shown
+    assert "Joint 5 stands still (0.1 deg over 60 poses): alpha_5, a_5, d_5 and theta_5 cannot be identified;" in shown
+    assert "the manifest takes the better: the measured ones leave" in shown
+    assert "--check" in aacmm("import", "m.toml", expect=2).stderr

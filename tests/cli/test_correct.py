@@ -38,7 +38,7 @@ def table(path) -> list[dict[str, str]]:
 
 
 def run(arms, *arguments, expect=0):
-    return command_line(arms[0], "correct", "calibration.h5", *arguments, expect=expect)
+    return command_line(arms[0], "correct", "calibration.h5", *arguments, "--overwrite", expect=expect)
 
 
 def write(path, header: list[str], rows) -> None:

@@ -1,5 +1,6 @@
 """What a command writes: never a file that it reads, all files or none, with the permissions of what they replace."""
 
+import contextlib
 import os
 import re
 import stat
@@ -12,6 +13,8 @@ import aacmm_jax as aj
 from aacmm_jax.data.recording import Recording
 from aacmm_jax.files import atomic_write
 from aacmm_jax.files.arms import specification_toml
+from aacmm_jax.files.outputs import asking
+from tests.conftest import EXAMPLES
 from tests.refusals import assert_refused
 
 POINTS = '[points]\nunit = "mm"\n[[socket]]\nfile = "PA.csv"\n'
@@ -36,6 +39,13 @@ def inputs(tmp_path, paper_capture):
     (tmp_path / "link.csv").symlink_to("A.csv")
     os.link(tmp_path / "arm.toml", tmp_path / "same.toml")
     return tmp_path
+
+
+@pytest.fixture
+def calibrated(inputs, aacmm):
+    """And a calibration."""
+    aacmm("calibrate", "c.h5", "-o", "y.h5")
+    return inputs
 
 
 def content(folder):
@@ -99,10 +109,95 @@ def test_demo_leaves_other_files_alone(aacmm, inputs):
     assert sorted(content(inputs).values()) == sorted(before.values())
 
 
+FOREIGN = b"a,b\n1,2\n"
+
+
+def replaced(path, old: bytes, new: bytes) -> bool:
+    path.write_bytes(old)
+    with asking(), contextlib.suppress(aj.InputError), atomic_write.write_atomically(path) as temporary:
+        temporary.write_bytes(new)
+    return path.read_bytes() == new
+
+
+@pytest.mark.parametrize(
+    ("new", "own", "foreign"),
+    [
+        (b"\x89HDF 1 aacmm_jax", b"\x89HDF 2 aacmm_jax", b"\x89HDF of another program"),
+        (b"\x89HDF 1 aacmm_jax", b"", b"# Written by aacmm_jax"),
+        (b"\x89PNG Matplotlib 1", b"\x89PNG Matplotlib 2", b"\x89PNG of another program"),
+        (b"# Written by aacmm_jax\n1", b"# Written by aacmm_jax\n2", b"import numpy\n"),
+        (b'{\n  "kind": "arm",\n  1}', b'{\n  "kind": "arm",\n  2}', b'{\n  "mine": 1}'),
+        (b"parameter,u\n1", b"parameter,u\n2", b"a,b\n1,2"),
+        (b'<?xml?>\n<robot name="a">1', b'<?xml?>\n<robot name="a">2', b'<?xml?>\n<robot name="b">1'),
+    ],
+)
+def test_what_a_command_replaces(tmp_path, new, own, foreign):
+    path = tmp_path / "output"
+    assert replaced(path, own, new)
+    assert replaced(path, new, new)
+    assert not replaced(path, foreign, new)
+    assert [item.name for item in tmp_path.iterdir()] == ["output"]
+    with atomic_write.write_atomically(path) as temporary:  # from Python
+        temporary.write_bytes(new)
+
+
+def test_a_capture_of_somebody_else_is_not_replaced(aacmm, inputs):
+    (inputs / "x.h5").write_bytes(FOREIGN)
+    assert "x.h5 exists and is no earlier output" in aacmm(*SIMULATE, "-o", "x.h5", expect=2).stderr
+    assert (inputs / "x.h5").read_bytes() == FOREIGN
+    aacmm(*SIMULATE, "-o", "x.h5", "--overwrite")
+    aacmm(*SIMULATE, "-o", "x.h5")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "output", "foreign"),
+    [
+        (("calibrate", "c.h5", "-o", "y.h5", "--figure"), "x.png", b"\x89PNG\r\n\x1a\n of another program"),
+        (("report", "y.h5", "-o"), "x.html", b"<!doctype html>\n<html lang='en'>a page of mine</html>"),
+        (("export", "y.h5", "-o"), "x.toml", b'name = "My arm"\n'),
+        (("export", "y.h5", "--format", "json", "-o"), "x.json", b'{\n  "mine": 1}'),
+        (("export", "y.h5", "--format", "offsets", "-o"), "x.txt", FOREIGN),
+        (("export", "y.h5", "--format", "python", "-o"), "x.py", b"import numpy\n"),
+        (("correct", "y.h5", "A.csv", "--unit", "rad", "-o"), "x.csv", FOREIGN),
+        (("compare", "y.h5", "y.h5", "--csv"), "x.csv", FOREIGN),
+    ],
+    ids=lambda value: " ".join(map(str, value)) if isinstance(value, tuple) else None,
+)
+def test_a_file_of_somebody_else_is_not_replaced(aacmm, calibrated, command, output, foreign):
+    """But the output of the same command is, and an empty file, and any with --overwrite."""
+    path = calibrated / output
+    path.write_bytes(foreign)
+    done = aacmm(*command, output, expect=2)
+    assert f"{output} exists and is no earlier output of this kind" in done.stderr
+    assert path.read_bytes() == foreign
+    aacmm(*command, output, "--overwrite")
+    written = path.read_bytes()
+    assert written != foreign
+    path.write_bytes(b"")
+    aacmm(*command, output)
+    aacmm(*command, output)
+    assert path.read_bytes()[:64] == written[:64]
+    path.unlink()
+
+
+@pytest.mark.slow
+def test_the_robot_of_the_user_is_not_replaced(aacmm, tmp_path):
+    for file in ("robot.urdf", "tracker.toml", "tracker.csv"):
+        (tmp_path / file).write_bytes((EXAMPLES / "simulated_robot" / file).read_bytes())
+    before = (tmp_path / "robot.urdf").read_bytes()
+    aacmm("import", "tracker.toml", "-o", "c.h5")
+    aacmm("calibrate", "c.h5", "-o", "y.h5")
+    assert "robot.urdf is the original" in aacmm("export", "y.h5", "-o", "robot.urdf", expect=2).stderr
+    assert (tmp_path / "robot.urdf").read_bytes() == before
+    for _ in range(2):
+        aacmm("export", "y.h5", "-o", "calibrated.urdf")
+
+
 @pytest.mark.parametrize("failing", ["figure", "replace"])
 def test_all_outputs_or_none(aacmm, inputs, monkeypatch, failing):
     """A command that fails at its second output, or while it puts them in place, leaves the first as it was."""
-    (inputs / "old.h5").write_bytes(b"old")
+    (inputs / "old.h5").write_bytes((inputs / "c.h5").read_bytes())
     before = content(inputs)
 
     def refused(*_):

@@ -75,6 +75,26 @@ def test_other_commands(aacmm, tmp_path, command, part):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("text", [10_000 * "n", 5_000 * "n ", "\x1b[2J"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("{}",),
+        ("show", "{}"),
+        ("show", "c.h5", "{}"),
+        ("import", "{}", "-o", "c.h5"),
+        (*SIMULATE, "--acceptance", "{}"),
+        (*SIMULATE, "--true-arm", "{}"),
+        (*SIMULATE, "--length", "{}"),
+        (*SIMULATE, "--{}"),
+    ],
+)
+def test_long_arguments(aacmm, command, text):
+    said = aacmm(*(word.format(text) for word in command), expect=2).stderr
+    assert len(said) < 1300  # with the usage
+    assert "\x1b" not in said
+
+
 def test_names_from_a_file_do_not_reach_the_terminal_raw(aacmm, tmp_path, paper_capture):
     """ESC in the name of an arm, which only Python can put into a file."""
     arm = aj.files.load_specification("cheng2018-simulation")._replace(name="\x1b]0;owned\x07arm")

@@ -231,6 +231,33 @@ REFUSED = {
     "xacro value": (('xyz="0.35 0 0.03"', 'xyz="${length} 0 0"'), {}, ["xacro FILE.xacro > FILE.urdf"]),
     "no XML": (("</robot>", ""), {}, ["not valid XML", "correct it there"]),
     "another format": (("<robot", "<model"), {}, ["not valid XML"]),
+    "misspelt origin": (
+        ('<origin xyz="0.35', '<orign xyz="0.35'), {}, ["line 50: joint 'joint_4'", "<orign>; did you mean '<origin>'?"]
+    ),
+    "Origin": (('<origin xyz="0.35', '<Origin xyz="0.35'), {}, ["<Origin>; did you mean '<origin>'?"]),
+    "xzy": (('xyz="0.35', 'xzy="0.35'), {}, ["line 50: <origin> of joint 'joint_4'", "'xzy'; did you mean 'xyz'?"]),
+    "rpY": (('rpy="0 1.5708 0"', 'rpY="0 1.5708 0"'), {}, ["'rpY'; did you mean 'rpy'?"]),
+    "axes": (joint("joint_5", axis='<axes xyz="0 1 0"/>'), {}, ["joint 'joint_5'", "<axes>; did you mean '<axis>'?"]),
+    "Lower": (('lower="-2"', 'Lower="-2"'), {}, ["<limit> of joint 'joint_5'", "'Lower'; did you mean 'lower'?"]),
+    "two origins": (
+        ('<origin xyz="0.35', '<origin xyz="0 0 0"/><origin xyz="0.35'), {}, ["second <origin>, after that of line 50"]
+    ),
+    "two axes": (joint("joint_5", axis='<axis xyz="0 1 0"/><axis xyz="1 0 0"/>'), {}, ["has a second <axis>"]),
+    "axis without xyz": (joint("joint_5", axis="<axis/>"), {}, ["<axis> of joint 'joint_5' has no xyz"]),
+    "misspelt link": (('<link name="wrist_2"/>', '<Link name="wrist_2"/>'), {}, ["the robot", "<Link>; did you mean"]),
+    "misspelt mass": (('<mass value="3"/>', '<mas value="3"/>'), {}, ["<inertial> of link 'upper'", "<mas>"]),
+    "mass outside": (
+        ('<inertial><origin xyz="0 0 0.2"/><mass value="3"/>', '<mass value="3"/><inertial>'), {}, ["'upper'", "<mass>"]
+    ),
+    "inside an origin": (
+        ('<origin xyz="0.08 0 0"/>', '<origin xyz="0.08 0 0"><axis xyz="0 0 1"/></origin>'), {}, ["<axis>, but holds"]
+    ),
+    "text": (('<origin xyz="0.35 0 0.03"', 'origin xyz="0.35" <origin'), {}, ["holds the text 'origin xyz=\"0.35\"'"]),
+    "quaternion": (('rpy="0 1.5708 0"', 'quat_xyzw="0 1 0 0"'), {}, ["quat_xyzw", "as rpy"]),
+    "two shapes": (
+        ('<link name="wrist_2"/>', '<link name="wrist_2"><collision><geometry><sphere radius="1"/><box size="1 1 1"/>'
+         "</geometry></collision></link>"), {}, ["<geometry> of link 'wrist_2' has 2 shapes"]
+    ),
 }  # fmt: skip
 
 
@@ -241,6 +268,23 @@ def test_refusals_are_one_sentence(tmp_path, case):
     assert replacement is None or text != TEXT
     path = written(tmp_path, text)
     assert_refused(lambda: aj.load_arm(path, **{"tip": "tool0"} | links), path, *parts)
+
+
+OTHER_TOOLS = [
+    ("</robot>", '<gazebo reference="flange"><limit/></gazebo><ros2_control name="a"><joint/></ros2_control></robot>'),
+    ('<origin xyz="0.08 0 0"/>', '<origin xyz="0.08 0 0"/><drake:joint/><safety_controller k_velocity="1"/><gazebo/>'),
+    ('<link name="flange"/>', '<link name="flange" drake:x="1"><origin/><contact><damping/></contact></link>'),
+    ('type="fixed">', 'type="fixed" dont_collapse="true">'),
+    ('effort="10"', 'effort="10" acceleration="3" jerk="1e300"'),
+]
+
+
+@pytest.mark.parametrize("replacement", OTHER_TOOLS)
+def test_what_other_tools_write_passes(tmp_path, nominal, replacement):
+    text = TEXT.replace(*replacement).replace("<robot ", '<robot xmlns:drake="https://drake.mit.edu" ')
+    assert replacement[1] in text
+    found = aj.load_arm(written(tmp_path, text), tip="tool0")
+    np.testing.assert_array_equal(found.pose(Q), nominal.arm.pose(Q))
 
 
 BOMB = '<!DOCTYPE robot [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]>'
