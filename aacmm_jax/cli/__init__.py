@@ -56,6 +56,7 @@ def main() -> None:
         _interrupted()
     try:
         check_numbers(sys.argv[1:])
+        _prepare_jax(sys.argv[1:])
         app(prog_name="aacmm")
     except SystemExit as done:
         if done.code == INTERRUPTED:
@@ -76,6 +77,7 @@ def main() -> None:
     except Exception as error:
         if debug:
             raise
+        _fail_without_jax()
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             _discard_output()
             _fail("standard output cannot be written: no space left on the device; free some, or write elsewhere.", 1)
@@ -85,6 +87,27 @@ def main() -> None:
         )
     finally:
         gc.freeze()
+
+
+def _prepare_jax(arguments: list[str]) -> None:
+    """Where a command will compute, have JAX do so on what is there."""
+    from ..core.backend import prepare_command
+
+    if not arguments or arguments[0] in ("show", "--help", "--version") or "--help" in arguments:
+        return
+    warning = prepare_command()
+    if warning is not None:
+        print(warning, file=sys.stderr)
+
+
+def _fail_without_jax() -> None:
+    from ..core.backend import check_backend
+    from ..core.errors import InputError
+
+    try:
+        check_backend()
+    except InputError as error:
+        _fail(str(error), 2)
 
 
 def _interrupted() -> NoReturn:
