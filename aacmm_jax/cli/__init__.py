@@ -44,7 +44,7 @@ def main() -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         from ..core.errors import InputError
-        from .app import Stopped, app, check_numbers
+        from .app import Stopped, app, check_numbers, prepare_jax
 
         for family in _FAMILIES:
             import_module(f".{family}", __name__)
@@ -56,7 +56,8 @@ def main() -> None:
         _interrupted()
     try:
         check_numbers(sys.argv[1:])
-        _prepare_jax(sys.argv[1:])
+        if sys.argv[1:2] != ["show"] and not {"--help", "--version"} & set(sys.argv):  # which rarely compute
+            prepare_jax()
         app(prog_name="aacmm")
     except SystemExit as done:
         if done.code == INTERRUPTED:
@@ -87,17 +88,6 @@ def main() -> None:
         )
     finally:
         gc.freeze()
-
-
-def _prepare_jax(arguments: list[str]) -> None:
-    """Where a command will compute, have JAX do so on what is there."""
-    from ..core.backend import prepare_command
-
-    if not arguments or arguments[0] in ("show", "--help", "--version") or "--help" in arguments:
-        return
-    warning = prepare_command()
-    if warning is not None:
-        print(warning, file=sys.stderr)
 
 
 def _fail_without_jax() -> None:

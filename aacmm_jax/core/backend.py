@@ -1,8 +1,10 @@
 """Whether JAX can start on the platforms that it is told to use, and the CPU in their place for the command line.
 
-In Python this setting is the whole program's, so that nothing is changed there: a sentence says what is wrong with it.
+In Python these settings are those of the whole program, so that they are not changed there: a sentence says what is
+wrong with them.
 """
 
+import functools
 import os
 import sys
 
@@ -10,6 +12,12 @@ from .errors import InputError
 
 _SETTINGS = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")  # environment variables; the second is an older name
 _GUARDS = [f"JAX_TRANSFER_GUARD{kind}" for kind in ("", "_HOST_TO_DEVICE", "_DEVICE_TO_DEVICE", "_DEVICE_TO_HOST")]
+
+
+def _told() -> str:
+    """The settings that name more than the CPU; where there are none, JAX takes what is there."""
+    given = {name: os.environ.get(name, "") for name in _SETTINGS}
+    return " and ".join(f"{name}={value}" for name, value in given.items() if value not in ("", "cpu"))
 
 
 def check_backend() -> None:
@@ -20,12 +28,18 @@ def check_backend() -> None:
     try:
         jax.devices()
     except Exception as error:  # a RuntimeError, or an AssertionError where nothing that is named is there
-        told = " and ".join(f"{name}={os.environ[name]}" for name in _SETTINGS if os.environ.get(name))
-        reason = f"{told} names no device" if told else "it finds no device"
+        told = _told()
         raise InputError(
-            f"JAX cannot start, as {reason} that this machine and this installation have; unset "
-            f"{'it' if told else 'the options of JAX'}, or set JAX_PLATFORMS=cpu."
+            f"JAX cannot start, as {f'{told} names no device' if told else 'it finds no device'} that this machine and "
+            f"this installation have; {'unset it' if told else 'see its message'}, or set JAX_PLATFORMS=cpu."
         ) from error
+
+
+@functools.cache
+def check_setting() -> None:
+    """The same, once, where a setting names more than the CPU; otherwise JAX is not started for it."""
+    if _told():
+        check_backend()
 
 
 def prepare_command() -> str | None:
@@ -35,8 +49,8 @@ def prepare_command() -> str | None:
     """
     for name in _GUARDS:
         os.environ.pop(name, None)
-    if all(os.environ.get(name, "cpu") in ("", "cpu") for name in _SETTINGS):
-        return None  # JAX takes what is there
+    if not _told():
+        return None
     import jax
 
     try:

@@ -30,6 +30,7 @@ _CPU_SECONDS, _SECONDS_PER_MIB, _CLOCK_PER_CPU = 2.0, 1.0, 30
 _MEMORY = 256 * 2**20
 _MOST_SEALS = 100_000
 _vouched_for: set[str] = set()
+_OUT_OF_TIME = (1, -getattr(signal, "SIGPROF", 0))  # exit statuses, by the clock and by the CPU time
 _READY = b"ready\n"
 _COMMAND = "import sys; sys.path[:] = sys.argv[1:]; from aacmm_jax.files.reader_process import serve; serve()"
 
@@ -57,7 +58,15 @@ def read_through(path: str | os.PathLike, source: Any, size: int, largest: int, 
     content = source.getbuffer() if hasattr(source, "getbuffer") else source  # of a file that is in memory already
     sent = isinstance(content, bytes | memoryview)
     opened = None if sent else os.path.abspath(path)
-    request = {"path": str(path), "opened": opened, "size": size, "largest": largest}
+    seconds = _CPU_SECONDS + _SECONDS_PER_MIB * size / 2**20
+    request = {
+        "path": str(path),
+        "opened": opened,
+        "size": size,
+        "largest": largest,
+        "seconds": (seconds, _CLOCK_PER_CPU * seconds),
+        "memory": _MEMORY + 3 * size + min(largest, 100 * size),  # the bytes, copies by HDF5, and what is read of them
+    }
     answer = _reader.answer(request, content if sent else b"")
     if answer is None:
         raise damaged(path)
@@ -77,11 +86,11 @@ class _Reader:
 
     def __init__(self) -> None:
         self._process: Any = None
-        self._lock = threading.Lock()
+        self.lock = threading.Lock()
         self._ready = self._has_refused = False
 
     def start(self) -> None:
-        with self._lock, contextlib.suppress(OSError):  # which `answer` meets again
+        with self.lock, contextlib.suppress(OSError):  # which `answer` meets again
             self._start()
 
     def _start(self) -> None:
@@ -116,19 +125,21 @@ class _Reader:
                     pipe.close()
 
     def forget(self) -> None:
-        """After a fork: the child is the parent's."""
+        """After a fork, before which it was locked: the child is the parent's."""
         if self._process is not None:
             self._process.returncode = 0
+            self._process.stdin.close()
+            self._process.stdout.close()
         self.__init__()
 
     def answer(self, request: dict[str, Any], content: Any) -> str | None:
         """Empty where a file can be read, else why not; None where it is damaged."""
-        with self._lock:
+        with self.lock:
             try:
                 had_refused = self._has_refused
-                answer, ended = self._ask(request, content)
-                if ended and had_refused:  # what it read before may have spoilt its memory
-                    answer, ended = self._ask(request, content)
+                answer, crashed = self._ask(request, content)
+                if crashed and had_refused:  # what it read before may have spoilt its memory
+                    answer, _ = self._ask(request, content)
                 self._has_refused |= answer != ""
                 return answer
             except BaseException:  # the answer to a request that was interrupted must not be taken for the next one's
@@ -136,7 +147,7 @@ class _Reader:
                 raise
 
     def _ask(self, request: dict[str, Any], content: Any) -> tuple[str | None, bool]:
-        """The answer, and whether the child ended in place of one."""
+        """The answer, and whether the child crashed in place of one."""
         try:
             self._start()
             if not self._ready and self._process.stdout.readline() != _READY:
@@ -155,14 +166,17 @@ class _Reader:
             answer = self._process.stdout.readline()
         if answer.endswith(b"\n"):
             return json.loads(answer), False
+        crashed = self._process.wait() not in _OUT_OF_TIME
         self.stop()
-        return None, True
+        return None, crashed
 
 
 _reader = _Reader()
 atexit.register(_reader.stop)
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_reader.forget)
+    os.register_at_fork(
+        before=_reader.lock.acquire, after_in_parent=_reader.lock.release, after_in_child=_reader.forget
+    )
 
 
 def serve() -> None:
@@ -179,7 +193,7 @@ def serve() -> None:
         content, path, size = sys.stdin.buffer.read(request["sent"]), request["path"], request["size"]
         answer: str | None = ""
         try:
-            with limits.of(size, request["largest"]), contextlib.ExitStack() as stack:
+            with limits.of(*request["seconds"], request["memory"]), contextlib.ExitStack() as stack:
                 source = content or stack.enter_context(open(request["opened"], "rb"))
                 stack.enter_context(content_of(path, source, size, request["largest"])).check()
         except InputError as error:
@@ -206,19 +220,17 @@ class _Limits:
             self._used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 
     @contextlib.contextmanager
-    def of(self, size: int, largest: int) -> Iterator[None]:
-        """While a file of this size is read."""
-        seconds = _CPU_SECONDS + _SECONDS_PER_MIB * size / 2**20
-        faulthandler.dump_traceback_later(_CLOCK_PER_CPU * seconds, exit=True)
+    def of(self, cpu: float, clock: float, memory: int) -> Iterator[None]:
+        """While a file is read: so many seconds of CPU time and by the clock, and bytes of memory."""
+        faulthandler.dump_traceback_later(clock, exit=True)
         if self._used:
             import resource
 
             hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-            wanted = self._used + _MEMORY + 3 * size + min(largest, 100 * size)
-            limit = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+            limit = self._used + memory if hard == resource.RLIM_INFINITY else min(self._used + memory, hard)
             resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
         if hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_PROF, seconds)
+            signal.setitimer(signal.ITIMER_PROF, cpu)
         try:
             yield
         finally:

@@ -25,9 +25,9 @@ from ..files.atomic_write import ELSEWHERE, write_atomically
 from ..files.captures import arm_table, recording_of, recording_tables, specification_of
 from ..files.hdf5 import (
     BLOCK,
-    SEALED_SINCE,
     FORMAT,
     FORMAT_VERSION,
+    SEALED_SINCE,
     Table,
     Variable,
     check_sense,
