@@ -77,11 +77,12 @@ class Content:
     """
 
     def __init__(self, path: str | os.PathLike, file: Any, size: int, largest: int):
-        self.path, self.file, self._size = path, file, size
+        self.path, self.file = path, file
         self.attributes = attributes_of(file)
         self._virtual = self.attributes.get("parts") if self.attributes.get("kind") == "study" else None
         self._credible = _ALWAYS_READ + _MOST_COMPRESSED * size
         self._left = min(largest, self._credible)
+        self._texts_at_once = max(1, self._credible // size)
 
     def _refuse(self, name: str, what: str) -> InputError:
         return InputError(f"{self.path}: '{name}' is {what}, which is not read; name a file written by aacmm.")
@@ -134,9 +135,10 @@ class Content:
     def values(self, group: Any, name: str) -> np.ndarray:
         """An array, read whole; texts are str."""
         item = self.array(group, name)
-        self._left -= math.prod(item.shape) * item.dtype.itemsize
+        shape, kind = item.shape, item.dtype
+        self._left -= math.prod(shape) * kind.itemsize
         if self._left >= 0:
-            return self._texts(item, name) if h5py.check_string_dtype(item.dtype) else _numbers(item)
+            return self._texts(item, name) if h5py.check_string_dtype(kind) else _read(item, shape, kind)
         raise self._too_large(name, item)
 
     def _too_large(self, name: str, item: Any) -> InputError:
@@ -149,9 +151,9 @@ class Content:
             raise self._refuse(name, "a table of texts in several dimensions")
         if not item.shape:
             return np.asarray(texts[()], dtype=object)
-        step, found = max(1, self._credible // self._size), []
-        for first in range(0, item.shape[0], step):
-            part = texts[first : first + step]
+        found = []
+        for first in range(0, item.shape[0], self._texts_at_once):
+            part = texts[first : first + self._texts_at_once]
             self._left -= sum(map(len, part))
             if self._left < 0:
                 raise self._too_large(name, item)
@@ -166,7 +168,7 @@ class Content:
         if self.attributes and "format" not in self.attributes:
             return
         root = self.file.id
-        self._check_attributes(root)
+        self._check_attributes(root, read=False)  # as they have been
         for name in self.names(root):
             item = self._item(root, name)
             if not isinstance(item, h5py.h5g.GroupID):
@@ -182,31 +184,30 @@ class Content:
             self._check_attributes(item)
             for dimension in h5py.Dataset(item).dims:
                 dimension.keys()
-        if item.get_create_plist().get_layout() == h5py.h5d.VIRTUAL:
-            return  # its values are those of other files, which are checked when they are opened
+            if item.get_create_plist().get_layout() == h5py.h5d.VIRTUAL:
+                return  # its values are those of other files, which are checked when they are opened
         shape, kind = item.shape, item.dtype
         declared = math.prod(shape) * kind.itemsize
         if declared > self._credible:
             raise self._too_large(name, item)
-        if h5py.check_string_dtype(kind):
+        if h5py.check_string_dtype(kind) and math.prod(shape) > self._texts_at_once:
             self._texts(item, name)
         elif declared <= _BUFFER:
-            _numbers(item)
+            _read(item, shape, kind)
         else:
             for rows in _parts(shape, kind.itemsize):
                 h5py.Dataset(item)[rows]
 
-    def _check_attributes(self, item: Any) -> None:
-        attributes = h5py.AttributeManager(
-            h5py.Group(item) if isinstance(item, h5py.h5g.GroupID) else h5py.Dataset(item)
-        )
-        for name in attributes:
-            attribute = attributes.get_id(name)
-            if name not in ("DIMENSION_LIST", "REFERENCE_LIST"):  # by which HDF5 attaches scales
-                _check_type(name, self._refuse, attribute.get_type())
-            if math.prod(attribute.shape) * attribute.dtype.itemsize > self._credible:
-                raise self._too_large(name, attribute)
-            attributes[name]
+    def _check_attributes(self, item: Any, read: bool = True) -> None:
+        for index in range(h5py.h5a.get_num_attrs(item)):
+            attribute = h5py.h5a.open(item, index=index)
+            if attribute.name not in (b"DIMENSION_LIST", b"REFERENCE_LIST"):  # by which HDF5 attaches scales
+                _check_type(attribute.name.decode(), self._refuse, attribute.get_type())
+            shape, kind = attribute.shape, attribute.dtype
+            if math.prod(shape) * kind.itemsize > self._credible:
+                raise self._too_large(attribute.name.decode(), attribute)
+            if read and math.prod(shape):
+                attribute.read(np.empty(shape, kind))
 
 
 def attributes_of(item: Any) -> dict[str, Any]:
@@ -222,8 +223,9 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _numbers(item: Any) -> np.ndarray:
-    values = np.empty(item.shape, item.dtype)
+def _read(item: Any, shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
+    """An array as HDF5 reads it: numbers, or texts as bytes."""
+    values = np.empty(shape, kind)
     if values.size:
         item.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
     return values

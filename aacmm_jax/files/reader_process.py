@@ -31,6 +31,7 @@ _MEMORY = 256 * 2**20
 _MOST_SEALS = 100_000
 _vouched_for: set[str] = set()
 _OUT_OF_TIME = (1, -getattr(signal, "SIGPROF", 0))  # exit statuses, by the clock and by the CPU time
+_UNSTARTABLE = (OSError, TypeError, ValueError)  # an interpreter that is not there, has no name, or fails
 _READY = b"ready\n"
 _COMMAND = "import sys; sys.path[:] = sys.argv[1:]; from aacmm_jax.files.reader_process import serve; serve()"
 
@@ -90,7 +91,7 @@ class _Reader:
         self._ready = self._has_refused = False
 
     def start(self) -> None:
-        with self.lock, contextlib.suppress(OSError):  # which `answer` meets again
+        with self.lock, contextlib.suppress(*_UNSTARTABLE):  # which `answer` meets again
             self._start()
 
     def _start(self) -> None:
@@ -152,7 +153,7 @@ class _Reader:
             self._start()
             if not self._ready and self._process.stdout.readline() != _READY:
                 raise OSError(None, f"exit status {self._process.wait()}")
-        except (OSError, ValueError, TypeError) as error:  # of a program that is not there, not named, or fails
+        except _UNSTARTABLE as error:
             reason = (getattr(error, "strerror", None) or str(error)).lower()
             raise InputError(
                 f"{request['path']} cannot be read, as the process that opens HDF5 files first does not start: "
@@ -166,9 +167,12 @@ class _Reader:
             answer = self._process.stdout.readline()
         if answer.endswith(b"\n"):
             return json.loads(answer), False
-        crashed = self._process.wait() not in _OUT_OF_TIME
+        status = self._process.wait()
         self.stop()
-        return None, crashed
+        if status == -getattr(signal, "SIGKILL", 0):
+            path = request["path"]
+            return f"{path} cannot be read: the system ended the process that opens it; free some memory.", False
+        return None, status not in _OUT_OF_TIME
 
 
 _reader = _Reader()
