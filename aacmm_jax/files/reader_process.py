@@ -32,6 +32,7 @@ _MOST_SEALS = 100_000
 _vouched_for: set[str] = set()
 _OUT_OF_TIME = (1, -getattr(signal, "SIGPROF", 0))  # exit statuses, by the clock and by the CPU time
 _UNSTARTABLE = (OSError, TypeError, ValueError)  # an interpreter that is not there, has no name, or fails
+_KEPT = 2**20  # bytes of an intact file, for comparison
 _READY = b"ready\n"
 _COMMAND = "import sys; sys.path[:] = sys.argv[1:]; from aacmm_jax.files.reader_process import serve; serve()"
 
@@ -65,8 +66,8 @@ def read_through(path: str | os.PathLike, source: Any, size: int, largest: int, 
         "opened": opened,
         "size": size,
         "largest": largest,
-        "seconds": (seconds, _CLOCK_PER_CPU * seconds),
-        "memory": _MEMORY + 3 * size + min(largest, 100 * size),  # the bytes, copies by HDF5, and what is read of them
+        # Of memory: the bytes, copies of them in HDF5, and what is read.
+        "limits": (seconds, _CLOCK_PER_CPU * seconds, _MEMORY + 3 * size + min(largest, 100 * size)),
     }
     answer = _reader.answer(request, content if sent else b"")
     if answer is None:
@@ -141,7 +142,7 @@ class _Reader:
                 answer, crashed = self._ask(request, content)
                 if crashed and had_refused:  # what it read before may have spoilt its memory
                     answer, _ = self._ask(request, content)
-                self._has_refused |= answer != ""
+                self._has_refused |= answer is None
                 return answer
             except BaseException:  # the answer to a request that was interrupted must not be taken for the next one's
                 self.stop()
@@ -185,27 +186,38 @@ if hasattr(os, "register_at_fork"):
 
 def serve() -> None:
     """What the child does: read one file after the other, until nobody can ask any more."""
-    answers = os.fdopen(os.dup(1), "wb")
+    answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # what a library prints is no answer
     from .hdf5_content import content_of
 
+    def check(content: bytes, request: dict[str, Any]) -> None:
+        with limits.of(*request["limits"]), contextlib.ExitStack() as stack:
+            source = content or stack.enter_context(open(request["opened"], "rb"))
+            stack.enter_context(content_of(request["path"], source, request["size"], request["largest"])).check()
+
     limits = _Limits()
+    intact: tuple[bytes, dict[str, Any]] | None = None
     answers.write(_READY)
-    answers.flush()
     for line in sys.stdin.buffer:
         request = json.loads(line)
-        content, path, size = sys.stdin.buffer.read(request["sent"]), request["path"], request["size"]
+        content = sys.stdin.buffer.read(request["sent"])
         answer: str | None = ""
         try:
-            with limits.of(*request["seconds"], request["memory"]), contextlib.ExitStack() as stack:
-                source = content or stack.enter_context(open(request["opened"], "rb"))
-                stack.enter_context(content_of(path, source, size, request["largest"])).check()
+            check(content, request)
         except InputError as error:
             answer = str(error)
         except Exception:  # a single wrong byte surfaces as almost any exception of HDF5, h5py and NumPy
             answer = None
         answers.write(json.dumps(answer).encode() + b"\n")
-        answers.flush()
+        if answer == "" and 0 < len(content) < _KEPT:
+            intact = content, request
+        if answer is None:  # without memory, for one, HDF5 can no longer read what it could before
+            if intact is None:
+                break
+            try:
+                check(*intact)
+            except Exception:
+                break
     os._exit(0)
 
 
