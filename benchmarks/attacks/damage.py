@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from .flips import Target, make, targets
+from .flips import Target, targets
 from .outcomes import HANG, LARGE, OTHER, SILENT, UNEXPECTED, Attempt, exact, read_again
+from .samples import make
 
 SEALS = ("as written", "missing", "recomputed")
 SECONDS = 120  # without an answer: more than all limits of time in the package for files of this size
@@ -61,7 +62,7 @@ def with_seal(content: bytes, original: bytes, seal: str, random: np.random.Gene
     return content + (original if seal == "as written" else original[: int(random.integers(-40, len(original)))])
 
 
-def _attempts(folder: Path, kind: str, seal: str, seed: list[int], first: int, count: int, pipe: Any) -> None:
+def _attempts(folder: Path, kind: str, seed: list[int], first: int, count: int, pipe: Any) -> None:
     """In a process of its own: damage a file, read it, and send how that ended."""
     from aacmm_jax.files import reader_process
 
@@ -72,7 +73,7 @@ def _attempts(folder: Path, kind: str, seal: str, seed: list[int], first: int, c
     expected = exact(target.read())
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for number in range(first, count):
-        random = np.random.default_rng([*seed, number])
+        random, seal = np.random.default_rng([*seed, number]), SEALS[number % len(SEALS)]
         changed, what = damaged(content[:end], random)
         target.file.write_bytes(with_seal(changed, content[end:], seal, random))
         pipe.send((number, what, None, None))
@@ -84,14 +85,18 @@ def _attempts(folder: Path, kind: str, seal: str, seed: list[int], first: int, c
     pipe.send(None)
 
 
-def attempts(folder: Path, kind: str, seal: str, seed: list[int], count: int) -> Iterator[Attempt]:
+def attempts(folder: Path, kind: str, seed: list[int], count: int) -> Iterator[Attempt]:
     """So many damages of one file; a process that hangs or crashes is replaced."""
-    context, number, name = multiprocessing.get_context("spawn"), -1, f"{kind}, seal {seal}"
+    context, number = multiprocessing.get_context("spawn"), -1
     file, what = targets(folder)[kind].file, ""
     content = file.read_bytes()
+
+    def attempt(outcome: str, detail: str) -> Attempt:
+        return Attempt(f"{kind}, seal {SEALS[number % len(SEALS)]}", outcome, f"{what}: {detail}")
+
     while number < count - 1:
         receiver, sender = context.Pipe(duplex=False)
-        process = context.Process(target=_attempts, args=(folder, kind, seal, seed, number + 1, count, sender))
+        process = context.Process(target=_attempts, args=(folder, kind, seed, number + 1, count, sender))
         process.start()
         sender.close()
         try:
@@ -100,12 +105,12 @@ def attempts(folder: Path, kind: str, seal: str, seed: list[int], count: int) ->
                     break
                 number, what, outcome, message = found
                 if outcome is not None:
-                    yield Attempt(name, outcome, f"{what}: {message}")
+                    yield attempt(outcome, message)
             else:
-                yield Attempt(name, HANG, what)
+                yield attempt(HANG, f"no answer for {SECONDS} s")
         except EOFError:
             process.join()
-            yield Attempt(name, UNEXPECTED, f"{what}: the process ended with {process.exitcode}")
+            yield attempt(UNEXPECTED, f"the process ended with {process.exitcode}")
         process.kill()
         process.join()
         file.write_bytes(content)
@@ -115,5 +120,5 @@ def attack(folder: Path, seed: int, count: int) -> Iterator[Attempt]:
     """So many damages, over files of all kinds and the three seals."""
     make(folder)
     for number, kind in enumerate(found := targets(folder)):
-        for seal in SEALS:
-            yield from attempts(folder, kind, seal, [seed, number], count // (len(found) * len(SEALS)))
+        share = count * (number + 1) // len(found) - count * number // len(found)
+        yield from attempts(folder, kind, [seed, number], share)

@@ -9,7 +9,7 @@ import numpy as np
 import aacmm_jax as aj
 
 from .outcomes import Attempt, command_line, exact, read_again
-from .samples import READERS, make_studies, results, studies, study_results
+from .samples import READERS, make, studies, study_results
 
 COMMAND_SHARE = 20  # one flip in so many is read by the command line instead
 
@@ -20,13 +20,6 @@ class Target(NamedTuple):
     file: Path
     read: Callable[[], Any]
     command: list[str]  # of the command line, that reads it
-
-
-def make(folder: Path) -> None:
-    """One file of each kind, in a folder."""
-    for kind, write in results().writers.items():
-        write(folder / f"{kind}.h5")
-    make_studies(folder)
 
 
 def targets(folder: Path) -> dict[str, Target]:

@@ -105,8 +105,10 @@ def study_results(path: Path) -> Any:
     return results.finished, [results.columns(cell) for cell in cells], [list(results.errors(cell)) for cell in cells]
 
 
-def make_studies(folder: Path) -> None:
-    """Run a small study twice, into a folder: to its end, and with its blocks kept."""
+def make(folder: Path) -> None:
+    """One file of each kind, in a folder; a small study runs twice: to its end, and with its blocks kept."""
+    for kind, write in results().writers.items():
+        write(folder / f"{kind}.h5")
     (folder / "study.toml").write_text(STUDY)
     study = aj.study.read_study(folder / "study.toml")
     run = partial(aj.study.run_study, study, chunk=BLOCK)
