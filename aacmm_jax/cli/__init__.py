@@ -92,11 +92,10 @@ def main() -> None:
 
 def _fail_without_jax() -> None:
     from ..core.backend import check_backend
-    from ..core.errors import InputError
 
     try:
         check_backend()
-    except InputError as error:
+    except RuntimeError as error:
         _fail(str(error), 2)
 
 

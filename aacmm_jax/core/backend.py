@@ -1,14 +1,12 @@
 """Whether JAX can start on the platforms that it is told to use, and the CPU in their place for the command line.
 
 In Python these settings are those of the whole program, so that they are not changed there: a sentence says what is
-wrong with them.
+wrong with them. It is a `RuntimeError`, as JAX's own, and no `InputError`: to those, readers add the name of a file.
 """
 
 import functools
 import os
 import sys
-
-from .errors import InputError
 
 _SETTINGS = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")  # environment variables; the second is an older name
 _GUARDS = [f"JAX_TRANSFER_GUARD{kind}" for kind in ("", "_HOST_TO_DEVICE", "_DEVICE_TO_DEVICE", "_DEVICE_TO_HOST")]
@@ -21,7 +19,7 @@ def _told() -> str:
 
 
 def check_backend() -> None:
-    """Raise `InputError` where JAX has been imported and cannot start."""
+    """Raise `RuntimeError` where JAX has been imported and cannot start."""
     jax = sys.modules.get("jax")
     if jax is None:
         return
@@ -29,7 +27,7 @@ def check_backend() -> None:
         jax.devices()
     except Exception as error:  # a RuntimeError, or an AssertionError where nothing that is named is there
         told = _told()
-        raise InputError(
+        raise RuntimeError(
             f"JAX cannot start, as {f'{told} names no device' if told else 'it finds no device'} that this machine and "
             f"this installation have; {'unset it' if told else 'see its message'}, or set JAX_PLATFORMS=cpu."
         ) from error
@@ -55,7 +53,7 @@ def prepare_command() -> str | None:
 
     try:
         check_backend()
-    except InputError as error:
+    except RuntimeError as error:
         for name in _SETTINGS:
             if name in os.environ:
                 os.environ[name] = "cpu"  # for processes started from here

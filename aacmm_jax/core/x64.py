@@ -24,7 +24,7 @@ else:
 
 
 def check_x64() -> None:
-    """Raise `InputError` where 64-bit floats were turned off after the import, or JAX cannot start as it is told."""
+    """Raise `InputError` where 64-bit floats were turned off after the import, and what `check_setting` raises."""
     import jax
 
     check_setting()

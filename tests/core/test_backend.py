@@ -8,7 +8,7 @@ import pytest
 
 from aacmm_jax.core import backend
 from aacmm_jax.files.hdf5 import undamaged
-from tests.refusals import assert_refused, refusal
+from tests.refusals import assert_refused
 
 SENTENCE = (
     "JAX cannot start, as JAX_PLATFORMS=cuda names no device that this machine and this installation have; unset it, "
@@ -34,14 +34,20 @@ def without_gpu(monkeypatch):
     backend.check_setting.cache_clear()
 
 
+def sentence(call):
+    with pytest.raises(RuntimeError) as caught:
+        call()
+    return str(caught.value)
+
+
 def failing(error):
     with undamaged("capture.h5"):
         raise error
 
 
 def test_only_failures_of_reading_blame_the_file(without_gpu):
-    assert refusal(lambda: failing(AssertionError())) == SENTENCE
-    assert refusal(lambda: failing(KeyError("angle"))) == SENTENCE  # whatever it led to
+    for error in (AssertionError(), KeyError("angle"), RuntimeError()):  # whatever it led to
+        assert sentence(lambda error=error: failing(error)) == SENTENCE
     backend.prepare_command()
     assert_refused(lambda: failing(KeyError("angle")), "capture.h5 is damaged")
     assert_refused(lambda: failing(MemoryError()), "capture.h5 cannot be read", "no memory")
@@ -60,7 +66,7 @@ def test_a_command_goes_on_on_the_cpu(without_gpu, monkeypatch):
 
 
 def test_python_is_told(without_gpu):
-    assert refusal(backend.check_setting) == SENTENCE
+    assert sentence(backend.check_setting) == SENTENCE
     backend.prepare_command()
     backend.check_setting()
 
